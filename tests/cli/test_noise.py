@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -26,6 +27,7 @@ def test_table_and_files(shots: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert f"{shots}: noise from 8 tracks" in said
     assert "error of a position that lasts, along x" in said
     assert "90 % intervals of these forecasts hold" in said
+    assert re.search(r"lasts, along x +([\d.]+) x/: ([\d.]+)  mm  \(([\d.]+) to ([\d.]+)\)", said)
     noise = load_model(out).noise
     assert noise is not None
     assert noise == read_dataset(shots).info.noise  # stated in both files now

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -88,8 +89,16 @@ def _table(found: NoiseEstimate) -> list[str]:
         value = content[field]
         number = factor * (value["xyz".index(axis)] if axis else value)
         doubt = "  (hardly known)" if error >= UNKNOWN else ""
-        lines.append(f"  {meaning.format(axis):52} {number:8.3g} x/: {_ratio(error)}  {unit}{doubt}")
+        limits = _limits(*(factor * limit for limit in found.intervals[name]))
+        lines.append(f"  {meaning.format(axis):52} {number:8.3g} x/: {_ratio(error)}  {unit}{limits}{doubt}")
     return lines
+
+
+def _limits(low: float, high: float) -> str:
+    """The interval of a number, or the one limit that the tracks show."""
+    if math.isinf(high):
+        return f"  (above {low:.2g})" if low > 0.0 else ""
+    return f"  ({low:.2g} to {high:.2g})" if low > 0.0 else f"  (below {high:.2g})"
 
 
 def _ratio(error: float) -> str:

@@ -28,6 +28,7 @@ from ballfg.estimation.noise.parameters import (
     track_noise,
     with_noise,
 )
+from ballfg.estimation.noise.profile import Profile
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.parallel.work import on_one_thread
@@ -45,8 +46,8 @@ EARLIEST_SHARE: Final = 0.7
 """Share of a short track that is seen before the first forecast."""
 EVERY_SHARE: Final = 0.12
 """Share of a short track between two starts."""
-DIFFERENCE: Final = 0.02
-"""Step of a logarithm for the second derivatives behind the error bars."""
+OPEN: Final = 0.7
+"""Of the standard deviation of the prior. Beyond it the prior and not the tracks ends an interval, which is open."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,9 @@ class NoiseEstimate:
     Attributes:
         noise: standard deviations.
         relative_errors: standard deviation of each number's logarithm, by name, with `.x`, `.y`, `.z` where there is
-            one per axis, from the scatter of the score from track to track.
+            one per axis; the larger one of its two sides.
+        intervals: of the same numbers, one standard deviation to each side, in their own units; from 0 where tracks do
+            not tell how small a number is, to infinity where they do not tell how large.
         coefficient_factor: spread of coefficients from track to track, as a multiple of the settings'.
         settings: with that noise.
         held_before: share of forecast coordinates inside their 90 % intervals with the settings given.
@@ -67,6 +70,7 @@ class NoiseEstimate:
 
     noise: TrackNoise
     relative_errors: dict[str, float]
+    intervals: dict[str, tuple[float, float]]
     coefficient_factor: float
     settings: Settings
     held_before: float
@@ -136,10 +140,15 @@ def _searched(
     watched = watch(range(2 * MOST_ITERATIONS), 2 * MOST_ITERATIONS, "steps of the noise")
     with closing(step for step in watched) as steps:
         logs = search.minimised(lambda: next(steps, None))
+    sides = np.empty((0, 2))
+    if errors:
+        profile = search.profile(logs)
+        logs, sides = profile.best, profile.sides()
     found = track_noise(parameters, logs, settings)
     return NoiseEstimate(
         noise=found,
-        relative_errors=search.errors(logs) if errors else {},
+        relative_errors=dict(zip(search.names, sides.max(axis=1).tolist(), strict=False)),
+        intervals=dict(zip(search.names, _intervals(logs, sides, OPEN * search.spread), strict=False)),
         coefficient_factor=float(np.exp(logs[-1])) if parameters[-1].name == COEFFICIENTS else 1.0,
         settings=with_noise(settings, found),
         held_before=search.held(search.start),
@@ -147,6 +156,19 @@ def _searched(
         tracks=len(linear),
         starts=len(forecaster.starts),
     )
+
+
+def _intervals(logs: Array, sides: Array, wide: Array) -> list[tuple[float, float]]:
+    """Limits at distances (k, 2) below and above logarithms (k,); none where a distance is beyond `wide` (k,)."""
+    limits = []
+    for log, (below, above), most in zip(logs, sides, wide, strict=False):
+        limits.append(
+            (
+                float(np.exp(log - below)) if below < most else 0.0,
+                float(np.exp(log + above)) if above < most else np.inf,
+            )
+        )
+    return limits
 
 
 def linearised(
@@ -239,24 +261,14 @@ class _Search:
         found = minimize(told, self.start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
         return np.asarray(found.x)
 
-    def errors(self, logs: Array) -> dict[str, float]:
-        """Standard deviations of the logarithms: tracks are independent, forecasts within a track are not.
+    def profile(self, logs: Array) -> Profile:
+        """What is known about the minimum near some logarithms (k,)."""
+        return Profile(self.value, self._scatter, logs, self.spread, self.low, self.high)
 
-        With H the Hessian of the objective, G the sum over tracks of the squares of their gradients and P the precision
-        of the prior, the covariance is H^-1 (G + P) H^-1 (P. J. Huber 1967; clusters: K.-Y. Liang, S. L. Zeger 1986).
-        """
-        size = len(logs)
-        hessian = np.empty((size, size))
-        for k in range(size):
-            step = np.zeros(size)
-            step[k] = DIFFERENCE
-            hessian[k] = (self.value(logs + step)[1] - self.value(logs - step)[1]) / (2.0 * DIFFERENCE)
-        values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
-        least = 1.0 / self.spread.max() ** 2  # where the score bends downwards the prior alone is what is known
-        inverse = (vectors / np.maximum(values, least)) @ vectors.T
-        covariance = inverse @ (self._scatter(logs) + np.diag(self.spread**-2)) @ inverse
-        names = [p.name if p.axis is None else f"{p.name}.{'xyz'[p.axis]}" for p in self.parameters]
-        return dict(zip(names, np.sqrt(np.diagonal(covariance)).tolist(), strict=True))
+    @property
+    def names(self) -> list[str]:
+        """Of the numbers, with `.x`, `.y`, `.z` where there is one per axis."""
+        return [p.name if p.axis is None else f"{p.name}.{'xyz'[p.axis]}" for p in self.parameters]
 
     def _scatter(self, logs: Array) -> Array:
         """(k, k) sum over tracks of the squares of their gradients about the mean."""

@@ -14,6 +14,7 @@ from ballfg.estimation import (
 )
 from ballfg.simulation import MeasurementNoise, MotionNoise, SimulationConfig, parse_effects, write_simulation
 from ballfg.tracks import read_dataset
+from tests.estimation.noise import intervals
 
 
 def held(model, surfaces, settings, tracks):
@@ -47,6 +48,20 @@ def test_planted_memory_comes_back(found):
 def test_error_bars_are_of_the_size_of_the_errors(found):
     for axis, value in zip("xyz", found.noise.memory, strict=True):
         assert abs(np.log(value / 0.003)) < 3.0 * found.relative_errors[f"memory.{axis}"]
+
+
+def test_factors_hold_where_the_curvature_is_not_honest():
+    """White noise of 0.5 mm beside 2 mm that last for 10 ms: upwards it is known, downwards hardly."""
+    rows = []
+    for world, tracks in intervals.worlds(2, 7, intervals.WORLDS["lasting"]):
+        rows += list(intervals.rows_of(world, intervals.found_in(tracks)))
+    white = [row for row in rows if row.name.startswith("position")]
+    assert len(white) == 6
+    assert intervals.rms(row.z for row in white) < 1.4
+    assert intervals.rms(row.z for row in rows if row.true) < 1.4
+    for row in white:
+        assert row.low < row.found < row.high
+        assert np.log(row.high / row.found) < row.error + 1e-9
 
 
 def test_intervals_hold_with_it_on_other_tracks(lasting, found):

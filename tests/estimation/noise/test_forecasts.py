@@ -155,8 +155,8 @@ def test_what_is_known_of_a_start_is_told_as_a_deviation_from_the_estimate(case)
         np.testing.assert_allclose(own, known - found, rtol=1e-3, atol=1e-4)
 
 
-def test_error_bars_are_those_of_the_curvature_and_of_the_scatter_of_tracks(case):
-    """H^-1 (G + P) H^-1 with second differences of the objective itself in place of differences of its gradient."""
+def test_curvature_and_scatter_behind_the_error_bars(case):
+    """H and G of H^-1 (G + P) H^-1, by second differences of the objective itself and by the tracks one by one."""
     *_, settings, _, linear, forecaster = case
     known = parameters_of(settings, linear, position_known=True)
     search = _Search(forecaster, [p for p in known if p.name == "acceleration" or p.axis == 2], settings)
@@ -167,8 +167,11 @@ def test_error_bars_are_those_of_the_curvature_and_of_the_scatter_of_tracks(case
         ends = ((a, b, search.value(logs + a * moves[i] + b * moves[j])[0]) for a in (-1, 1) for b in (-1, 1))
         hessian[i, j] = hessian[j, i] = sum(a * b * value for a, b, value in ends) / (4.0 * step**2)
     assert (np.linalg.eigvalsh(hessian) > 1.0 / search.spread.max() ** 2).all()
-    inverse = np.linalg.inv(hessian)
-    covariance = inverse @ (search._scatter(logs) + np.diag(search.spread**-2)) @ inverse
-    errors = search.errors(logs)
-    assert list(errors) == ["memory.z", "acceleration"]
-    np.testing.assert_allclose(list(errors.values()), np.sqrt(np.diagonal(covariance)), rtol=0.02)
+    profile, inverse = search.profile(logs), np.linalg.inv(hessian)
+    assert search.names == ["memory.z", "acceleration"]
+    np.testing.assert_allclose(profile._inverse(logs), inverse, rtol=0.02)
+    rows = torch.tensor(np.tile(logs, (forecaster.count, 1)), requires_grad=True)
+    scores = forecaster.score(tensors_of(search.parameters, rows, settings)).by_track
+    own = [torch.autograd.grad(score, rows, retain_graph=True)[0].sum(dim=0).numpy() for score in scores]
+    scatter = np.cov(np.array(own).T) * len(own) * search.weight**2
+    np.testing.assert_allclose(search._scatter(logs), scatter, rtol=1e-6)
