@@ -297,6 +297,25 @@ def test_five_observations_around_a_bounce(seed, labelled) -> None:
     honest(Smoother(MODEL, TABLE, settings).estimate(track), states[part])
 
 
+@pytest.mark.parametrize("far", [0.0, 30.0])
+def test_two_samples_a_nanosecond_apart_are_one_of_half_the_variance(far, settings) -> None:
+    """Rounding must not pass for motion there. `far`: m, from the origin."""
+    times, states = TIMES[:70], truth(SERVE)[:70]
+    states[:, 0] += far
+    positions, sigmas = measured(states), np.full((70, 3), SIGMA)
+    twice, again = np.insert(times, 31, times[30] + 1e-9), positions[30] + (0.001, -0.002, 0.001)
+    labels, smoother = (
+        dict(zip(("spin_x", "spin_y", "spin_z"), SERVE[6:], strict=True)),
+        Smoother(MODEL, TABLE, settings),
+    )
+    found = smoother.estimate(Track(twice, np.insert(positions, 31, again, axis=0), labels=labels))
+    positions[30], sigmas[30] = 0.5 * (positions[30] + again), SIGMA / np.sqrt(2.0)
+    merged = smoother.estimate(Track(times, positions, sigmas, labels=labels))
+    assert found.status is merged.status is Status.OK
+    assert np.abs((np.delete(found.states, 31, axis=0) - merged.states) / merged.sigmas).max() < 0.05
+    np.testing.assert_allclose(np.delete(found.sigmas, 31, axis=0), merged.sigmas, rtol=0.01)
+
+
 @pytest.mark.parametrize("before", [1, 8, 15])
 def test_a_gap_of_a_fifth_of_a_second_across_a_bounce(before, settings) -> None:
     states = truth(SERVE)
