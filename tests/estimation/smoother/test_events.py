@@ -17,6 +17,7 @@ from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Contact
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.initial import initial_states, move_contacts
+from ballfg.estimation.smoother.motion import Motion
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.graph import run
 from ballfg.tracks import Track
@@ -400,3 +401,10 @@ def test_sigmas_of_a_track_stay_as_they_are() -> None:
     np.testing.assert_array_equal(smoother.estimate(track).states, first.states)
     without = smoother.estimate(Track(TIMES, positions, name="t"))
     np.testing.assert_allclose(without.states, first.states, atol=1e-12)
+
+
+def test_the_process_noise_knows_when_a_contact_was_to_a_64th_of_its_interval() -> None:
+    dt, times = 0.008, (0.0013, 0.0071)
+    kicks = Motion(heights=(0.0, 0.0), times=times).kick_times(dt)
+    np.testing.assert_allclose(kicks, times, rtol=0, atol=0.5 * dt / 64)
+    np.testing.assert_allclose(np.array(kicks) / dt * 64, np.round(np.array(kicks) / dt * 64), atol=1e-9)
