@@ -149,8 +149,14 @@ NEAR = 0.5
 well enough to say which share of the step is best."""
 WHOLE = 0.5
 """A step that keeps more than this share of its promise is as good as the linear model can make it."""
+SHORT = 1.5
+"""A step that brings more than this multiple of its promise is too short: the objective bends half as much."""
+ROUNDING = 1e-14
+"""Of the objective, to which its sum is rounded: what a step brings says nothing where it promises less."""
 RATE_MARGIN = 10.0
 """How many times slower than so far the lengths of the steps may fall for the next one to be left out."""
+LONGEST = 10.0
+"""Of a whole step, that is tried where it is too short."""
 MOST_DAMPING = 1e8
 """Marquardt's lambda at which a step is as good as none."""
 
@@ -203,8 +209,8 @@ class LevenbergMarquardt:
                 return point.moved(step).minimum(step, Convergence.CONVERGED, iteration, float(beyond), float(length))
             trial = None if step is None else (yield from _tried(graph, point, step, damping))
             if step is not None and trial is not None and trial.error <= point.error * (1 + 1e-12):
-                gain = (point.error - trial.error) / max(step.decrease, np.finfo(float).tiny)
-                point, last = trial, length if gain > WHOLE else np.inf
+                gain = _gain(point, trial, step)
+                point, last = trial, length if WHOLE < gain < SHORT else np.inf
                 damping, growth = damping * (0.1 if gain > WHOLE else 0.5), 10.0
                 damping = 0.0 if damping < self.first_damping else damping
             elif length < AT_KINK:
@@ -247,18 +253,24 @@ class _Point:
         return Minimum(self.values, self.error, step, convergence, iterations, *known, distance, last)
 
 
+def _gain(before: _Point, after: _Point, step: Step) -> float:
+    """What a step brought, as a share of its promise."""
+    return (before.error - after.error) / max(step.decrease, np.finfo(float).tiny)
+
+
 def _tried(graph: BallGraph, point: _Point, step: Step, damping: float) -> Search[_Point]:
-    """Where a step leads: all of it, or a share where an undamped one brought less than half of its promise.
+    """Where a step leads: all of it, or a multiple where an undamped one brought far less or more than its promise.
 
     Where the objective bends r times as much along the step as the linear model says (friction between slip and grip
     does), the whole step brings (2 - r) of its promise and 1 / r of it is best. Whole steps then creep or diverge.
     """
     values = point.values.moved(step.states, step.coefficients)
     whole = _Point(values, (yield Linearization(graph, values)))
-    gain = (point.error - whole.error) / max(step.decrease, np.finfo(float).tiny)
-    if damping > 0.0 or gain > WHOLE or step.decrease > NEAR or not np.isfinite(whole.error):
+    gain = _gain(point, whole, step)
+    tells = gain <= WHOLE or (gain >= SHORT and step.decrease > ROUNDING * point.error)
+    if damping > 0.0 or not tells or step.decrease > NEAR or not np.isfinite(whole.error):
         return whole
-    share = 1.0 / (2.0 - gain)
+    share = 1.0 / max(2.0 - gain, 1.0 / LONGEST)
     values = point.values.moved(share * step.states, share * step.coefficients)
     nearer = _Point(values, (yield Linearization(graph, values)))
     return nearer if nearer.error < min(point.error, whole.error) else whole

@@ -140,10 +140,15 @@ class Kicks:
         return basis
 
 
+SHORTEST = 1e-7
+"""s. The position strays over a shorter interval as over this one: by 2e-12 m for 0.1 m/s^2/sqrt(Hz). Positions of some
+metres are rounded to 1e-15 m, and of two samples 1 ns apart rounding alone would break the motion."""
+
+
 def _white_acceleration(dt: Array, acceleration: float, spin: float) -> Array:
     """(n, 3, 3) of position, velocity and spin along one axis."""
     covariance = np.zeros((len(dt), 3, 3))
-    covariance[:, 0, 0] = acceleration**2 * dt**3 / 3
+    covariance[:, 0, 0] = acceleration**2 * np.maximum(dt, SHORTEST) ** 3 / 3
     covariance[:, 0, 1] = covariance[:, 1, 0] = acceleration**2 * dt**2 / 2
     covariance[:, 1, 1] = acceleration**2 * dt
     covariance[:, 2, 2] = spin**2 * dt

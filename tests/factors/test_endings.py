@@ -49,3 +49,36 @@ def test_without_a_bend_it_converges() -> None:
     minimum = LevenbergMarquardt().minimize(graph, Values(np.full((1, 9), 0.5), np.zeros(0)))
     assert minimum.convergence is Convergence.CONVERGED
     assert minimum.values.states[0, 0] == pytest.approx(-0.4 / 1.16, abs=1e-9)  # of x^2 + (1 + 0.4 x)^2
+
+
+class OnCircle(FactorBatch):
+    """Residuals of a point at an angle on a circle from a point at a distance of its centre; the angle is x, scaled."""
+
+    def __init__(self, radius: float, distance: float) -> None:
+        super().__init__(np.array([[0]]), 11)
+        self.radius, self.distance = radius, distance
+
+    def compute(self, rows, inputs):
+        (state,) = inputs
+        angle = state[:, 0] / self.radius
+        residual = np.concatenate((state, np.zeros((len(state), 2))), axis=1)
+        residual[:, 0] = 0.0
+        residual[:, 9] = self.radius * np.cos(angle) - self.distance
+        residual[:, 10] = self.radius * np.sin(angle)
+        jacobian = np.zeros((len(state), 11, 9))
+        jacobian[:, np.arange(1, 9), np.arange(1, 9)] = 1.0
+        jacobian[:, 9, 0], jacobian[:, 10, 0] = -np.sin(angle), np.cos(angle)
+        return residual, (jacobian,)
+
+
+@pytest.mark.parametrize("bend", [0.1, 0.15, 0.3, 1.0, 1.6, 1.9])
+def test_steps_that_are_too_long_or_too_short_do_not_creep(bend: float) -> None:
+    """The objective bends `bend` times as much as its linear model says; the minimum is at zero.
+
+    Whole steps would shrink the distance to it by |1 - bend| each: to a hundred-thousandth in 100 steps for 0.1.
+    """
+    graph, start = BallGraph((OnCircle(50.0, 50.0 * bend),)), np.full((1, 9), 0.5)
+    minimum = LevenbergMarquardt().minimize(graph, Values(start, np.zeros(0)))
+    assert minimum.convergence is Convergence.CONVERGED
+    assert minimum.iterations <= 12
+    assert abs(minimum.values.states[0, 0]) < 1e-4

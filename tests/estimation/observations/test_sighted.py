@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from ballfg.estimation.measurement.position_noise import estimate_position_noise
-from ballfg.estimation.observations.ray_path import BEFORE, Rays, rough_path
+from ballfg.estimation.observations.ray_path import BEFORE, SPEED, SPREAD, Rays, _robust, rough_path
 from ballfg.estimation.observations.sightings import SAME_MOMENT, in_order, sighted_track, sightings_of
 from ballfg.estimation.registry import make_estimator
 from ballfg.estimation.result import Status
@@ -20,6 +20,7 @@ from ballfg.factors.noise import ProcessNoise
 from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate
 from ballfg.simulation import MotionNoise as TrueNoise
 from ballfg.tracks import Track
+from ballfg.tracks.sightings import Sightings
 from tests.estimation.observations.sighted_rig import NOISE, RIG, Scene, World, scene, seen, track_of, world
 
 
@@ -229,3 +230,25 @@ def test_order_of_sightings_is_free(ball: World, made: Scene) -> None:
     """Grouped by camera, as files have them; put in order by true time they are the same track."""
     shuffled = made.sightings.taken(np.argsort(made.sightings.camera, kind="stable"))
     np.testing.assert_array_equal(in_order(shuffled, RIG).pixels, made.sightings.pixels)
+
+
+def test_what_no_ray_tells_is_known_as_well_as_before() -> None:
+    """Two cameras at one moment tell the place, and of the velocity nothing; one camera nothing along its ray."""
+    ball, covariances = np.array([0.2, 0.1, 1.0]), np.tile(NOISE**2 * np.eye(2), (2, 1, 1))
+    pixels = np.concatenate([camera.project(ball[None]) for camera in RIG[:2]])
+    names = tuple(camera.name for camera in RIG)
+    seen_once = Sightings(names, np.array([0, 1]), np.zeros(2), pixels, covariances)
+    both = Rays.of(seen_once, np.zeros(2), RIG)
+    every = np.array([[0, 1]])
+
+    def solved(inside: list[bool]):
+        matrix = both.matrix[every]
+        equations = np.concatenate((matrix, 0.0 * matrix), axis=-1)
+        return _robust(both, every, np.array([inside]), equations, both.target[every], np.zeros((1, 2)))
+
+    found, known, _ = solved([True, True])
+    np.testing.assert_allclose(found[0, :3], ball, atol=1e-3)
+    np.testing.assert_allclose(np.sqrt(np.diag(known[0])[3:]), SPEED)
+    assert np.sqrt(np.diag(known[0])[:3]).max() < 0.01
+    alone = np.linalg.eigvalsh(solved([True, False])[1][0, :3, :3])
+    assert np.sqrt(alone[-1]) == pytest.approx(SPREAD, rel=0.01)

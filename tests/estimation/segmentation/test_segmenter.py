@@ -4,6 +4,7 @@ import gc
 import weakref
 
 import numpy as np
+import pytest
 
 from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.estimation.segmentation import (
@@ -81,3 +82,15 @@ def test_an_endless_stream_keeps_no_old_events(make_rally):
     gc.collect()
     assert reported > 100
     assert len(seen) < 20
+
+
+def test_a_first_sample_is_the_ball_or_an_outlier_by_their_densities() -> None:
+    """Far from all surfaces, where nothing rests. All hypotheses expect the sample within the spread of outliers."""
+    settings, sigma = SegmentationSettings(), 0.01
+    segmenter = Segmenter(Surfaces(0.0), settings=settings)
+    segmenter.push(0.0, (0.0, 0.0, 5.0), (sigma,) * 3)
+    scores = np.sort(segmenter._bank["score"])
+    good = np.log(1.0 - settings.wide_share - settings.outlier_share)
+    assert scores[-1] == pytest.approx(good - 1.5 * np.log(settings.outlier_spread**2 + sigma**2), abs=1e-9)
+    stray = np.log(settings.outlier_share) - 1.5 * np.log(settings.outlier_spread**2)
+    assert np.abs(scores - stray).min() < 1e-9

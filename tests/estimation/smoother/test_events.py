@@ -17,6 +17,7 @@ from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Contact
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.initial import initial_states, move_contacts
+from ballfg.estimation.smoother.motion import Motion
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.graph import run
 from ballfg.tracks import Track
@@ -297,6 +298,25 @@ def test_five_observations_around_a_bounce(seed, labelled) -> None:
     honest(Smoother(MODEL, TABLE, settings).estimate(track), states[part])
 
 
+@pytest.mark.parametrize("far", [0.0, 30.0])
+def test_two_samples_a_nanosecond_apart_are_one_of_half_the_variance(far, settings) -> None:
+    """Rounding must not pass for motion there. `far`: m, from the origin."""
+    times, states = TIMES[:70], truth(SERVE)[:70]
+    states[:, 0] += far
+    positions, sigmas = measured(states), np.full((70, 3), SIGMA)
+    twice, again = np.insert(times, 31, times[30] + 1e-9), positions[30] + (0.001, -0.002, 0.001)
+    labels, smoother = (
+        dict(zip(("spin_x", "spin_y", "spin_z"), SERVE[6:], strict=True)),
+        Smoother(MODEL, TABLE, settings),
+    )
+    found = smoother.estimate(Track(twice, np.insert(positions, 31, again, axis=0), labels=labels))
+    positions[30], sigmas[30] = 0.5 * (positions[30] + again), SIGMA / np.sqrt(2.0)
+    merged = smoother.estimate(Track(times, positions, sigmas, labels=labels))
+    assert found.status is merged.status is Status.OK
+    assert np.abs((np.delete(found.states, 31, axis=0) - merged.states) / merged.sigmas).max() < 0.05
+    np.testing.assert_allclose(np.delete(found.sigmas, 31, axis=0), merged.sigmas, rtol=0.01)
+
+
 @pytest.mark.parametrize("before", [1, 8, 15])
 def test_a_gap_of_a_fifth_of_a_second_across_a_bounce(before, settings) -> None:
     states = truth(SERVE)
@@ -381,3 +401,10 @@ def test_sigmas_of_a_track_stay_as_they_are() -> None:
     np.testing.assert_array_equal(smoother.estimate(track).states, first.states)
     without = smoother.estimate(Track(TIMES, positions, name="t"))
     np.testing.assert_allclose(without.states, first.states, atol=1e-12)
+
+
+def test_the_process_noise_knows_when_a_contact_was_to_a_64th_of_its_interval() -> None:
+    dt, times = 0.008, (0.0013, 0.0071)
+    kicks = Motion(heights=(0.0, 0.0), times=times).kick_times(dt)
+    np.testing.assert_allclose(kicks, times, rtol=0, atol=0.5 * dt / 64)
+    np.testing.assert_allclose(np.array(kicks) / dt * 64, np.round(np.array(kicks) / dt * 64), atol=1e-9)
