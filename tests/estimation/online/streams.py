@@ -18,7 +18,7 @@ SAME = 1e-4
 LIVE = 0.05
 """The same for the running answer in flight with a squared loss; 0.01 is what it does."""
 LIVE_BOUNCE = 0.3
-"""And after a bounce with a strong spin, whose friction has a kink between sliding and rolling; 0.17 is what it does."""
+"""And after a bounce, whose friction has a kink between sliding and rolling; up to 0.17 was seen."""
 
 
 class NetworkModel(BallModel):
