@@ -137,7 +137,7 @@ class Tally:
 
     def __str__(self) -> str:
         clean = f"{self.accusing} of {self.sets} sets with right labels accuse one" if self.sets else ""
-        clean += f" ({self.effects} name an effect of all labels)" if self.sets else ""
+        clean += f" ({self.effects} name an effect of all labels)" if self.effects else ""
         mixed = (
             f"{self.found} of {self.wrong} wrong labels found ({100 * self.found / self.wrong:.0f} %), "
             f"{self.accused} of {self.right} right ones beside them accused ({100 * self.accused / self.right:.1f} %)"

@@ -49,15 +49,16 @@ def scattering_model(
     """
     plain = with_effects(model)
     plain.variations = model.variations
-    settings = dataset_settings(holdout.dataset, plain)  # those of the usual world: nothing is trained in this model
+    usual = dataset_settings(holdout.dataset, plain)  # no noise is stated in this model
     names = [
         name for name in declared_free(declared) if not name.startswith("measurement.") and name not in model.variations
     ]
     if names:
-        plain = _of_population(plain, declared, names, tracks, holdout, settings, jobs)
+        plain = _of_population(plain, declared, names, tracks, holdout, usual, jobs)
     plain.noise = noise_about(plain, tracks, holdout.dataset, tracker, jobs=jobs)
     settings = dataset_settings(holdout.dataset, plain)
-    return plain, replace(settings, spin_label_noise=holdout.settings.spin_label_noise)
+    # what tracks show of the labels' error holds wrong labels too: right ones err as the dataset states
+    return plain, replace(settings, spin_label_noise=usual.spin_label_noise)
 
 
 def _of_population(
