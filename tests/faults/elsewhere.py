@@ -31,8 +31,8 @@ from tests.faults.kills import in_fork
 from tests.faults.scenarios import ballfg, filmed, learned, nominal_model, report, save_model, succeed, warm_up
 from tests.places import ROOT
 
-LONGEST = 30
-"""s that a command may take."""
+LONGEST = 30.0
+"""s that a command may take; as a process, which loads and compiles, four times as long."""
 OWN_PROCESS = 0.01
 """Share of the commands that run as a user starts them."""
 PLACES = ("home", "home/hd", "home/models", "home/report", "home/out")
@@ -231,7 +231,7 @@ def in_this_process(words: list[str], longest: float = LONGEST) -> tuple[int, st
     return 0, said.getvalue()
 
 
-def as_process(words: list[str], longest: float = LONGEST) -> tuple[int, str]:
+def as_process(words: list[str], longest: float = 4 * LONGEST) -> tuple[int, str]:
     """The same of a command as a user starts it."""
     command = [sys.executable, "-c", "import sys; from ballfg.cli.main import run; run(sys.argv[1:])", *words]
     try:
@@ -260,7 +260,7 @@ def one_folder(pristine: Path, place: Path, number: int, seed: int) -> Iterator[
 
     where = f"folder {number} ({'; '.join(planted)})"
     try:
-        in_fork(work, place / "said")
+        in_fork(work, place / "said", 600.0)
     except TimeoutError:
         yield "hangs", f"{where}: killed"
     for command, status, said in map(json.loads, told.read_text(encoding="utf-8").splitlines()):
@@ -291,6 +291,8 @@ def try_folders(count: int, seed: int) -> tuple[Counter[str], list[str]]:
             if status not in (0, 3) and not said.startswith("ballfg: error:"):
                 raise RuntimeError(f"{command} must work without any fault; got {status}: {said}")
         for number in range(count):
+            if number % 50 == 0:
+                print(f"{number} folders: {dict(seen)}", file=sys.stderr, flush=True)
             place = top / "one"
             place.mkdir()
             for kind, sentence in one_folder(top / "pristine", place, number, seed):

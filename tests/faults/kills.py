@@ -76,14 +76,14 @@ def succeed(work: Callable[[Path], None], folder: Path) -> None:
             raise AssertionError(f"a command ended with status {exit_.code} without any fault") from exit_
 
 
-def in_fork(work: Callable[[], object], said: Path) -> int:
+def in_fork(work: Callable[[], object], said: Path, patience: float = PATIENCE) -> int:
     """Runs some work in a copy of this process. Returns: its status, 0 if it returns, or minus the signal."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12 warns of threads, which wait here
         process = os.fork()
     if process == 0:
         _in_child(work, said)
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + patience
     while time.monotonic() < deadline:
         ended, status = os.waitpid(process, os.WNOHANG)
         if ended:
@@ -91,7 +91,7 @@ def in_fork(work: Callable[[], object], said: Path) -> int:
         time.sleep(0.001)
     os.kill(process, signal.SIGKILL)
     os.waitpid(process, 0)
-    raise TimeoutError(f"a process took more than {PATIENCE:g} s: {said.read_text()[-500:]}")
+    raise TimeoutError(f"a process took more than {patience:g} s: {said.read_text()[-500:]}")
 
 
 def _in_child(work: Callable[[], object], said: Path) -> None:
