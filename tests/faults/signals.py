@@ -250,7 +250,9 @@ IMPORT: Final = (
     "ballfg import @/capture.csv --out @/mine --length m --time s --up z --ball table-tennis --table-height 0"
 )
 CALIBRATE: Final = "ballfg calibrate-cameras --intrinsics @/lenses.yaml --table @/table.yaml --out @/found.yaml"
-TRACK: Final = "ballfg track @/scene/left.mp4 @/scene/right.mp4 --cameras @/scene/cameras.yaml --out @/tracked"
+TRACK: Final = (
+    "ballfg track @/scene/left.mp4 @/scene/right.mp4 @/scene/far.mp4 --cameras @/scene/cameras.yaml --out @/tracked"
+)
 DIAGNOSE: Final = "ballfg diagnose @/shots --out @/report"
 DESIGN: Final = "ballfg design @/shots --candidates speed=8..14:2 --between wind.x,drag.k --shots 3 --out @/plan.csv"
 EARLIER: Final = "ballfg estimate @/shots --method ekf --jobs 1 --out @/s.csv"
@@ -267,7 +269,7 @@ SCENARIOS: Final = (
     Scenario("predict-2", (MANY, f"{PREDICT} --observe 0.2 --jobs 1"), f"{PREDICT} --observe 0.3 --jobs 2"),
     Scenario("noise", (SHOTS, f"{NOISE} --tracks 5"), f"{NOISE} --tracks 8"),
     Scenario(
-        "show", (SHOTS, "ballfg show @/shots --track 0000 --out @/page.html"), "ballfg show @/shots --out @/page.html"
+        "show", (SHOTS, "ballfg show @/shots --track 000 --out @/page.html"), "ballfg show @/shots --out @/page.html"
     ),
     Scenario(
         "example",
