@@ -94,8 +94,14 @@ class HopMoments:
     def taken(self, inside: slice) -> HopMoments:
         """Those of some of the samples."""
         between = slice(inside.start, inside.stop - 1)
-        own = (self.mean, self.second, self.higher, self.speed, self.resting)
-        return HopMoments(*(part[inside] for part in own), self.bounces[between])
+        return HopMoments(
+            self.mean[inside],
+            self.second[inside],
+            self.higher[inside],
+            self.speed[inside],
+            self.resting[inside],
+            self.bounces[between],
+        )
 
 
 class HopGrid:
