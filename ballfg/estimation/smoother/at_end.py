@@ -71,6 +71,8 @@ def _filtered(smoother: Smoother, track: Track) -> tuple[Array, Array] | None:
     if minimum.step is None:
         return None
     known, values, p = marginal_covariances(minimum.step.root).definite(), minimum.values, problem.width
+    if known is None:
+        return None
     biases = np.zeros(0) if values.biases is None else values.biases[-1]
     mean = np.concatenate((values.states[-1], values.coefficients[:p], biases))
     width = STATE_DIM + len(biases)
