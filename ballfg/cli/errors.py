@@ -1,5 +1,6 @@
 """What a user sees when something is wrong: one line on stderr and an exit status."""
 
+import errno
 import sys
 from collections.abc import Callable, Sequence
 from typing import Final
@@ -66,7 +67,9 @@ def _refused(error: Exception) -> int:
             raise error
         return _bad_input(_in_words(error))
     # errors in the use of a command: typer's own base class has moved between versions, their method has not
-    message = getattr(error, "format_message", None)
+    message, cause = getattr(error, "format_message", None), error.__context__
+    if isinstance(cause, OSError) and cause.errno == errno.ELOOP:  # as `Path.resolve` has it before Python 3.13
+        return _bad_input(_in_words(cause))
     if message is None and NO_MEMORY in str(error):
         return _bad_input(_in_words(MemoryError(f"torch {NO_MEMORY}")))
     if message is None:

@@ -102,6 +102,22 @@ def test_a_pipe_in_place_of_a_file_is_not_waited_for(home: Path, name: str) -> N
     assert found == (0 if name == "labels.csv" else 2), said
 
 
+def test_links_in_a_loop_are_refused_in_one_line(home: Path) -> None:
+    for name in ("detections.csv", "cameras.yaml"):
+        (home / "d" / name).symlink_to(name)
+    words = [
+        "track",
+        home / "d" / "detections.csv",
+        "--cameras",
+        home / "d" / "cameras.yaml",
+        "--out",
+        home / "tracked",
+    ]
+    found, said = in_this_process(list(map(str, words)))
+    assert (found, said.count("\n")) == (2, 1), said
+    assert "Too many levels of symbolic links" in said
+
+
 def test_an_output_in_proc_is_refused_at_once(home: Path) -> None:
     found, said = in_this_process(["estimate", str(home / "d"), "--out", "/proc/x.csv", "--jobs", "1"], 20.0)
     assert (found, said.count("\n")) == (2, 1)
