@@ -24,14 +24,18 @@ _raised: float | None = None
 
 
 def listen() -> None:
-    """Lets the signals end this program; those that whoever started it wants ignored, as nohup does, stay ignored."""
+    """Lets the signals end this program."""
     global _listening
     _listening = True
-    for number in SIGNALS:
-        if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, _on_signal)
+    for number in heeded():
+        signal.signal(number, _on_signal)
     signal.signal(signal.SIGALRM, _on_alarm)
     sys.unraisablehook = _not_raised
+
+
+def heeded() -> list[signal.Signals]:
+    """The signals, but for those that whoever started this program wants ignored, as nohup does."""
+    return [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
 
 
 def let_go() -> None:

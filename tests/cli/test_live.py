@@ -96,6 +96,22 @@ def test_a_replay_gives_the_states_of_the_online_estimator(
     assert "28 positions, 2 balls; 0 late, 0 too old, 0 repeated, 0 malformed, 0 dropped" in text
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_service_manager_or_a_closed_terminal_end_a_stream_like_ctrl_c(dataset: Path, number: int) -> None:
+    with started("--listen", "tcp://127.0.0.1:0", "--like", dataset) as process:
+        assert process.stderr is not None
+        assert process.stdout is not None
+        place = re.search(r"reading tcp://127.0.0.1:(\d+)", process.stderr.readline().decode())
+        assert place is not None
+        with socket.create_connection(("127.0.0.1", int(place[1]))) as sender:
+            sender.sendall(csv(dataset, 0)[0])
+            process.stdout.readline()
+        process.send_signal(number)
+        _, said = process.communicate()
+    assert process.returncode == 0
+    assert b"1 positions" in said
+
+
 def test_senders_that_talk_nonsense_and_break_off_do_not_hurt_the_next_ball(dataset: Path) -> None:
     """The second sender's clock begins anew, and its ball is tracked like the first; Ctrl-C ends it."""
     with started("--listen", "tcp://127.0.0.1:0", "--like", dataset, "--patience", 0) as process:

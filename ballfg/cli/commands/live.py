@@ -14,6 +14,7 @@ import typer
 
 from ballfg import progress
 from ballfg.cli import inputs
+from ballfg.interrupts import heeded
 
 if TYPE_CHECKING:
     from ballfg.dynamics import BallModel, Surfaces
@@ -232,13 +233,13 @@ def _watchers(out: Path | None, source: Source, viewer: bool, horizon: float) ->
 
 
 def _run(session: Session, inbox: Inbox) -> None:
-    """Until the input ends, the output closes, or Ctrl-C: the first lets the sample at hand be finished."""
+    """Until the input ends, the output closes, or a signal: the first lets the sample at hand be finished."""
 
     def stop(number: int, frame: object) -> None:
         inbox.interrupt()
         signal.signal(number, signal.default_int_handler)
 
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, stop) for number in heeded()}
     interval = sys.getswitchinterval()
     sys.setswitchinterval(5e-4)  # the reading thread gets its turn soon, and with it the true moment of reading
     try:

@@ -41,7 +41,8 @@ WIDEST: Final = 2.5
 SURE: Final = 0.95
 """Probability of rest from which on nothing is said about bounces that may have been missed."""
 UNCOUNTED: Final = (
-    "from {:.2f} s on the ball may hop lower than the noise: bounces there are not counted, covariances allow for them"
+    "from {:.2f} s after the first sample on the ball may hop lower than the noise: bounces there are not counted, "
+    "covariances allow for them"
 )
 VERTICAL: Final = [Z, VZ]
 
@@ -208,7 +209,7 @@ def _jumps(estimate: Estimate, hops: LowHops, model: BallModel) -> Array:
 def uncounted_note(hops: Sequence[LowHops], times: Array) -> tuple[str, ...]:
     """Says from when on bounces are too low to be counted. Args: hops: of the track.  times: (n,) s."""
     unclear = [sample for one in hops if (sample := one.first_unclear()) is not None]
-    return (UNCOUNTED.format(float(times[min(unclear)])),) if unclear else ()
+    return (UNCOUNTED.format(float(times[min(unclear)] - times[0])),) if unclear else ()
 
 
 class _Ball:
