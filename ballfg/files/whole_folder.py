@@ -114,15 +114,15 @@ def check_replaceable(
     Raises: ValueError: other content, or an earlier result and no `force`; else as `whole_folder`.
     """
     target = _exchangeable(folder, "out")
-    with held(target), hidden(target.parent, target, folder):  # what was left between two steps is put back
-        present = {entry.name for entry in target.iterdir()} if target.exists() else set()
-    present = {name for name in present if not name.startswith(MARK)}
-    if not present:
-        return
-    if not is_mark(folder / mark) or (only is not None and not present <= set(only)):
-        raise ValueError(f"out must be new, empty or hold {what}; {folder} holds other files. Choose another name.")
-    if not force:
-        raise ValueError(f"out must be new or empty; {folder} holds {what}. Replace it with --force.")
+    with held(target):  # what was left between two steps is put back
+        names = {entry.name for entry in target.iterdir()} if target.exists() else set()
+        present = {name for name in names if not name.startswith(MARK)}
+        if present and (not is_mark(folder / mark) or (only is not None and not present <= set(only))):
+            raise ValueError(f"out must be new, empty or hold {what}; {folder} holds other files. Choose another name.")
+        if present and not force:
+            raise ValueError(f"out must be new or empty; {folder} holds {what}. Replace it with --force.")
+        with hidden(target.parent, target, folder):  # a folder that cannot be written to is refused here
+            pass
 
 
 def _exchangeable(folder: Path, argument: str) -> Path:

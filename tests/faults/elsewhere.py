@@ -56,7 +56,9 @@ SLOW = (
     "track @/hd/detections.csv --cameras @/hd/cameras.yaml --out @/out/tracked",
 )
 """Of these each folder sees one."""
-WRITTEN = {word.removeprefix("@/out/") for command in (*QUICK, *SLOW) for word in command.split() if "/out/" in word}
+WRITTEN = sorted(
+    {word.removeprefix("@/out/") for words in (*QUICK, *SLOW) for word in words.split() if "/out/" in word}
+)
 
 
 class HangError(BaseException):
@@ -97,7 +99,7 @@ def plant(place: Path, sandbox: Path, draw: random.Random) -> str:
 def _free(place: Path, draw: random.Random) -> Path:
     """A name to put something at: that of an input, which goes, or another."""
     hidden = f".ballfg-{draw.getrandbits(64):016x}"
-    names = [path.name for path in place.iterdir() if path.is_file()] + [hidden, ".ballfg-writing", "labels.csv"]
+    names = [*sorted(path.name for path in place.iterdir() if path.is_file()), hidden, ".ballfg-writing", "labels.csv"]
     if place.name == "out":
         names = [*WRITTEN, hidden, *(f".{name}.ballfg-writing" for name in WRITTEN)]
     path = place / draw.choice(names)
@@ -111,8 +113,8 @@ def _link(place: Path, sandbox: Path, draw: random.Random) -> None:
     target = draw.choice(
         (sandbox / precious, os.path.relpath(sandbox / precious, place), "nowhere", path.name, "/", ".")
     )
-    if path.name in WRITTEN and (place / target).is_file():
-        return  # who names such a link as the output means the file
+    if path.name in WRITTEN and (place / target).exists() and target != path.name:
+        return  # who names such a link as the output means what it leads to
     path.symlink_to(target)
 
 
@@ -120,7 +122,7 @@ def _plan(place: Path, sandbox: Path, draw: random.Random) -> None:
     """What earlier versions obeyed: a plan of moves, with a lock that leads elsewhere."""
     hidden = place / ".ballfg-writing"
     if place.name == "out":
-        hidden = place / f".{draw.choice(tuple(WRITTEN))}.ballfg-writing"
+        hidden = place / f".{draw.choice(WRITTEN)}.ballfg-writing"
     (hidden / "new").mkdir(parents=True)
     (hidden / "new" / "thesis.tex").write_text("theirs")
     names = ["thesis.tex", "src", "notes.txt", "../thesis.tex", "../../precious/v.txt", str(sandbox / "precious")]
@@ -169,7 +171,9 @@ PLANTS: dict[str, Callable[[Path, Path, random.Random], None]] = {
     "device": _device,
     "socket": _socket,
     "deep tree": _deep,
-    "unreadable": lambda place, _, draw: draw.choice([p for p in place.iterdir() if p.is_file()] or [place]).chmod(0),
+    "unreadable": lambda place, _, draw: draw.choice(
+        sorted(p for p in place.iterdir() if p.is_file()) or [place]
+    ).chmod(0),
     "folder": lambda place, _, draw: _free(place, draw).mkdir(),
     "odd name": _odd_name,
 }
