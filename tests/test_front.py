@@ -339,7 +339,7 @@ def test_swapped_axes_and_a_wrong_table_are_noted(shots: bf.Dataset) -> None:
     right = bf.Settings.for_measured(bf.nominal_model(), position_noise=(0.003,) * 3)  # that of the simulation
     for method in ("smoother", "online", "ekf", "sliding-window"):
         found = bf.estimate(swapped, surfaces=shots.table, method=method, settings=right)
-        assert found.notes == (SWAPPED,)
+        assert found.notes[0] == SWAPPED
         (note,) = bf.estimate(below, surfaces=0.0, method=method, settings=right).notes
         assert note.startswith(TABLE)
         assert "where no surface is declared (they are at 0 and -0.76 m). Correct the table's height." in note

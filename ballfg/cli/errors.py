@@ -41,6 +41,8 @@ def guarded(command: Callable[[], object]) -> int:
     except (KeyboardInterrupt, typer.Abort):
         return say_so()
     except SystemExit as error:
+        if isinstance(error.__context__, BrokenPipeError):  # the way of click and rich where nobody reads on
+            raise
         return _left(error)
     except Exception as error:
         return say_so() if interrupted() else _refused(error)  # libraries make other exceptions of an interrupt

@@ -10,17 +10,18 @@ from ballfg.diagnosis.fit.fit import noise_by_axis, values_of
 from ballfg.diagnosis.fit.holdout import Holdout, hold_out
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.remains.fallback import fallback
-from ballfg.diagnosis.remains.generic import ALARM, generic_tests
-from ballfg.diagnosis.remains.label_check import LabelCheck, check_labels, label_test
+from ballfg.diagnosis.remains.generic import generic_tests
+from ballfg.diagnosis.remains.label_check import check_labels, label_test
 from ballfg.diagnosis.remains.residuals import residuals_of
 from ballfg.diagnosis.remains.tracker import look_at_tracker
 from ballfg.diagnosis.report.wording import refusal, sentence
-from ballfg.diagnosis.result import Diagnosis, Errors, Fallback, GenericTest, Unexplained, Value, Verdict
+from ballfg.diagnosis.result import Diagnosis, Errors, Fallback, Unexplained, Value, Verdict
 from ballfg.diagnosis.search.evaluation import prediction_errors, prediction_floor
 from ballfg.diagnosis.search.loop import Search, SearchLoop
 from ballfg.diagnosis.search.plausible import implausible
 from ballfg.diagnosis.search.process_noise import Predicting, calibrated_model, noise_about
 from ballfg.diagnosis.search.stamp_effects import as_declared
+from ballfg.diagnosis.unnamed import ALARM, GenericTest, LabelCheck
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Effect
 from ballfg.estimation import dataset_settings
 from ballfg.tracks import Dataset, TrackNoise

@@ -22,7 +22,7 @@ from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout, hold_out
 from ballfg.diagnosis.fit.problem import Fit, Noise, Problem
 from ballfg.diagnosis.fit.stretches import Stretches, joined
 from ballfg.diagnosis.remains.generic import generic_tests
-from ballfg.diagnosis.remains.label_check import LabelCheck, judged, label_evidence, label_test
+from ballfg.diagnosis.remains.label_check import judged, label_evidence, label_test
 from ballfg.diagnosis.remains.patterns import DRIFT
 from ballfg.diagnosis.remains.residuals import residuals_of
 from ballfg.diagnosis.report.wording import joined as listed
@@ -33,6 +33,7 @@ from ballfg.diagnosis.search.hypothesis import effects_of, has_effect, with_effe
 from ballfg.diagnosis.search.loop import SearchLoop
 from ballfg.diagnosis.search.process_noise import PredictiveModel, calibrated_model, fitted_model, noise_about
 from ballfg.diagnosis.search.varying import Grouping, Varying
+from ballfg.diagnosis.unnamed import LabelCheck
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Effect
 from ballfg.estimation import dataset_settings
 from ballfg.tracks import Dataset, TrackNoise

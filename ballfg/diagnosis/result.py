@@ -8,12 +8,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from ballfg.arrays import Array, Index
+from ballfg.diagnosis.unnamed import GenericTest, LabelCheck
 from ballfg.dynamics import BallModel
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from ballfg.diagnosis.remains.label_check import LabelCheck
 
 
 class Verdict(enum.Enum):
@@ -166,24 +165,6 @@ class Errors:
     nis_median: float = float("nan")
     paths: tuple[PredictedPath, ...] = ()
     nis_error: float = float("nan")
-
-
-@dataclass(frozen=True)
-class GenericTest:
-    """A test for a pattern of any cause.
-
-    Attributes:
-        name: `flight`, `contact`, `measurement`, `recording` (coefficients from track to track), `label` (spin labels
-            against flights) or `time` (whiteness along the tracks).
-        where: place, dependence and size of the pattern in words.
-        p_value: probability of such a pattern by chance; of `label`, that every label is right.
-        share: part of the pattern at the start that is still there, 0 to 1.
-    """
-
-    name: str
-    where: str
-    p_value: float
-    share: float
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ HOSTILE: tuple[Any, ...] = (
     None, "x", "", b"x", math.nan, math.inf, -math.inf, -1, -1.0, 0, 0.0, 1e300, 1e-300, 10**400, True, 1j,
     [], [1, 2], [[1.0]], [None] * 3, (1, 2, 3, 4), ("a", "b", "c"), {}, {"x": 1}, object(), int, lambda *_: 0,
     "a\0b", "\x1b[2J", "a\u202eb", "a" * 100_000, Path("a\0b"),
-    Path("/nonexistent"), np.array([1.0, 2.0]), np.zeros((0, 3)), np.array(["a", "b", "c"]),
+    Path("nonexistent/deep"), np.array([1.0, 2.0]), np.zeros((0, 3)), np.array(["a", "b", "c"]),
     np.datetime64("2024-01-01"), np.timedelta64(1, "s"), np.ma.masked_array([1.0, 2.0, 3.0], [True, False, False]),
 )  # fmt: skip
 """Values of the wrong type, size or sort; some are right for some arguments."""

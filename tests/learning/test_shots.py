@@ -79,7 +79,7 @@ def test_a_hit_ends_the_shot() -> None:
     assert abs(hit - 39) <= 1
     shot = shot_of(track, samples=20)
     assert len(shot.track) == len(shot.usable) == hit + 1
-    np.testing.assert_array_equal(shot.track.times, track.times[: hit + 1])
+    np.testing.assert_array_equal(shot.track.times, track.seconds[: hit + 1])
     whole = shot_of(track, replace(SETTINGS, find_events=False), samples=20)
     assert len(whole.track) == 69
 

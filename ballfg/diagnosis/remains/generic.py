@@ -22,13 +22,11 @@ from ballfg.diagnosis.remains.patterns import (
     drift_block,
 )
 from ballfg.diagnosis.remains.whiteness import whiteness
-from ballfg.diagnosis.result import GenericTest
 from ballfg.diagnosis.search.score import pattern_tests
 from ballfg.diagnosis.search.signatures import signatures_of
+from ballfg.diagnosis.unnamed import GenericTest
 from ballfg.tracks import TrackNoise
 
-ALARM = 0.005
-"""Probability that any of the tests of a fit that lacks nothing raises an alarm: p-values below it are alarms."""
 TRACKS_PER_DIRECTION = 4
 """Tracks for each direction of a block that is tested: their scatter must tell the directions' covariance."""
 LEAST_INFORMATION = 1.0

@@ -7,24 +7,20 @@ integrated out. So a label is wrong with a probability, and a single doubtful on
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.holdout import Holdout
-from ballfg.diagnosis.remains.generic import ALARM
 from ballfg.diagnosis.remains.label_flights import LabelledFlight, labelled_flights
 from ballfg.diagnosis.remains.label_model import scattering_model
-from ballfg.diagnosis.result import GenericTest
+from ballfg.diagnosis.unnamed import GenericTest, LabelCheck, LabelVerdict
 from ballfg.dynamics import AnalyticModel
 from ballfg.tracks import TrackNoise
 
 LABEL: Final = "label"
 """Kind of the test."""
-SURE: Final = 0.95
-"""Probability from which on a label is called wrong."""
 NONE_WRONG: Final = 0.5
 """Probability beforehand that all labels are right; else every share of wrong ones is as probable as any other."""
 SHARES: Final = (np.arange(40) + 0.5) / 40
@@ -35,69 +31,6 @@ RIGHT_SPREAD: Final = 0.7
 """Standard deviation of the logarithm of such a multiple: stated noise is known to a factor of two."""
 WRONG: Final = np.exp(np.linspace(-1.1, 1.1, 9))
 """Errors of wrong labels beside those of right ones, as multiples of `wrong_error`: a third to three times."""
-
-
-@dataclass(frozen=True)
-class LabelVerdict:
-    """What is said of one spin label.
-
-    Attributes:
-        track: its name.
-        probability: that the label is wrong.
-        off: rad/s, its distance from the spin that the flight shows.
-        sigma: rad/s, standard deviation of that spin along this distance, by noise and by the scatter of flight and
-            bounces.
-    """
-
-    track: str
-    probability: float
-    off: float
-    sigma: float
-
-
-@dataclass(frozen=True)
-class LabelCheck:
-    """What is said of all spin labels.
-
-    Attributes:
-        p_all_right: probability that every label is right.
-        verdicts: on each label, the least probable first.
-    """
-
-    p_all_right: float
-    verdicts: tuple[LabelVerdict, ...]
-
-    @property
-    def contradicted(self) -> tuple[LabelVerdict, ...]:
-        """Verdicts on labels that are wrong as good as surely; none where all of them may well be right."""
-        if not self.p_all_right < ALARM:
-            return ()
-        return tuple(verdict for verdict in self.verdicts if verdict.probability >= SURE)
-
-    @property
-    def where(self) -> str:
-        """In words, which labels contradict their flights."""
-        wrong, labels = self.contradicted, len(self.verdicts)
-        if not wrong:
-            return (
-                f"label: none of {labels} spin labels contradicts its flight beyond the scatter of flight and bounces"
-            )
-        shown = ", ".join(verdict.track for verdict in wrong[:4]) + (", ..." if len(wrong) > 4 else "")
-        off, sigma = (np.median([getattr(verdict, name) for verdict in wrong]) for name in ("off", "sigma"))
-        return (
-            f"label: {len(wrong)} of {labels} spin labels contradict their flights, typically by {off:.0f} rad/s where "
-            f"flight and bounces leave the spin open by {sigma:.0f} rad/s (tracks {shown}; each of these is "
-            f"wrong with a probability of at least {percent(wrong[-1].probability)})"
-        )
-
-
-def percent(probability: float) -> str:
-    """For instance `97 %`, `99.9 %`: rounded towards doubt, and never to certainty."""
-    for digits in (0, 1):
-        least = np.floor(100.0 * 10.0**digits * probability) / 10.0**digits
-        if least < 99.0:
-            break
-    return f"{min(least, 99.9):.{digits}f} %"
 
 
 def check_labels(

@@ -7,21 +7,18 @@ import itertools
 import numpy as np
 import pytest
 
-from ballfg.diagnosis.remains.generic import ALARM
 from ballfg.diagnosis.remains.label_check import (
     NONE_WRONG,
     RIGHT,
     RIGHT_SPREAD,
     SHARES,
     WRONG,
-    LabelCheck,
-    LabelVerdict,
     _mixture,
     judged,
     label_test,
-    percent,
 )
 from ballfg.diagnosis.remains.label_flights import LabelledFlight, LabelPosterior, wrong_error
+from ballfg.diagnosis.unnamed import ALARM, LabelCheck, LabelVerdict, percent
 
 STATED, FAR = 4.0, 120.0
 """rad/s, errors of labels that are right and wrong."""

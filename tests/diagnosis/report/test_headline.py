@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ballfg.diagnosis.remains.label_check import LabelCheck, LabelVerdict, label_test
+from ballfg.diagnosis.remains.label_check import label_test
 from ballfg.diagnosis.report.glossary import OUTCOMES, TERMS
 from ballfg.diagnosis.report.headline import advice, answer, certainty, further, headline, where
 from ballfg.diagnosis.report.origin import Origin
@@ -19,7 +19,8 @@ from ballfg.diagnosis.report.plain_effects import PLAIN, in_plain_words, plain_n
 from ballfg.diagnosis.report.predictions import meaning
 from ballfg.diagnosis.report.report import content
 from ballfg.diagnosis.report.shots import distances, error_map, median_shot
-from ballfg.diagnosis.result import Diagnosis, GenericTest, Outcome, Unexplained, Value, Verdict
+from ballfg.diagnosis.result import Diagnosis, Outcome, Unexplained, Value, Verdict
+from ballfg.diagnosis.unnamed import GenericTest, LabelCheck, LabelVerdict
 from ballfg.dynamics import EFFECTS
 from ballfg.estimation.noise.tracker import NUMBERS
 from tests.diagnosis.made_diagnosis import found, residuals, rounds, silent, unexplained
