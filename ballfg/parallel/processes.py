@@ -73,7 +73,7 @@ class _Chunk:
 
     def __init__(self, line: "_Line", work: Work, chunk: Sequence[Any], told: Told | None) -> None:
         self._first, self._told = repr(chunk[0]), told
-        self._call = pickle.dumps((work.name, work.content, packed(chunk), own_versions()))
+        self._call = pickle.dumps((os.getcwd(), work.name, work.content, packed(chunk), own_versions()))
         self._future = Future[tuple[str, bytes]]()
         line.put(self)
 

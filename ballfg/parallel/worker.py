@@ -51,8 +51,9 @@ def _send(thing: tuple[str, Any]) -> None:
     _asker.send_bytes(pickle.dumps(thing))
 
 
-def _answer(name: str, content: bytes, chunk: bytes, versions: dict[str, str]) -> tuple[str, bytes]:
+def _answer(folder: str, name: str, content: bytes, chunk: bytes, versions: dict[str, str]) -> tuple[str, bytes]:
     try:
+        os.chdir(folder)  # the process that asks may have gone elsewhere since it started this one
         return "value", compute(name, content, chunk, versions)
     except BaseException as error:
         return "error", _packed(error)

@@ -73,5 +73,7 @@ def test_parquet_is_bounded_by_its_metadata(tmp_path: Path, columns: dict[str, n
 
 def test_a_header_of_weights_is_bounded(tmp_path: Path) -> None:
     (tmp_path / "a.safetensors").write_bytes((1_000_001).to_bytes(8, "little") + b" " * 1_000_001)
-    with pytest.raises(ValueError, match=r"a\.safetensors must have at most 1000000 bytes of header; got 1000001"):
+    with pytest.raises(
+        ValueError, match=r"a\.safetensors must be a whole safetensors file; .* header has 1000001 bytes"
+    ):
         read_tensors(tmp_path / "a.safetensors")

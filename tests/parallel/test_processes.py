@@ -165,3 +165,16 @@ def test_after_a_stop_the_next_work_starts_new_processes() -> None:
 
 def _where(_chunk: Sequence[int]) -> int:
     return os.getpid()
+
+
+def folder(chunk: Sequence[int]) -> str:
+    return os.getcwd()
+
+
+def test_a_process_that_was_started_elsewhere_works_in_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Relative paths mean the same in all processes."""
+    assert Processes(1, helped=False).sender(folder)([0]).result() == os.getcwd()
+    monkeypatch.chdir(tmp_path)
+    assert Processes(1, helped=False).sender(folder)([0]).result() == str(tmp_path.resolve())
