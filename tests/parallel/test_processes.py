@@ -27,7 +27,7 @@ import time
 from ballfg.parallel.processes import Processes
 
 def work(chunk):
-    print(os.getpid(), flush=True)
+    os.write(1, f"{{os.getpid()}}\\n".encode())  # whole lines, whoever else writes
     time.sleep(chunk[0])
     return chunk
 
