@@ -9,6 +9,8 @@ import numpy as np
 from ballfg.diagnosis.fit.fit import noise_by_axis, values_of
 from ballfg.diagnosis.fit.holdout import Holdout, hold_out
 from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.generic_test import ALARM, GenericTest
+from ballfg.diagnosis.label_verdicts import LabelCheck
 from ballfg.diagnosis.remains.fallback import fallback
 from ballfg.diagnosis.remains.generic import generic_tests
 from ballfg.diagnosis.remains.label_check import check_labels, label_test
@@ -21,7 +23,6 @@ from ballfg.diagnosis.search.loop import Search, SearchLoop
 from ballfg.diagnosis.search.plausible import implausible
 from ballfg.diagnosis.search.process_noise import Predicting, calibrated_model, noise_about
 from ballfg.diagnosis.search.stamp_effects import as_declared
-from ballfg.diagnosis.unnamed import ALARM, GenericTest, LabelCheck
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Effect
 from ballfg.estimation import dataset_settings
 from ballfg.tracks import Dataset, TrackNoise

@@ -21,6 +21,7 @@ from ballfg.diagnosis.fit.free import LOOSE, Deviation, declared_free
 from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout, hold_out
 from ballfg.diagnosis.fit.problem import Fit, Noise, Problem
 from ballfg.diagnosis.fit.stretches import Stretches, joined
+from ballfg.diagnosis.label_verdicts import LabelCheck
 from ballfg.diagnosis.remains.generic import generic_tests
 from ballfg.diagnosis.remains.label_check import judged, label_evidence, label_test
 from ballfg.diagnosis.remains.patterns import DRIFT
@@ -33,7 +34,6 @@ from ballfg.diagnosis.search.hypothesis import effects_of, has_effect, with_effe
 from ballfg.diagnosis.search.loop import SearchLoop
 from ballfg.diagnosis.search.process_noise import PredictiveModel, calibrated_model, fitted_model, noise_about
 from ballfg.diagnosis.search.varying import Grouping, Varying
-from ballfg.diagnosis.unnamed import LabelCheck
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Effect
 from ballfg.estimation import dataset_settings
 from ballfg.tracks import Dataset, TrackNoise

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from ballfg.arrays import Array, Index
-from ballfg.diagnosis.unnamed import GenericTest, LabelCheck
+from ballfg.diagnosis.generic_test import GenericTest
+from ballfg.diagnosis.label_verdicts import LabelCheck
 from ballfg.dynamics import BallModel
 
 if TYPE_CHECKING:

@@ -68,7 +68,7 @@ def check_unpacked(path: Path, size: int, free: int = FREE) -> None:
         )
 
 
-def check_count(path: Path, what: str, count: int, most: int) -> None:
+def check_parts(path: Path, what: str, count: int, most: int) -> None:
     """Refuses a file with more parts than its reader can look at. Args: what: the parts. Raises: ValueError."""
     if count > most:
         raise ValueError(f"{path} must have at most {most} {what}; got {count}. Split it, or leave some out.")

@@ -26,8 +26,9 @@ NEW, OLD = "new", "old"
 PATIENCE: Final = 0.3
 """s after which a lock counts as that of a writer."""
 _DISK: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
-_records: ContextVar[dict[Path, Path]] = ContextVar("records")
-"""Of what this line of work holds, results and hidden folders: the files of the locks. Another thread has none."""
+_records: ContextVar[dict[Path, Path | None]] = ContextVar("records")
+"""Of what this line of work holds, results and hidden folders: the files of the locks, None for a result that could not
+be locked. Another thread has none."""
 
 
 @contextmanager
@@ -56,9 +57,12 @@ def held(target: Path, argument: str = "out") -> Iterator[None]:
         ) from None
     except OSError:
         pass  # no locks or no room there
+    if not lock.is_locked:
+        with _holding(target, None):
+            yield
+        return
     try:
-        if lock.is_locked:
-            _clear_after(record, target)
+        _clear_after(record, target)
         _write(record, os.getpid(), "w")
         with _holding(target, record):
             yield
@@ -75,7 +79,8 @@ def hidden(parent: Path, target: Path, path: Path) -> Iterator[Path]:
     Args: parent: where it is made.  target: the result, held.  path: its name, which errors of the disk get.
     """
     place, record = parent / f"{MARK}{secrets.token_hex(8)}", _records.get()[target]
-    _write(record, str(place))
+    if record is not None:
+        _write(record, str(place))
     try:
         place.mkdir(PRIVATE)
         with _holding(place, record):
@@ -94,7 +99,7 @@ def is_hidden(path: Path) -> bool:
 
 
 @contextmanager
-def _holding(path: Path, record: Path) -> Iterator[None]:
+def _holding(path: Path, record: Path | None) -> Iterator[None]:
     _records.set(_records.get({}) | {path: record})
     try:
         yield

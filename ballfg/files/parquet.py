@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ballfg.checks import MAX_TEXT
-from ballfg.files.damaged import MAX_COLUMNS, NUMBER, check_count, check_unpacked, library_reads
+from ballfg.files.damaged import MAX_COLUMNS, NUMBER, check_parts, check_unpacked, library_reads
 
 MAX_FOOTER: Final = 16_000_000
 """Bytes of the metadata at the end of a file: some 100,000 pieces of columns."""
@@ -33,10 +33,10 @@ def open_parquet(path: Path) -> pq.ParquetFile:
             file.seek(max(size - 8, 0))
             footer, end = int.from_bytes(file.read(4), "little"), file.read(4)
         if end == b"PAR1" and footer < size:
-            check_count(path, "bytes of metadata", footer, MAX_FOOTER)
+            check_parts(path, "bytes of metadata", footer, MAX_FOOTER)
         about = pq.read_metadata(path)
-        check_count(path, "columns", about.num_columns, MAX_COLUMNS)
-        check_count(path, "pieces of columns", about.num_row_groups * max(about.num_columns, 1), MAX_PIECES)
+        check_parts(path, "columns", about.num_columns, MAX_COLUMNS)
+        check_parts(path, "pieces of columns", about.num_row_groups * max(about.num_columns, 1), MAX_PIECES)
         check_unpacked(path, _unpacked(about))
         schema = about.schema
         texts = [schema.column(i).path for i in range(len(schema)) if schema.column(i).physical_type == "BYTE_ARRAY"]

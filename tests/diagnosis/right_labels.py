@@ -20,8 +20,8 @@ import torch
 from torch import Tensor
 
 from ballfg.diagnosis import check_labels, diagnose, fit_model, hold_out
+from ballfg.diagnosis.label_verdicts import LabelCheck
 from ballfg.diagnosis.search.process_noise import calibrated_model
-from ballfg.diagnosis.unnamed import LabelCheck
 from ballfg.dynamics import advance, nominal_model
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.augmented import AugmentedModel

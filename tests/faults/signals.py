@@ -245,7 +245,7 @@ def calibrate(folder: Path) -> None:
 
 SHOTS: Final = "ballfg simulate --out @/shots --tracks 8 --rate 100 --seed 1 --quiet"
 MANY: Final = "ballfg simulate --out @/shots --tracks 300 --rate 60 --seed 1 --quiet"
-FILM: Final = "ballfg render --out @/scene --shots 1 --size 320x180 --no-distractors --force"
+FILM: Final = "ballfg render --out @/scene --shots 1 --size 480x270 --no-distractors --force"
 IMPORT: Final = (
     "ballfg import @/capture.csv --out @/mine --length m --time s --up z --ball table-tennis --table-height 0"
 )

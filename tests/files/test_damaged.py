@@ -7,7 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from ballfg.files.damaged import FREE, MAX_PIXELS, RATIO, check_count, check_pixels, check_unpacked, whole_content
+from ballfg.files.damaged import FREE, MAX_PIXELS, RATIO, check_parts, check_pixels, check_unpacked, whole_content
 from ballfg.files.json_file import MAX_VALUES, has_too_many, parse_json
 from ballfg.files.parquet import open_parquet, texts_of
 from ballfg.files.weights import read_tensors
@@ -34,9 +34,9 @@ def test_pixels_and_parts_are_counted(tmp_path: Path) -> None:
     for width, height in ((8000, MAX_PIXELS // 8000 + 1), (0, 5), (-3, 5)):
         with pytest.raises(ValueError, match=f"at most 64 million pixels; it says {width} x {height}"):
             check_pixels(tmp_path, width, height)
-    check_count(tmp_path, "arrays", 3, 3)
+    check_parts(tmp_path, "arrays", 3, 3)
     with pytest.raises(ValueError, match="at most 3 arrays; got 4"):
-        check_count(tmp_path, "arrays", 4, 3)
+        check_parts(tmp_path, "arrays", 4, 3)
 
 
 def test_json_is_counted_before_it_is_parsed() -> None:

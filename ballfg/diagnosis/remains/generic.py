@@ -12,6 +12,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.system import System
+from ballfg.diagnosis.generic_test import GenericTest
 from ballfg.diagnosis.remains.patterns import (
     DRIFT,
     EVERYWHERE,
@@ -24,7 +25,6 @@ from ballfg.diagnosis.remains.patterns import (
 from ballfg.diagnosis.remains.whiteness import whiteness
 from ballfg.diagnosis.search.score import pattern_tests
 from ballfg.diagnosis.search.signatures import signatures_of
-from ballfg.diagnosis.unnamed import GenericTest
 from ballfg.tracks import TrackNoise
 
 TRACKS_PER_DIRECTION = 4

@@ -13,9 +13,10 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.holdout import Holdout
+from ballfg.diagnosis.generic_test import GenericTest
+from ballfg.diagnosis.label_verdicts import LabelCheck, LabelVerdict
 from ballfg.diagnosis.remains.label_flights import LabelledFlight, labelled_flights
 from ballfg.diagnosis.remains.label_model import scattering_model
-from ballfg.diagnosis.unnamed import GenericTest, LabelCheck, LabelVerdict
 from ballfg.dynamics import AnalyticModel
 from ballfg.tracks import TrackNoise
 

@@ -5,6 +5,8 @@ from collections.abc import Iterator, Mapping
 
 from matplotlib.figure import Figure
 
+from ballfg.diagnosis.generic_test import ALARM, GenericTest
+from ballfg.diagnosis.label_verdicts import percent
 from ballfg.diagnosis.report import pictures
 from ballfg.diagnosis.report.candidates import invisible, noticed_from, rankings
 from ballfg.diagnosis.report.glossary import glossary, term
@@ -14,7 +16,6 @@ from ballfg.diagnosis.report.plain_effects import in_plain_words, plain_name
 from ballfg.diagnosis.report.predictions import errors, one_shot
 from ballfg.diagnosis.report.wording import NONE, capital, fixed, joined, number, plus_minus, probability
 from ballfg.diagnosis.result import Diagnosis, Finding, Residuals, Value, Verdict
-from ballfg.diagnosis.unnamed import ALARM, GenericTest, percent
 from ballfg.dynamics import EFFECTS
 from ballfg.machine import date
 from ballfg.pages.html import Html, items, picture, section, table, tag, typed

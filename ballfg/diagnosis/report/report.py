@@ -11,11 +11,11 @@ from typing import Any, Final
 
 import numpy as np
 
+from ballfg.diagnosis.label_verdicts import LabelCheck
 from ballfg.diagnosis.report.headline import headline
 from ballfg.diagnosis.report.origin import Origin
 from ballfg.diagnosis.report.page import page
 from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Value
-from ballfg.diagnosis.unnamed import LabelCheck
 from ballfg.dynamics import BallModel, save_model
 from ballfg.dynamics.networks.learned_file import LEARNED
 from ballfg.files.json_file import read_json

@@ -10,7 +10,7 @@ from typing import IO, Any, Final
 import numpy as np
 
 from ballfg.checks import listed, shown
-from ballfg.files.damaged import FREE, NUMBER, check_count, check_unpacked, library_reads
+from ballfg.files.damaged import FREE, NUMBER, check_parts, check_unpacked, library_reads
 from ballfg.importing.formats.nested import nested_tables
 from ballfg.importing.formats.raw import RawTable, table_of
 from ballfg.importing.formats.text_files import text_table
@@ -90,7 +90,7 @@ def read_excel(path: Path) -> list[RawTable]:
         raise ValueError(f"{path} must be an Excel file (.xlsx); it is none. Save it again as .xlsx or CSV.")
     with library_reads(path, "Excel"), zipfile.ZipFile(path) as archive:
         members = archive.infolist()
-        check_count(path, "files within it", len(members), MAX_MEMBERS)
+        check_parts(path, "files within it", len(members), MAX_MEMBERS)
         check_unpacked(path, sum(member.file_size for member in members), EXCEL_FREE)
     sheets: dict[str, str] = {}
     left = EXCEL_CELLS + path.stat().st_size // 2
@@ -122,7 +122,7 @@ def _rows(path: Path, sheet: Any, most: int) -> Iterator[list[str]]:
     count = 0
     for row in sheet.iter_rows(values_only=True):
         count += len(row)
-        check_count(path, "cells", count, most)
+        check_parts(path, "cells", count, most)
         cells = _cells(row)
         if any(cells):
             yield cells
@@ -216,7 +216,7 @@ class _Group:
                 content[key] = value
         if depth > MAX_DEPTH:
             raise ValueError(f"{self._path}: groups must be nested at most {MAX_DEPTH} deep. Write it flatter.")
-        check_count(self._path, "groups and datasets", len(self._seen) + len(group), MAX_MEMBERS)
+        check_parts(self._path, "groups and datasets", len(self._seen) + len(group), MAX_MEMBERS)
         for key in group:
             if self._is_known(group, key):
                 continue
@@ -275,7 +275,7 @@ def _array_bytes(path: Path) -> int:
     size = 0
     with zipfile.ZipFile(path) as archive:
         members = archive.infolist()
-        check_count(path, "arrays", len(members), MAX_MEMBERS)
+        check_parts(path, "arrays", len(members), MAX_MEMBERS)
         for member in members:
             within = member.file_size
             if member.filename.endswith(".npy"):

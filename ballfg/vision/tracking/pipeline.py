@@ -122,7 +122,7 @@ def track_videos(
         watch: sees the numbers of the frames that are searched.
     Raises: FileNotFoundError: a file is missing. ValueError: as `open_video`, `check_sizes` and `track_detections`.
     """
-    check_count(cameras)
+    check_rig(cameras)
     check_sizes({name: open_video(path, (stamps or {}).get(name)).size for name, path in videos.items()}, cameras)
     found = detect_all(videos, make, stamps=stamps, jobs=jobs, watch=watch)
     return track_detections(list(found.values()), cameras, settings)
@@ -140,7 +140,7 @@ def track_detections(
     Raises: ValueError: a camera without detections or detections without a camera, too few cameras, or recordings
         that do not overlap in time.
     """
-    check_count(cameras)
+    check_rig(cameras)
     by_name = {seen.camera: seen for seen in detections}
     wanted, given = sorted(camera.name for camera in cameras), sorted(seen.camera for seen in detections)
     if wanted != given or len(set(wanted)) < len(wanted):
@@ -151,7 +151,7 @@ def track_detections(
     return Tracking(tuple(cameras), ordered, balls, check_agreement(balls, cameras) if balls else None)
 
 
-def check_count(cameras: Sequence[Camera]) -> None:
+def check_rig(cameras: Sequence[Camera]) -> None:
     """Refuses too few cameras. Raises: ValueError."""
     if len(cameras) < FEWEST:
         raise ValueError(f"cameras must be at least {FEWEST}; got {len(cameras)}. One alone does not see distance.")

@@ -9,13 +9,13 @@ import pytest
 from scipy import stats
 
 from ballfg.diagnosis.fit.response import fitted_path, responses
+from ballfg.diagnosis.generic_test import ALARM
 from ballfg.diagnosis.remains.generic import generic_tests, where
 from ballfg.diagnosis.remains.patterns import EVERYWHERE, PLAUSIBLE, WORLD, Block, blocks_of
 from ballfg.diagnosis.remains.whiteness import REACHES, whiteness
 from ballfg.diagnosis.search.hypothesis import Hypothesis
 from ballfg.diagnosis.search.score import pattern_tests
 from ballfg.diagnosis.search.signatures import Signatures, hypothesis_columns
-from ballfg.diagnosis.unnamed import ALARM
 from ballfg.dynamics.effects.generic import GenericFlight
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")  # torch's own

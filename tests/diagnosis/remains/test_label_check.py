@@ -7,6 +7,8 @@ import itertools
 import numpy as np
 import pytest
 
+from ballfg.diagnosis.generic_test import ALARM
+from ballfg.diagnosis.label_verdicts import LabelCheck, LabelVerdict, percent
 from ballfg.diagnosis.remains.label_check import (
     NONE_WRONG,
     RIGHT,
@@ -18,7 +20,6 @@ from ballfg.diagnosis.remains.label_check import (
     label_test,
 )
 from ballfg.diagnosis.remains.label_flights import LabelledFlight, LabelPosterior, wrong_error
-from ballfg.diagnosis.unnamed import ALARM, LabelCheck, LabelVerdict, percent
 
 STATED, FAR = 4.0, 120.0
 """rad/s, errors of labels that are right and wrong."""

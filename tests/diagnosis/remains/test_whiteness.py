@@ -9,9 +9,9 @@ import pytest
 import torch
 from scipy import stats
 
+from ballfg.diagnosis.generic_test import ALARM
 from ballfg.diagnosis.remains.generic import generic_tests
 from ballfg.diagnosis.remains.whiteness import _p_value, _summed, whiteness
-from ballfg.diagnosis.unnamed import ALARM
 from ballfg.tracks import TrackNoise
 from tests.diagnosis.conftest import POSITION_NOISE
 

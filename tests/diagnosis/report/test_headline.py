@@ -9,6 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ballfg.diagnosis.generic_test import GenericTest
+from ballfg.diagnosis.label_verdicts import LabelCheck, LabelVerdict
 from ballfg.diagnosis.remains.label_check import label_test
 from ballfg.diagnosis.report.glossary import OUTCOMES, TERMS
 from ballfg.diagnosis.report.headline import advice, answer, certainty, further, headline, where
@@ -20,7 +22,6 @@ from ballfg.diagnosis.report.predictions import meaning
 from ballfg.diagnosis.report.report import content
 from ballfg.diagnosis.report.shots import distances, error_map, median_shot
 from ballfg.diagnosis.result import Diagnosis, Outcome, Unexplained, Value, Verdict
-from ballfg.diagnosis.unnamed import GenericTest, LabelCheck, LabelVerdict
 from ballfg.dynamics import EFFECTS
 from ballfg.estimation.noise.tracker import NUMBERS
 from tests.diagnosis.made_diagnosis import found, residuals, rounds, silent, unexplained

@@ -1,32 +1,14 @@
-"""What a diagnosis says beside effects: tests for patterns of any cause, and verdicts on the spin labels."""
+"""The verdicts on spin labels: which are wrong, how surely, and by how much."""
 
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-ALARM: Final = 0.005
-"""Probability that any of the tests of a fit that lacks nothing raises an alarm: p-values below it are alarms."""
+from ballfg.diagnosis.generic_test import ALARM
+
 SURE: Final = 0.95
 """Probability from which on a label is called wrong."""
-
-
-@dataclass(frozen=True)
-class GenericTest:
-    """A test for a pattern of any cause.
-
-    Attributes:
-        name: `flight`, `contact`, `measurement`, `recording` (coefficients from track to track), `label` (spin labels
-            against flights) or `time` (whiteness along the tracks).
-        where: place, dependence and size of the pattern in words.
-        p_value: probability of such a pattern by chance; of `label`, that every label is right.
-        share: part of the pattern at the start that is still there, 0 to 1.
-    """
-
-    name: str
-    where: str
-    p_value: float
-    share: float
 
 
 @dataclass(frozen=True)
