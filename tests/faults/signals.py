@@ -24,6 +24,7 @@ from typing import Final
 
 import numpy as np
 
+from ballfg.machine import DATE
 from tests.faults.kills import State, Tally, _digest
 from tests.places import ROOT
 
@@ -75,8 +76,8 @@ def words(command: str, folder: Path) -> list[str]:
 
 
 def environment(**more: str) -> dict[str, str]:
-    """Variables of a command: a single thread, and ballfg of this checkout."""
-    return {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), **more}
+    """Variables of a command: a single thread, ballfg of this checkout, and one date for all pages."""
+    return {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), DATE: "1700000000", **more}
 
 
 def undisturbed(command: str, folder: Path) -> float:
