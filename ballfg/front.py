@@ -30,7 +30,6 @@ from ballfg.estimation import (
     predict_tracks,
     read,
 )
-from ballfg.estimation.batch import check_device, estimate_together
 from ballfg.parallel.executor import MOST_JOBS
 from ballfg.parallel.work import on_one_thread
 from ballfg.prediction import Ahead, BallState
@@ -52,7 +51,6 @@ class Options(TypedDict, total=False):
     surfaces: Surfaces | float | None
     settings: Settings | None
     jobs: int
-    device: str | None
 
 
 class PredictOptions(Options, total=False):
@@ -74,7 +72,6 @@ def estimate(
     surfaces: Surfaces | float | None = None,
     settings: Settings | None = None,
     jobs: int = 1,
-    device: str | None = None,
 ) -> Estimate | dict[str, Estimate]:
     """Position, velocity and spin of the ball at every stamp, with covariances.
 
@@ -89,21 +86,18 @@ def estimate(
         surfaces: that the ball may bounce on; a number is the height of the table, m.
         settings: noise and priors; those of measured tracks where None.
         jobs: processes for a dataset.
-        device: torch device that computes motion and linear systems of a dataset's tracks together, as "cuda"; machine
-            code, track by track, where None. For the smoother alone.
     Returns: the estimate of a track; of a dataset, the estimates of all its tracks by name.
     Raises:
         TypeError: for anything else in place of a track.
         ValueError: an unknown method, or numbers that cannot be metres and seconds.
         FileNotFoundError: a folder or model file that is not there.
     """
-    check_device(method, device)
     check_count("jobs", jobs, 1, MOST_JOBS)
     data = _opened(measured)
     estimator = estimator_for(data, method, model, surfaces, settings)
     if isinstance(data, Track):
-        return estimator.estimate(data) if device is None else estimate_together(estimator, [data], device)[0]
-    return {one.name: one for one in estimate_tracks(estimator, data, len(data), jobs, device)}
+        return estimator.estimate(data)
+    return {one.name: one for one in estimate_tracks(estimator, data, len(data), jobs)}
 
 
 @overload
@@ -125,7 +119,6 @@ def predict(
     settings: Settings | None = None,
     conformal: Conformal = None,
     jobs: int = 1,
-    device: str | None = None,
 ) -> Ahead | dict[str, TrackPrediction]:
     """The path of the ball ahead, with standard deviations.
 
@@ -137,14 +130,13 @@ def predict(
         conformal: for a dataset: calibration tracks of the same kind or their folder, scales that an earlier prediction
             has, or their file. The sigmas are scaled so that mean +- 1.645 sigma are conformal 90 % intervals
             (docs/predict.md); `conformal` of each prediction has the scales and the coverage on the calibration tracks.
-        method, model, surfaces, settings, jobs, device: as for `estimate`; the calibration tracks are estimated alike.
+        method, model, surfaces, settings, jobs: as for `estimate`; the calibration tracks are estimated alike.
     Returns: the path ahead; of a dataset, the predicted measurements of each track by name.
     Raises:
         TypeError: for anything else in place of what is known or of the calibration tracks.
         ValueError: a horizon that is not positive, calibration tracks that are too few or of another kind, or what
             `estimate` raises.
     """
-    check_device(method, device)
     check_count("jobs", jobs, 1, MOST_JOBS)
     if isinstance(known, Estimate | BallState):
         _refuse(conformal)
@@ -153,11 +145,11 @@ def predict(
     if isinstance(data, Track):
         _refuse(conformal)
         estimator = estimator_for(data, method, model, surfaces, settings)
-        return estimate_together(estimator, [data], device)[0].predict(horizon)
+        return estimator.estimate(data).predict(horizon)
     check_observe(observe)
     observe = float(observe)
     estimator = estimator_for(data, method, model, surfaces, settings, observe)
-    predicted = partial(predict_tracks, estimator, observe=observe, horizon=horizon, jobs=jobs, device=device)
+    predicted = partial(predict_tracks, estimator, observe=observe, horizon=horizon, jobs=jobs)
     scales = _scales(conformal, data, predicted, method, observe)
     found = predicted(data, len(data))
     return {one.name: one if scales is None else scales.scaled(one) for one in found}

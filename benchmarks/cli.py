@@ -15,7 +15,6 @@ import typer
 
 from ballfg.cli.inputs import CORES, Address, Cluster, workers
 from ballfg.cli.start import start
-from ballfg.machine import usable_device
 
 if TYPE_CHECKING:
     from ballfg.benchmarks.results import Results
@@ -241,9 +240,6 @@ def speed(
     gate: Annotated[
         Path | None, typer.Option(help="An earlier results.json; fail where something has become slower since.")
     ] = None,
-    device: Annotated[
-        str | None, typer.Option(help="cuda, for instance: time rollouts and estimates of many balls there as well.")
-    ] = None,
     out: Out = Path("results"),
     quick: Quick = False,
     seed: Seed = 0,
@@ -259,22 +255,19 @@ def speed(
     from ballfg.benchmarks.speed.peers.suite import run_peers
     from ballfg.benchmarks.speed.suite import FULL, QUICK, run_speed
 
-    interpreters, there = _interpreters(peer or []), None if device is None else usable_device(device)
+    interpreters = _interpreters(peer or [])
     if peer and not peers:
         raise typer.BadParameter("it is for --peers. Give that too, or leave both out.", param_hint="--peer")
     if peers and data is not None:
         raise typer.BadParameter("peers solve the fixed problems only. Leave it out.", param_hint="--data")
-    if peers and there is not None:
-        raise typer.BadParameter("peers run on the processor. Leave it out.", param_hint="--device")
     words = [*(["--peers"] if peers else []), *(word for name in interpreters for word in ("--peer", name))]
-    words += [] if device is None else ["--device", device]
     results, size = _start("speed", [] if data is None else [data], quick, seed, words), QUICK if quick else FULL
     if gate is not None and not gate.is_file():
         raise typer.BadParameter(f"there is no file {gate}. Give an earlier results.json.", param_hint="--gate")
     if peers:
         run_peers(results, interpreters, size)
     else:
-        run_speed(results, None if data is None else _open(data), size, there)
+        run_speed(results, None if data is None else _open(data), size)
     with _folder(out) as folder:
         _finish(results, folder, [])
     if gate is not None:

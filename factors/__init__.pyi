@@ -20,14 +20,11 @@ from .graph import BallGraph as BallGraph
 from .graph import Convergence as Convergence
 from .graph import LevenbergMarquardt as LevenbergMarquardt
 from .graph import Minimum as Minimum
-from .graph import Search as Search
-from .graph import run as run
 from .launcher import LauncherSpinFactors as LauncherSpinFactors
 from .linear.covariance import Covariances as Covariances
 from .linear.covariance import marginal_covariances as marginal_covariances
 from .linear.step import Step as Step
 from .linear.step import solve as solve
-from .lockstep import run_together as run_together
 from .loss import Loss as Loss
 from .noise import Kicks as Kicks
 from .noise import ProcessNoise as ProcessNoise

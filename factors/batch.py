@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import ClassVar, Self, TypeVar
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from ballfg.arrays import Array, Index
@@ -117,11 +116,9 @@ class FactorBatch(ABC):
         dim: dimension of a residual.
         loss: the loss on the norm of a whitened residual.
         row_arrays: names of the attributes that hold one entry a factor.
-        costly: whether an evaluation is a torch call, worth sharing between graphs.
         sees_biases: whether its variables are states with the tracker's biases behind them.
     """
 
-    costly: ClassVar[bool] = False
     sees_biases: ClassVar[bool] = False
 
     row_arrays: ClassVar[tuple[str, ...]] = ("variables",)
@@ -192,10 +189,6 @@ class FactorBatch(ABC):
         for name in self.row_arrays:
             setattr(part, name, getattr(self, name)[rows])
         return part
-
-    def on(self, device: torch.device) -> Self:
-        """The same factors, computed on a device where that saves time; these as they are, unless a sort says more."""
-        return self
 
     def inputs(self, values: Values) -> tuple[Array, ...]:
         """For each variable of a factor the values (m, d) that `compute` takes, in the variable's own units."""

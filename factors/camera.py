@@ -39,7 +39,6 @@ class CameraFactors(FactorBatch):
     """
 
     row_arrays: ClassVar[tuple[str, ...]] = ("variables", "camera", "pixels", "root", "delay", "column")
-    costly: ClassVar[bool] = True
 
     def __init__(
         self,

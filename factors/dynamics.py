@@ -51,7 +51,6 @@ class DynamicsFactors(FactorBatch):
     Raises: ValueError: if a dt is not positive.
     """
 
-    costly: ClassVar[bool] = True
     row_arrays: ClassVar[tuple[str, ...]] = ("variables", "dt", "whitening", "kick_times", "hit")
 
     def __init__(
@@ -71,17 +70,10 @@ class DynamicsFactors(FactorBatch):
         self.whitening = root if root.shape[-1] == STATE_DIM else along_all_axes(root)
         kicks = kicks or Kicks.none(len(states))
         self.kick_times, self.hit = kicks.times, kicks.hit
-        self.device = torch.device("cpu")
 
-    def on(self, device: torch.device) -> Self:
-        """The same factors with a copy of the model on a device; what `compute` returns lies in memory all the same."""
-        other = copy.copy(self)
-        other.model, other.device = copy.deepcopy(self.model).to(device), device
-        return other
-
-    def _tensor(self, array: Array) -> Tensor:
-        """An array where the model is."""
-        return torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
+    @staticmethod
+    def _tensor(array: Array) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array))
 
     @abstractmethod
     def propagate(self, state: Tensor, rows: Index | slice) -> tuple[Tensor, Tensor]:

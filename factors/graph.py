@@ -2,9 +2,8 @@
 
 import copy
 import enum
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
 
 import numpy as np
 
@@ -38,68 +37,6 @@ def objective(linearized: Sequence[Rows]) -> float:
     return total if np.isfinite(total) else np.inf
 
 
-R = TypeVar("R")
-
-
-@dataclass(frozen=True)
-class Linearization:
-    """The question for a graph linearised at a point; the answer is a list of `Rows`, one for each batch."""
-
-    graph: BallGraph
-    values: Values
-
-    def answer(self) -> list[Rows]:
-        """All factors at the point."""
-        return self.graph.linearize(self.values)
-
-
-@dataclass(frozen=True)
-class LinearSolution:
-    """The question for the step that minimises linearised factors; the answer is a `Step`, or None."""
-
-    linearized: Sequence[Rows]
-    values: Values
-    damping: float = 0.0
-
-    def answer(self) -> Step | None:
-        """See `ballfg.factors.linear.step.solve`."""
-        return solve(self.linearized, self.values, self.damping)
-
-
-Question = Linearization | LinearSolution
-Search = Generator[Question, Any, R]
-"""A computation that asks for linearisations and for solutions of linear systems, and is sent them. Several searches
-can so be answered together (`ballfg.factors.lockstep`)."""
-
-
-def run(search: Search[R]) -> R:
-    """The result of one search, answered as it asks."""
-    try:
-        question = next(search)
-        while True:
-            question = search.send(question.answer())
-    except StopIteration as end:
-        return end.value
-
-
-def searched_while(search: Search[R], holds: Callable[[Values], bool]) -> Search[R | None]:
-    """A search that is given up, with None, when it goes on from a point that is not wanted.
-
-    Args: search: to begin.  holds: whether a point is wanted.
-    """
-    answer = None
-    try:
-        while True:
-            question = search.send(answer)
-            if isinstance(question, LinearSolution) and not holds(question.values):
-                search.close()
-                return None
-            answer = yield question
-    except StopIteration as end:
-        result: R = end.value
-        return result
-
-
 class Convergence(enum.Enum):
     """How a minimisation ended."""
 
@@ -108,6 +45,7 @@ class Convergence(enum.Enum):
     STUCK = "no step reduces the objective further although the gradient is not zero"
     TOO_MANY_ITERATIONS = "the iteration limit was reached"
     NOT_FINITE = "the objective is not finite at the start"
+    LEFT = "the search left where it was to stay"
 
 
 @dataclass(frozen=True)
@@ -176,38 +114,41 @@ class LevenbergMarquardt:
     max_iterations: int = 60
     first_damping: float = 1e-8
 
-    def minimize(self, graph: BallGraph, values: Values) -> Minimum:
-        """Minimise a graph's objective from a starting point; see `search`."""
-        return run(self.search(graph, values))
-
-    def search(self, graph: BallGraph, start: Values | Minimum) -> Search[Minimum]:
-        """Minimise a graph's objective from a starting point, asking for linearisations and solutions.
+    def minimize(
+        self, graph: BallGraph, start: Values | Minimum, within: Callable[[Values], bool] | None = None
+    ) -> Minimum:
+        """Minimise a graph's objective from a starting point.
 
         Each iteration tries the Gauss-Newton step; where it does not reduce the objective, lambda grows until a
         step does. The length of an undamped step in the metric of J^T J, |J d|, is the distance to the minimum in
         posterior standard deviations: free of units, and what `tolerance` bounds. When the lengths fall so quickly that
         the next step would be within the tolerance, the present one is the last.
 
-        Args: graph: what is minimised.  start: where from; a minimum found with a larger tolerance is gone on from.
+        Args:
+            graph: what is minimised.
+            start: where from; a minimum found with a larger tolerance is gone on from.
+            within: whether a point may be gone on from; the search ends as `LEFT` at one that may not.
         """
         found = (
             Minimum(start, np.inf, None, Convergence.CONVERGED, 0, beyond=True) if isinstance(start, Values) else start
         )
         known = None if found.beyond else found.linearized
-        point = _Point(found.values, (yield Linearization(graph, found.values)) if known is None else known)
+        point = _Point(found.values, graph.linearize(found.values) if known is None else known)
         if not np.isfinite(point.error):
             return Minimum(point.values, point.error, None, Convergence.NOT_FINITE, 1, point.linearized)
         damping, growth, last = 0.0, 10.0, found.last
         for iteration in range(found.iterations + found.beyond, self.max_iterations + 1):
+            if within is not None and not within(point.values):
+                return point.minimum(None, Convergence.LEFT, iteration)
             again = known is not None and iteration == found.iterations
-            step = found.step if again else (yield point.question(damping))
+            step = found.step if again else solve(point.linearized, point.values, damping)
             length = np.sqrt(2 * abs(step.decrease)) if step is not None and damping == 0.0 else np.inf
             if step is not None and length < self.tolerance:
                 return point.minimum(step, Convergence.CONVERGED, iteration, float(length), last)
             beyond = RATE_MARGIN * length * (length / last) if np.isfinite(last) else np.inf
             if step is not None and beyond < self.tolerance:
                 return point.moved(step).minimum(step, Convergence.CONVERGED, iteration, float(beyond), float(length))
-            trial = None if step is None else (yield from _tried(graph, point, step, damping))
+            trial = None if step is None else _tried(graph, point, step, damping)
             if step is not None and trial is not None and trial.error <= point.error * (1 + 1e-12):
                 gain = _gain(point, trial, step)
                 point, last = trial, length if WHOLE < gain < SHORT else np.inf
@@ -216,10 +157,12 @@ class LevenbergMarquardt:
             elif length < AT_KINK:
                 return point.minimum(step, Convergence.AT_KINK, iteration)
             elif damping > MOST_DAMPING:
-                return point.minimum((yield point.question()), Convergence.STUCK, iteration)
+                return point.minimum(solve(point.linearized, point.values), Convergence.STUCK, iteration)
             else:
                 damping, growth = max(self.first_damping, growth * damping), 2.0 * growth
-        return point.minimum((yield point.question()), Convergence.TOO_MANY_ITERATIONS, self.max_iterations)
+        return point.minimum(
+            solve(point.linearized, point.values), Convergence.TOO_MANY_ITERATIONS, self.max_iterations
+        )
 
 
 class _Point:
@@ -228,10 +171,6 @@ class _Point:
     def __init__(self, values: Values, linearized: Sequence[Rows]) -> None:
         self.values, self.linearized, self.error = values, linearized, objective(linearized)
         self.beyond = False
-
-    def question(self, damping: float = 0.0) -> LinearSolution:
-        """The question for the step from here, held back by Marquardt's lambda."""
-        return LinearSolution(self.linearized, self.values, damping)
 
     def moved(self, step: Step) -> "_Point":
         """The point after a step that is not looked at, with the objective that it promises."""
@@ -258,19 +197,19 @@ def _gain(before: _Point, after: _Point, step: Step) -> float:
     return (before.error - after.error) / max(step.decrease, np.finfo(float).tiny)
 
 
-def _tried(graph: BallGraph, point: _Point, step: Step, damping: float) -> Search[_Point]:
+def _tried(graph: BallGraph, point: _Point, step: Step, damping: float) -> _Point:
     """Where a step leads: all of it, or a multiple where an undamped one brought far less or more than its promise.
 
     Where the objective bends r times as much along the step as the linear model says (friction between slip and grip
     does), the whole step brings (2 - r) of its promise and 1 / r of it is best. Whole steps then creep or diverge.
     """
     values = point.values.moved(step.states, step.coefficients)
-    whole = _Point(values, (yield Linearization(graph, values)))
+    whole = _Point(values, graph.linearize(values))
     gain = _gain(point, whole, step)
     tells = gain <= WHOLE or (gain >= SHORT and step.decrease > ROUNDING * point.error)
     if damping > 0.0 or not tells or step.decrease > NEAR or not np.isfinite(whole.error):
         return whole
     share = 1.0 / max(2.0 - gain, 1.0 / LONGEST)
     values = point.values.moved(share * step.states, share * step.coefficients)
-    nearer = _Point(values, (yield Linearization(graph, values)))
+    nearer = _Point(values, graph.linearize(values))
     return nearer if nearer.error < min(point.error, whole.error) else whole

@@ -30,7 +30,6 @@ class LauncherSpinFactors(FactorBatch):
     """
 
     row_arrays: ClassVar[tuple[str, ...]] = ("variables", "settings", "sigma")
-    costly: ClassVar[bool] = True
 
     def __init__(
         self, states: Index, settings: Array, embedding: SpinEmbedding, sigma: Array, loss: Loss | None = None

@@ -80,14 +80,6 @@ Address = Annotated[
     str | None,
     typer.Option("--address", help="Address of the cluster: of dask's scheduler, such as tcp://10.0.0.1:8786."),
 ]
-Device = Annotated[
-    str | None,
-    typer.Option(
-        "--device",
-        help="Torch device that computes motion and linear systems of many tracks at once, such as cuda.",
-        show_default="machine code, track by track",
-    ),
-]
 OutTable = Annotated[Path, typer.Option("--out", help="Output table, .csv or .parquet.")]
 Seed = Annotated[int, typer.Option("--seed", help="Random seed.")]
 DATASET_TABLES = ("tracks", "labels", "detections", "truth")

@@ -7,13 +7,8 @@ from functools import partial
 from itertools import islice
 from typing import TypeVar
 
-import torch
-
-from ballfg.checks import shown
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.result import Estimate
-from ballfg.factors.lockstep import run_together
-from ballfg.machine import usable_device
 from ballfg.parallel.executor import executor
 from ballfg.parallel.parts import with_jobs
 from ballfg.parallel.processes import Processes
@@ -28,109 +23,25 @@ PROBED = 10
 """Tracks done in this process first, to see how long one takes; the first of them warms up and does not count."""
 START_UP = 5.0
 """s that worker processes take to start (they import torch and gtsam): less work than that stays here."""
-TOGETHER = 1000
-"""Tracks whose linear systems lie on a device at once; with 80 samples each they take 100 MB there."""
 HAND_OVER = 0.3
 """s that it takes to hand work to processes that were started before."""
 
 
-def estimate_tracks(
-    estimator: Estimator, tracks: Iterable[Track], count: int, jobs: int, device: str | None = None
-) -> Iterator[Estimate]:
-    """Estimates in the order of the tracks: `map_estimates` that changes nothing."""
+def estimate_tracks(estimator: Estimator, tracks: Iterable[Track], count: int, jobs: int) -> Iterator[Estimate]:
+    """Estimates in the order of the tracks.
+
+    Args: tracks, count, jobs: as for `map_tracks`.
+    """
     if estimator.model.variations:  # the world of each estimate is that of its track
-        yield from map_estimates(_same, estimator, tracks, count, jobs, device)
+        yield from map_tracks(estimator.estimate, tracks, count, jobs)
         return
-    for estimate in map_estimates(_without_world, estimator, tracks, count, jobs, device):
+    for estimate in map_tracks(partial(_without_world, estimator), tracks, count, jobs):
         yield replace(estimate, world=estimator.world)
 
 
-def _same(estimate: Estimate) -> Estimate:
-    return estimate
-
-
-def _without_world(estimate: Estimate) -> Estimate:
+def _without_world(estimator: Estimator, track: Track) -> Estimate:
     """The estimate without the model, which need not travel between processes with every track."""
-    return replace(estimate, world=None)
-
-
-def map_estimates(
-    function: Callable[[Estimate], R],
-    estimator: Estimator,
-    tracks: Iterable[Track],
-    count: int,
-    jobs: int,
-    device: str | None = None,
-) -> Iterator[R]:
-    """A function of the estimate of each track, in the order of the tracks; as `map_tracks`.
-
-    Args: function, tracks, count, jobs: as for `map_tracks`.  device: as for `estimate_together`.
-    """
-    if device is None:
-        return map_tracks(partial(_of_one, function, estimator), tracks, count, jobs)
-    return map_blocks(partial(_of_many, function, estimator, device), tracks, count, jobs, TOGETHER)
-
-
-def map_sections(
-    function: Callable[[Iterable[Estimate]], R],
-    estimator: Estimator,
-    tracks: Iterable[Track],
-    count: int,
-    jobs: int,
-    device: str | None = None,
-) -> Iterator[R]:
-    """A function of the estimate of each track in parts (`Estimator.in_sections`), in the order of the tracks.
-
-    Args: function, tracks, count, jobs: as for `map_tracks`.  device: as for `estimate_together`, one part a track.
-    """
-    if device is None:
-        return map_tracks(partial(_of_sections, function, estimator), tracks, count, jobs)
-    return map_estimates(partial(_of_whole, function), estimator, tracks, count, jobs, device)
-
-
-def _of_sections(function: Callable[[Iterable[Estimate]], R], estimator: Estimator, track: Track) -> R:
-    return function(estimator.in_sections(track))
-
-
-def _of_whole(function: Callable[[Iterable[Estimate]], R], estimate: Estimate) -> R:
-    return function((estimate,))
-
-
-def _of_one(function: Callable[[Estimate], R], estimator: Estimator, track: Track) -> R:
-    return function(estimator.estimate(track))
-
-
-def _of_many(
-    function: Callable[[Estimate], R], estimator: Estimator, device: str, tracks: Sequence[Track]
-) -> Iterator[R]:
-    return map(function, estimate_together(estimator, tracks, device))
-
-
-def estimate_together(estimator: Estimator, tracks: Sequence[Track], device: str | None) -> list[Estimate]:
-    """The estimates of some tracks.
-
-    Args:
-        device: name of the torch device that computes their motion and linear systems, all tracks at once, as "cuda".
-            None: each track by itself, in machine code.
-    """
-    if device is None:
-        return [estimator.estimate(track) for track in tracks]
-    return run_together([estimator.estimating(track) for track in tracks], torch.device(device))
-
-
-def check_device(method: str, device: str | None) -> None:
-    """Refuses a device that torch cannot compute on, or that the method has no use for.
-
-    Args: method: name of an estimator.  device: as for `estimate_together`.
-    Raises: ValueError: if it is one.
-    """
-    if device is None:
-        return
-    if method != "smoother":
-        raise ValueError(
-            f"device must be left out for the method {shown(method)}: only the smoother can compute on one."
-        )
-    usable_device(device)
+    return replace(estimator.estimate(track), world=None)
 
 
 def map_tracks(function: Callable[[Track], R], tracks: Iterable[Track], count: int, jobs: int) -> Iterator[R]:

@@ -8,7 +8,6 @@ from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.settings import Settings
 from ballfg.factors.batch import FactorBatch
-from ballfg.factors.graph import Search, run
 from ballfg.tracks import Track
 
 
@@ -39,11 +38,4 @@ class EachItsModel(Estimator):
 
     def estimate(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Estimate:
         """The states of a track, one per stamp, with the track's own coefficients."""
-        return run(self.estimating(track, factors))
-
-    def estimating(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Search[Estimate]:
-        """`estimate` as the search of the track's own estimator.
-
-        Args: track, factors: as for `estimate`.
-        """
-        return self.of(self.prepared(track)).estimating(track, factors)
+        return self.of(self.prepared(track)).estimate(track, factors)

@@ -15,7 +15,6 @@ from ballfg.estimation.observations.given import given
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.settings import Settings
 from ballfg.factors.batch import FactorBatch
-from ballfg.factors.graph import Search
 from ballfg.prediction.state import World
 from ballfg.tracks import Ball, Track
 from ballfg.tracks.checks import check_scale, doubts_about
@@ -80,14 +79,6 @@ class Estimator(ABC):
             TypeError: if track is not a `Track`.
             ValueError: if its numbers cannot be metres and seconds.
         """
-
-    def estimating(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Search[Estimate]:
-        """`estimate` as a search, for `ballfg.factors.lockstep`: here one that asks nothing.
-
-        Args: track, factors: as for `estimate`.
-        """
-        yield from ()
-        return self.estimate(track, factors)
 
     def in_sections(self, track: Track) -> Iterator[Estimate]:
         """The estimate of a track in parts that follow one another, for those who need not hold all of a long one.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ballfg.arrays import Array
 from ballfg.checks import as_float
-from ballfg.estimation.batch import TOGETHER, estimate_together, map_blocks
+from ballfg.estimation.batch import map_blocks
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.measurement.as_measured import measured_positions, true_times
 from ballfg.estimation.outside import outside_of
@@ -83,7 +83,6 @@ def predict_tracks(
     *,
     horizon: float = np.inf,
     jobs: int = 1,
-    device: str | None = None,
 ) -> Iterator[TrackPrediction]:
     """Predictions in the order of the tracks.
 
@@ -94,7 +93,6 @@ def predict_tracks(
         observe: s from the track's first stamp; a stamp at its end is observed. A function gives each track its own.
         horizon: s after the last observed stamp; later stamps are left out.
         jobs: processes.
-        device: on which the observed parts are estimated, as in `ballfg.estimation.batch.estimate_together`.
 
     Raises: ValueError: if observe or horizon is not positive.
     """
@@ -104,7 +102,7 @@ def predict_tracks(
     if not horizon > 0.0:
         raise ValueError(f"horizon must be a positive number of seconds; got {horizon:g}. Leave it out for all stamps.")
     seconds = observe if callable(observe) else lambda track: observe
-    return _predictions(estimator, tracks, count, seconds, horizon, jobs, device)
+    return _predictions(estimator, tracks, count, seconds, horizon, jobs)
 
 
 def check_observe(observe: float) -> None:
@@ -127,11 +125,10 @@ def _predictions(
     observe: Callable[[Track], float],
     horizon: float,
     jobs: int,
-    device: str | None,
 ) -> Iterator[TrackPrediction]:
     propagator = Propagator(estimator.surfaces, estimator.settings.process)
-    work = partial(_block, estimator, propagator, observe, horizon, device)
-    for one in map_blocks(work, tracks, count, jobs, BLOCK if device is None else TOGETHER):
+    work = partial(_block, estimator, propagator, observe, horizon)
+    for one in map_blocks(work, tracks, count, jobs, BLOCK):
         plain = one.estimate.world is None
         yield replace(one, estimate=replace(one.estimate, world=estimator.world)) if plain else one
 
@@ -141,7 +138,6 @@ def _block(
     propagator: Propagator,
     observe: Callable[[Track], float],
     horizon: float,
-    device: str | None,
     tracks: Sequence[Track],
 ) -> list[TrackPrediction]:
     """Predictions of a block; without the model where it is that of all, which need not travel with every track."""
@@ -149,7 +145,7 @@ def _block(
         estimator.prepared(track)  # what is no track in m and s shows in the whole
     counted = [track.since_first() for track in tracks]
     parts = [track.opening(observe(track)) for track in counted]
-    estimates = estimate_together(estimator, parts, device)
+    estimates = [estimator.estimate(part) for part in parts]
     made = _predict_block(estimator, propagator, estimates, counted, horizon)
     found = [_dated(one, track.times) for one, track in zip(made, tracks, strict=True)]
     if estimator.model.variations:  # the world of each estimate is that of its track

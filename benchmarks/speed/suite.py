@@ -17,7 +17,6 @@ from ballfg.benchmarks.results import Results
 from ballfg.benchmarks.speed.banded import BandedProblem
 from ballfg.benchmarks.speed.gradient_cost import time_gradients
 from ballfg.benchmarks.speed.network import FIT_ITERATIONS, fitted_network, parameter_count
-from ballfg.benchmarks.speed.on_device import time_on_device
 from ballfg.benchmarks.speed.robot import time_bounces, time_events, time_growth, time_rollouts, time_stream
 from ballfg.benchmarks.speed.stopwatch import Stopwatch, milliseconds
 from ballfg.dynamics import (
@@ -89,10 +88,10 @@ FULL = Size(runs=60, warm_up=5)
 QUICK = Size(runs=5, warm_up=2, flights=4)
 
 
-def run_speed(results: Results, dataset: Dataset | None, size: Size, device: torch.device | None = None) -> None:
+def run_speed(results: Results, dataset: Dataset | None, size: Size) -> None:
     """All times; a control before each model and at the end.
 
-    With a dataset the time for each of some of its tracks, with a device those of many balls there.
+    With a dataset the time for each of some of its tracks.
     """
     model = problem_model()
     track = problem_track(model)
@@ -107,7 +106,6 @@ def run_speed(results: Results, dataset: Dataset | None, size: Size, device: tor
         *(partial(time_stream, watch, solver, size.flights) for solver in ONLINE),
         partial(time_events, watch),
         partial(time_rollouts, watch),
-        *(() if device is None else (partial(time_on_device, watch, device),)),
     ]
     for part in progress(parts, len(parts), "parts timed"):
         part()

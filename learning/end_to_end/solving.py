@@ -15,8 +15,7 @@ from ballfg.estimation.smoother.problem import effective_sigmas
 from ballfg.estimation.smoother.smoother import Earlier
 from ballfg.estimation.smoother.solution import Solution
 from ballfg.factors.batch import Values
-from ballfg.factors.graph import Convergence, LevenbergMarquardt, Search
-from ballfg.factors.lockstep import run_together
+from ballfg.factors.graph import Convergence, LevenbergMarquardt
 from ballfg.learning.augment import apply, rotate, undo
 from ballfg.learning.end_to_end.learnables import Learnables
 from ballfg.learning.shots import Shot
@@ -128,10 +127,10 @@ class BatchSolver:
         Args: numbers: of the shots.  poses: for those that are not seen as measured.
         """
         smoothers: dict[tuple[int, Surfaces, bool], Smoother] = {}
-        searches = [self._search(number, poses.get(number), smoothers) for number in numbers]
         solved, failed = [], []
-        for number, solution in zip(numbers, run_together(searches), strict=True):
+        for number in numbers:
             pose, positions = poses.get(number), self.shots[number].track.positions
+            solution = self._solution(number, pose, smoothers)
             minimum = solution.minimum
             if minimum.convergence in ACCEPTED and minimum.step is not None:
                 self.warm.keep(number, solution, pose)
@@ -141,9 +140,9 @@ class BatchSolver:
                 failed.append((self.shots[number].name, minimum.convergence.value))
         return solved, failed
 
-    def _search(
+    def _solution(
         self, number: int, pose: Pose | None, smoothers: dict[tuple[int, Surfaces, bool], Smoother]
-    ) -> Search[Solution]:
+    ) -> Solution:
         shot = self.shots[number]
         key = id(shot.settings), shot.surfaces, pose is not None
         if key not in smoothers:
@@ -161,7 +160,7 @@ class BatchSolver:
             sigma[:, :2] = np.sqrt(np.square(sigma[:, :2]).mean(axis=1, keepdims=True))  # a turn mixes x and y
         warm = self.warm.get(number, pose)
         if warm is None:
-            return smoother.search(smoother.problem(track, segmentation, sigma))
+            return smoother.settle(smoother.problem(track, segmentation, sigma))
         values, contacts = warm
         problem = smoother.problem(track, replace(segmentation, contacts=contacts), sigma)
-        return smoother.search(problem, Earlier(replace(values, biases=problem.start(values.states).biases)))
+        return smoother.settle(problem, Earlier(replace(values, biases=problem.start(values.states).biases)))

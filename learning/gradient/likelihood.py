@@ -16,10 +16,9 @@ from torch import Tensor
 
 from ballfg.arrays import Array
 from ballfg.factors.batch import FactorBatch, Noise, Rows, Values
-from ballfg.factors.graph import BallGraph, Linearization
+from ballfg.factors.graph import BallGraph
 from ballfg.factors.linear.covariance import NeighbourCovariances
 from ballfg.factors.linear.step import weighted
-from ballfg.factors.lockstep import linearize_together
 from ballfg.learning.gradient.conjugate_gradients import GaussNewtonFactors
 
 
@@ -39,8 +38,9 @@ def negative_log_likelihood(
     posterior = factors.covariances()
     log_roots = factors.log_determinants()
     totals = []
-    for track, rows in enumerate(linearize_together(list(map(Linearization, graphs, minima)))):
-        kinds = [kind for kind in graphs[track].batches if len(kind)]
+    for track, (graph, minimum) in enumerate(zip(graphs, minima, strict=True)):
+        rows = graph.linearize(minimum)
+        kinds = [kind for kind in graph.batches if len(kind)]
         value = log_roots[track] + sum(r.error() for r in rows) + sum(kind.log_spread() for kind in kinds)
         expected = torch.zeros((), dtype=torch.float64)
         for kind, linearized in zip(kinds, rows, strict=True):

@@ -82,19 +82,6 @@ def test_the_same_bytes_on_one_process_or_two(tmp_path: Path, monkeypatch: pytes
         assert (tmp_path / "one.csv").read_bytes() == (tmp_path / "two.csv").read_bytes()
 
 
-def test_together_on_a_device_as_one_by_one(dataset: Path, tmp_path: Path) -> None:
-    """To a billionth of a standard deviation; the device is the processor, which every machine has."""
-    for name, words in (("alone", []), ("together", ["--device", "cpu"])):
-        assert status("estimate", dataset, "--out", tmp_path / f"{name}.parquet", *words) == 0
-    alone, together = (pq.read_table(tmp_path / f"{name}.parquet") for name in ("alone", "together"))
-    assert alone.column_names == together.column_names
-    assert alone["trajectory"] == together["trajectory"]
-    for name in STATE:
-        off = (alone[name].to_numpy() - together[name].to_numpy()) / alone[f"sigma_{name}"].to_numpy()
-        assert np.abs(off).max() < 1e-9
-        np.testing.assert_allclose(together[f"sigma_{name}"].to_numpy(), alone[f"sigma_{name}"].to_numpy(), rtol=1e-9)
-
-
 def test_repaired_input_is_noted_on_stderr_and_exact_repeats_count_once(
     damaged: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -184,8 +171,6 @@ def test_bad_model_files(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFi
         (["--jobs", "0"], "'--jobs'"),
         (["--model", "none.yaml"], "none.yaml does not exist"),
         (["--bogus"], "--bogus"),
-        (["--device", "abacus"], "device must be one that torch computes on; got 'abacus'"),
-        (["--device", "cpu", "--method", "ekf"], "device must be left out for the method 'ekf'"),
     ],
 )
 def test_bad_options(

@@ -111,7 +111,7 @@ def settings_with(launcher: Launcher | None, **changes) -> Settings:
 def kinds_of(track: Track, settings: Settings) -> list[object]:
     smoother = Smoother(nominal_model(), TABLE, settings)
     events = smoother.segment(track)
-    solution = smoother.solve(smoother.problem(track, events))
+    solution = smoother.settle(smoother.problem(track, events))
     return list(smoother.problem(track, events, np.full((len(track), 3), 0.001)).graph(solution.events).batches)
 
 

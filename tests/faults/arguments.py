@@ -119,7 +119,7 @@ def calls_of_estimates(_folder: Path) -> dict[str, Call]:
     info = tracks.DatasetInfo("a", 0.76, bf.Ball(0.02, 0.0027))
     dataset = tracks.dataset_in_memory(info, [track])
     options = {"method": "sliding-window", "model": None, "surfaces": 0.76, "settings": settings, "jobs": 1}
-    ahead = {"horizon": 0.05, "observe": 0.05, "conformal": None, "device": None}
+    ahead = {"horizon": 0.05, "observe": 0.05, "conformal": None}
     found = bf.estimate(track, method="ekf", surfaces=0.76)
     parts = {"model": model, "surfaces": 0.76, "settings": settings}
 
@@ -133,10 +133,10 @@ def calls_of_estimates(_folder: Path) -> dict[str, Call]:
         return bf.estimate((times, positions), method="sliding-window")
 
     return {
-        "estimate": Call(bf.estimate, {"measured": track, **options, "device": None}),
+        "estimate": Call(bf.estimate, {"measured": track, **options}),
         "estimate of arrays": Call(arrays, {"times": track.times, "positions": track.positions}),
         "estimate of a dataset": Call(bf.estimate, {"measured": dataset, **options}),
-        "predict": Call(bf.predict, {"known": track, **options, "horizon": 0.05, "conformal": None, "device": None}),
+        "predict": Call(bf.predict, {"known": track, **options, "horizon": 0.05, "conformal": None}),
         "predict of a dataset": Call(bf.predict, {"known": dataset, **options, **ahead}),
         "diagnose": Call(bf.diagnose, {"measured": "/nonexistent", "model": None, "jobs": 1}),
         "Estimate.predict": Call(found.predict, {"horizon": 0.05, "step": 0.01}),

@@ -19,7 +19,6 @@ from ballfg.estimation.smoother.smoother import Earlier, Smoother
 from ballfg.estimation.smoother.solution import Solution
 from ballfg.factors.batch import Values
 from ballfg.factors.graph import Convergence, LevenbergMarquardt
-from ballfg.factors.lockstep import run_together
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.learning.config.training import LossConfig
@@ -115,12 +114,11 @@ class Estimates:
 
     def solve(self) -> list[Solution]:
         smoother = Smoother(self.model, self.surfaces, self.noise.settings(self.settings), TIGHT)
-        scale, searches = self.noise.position_scale(), []
+        scale, found = self.noise.position_scale(), []
         for k, (track, events) in enumerate(zip(self.tracks, self.segmentations, strict=True)):
             sigma = effective_sigmas(track, events, self.settings) * scale
             earlier = Earlier(self.starts[k]) if self.starts else None
-            searches.append(smoother.search(smoother.problem(track, events, sigma), earlier))
-        found = run_together(searches)
+            found.append(smoother.settle(smoother.problem(track, events, sigma), earlier))
         assert all(s.minimum.convergence is Convergence.CONVERGED for s in found)
         return found
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,6 +17,8 @@ if TYPE_CHECKING:
 
     from ballfg.dynamics import BallModel
     from ballfg.estimation import Estimate, Status
+    from ballfg.estimation.estimator import Estimator
+    from ballfg.tracks import Track
 
 
 def estimate(
@@ -43,7 +44,6 @@ def estimate(
     jobs: inputs.Jobs = inputs.CORES,
     cluster: inputs.Cluster = None,
     address: inputs.Address = None,
-    device: inputs.Device = None,
 ) -> None:
     """Position, velocity and spin with standard deviations, one row per stamp.
 
@@ -59,20 +59,19 @@ def estimate(
     Example: ballfg estimate data/aimy --method smoother --out states.csv
     """
     from ballfg.estimation import has_positions
-    from ballfg.estimation.batch import check_device, map_sections
+    from ballfg.estimation.batch import map_tracks
     from ballfg.tracks import TableWriter
 
     outcome = inputs.Outcome()
     rows = hits = 0
     with TableWriter(out) as table, inputs.workers(cluster, address, jobs) as workers:
         inputs.check_out(out, dataset)
-        check_device(method, device)
         positions = has_positions(dataset) if source is None else source is inputs.Source.POSITIONS
         open_dataset = inputs.open_inputs if positions else inputs.open_sighted
         opened = open_dataset(dataset, model, effects_file, ball=ball)
         count = len(opened.dataset)
-        work = partial(_estimated, opened.model)
-        results = map_sections(work, opened.estimator(method), opened.dataset, count, workers, device)
+        work = partial(_estimated, opened.model, opened.estimator(method))
+        results = map_tracks(work, opened.dataset, count, workers)
         for result in progress(results, count, "tracks estimated"):
             for columns in result.columns:
                 table.write(columns)
@@ -97,12 +96,12 @@ class _Estimated:
     hits: int
 
 
-def _estimated(model: BallModel, parts: Iterable[Estimate]) -> _Estimated:
+def _estimated(model: BallModel, estimator: Estimator, track: Track) -> _Estimated:
     from ballfg.estimation.outside import outside_of
 
     columns, shares, notes, rows, hits = [], list[float](), list[str](), 0, 0
     status = None
-    for part in parts:
+    for part in estimator.in_sections(track):
         share = outside_of(model, part.states)
         columns.append(_columns(part) | ({} if share is None else {"outside": share}))
         shares += [] if share is None else [float(share.sum())]

@@ -39,7 +39,6 @@ def predict(
     jobs: inputs.Jobs = inputs.CORES,
     cluster: inputs.Cluster = None,
     address: inputs.Address = None,
-    device: inputs.Device = None,
 ) -> None:
     """Positions at every stamp after the observed part, with the standard deviation of a measurement there.
 
@@ -52,7 +51,6 @@ def predict(
     Example: ballfg predict data/ballgun --observe 0.25 --out predictions.csv
     """
     from ballfg.estimation import check_observe, predict_tracks
-    from ballfg.estimation.batch import check_device
     from ballfg.files.whole_file import check_file
     from ballfg.tracks import TableWriter
 
@@ -64,14 +62,13 @@ def predict(
             check_file(save_conformal, "save_conformal")
             if conformal is None:
                 raise ValueError("save_conformal must come with --conformal, whose scales it keeps. Add --conformal.")
-        check_device(method, device)
         opened = inputs.open_inputs(dataset, model, effects_file, observe, ball)
         count = len(opened.dataset)
         estimator = opened.estimator(method)
         scales = None
         if conformal is not None:
-            scales = _conformal_scales(conformal, opened.dataset, estimator, method, observe, workers, device)
-        predictions = predict_tracks(estimator, opened.dataset, count, observe, jobs=workers, device=device)
+            scales = _conformal_scales(conformal, opened.dataset, estimator, method, observe, workers)
+        predictions = predict_tracks(estimator, opened.dataset, count, observe, jobs=workers)
         for plain in progress(predictions, count, "tracks predicted"):
             result = plain if scales is None else scales.scaled(plain)
             table.write(_columns(result))
@@ -94,7 +91,6 @@ def _conformal_scales(
     method: str,
     observe: float,
     jobs: int,
-    device: str | None,
 ) -> ConformalScales:
     """Scales from the calibration tracks of a folder, or from a file that keeps them."""
     from ballfg.estimation import (
@@ -114,7 +110,7 @@ def _conformal_scales(
     check_calibration_tracks(calibration, dataset)
     inputs.print_notes(f"calibration tracks: {note}" for note in calibration.notes)
     count = len(calibration)
-    predictions = predict_tracks(estimator, calibration, count, observe, jobs=jobs, device=device)
+    predictions = predict_tracks(estimator, calibration, count, observe, jobs=jobs)
     watched = progress(predictions, count, "calibration tracks predicted")
     return ConformalScales.of(watched, calibration.info.name, observe, method)
 

@@ -112,7 +112,7 @@ def _cut(smoother: Smoother, launcher: Launcher, track: Track) -> list[Stretches
     known = launcher.settings(track)
     settings = np.zeros(len(launcher.embedding.names)) if known is None else known
     problem = smoother.problem(track)
-    sigma, solution = problem.sigma, smoother.solve(problem)
+    sigma, solution = problem.sigma, smoother.settle(problem)
     estimate, segmentation = smoother.result(problem, solution), solution.events.segmentation
     if estimate.status.failed:
         return []

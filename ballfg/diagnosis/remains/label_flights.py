@@ -23,7 +23,7 @@ from ballfg.estimation.smoother.initial import initial_states
 from ballfg.estimation.smoother.problem import UNINFORMATIVE_SPIN
 from ballfg.estimation.smoother.solution import Solution
 from ballfg.factors.batch import Values
-from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Minimum, run
+from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Minimum
 from ballfg.factors.linear.covariance import SquareRootInformation, marginal_covariances
 from ballfg.factors.loss import Loss
 from ballfg.state import SPIN
@@ -134,7 +134,7 @@ def _labelled_flight(
         inverse = InvertMeasurement(Smoother, ball, surfaces, settings)
         track, smoother = inverse.undo(track).track, inverse.smoother
     bare = smoother.problem(replace(track, labels={}))
-    flight = smoother.solve(bare)  # with the spin that the flight alone shows best
+    flight = smoother.settle(bare)  # with the spin that the flight alone shows best
     near, wide = (
         TrackProblem(track, smoother.model, replace(smoother.settings, spin_label_noise=error), bare.segmentation)
         for error in (smoother.settings.spin_label_noise, far)
@@ -158,7 +158,7 @@ def _from_label(problem: TrackProblem, flight: Solution) -> Values:
 
 def _lowest(optimizer: LevenbergMarquardt, graph: BallGraph, starts: Sequence[Values]) -> Minimum | None:
     """The lowest point of a graph that some starts lead to; None where that is no minimum."""
-    lowest = min((run(optimizer.search(graph, start)) for start in starts), key=lambda found: found.error)
+    lowest = min((optimizer.minimize(graph, start) for start in starts), key=lambda found: found.error)
     return lowest if lowest.convergence in MINIMA and lowest.step is not None else None
 
 

@@ -29,7 +29,6 @@ from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.settings import Settings, sample_sigmas
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.batch import FactorBatch
-from ballfg.factors.graph import Search, run
 from ballfg.state import POSITION, STATE_DIM
 from ballfg.tracks import SPIN_LABELS, Track
 
@@ -88,16 +87,9 @@ class InvertMeasurement(Estimator):
 
     def estimate(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Estimate:
         """The true states at the written stamps; `NOT_CONVERGED` where the shifts did not settle."""
-        return run(self.estimating(track, factors))
-
-    def estimating(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Search[Estimate]:
-        """`estimate`, asking as the smoother does.
-
-        Args: track, factors: as for `estimate`.
-        """
         written = self.prepared(track, factors)
         track = written.since_first()
-        undone = yield from self._undoing(track)
+        undone = self.undo(track)
         found = undone.estimate if self.inner is self.smoother else self.inner.estimate(undone.track)
         lost = found.status is Status.OK and not undone.settled
         contacts = (replace(c, time=written_time(self.model, 0.0, c.time)) for c in found.contacts)
@@ -112,9 +104,6 @@ class InvertMeasurement(Estimator):
 
     def undo(self, track: Track) -> Undone:
         """The track as it happened, and what the smoother makes of it; of shifts that do not settle, the steadiest."""
-        return run(self._undoing(track))
-
-    def _undoing(self, track: Track) -> Search[Undone]:
         if track.rough:
             raise ValueError(
                 "model must have no measurement effects for a track that cameras saw: they act on positions, and there "
@@ -126,7 +115,7 @@ class InvertMeasurement(Estimator):
         best, least = None, np.inf
         for _ in range(ROUNDS):
             shifted = replace(track, positions=track.positions - shift)
-            estimate = yield from self.smoother.estimating(shifted)
+            estimate = self.smoother.estimate(shifted)
             found = self._shift(estimate)
             change = float(np.nan_to_num(np.abs(found - shift) / sigma, nan=np.inf).max())
             if best is None or change < least:

@@ -24,7 +24,6 @@ from ballfg.estimation.smoother.problem import START_POSITION_SIGMA, TrackProble
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.estimation.smoother.solution import Solution
 from ballfg.factors.dynamics import DynamicsFactors
-from ballfg.factors.graph import run
 from ballfg.factors.noise import PROCESS_NOISE, Kicks
 from ballfg.progress import Watch, unwatched
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
@@ -130,7 +129,7 @@ def _piece(smoother: Smoother, track: Track) -> _Piece:
     model = smoother.model.for_track(track)
     own = smoother if model is smoother.model else Smoother(model, smoother.surfaces, smoother.settings)
     problem = own.problem(track)
-    return _linearised(problem, run(own.search(problem)))
+    return _linearised(problem, own.settle(problem))
 
 
 def _linearised(problem: TrackProblem, solution: Solution) -> _Piece:

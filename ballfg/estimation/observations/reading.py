@@ -218,7 +218,6 @@ class ReadingFactors(FactorBatch):
     """
 
     row_arrays: ClassVar[tuple[str, ...]] = ("variables", "values", "sigma", "delay")
-    costly: ClassVar[bool] = True
 
     def __init__(self, reading: Reading, model: BallModel) -> None:
         super().__init__(reading.state[:, None], len(reading.columns), reading.loss)

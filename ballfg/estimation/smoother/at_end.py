@@ -67,7 +67,7 @@ def _before_contact(estimate: Estimate, model: HypothesisModel, track: Track) ->
 def _filtered(smoother: Smoother, track: Track) -> tuple[Array, Array] | None:
     """Mean and covariance of state, coefficients and bias at the end of a track; None where they are not known."""
     problem = smoother.problem(track)
-    minimum = smoother.solve(problem).minimum
+    minimum = smoother.settle(problem).minimum
     if minimum.step is None:
         return None
     known, values, p = marginal_covariances(minimum.step.root).definite(), minimum.values, problem.width

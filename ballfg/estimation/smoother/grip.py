@@ -21,7 +21,7 @@ from ballfg.estimation.smoother.near_bounce import worth_a_search
 from ballfg.estimation.smoother.solution import Solution
 from ballfg.factors.batch import Values
 from ballfg.factors.dynamics import model_width
-from ballfg.factors.graph import Convergence, LevenbergMarquardt, Search, searched_while
+from ballfg.factors.graph import Convergence, LevenbergMarquardt
 from ballfg.state import SPIN, STATE_DIM, VELOCITY
 
 SLIDES = 0.05
@@ -43,7 +43,7 @@ RIVAL_APART = 2.5
 """Posterior standard deviations of the spin, beyond which another spin is said to explain the track too."""
 
 
-def with_other_spins(solution: Solution, model: BallModel, optimizer: LevenbergMarquardt) -> Search[Solution]:
+def with_other_spins(solution: Solution, model: BallModel, optimizer: LevenbergMarquardt) -> Solution:
     """The lower of a solution and of those with which the ball grips instead of slides at a bounce, or slides.
 
     Args: solution: so far.  model: of the ball, with the coefficients that are estimated.  optimizer: for the others.
@@ -52,10 +52,10 @@ def with_other_spins(solution: Solution, model: BallModel, optimizer: LevenbergM
     sides = other_sides(solution.minimum.values, bounces, model)
     for number, bounce in enumerate(bounces):
         side = next(sides)
-        if side is None or not (yield from worth_a_search(solution, bounce, side, optimizer, TIE)):
+        if side is None or not worth_a_search(solution, bounce, side, optimizer, TIE):
             continue
-        minimum = yield from searched_while(optimizer.search(solution.graph, side.values), side.holds)
-        if minimum is None or minimum.convergence is not Convergence.CONVERGED:
+        minimum = optimizer.minimize(solution.graph, side.values, side.holds)
+        if minimum.convergence is not Convergence.CONVERGED:
             continue
         found, lower = solution.minimum, minimum.error < solution.minimum.error - least
         tie = least < abs(minimum.error - found.error) < TIE

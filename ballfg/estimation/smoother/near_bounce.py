@@ -13,7 +13,7 @@ import numpy as np
 
 from ballfg.estimation.smoother.solution import Solution
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Values
-from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Search, searched_while
+from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt
 from ballfg.factors.prior import PriorFactors, spin_prior
 from ballfg.state import SPIN
 
@@ -30,7 +30,7 @@ SPIN_SPREAD: Final = 60.0
 
 def worth_a_search(
     solution: Solution, bounce: Bounce, side: OtherSide, optimizer: LevenbergMarquardt, margin: float
-) -> Search[bool]:
+) -> bool:
     """Whether, near a bounce, the minimum on its other side is another one, and higher by less than a margin.
 
     Args:
@@ -46,10 +46,10 @@ def worth_a_search(
     first, last = max(0, bounce.first - REACH), min(count - 1, bounce.last + REACH)
     graph, begin = _around(solution, first, last), _taken(side.values, first, last)
     holds = replace(side, interval=side.interval - first).holds
-    there = yield from searched_while(optimizer.search(graph, begin), holds)
-    if there is None or there.convergence is not Convergence.CONVERGED:
+    there = optimizer.minimize(graph, begin, holds)
+    if there.convergence is not Convergence.CONVERGED:
         return False
-    here = yield from optimizer.search(graph, _taken(solution.minimum.values, first, last))
+    here = optimizer.minimize(graph, _taken(solution.minimum.values, first, last))
     higher = there.error - here.error
     return higher < margin and abs(higher) > optimizer.tolerance
 

@@ -8,7 +8,7 @@ where it holds, and the search begins again from there; the lower minimum is the
 import numpy as np
 
 from ballfg.factors.batch import Values
-from ballfg.factors.graph import BallGraph, LevenbergMarquardt, Minimum, Search
+from ballfg.factors.graph import BallGraph, LevenbergMarquardt, Minimum
 from ballfg.factors.launcher import LauncherSpinFactors
 from ballfg.factors.prior import SpinLabelFactors
 
@@ -23,12 +23,10 @@ def label_let_go(graph: BallGraph, values: Values) -> bool:
     return any((np.linalg.norm(batch.linearize(values).residual, axis=-1) > batch.loss.scale).any() for batch in able)
 
 
-def minimise_with_restart(
-    optimizer: LevenbergMarquardt, graph: BallGraph, start: Values, found: Minimum
-) -> Search[Minimum]:
+def minimise_with_restart(optimizer: LevenbergMarquardt, graph: BallGraph, start: Values, found: Minimum) -> Minimum:
     """The lower of a minimum that was found and of the one that convex losses on labels lead to."""
-    held = yield from optimizer.search(_convex(graph), start)
-    again = yield from optimizer.search(graph, held.values)
+    held = optimizer.minimize(_convex(graph), start)
+    again = optimizer.minimize(graph, held.values)
     return again if again.error < found.error else found
 
 

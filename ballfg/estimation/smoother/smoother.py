@@ -19,32 +19,27 @@ from ballfg.estimation.segmentation import Segmentation, physics_of, segment
 from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
 from ballfg.estimation.sides.widening import widened_near_contacts
 from ballfg.estimation.smoother.at_end import with_both_sides
+from ballfg.estimation.smoother.contacts import ContactSearch
 from ballfg.estimation.smoother.grip import rival_note, with_other_spins
-from ballfg.estimation.smoother.initial import initial_states, move_contacts
+from ballfg.estimation.smoother.initial import initial_states
 from ballfg.estimation.smoother.low_hops import LowHops, counted, low_hops, uncounted_note, with_low_hops
 from ballfg.estimation.smoother.problem import Events, TrackProblem
 from ballfg.estimation.smoother.restart import label_let_go, minimise_with_restart
 from ballfg.estimation.smoother.solution import (
     ROUGH,
     Solution,
-    contacts_at_ends,
-    places_of,
     prior_covariances,
-    refined_contacts,
     status_of,
     timed_contacts,
     worst_break,
 )
 from ballfg.factors.batch import FactorBatch, Values
-from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Search, run
+from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt
 from ballfg.factors.linear.covariance import marginal_covariances
 from ballfg.factors.prior import PriorFactors
 from ballfg.factors.tracker import BiasStartFactors
 from ballfg.state import STATE_DIM
 from ballfg.tracks import Ball, Track
-
-MAX_REFINEMENTS = 6
-"""How often contacts may move to a neighbouring interval; two were the most seen on measured tracks."""
 
 MAX_UNSEEN_HITS = 8
 """How many hits the estimate may add to those that the segmentation found; measured logs needed three at most."""
@@ -113,15 +108,6 @@ class Smoother(Estimator):
 
         Args: track, factors: as for every estimator.  move_stamps: False leaves stamps where they are.
         """
-        return run(self.estimating(track, factors, move_stamps=move_stamps))
-
-    def estimating(
-        self, track: Track, factors: Sequence[FactorBatch] = (), *, move_stamps: bool = True
-    ) -> Search[Estimate]:
-        """`estimate`, asking for linearisations and solutions, so that several tracks are estimated together.
-
-        Args: track, factors, move_stamps: as for `estimate`.
-        """
         track = self.prepared(track, factors)
         moving = move_stamps and bool(self.settings.time_offsets)
         if self.is_long(track):
@@ -133,7 +119,7 @@ class Smoother(Estimator):
         smoother = self.first_look() if moving else self
         for _ in range(OFFSET_ROUNDS):
             problem = smoother.problem(track.since_first())
-            found = smoother.result(problem, (yield from smoother.search(problem)))
+            found = smoother.result(problem, smoother.settle(problem))
             estimate = found.dated(track.times)
             if not moving or estimate.status.failed:
                 return estimate
@@ -197,79 +183,51 @@ class Smoother(Estimator):
         events = self.segment(track) if segmentation is None else segmentation
         return TrackProblem(track, self.model, self.settings, events, sigma)
 
-    def solve(self, problem: TrackProblem, earlier: Earlier | None = None) -> Solution:
-        """Minimise; where the motion still breaks the model by far more than its noise, a hit went unseen: mark it.
+    def settle(self, problem: TrackProblem, earlier: Earlier | None = None) -> Solution:
+        """The minimum with the events that go with it.
+
+        Contacts move to where the estimate has them; where no label chooses the spin, a lower minimum with another one
+        is looked for; where the motion still breaks the model by far more than its noise, a hit went unseen, and is
+        marked. All this is decided at rough minima (`ROUGH`).
 
         Args: problem: of a track.  earlier: what came before, where the track is the end of a longer one.
         """
-        return run(self.search(problem, earlier))
-
-    def search(self, problem: TrackProblem, earlier: Earlier | None = None) -> Search[Solution]:
-        """`solve`, asking for linearisations, so that several tracks can be solved together."""
-        segmentation = problem.segmentation
-        solution = yield from self._lowest(problem, segmentation, earlier)
-        for _ in range(MAX_UNSEEN_HITS if self.settings.find_events else 0):
-            interval = worst_break(solution)
+        rough = replace(self.optimizer, tolerance=max(ROUGH, self.optimizer.tolerance))
+        segmentation, before = problem.segmentation, None
+        for left in range(MAX_UNSEEN_HITS if self.settings.find_events else 0, -1, -1):
+            search = ContactSearch(problem, self.surfaces, segmentation)
+            arrangement: tuple[Events, Values] | None = self._begin(problem, segmentation, earlier)
+            while arrangement is not None:
+                events, values = arrangement
+                graph = problem.graph(events)
+                graph = graph if earlier is None else earlier.join(graph)
+                minimum = rough.minimize(graph, values)
+                if label_let_go(graph, minimum.values):
+                    minimum = minimise_with_restart(rough, graph, values, minimum)
+                arrangement = search.after(Solution(events, graph, minimum))
+            solution = search.best
+            if earlier is None and self.settings.spin_label(problem.track) is None:
+                solution = with_other_spins(solution, problem.ball, rough)
+            if before is not None and _leads_nowhere(solution, before):
+                break
+            interval = worst_break(solution) if left else None
             if interval is None:
                 break
             segmentation, before = replace(segmentation, hits=np.union1d(segmentation.hits, [interval])), solution
-            solution = yield from self._lowest(problem, segmentation, earlier)
-            if solution.minimum.convergence in NOWHERE and solution.minimum.error > LEAST_GAIN * before.minimum.error:
-                break
         found = solution.minimum
-        if found.convergence is not Convergence.CONVERGED or found.distance < self.optimizer.tolerance:
-            return replace(solution, minimum=found.bare())
-        minimum = yield from self.optimizer.search(solution.graph, found)
-        return replace(solution, minimum=minimum.bare())
+        if found.convergence is Convergence.CONVERGED and found.distance >= self.optimizer.tolerance:
+            found = self.optimizer.minimize(solution.graph, found)
+        return replace(solution, minimum=found.bare())
 
-    def _lowest(self, problem: TrackProblem, segmentation: Segmentation, earlier: Earlier | None) -> Search[Solution]:
-        """Minimise; where no label chooses the spin, look for a lower minimum with another one."""
-        solution = yield from self._settle(problem, segmentation, earlier)
-        if earlier is not None or self.settings.spin_label(problem.track) is not None:
-            return solution
-        return (yield from with_other_spins(solution, problem.ball, self._up_to(ROUGH)))
-
-    def _settle(self, problem: TrackProblem, segmentation: Segmentation, earlier: Earlier | None) -> Search[Solution]:
-        """Minimise, move contacts to where the estimate says they are, and minimise again until they stay.
-
-        The minima are rough ones, see `ROUGH`.
-        """
-        rough = self._up_to(ROUGH)
-        track, ball = problem.track, problem.ball
-        events = Events(segmentation.contacts, segmentation)
-        if earlier is None:
-            label = self.settings.spin_label(track)
-            values = problem.start(initial_states(track, events.contacts, segmentation, self.model, label))
-        else:
-            values = earlier.start
-        seen: dict[tuple[tuple[int, float], ...], Solution] = {}
-        settled: tuple[Solution, ...] = ()
-        for _ in range(MAX_REFINEMENTS):
-            graph = problem.graph(events)
-            graph = graph if earlier is None else earlier.join(graph)
-            minimum = yield from rough.search(graph, values)
-            if label_let_go(graph, minimum.values):
-                minimum = yield from minimise_with_restart(rough, graph, values, minimum)
-            solution = Solution(events, graph, minimum)
-            seen[places_of(events.contacts)] = solution
-            refined = refined_contacts(track.times, solution)
-            if places_of(refined) == places_of(events.contacts):
-                unseen = () if settled else contacts_at_ends(track.times, solution, ball, self.surfaces)
-                if not unseen:  # a contact that only the end of the track suggests must also explain it better
-                    return min((*settled, solution), key=lambda s: s.minimum.error)
-                settled = (solution,)
-                refined = tuple(sorted((*refined, *unseen), key=lambda c: c.time))
-            if places_of(refined) in seen:
-                break
-            values = move_contacts(
-                solution.minimum.values, track.times, places_of(events.contacts), places_of(refined), ball
-            )
-            events = Events(refined, segmentation)
-        return min(seen.values(), key=lambda s: s.minimum.error)
-
-    def _up_to(self, tolerance: float) -> LevenbergMarquardt:
-        """The optimizer for a minimum that need not be known better, in posterior standard deviations."""
-        return replace(self.optimizer, tolerance=max(tolerance, self.optimizer.tolerance))
+    def _begin(
+        self, problem: TrackProblem, segmentation: Segmentation, earlier: Earlier | None
+    ) -> tuple[Events, Values]:
+        """The events that the segmentation found, and values to start from."""
+        if earlier is not None:
+            return Events(segmentation.contacts, segmentation), earlier.start
+        label = self.settings.spin_label(problem.track)
+        states = initial_states(problem.track, segmentation.contacts, segmentation, self.model, label)
+        return Events(segmentation.contacts, segmentation), problem.start(states)
 
     def result(self, problem: TrackProblem, solution: Solution) -> Estimate:
         """What a solution says about the track."""
@@ -308,3 +266,9 @@ class Smoother(Estimator):
         hops = self.low_hops(track, segmentation)
         estimate = replace(estimate, notes=estimate.notes + uncounted_note(hops, track.times))
         return with_low_hops(estimate, hops, self.model)
+
+
+def _leads_nowhere(solution: Solution, before: Solution) -> bool:
+    """Whether one more hit left the search without a minimum, and the objective nearly as high."""
+    found, gone = solution.minimum, solution.minimum.convergence in NOWHERE
+    return gone and found.error > LEAST_GAIN * before.minimum.error

@@ -110,7 +110,7 @@ def model_of(problem: Problem) -> BallModel:
 
 
 def solver(problem: Problem, task: str):
-    """Graphs of all tracks, minimised in lockstep where there are several; or the network rolled out."""
+    """Graphs of all tracks, minimised one by one; or the network rolled out."""
     model = model_of(problem)
     if task == "rollout":
         return _rollout(problem, model)

@@ -7,10 +7,9 @@ import pytest
 import torch
 
 from ballfg.benchmarks.results import Results
-from ballfg.benchmarks.speed import on_device, robot
+from ballfg.benchmarks.speed import robot
 from ballfg.benchmarks.speed.network import GRAVITY, fitted_network, parameter_count
-from ballfg.benchmarks.speed.stopwatch import Stopwatch
-from ballfg.benchmarks.speed.suite import QUICK, banded_problem, problem_model, problem_track, run_speed
+from ballfg.benchmarks.speed.suite import QUICK, problem_model, problem_track, run_speed
 
 
 def test_network_is_the_same_each_time_and_close_to_the_model() -> None:
@@ -65,16 +64,3 @@ def test_speed_run_has_every_time() -> None:
     assert {"stream_push_p999", "next_bounce_time", "plane_crossing_time"} <= found
     assert {"rollout_time", "rollout_time_torch"} <= found
     assert {f"estimate_us_per_observation_{count}" for count in robot.LONG} <= found
-
-
-def test_what_a_device_computes_is_what_machine_code_does(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(on_device, "BALLS", (1, 3))
-    monkeypatch.setattr(on_device, "TRACKS", (3,))
-    results = Results("test", 0)
-    on_device.time_on_device(
-        Stopwatch(results, "test", 1, 1, banded_problem(problem_track(problem_model()))), torch.device("cpu")
-    )
-    off = {row.method: row.value for row in results.rows if row.metric.endswith("_difference_cpu")}
-    assert set(off) == {"nominal, 3 tracks", *(f"{n}, {k} balls" for n in ("nominal", "mnn+gs") for k in (1, 3))}
-    assert max(off.values()) < 1e-9
-    assert {"estimates_time", "estimates_time_cpu", "rollout_100_stamps_time"} <= {row.metric for row in results.rows}

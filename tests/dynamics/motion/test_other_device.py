@@ -9,18 +9,12 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from torch.overrides import TorchFunctionMode
 
 from ballfg.dynamics import Architecture, BallModel, Surfaces, build, nominal_model, rollout
-from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.dynamics.compiled import motion
 from ballfg.dynamics.networks.architecture import DEFAULT_SIZES
-from ballfg.factors.batch import Values
-from ballfg.factors.dynamics import ContactFactors, FlightFactors, RestFactors
-from ballfg.factors.noise import ProcessNoise
 
 TABLE = Surfaces(0.0, -0.76, (-1.0, 2.7, -0.8, 0.8))
 TIMES = torch.arange(1, 80, dtype=torch.float64) / 50
@@ -75,45 +69,3 @@ def test_all_tensors_of_a_rollout_are_made_or_brought_where_the_states_are(name:
     assert states.is_cpu
     assert not watched.mixed
     torch.testing.assert_close(states, expected, rtol=0, atol=1e-9)
-
-
-KINDS = {
-    "flight": lambda model, dt, noise: FlightFactors(model, np.arange(3), dt, noise),
-    "contact": lambda model, dt, noise: ContactFactors(model, np.arange(3), dt, noise, np.zeros((3, 1))),
-    "rest": lambda model, dt, noise: RestFactors(model, np.arange(3), dt, noise, np.zeros(3)),
-}
-LOW = np.array([[0.0, 0.0, 0.03 + 0.01 * i, 3.0, 0.5, -2.0, 10.0, 80.0, 20.0] for i in range(4)])
-
-
-@pytest.mark.parametrize("augmented", [False, True])
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", models())
-def test_all_tensors_of_factors_are_made_or_brought_where_the_model_is(
-    name: str, kind: str, augmented: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    model = models()[name]
-    if augmented:
-        model = AugmentedModel(model, [n for n, parameter in model.named_parameters() if not parameter.dim()][:2])
-    dt = np.array([0.05, 0.06, 0.07])
-    factors = KINDS[kind](model, dt, ProcessNoise().flight(dt))
-    coefficients = model.means().detach().numpy().copy() if isinstance(model, AugmentedModel) else np.zeros(0)
-    inputs = factors.inputs(Values(LOW, coefficients))
-    expected, by_variable = factors.compute(slice(None), inputs)
-    on_processor = factors.on(torch.device("cpu"))
-    monkeypatch.setattr(motion, "functions_of", lambda model: None)  # machine code is of no use elsewhere
-    known = constants()
-    given: list[torch.Tensor] = []
-    from_numpy = torch.from_numpy
-
-    def noted(array: np.ndarray) -> torch.Tensor:
-        given.append(from_numpy(array))
-        known.add(id(given[-1]))
-        return given[-1]
-
-    monkeypatch.setattr(torch, "from_numpy", noted)
-    with torch.device("meta"), Elsewhere(known) as watched:
-        residual, jacobians = on_processor.compute(slice(None), inputs)
-    assert not watched.mixed
-    np.testing.assert_allclose(residual, expected, rtol=1e-9, atol=1e-7)
-    for found, wanted in zip(jacobians, by_variable, strict=True):
-        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max())

@@ -17,7 +17,6 @@ from ballfg.dynamics.motion.rollout import rollout
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
-from ballfg.factors.graph import run
 from ballfg.factors.loss import Loss
 from ballfg.simulation import table_tennis
 from ballfg.tracks import Track
@@ -75,8 +74,8 @@ def excess(truth: Array, track: Track, settings: Settings) -> float:
     """By how much the objective at the end lies above that of a start from the truth."""
     smoother = Smoother(MODEL, SURFACES, settings)
     problem = smoother.problem(track)
-    solution = smoother.solve(problem)
-    from_truth = run(smoother.optimizer.search(solution.graph, problem.start(truth.copy())))
+    solution = smoother.settle(problem)
+    from_truth = smoother.optimizer.minimize(solution.graph, problem.start(truth.copy()))
     return float(solution.minimum.error - from_truth.error)
 
 

@@ -19,7 +19,6 @@ from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.initial import initial_states, move_contacts
 from ballfg.estimation.smoother.motion import Motion
 from ballfg.estimation.smoother.smoother import Smoother
-from ballfg.factors.graph import run
 from ballfg.tracks import Track
 
 SIGMA = 0.0015
@@ -103,12 +102,12 @@ def test_a_contact_in_the_wrong_interval_moves_to_the_right_one(shift, settings)
     track = Track(LATER, measured(truth_at(LATER)), name="t")
     smoother = Smoother(MODEL, TABLE, settings)
     found = smoother.segment(track)
-    right = [c.interval for c in smoother.solve(smoother.problem(track, found)).events.contacts]
+    right = [c.interval for c in smoother.settle(smoother.problem(track, found)).events.contacts]
     planted = tuple(
         Contact(c.interval + shift * (i == 0), c.time + 0.01 * shift, c.height) for i, c in enumerate(found.contacts)
     )
     wrong = replace(found, contacts=planted)
-    solution = smoother.solve(smoother.problem(track, wrong))
+    solution = smoother.settle(smoother.problem(track, wrong))
     assert [c.interval for c in solution.events.contacts] == right
     assert len(solution.events.segmentation.hits) == 0
 
@@ -183,7 +182,7 @@ def test_a_hit_that_the_segmentation_missed_is_marked(settings) -> None:
     track = Track(TIMES, measured(states), name="t")
     smoother = Smoother(MODEL, TABLE, settings)
     blind = replace(smoother.segment(track), hits=np.zeros(0, dtype=np.int64))
-    solution = smoother.solve(smoother.problem(track, blind))
+    solution = smoother.settle(smoother.problem(track, blind))
     hits = solution.events.segmentation.hits
     assert len(hits) == 1
     assert 19 <= hits[0] <= 21
@@ -203,7 +202,7 @@ def test_a_known_hit_that_is_harder_than_stated_does_not_hide_another() -> None:
     track = Track(TIMES, measured(states), name="t")
     smoother = Smoother(MODEL, nowhere, weak)
     one = replace(smoother.segment(track), hits=np.array([20]))
-    hits = smoother.solve(smoother.problem(track, one)).events.segmentation.hits
+    hits = smoother.settle(smoother.problem(track, one)).events.segmentation.hits
     assert hits[0] == 20
     assert len(hits) == 2
     assert 49 <= hits[1] <= 51
@@ -380,7 +379,7 @@ def test_an_impossible_contact_is_a_status_not_an_exception(settings) -> None:
     smoother = Smoother(MODEL, TABLE, settings)
     found = replace(smoother.segment(track), contacts=(Contact(8, 0.085, -60.0),))
     problem = smoother.problem(track, found)
-    estimate = smoother.result(problem, run(smoother._settle(problem, found, None)))
+    estimate = smoother.result(problem, smoother.settle(problem))
     assert estimate.status is Status.FAILED
     assert "table height" in estimate.status.value
     assert np.isfinite(estimate.covariances).all()

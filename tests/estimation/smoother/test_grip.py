@@ -73,7 +73,7 @@ def test_another_spin_that_explains_the_track_is_named() -> None:
 def test_the_other_side_keeps_the_direction_of_the_slip() -> None:
     truth, track = one_bounce(1, 3, 30.0, 0.0015)[0]
     smoother = Smoother(MODEL, SURFACES, DEFAULT)
-    solution = smoother.solve(smoother.problem(track))
+    solution = smoother.settle(smoother.problem(track))
     (bounce,) = bounces_of(solution)
     assert (bounce.first, bounce.last) == (0, len(track) - 1)
     assert truth[bounce.interval, 5] < 0.0 < truth[bounce.interval + 1, 5]

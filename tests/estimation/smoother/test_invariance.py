@@ -87,7 +87,7 @@ def test_time_shift(track) -> None:
 def test_order_of_factors(track) -> None:
     smoother = Smoother(MODEL, Surfaces.table_tennis(0.76), SETTINGS)
     segmentation = smoother.segment(track)
-    solution = smoother.solve(smoother.problem(track, segmentation))
+    solution = smoother.settle(smoother.problem(track, segmentation))
     values = solution.minimum.values
     start = Values(values.states + np.repeat((1e-3, 1e-2, 1.0), 3), values.coefficients)
     minima = [

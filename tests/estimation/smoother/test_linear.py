@@ -106,7 +106,7 @@ def brute_force(model, surfaces: Surfaces, settings: Settings, track: Track, sam
     smoother = Smoother(model, surfaces, settings)
     segmentation = smoother.segment(track)
     sigma = effective_sigmas(track, segmentation, settings)
-    solution = smoother.solve(smoother.problem(track, segmentation, sigma))
+    solution = smoother.settle(smoother.problem(track, segmentation, sigma))
     graph = smoother.problem(track, segmentation, sigma).graph(solution.events)
     whitened = []
     for k in samples:
@@ -166,7 +166,7 @@ def test_order_of_factors_does_not_matter(gravity_model) -> None:
     track = falling_track()
     smoother = Smoother(gravity_model, NOWHERE, PLAIN)
     segmentation = smoother.segment(track)
-    solution = smoother.solve(smoother.problem(track, segmentation))
+    solution = smoother.settle(smoother.problem(track, segmentation))
     start = Values(solution.minimum.values.states + 0.01, np.zeros(0))
     optimizer = LevenbergMarquardt()
     forward = optimizer.minimize(solution.graph, start)

@@ -175,7 +175,7 @@ def solved():
         segmentation = smoother.segment(track)
         sigma = effective_sigmas(track, segmentation, SETTINGS)
         solution, closer = (
-            smoother.solve(smoother.problem(track, segmentation, sigma)),
+            smoother.settle(smoother.problem(track, segmentation, sigma)),
             tight.solve(tight.problem(track, segmentation, sigma)),
         )
         reference = Reference(track, solution.events.contacts)

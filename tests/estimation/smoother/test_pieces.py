@@ -37,7 +37,7 @@ def at_once(smoother: Smoother, track: Track, length: int) -> Estimate:
     found = joined_minimum(smoother, track, length)
     assert found is not None
     problem = smoother.problem(track, found.segmentation)
-    return smoother.result(problem, smoother.solve(problem))
+    return smoother.result(problem, smoother.settle(problem))
 
 
 def assert_same(found: Estimate, whole: Estimate) -> None:

@@ -48,7 +48,7 @@ def test_estimates_are_the_smoother_s() -> None:
         smoother = Smoother(usual_ball(), TABLE, settings, TIGHT)
         sigma = settings.position_scale * np.tile(settings.position_noise, (OBSERVED, 1))
         assert sigma[0, 0] == pytest.approx(0.002 * np.exp(0.4))
-        alone = smoother.solve(smoother.problem(seen, shot.segmentation, sigma))
+        alone = smoother.settle(smoother.problem(seen, shot.segmentation, sigma))
         np.testing.assert_allclose(
             one.solution.minimum.values.states, alone.minimum.values.states, rtol=1e-7, atol=1e-7
         )

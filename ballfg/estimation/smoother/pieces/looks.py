@@ -15,7 +15,6 @@ from ballfg.estimation.segmentation import Contact, Rest, Segmentation
 from ballfg.estimation.smoother.pieces.section import Section, events_of, part_of, shifted
 from ballfg.estimation.smoother.solution import places_of, timed_contacts
 from ballfg.factors.batch import Values
-from ballfg.factors.graph import run
 from ballfg.tracks import Track
 
 if TYPE_CHECKING:
@@ -78,7 +77,7 @@ def look(smoother: Smoother, part: tuple[int, Track]) -> Look | None:
     Args: smoother: that need not find the exact minimum.  part: its first sample's number, and its track.
     """
     begin, track = part
-    solution = run(smoother.search(smoother.problem(track)))
+    solution = smoother.settle(smoother.problem(track))
     if solution.minimum.step is None:
         return None
     found = replace(solution.events.segmentation, contacts=solution.events.contacts)
