@@ -11,6 +11,7 @@ from ballfg.estimation.noise.estimate import _Search
 from ballfg.estimation.noise.forecasts import HORIZONS, Forecaster
 from ballfg.estimation.noise.linear_tracks import linearise
 from ballfg.estimation.noise.parameters import parameters_of, tensors_of
+from ballfg.factors.noise import PROCESS_NOISE
 from ballfg.simulation import MeasurementNoise
 from ballfg.state import POSITION, STATE_DIM
 from ballfg.tracks.stamps import STAMP_TOLERANCE
@@ -28,6 +29,23 @@ def case(recorded):
 def noise_of(settings, linear, shift=0.0):
     parameters = parameters_of(settings, linear, position_known=False)
     return tensors_of(parameters, torch.tensor([np.log(p.start) + shift for p in parameters])[None], settings)
+
+
+def test_noise_without_parameters_is_the_settings(case):
+    """And a first spread of coefficients that is once theirs."""
+    *_, settings, _, _, _ = case
+    noise = tensors_of([], torch.zeros((1, 0), dtype=torch.float64), settings)
+    assert noise.coefficients.item() == 1.0
+    assert noise.position.tolist() == [[1.0, 1.0, 1.0]]
+    assert noise.spin_label.item() == settings.spin_label_noise
+    assert noise.spin_prior.item() == settings.spin_prior
+    assert noise.process[0].tolist() == [getattr(settings.process, name) for name in PROCESS_NOISE]
+
+
+def test_forecasts_start_a_fifth_of_a_second_after_the_first_sample(case):
+    *_, linear, forecaster = case
+    starts = linear.times[forecaster.starts[:, 0], forecaster.starts[:, 1]]
+    assert 0.2 - STAMP_TOLERANCE <= starts.min() < 0.2 + 0.02
 
 
 def dense(linear, forecaster, noise, track):

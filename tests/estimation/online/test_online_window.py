@@ -9,6 +9,7 @@ import torch
 
 from ballfg.dynamics import nominal_model
 from ballfg.estimation.online.online import Online
+from ballfg.estimation.online.tracker import carried_with_bias
 from ballfg.estimation.result import Status
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
@@ -160,3 +161,28 @@ def test_a_window_that_cannot_be_solved_says_so():
     assert len(online.window) == 1
     model.limit = np.inf
     assert online.push(0.12, track.positions[12]).status is Status.OK
+
+
+def test_a_bias_is_carried_beside_the_state_and_in_front_of_the_coefficients():
+    """x' = f(x) + F dx + G dc and b' = exp(-dt / T) b, each block where state, bias and coefficients stand."""
+    rng, own = np.random.default_rng(3), settings(memory=(0.002, 0.003, 0.004), memory_time=0.05)
+    piece, bias, dt = rng.normal(size=(9, 1 + 9 + 2)), rng.normal(size=3), 0.01
+    covariance = np.diag(rng.uniform(1.0, 2.0, 9))
+    carried, noise = carried_with_bias(piece, covariance, bias, dt, own)
+    state, shift, coefficients = rng.normal(size=9), rng.normal(size=3), rng.normal(size=2)
+    found = carried @ np.concatenate(([1.0], state, shift, coefficients))
+    decay = np.exp(-dt / 0.05)
+    np.testing.assert_allclose(found[:9], piece[:, 0] + piece[:, 1:10] @ state + piece[:, 10:] @ coefficients)
+    np.testing.assert_allclose(found[9:], decay * (bias + shift))
+    np.testing.assert_allclose(noise[:9, :9], covariance)
+    np.testing.assert_allclose(np.diag(noise)[9:], np.square([0.002, 0.003, 0.004]) * (1.0 - decay**2))
+
+
+def test_whether_the_ball_has_bounced_in_the_last_intervals():
+    model, (track, _) = nominal_model(), make_track(BOUNCING)
+    online = Online(model, TABLE, settings())
+    feed(online, track)
+    bounced = [k for k, sample in enumerate(online._samples) if sample.motion.heights]
+    since = len(online._samples) - bounced[-1]  # intervals from the one with the bounce to the newest, both counted
+    assert since > 2
+    assert [online._has_bounced(count) for count in (1, since - 1, since, since + 1)] == [False, False, True, True]

@@ -1,5 +1,7 @@
 """Contacts at which something else was touched as well: what the jump of the velocity says, and from which samples."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -13,9 +15,10 @@ AT = 20
 TIMES = np.arange(41) / 180.0
 
 
-def looked_at(after: float, usable: range | np.ndarray) -> list[int]:
+def looked_at(after: float, usable: range | np.ndarray, drag: float | None = None) -> list[int]:
     """The verdict on a bounce that comes with 5 m/s along x and leaves with another velocity along it, without air."""
     physics = physics_of(nominal_model())
+    physics = physics if drag is None else replace(physics, drag=drag)
     since = TIMES - (TIMES[AT] + TIMES[AT + 1]) / 2
     late = since > 0.0
     positions = np.stack((np.where(late, after, 5.0) * since, 0.0 * since, np.where(late, 2.7, -3.0) * since), axis=-1)
@@ -30,6 +33,13 @@ def looked_at(after: float, usable: range | np.ndarray) -> list[int]:
 def test_more_than_friction_can_do_is_a_hit(after, hit) -> None:
     """At 3 m/s downwards friction changes the motion along the table by 0.25 x 1.9 x 3 m/s at most."""
     assert looked_at(after, np.arange(41)) == ([AT] if hit else [])
+
+
+@pytest.mark.parametrize(("beyond", "hit"), [(0.2, False), (0.4, True)])
+def test_noise_and_the_magnus_force_may_add_three_tenths_of_a_metre_a_second(beyond, hit) -> None:
+    physics, excess = physics_of(nominal_model()), SegmentationSettings().friction_excess
+    limit = excess * physics.friction * (1.0 + physics.restitution) * 3.0
+    assert looked_at(5.0 + limit + beyond, np.arange(41), drag=0.0) == ([AT] if hit else [])
 
 
 @pytest.mark.parametrize(
