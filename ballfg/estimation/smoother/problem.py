@@ -20,6 +20,7 @@ from ballfg.estimation.segmentation import Contact, Quality, Segmentation
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, total_sigmas
 from ballfg.estimation.smoother.dynamics import TrackDynamics
 from ballfg.estimation.smoother.initial import bridged_positions
+from ballfg.estimation.smoother.low_hops import LowHops
 from ballfg.factors.batch import FactorBatch, Values
 from ballfg.factors.dynamics import ContactFactors, model_width
 from ballfg.factors.graph import BallGraph
@@ -84,6 +85,7 @@ class TrackProblem:
         settings: noise and priors.
         segmentation: the events to start from.
         sigma: (n, 3) m, standard deviations of the positions; those of `effective_sigmas` where None.
+        hops: the low hops that the segmentation allows for, where they were looked for.
 
     Attributes:
         ball: the model with the coefficients that are estimated.
@@ -102,8 +104,9 @@ class TrackProblem:
         settings: Settings,
         segmentation: Segmentation,
         sigma: Array | None = None,
+        hops: tuple[LowHops, ...] | None = None,
     ) -> None:
-        self.track = track
+        self.track, self.hops = track, hops
         self.model = model
         self.settings = settings = settings.for_track(track)
         self.segmentation = segmentation

@@ -158,13 +158,18 @@ class Smoother(Estimator):
 
     def segment(self, track: Track) -> Segmentation:
         """The events in a track."""
+        return self._segmented(track)[0]
+
+    def _segmented(self, track: Track) -> tuple[Segmentation, tuple[LowHops, ...]]:
+        """The events in a track, and the low hops that they allow for."""
         settings = self.settings.for_track(track)
         white = sample_sigmas(settings, len(track), track.sigmas)
         sigma = total_sigmas(settings, white, window_velocities(track.times, track.positions))
         physics = physics_of(self.model)
         found = segment(track.times, track.positions, sigma, surfaces=self.surfaces, physics=physics)
         found = found if self.settings.find_events else found.only_contacts()
-        return counted(found, self.low_hops(track, found), track.times)
+        hops = self.low_hops(track, found)
+        return counted(found, hops, track.times), hops
 
     def low_hops(self, track: Track, events: Segmentation) -> tuple[LowHops, ...]:
         """The stretches in which the ball hops too low for its bounces to be told one by one."""
@@ -180,8 +185,8 @@ class Smoother(Estimator):
             segmentation: the events to start from; found in the track where None.
             sigma: (n, 3) m, of the positions; the settings' or the track's own where None.
         """
-        events = self.segment(track) if segmentation is None else segmentation
-        return TrackProblem(track, self.model, self.settings, events, sigma)
+        events, hops = self._segmented(track) if segmentation is None else (segmentation, None)
+        return TrackProblem(track, self.model, self.settings, events, sigma, hops)
 
     def settle(self, problem: TrackProblem, earlier: Earlier | None = None) -> Solution:
         """The minimum with the events that go with it.
@@ -263,7 +268,8 @@ class Smoother(Estimator):
         estimate = plausible(estimate, track, problem.sigma, self.settings)
         estimate = replace(estimate, notes=estimate.notes + rival_note(solution, estimate.covariances[0]))
         estimate = with_both_sides(self, problem, widened_near_contacts(estimate, problem.ball))
-        hops = self.low_hops(track, segmentation)
+        hops = problem.hops if segmentation is problem.segmentation else None
+        hops = self.low_hops(track, segmentation) if hops is None else hops
         estimate = replace(estimate, notes=estimate.notes + uncounted_note(hops, track.times))
         return with_low_hops(estimate, hops, self.model)
 
