@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from ballfg.dynamics import EFFECTS, AnalyticModel, nominal_model
-from ballfg.estimation import make_estimator
+from ballfg.estimation import configure, make_estimator
 from ballfg.estimation.configure import dataset_settings, dataset_surfaces
 from ballfg.estimation.segmentation import Quality, Segmentation
 from ballfg.estimation.settings import MEASURED, Settings, sample_sigmas
 from ballfg.estimation.smoother.problem import QUALITY_SIGMA, effective_sigmas
 from ballfg.simulation import SimulationConfig, simulate
-from ballfg.tracks import Track, read_dataset
+from ballfg.tracks import Ball, DatasetInfo, Track, dataset_in_memory, read_dataset
 
 NONE = np.zeros(0, dtype=np.int64)
 
@@ -52,6 +52,15 @@ def test_what_is_at_the_bounds_is_estimated() -> None:
             spread = np.sqrt(np.diagonal(found.covariances, axis1=1, axis2=2))
             correlations = found.covariances / spread[:, :, None] / spread[:, None, :]
             assert (np.linalg.eigvalsh(correlations) > 0.0).all(), (method, bounds)
+
+
+@pytest.mark.parametrize(("tracks", "looked_for"), [(4, False), (5, True)])
+def test_five_tracks_tell_the_noise_where_nobody_states_it(tracks, looked_for, monkeypatch) -> None:
+    found = Settings(position_noise=(0.0042,) * 3)
+    monkeypatch.setattr(configure, "_fitted", lambda *_: found)
+    shots = [shot.track for shot in simulate(SimulationConfig(tracks=tracks, seed=4))]
+    data = dataset_in_memory(DatasetInfo("unstated", 0.0, Ball(0.02, 0.0027)), shots)
+    assert (configure.fitted_settings(data, nominal_model()) is found) == looked_for
 
 
 def test_uncertain_takes_the_coefficients_that_vary() -> None:

@@ -213,3 +213,24 @@ def test_measured_tracks(name):
     assert np.median([np.sqrt((e**2).sum(-1).mean()) for e in errors]) < 0.022
     whitened = np.concatenate([e / r.sigmas for e, r in zip(errors, results, strict=True)])
     assert 0.80 <= inside(whitened, 1.6449) <= 0.97
+
+
+def test_a_track_whose_rest_cannot_be_metres_is_refused() -> None:
+    """The observed part alone would pass."""
+    (track,) = simulated(1)
+    positions = track.positions.copy()
+    positions[track.times > 0.3] *= 1e5
+    with pytest.raises(ValueError, match="track '0'"):
+        list(predict_tracks(estimator(), [replace(track, positions=positions)], 1, 0.25))
+
+
+def test_predictions_say_how_far_they_are_from_where_a_network_was_trained() -> None:
+    """None for a model that knows no such place; else what is left of its trust there."""
+    (track,) = simulated(1)
+    (plain,) = predict_tracks(estimator(), [track], 1, 0.25)
+    assert plain.outside is None
+    model = nominal_model()
+    model.inside = lambda states: torch.full((len(states),), 0.25, dtype=torch.float64)
+    (found,) = predict_tracks(make_estimator("ekf", model, TABLE, SETTINGS), [track], 1, 0.25)
+    assert found.outside is not None
+    assert found.outside.tolist() == [0.75] * len(found.times)

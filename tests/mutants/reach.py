@@ -113,11 +113,11 @@ class Recording:
     def reaching(self, name: str, first: int, last: int) -> dict[str, float]:
         """Seconds of the tests that reach some lines of a file.
 
-        Lines that a module runs as it is imported, and machine code, belong to no test: then those that reach the
-        function whose default stands there, or that use the name which these lines define, or else all that reach
-        their file.
+        Lines that a module runs as it is imported belong to no test, not even to that which imported it first, and
+        machine code is not seen: then those that reach the function whose default stands there, or that use the name
+        which these lines define, or else all that reach their file.
         """
-        tests = self._on(name, range(first, last + 1))
+        tests = self._on(name, range(first, last + 1)) if self.known.in_a_function(name, first) else set[str]()
         if not tests:
             tests = self._on(name, self.known.headed(name, first))
         if not tests:
@@ -171,6 +171,14 @@ class Names:
                     return getattr(node.target, "id", None)
                 return getattr(node, "name", None)
         return None
+
+    def in_a_function(self, name: str, line: int) -> bool:
+        """Whether a line runs when a function is called."""
+        return any(
+            node.body[0].lineno <= line <= (node.end_lineno or line)
+            for node in ast.walk(self.trees[name])
+            if isinstance(node, ast.FunctionDef)
+        )
 
     def headed(self, name: str, line: int) -> range:
         """The lines of the function in whose head a line stands; none where it stands in no head."""

@@ -5,6 +5,7 @@ import pytest
 
 from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.estimation.segmentation import Quality, segment
+from ballfg.estimation.segmentation.branches import _rarity
 
 TABLE = Surfaces(0.75)
 T = np.arange(60) / 180
@@ -163,3 +164,10 @@ def test_below_every_surface():
 def test_bad_input_is_named(times, positions, sigma, message):
     with pytest.raises(ValueError, match=message):
         segment(times, positions, sigma, surfaces=TABLE)
+
+
+def test_an_event_costs_what_chance_says_and_no_more_for_closer_stamps() -> None:
+    """Of a Poisson process with 50 events a second, minus the log probability of one within dt; below 1 ms alike."""
+    assert _rarity(50.0, 0.01) == pytest.approx(-np.log(1.0 - np.exp(-0.5)))
+    assert _rarity(50.0, 0.0015) == pytest.approx(-np.log(1.0 - np.exp(-0.075)))
+    assert _rarity(50.0, 1e-6) == _rarity(50.0, 0.001)

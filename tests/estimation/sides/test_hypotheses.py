@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from scipy.stats import norm
+from scipy.stats import multivariate_normal, norm
 
 from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces
 from ballfg.dynamics.motion.rollout import advance
@@ -16,6 +16,7 @@ from ballfg.estimation.sides.gaussians import GaussianMixture
 from ballfg.estimation.sides.hypotheses import ContactHypotheses, HypothesisModel, SampleMeasurement
 from ballfg.estimation.sides.monitor import ContactMonitor
 from ballfg.factors.noise import ProcessNoise
+from ballfg.factors.prior import PriorFactors
 from ballfg.simulation import table_tennis
 
 QUIET = Settings(process=ProcessNoise(1e-9, 1e-6, 1e-9, 0.0, 1e-6))
@@ -55,6 +56,22 @@ def test_merged_gaussians_have_the_moments_of_all() -> None:
     np.testing.assert_allclose(merged.means[0], mean)
     np.testing.assert_allclose(merged.covariances[0], second - np.outer(mean, mean), atol=1e-12)
     assert np.exp(merged.log_weight) == pytest.approx(2.0)
+
+
+def test_weights_gain_the_density_of_what_a_factor_measured() -> None:
+    """Of two Gaussians, by the densities of the measured velocity under each; mean and covariance as Kalman's."""
+    rng = np.random.default_rng(4)
+    roots = rng.normal(size=(2, 9, 9))
+    means, covariances = rng.normal(size=(2, 9)), roots @ roots.swapaxes(1, 2)
+    known = PriorFactors(np.array([0]), rng.normal(size=(1, 9)), np.diag(1.0 / np.arange(1.0, 10.0))[None])
+    found = GaussianMixture(np.log([0.5, 0.5]), means, covariances).updated_by_factor(known, 0)
+    noise = np.diag(np.arange(1.0, 10.0) ** 2)
+    density = [multivariate_normal.logpdf(known.mean[0], m, c + noise) for m, c in zip(means, covariances, strict=True)]
+    assert np.diff(found.log_weights) == pytest.approx(np.diff(density))
+    for k in range(2):
+        gain = covariances[k] @ np.linalg.inv(covariances[k] + noise)
+        np.testing.assert_allclose(found.means[k], means[k] + gain @ (known.mean[0] - means[k]), atol=1e-9)
+        np.testing.assert_allclose(found.covariances[k], covariances[k] - gain @ covariances[k], atol=1e-9)
 
 
 @pytest.mark.parametrize("dt", [0.0062, 0.0068, 0.0074])

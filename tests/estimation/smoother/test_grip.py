@@ -11,6 +11,7 @@ import torch
 
 import ballfg.estimation.smoother.smoother as room
 from ballfg.dynamics.motion.impact import slip_velocity
+from ballfg.estimation.segmentation import Contact
 from ballfg.estimation.smoother.grip import Bounce, bounces_of, other_sides
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.estimation.smoother.solution import Solution
@@ -92,6 +93,17 @@ def test_the_other_side_keeps_the_direction_of_the_slip() -> None:
     assert np.abs(moved[:, :6]).max() == 0.0
     assert np.ptp(moved[: bounce.interval + 1, 6:], axis=0).max() < 1e-9
     assert np.abs(moved[:, 8]).max() < 1e-9
+
+
+def test_a_bounce_is_one_up_to_the_last_interval() -> None:
+    """Of n states the last interval is n - 2; a contact beyond it has no state behind it."""
+    smoother = Smoother(MODEL, SURFACES, DEFAULT)
+    solution = smoother.settle(smoother.problem(one_bounce(1, 3, 30.0, 0.0015)[0][1]))
+    last = len(solution.minimum.values.states) - 2
+    for interval, expected in ((last - 1, [last - 1]), (last, [last]), (last + 1, [])):
+        contacts = (Contact(interval, 0.0, 0.0),)
+        moved = replace(solution, events=replace(solution.events, contacts=contacts))
+        assert [bounce.interval for bounce in bounces_of(moved)] == expected
 
 
 @pytest.mark.parametrize(("share", "slides"), [(0.3, True), (0.55, True), (0.7, True), (1.4, False), (3.0, False)])

@@ -9,8 +9,8 @@ import pytest
 
 from ballfg.estimation.result import Status
 from ballfg.estimation.segmentation import Segmentation
-from ballfg.estimation.smoother.hop_grid import SPEEDS, HopGrid, HopLaw, averaged
-from ballfg.estimation.smoother.low_hops import counted, uncounted_note
+from ballfg.estimation.smoother.hop_grid import RESTS, SPEEDS, HopGrid, HopLaw, averaged
+from ballfg.estimation.smoother.low_hops import _Ball, counted, uncounted_note
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.tracks import Track
 from tests.estimation.low_bounces import LIMIT, LYING, MODEL, SETTINGS, SURFACES, beside_bounces, hopping_out, nees
@@ -48,6 +48,20 @@ def test_the_grid_is_the_average_over_all_hops() -> None:
     assert found.bounces.sum() == pytest.approx(weights @ bounces[:, -1], abs=0.1)
     wide, dense = found.second[:, 1, 1] - found.mean[:, 1] ** 2, weights @ v**2 - (weights @ v) ** 2
     assert 0.7 < np.sqrt(wide.mean() / dense.mean()) < 1.5
+
+
+def test_before_the_first_sample_each_hop_is_as_probable_and_rest_has_its_share() -> None:
+    shares = HopGrid(NEARLY_EXACT, 48, 1e-4)._first()
+    assert shares.sum() == pytest.approx(1.0)
+    assert shares[-1] == RESTS
+    assert np.ptp(shares[:-1]) == 0.0
+
+
+def test_the_gap_of_a_ball_is_its_height_above_where_it_touches() -> None:
+    ball = _Ball(MODEL, SETTINGS["coefficients estimated"])
+    gap = ball.gap(np.array([[0.0, 0.0, LYING], [0.1, 0.2, LYING + 0.05]]), 0.0)
+    assert gap[1] - gap[0] == pytest.approx(0.05)
+    assert abs(gap[0]) < 0.01
 
 
 def test_a_ball_that_lies_still_is_known_to() -> None:

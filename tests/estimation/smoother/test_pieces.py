@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import pairwise
 
@@ -13,12 +14,15 @@ from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother import near_bounce
 from ballfg.estimation.smoother import smoother as smoother_module
+from ballfg.estimation.smoother.pieces import joining
 from ballfg.estimation.smoother.pieces.joining import joined_minimum
 from ballfg.estimation.smoother.pieces.looks import bounds_of, cut_between, look
+from ballfg.estimation.smoother.pieces.reduction import Point, Reduction
 from ballfg.estimation.smoother.pieces.section import part_of
 from ballfg.estimation.smoother.pieces.whole import in_pieces
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.graph import LevenbergMarquardt
+from ballfg.factors.linear.step import solve
 from ballfg.parallel.parts import with_jobs
 from ballfg.tracks import Track
 from tests.faults.large import HEIGHT, rally
@@ -78,6 +82,33 @@ def test_pieces_find_the_minimum_of_the_whole_track(case):
     found = in_pieces(smoother, track, 500)
     assert found is not None
     assert_same(found, at_once(smoother, track, 500))
+
+
+def test_inner_states_follow_the_ends_as_the_whole_problem_says():
+    """Eliminated and taken up again, they take the step of the whole linear problem."""
+    smoother = Smoother(MODEL, TABLE, Settings.for_measured(MODEL))
+    track = rally(40)
+    problem = smoother.problem(track)
+    solution = smoother.settle(problem)
+    values = problem.start(solution.minimum.values.states + 1e-3)
+    linearized = solution.graph.linearize(values)
+    step = solve(linearized, values)
+    assert step is not None
+    reduction = Reduction(linearized, values)
+    found = reduction.steps(Point(step.states[0], step.states[-1], step.coefficients))
+    assert np.abs((found - step.states) / np.abs(step.states).max(axis=0)).max() < 1e-6
+    assert np.abs(step.states[1:-1]).max() > 1e-4
+
+
+def test_pieces_say_how_many_are_done(monkeypatch):
+    said = []
+
+    class Stage:
+        text = property(lambda self: said[-1], lambda self, text: said.append(text))
+
+    monkeypatch.setattr(joining, "doing", lambda text: nullcontext(Stage()))
+    assert list(joining.watched(abs, [-1, -2, 3], "looked at")) == [1, 2, 3]
+    assert said == [f"{k} of 3 pieces looked at" for k in (1, 2, 3)]
 
 
 def test_events_are_those_of_the_whole_track():
