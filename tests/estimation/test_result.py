@@ -27,6 +27,7 @@ def test_sigmas_and_nis() -> None:
     assert estimate.contacts == ()
     assert len(estimate.hits) == 0
     assert estimate.cross_covariances.shape == (0, 9, 0)
+    assert estimate.unknown_covariance.shape == (0, 0)
     assert np.isnan(estimate.error)
 
 

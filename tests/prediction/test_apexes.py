@@ -104,6 +104,13 @@ def test_a_path_that_never_rises_has_its_highest_sample(hops) -> None:  # type: 
     assert np.isnan(path_apex(times, falling, 5.0, 6.0)[0]).all()
 
 
+def test_a_path_that_has_no_sample_between_two_times_has_no_highest_point() -> None:
+    point, time = path_apex(np.array([0.0, 1.0]), np.zeros((2, 3)), 0.2, 0.8)
+    assert point.shape == (3,)
+    assert np.isnan(point).all()
+    assert np.isnan(time)
+
+
 def test_flights_end_with_the_track() -> None:
     times = np.linspace(0.0, 1.0, 11)
     assert flight_bounds(times, np.array([0.4])) == [(0.0, 0.4), (0.4, 1.0)]
