@@ -24,15 +24,14 @@ def blocks(page, language):
 
 def coefficient_table():
     lines = [
-        "| effect | section | coefficient | default | absent | sigma | unit | bounds | what |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| effect | section | coefficient | default | absent | sigma | unit | bounds |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for name, effect in EFFECTS.items():
         for c in effect.coefficients:
             absent = "shape" if c.absent is None else f"{c.absent:g}"
-            what = effect.sentence if c is effect.coefficients[0] else ""
             numbers = (f"{c.default:g}", absent, f"{c.sigma:g}", c.unit, f"{c.low:g} to {c.high:g}")
-            lines.append(f"| {' | '.join((name, effect.kind, c.name, *numbers, what))} |")
+            lines.append(f"| {' | '.join((name, effect.kind, c.name, *numbers))} |")
     return "\n".join(lines)
 
 
