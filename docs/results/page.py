@@ -48,7 +48,8 @@ def _section(section: dict[str, Any]) -> Iterator[str]:
         if "text" in table:
             yield table["text"].strip()
         lines = _lines(table)
-        yield "\n".join("| " + " | ".join(line) + " |" for line in (lines[0], ["---"] * len(lines[0]), *lines[1:]))
+        head, *rest = ("| " + " | ".join(line) + " |" for line in lines)
+        yield "\n".join((head, "|" + "---|" * len(lines[0]), *rest))
     if "after" in section:
         yield section["after"].strip()
 

@@ -28,7 +28,7 @@ def test_the_page_is_what_the_command_writes(docs: Path) -> None:
     assert (DOCS / "benchmarks.md").read_text(encoding="utf-8") == page, "run `make results-page`"
     lines = page.splitlines()
     assert len(lines) <= 300
-    for head in (first for first, second in itertools.pairwise(lines) if second.startswith("| ---")):
+    for head in (first for first, second in itertools.pairwise(lines) if second.startswith("|---")):
         assert re.search(r"\brequired\b", head) or "| tracks |" in head or "| size 1 |" in head, head
 
 
