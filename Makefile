@@ -4,7 +4,7 @@ DATA   ?= $(or $(BALLFG_DATA),../shared/data)
 VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
-SOURCES := ballfg factors learning benchmarks tests
+SOURCES := ballfg factors learning benchmarks tests docs/results
 TOOLS  := build/tools/bin/pip-audit
 OLDEST := tests/factors tests/files tests/importing/test_forms.py tests/live/test_bag.py tests/dynamics/test_model_file.py \
 	tests/dynamics/compiled/test_kept.py \
