@@ -4,7 +4,7 @@ DATA   ?= $(or $(BALLFG_DATA),../shared/data)
 VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
-SOURCES := ballfg factors learning benchmarks tests
+SOURCES := ballfg factors learning benchmarks tests docs/results
 TOOLS  := build/tools/bin/pip-audit
 OLDEST := tests/factors tests/files tests/importing/test_forms.py tests/live/test_bag.py tests/dynamics/test_model_file.py \
 	tests/dynamics/compiled/test_kept.py \
@@ -14,7 +14,7 @@ OLDEST := tests/factors tests/files tests/importing/test_forms.py tests/live/tes
 export OMP_NUM_THREADS ?= 1
 unexport PYTHONDONTWRITEBYTECODE  # interpreters that tests start compile the package once
 
-.PHONY: bench test check check-speed check-deps check-oldest docs package sbom readme fuzz mutants format clean
+.PHONY: bench test check check-speed check-deps check-oldest docs results-page package sbom readme fuzz mutants format clean
 
 bench: $(READY)  ## the estimator comparison: table, results/results.json, pictures; measured tracks too where they are
 	$(BIN)/ballfg-bench estimators --out results
@@ -37,6 +37,9 @@ docs: check  ## the documentation as a site: build/site/index.html
 
 check-speed: $(READY)  ## times as multiples of a control, against those of the baseline; two minutes, nothing else running
 	$(BIN)/ballfg-bench speed --gate benchmarks/speed/baseline.json --out results/speed
+
+results-page: $(READY)  ## docs/benchmarks.md from the result files in docs/results
+	$(BIN)/python docs/results/page.py
 
 readme:  ## types all blocks of the README in a fresh clone, installation included; needs no environment
 	$(PYTHON) tests/type_readme.py

@@ -55,7 +55,7 @@ class Minimum:
     Attributes:
         values: the point.
         error: objective there; after a last step without another linearisation, the one that the step promised.
-        step: the last undamped linear solution, there or one step before: its Bayes net holds the covariances.
+        step: the last undamped linear solution, there or one step before: its triangle holds the covariances.
         convergence: why it stopped.
         iterations: number of linear solutions.
         linearized: the factors, linearised at the point or, where it is `beyond` them, one step before.

@@ -35,3 +35,12 @@ def test_links_lead_somewhere(document: Path) -> None:
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", document.read_text(encoding="utf-8")):
         if not target.startswith("http"):
             assert (document.parent / target).exists(), f"{document.name} links to {target}, which is not there"
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_files_named_in_documents_exist(document: Path) -> None:
+    """Such as `tests/tracks/test_reading.py` beside a promise."""
+    paths = re.findall(
+        r"`((?:tests|ballfg|benchmarks|factors|learning)/[\w./]+\.py)`", document.read_text(encoding="utf-8")
+    )
+    assert [path for path in paths if not (ROOT / path).exists()] == []

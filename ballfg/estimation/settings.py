@@ -11,7 +11,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.checks import check_array, check_flag, check_instance, check_number, check_range, shown, type_name
 from ballfg.dynamics.analytic import coefficient_sigmas
-from ballfg.dynamics.earlier_names import todays_name
+from ballfg.dynamics.earlier_names import todays_name, todays_names
 from ballfg.dynamics.model import BallModel
 from ballfg.estimation.launcher import Launcher, SpinLabel
 from ballfg.factors.loss import Loss
@@ -146,7 +146,8 @@ class Settings:
         if not earlier:
             return self
         known = {name for name, _ in model.named_parameters()}
-        return replace(self, coefficients={todays_name(name, known): s for name, s in self.coefficients.items()})
+        names = todays_names(self.coefficients, known)
+        return replace(self, coefficients=dict(zip(names, self.coefficients.values(), strict=True)))
 
     def spin_label(self, track: Track) -> SpinLabel | None:
         """The spin label of a track: its own, else that of its launcher settings, else None."""

@@ -1,4 +1,4 @@
-"""Rows of results from the records of the loop's cases; docs/benchmarks_loop.md says what each metric is."""
+"""Rows of results from the records of the loop's cases; docs/benchmarks.md says what each metric is."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial

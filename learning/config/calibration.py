@@ -5,13 +5,13 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, Field
 
-from ballfg.dynamics.earlier_names import todays_name
+from ballfg.dynamics.earlier_names import todays_names
 from ballfg.learning.config.training import Count, Positive, Section, Share
 
 Coefficients = Annotated[
     tuple[str, ...],
     Field(min_length=1, strict=False),
-    AfterValidator(lambda names: tuple(todays_name(name) for name in names)),
+    AfterValidator(todays_names),
 ]
 
 

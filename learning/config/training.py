@@ -6,6 +6,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from ballfg.checks import shown
+from ballfg.dynamics.earlier_names import warn_of
 from ballfg.learning.registry import TRAINEES
 
 Positive = Annotated[float, Field(gt=0.0)]
@@ -30,7 +31,7 @@ class Section(BaseModel):
 
     @classmethod
     def renamed(cls, content: Mapping[str, Any]) -> dict[str, Any]:
-        """The content under the names of today.
+        """The content under the names of today; an earlier name brings a `DeprecationWarning`.
 
         Args: content: fields by name.
         Raises: ValueError: if it has a field under both names.
@@ -38,6 +39,8 @@ class Section(BaseModel):
         for earlier, name in cls.EARLIER.items():
             if earlier in content and name in content:
                 raise ValueError(f"'{earlier}' is the earlier name of '{name}'; got both. Delete '{earlier}'.")
+            if earlier in content:
+                warn_of(earlier, name)
         return {cls.EARLIER.get(key, key): value for key, value in content.items()}
 
 

@@ -1,8 +1,8 @@
-"""Solving with the exact Hessian: conjugate gradients, preconditioned with GTSAM's Gauss-Newton factorisation.
+"""Solving with the exact Hessian: conjugate gradients, preconditioned with the Gauss-Newton triangle.
 
 The Hessian of a batch of tracks is block diagonal, one block per track. All blocks are solved in lockstep: one product
 with the whole Hessian serves all of them, while each track has its own step lengths. The Gauss-Newton matrix R^T R,
-which GTSAM has factorised on the way to the minimum, differs from a block only by the curvature of the residuals, so
+whose triangle the last elimination has left, differs from a block only by the curvature of the residuals, so
 that a few steps are enough.
 """
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import groupby
 from pathlib import Path
 
 import pytest
@@ -22,17 +23,22 @@ def blocks(page, language):
     )
 
 
+def numbers(coefficient):
+    absent = "shape" if coefficient.absent is None else f"{coefficient.absent:g}"
+    bounds = f"{coefficient.low:g} to {coefficient.high:g}"
+    return f"{coefficient.default:g}", absent, f"{coefficient.sigma:g}", coefficient.unit, bounds
+
+
 def coefficient_table():
+    """Coefficients of an effect whose numbers are equal share a row."""
     lines = [
-        "| effect | section | coefficient | default | absent | sigma | unit | bounds | what |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| effect | section | coefficients | default | absent | sigma | unit | bounds |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for name, effect in EFFECTS.items():
-        for c in effect.coefficients:
-            absent = "shape" if c.absent is None else f"{c.absent:g}"
-            what = effect.sentence if c is effect.coefficients[0] else ""
-            numbers = (f"{c.default:g}", absent, f"{c.sigma:g}", c.unit, f"{c.low:g} to {c.high:g}")
-            lines.append(f"| {' | '.join((name, effect.kind, c.name, *numbers, what))} |")
+        for same, coefficients in groupby(effect.coefficients, numbers):
+            names = ", ".join(c.name for c in coefficients)
+            lines.append(f"| {' | '.join((name, effect.kind, names, *same))} |")
     return "\n".join(lines)
 
 

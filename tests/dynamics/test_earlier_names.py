@@ -34,13 +34,16 @@ def test_estimators_take_the_earlier_names() -> None:
     track = Track(times, np.stack((4.0 * times, 0.0 * times, 0.5 - 4.905 * times**2), axis=1))
     sigmas = {"flight.drag.k": 0.03, "contact.restitution.e": 0.02}
     for estimator in (Smoother, ExtendedKalmanFilter):
-        found = estimator(nominal_model(), 0.0, Settings(coefficients=sigmas)).estimate(track)
+        with pytest.warns(DeprecationWarning, match="earlier name of 'bounce.restitution.e' and will be refused"):
+            found = estimator(nominal_model(), 0.0, Settings(coefficients=sigmas)).estimate(track)
         assert found.coefficient_names == ("flight.drag.k", "bounce.restitution.e")
 
 
 def test_calibrations_take_the_earlier_names() -> None:
     given = {"kind": "calibrate", "coefficients": ["flight.drag.k", "contact.restitution.e"]}
-    assert CalibrationConfig.model_validate(given).coefficients == ("flight.drag.k", "bounce.restitution.e")
+    with pytest.warns(DeprecationWarning, match="Write 'bounce.restitution.e'"):
+        config = CalibrationConfig.model_validate(given)
+    assert config.coefficients == ("flight.drag.k", "bounce.restitution.e")
 
 
 def test_checkpoints_of_earlier_versions_are_of_the_same_model() -> None:

@@ -60,8 +60,8 @@ def test_every_effect_of_the_catalogue_is_planted() -> None:
 
 
 def test_typical_sizes_are_those_of_the_documents() -> None:
-    text = (ROOT / "docs" / "benchmarks_loop.md").read_text(encoding="utf-8")
-    table = text[text.index("| effect | size 1 |") : text.index("**Right** is")]
+    text = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    table = text[text.index("| effect | size 1 |") :].split("\n\n")[0]
     units = {"ms": 1e-3, "mm": 1e-3, "%": 1e-2}
     told = {
         name: float(number) * units.get(unit, 1.0)
@@ -179,7 +179,7 @@ def test_datasets_of_one_folder_name_are_refused() -> None:
 
 def test_the_page_states_the_sizes_that_are_planted() -> None:
     """`wind.x` | 0.2 m/s, and so on, in the table of typical sizes."""
-    text = (ROOT / "docs" / "benchmarks_loop.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
     table = text[text.index("| effect | size 1 |") :].split("\n\n")[0]
     found = re.findall(r"`(\w+)\.(\w+)`(?: \(hidden\))? \| ([\d.]+) ?(\S*)", table)
     assert len(found) >= 18

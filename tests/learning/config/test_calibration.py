@@ -25,6 +25,7 @@ def test_defaults_overrides_and_options(tmp_path: Path) -> None:
     assert (found.horizon, found.split, found.data) == (None, "label", "b")
 
 
+@pytest.mark.filterwarnings("ignore:.*is the earlier name of:DeprecationWarning")
 def test_the_earlier_name_of_the_observed_share_is_read(tmp_path: Path) -> None:
     found = read_config(written(tmp_path, "kind: calibrate\nobserve: 0.3"))
     assert found == CalibrationConfig(observed_share=0.3)
@@ -34,6 +35,7 @@ def test_the_earlier_name_of_the_observed_share_is_read(tmp_path: Path) -> None:
     assert read_config(path, ["kind=calibrate", "observe=0.5"]) == CalibrationConfig(observed_share=0.5)
 
 
+@pytest.mark.filterwarnings("ignore:.*is the earlier name of:DeprecationWarning")
 @pytest.mark.parametrize(
     ("text", "message"),
     [

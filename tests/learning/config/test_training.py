@@ -54,6 +54,7 @@ def test_overrides_reach_into_sections(tmp_path: Path) -> None:
     assert TrainConfig(data="d").data == ("d",)
 
 
+@pytest.mark.filterwarnings("ignore:.*is the earlier name of:DeprecationWarning")
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -110,8 +111,11 @@ def test_a_number_to_observe_is_seconds(tmp_path: Path) -> None:
     assert (found.observe.samples, found.observe.seconds) == (40, None)
 
 
+@pytest.mark.filterwarnings("ignore:.*is the earlier name of:DeprecationWarning")
 def test_the_earlier_name_of_jobs_is_read(tmp_path: Path) -> None:
     path = written(tmp_path, "workers: 3")
+    with pytest.warns(DeprecationWarning, match="'workers' is the earlier name of 'jobs'.* Write 'jobs'"):
+        read_config(path)
     assert read_config(path) == checked_config({"workers": 3}, "here") == TrainConfig(jobs=3)
     assert "workers" not in read_config(path).model_dump()
     for name in ("jobs", "workers"):
