@@ -1,7 +1,5 @@
 """One ball of a tracker: its estimator, and what it needs to put a late sample where it belongs."""
 
-from __future__ import annotations
-
 from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Sequence

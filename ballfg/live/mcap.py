@@ -5,8 +5,6 @@ each with an index of its messages for every channel. A summary ends the file: r
 tell all that is in it.
 """
 
-from __future__ import annotations
-
 import io
 import struct
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """A newcomer: positions that may become a ball, with no estimator yet."""
 
-from __future__ import annotations
-
 from bisect import insort
 
 import numpy as np

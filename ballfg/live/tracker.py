@@ -1,7 +1,5 @@
 """The tracker: positions of any number of balls in, the state of each ball out, one stamp at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 

@@ -1,7 +1,5 @@
 """The balls in the viewer rerun, as they fly: the extra `viewer`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

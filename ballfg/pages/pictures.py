@@ -1,7 +1,5 @@
 """Pictures of one shot for papers: views from the side and from above, and each axis by time."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

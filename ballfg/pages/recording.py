@@ -1,7 +1,5 @@
 """Shots as a recording for the viewer rerun, for logs that are too large for a page: the extra `viewer`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

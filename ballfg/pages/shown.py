@@ -1,7 +1,5 @@
 """What a page shows: the shots that were chosen, from all that was given, checked against each other."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 

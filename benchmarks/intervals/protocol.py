@@ -5,8 +5,6 @@ package's constants with the scatter of the samples. "From observed parts" it co
 tracks, "from other tracks" from whole tracks of the half that is not judged.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final

@@ -1,7 +1,5 @@
 """Coverage of 90 % intervals on measured datasets, and on simulated ones whose trackers have a memory and jitter."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Comparison of times with those of an earlier run, each as a multiple of the control that was timed beside it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final

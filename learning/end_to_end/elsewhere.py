@@ -1,7 +1,5 @@
 """What a residual network has to know to be used in other rooms: where it was trained, and the noise there."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace

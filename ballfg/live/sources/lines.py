@@ -1,7 +1,5 @@
 """Lines of a stream to samples: CSV `t,x,y,z` or JSON, each line by itself."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass

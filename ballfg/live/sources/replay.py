@@ -1,7 +1,5 @@
 """A dataset as a stream: its tracks one after the other, at the rate at which they were measured."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterable, Iterator
 from time import perf_counter

@@ -1,7 +1,5 @@
 """Lines over TCP."""
 
-from __future__ import annotations
-
 import socket
 import threading
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """One library with one problem, in a process of its own that is asked for solutions."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """The suite of `ballfg-bench speed --peers`: the same problems by every library that is installed, in turns."""
 
-from __future__ import annotations
-
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
