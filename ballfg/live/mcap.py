@@ -10,6 +10,8 @@ import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PosixPath
+from shutil import copyfileobj
+from tempfile import TemporaryFile
 from typing import Any, NamedTuple
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -167,7 +169,7 @@ def readable(path: Path) -> Path:
 
 
 class Unfinished(PosixPath):
-    """A path to a file without end: who opens it reads the whole chunks, and the end that is missing.
+    """A path to a file without end: who opens it reads a copy of its whole chunks, and the end that is missing.
 
     Attributes: whole: bytes of the file that count.  ending: what follows them.
     """
@@ -177,40 +179,14 @@ class Unfinished(PosixPath):
 
     def open(self, *_: Any, **__: Any) -> Any:
         """The file, in binary, to read."""
-        return io.BufferedReader(_Joined(super().open("rb", buffering=0), self.whole, self.ending))
-
-
-class _Joined(io.RawIOBase):
-    """The first bytes of a file, and others after them. Args: whole: number of those bytes."""
-
-    def __init__(self, file: Any, whole: int, ending: bytes) -> None:
-        self._file, self._whole, self._ending = file, whole, ending
-        self._at = 0
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        ends = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._whole + len(self._ending)}
-        self._at = ends[whence] + offset
-        return self._at
-
-    def readinto(self, buffer: Any) -> int:
-        if self._at < self._whole:
-            self._file.seek(self._at)
-            found = self._file.read(min(len(buffer), self._whole - self._at))
-        else:
-            found = self._ending[self._at - self._whole :][: len(buffer)]
-        buffer[: len(found)] = found
-        self._at += len(found)
-        return len(found)
-
-    def close(self) -> None:
-        self._file.close()
-        super().close()
+        copy = TemporaryFile()  # noqa: SIM115 - who opened the path closes it
+        with super().open("rb") as file:
+            copyfileobj(file, copy)
+        copy.truncate(self.whole)
+        copy.seek(self.whole)
+        copy.write(self.ending)
+        copy.seek(0)
+        return copy
 
 
 def _opening_of(read: Read) -> tuple[bytes, int] | None:

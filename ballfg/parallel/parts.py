@@ -41,9 +41,5 @@ def in_parts(function: Callable[[T], R], parts: Sequence[T], together: int) -> I
         yield from map(function, parts)
         return
     stream = iter(parts)
-    chunks = iter(partial(_taken, stream, together), [])
+    chunks = iter(lambda: list(islice(stream, together)), [])
     yield from in_order(partial(each, function), chunks, others)
-
-
-def _taken(stream: Iterator[T], count: int) -> list[T]:
-    return list(islice(stream, count))
