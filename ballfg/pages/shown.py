@@ -56,7 +56,12 @@ def collect(given: Given, names: Sequence[str] = (), limited: bool = True) -> Sh
     Raises: ValueError: a name that is not there, results that belong to other tracks, or a shot too long for a page.
     """
     known = _names(given)
-    _check_names(names, known)
+    for name in names:
+        if name not in known:
+            hint = did_you_mean(name, known)
+            raise ValueError(
+                f"--track must name one of the {len(known)} shots; got {shown(name)}.{hint} Correct the name."
+            )
     notes = list(_check_results(given))
     wanted = set(names) if names else set(known[:MOST_SHOTS] if limited else known)
     shots: list[Shot] = []
@@ -88,15 +93,6 @@ def _names(given: Given) -> list[str]:
         return given.dataset.names
     tables = [one for one in (given.states, given.predictions) if one is not None]
     return list(dict.fromkeys(name for one in tables for name in one.rows))
-
-
-def _check_names(names: Sequence[str], known: Sequence[str]) -> None:
-    for name in names:
-        if name not in known:
-            hint = did_you_mean(name, known)
-            raise ValueError(
-                f"--track must name one of the {len(known)} shots; got {shown(name)}.{hint} Correct the name."
-            )
 
 
 def _check_results(given: Given) -> Iterator[str]:
