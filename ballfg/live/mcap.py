@@ -34,14 +34,6 @@ Read = Callable[[int, int], bytes]
 """Bytes of a file, from an offset on, at most as many as asked for."""
 
 
-class Topic(NamedTuple):
-    """A topic, with the name and the definition of its messages in ROS 2."""
-
-    name: str
-    kind: str
-    definition: str
-
-
 class Message(NamedTuple):
     """A message of a channel, which is a number from 1 on, at a time in ns."""
 
@@ -80,13 +72,16 @@ class Chunk:
         return self.indexes[-1]
 
 
-def opening(topics: Sequence[Topic]) -> bytes:
-    """How a file begins: its header, then the schema and the channel of each topic, numbered from 1 on."""
+def opening(topics: Sequence[tuple[str, str, str]]) -> bytes:
+    """How a file begins: its header, then the schema and the channel of each topic, numbered from 1 on.
+
+    Args: topics: name of each, with the name and the definition of its messages in ROS 2.
+    """
     parts = [MAGIC, _record(HEADER, _text("ros2") + _text(WRITER))]
-    for number, topic in enumerate(topics, start=1):
-        schema = _text(topic.kind) + _text("ros2msg") + _text(topic.definition)
+    for number, (name, kind, definition) in enumerate(topics, start=1):
+        schema = _text(kind) + _text("ros2msg") + _text(definition)
         metadata = _text("offered_qos_profiles") + _text("[]")
-        channel = _text(topic.name) + _text("cdr") + struct.pack("<I", len(metadata)) + metadata
+        channel = _text(name) + _text("cdr") + struct.pack("<I", len(metadata)) + metadata
         parts.append(_record(SCHEMA, struct.pack("<H", number) + schema))
         parts.append(_record(CHANNEL, struct.pack("<HH", number, number) + channel))
     return b"".join(parts)
@@ -145,7 +140,6 @@ def readable(path: Path) -> Path:
 
     The file itself stays as it is.
 
-    Args: path: of an MCAP file.
     Raises: ValueError: such a file, in which something else is among the chunks.
     """
     with path.open("rb") as file:

@@ -17,10 +17,7 @@ BEND = 12.0
 
 
 class Newcomer:
-    """The first positions of what may be a ball.
-
-    Args: first: its first sample.  gate: of the tracker.
-    """
+    """The first positions of what may be a ball."""
 
     patience = PATIENCE
 

@@ -17,10 +17,7 @@ _JOBS: ContextVar[int] = ContextVar("jobs", default=1)
 
 
 def with_jobs(jobs: int, function: Callable[[T], R], argument: T) -> R:
-    """What a function gives, whose parts may use several processes.
-
-    Args: jobs: number of processes.  function: of the argument.
-    """
+    """What a function gives, whose parts may use several processes."""
     token = _JOBS.set(jobs)
     try:
         return function(argument)

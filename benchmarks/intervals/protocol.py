@@ -83,14 +83,7 @@ def judged_both_ways(
 ) -> Judged:
     """All tracks judged, each half with noise that knows nothing of its later parts.
 
-    Args:
-        method: of `METHODS`.
-        model: the ball.
-        surfaces: what it may bounce on.
-        settings: as usual.
-        tracks: of a set.
-        jobs: processes.
-        position_known: whether the noise of positions is stated.
+    Args: method: of `METHODS`.  settings: as usual.  position_known: whether the noise of positions is stated.
     """
     halves = tracks[0::2], tracks[1::2]
     parts = []

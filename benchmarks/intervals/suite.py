@@ -66,10 +66,6 @@ def run_intervals(
     """Rows for measured datasets, or for simulated ones where there are none.
 
     Args:
-        results: to add to.
-        datasets: measured ones.
-        plan: how much is simulated.
-        jobs: processes.
         first: how many tracks of a measured dataset are used, the first ones; None for all.
         diagnosed: whether simulated tracks are predicted with the model that a diagnosis of others made.
     """

@@ -32,7 +32,6 @@ class Section(BaseModel):
     def renamed(cls, content: Mapping[str, Any]) -> dict[str, Any]:
         """The content under the names of today.
 
-        Args: content: fields by name.
         Raises: ValueError: if it has a field under both names.
         """
         for earlier, name in cls.EARLIER.items():

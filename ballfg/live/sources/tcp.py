@@ -18,8 +18,6 @@ PIECE = 4096
 class Connection(Sender):
     """A TCP sender.
 
-    Args: connected: its socket.  name: its address.
-
     Attributes: open: whether more may come.
     """
 
