@@ -50,7 +50,6 @@ def collect(given: Given, names: Sequence[str] = (), limited: bool = True) -> Sh
     """Chooses shots and puts together what is known of each.
 
     Args:
-        given: what there is.
         names: of the shots; where empty, the first ones.
         limited: whether at most 40 shots and 36,000 rows are taken, as a page holds.
     Raises: ValueError: a name that is not there, results that belong to other tracks, or a shot too long for a page.

@@ -45,7 +45,6 @@ def score_path(shot: Shot, predicted: Array) -> PathScore:
     """The errors of a path predicted for a shot.
 
     Args:
-        shot: what it is judged by.
         predicted: (n, 3) m at the shot's stamps; NaN at observed stamps by methods that predict only what comes after.
     Raises: ValueError: if the shape is another, or an unobserved position is not finite.
     """

@@ -41,7 +41,6 @@ def run_training(
         before the first step.
 
     Args:
-        config: of the training.
         folder: to write; that of the earlier run if it is to `resume`.
         resume: continue from the last checkpoint.
         watch: sees the batches pass in the first process, for instance to show progress.
