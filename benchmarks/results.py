@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ballfg.benchmarks.metrics import Figure
-from ballfg.files.whole_file import whole_file
+from ballfg.files.whole_file import write_text
 from ballfg.machine import usable_cores, versions
 
 PACKAGES = ("ballfg", "gtsam", "torch", "numpy", "scipy", "filterpy")
@@ -70,21 +70,14 @@ class Results:
 
     def to_dict(self) -> dict[str, Any]:
         """The content of `results.json`."""
-        rows = [asdict(row) for row in self.rows]
-        return {
-            "command": self.command,
-            "versions": versions(PACKAGES),
-            "machine": machine(),
-            "seed": self.seed,
-            "rows": rows,
-        }
+        origin = {"command": self.command, "versions": versions(PACKAGES), "machine": machine(), "seed": self.seed}
+        return {**origin, "rows": [asdict(row) for row in self.rows]}
 
     def write(self, folder: Path) -> Path:
         """Write `results.json` whole or not at all."""
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / RESULTS_FILE
-        with whole_file(path) as part:
-            part.write_text(json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        write_text(path, json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n")
         return path
 
 

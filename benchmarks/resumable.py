@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 from ballfg.checks import one_line, short_text
 from ballfg.files.json_file import read_json
-from ballfg.files.whole_file import whole_file
+from ballfg.files.whole_file import write_text
 from ballfg.parallel.executor import executor
 from ballfg.parallel.stream import finished
 from ballfg.parallel.work import on_one_thread
@@ -47,8 +47,7 @@ def collect(
 
 def write_record(path: Path, content: Mapping[str, Any]) -> None:
     """Write a record whole or not at all. Raises: ValueError: if a number is not finite."""
-    with whole_file(path) as part:
-        part.write_text(json.dumps(content, allow_nan=False) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(content, allow_nan=False) + "\n")
 
 
 def read_record(path: Path, digest: str, build: Callable[[dict[str, Any]], R], what: str) -> R | None:

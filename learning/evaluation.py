@@ -1,14 +1,12 @@
 """The error of a model's predictions on tracks that were not fitted: observe the first part, predict the rest."""
 
-from collections.abc import Iterable, Iterator, Sequence
-from functools import partial
+from collections.abc import Sequence
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.special import ndtri
 
 from ballfg.estimation import Estimator, Status, predict_tracks
-from ballfg.estimation.batch import map_tracks
 from ballfg.tracks import Track
 
 NINETY = float(ndtri(0.95))
@@ -51,14 +49,6 @@ class Summary(BaseModel):
     """Mean over predicted samples; 3 is right."""
     nis: float
     """Mean over tracks of the observed part's NIS; 3 is right."""
-
-
-def judge_tracks(
-    estimator: Estimator, tracks: Iterable[Track], observed_share: float, horizon: float, jobs: int, count: int
-) -> Iterator[TrackScore | None]:
-    """Scores of a stream of `count` tracks, in their order, as `judge_track`."""
-    judge = partial(judge_track, estimator, observed_share=observed_share, horizon=horizon)
-    return map_tracks(judge, tracks, count, jobs)
 
 
 def judge_track(estimator: Estimator, track: Track, observed_share: float, horizon: float) -> TrackScore | None:

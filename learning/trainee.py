@@ -88,17 +88,11 @@ class Trainee(ABC):
         """Write the model into a folder. Returns: the path that other commands and classes load it from."""
 
     def shown(self, track: int) -> PredictedShot | None:
-        """A track as the model predicts it, for a picture; None where it cannot be predicted, or by default.
-
-        Args: track: its number.
-        """
+        """A track as the model predicts it, for a picture; None where it cannot be predicted, or by default."""
         return None
 
     def without_training(self, tracks: Sequence[int]) -> BatchLoss | None:
-        """As `judge`, of the model that one has without any training; None, by default, where that is no other model.
-
-        Args: tracks: numbers.
-        """
+        """As `judge`, of the model that one has without any training; by default None: that is no other model."""
         return None
 
     def learned(self) -> Sequence[Learned]:

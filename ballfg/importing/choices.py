@@ -99,7 +99,6 @@ class Guess:
 def parse_columns(text: str) -> dict[str, str]:
     """Roles and columns from text such as "t=stamp,x=X".
 
-    Args: text: as typed after --columns.
     Returns: role -> name of the column.
     Raises: ValueError: not of this form.
     """

@@ -8,7 +8,7 @@ import numpy as np
 
 from ballfg.checks import did_you_mean, listed, short_text, shown
 from ballfg.importing.choices import Choices, UndecidedError
-from ballfg.importing.formats.raw import Column, RawTable, is_number, numbers
+from ballfg.importing.formats.raw import RawTable, is_number, numbers
 from ballfg.importing.names import Meaning, meanings
 from ballfg.importing.stamps import as_stamps
 
@@ -80,7 +80,7 @@ def roles_of(table: RawTable, choices: Choices) -> Roles | None:
     frame = frame or (counters[0] if counters else None)
     if not time and frame is None:
         time, frame = _time_by_numbers(table, {*places, *([trajectory] if trajectory else [])})
-    sigmas = _sigmas(read, given)
+    sigmas, unit, rate = _sigmas(read, given), _constant(table, UNITS), _constant(table, RATES)
     used = {*places, *time, *(sigmas or ())} | {one for one in (frame, trajectory) if one}
     return Roles(
         places,
@@ -88,9 +88,9 @@ def roles_of(table: RawTable, choices: Choices) -> Roles | None:
         None if time else frame,
         trajectory,
         sigmas,
-        units or _stated_unit(table),
+        units or (unit.strip().lower() if isinstance(unit, str) else None),
         _time_unit(read, time),
-        _stated_rate(table),
+        float(rate) if isinstance(rate, int | float) and rate > 0 else None,
         by_name,
         tuple(name for name in table.columns if name not in used and name.lower() not in (*RATES, *UNITS)),
     )
@@ -175,16 +175,12 @@ def _named_time(
         return ()
     least = min(rank for rank, _ in candidates)
     best = [name for rank, name in candidates if rank == least]
-    moving = [name for name in best if _varies(table.columns[name])] or best
+    moving = [name for name in best if len(set(table.columns[name][:1000].tolist())) > 1] or best
     if len(moving) > 1 and not _one_clock(table, moving):
         raise UndecidedError(
             f"{table.where}: {' and '.join(moving)} may both be the time", "columns", [f"t={name}" for name in moving]
         )
     return (moving[0],)
-
-
-def _varies(column: Column) -> bool:
-    return len(set(column[:1000].tolist())) > 1
 
 
 def _one_clock(table: RawTable, names: list[str]) -> bool:
@@ -280,13 +276,3 @@ def _constant(table: RawTable, names: tuple[str, ...]) -> object:
         if name.lower() in names and len(column) and len(set(column.tolist())) == 1:
             return column.tolist()[0]
     return None
-
-
-def _stated_rate(table: RawTable) -> float | None:
-    value = _constant(table, RATES)
-    return float(value) if isinstance(value, int | float) and value > 0 else None
-
-
-def _stated_unit(table: RawTable) -> str | None:
-    value = _constant(table, UNITS)
-    return value.strip().lower() if isinstance(value, str) else None

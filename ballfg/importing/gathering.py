@@ -26,7 +26,6 @@ _INTERRUPTED: Final = 0.5
 def understood(tables: Sequence[RawTable], choices: Choices) -> tuple[list[RawTable], Roles, list[RawTable]]:
     """What each table of a source is.
 
-    Args: tables: one or more.  choices: what is decided.
     Returns: the tables of positions, which all have the same columns; their roles; and the tables beside them.
     Raises: UndecidedError: no positions, or positions in different columns.
     """
@@ -68,9 +67,6 @@ def understood(tables: Sequence[RawTable], choices: Choices) -> tuple[list[RawTa
 def shots_of(tables: Sequence[RawTable], roles: Roles, choices: Choices, counts: Counts) -> list[Shot]:
     """The shots of all tables, in the source's units, with names of their own.
 
-    Args:
-        tables: of positions.  roles: of their columns.  choices: what is decided.
-        counts: adds what was left out or put in order.
     Raises:
         UndecidedError: no times and no rate; it says which rate fits.
         ValueError: no shot with two samples.
@@ -161,10 +157,7 @@ def split(shots: list[Shot], roles: Roles, frame: Frame, choices: Choices) -> tu
 
 
 def with_labels(shots: list[Shot], beside: Sequence[RawTable]) -> list[Shot]:
-    """The shots with the labels of tables that have one row for each of them.
-
-    Args: shots: of the tables of positions.  beside: the other tables.
-    """
+    """The shots with the labels of tables that have one row for each of them."""
     names = {shot.name for shot in shots}
     for table in beside:
         for key, column in table.columns.items():

@@ -232,9 +232,9 @@ def _labels(
         column = table.columns.get(name)
         if column is None:  # the first table has it, this one does not
             counts.ignored.add(name)
-        elif all((column[part] == column[part[0]]).all() for part in parts) and _may_be_label(name):
+        elif all((column[part] == column[part[0]]).all() for part in parts) and is_name(name) and name != "trajectory":
             found[name] = [_label(column, int(part[0])) for part in parts]
-        elif not _empty(column):
+        elif not is_number(column) or np.isfinite(numbers(column)).any():
             counts.ignored.add(name)
     return found
 
@@ -245,16 +245,8 @@ def _needed(roles: Roles) -> tuple[str, ...]:
     return (*roles.time, *roles.places, *alone, *(roles.sigmas or ()))
 
 
-def _may_be_label(name: str) -> bool:
-    return is_name(name) and name != "trajectory"
-
-
 def _label(column: Column, row: int) -> Label | None:
     if is_number(column):
         value = float(column[row])
         return value if np.isfinite(value) else None
     return short_text(" ".join(str(column[row]).split()), MAX_TEXT) or None
-
-
-def _empty(column: Column) -> bool:
-    return is_number(column) and not np.isfinite(numbers(column)).any()

@@ -25,11 +25,7 @@ _MOST_POINTS: Final = 300
 def write_import(folder: Path, proposal: Proposal, file_format: Literal["csv", "parquet"], force: bool) -> None:
     """Writes the dataset and its page as a whole, or nothing.
 
-    Args:
-        folder: new, empty, or with `force` a dataset to replace, and the truth of a simulated one.
-        proposal: to write.
-        file_format: of the tracks.
-        force: replace it.
+    Args: folder: new, empty, or with `force` a dataset to replace, and the truth of a simulated one.
     Raises: ValueError: a folder with other content. FileNotFoundError: its parent does not exist.
     """
     simulated = (folder / TRUTH_FILE).is_file()

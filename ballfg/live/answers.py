@@ -1,7 +1,5 @@
 """What comes out: one JSON line for each position that came in, and for each ball that was lost."""
 
-from __future__ import annotations
-
 import json
 import math
 from typing import Any

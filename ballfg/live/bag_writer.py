@@ -10,7 +10,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.estimation.online.state import OnlineState
-from ballfg.live.mcap import Chunk, Message, Topic, chunk_of, ending, opening, whole_chunks
+from ballfg.live.mcap import Chunk, Message, chunk_of, ending, opening, whole_chunks
 from ballfg.live.outlook import Outlook, unusable
 from ballfg.live.recording import Recording, refuse_repeated, refused, say_continued
 from ballfg.live.sources.bag import need_rosbags
@@ -45,7 +45,7 @@ class BagWriter:
 
         self.store = get_typestore(Stores.ROS2_HUMBLE)
         self.horizon = horizon
-        self._opening = opening([Topic(name, kind, self.store.generate_msgdef(kind)[0]) for name, kind in TOPICS])
+        self._opening = opening([(name, kind, self.store.generate_msgdef(kind)[0]) for name, kind in TOPICS])
         self._chunks: list[Chunk] = []
         self._messages: list[Message] = []
         self._turn = threading.Lock()

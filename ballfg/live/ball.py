@@ -1,7 +1,5 @@
 """One ball of a tracker: its estimator, and what it needs to put a late sample where it belongs."""
 
-from __future__ import annotations
-
 from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Sequence
@@ -98,18 +96,13 @@ class Ball:
         return Known.of(self.states[0])
 
     def take(self, kept: Kept) -> OnlineState:
-        """Take in a sample, late or not; returns the newest state.
+        """Take in a sample, late or not, in place of one with its stamp; returns the newest state.
 
         Raises: ValueError, RuntimeError: from the estimator, where nothing can be made of the samples.
         """
         if not self.states or kept.time > self.last:
             self.tidy()
             return self._push(kept)
-        self._rebuild(kept.time, added=kept)
-        return self.states[-1]
-
-    def replace(self, kept: Kept) -> OnlineState:
-        """Take in a sample in place of the one with its stamp. Raises: as `take`."""
         self._rebuild(kept.time, added=kept)
         return self.states[-1]
 
@@ -179,12 +172,10 @@ class Ball:
         found: list[BallEvent] = []
         for before, sample in pairwise(samples):
             found += _events(sample.motion, before.motion, *map(self._online.stamp_of, (before.time, sample.time)))
-        fresh = [event for event in found if not self._was_told(event)]
+        told = self._told
+        fresh = [e for e in found if not any(k == e.kind and abs(t - e.time) < SAME_EVENT for k, t in told)]
         self._told.extend((event.kind, event.time) for event in fresh)
         return tuple(fresh)
-
-    def _was_told(self, event: BallEvent) -> bool:
-        return any(kind == event.kind and abs(time - event.time) < SAME_EVENT for kind, time in self._told)
 
 
 def _events(motion: Motion, before: Motion, start: float, end: float) -> Sequence[BallEvent]:

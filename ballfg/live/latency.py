@@ -1,7 +1,5 @@
 """Latencies of an endless stream in bounded memory: counts on a logarithmic scale, and the worst."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -5,13 +5,13 @@ each with an index of its messages for every channel. A summary ends the file: r
 tell all that is in it.
 """
 
-from __future__ import annotations
-
 import io
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PosixPath
+from shutil import copyfileobj
+from tempfile import TemporaryFile
 from typing import Any, NamedTuple
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -32,14 +32,6 @@ LONGEST_OPENING = 1 << 20
 
 Read = Callable[[int, int], bytes]
 """Bytes of a file, from an offset on, at most as many as asked for."""
-
-
-class Topic(NamedTuple):
-    """A topic, with the name and the definition of its messages in ROS 2."""
-
-    name: str
-    kind: str
-    definition: str
 
 
 class Message(NamedTuple):
@@ -80,13 +72,16 @@ class Chunk:
         return self.indexes[-1]
 
 
-def opening(topics: Sequence[Topic]) -> bytes:
-    """How a file begins: its header, then the schema and the channel of each topic, numbered from 1 on."""
+def opening(topics: Sequence[tuple[str, str, str]]) -> bytes:
+    """How a file begins: its header, then the schema and the channel of each topic, numbered from 1 on.
+
+    Args: topics: name of each, with the name and the definition of its messages in ROS 2.
+    """
     parts = [MAGIC, _record(HEADER, _text("ros2") + _text(WRITER))]
-    for number, topic in enumerate(topics, start=1):
-        schema = _text(topic.kind) + _text("ros2msg") + _text(topic.definition)
+    for number, (name, kind, definition) in enumerate(topics, start=1):
+        schema = _text(kind) + _text("ros2msg") + _text(definition)
         metadata = _text("offered_qos_profiles") + _text("[]")
-        channel = _text(topic.name) + _text("cdr") + struct.pack("<I", len(metadata)) + metadata
+        channel = _text(name) + _text("cdr") + struct.pack("<I", len(metadata)) + metadata
         parts.append(_record(SCHEMA, struct.pack("<H", number) + schema))
         parts.append(_record(CHANNEL, struct.pack("<HH", number, number) + channel))
     return b"".join(parts)
@@ -145,7 +140,6 @@ def readable(path: Path) -> Path:
 
     The file itself stays as it is.
 
-    Args: path: of an MCAP file.
     Raises: ValueError: such a file, in which something else is among the chunks.
     """
     with path.open("rb") as file:
@@ -169,7 +163,7 @@ def readable(path: Path) -> Path:
 
 
 class Unfinished(PosixPath):
-    """A path to a file without end: who opens it reads the whole chunks, and the end that is missing.
+    """A path to a file without end: who opens it reads a copy of its whole chunks, and the end that is missing.
 
     Attributes: whole: bytes of the file that count.  ending: what follows them.
     """
@@ -179,40 +173,14 @@ class Unfinished(PosixPath):
 
     def open(self, *_: Any, **__: Any) -> Any:
         """The file, in binary, to read."""
-        return io.BufferedReader(_Joined(super().open("rb", buffering=0), self.whole, self.ending))
-
-
-class _Joined(io.RawIOBase):
-    """The first bytes of a file, and others after them. Args: whole: number of those bytes."""
-
-    def __init__(self, file: Any, whole: int, ending: bytes) -> None:
-        self._file, self._whole, self._ending = file, whole, ending
-        self._at = 0
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        ends = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._whole + len(self._ending)}
-        self._at = ends[whence] + offset
-        return self._at
-
-    def readinto(self, buffer: Any) -> int:
-        if self._at < self._whole:
-            self._file.seek(self._at)
-            found = self._file.read(min(len(buffer), self._whole - self._at))
-        else:
-            found = self._ending[self._at - self._whole :][: len(buffer)]
-        buffer[: len(found)] = found
-        self._at += len(found)
-        return len(found)
-
-    def close(self) -> None:
-        self._file.close()
-        super().close()
+        copy = TemporaryFile()  # noqa: SIM115 - who opened the path closes it
+        with super().open("rb") as file:
+            copyfileobj(file, copy)
+        copy.truncate(self.whole)
+        copy.seek(self.whole)
+        copy.write(self.ending)
+        copy.seek(0)
+        return copy
 
 
 def _opening_of(read: Read) -> tuple[bytes, int] | None:

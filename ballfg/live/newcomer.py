@@ -1,7 +1,5 @@
 """A newcomer: positions that may become a ball, with no estimator yet."""
 
-from __future__ import annotations
-
 from bisect import insort
 
 import numpy as np
@@ -19,10 +17,7 @@ BEND = 12.0
 
 
 class Newcomer:
-    """The first positions of what may be a ball.
-
-    Args: first: its first sample.  gate: of the tracker.
-    """
+    """The first positions of what may be a ball."""
 
     patience = PATIENCE
 

@@ -1,7 +1,5 @@
 """A session of `ballfg live`: samples from an inbox to a tracker, its answers to those who want them."""
 
-from __future__ import annotations
-
 import gc
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass

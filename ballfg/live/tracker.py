@@ -1,7 +1,5 @@
 """The tracker: positions of any number of balls in, the state of each ball out, one stamp at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -329,7 +327,7 @@ class Tracker:
         """A ball's update with a sample; where nothing can be made of it, the ball begins anew with it."""
         reason, displaced = "", ball.at(kept.time)
         try:
-            state = ball.take(kept) if displaced is None else ball.replace(kept)
+            state = ball.take(kept)
         except (ValueError, RuntimeError) as error:
             self.counts.failed += 1
             reason = f"the estimator began anew: {' '.join(str(error).split())}"

@@ -1,13 +1,12 @@
 """The balls in the viewer rerun, as they fly: the extra `viewer`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
 
 from ballfg.live.outlook import Outlook, unusable
 from ballfg.live.tracker import BallUpdate
+from ballfg.pages.recording import check_rerun
 from ballfg.prediction import Crossing
 
 EVERY = 3
@@ -24,12 +23,7 @@ class Viewer:
     """
 
     def __init__(self, horizon: float, save: Path | None = None) -> None:
-        try:
-            import rerun
-        except ImportError as error:
-            raise ValueError(
-                f"viewer must have the package rerun-sdk; got {error}. Install it: pip install 'ballfg[viewer]'."
-            ) from None
+        rerun = check_rerun("viewer")
         self.horizon = horizon
         self._rerun = rerun
         self._recording = rerun.RecordingStream("ballfg live")

@@ -1,7 +1,5 @@
 """How often predictions hold: the share of measured coordinates inside their 90 % intervals, by horizon."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from statistics import NormalDist

@@ -1,7 +1,5 @@
 """What the words of `ballfg show` are: a dataset, states, predictions, a diagnosis, in any order."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -29,8 +29,6 @@ def text(words: str) -> Html:
     """Escaped words; `Html` stays.
 
     Minus signs, squares in units and powers of ten are typeset: 3e-12 as 3·10 with −12 raised.
-
-    Args: words: plain text, or HTML.
     """
     if isinstance(words, Html):
         return words
@@ -59,28 +57,19 @@ def tag(name: str, *content: str, kind: str = "", **attributes: str) -> Html:
 
 
 def section(title: str, *content: str) -> Html:
-    """A part of the page with its heading; empty where there is no content.
-
-    Args: title: of the part.  content: text or HTML under it.
-    """
+    """A part of the page with its heading; empty where there is no content."""
     parts = [part for part in content if part]
     return tag("section", tag("h2", title), *parts) if parts else Html()
 
 
 def items(lines: Iterable[str]) -> Html:
-    """A list; empty without lines.
-
-    Args: lines: text or HTML of each item.
-    """
+    """A list; empty without lines."""
     rows = [tag("li", line) for line in lines]
     return tag("ul", *rows) if rows else Html()
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Html:
-    """A table that scrolls within itself on a narrow screen; empty without rows.
-
-    Args: head: names of the columns.  rows: text or HTML of the cells.
-    """
+    """A table that scrolls within itself on a narrow screen; empty without rows."""
     lines = [tag("tr", *(tag("td", cell) for cell in row)) for row in rows]
     if not lines:
         return Html()
@@ -89,26 +78,17 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Html:
 
 
 def typed(words: str) -> Html:
-    """What a reader copies into a terminal, to the letter: a typeset minus sign would not be understood there.
-
-    Args: words: a command or an option.
-    """
+    """What a reader copies into a terminal, to the letter: a typeset minus sign would not be understood there."""
     return Html(f"<code>{html.escape(words)}</code>")
 
 
 def explained(word: str, meaning: str, kind: str = "") -> Html:
-    """A word whose meaning appears under the pointer, and below it when it is touched or reached by the keyboard.
-
-    Args: word: as it stands in the sentence.  meaning: one sentence or two.  kind: its CSS class.
-    """
+    """A word whose meaning appears under the pointer, and below it when it is touched or reached by the keyboard."""
     return tag("abbr", word, kind=kind, title=meaning, tabindex="0")
 
 
 def meanings(words: Mapping[str, str]) -> Html:
-    """A list of words with their meanings.
-
-    Args: words: word -> meaning.
-    """
+    """A list of words with their meanings."""
     return tag("dl", *(part for name, meaning in words.items() for part in (tag("dt", name), tag("dd", meaning))))
 
 

@@ -1,7 +1,5 @@
 """Contacts and hits, found in the states: the tables of an estimate do not list them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

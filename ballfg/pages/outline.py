@@ -1,7 +1,5 @@
 """Where the table, its net and the floor are drawn."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

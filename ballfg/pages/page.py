@@ -43,10 +43,7 @@ def whole_page(
 
 
 def own(name: str) -> str:
-    """The text of a style or a script of this room.
-
-    Args: name: of its file.
-    """
+    """The text of a style or a script of this room."""
     return files(__package__).joinpath(name).read_text(encoding="utf-8")
 
 

@@ -1,7 +1,5 @@
 """Pictures of one shot for papers: views from the side and from above, and each axis by time."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np
@@ -29,7 +27,8 @@ def views(shot: Shot, table: Outline | None = None) -> Figure:
     """
     figure = Figure(figsize=(7.0, 5.6), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
-    across = _longer(shot)
+    size = np.ptp(np.concatenate((shot.positions, shot.states[:, :3], shot.predicted)), axis=0)
+    across = int(size[1] > size[0])
     for panel, up in zip(panels, (2, 1 - across), strict=True):
         _table(panel, table, across, up)
         _paths(panel, shot, across, up)
@@ -42,10 +41,7 @@ def views(shot: Shot, table: Outline | None = None) -> Figure:
 
 
 def by_axis(shot: Shot) -> Figure:
-    """x, y and z by time: measured, estimated and predicted, with 90 % bands.
-
-    Args: shot: what is known of it.
-    """
+    """x, y and z by time: measured, estimated and predicted, with 90 % bands."""
     figure = Figure(figsize=(8.0, 7.0), layout="constrained")
     panels = figure.subplots(3, 1, sharex=True)
     parts = [
@@ -70,12 +66,6 @@ def by_axis(shot: Shot) -> Figure:
     panels[0].set_title(f"track {shot.name}: positions with 90 % intervals")
     panels[2].set_xlabel("time, s")
     return figure
-
-
-def _longer(shot: Shot) -> int:
-    """The axis, 0 or 1, along which the shot goes further."""
-    size = np.ptp(np.concatenate((shot.positions, shot.states[:, :3], shot.predicted)), axis=0)
-    return int(size[1] > size[0])
 
 
 def _table(panel: Axes, table: Outline | None, across: int, up: int) -> None:

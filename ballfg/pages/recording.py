@@ -1,7 +1,5 @@
 """Shots as a recording for the viewer rerun, for logs that are too large for a page: the extra `viewer`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -36,13 +34,13 @@ def record(shown: Shown, path: Path) -> None:
     recording.disconnect()
 
 
-def check_rerun() -> Any:
-    """The package rerun. Raises: ValueError: it is missing."""
+def check_rerun(option: str = "rerun") -> Any:
+    """The package rerun, which an option of a command needs. Raises: ValueError: it is missing."""
     try:
         import rerun
     except ImportError as error:
         raise ValueError(
-            f"rerun must have the package rerun-sdk; got {error}. Install it: pip install 'ballfg[viewer]'."
+            f"{option} must have the package rerun-sdk; got {error}. Install it: pip install 'ballfg[viewer]'."
         ) from None
     return rerun
 

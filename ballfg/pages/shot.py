@@ -1,7 +1,5 @@
 """One shot with all that is known of it: samples, states, predictions, contacts and hits."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

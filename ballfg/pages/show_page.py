@@ -1,7 +1,5 @@
 """The page of `ballfg show`: its sentence, its parts, and the data that its script draws."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

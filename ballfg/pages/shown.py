@@ -1,7 +1,5 @@
 """What a page shows: the shots that were chosen, from all that was given, checked against each other."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -52,13 +50,17 @@ def collect(given: Given, names: Sequence[str] = (), limited: bool = True) -> Sh
     """Chooses shots and puts together what is known of each.
 
     Args:
-        given: what there is.
         names: of the shots; where empty, the first ones.
         limited: whether at most 40 shots and 36,000 rows are taken, as a page holds.
     Raises: ValueError: a name that is not there, results that belong to other tracks, or a shot too long for a page.
     """
     known = _names(given)
-    _check_names(names, known)
+    for name in names:
+        if name not in known:
+            hint = did_you_mean(name, known)
+            raise ValueError(
+                f"--track must name one of the {len(known)} shots; got {shown(name)}.{hint} Correct the name."
+            )
     notes = list(_check_results(given))
     wanted = set(names) if names else set(known[:MOST_SHOTS] if limited else known)
     shots: list[Shot] = []
@@ -90,15 +92,6 @@ def _names(given: Given) -> list[str]:
         return given.dataset.names
     tables = [one for one in (given.states, given.predictions) if one is not None]
     return list(dict.fromkeys(name for one in tables for name in one.rows))
-
-
-def _check_names(names: Sequence[str], known: Sequence[str]) -> None:
-    for name in names:
-        if name not in known:
-            hint = did_you_mean(name, known)
-            raise ValueError(
-                f"--track must name one of the {len(known)} shots; got {shown(name)}.{hint} Correct the name."
-            )
 
 
 def _check_results(given: Given) -> Iterator[str]:

@@ -1,7 +1,5 @@
 """The tables that `ballfg estimate` and `ballfg predict` write, read back track by track."""
 
-from __future__ import annotations
-
 import enum
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -17,10 +17,7 @@ _JOBS: ContextVar[int] = ContextVar("jobs", default=1)
 
 
 def with_jobs(jobs: int, function: Callable[[T], R], argument: T) -> R:
-    """What a function gives, whose parts may use several processes.
-
-    Args: jobs: number of processes.  function: of the argument.
-    """
+    """What a function gives, whose parts may use several processes."""
     token = _JOBS.set(jobs)
     try:
         return function(argument)
@@ -41,9 +38,5 @@ def in_parts(function: Callable[[T], R], parts: Sequence[T], together: int) -> I
         yield from map(function, parts)
         return
     stream = iter(parts)
-    chunks = iter(partial(_taken, stream, together), [])
+    chunks = iter(lambda: list(islice(stream, together)), [])
     yield from in_order(partial(each, function), chunks, others)
-
-
-def _taken(stream: Iterator[T], count: int) -> list[T]:
-    return list(islice(stream, count))

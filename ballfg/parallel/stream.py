@@ -3,9 +3,10 @@
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future
 from functools import partial
 from threading import Thread
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
 from ballfg.parallel.executor import Executor, Pending
 from ballfg.parallel.work import alone
@@ -19,24 +20,6 @@ HELPED: Final = 8
 """Chunks that are done and not yet taken, besides. Memory is bounded by both."""
 LOOK: Final = 0.02
 """s between two looks at what has finished."""
-
-
-class _Here:
-    """A chunk that this process has computed."""
-
-    def __init__(self, value: Any) -> None:
-        self._value = value
-
-    def done(self) -> bool:
-        """It is."""
-        return True
-
-    def result(self) -> Any:
-        """The result."""
-        return self._value
-
-    def cancel(self) -> None:
-        """Nothing is left to give up."""
 
 
 def in_order(
@@ -64,7 +47,9 @@ def in_order(
             if executor.helped and len(pending) < most + HELPED and not pending[0].done():
                 chunk = next(chunks, None)
                 if chunk is not None:
-                    pending.append(_Here(alone(function, chunk)))
+                    here = Future[Iterable[R]]()
+                    here.set_result(alone(function, chunk))
+                    pending.append(here)
                     continue
             yield from pending.popleft().result()
     except KeyboardInterrupt:

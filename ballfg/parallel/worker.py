@@ -18,10 +18,7 @@ _asker: Connection | None = None
 
 
 def serve(handle: int) -> None:
-    """Computes one chunk after another, until nobody asks any more.
-
-    Args: handle: of a connection, for calls and answers.
-    """
+    """Computes one chunk after another, until nobody asks any more."""
     global _asker
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C at the terminal: the process that asks ends this one
     Thread(target=_end_with_asker, daemon=True).start()

@@ -10,7 +10,7 @@ from ballfg.dynamics import KNOWN_BALLS, AnalyticModel, Surfaces, known_ball, mo
 from ballfg.dynamics.model import THIN_SHELL
 from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR, TABLE_LENGTH, TABLE_WIDTH
 from ballfg.files.strict_yaml import read_yaml
-from ballfg.simulation.launcher import TABLE_LAUNCHER, TENNIS_LAUNCHER, SimulatedLauncher
+from ballfg.simulation.launcher import TABLE_LAUNCHER, SimulatedLauncher
 from ballfg.simulation.launchers import LAUNCHERS
 from ballfg.tracks import Ball
 
@@ -63,19 +63,17 @@ def ball_kind(name: str) -> BallKind:
         try:
             return _known(known_ball(name))
         except ValueError as error:
-            raise (error if "badminton" in str(error) else _neither(name)) from None
+            if "badminton" in str(error):
+                raise
+            known = ", ".join(key.replace("_", "-") for key in KNOWN_BALLS)
+            raise FileNotFoundError(
+                f"ball must be {known} or a YAML file that exists; got '{name}'. See ballfg balls and docs/simulate.md."
+            ) from None
     content = read_yaml(path)
     try:
         return ball_from_mapping(content, default_name=path.stem)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
-
-
-def _neither(name: str) -> FileNotFoundError:
-    known = ", ".join(key.replace("_", "-") for key in KNOWN_BALLS)
-    return FileNotFoundError(
-        f"ball must be {known} or a YAML file that exists; got '{name}'. See ballfg balls and docs/simulate.md."
-    )
 
 
 def _known(name: str) -> BallKind:
@@ -113,7 +111,7 @@ def ball_from_mapping(content: Any, default_name: str = "ball") -> BallKind:
     surface = content.get("surface", "table")
     if surface not in ("table", "court"):
         raise ValueError(f"surface must be 'table' or 'court'; got {shown(surface)}. Choose one of them.")
-    launcher = TABLE_LAUNCHER if surface == "table" else TENNIS_LAUNCHER
+    launcher = LAUNCHERS["table_tennis" if surface == "table" else "tennis"]
     return BallKind(
         str(content.get("name", default_name)),
         ball,

@@ -78,7 +78,6 @@ def looking_at(
     """A camera at one point that looks at another and is held level.
 
     Args:
-        name: of the camera.
         centre: (3,) m, where it stands.
         target: (3,) m, what is seen at the principal point.
         focal: px.

@@ -142,19 +142,3 @@ class SimulatedLauncher:
 
 TABLE_LAUNCHER: Final = SimulatedLauncher()
 """For table tennis: returns topspin -3 at low levels, turns +-5 sidespin by 45 degrees, bounces once to three times."""
-
-TENNIS_LAUNCHER: Final = SimulatedLauncher(
-    height=1.0,
-    speed_slow=14.0,
-    speed_fast=26.0,
-    elevation_slow=0.28,
-    elevation_fast=0.10,
-    topspin_scale=50.0,
-    sidespin_scale=50.0,
-    position_spread=0.01,
-    x_low=-3.0,
-    x_high=30.0,
-    y_far=9.0,
-    duration=2.5,
-)
-"""On a court of 23.77 m, from one baseline."""

@@ -41,7 +41,6 @@ def measure(
     """The tracks of a block of shots.
 
     Args:
-        config: noise, rate, seed.
         model: the true ball without random kicks, and how it is measured.
         motion: (n, k) true frames.
         settings: (n, 3) of the launcher.

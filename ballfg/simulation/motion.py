@@ -47,10 +47,8 @@ def simulate_motion(
     """Follows shots until they leave the launcher's view or last too long.
 
     Args:
-        model: the true ball.
         start: (n, 9) first states.
         rate: Hz.
-        surfaces: what the ball bounces on.
         launcher: says where and when a track ends.
         noise: process noise of the flight; that of contacts is in `model`.
         rng: draws the process noise.

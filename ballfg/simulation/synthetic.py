@@ -19,8 +19,6 @@ def simulate(config: SimulationConfig) -> Iterator[SimulatedTrack]:
 
     Memory is that of one block, whatever the number of tracks.
 
-    Args:
-        config: everything about the simulation.
     Returns: an iterator over the tracks in the order of their names, "000", "001" ...
     Raises: ValueError: at once, if an undeclared effect does not go with the model.
     """

@@ -39,7 +39,6 @@ def write_simulation(
 
     Args:
         folder: new or empty; its parent must exist.
-        config: the simulation.
         file_format: "csv" or "parquet", for tracks and truth.
         force: replace a simulated dataset that is there already.
         watch: sees the tracks that are simulated.

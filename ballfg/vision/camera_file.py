@@ -161,7 +161,11 @@ def _camera(name: str, content: Any, posed: bool) -> Camera:
             "Add it, or let 'ballfg calibrate-cameras --intrinsics FILE --table TABLE' find where the camera stands."
         )
     size, offset = fields["size"], fields.get("time_offset", 0.0)
-    if not (isinstance(size, list | tuple) and len(size) == 2 and all(_is_whole(side) for side in size)):
+    if not (
+        isinstance(size, list | tuple)
+        and len(size) == 2
+        and all(is_number(side) and isinstance(side, Integral) for side in size)
+    ):
         raise ValueError(
             f"{where}: size must be width and height in pixels, as [1280, 720]; got {shown(size)}. Correct it."
         )
@@ -178,10 +182,6 @@ def _camera(name: str, content: Any, posed: bool) -> Camera:
         tvec=np.zeros(3) if missing else fields["tvec"],
         time_offset=offset,
     )
-
-
-def _is_whole(value: object) -> bool:
-    return is_number(value) and isinstance(value, Integral)
 
 
 def _fields(node: Mapping[str, Tree], where: str) -> dict[str, Any]:

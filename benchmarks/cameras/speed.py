@@ -1,8 +1,6 @@
 """Times of tracking: three video streams through detection and association, and live updates from sightings."""
 
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,48 +13,30 @@ from ballfg.estimation import Online, Settings, sightings_of
 from ballfg.parallel.processes import Processes
 from ballfg.progress import progress
 from ballfg.simulation.scene import write_scene
-from ballfg.vision import Camera, Detections, detect_all, track_detections
+from ballfg.vision import Detections, detect_all, track_detections
 
 
-@dataclass(frozen=True)
-class StreamTimes:
-    """Wall-clock times of one recording.
+def stream_times(scenario: Scenario, runs: int) -> tuple[int, list[tuple[float, float]]]:
+    """Draws the videos, then times what `ballfg track` does before it draws pictures: a process for each camera.
 
-    Attributes:
-        frames: of each camera.
-        searching: s, videos to candidates, with the start of the processes.
-        associating: s, candidates to balls, and whether the cameras agree.
+    Returns: frames of each camera; for each run the s from videos to candidates, with the start of the processes, and
+        the s from candidates to balls and to whether the cameras agree.
     """
-
-    frames: int
-    searching: float
-    associating: float
-
-    @property
-    def rate(self) -> float:
-        """Frames per second of each camera, everything included."""
-        return self.frames / (self.searching + self.associating)
-
-
-def stream_times(scenario: Scenario, runs: int) -> list[StreamTimes]:
-    """Draws the videos, then times what `ballfg track` does before it draws pictures: a process for each camera."""
-    recording = scenario.recording()
+    recording, times, frames = scenario.recording(), [], 0
     with TemporaryDirectory() as folder:
         scene = Path(folder) / "scene"
         images = f"frames of {scenario.name}, timed"
         write_scene(scene, recording, watch=lambda items, total, _: progress(items, total, images))
         videos = {camera.name: scene / f"{camera.name}.mp4" for camera in recording.cameras}
-        return [_timed(videos, recording.cameras) for _ in progress(range(runs), runs, "runs timed")]
-
-
-def _timed(videos: dict[str, Path], cameras: Sequence[Camera]) -> StreamTimes:
-    Processes(len(videos), helped=False).stop()  # each run starts its processes, as the command does
-    start = time.perf_counter()
-    found: dict[str, Detections] = detect_all(videos, jobs=len(videos))
-    searched = time.perf_counter()
-    track_detections(list(found.values()), cameras)
-    end = time.perf_counter()
-    return StreamTimes(min(len(d.frames) for d in found.values()), searched - start, end - searched)
+        for _ in progress(range(runs), runs, "runs timed"):
+            Processes(len(videos), helped=False).stop()  # each run starts its processes, as the command does
+            start = time.perf_counter()
+            found: dict[str, Detections] = detect_all(videos, jobs=len(videos))
+            searched = time.perf_counter()
+            track_detections(list(found.values()), recording.cameras)
+            times.append((searched - start, time.perf_counter() - searched))
+            frames = min(len(detections.frames) for detections in found.values())
+    return frames, times
 
 
 def push_times(filmed: Filmed) -> list[float]:

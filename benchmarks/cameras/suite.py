@@ -127,11 +127,11 @@ def add_turns(results: Results, found: Sequence[Turn], filmed: Filmed) -> None:
 
 def _add_speed(results: Results, scenario: Scenario, filmed: Filmed, runs: int) -> None:
     """Frames per second and camera on the wall clock, and the latency of live sightings."""
-    timed, add = stream_times(scenario, runs), partial(results.add, "three 1280x720 streams")
+    add, (frames, timed) = partial(results.add, "three 1280x720 streams"), stream_times(scenario, runs)
     name = "a process for each camera"
-    figure = median_and_range([run.rate for run in timed])
-    add(name, "frames_per_second_and_camera", "Hz", figure, timed[0].frames)
-    add(name, "association", "s", float(np.median([run.associating for run in timed])), 1)
+    figure = median_and_range([frames / (searching + associating) for searching, associating in timed])
+    add(name, "frames_per_second_and_camera", "Hz", figure, frames)
+    add(name, "association", "s", float(np.median([associating for _, associating in timed])), 1)
     pushes = push_times(filmed)
     add("online", "push_sighting", "ms", median_and_quartiles(pushes), len(pushes))
     add("online", "push_sighting_p95", "ms", float(np.quantile(pushes, 0.95)), len(pushes))

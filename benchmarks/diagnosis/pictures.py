@@ -82,19 +82,16 @@ def confusion_picture(cases: Sequence[Case], records: Mapping[str, Record], path
         counts = np.zeros((len(planted), len(columns)))
         for case, name in zip(chosen, first, strict=True):
             counts[planted.index(case.subject), columns.index(name)] += 1
-        _draw_shares(axes, counts / np.maximum(counts.sum(axis=1, keepdims=True), 1))
+        shares = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
+        axes.imshow(shares, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
+        for (row, column), value in np.ndenumerate(shares):
+            if value > 0.0:
+                colour = "white" if value > 0.5 else "black"
+                axes.text(column, row, f"{100 * value:.0f}", ha="center", va="center", size=7, color=colour)
         axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize="small")
         axes.set_yticks(range(len(planted)), planted, fontsize="small")
         axes.set(xlabel="named first", ylabel="planted", title=f"{title}, {len(chosen)} datasets")
     return save(figure, path)
-
-
-def _draw_shares(axes: Axes, shares: np.ndarray) -> None:
-    axes.imshow(shares, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
-    for (row, column), value in np.ndenumerate(shares):
-        if value > 0.0:
-            colour = "white" if value > 0.5 else "black"
-            axes.text(column, row, f"{100 * value:.0f}", ha="center", va="center", size=7, color=colour)
 
 
 def repair_picture(rows: Sequence[Row], path: Path) -> Path:

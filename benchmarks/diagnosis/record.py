@@ -80,10 +80,7 @@ def read_record(path: Path, digest: str) -> Record | None:
 
 
 def record_of(case: Case, digest: str, diagnosis: Diagnosis, true: Errors | None, seconds: float) -> Record:
-    """The part of a diagnosis that is kept.
-
-    Args: true: errors of the true model, where it was fitted.
-    """
+    """The part of a diagnosis that is kept."""
     errors = {"before": diagnosis.before, "after": diagnosis.after}
     left = diagnosis.unexplained
     if left.fallback is not None:

@@ -3,7 +3,6 @@
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -40,22 +39,20 @@ def collect_records(
     run.
     """
 
-    def read(case: Case) -> Record | None:
-        return read_record(folder / f"{case.name}.json", case_digest(case))
+    def path(case: Case) -> Path:
+        return folder / f"{case.name}.json"
 
-    found = collect(cases, read, partial(_finish, run, folder), jobs, "diagnoses finished")
+    def finish(case: Case) -> Record | None:
+        try:
+            record = run(case)
+        except Exception as error:  # counted as a failure of the diagnosis: one bad case must not end a long run
+            print(f"{case.name}: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
+            return None
+        record.save(path(case))
+        return record
+
+    found = collect(cases, lambda case: read_record(path(case), case_digest(case)), finish, jobs, "diagnoses finished")
     return {case.name: record for case, record in zip(cases, found, strict=True) if record is not None}
-
-
-def _finish(run: Callable[[Case], Record], folder: Path, case: Case) -> Record | None:
-    """Run a case and keep its record; None, and a line on stderr, if an error stopped it."""
-    try:
-        record = run(case)
-    except Exception as error:  # counted as a failure of the diagnosis: one bad case must not end a long run
-        print(f"{case.name}: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
-        return None
-    record.save(folder / f"{case.name}.json")
-    return record
 
 
 def collect_ideals(
@@ -64,14 +61,13 @@ def collect_ideals(
     """The ideal tests of effects by name: read where they are there, else computed and kept."""
     cases = [ideal_case(name, seed) for name in names]
 
-    def read(case: Case) -> Ideal | None:
-        return read_ideal(folder / f"ideal-{case.subject}.json", case_digest(case))
+    def path(case: Case) -> Path:
+        return folder / f"ideal-{case.subject}.json"
 
-    found = collect(cases, read, partial(_finish_ideal, compute, folder), jobs, "ideal tests finished")
+    def finish(case: Case) -> Ideal:
+        ideal = compute(case)
+        ideal.save(path(case))
+        return ideal
+
+    found = collect(cases, lambda case: read_ideal(path(case), case_digest(case)), finish, jobs, "ideal tests finished")
     return {case.subject: ideal for case, ideal in zip(cases, found, strict=True) if ideal is not None}
-
-
-def _finish_ideal(compute: Callable[[Case], Ideal], folder: Path, case: Case) -> Ideal:
-    ideal = compute(case)
-    ideal.save(folder / f"ideal-{case.subject}.json")
-    return ideal

@@ -25,10 +25,7 @@ def run_loop(
 ) -> list[Path]:
     """Plant, diagnose, judge, and add the rows. Finished cases are kept: a run that was stopped goes on where it was.
 
-    Args:
-        data: folders of measured tracks, for the part that needs some.
-        out: an existing folder.
-        run: makes the record of a case.  ideal: computes the ideal test of a case.
+    Args: data: folders of measured tracks, for the part that needs some.  out: an existing folder.
     Returns: the pictures written.
     """
     from ballfg.benchmarks.diagnosis.pictures import confusion_picture, power_picture, repair_picture

@@ -24,10 +24,7 @@ from ballfg.tracks import Dataset
 
 
 def true_errors(case: Case, dataset: Dataset) -> Errors:
-    """Errors of the true model on the held-out half, its coefficients fitted to the other half.
-
-    Args: case: with planted effects of the catalogue and one session.  dataset: its tracks.
-    """
+    """Errors of the true model on the held-out half, its coefficients fitted to the other half."""
     truth, declared = actual_model(case), declared_model(case, dataset.info.ball.radius)
     holdout = hold_out(dataset, declared)  # the diagnosis splits in the same way
     moving = plainly_measured(truth)

@@ -1,9 +1,7 @@
 """One launch with many spins: the paths that a dynamics model predicts for each launcher setting."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -26,29 +24,20 @@ DIGITS: Final = 5
 """Of a kept coordinate in m, 0.01 mm."""
 
 
+Point = tuple[float, float, float]
+
+
 @dataclass(frozen=True)
 class Fan:
     """Paths from one launch.
 
     Attributes:
-        topspin: by level, (k, 3) m, without sidespin.
-        sidespin: by level, (k, 3) m, without topspin.
+        topspin: by level, m, without sidespin, to `DIGITS`.
+        sidespin: by level, m, without topspin.
     """
 
-    topspin: dict[int, Array]
-    sidespin: dict[int, Array]
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain lists."""
-        return {
-            name: {str(level): np.round(path, DIGITS).tolist() for level, path in group.items()}
-            for name, group in vars(self).items()
-        }
-
-    @classmethod
-    def from_json(cls, content: dict[str, Any]) -> Fan:
-        """The fan that `to_json` wrote."""
-        return cls(**{name: {int(k): np.array(path) for k, path in group.items()} for name, group in content.items()})
+    topspin: dict[int, list[Point]]
+    sidespin: dict[int, list[Point]]
 
 
 def fan_of(contender: GraphContender) -> Fan:
@@ -56,14 +45,15 @@ def fan_of(contender: GraphContender) -> Fan:
     return Fan(_paths(contender, "topspin"), _paths(contender, "sidespin"))
 
 
-def _paths(contender: GraphContender, setting: str) -> dict[int, Array]:
+def _paths(contender: GraphContender, setting: str) -> dict[int, list[Point]]:
     """The paths by the levels of one setting, the other one being zero."""
     levels, start = SETTING_LEVELS[setting], _launch()
     states = np.tile(start, (len(levels), 1))
     for row, level in zip(states, levels, strict=True):
         row[SPIN] = _spin(contender, start, {setting: float(level)})
     times = np.arange(round(DURATION * RATE) + 1) / RATE
-    return dict(zip(levels, contender.roll(states, [times] * len(levels)), strict=True))
+    paths = contender.roll(states, [times] * len(levels))
+    return {level: np.round(path, DIGITS).tolist() for level, path in zip(levels, paths, strict=True)}
 
 
 def _launch() -> Array:

@@ -133,7 +133,8 @@ def fan_picture(records: Sequence[Record], table_height: float, path: Path) -> P
         colours = ScalarMappable(Normalize(-top, top), "coolwarm")
         figure.colorbar(colours, ax=row, label=f"{name} level", shrink=0.8)
         for axes, method in zip(row, shown, strict=True):
-            for level, whole in vars(fans[method])[name].items():
+            for level, points in vars(fans[method])[name].items():
+                whole = np.array(points)
                 on_table = whole[np.maximum.accumulate(whole[:, 0]) <= TABLE_LENGTH]
                 axes.plot(on_table[:, 0], on_table[:, across], color=colours.to_rgba(level), linewidth=1.4)
             axes.set(aspect="equal", xlim=(-MARGIN, TABLE_LENGTH + MARGIN))

@@ -1,15 +1,12 @@
 """The record of a finished contender: its errors on every validation track, as a JSON file that a later run reads."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import TypeAdapter
 
 from ballfg.benchmarks.dynamics.fan import Fan
 from ballfg.benchmarks.dynamics.scoring import PathScore
@@ -44,40 +41,7 @@ class Record:
 
     def save(self, path: Path) -> None:
         """Write the file whole or not at all."""
-        fan = None if self.fan is None else self.fan.to_json()
-        write_record(path, vars(self) | {"scores": [score.to_json() for score in self.scores], "fan": fan})
-
-    @classmethod
-    def from_json(cls, content: dict[str, Any]) -> Record:
-        """The record that `save` wrote. Raises: ValueError: it is another one."""
-        _Content.model_validate(content)
-        scores, fan = tuple(map(PathScore.from_json, content["scores"])), content["fan"]
-        return cls(**content | {"scores": scores, "fan": None if fan is None else Fan.from_json(fan)})
-
-
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
-
-
-class _Score(_Part):
-    track: tuple[float | None, int]
-    rest: tuple[float | None, int]
-    apex: tuple[float | None, float | None, float | None]
-    apex_ahead: tuple[bool, bool, bool]
-
-
-class _Content(_Part):
-    """What a record must hold."""
-
-    digest: str
-    method: str
-    seed: int
-    parameters: int
-    training_time: float
-    inference_time: float
-    not_converged: int
-    scores: list[_Score]
-    fan: dict[Literal["topspin", "sidespin"], dict[int, list[tuple[float, float, float]]]] | None
+        write_record(path, asdict(self))
 
 
 def read_record(path: Path, digest: str) -> Record | None:
@@ -85,7 +49,7 @@ def read_record(path: Path, digest: str) -> Record | None:
 
     Raises: ValueError: if the file is no record.
     """
-    return read_any(path, digest, Record.from_json, "a finished run")
+    return read_any(path, digest, TypeAdapter(Record).validate_python, "a finished run")
 
 
 def task_digest(task: Task, recipe: str) -> str:

@@ -37,13 +37,12 @@ def figures(record: Record, measured: bool) -> Iterator[tuple[str, str, float, i
     """
     scores = record.scores
     n = len(scores)
-    if np.isfinite([s.track_sum for s in scores]).all():
-        yield "track_rmse", "m", pooled_rmse([s.track_sum for s in scores], [s.track_points for s in scores]), n
+    if all(s.track[0] is not None for s in scores):
+        yield "track_rmse", "m", pooled_rmse([s.track for s in scores]), n
         yield "track_rmse_median", "m", float(np.median([s.track_rmse for s in scores])), n
-    ahead = [s for s in scores if s.rest_points]
+    ahead = [s for s in scores if s.rest[1]]
     if ahead:
-        pooled = pooled_rmse([s.rest_sum for s in ahead], [s.rest_points for s in ahead])
-        yield "rest_rmse", "m", pooled, len(ahead)
+        yield "rest_rmse", "m", pooled_rmse([s.rest for s in ahead]), len(ahead)
         median = float(np.median([s.rest_rmse for s in ahead]))
         yield "rest_rmse_median", "m", median, len(ahead)
         if measured:
@@ -57,7 +56,7 @@ def figures(record: Record, measured: bool) -> Iterator[tuple[str, str, float, i
 
 def _apex_figures(scores: Sequence[PathScore]) -> Iterator[tuple[str, str, float, int]]:
     """Mean and standard deviation of apex errors by flight: of all, and of those after the observed part."""
-    errors, ahead = np.stack([s.apex for s in scores]), np.stack([s.apex_ahead for s in scores])
+    errors, ahead = np.array([s.apex for s in scores], dtype=np.float64), np.array([s.apex_ahead for s in scores])
     for suffix, counted in (("", np.isfinite(errors)), ("_ahead", np.isfinite(errors) & ahead)):
         for flight, name in enumerate(APEXES):
             found = errors[counted[:, flight], flight]

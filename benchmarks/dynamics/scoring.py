@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,55 +19,32 @@ class PathScore:
     """The errors of one predicted path.
 
     Attributes:
-        track_sum: m^2, of the squared distances over all judged samples; NaN if some were not predicted.
-        track_points: number of these samples.
-        rest_sum, rest_points: the same over the judged samples after the observed ones.
-        apex: (3,) m, distance between predicted and reference apex by flight (`APEXES`); NaN where either is missing.
-        apex_ahead: (3,) whether the reference apex lies after the observed part.
+        track: m^2, of the squared distances over all judged samples (None if some were not predicted); their number.
+        rest: the same over the judged samples after the observed ones.
+        apex: m, distance between predicted and reference apex by flight (`APEXES`); None where either is missing.
+        apex_ahead: whether the reference apex lies after the observed part.
     """
 
-    track_sum: float
-    track_points: int
-    rest_sum: float
-    rest_points: int
-    apex: Array
-    apex_ahead: NDArray[np.bool_]
+    track: tuple[float | None, int]
+    rest: tuple[float | None, int]
+    apex: tuple[float | None, float | None, float | None]
+    apex_ahead: tuple[bool, bool, bool]
 
     @property
     def track_rmse(self) -> float:
-        """m, root mean square distance over the judged samples."""
-        return float(np.sqrt(self.track_sum / self.track_points))
+        """m, root mean square distance over the judged samples; NaN if some were not predicted."""
+        return pooled_rmse([self.track])
 
     @property
     def rest_rmse(self) -> float:
         """m, the same after the observed part; NaN where nothing is left to predict."""
-        return float(np.sqrt(self.rest_sum / self.rest_points)) if self.rest_points else float("nan")
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain numbers; null where there is none."""
-        numbers = [self.track_sum, self.rest_sum, *self.apex]
-        track, rest, *apex = (float(number) if np.isfinite(number) else None for number in numbers)
-        return {
-            "track": [track, self.track_points],
-            "rest": [rest, self.rest_points],
-            "apex": apex,
-            "apex_ahead": self.apex_ahead.tolist(),
-        }
-
-    @classmethod
-    def from_json(cls, content: dict[str, Any]) -> PathScore:
-        """The score that `to_json` wrote."""
-        (track, track_points), (rest, rest_points) = content["track"], content["rest"]
-        numbers = np.array([track, rest, *content["apex"]], dtype=np.float64)  # None becomes NaN
-        ahead = np.array(content["apex_ahead"], dtype=bool)
-        return cls(float(numbers[0]), int(track_points), float(numbers[1]), int(rest_points), numbers[2:], ahead)
+        return pooled_rmse([self.rest])
 
 
 def score_path(shot: Shot, predicted: Array) -> PathScore:
     """The errors of a path predicted for a shot.
 
     Args:
-        shot: what it is judged by.
         predicted: (n, 3) m at the shot's stamps; NaN at observed stamps by methods that predict only what comes after.
     Raises: ValueError: if the shape is another, or an unobserved position is not finite.
     """
@@ -79,14 +55,11 @@ def score_path(shot: Shot, predicted: Array) -> PathScore:
     squares = square_norms(predicted - shot.reference)[: shot.judged]
     rest = squares[shot.observed :]
     times = shot.track.times
-    return PathScore(
-        track_sum=float(squares.sum()),
-        track_points=len(squares),
-        rest_sum=float(rest.sum()),
-        rest_points=len(rest),
-        apex=apex_errors(times, predicted, shot.bounces, shot.apexes, shot.apex_times),
-        apex_ahead=shot.apex_times > times[shot.observed - 1],
-    )
+    errors = apex_errors(times, predicted, shot.bounces, shot.apexes, shot.apex_times)
+    first, second, third = (float(error) if np.isfinite(error) else None for error in errors)
+    whole = float(squares.sum()) if np.isfinite(squares).all() else None
+    a, b, c = (shot.apex_times > times[shot.observed - 1]).tolist()
+    return PathScore((whole, len(squares)), (float(rest.sum()), len(rest)), (first, second, third), (a, b, c))
 
 
 def apex_errors(times: Array, predicted: Array, bounces: Array, apexes: Array, apex_times: Array) -> Array:
@@ -110,6 +83,7 @@ def apex_errors(times: Array, predicted: Array, bounces: Array, apexes: Array, a
     return errors
 
 
-def pooled_rmse(sums: Sequence[float], points: Sequence[int]) -> float:
-    """m: root mean square distance over all samples of all tracks."""
-    return float(np.sqrt(sum(sums) / sum(points)))
+def pooled_rmse(parts: Sequence[tuple[float | None, int]]) -> float:
+    """m: root mean square distance over all samples of sums of squares with their numbers; NaN where one is unknown."""
+    number = sum(points for _, points in parts)
+    return float(np.sqrt(sum(np.nan if total is None else total for total, _ in parts) / number)) if number else np.nan

@@ -46,10 +46,7 @@ def run_dynamics(
 ) -> list[Path]:
     """Train, judge, and add the rows. Finished methods are kept in `out`: a run that was stopped goes on where it was.
 
-    Args:
-        data: measured tracks; None for synthetic ones.
-        out: an existing folder.
-        methods: names in `METHODS`, None for all; those that do not take part on such tracks are passed over.
+    Args: methods: names in `METHODS`, None for all; those that do not take part on such tracks are passed over.
     Returns: the pictures written.
     Raises: ValueError: if a method's name is unknown.
     """

@@ -43,13 +43,14 @@ def trained_contender(job: Job, task: Task) -> Contender:
         predictor = SequencePredictor.load(folder / FOLDER)
         return SequenceContender(job.method, predictor.parameter_count, seconds, predictor)
     model = load_model(folder / MODEL, radius=task.info.ball.radius)
+    launcher = None if model.trained is None else model.trained.launcher
     return GraphContender(
         name=job.method,
         model=model,
         surfaces=task.surfaces,
         settings=learned_settings(task, model),
         onward=job.measured,
-        parameter_count=_learned_numbers(model),
+        parameter_count=sum(p.numel() for part in (model, launcher) if part is not None for p in part.parameters()),
         training_seconds=seconds,
     )
 
@@ -117,12 +118,6 @@ def learned_settings(task: Task, model: BallModel) -> Settings:
         launcher=launcher_of(task.info, model),
         coefficients={},
     )
-
-
-def _learned_numbers(model: BallModel) -> int:
-    """The model's parameters and those of its launcher."""
-    launcher = None if model.trained is None else model.trained.launcher
-    return sum(p.numel() for part in (model, launcher) if part is not None for p in part.parameters())
 
 
 @dataclass

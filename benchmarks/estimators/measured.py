@@ -1,7 +1,5 @@
 """The comparison on measured tracks, where no truth exists: predict what was measured later."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial

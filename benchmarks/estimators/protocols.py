@@ -1,7 +1,5 @@
 """Tracks with known truth by the paper's protocol and by the fair one, and the estimators that are compared on them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,17 +51,14 @@ def score_tracks(
 ) -> Scores:
     """Scores of every candidate on every track.
 
-    Args:
-        candidates: by method.  tracks: with their truth.
-        counts: numbers of observations for `TrackScore.newest`.
-        jobs: processes.  what: for the progress line.
+    Args: counts: numbers of observations for `TrackScore.newest`.  what: for the progress line.
     """
-    per_track = in_processes(partial(_score_all, candidates, counts), tracks, jobs, what)
+
+    def scored(case: Case) -> dict[str, TrackScore]:
+        return {name: score_track(candidate, case, counts) for name, candidate in candidates.items()}
+
+    per_track = in_processes(scored, tracks, jobs, what)
     return {name: [scores[name] for scores in per_track] for name in candidates}
-
-
-def _score_all(candidates: Mapping[str, Candidate], counts: Sequence[int], case: Case) -> dict[str, TrackScore]:
-    return {name: score_track(candidate, case, counts) for name, candidate in candidates.items()}
 
 
 def score_track(candidate: Candidate, case: Case, counts: Sequence[int]) -> TrackScore:

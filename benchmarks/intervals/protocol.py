@@ -5,8 +5,6 @@ package's constants with the scatter of the samples. "From observed parts" it co
 tracks, "from other tracks" from whole tracks of the half that is not judged.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -85,14 +83,7 @@ def judged_both_ways(
 ) -> Judged:
     """All tracks judged, each half with noise that knows nothing of its later parts.
 
-    Args:
-        method: of `METHODS`.
-        model: the ball.
-        surfaces: what it may bounce on.
-        settings: as usual.
-        tracks: of a set.
-        jobs: processes.
-        position_known: whether the noise of positions is stated.
+    Args: method: of `METHODS`.  settings: as usual.  position_known: whether the noise of positions is stated.
     """
     halves = tracks[0::2], tracks[1::2]
     parts = []

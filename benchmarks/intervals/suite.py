@@ -1,7 +1,5 @@
 """Coverage of 90 % intervals on measured datasets, and on simulated ones whose trackers have a memory and jitter."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -68,10 +66,6 @@ def run_intervals(
     """Rows for measured datasets, or for simulated ones where there are none.
 
     Args:
-        results: to add to.
-        datasets: measured ones.
-        plan: how much is simulated.
-        jobs: processes.
         first: how many tracks of a measured dataset are used, the first ones; None for all.
         diagnosed: whether simulated tracks are predicted with the model that a diagnosis of others made.
     """

@@ -4,8 +4,6 @@ The noise is that of the observed parts of the judged tracks, as in `ballfg pred
 judged in the same way. Nothing of the judged datasets is used but these parts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations

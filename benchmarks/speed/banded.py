@@ -5,8 +5,6 @@ of the acceleration, x_{k+1} = x_k + dt v_k + dt^2/2 a_k, v_{k+1} = v_k + dt a_k
 one unknown. 483 numbers; the normal equations are a band with three columns more.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Comparison of times with those of an earlier run, each as a multiple of the control that was timed beside it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
@@ -31,9 +29,7 @@ class SlowerError(Exception):
 def check_ratios(rows: Sequence[Row], baseline: Path) -> list[str]:
     """One line for each time of the baseline: its ratio to the control then and now.
 
-    Args:
-        rows: of this run.
-        baseline: the `results.json` of an earlier run.
+    Args: baseline: the `results.json` of an earlier run.
     Raises:
         SlowerError: if a ratio has grown by more than `SLOWER`; it names all of them.
         ValueError: if the file holds no times that this run has too.
@@ -62,22 +58,17 @@ def check_ratios(rows: Sequence[Row], baseline: Path) -> list[str]:
 
 def _ratios(rows: Sequence[Row]) -> dict[tuple[str, str, str], float]:
     """Times over the control of the same case, by case, method and metric."""
-    controls, found = _controls(rows), dict[tuple[str, str, str], float]()
+    controls, found = dict[str, float](), dict[tuple[str, str, str], float]()
+    for row in rows:
+        time = _time(row)
+        if row.metric == CONTROL and time is not None:
+            controls[row.case] = min(time, controls.get(row.case, time))
     for row in rows:
         steady = row.metric != CONTROL and not row.metric.startswith(UNSTEADY) and not row.metric.endswith(RARE)
         steady = steady and not row.method.endswith("unrolled")
         time = _time(row)
         if row.unit == "ms" and steady and time is not None and row.case in controls:
-            found[row.case, row.method, row.metric] = time / min(controls[row.case])
-    return found
-
-
-def _controls(rows: Sequence[Row]) -> dict[str, list[float]]:
-    found: dict[str, list[float]] = {}
-    for row in rows:
-        time = _time(row)
-        if row.metric == CONTROL and time is not None:
-            found.setdefault(row.case, []).append(time)
+            found[row.case, row.method, row.metric] = time / controls[row.case]
     return found
 
 

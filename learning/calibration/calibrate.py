@@ -7,6 +7,7 @@ docs/train.md.
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
@@ -26,10 +27,11 @@ from ballfg.estimation import (
     estimate_tracks,
     spread_over,
 )
+from ballfg.estimation.batch import map_tracks
 from ballfg.learning.calibration.coefficients import Chosen, choose, with_values
 from ballfg.learning.calibration.population import Evidence, evidence, fit_population
 from ballfg.learning.config.calibration import CalibrationConfig
-from ballfg.learning.evaluation import TrackScore, judge_tracks
+from ballfg.learning.evaluation import TrackScore, judge_track
 from ballfg.learning.split import Split, split_tracks, tracks_of
 from ballfg.progress import Watch, unwatched
 from ballfg.tracks import Dataset
@@ -136,7 +138,8 @@ def score(
     horizon = np.inf if config.horizon is None else config.horizon
     estimator = problem.estimator(values, settings or problem.settings)
     tracks = tracks_of(problem.dataset, names)
-    scores = judge_tracks(estimator, tracks, config.observed_share, horizon, problem.jobs, len(names))
+    judge = partial(judge_track, estimator, observed_share=config.observed_share, horizon=horizon)
+    scores = map_tracks(judge, tracks, len(names), problem.jobs)
     return tuple(watch(scores, len(names), "tracks judged"))
 
 

@@ -33,7 +33,6 @@ class Section(BaseModel):
     def renamed(cls, content: Mapping[str, Any]) -> dict[str, Any]:
         """The content under the names of today; an earlier name brings a `DeprecationWarning`.
 
-        Args: content: fields by name.
         Raises: ValueError: if it has a field under both names.
         """
         for earlier, name in cls.EARLIER.items():

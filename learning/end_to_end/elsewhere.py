@@ -1,7 +1,5 @@
 """What a residual network has to know to be used in other rooms: where it was trained, and the noise there."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
@@ -61,9 +59,6 @@ def noise_elsewhere(base: BallModel, shots: Sequence[Shot]) -> TrackNoise | None
 
     Acceleration is the least of the rooms: tracks with hits that nobody found show more. Others are means.
 
-    Args:
-        base: the analytic model as trained.
-        shots: that trained.
     Returns: its coefficients as the learned model names them; None where no track is long enough.
     """
     found = []
@@ -91,11 +86,6 @@ def strength_abroad(model: LearnedModel, noise: TrackNoise, shots: Sequence[Shot
 
     Abroad the coefficients of the base are estimated with each track, which already takes in much of what a correction
     does. So held-out tracks are predicted in that way, with and without the correction.
-
-    Args:
-        model: that fades.
-        noise: of its training, for other rooms.
-        shots: held out.
     """
     if not shots or model.fading is None:
         return 0.0

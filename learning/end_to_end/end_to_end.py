@@ -81,7 +81,6 @@ class EndToEnd(Trainee):
     Args:
         shots: all of them; batches are numbers of shots.
         method: of the gradient through the estimate; by default `ImplicitGradient`.
-        seed: of the augmentation.
         augment: whether shots are rotated and shifted in training.
         optimizer: solves the estimates, with its tolerance.
         linear_solver: for the Hessians of a batch.

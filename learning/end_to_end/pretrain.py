@@ -75,7 +75,6 @@ def difference(model: BallModel, flying: Tensor, bouncing: Tensor, rates: Rates,
     """() sum of the mean square differences of a model's flight and bounce from given ones, in their units.
 
     Args:
-        model: to compare.
         flying: (n, 9) states.  rates: the given ones there.
         bouncing: (n, 9) states before a bounce.  after: (n, 9), the given states after it.
     """

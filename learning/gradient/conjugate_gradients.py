@@ -51,7 +51,6 @@ class ConjugateGradients:
     """Preconditioned conjugate gradients on blocks, in lockstep.
 
     Args:
-        factors: the preconditioner.
         owners: (n,) block number of each entry of a vector.
         tolerance: largest residual of a block relative to the right side, in the metric of the preconditioner.
         max_iterations: largest number of products with the Hessian.

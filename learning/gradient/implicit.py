@@ -43,9 +43,7 @@ class GradientMethod(ABC):
         """The solution (n,), in the units of `solve`, differentiable in the parameters.
 
         Args:
-            solve: finds the point.
             stationarity: the derivative that is zero there.
-            linear_solver: for the Hessian.
             parameters: leaf tensors of any shape and unit that may receive a gradient.
         """
 

@@ -30,8 +30,6 @@ def negative_log_likelihood(
     Robust losses count as Gaussians with each residual's weight at the minimum.
 
     Args:
-        graphs: one per track.
-        minima: of their objectives.
         factors: their Gauss-Newton factorisations there.
         noise: relative to that of the graphs, to which its value must be equal.
     """

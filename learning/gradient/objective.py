@@ -72,7 +72,6 @@ class BatchObjective:
     """Sum over factors of the losses, for each track of a batch.
 
     Args:
-        graphs: one per track.
         values: of each track, for the number of states and coefficients.
 
     Raises: ValueError: if some tracks have a tracker's biases and others none.

@@ -6,14 +6,13 @@ import io
 from contextlib import ExitStack, redirect_stderr, redirect_stdout
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.registry import TRAINEES
 from ballfg.learning.run import run_folder as files
 from ballfg.learning.run.checkpoint import Checkpoint, read_checkpoint
 from ballfg.learning.run.loop import Task, Training, TrainingStoppedError
-from ballfg.learning.run.metrics import Epoch
 from ballfg.learning.run.ranks import TOLD_BY_FIRST, Ranks, join_ranks
 from ballfg.learning.trainee import Prepared
 from ballfg.progress import Watch, unwatched
@@ -42,7 +41,6 @@ def run_training(
         before the first step.
 
     Args:
-        config: of the training.
         folder: to write; that of the earlier run if it is to `resume`.
         resume: continue from the last checkpoint.
         watch: sees the batches pass in the first process, for instance to show progress.
@@ -54,37 +52,32 @@ def run_training(
         SystemExit: in the other processes, where the first one raises.
     """
     with join_ranks() as ranks, ExitStack() as stack:
-        ranks.from_first(partial(_enter, stack, folder, config, resume))
+        ranks.from_first(lambda: stack.enter_context(files.running(folder, config, resume=resume)))
         trainee, train, validation = ranks.together(lambda: _built(ranks, config))
         # processes on machines of other kinds too begin with the same weights, bit for bit
         trainee.module.load_state_dict(ranks.from_first(trainee.module.state_dict))
         checkpoint = ranks.from_first(lambda: read_checkpoint(folder) if resume else None)
         task = Task(trainee, tuple(train), tuple(validation), config, ranks, watch)
         training = ranks.together(lambda: Training(task, checkpoint))
-        record = ranks.together(lambda: _opened(task, folder, checkpoint) if ranks.first else None)
+        record, ending = ranks.together(lambda: _opened(task, folder, checkpoint))
         try:
             for epoch in training.epochs():
                 due = epoch.epoch % config.checkpoint_every == 0 or epoch.epoch == config.optimizer.epochs
                 kept = training.checkpoint() if due else None
-                ranks.from_first(partial(_write, record, epoch, kept))
+                ranks.from_first(partial(record.write, epoch, kept) if record is not None else lambda: None)
             training.take_best()
-            return ranks.from_first(lambda: 0 if record is None else _finish(training, record, command))
+            return ranks.from_first(lambda: 0 if record is None else ending.finish(training, record, command))
         except TrainingStoppedError:
             if not ranks.first:
                 raise SystemExit(TOLD_BY_FIRST) from None
             raise
         except KeyboardInterrupt:
             if record is not None:
-                _stop(training, record, command)
+                ending.stop(training, record, command)
             raise
         finally:
             if record is not None:
                 record.close()
-
-
-def _enter(stack: ExitStack, folder: Path, config: TrainConfig, resume: bool) -> None:
-    """Keep other runs from the folder until the stack is closed."""
-    stack.enter_context(files.running(folder, config, resume=resume))
 
 
 def _built(ranks: Ranks, config: TrainConfig) -> Prepared:
@@ -96,27 +89,14 @@ def _built(ranks: Ranks, config: TrainConfig) -> Prepared:
         return build(config)
 
 
-def _write(record: Record | None, epoch: Epoch, checkpoint: Checkpoint | None) -> None:
-    if record is not None:
-        record.write(epoch, checkpoint)
+def _opened(task: Task, folder: Path, checkpoint: Checkpoint | None) -> tuple[Record | None, Any]:
+    """What writes the run, and what ends it; none but in the first process.
 
-
-# Pictures and TensorBoard take half a second to import; the other processes do without.
-
-
-def _opened(task: Task, folder: Path, checkpoint: Checkpoint | None) -> Record:
+    Pictures and TensorBoard take half a second to import; the other processes do without.
+    """
+    if not task.ranks.first:
+        return None, None
+    from ballfg.learning.run import ending
     from ballfg.learning.run.record import Record
 
-    return Record(task, folder, checkpoint)
-
-
-def _finish(training: Training, record: Record, command: str) -> int:
-    from ballfg.learning.run.ending import finish
-
-    return finish(training, record, command)
-
-
-def _stop(training: Training, record: Record, command: str) -> None:
-    from ballfg.learning.run.ending import stop
-
-    stop(training, record, command)
+    return Record(task, folder, checkpoint), ending

@@ -79,7 +79,6 @@ def page(
 
     Args:
         title: kind of the model and number of its tracks.
-        epochs: all that were run.
         best_epoch: whose weights were written.
         curves: loss and errors over the epochs.
         learned: coefficients and noise before and after.

@@ -32,9 +32,6 @@ class SequenceModel(nn.Module, ABC):
     def losses(self, batch: Batch, draws: Sequence[Draw]) -> tuple[Tensor, Tensor]:
         """The losses of a batch.
 
-        Args:
-            batch: with a measured rest.
-            draws: one for each track.
         Returns: (losses, positions): (b,) differentiable, in squared units of the frame; (b, m, 3) m, the rest as
             predicted in training, without gradient.
         """

@@ -53,11 +53,6 @@ class SequencePredictor:
 
     A prediction reaches as far as the longest rest in training; beyond that it goes straight on.
     Frames may be dropped, but the observed part should last as long as in training: a model has learned no other.
-
-    Args:
-        architecture: of the model.
-        launcher: which labels are settings, as in training.
-        model: trained.
     """
 
     architecture: SequenceArchitecture

@@ -29,7 +29,6 @@ class SequenceTrainee(Trainee):
     A track that cannot be used - too short, launcher settings missing - counts as failed in each batch.
 
     Args:
-        tracks: all parts.
         observed: number of observed samples of each.
         train: numbers of the training tracks, from which the model takes its scales; at least one that can be used.
         architecture: kind and size.

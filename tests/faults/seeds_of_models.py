@@ -145,8 +145,8 @@ def write_records(folder: Path) -> None:
 
 def contender_record() -> ContenderRecord:
     """A finished contender."""
-    fan = Fan({0: np.zeros((3, 3)), 10: np.ones((3, 3))}, {-5: np.ones((2, 3))})
-    score = PathScore(0.5, 10, float("nan"), 0, np.array([0.1, np.nan, 0.2]), np.array([True, False, True]))
+    fan = Fan({0: [(0.0, 0.0, 0.0)] * 3, 10: [(1.0, 1.0, 1.0)] * 3}, {-5: [(1.0, 1.0, 1.0)] * 2})
+    score = PathScore((0.5, 10), (None, 0), (0.1, None, 0.2), (True, False, True))
     return ContenderRecord("d", "mnn", 1, 500, 12.5, 0.002, 1, (score, score), fan)
 
 

@@ -129,7 +129,7 @@ def test_errors_of_a_shifted_path_are_the_shift(hops) -> None:  # type: ignore[n
     assert score.track_rmse == pytest.approx(0.005)
     assert score.rest_rmse == pytest.approx(0.005)
     np.testing.assert_allclose(score.apex, 0.005, atol=1e-9)
-    assert score.apex_ahead.tolist() == [False, True, True]  # 60 samples end at 0.49 s
+    assert score.apex_ahead == (False, True, True)  # 60 samples end at 0.49 s
 
 
 def test_a_path_that_is_late_by_some_time_is_off_by_speed_times_time() -> None:
@@ -147,7 +147,7 @@ def test_methods_that_predict_the_rest_only_are_judged_by_the_rest_only(hops) ->
     score = score_path(shot(times, states, bounces), path)
     assert np.isnan(score.track_rmse)
     assert score.rest_rmse == pytest.approx(0.002)
-    assert np.isnan(score.apex[0])  # its top was observed
+    assert score.apex[0] is None  # its top was observed
     np.testing.assert_allclose(score.apex[1:], 0.002, atol=1e-9)
 
 
@@ -163,4 +163,4 @@ def test_bad_predictions_are_refused(hops) -> None:  # type: ignore[no-untyped-d
 
 
 def test_pooled_rmse_weighs_samples() -> None:
-    assert pooled_rmse([1.0, 8.0], [1, 2]) == pytest.approx(np.sqrt(3.0))
+    assert pooled_rmse([(1.0, 1), (8.0, 2)]) == pytest.approx(np.sqrt(3.0))

@@ -1,7 +1,5 @@
 """Positions out of rosbag2 folders and MCAP files, without ROS: the extra `ros`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any

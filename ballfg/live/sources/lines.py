@@ -1,7 +1,5 @@
 """Lines of a stream to samples: CSV `t,x,y,z` or JSON, each line by itself."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -56,14 +54,11 @@ class LineReader:
             return _of_json(text)
         cells = [cell.strip() for cell in text.split(",")]
         if all(name in cells for name in COLUMNS):
-            self._name_columns(cells)
+            self._order = [cells.index(name) for name in COLUMNS]
+            self._sigma_order = [cells.index(name) for name in SIGMAS] if all(s in cells for s in SIGMAS) else None
+            self._width = len(cells)
             return None
         return self._of_cells(cells)
-
-    def _name_columns(self, names: list[str]) -> None:
-        self._order = [names.index(name) for name in COLUMNS]
-        self._sigma_order = [names.index(name) for name in SIGMAS] if all(s in names for s in SIGMAS) else None
-        self._width = len(names)
 
     def _of_cells(self, cells: list[str]) -> Sample:
         if self._order is None:

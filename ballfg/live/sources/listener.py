@@ -1,7 +1,5 @@
 """What listening over TCP and over UDP have in common: an address of its own, and words to senders and to the user."""
 
-from __future__ import annotations
-
 import selectors
 import socket
 import sys

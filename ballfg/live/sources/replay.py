@@ -1,7 +1,5 @@
 """A dataset as a stream: its tracks one after the other, at the rate at which they were measured."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterable, Iterator
 from time import perf_counter
@@ -9,7 +7,7 @@ from time import perf_counter
 from ballfg.live.sources.lines import Sample
 from ballfg.live.sources.sender import Line, Sender
 from ballfg.live.sources.source import Source
-from ballfg.tracks import Dataset, Track
+from ballfg.tracks import Dataset
 from ballfg.tracks.stamps import written
 
 PAUSE = 1.0
@@ -53,13 +51,9 @@ def dataset_samples(dataset: Dataset) -> Iterator[Sample]:
     begins = 0.0  # s, the track's first sample since that of the first track
     for track in dataset:
         origin = float(track.times[0]) if origin is None else origin
-        yield from _track_samples(track, origin, begins)
+        moments = zip(track.times.tolist(), track.seconds.tolist(), track.positions.tolist(), strict=True)
+        for k, (time, since, position) in enumerate(moments):
+            sigmas = None if track.sigmas is None else [track.sigmas[k].tolist()]
+            stamp = float(written(begins + since, origin))
+            yield Sample(stamp, [position], sigmas, (("trajectory", track.name), ("t_track", time)))
         begins += track.duration + PAUSE
-
-
-def _track_samples(track: Track, origin: float, begins: float) -> Iterator[Sample]:
-    moments = zip(track.times.tolist(), track.seconds.tolist(), track.positions.tolist(), strict=True)
-    for k, (time, since, position) in enumerate(moments):
-        sigmas = None if track.sigmas is None else [track.sigmas[k].tolist()]
-        stamp = float(written(begins + since, origin))
-        yield Sample(stamp, [position], sigmas, (("trajectory", track.name), ("t_track", time)))

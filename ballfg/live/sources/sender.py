@@ -61,8 +61,6 @@ class LineBuffer:
 class Sender:
     """One who sends lines, and those of its lines that wait to be answered.
 
-    Args: name: its address, for messages.
-
     Attributes:
         waiting: lines, or samples of a replay, with the time at which they were read (s, `time.perf_counter`).
         most: how many may wait now.

@@ -1,7 +1,5 @@
 """Samples from the network: lines over TCP, or packets over UDP."""
 
-from __future__ import annotations
-
 import re
 
 from ballfg.checks import shown

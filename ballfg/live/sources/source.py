@@ -1,7 +1,5 @@
 """Where samples come from: the interface of all sources, standard input, and the inbox in which live lines wait."""
 
-from __future__ import annotations
-
 import os
 import stat
 import sys

@@ -1,7 +1,5 @@
 """Lines over TCP."""
 
-from __future__ import annotations
-
 import socket
 import threading
 from collections.abc import Iterator
@@ -19,8 +17,6 @@ PIECE = 4096
 
 class Connection(Sender):
     """A TCP sender.
-
-    Args: connected: its socket.  name: its address.
 
     Attributes: open: whether more may come.
     """

@@ -1,7 +1,5 @@
 """Lines in UDP packets."""
 
-from __future__ import annotations
-
 import socket
 import sys
 import threading

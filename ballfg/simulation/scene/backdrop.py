@@ -58,10 +58,7 @@ class Backdrop:
 def backdrop(camera: Camera, kind: BallKind, rng: np.random.Generator) -> Backdrop:
     """Draws the room as a camera sees it; the same generator state gives every camera the same textures.
 
-    Args:
-        camera: must stand in the room.
-        kind: the ball, for its table and launcher.
-        rng: draws the texture.
+    Args: camera: must stand in the room.
     Raises: ValueError: the camera stands outside the room.
     """
     if not ((WALLS[0] < camera.centre) & (camera.centre < WALLS[1])).all():

@@ -44,7 +44,6 @@ def ball_image(camera: Camera, path: Array, radius: float) -> BallImage | None:
     """The image of a ball that moves along a path while the shutter is open.
 
     Args:
-        camera: through which it is seen.
         path: (m, 3) m, its centre, evenly in time from the opening to the closing.
         radius: m.
     Returns: None if no pixel of the camera sees it.

@@ -98,8 +98,6 @@ def draw(
     Args:
         image: (h, w, 3) grey levels, changed in place.
         distance: (h, w) m, of the room.
-        camera: through which it is seen.
-        capsule: the thing.
         exposure: s, for the blur of its motion.
     Returns: the part of the image that has changed; None if none has.
     """

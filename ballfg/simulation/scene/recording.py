@@ -53,9 +53,7 @@ class Recording:
 def record(config: SceneConfig, cameras: Sequence[Camera]) -> Recording:
     """Launches the balls and opens the shutters; images are drawn when they are asked for.
 
-    Args:
-        config: the recording.
-        cameras: with names of their own; `ballfg.simulation.cameras.table_rig` makes a rig.
+    Args: cameras: with names of their own; `ballfg.simulation.cameras.table_rig` makes a rig.
     Raises: ValueError: no camera, two of one name, or a clock of a camera that is not there.
     """
     names = [camera.name for camera in cameras]

@@ -41,10 +41,7 @@ BALL_COLOURS: Final[dict[str, Colour]] = {"white": (226.0, 230.0, 230.0), "orang
 class Renderer:
     """Draws what a camera sees of a recording.
 
-    Args:
-        config: of the recording.
-        camera: of its rig.
-        number: of the camera in the rig; it picks the random streams.
+    Args: number: of the camera in the rig; it picks the random streams.
     """
 
     def __init__(self, config: SceneConfig, camera: Camera, number: int) -> None:

@@ -51,7 +51,6 @@ def write_scene(
 
     Args:
         folder: new or empty; its parent must exist.
-        recording: what to draw.
         images: PNG files in place of videos.
         force: replace a scene that is there already.
         watch: sees the images that are drawn.

@@ -17,6 +17,7 @@ from ballfg.arrays import Array
 from ballfg.vision.association.gathering import SeenBall
 from ballfg.vision.association.paths import path
 from ballfg.vision.association.triangulate import triangulate
+from ballfg.vision.calibration.lens_covariance import POSE, slopes_of
 from ballfg.vision.camera import Camera
 
 LEAST_MISFIT: Final = 3.0
@@ -172,7 +173,7 @@ def _refined(scene: _Scene, cameras: list[Camera], points: Array, nudged: int | 
     start = None if nudged is None else np.concatenate((cameras[nudged].rvec, cameras[nudged].tvec))
     for _ in range(_STEPS):
         errors = _errors(scene, cameras, points)
-        slopes = [_slopes(camera, points) for camera in cameras]
+        slopes = [slopes_of(c, points, c.rvec, c.tvec)[:, :POSE].reshape(-1, 2, POSE) for c in cameras]
         by_point = np.stack([pose[..., 3:] @ camera.rotation for pose, camera in zip(slopes, cameras, strict=True)], 1)
         weighted = scene.weights @ by_point
         information = np.einsum("ncij,ncik->njk", by_point, weighted)
@@ -194,12 +195,6 @@ def _refined(scene: _Scene, cameras: list[Camera], points: Array, nudged: int | 
             pose = pose + change
             cameras[nudged] = replace(cameras[nudged], rvec=pose[:3], tvec=pose[3:])
     return points, cameras
-
-
-def _slopes(camera: Camera, points: Array) -> Array:
-    """(n, 2, 6) derivatives of the projection by rvec and tvec."""
-    _, jacobian = cv2.projectPoints(points, camera.rvec, camera.tvec, camera.matrix, camera.distortion)
-    return np.asarray(jacobian[:, :6], dtype=np.float64).reshape(-1, 2, 6)
 
 
 def _against_others(scene: _Scene, cameras: list[Camera], k: int) -> float:

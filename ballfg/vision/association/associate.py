@@ -22,6 +22,7 @@ from ballfg.vision.association.tracklets import find_tracklets
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections
 
+_NONE: Final = np.zeros(0, dtype=np.int64)
 _DISPUTED: Final = 2
 """Most frames in which two parts of one flight both have a candidate: one of the two candidates is wrong then."""
 
@@ -64,7 +65,10 @@ def associate(
     pieces = _pieces(footage)
     matching = match(pieces, footage.cameras)
     footage = replace(footage, offset=matching.offset)
-    balls = [gather(footage, _rows_of([pieces[i] for i in group], len(cameras))) for group in matching.groups]
+    balls = []
+    for group in matching.groups:
+        rows = [[pieces[i].rows for i in group if pieces[i].camera == c] for c in range(len(cameras))]
+        balls.append(gather(footage, [np.sort(np.concatenate([_NONE, *own])) for own in rows]))
     balls = _joined(footage, [ball for ball in balls if len(ball.track.times) >= 2])
     balls = _joined(footage, complete(footage, balls))
     balls = [ball for ball in balls if len(ball.track.times) >= settings.least_points and is_ball(ball.track)]
@@ -98,11 +102,6 @@ def _pieces(footage: Footage) -> list[Piece]:
         focal = float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
         pieces += [Piece(number, rows, footage.path(number, rows)) for rows in find_tracklets(seen, focal)]
     return pieces
-
-
-def _rows_of(pieces: Sequence[Piece], cameras: int) -> list[Index]:
-    none = np.zeros(0, dtype=np.int64)
-    return [np.sort(np.concatenate([none, *(p.rows for p in pieces if p.camera == c)])) for c in range(cameras)]
 
 
 def _joined(footage: Footage, balls: list[Gathered]) -> list[Gathered]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.checks import listed, shown
+from ballfg.vision.calibration.lens_covariance import POSE, slopes_of
 from ballfg.vision.calibration.table_points import Marked
 from ballfg.vision.camera import Camera
 
@@ -192,8 +193,7 @@ def _culprit(found: Extrinsics) -> str:
 def _covariance(found: Extrinsics) -> Array:
     """(6, 6) of a small turn about the world's axes and of the centre, from the slope of the pixels by both."""
     camera, marked = found.camera, found.marked
-    projected = cv2.projectPoints(marked.points, camera.rvec, camera.tvec, camera.matrix, camera.distortion)
-    by_pose = np.asarray(projected[1], dtype=np.float64)[:, :6]
+    by_pose = slopes_of(camera, marked.points, camera.rvec, camera.tvec)[:, :POSE]
     rotation, slope = cv2.Rodrigues(camera.rvec)
     slopes = np.asarray(slope, dtype=np.float64).reshape(3, 3, 3)  # of the rotation, by the three of rvec
     turns = np.stack([_axis(rotation.T @ by_r) for by_r in slopes], axis=1)

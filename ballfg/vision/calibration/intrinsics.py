@@ -118,7 +118,6 @@ def calibrate_intrinsics(name: str, views: Sequence[View], distortion: int = 5) 
     """Matrix and distortion of a camera.
 
     Args:
-        name: of the camera.
         views: of one board that lay at different places, turned differently; those without corners are counted only.
         distortion: how many coefficients: 0, 4, 5, 8, 12 or 14.
     Raises:

@@ -30,7 +30,7 @@ def covariance_of_lens(camera: Camera, boards: Sequence[PosedBoard]) -> Array:
     information = np.zeros((unknowns, unknowns))
     squares, freedom = 0.0, -unknowns
     for points, rvec, tvec, residuals in boards:
-        by_pose, by_lens = np.split(_slopes(camera, points, rvec, tvec), [POSE], axis=1)
+        by_pose, by_lens = np.split(slopes_of(camera, points, rvec, tvec), [POSE], axis=1)
         q, _ = np.linalg.qr(by_pose)
         left = by_lens - q @ (q.T @ by_lens)
         information += left.T @ left
@@ -56,7 +56,7 @@ def sigma_of_rays(camera: Camera, covariance: Array) -> Array:
         return np.full(len(pixel_grid(camera)), np.inf)
     plane = camera.normalized(pixel_grid(camera))
     points = np.column_stack((plane, np.ones(len(plane))))
-    slopes = _slopes(camera, points, np.zeros(3), np.zeros(3))
+    slopes = slopes_of(camera, points, np.zeros(3), np.zeros(3))
     turns, by_lens = slopes[:, :3], slopes[:, POSE:]
     q, _ = np.linalg.qr(turns)
     left = (by_lens - q @ (q.T @ by_lens)).reshape(len(points), 2, -1)
@@ -70,7 +70,7 @@ def pixel_grid(camera: Camera) -> Array:
     return np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
 
 
-def _slopes(camera: Camera, points: Array, rvec: Array, tvec: Array) -> Array:
+def slopes_of(camera: Camera, points: Array, rvec: Array, tvec: Array) -> Array:
     """(2 n, 6 + 4 + k) of the pixels by rvec, tvec, fx, fy, cx, cy and the coefficients."""
     _, slopes = cv2.projectPoints(points, rvec, tvec, camera.matrix, camera.distortion)
     return np.asarray(slopes, dtype=np.float64)[:, : POSE + 4 + len(camera.distortion)]

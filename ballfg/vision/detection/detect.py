@@ -81,8 +81,6 @@ def detect(video: Video, camera: str, detector: Detector, watch: Watch = unwatch
     """All candidates of a video.
 
     Args:
-        video: of one camera.
-        camera: its name.
         detector: called with each frame in order; for instance `learn_detector(video)`, or one of your own.
         watch: sees the numbers of the frames that are done.
     Raises: ValueError: a video that turns out unreadable, see `Video.frames`. TypeError: a detector that does not give

@@ -124,7 +124,6 @@ class Detections:
     def in_frame(self, number: int) -> Candidates:
         """The candidates of one frame.
 
-        Args: number: of the frame.
         Returns: its candidates, k >= 0.
         """
         rows = slice(*np.searchsorted(self.frame, (number, number + 1)))

@@ -34,7 +34,6 @@ def read_detections(
     Args:
         path: `t` (s, as the camera writes it), `camera`, `u`, `v` (px), optionally `sigma_u`, `sigma_v` (px), `rho_uv`
             and `score`.
-        cameras: of the rig.
         ignored: names of cameras whose rows are passed over.
     Returns: detections in the order of the cameras, and what was ignored, one sentence each.
     Raises:

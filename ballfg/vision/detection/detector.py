@@ -63,10 +63,7 @@ class DetectorSettings:
 
 
 class BallDetector:
-    """Finds small fast balls before a background that hardly moves. One per camera; call it with each frame in order.
-
-    Args: background: of the camera.  settings: what is known about the ball.
-    """
+    """Finds small fast balls before a background that hardly moves; one per camera, called with each frame in order."""
 
     def __init__(self, background: Background, settings: DetectorSettings | None = None) -> None:
         self.background = background

@@ -80,7 +80,6 @@ class Video(ABC):
     def sample(self, count: int) -> list[Image]:
         """Images spread over the recording.
 
-        Args: count: the most images.
         Returns: images (h, w, 3) uint8, at most `count`.
         """
 

@@ -60,11 +60,9 @@ def write_tracking(
 
     Args:
         folder: as `check_result_folder` allows.
-        tracking: what was found.
         info: the content of dataset.yaml.
         table: (x_low, x_high, y_low, y_high) m, drawn in the contact sheet; None where it is not known.
         streams: the videos; None where there are none: then there is no overlay, and the sheet has no pictures.
-        overlay: write it.
         watch: sees the frames of the overlay that are drawn.
     Returns: the names of the files.
     Raises: OSError: something cannot be written. ValueError: a track that breaks a rule of datasets.

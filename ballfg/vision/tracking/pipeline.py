@@ -117,8 +117,6 @@ def track_videos(
         cameras: at least two, calibrated at the videos' sizes.
         make: the detector of a camera, from its opened video.
         stamps: camera -> CSV file, for those whose stamps are not the container's.
-        settings: of the association.
-        jobs: processes.
         watch: sees the numbers of the frames that are searched.
     Raises: FileNotFoundError: a file is missing. ValueError: as `open_video`, `check_sizes` and `track_detections`.
     """
@@ -136,7 +134,6 @@ def track_detections(
     Args:
         detections: one for each of the cameras, in any order.
         cameras: at least two, with names of their own.
-        settings: of the association.
     Raises: ValueError: a camera without detections or detections without a camera, too few cameras, or recordings
         that do not overlap in time.
     """

@@ -1,7 +1,5 @@
 """One library with one problem, in a process of its own that is asked for solutions."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -27,9 +25,7 @@ class Session:
 
     Args:
         python: command that starts the library's interpreter.
-        library: its name, of a module `with_NAME`.
         task: "estimate" or "rollout".
-        problem: file of it.
 
     Attributes:
         cold: s from the start of the process to its first solution.

@@ -1,7 +1,5 @@
 """The suite of `ballfg-bench speed --peers`: the same problems by every library that is installed, in turns."""
 
-from __future__ import annotations
-
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -152,7 +150,8 @@ def _run_task(
                 times[library] += [1e3 * t for t in session.times(task.runs)]
         results.add(task.name, "control", "banded_time", "ms", median_and_quartiles(controls), len(controls))
         for library, session in sessions.items():
-            off = _difference(session.solution(folder), reference)
+            found = session.solution(folder)  # of each kind of numbers the largest difference over the largest number
+            off = max(float(np.abs(found[name] - x).max() / np.abs(x).max()) for name, x in reference.items())
             results.add(task.name, library, "difference", "1", off, 1)
             if off > SAME and task.kind != "gradient":
                 print(f"note: {task.name}: {library} is {off:.1e} away from the minimum: no time", file=sys.stderr)
@@ -202,8 +201,3 @@ def _slope(problem: Problem, which: int) -> float:
         return float(p @ p)
 
     return (8.0 * (loss(1.0) - loss(-1.0)) - (loss(2.0) - loss(-2.0))) / (12.0 * DIFFERENCE_STEPS[which])
-
-
-def _difference(found: Mapping[str, Array], wanted: Mapping[str, Array]) -> float:
-    """The largest, over the largest number of its kind."""
-    return max(float(np.abs(found[name] - right).max() / np.abs(right).max()) for name, right in wanted.items())

@@ -1,7 +1,5 @@
 """ballfg: factors of the same residuals, its own Levenberg-Marquardt, derivatives in machine code."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from problem import LOSS_STEPS, ROLLOUT_STEPS, Array, Problem

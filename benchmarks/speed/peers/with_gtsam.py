@@ -1,7 +1,5 @@
 """GTSAM as its users drive it from Python: one CustomFactor for each step, derivatives by hand in numpy."""
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 from problem import Array, Problem

@@ -1,7 +1,5 @@
 """jaxls: Gauss-Newton on sparse problems in JAX, compiled for the problem; CHOLMOD where scikit-sparse is there."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 

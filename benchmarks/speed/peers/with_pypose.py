@@ -1,7 +1,5 @@
 """PyPose: Levenberg-Marquardt with a dense Jacobian of the whole problem, by torch's autograd."""
 
-from __future__ import annotations
-
 import pypose as pp
 import torch
 from problem import Array, Problem

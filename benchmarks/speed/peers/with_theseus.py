@@ -1,7 +1,5 @@
 """Theseus: Gauss-Newton on batches of problems in torch, and the gradient through its solution."""
 
-from __future__ import annotations
-
 import importlib.util
 import warnings
 

@@ -1,7 +1,5 @@
 """The problem's acceleration in torch, shared by the libraries that are built on it; torch itself rolls out."""
 
-from __future__ import annotations
-
 import torch
 from problem import LOSS_STEPS, ROLLOUT_STEPS, Problem
 from torch import Tensor

@@ -4,8 +4,6 @@ It solves once, writes a line of JSON with what that took, and then obeys lines 
 timed solutions, or the name of a file for the solution. Runs in any environment that has numpy and the library.
 """
 
-from __future__ import annotations
-
 import gc
 import importlib
 import json
