@@ -136,7 +136,8 @@ class Bridge:
             row: of the batch.
             keys: GTSAM's, of its variables.
             values: that hold them.
-            trial: whether the residual alone is asked for; one that is not finite is then infinite, without Jacobians.
+            trial: whether the residual alone is asked for; there are no Jacobians then, and one that is not finite is
+                infinite.
         Raises: ValueError: as `prepare`.
         """
         vectors = [values.atVector(key) for key in keys]
@@ -149,6 +150,8 @@ class Bridge:
                 raise ValueError(_not_finite(f"{type(self.batch).__name__}.compute: residual and Jacobians", row))
             return np.full(self.batch.dim, np.inf), ()
         residual, blocks = self.kept(row)
+        if trial:
+            return residual, ()
         return residual, tuple([_widened(block, len(v)) for block, v in zip(blocks, vectors, strict=True)])
 
     def _seen(self, key: int, vector: Array) -> Array:
@@ -174,7 +177,11 @@ class Bridge:
 
 def _widened(block: Array, width: int) -> Array:
     """A Jacobian (r, d) with columns of zeros behind it, so that it has `width` of them."""
-    return block if block.shape[1] == width else np.pad(block, ((0, 0), (0, width - block.shape[1])))
+    if block.shape[1] == width:
+        return block
+    wide = np.zeros((len(block), width))
+    wide[:, : block.shape[1]] = block
+    return wide
 
 
 def _vector(values: gtsam.Values, variable: int, known: dict[int, Array]) -> Array | None:

@@ -37,7 +37,7 @@ class TrackGraph:
     Attributes:
         factors: all factors of the track; `push_back` adds further ones.
         values: the smoother's estimate, to start from; `insert` adds further variables.
-        keys: (n,) GTSAM's keys of the states.
+        keys: (n,) GTSAM's indices (keys) of the states.
         times: (n,) s, their stamps.
         model: the ball, its coefficients that are estimated behind the state.
         coefficients: names of the numbers in `symbol("c", 0)`.
