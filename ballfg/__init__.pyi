@@ -25,11 +25,13 @@ from .estimation import Settings as Settings
 from .estimation import Smoother as Smoother
 from .estimation import SpinReading as SpinReading
 from .estimation import Status as Status
+from .estimation import TrackGraph as TrackGraph
 from .estimation import read as read
 from .estimation import register_estimator as register_estimator
 from .estimation import register_observation as register_observation
 from .front import diagnose as diagnose
 from .front import estimate as estimate
+from .front import graph as graph
 from .front import predict as predict
 from .importing import import_tracks as import_tracks
 from .live import Tracker as Tracker

@@ -1,4 +1,4 @@
-"""The front door: estimate and predict for arrays, tracks, datasets and folders alike."""
+"""The front door: estimate and predict for arrays, tracks, datasets and folders alike; the graph of a track."""
 
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -19,6 +19,8 @@ from ballfg.estimation import (
     Estimator,
     Settings,
     SightedDataset,
+    Smoother,
+    TrackGraph,
     TrackPrediction,
     check_calibration_tracks,
     check_observe,
@@ -209,6 +211,30 @@ def diagnose(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) 
         )
     # as the commands do: threads gain nothing with such small batches, and beside other work wait for each other
     return on_one_thread(partial(diagnose_dataset, data, jobs=jobs), _model(model, data))
+
+
+def graph(
+    measured: OneTrack,
+    *,
+    model: Model = None,
+    surfaces: Surfaces | float | None = None,
+    settings: Settings | None = None,
+) -> TrackGraph:
+    """The factor graph of a track as GTSAM's objects, to be solved by GTSAM with factors of one's own.
+
+    Args:
+        measured: a track or its arrays, as for `estimate`.
+        model, surfaces, settings: as for `estimate`.
+    Returns: factors, values at the smoother's estimate, keys of the states; `Estimate.from_gtsam` leads back.
+    Raises:
+        TypeError: for anything else in place of a track.
+        ValueError: a track of which no graph can be made, a model with measurement effects, or as `estimate`.
+    """
+    track = _opened(measured)
+    if not isinstance(track, Track):
+        raise TypeError("measured must be one track; got a dataset. Choose a track of it by its name.")
+    found = estimator_for(track, "smoother", model, surfaces, settings).of(track)
+    return TrackGraph.of(Smoother(found.model, found.surfaces, found.settings), track)
 
 
 def estimator_for(

@@ -20,6 +20,7 @@ from .graph import BallGraph as BallGraph
 from .graph import Convergence as Convergence
 from .graph import LevenbergMarquardt as LevenbergMarquardt
 from .graph import Minimum as Minimum
+from .gtsam_solver import GtsamLevenbergMarquardt as GtsamLevenbergMarquardt
 from .launcher import LauncherSpinFactors as LauncherSpinFactors
 from .linear.covariance import Covariances as Covariances
 from .linear.covariance import marginal_covariances as marginal_covariances

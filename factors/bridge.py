@@ -12,8 +12,9 @@ import gtsam
 import numpy as np
 
 from ballfg.arrays import Array, Index
-from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Values
+from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Rows, Values
 from ballfg.factors.graph import BallGraph
+from ballfg.factors.linear.step import weighted
 from ballfg.state import STATE_DIM
 
 OnMiss = Literal["changed", "row"]
@@ -43,6 +44,9 @@ class Bridge:
         on_miss: `changed` evaluates all rows whose inputs differ from what is cached, in one call: right for solvers
             that move all variables at once. `row` evaluates the asked row alone: for iSAM2, where the caller
             prepares the rows that will be asked and a miss is a row that it did not foresee.
+
+    A row that is not finite raises, except where an optimizer of the first sort asks for its residual alone, to judge a
+    step: an infinite residual then makes it take a shorter one.
 
     Attributes:
         calls: how often the batch was evaluated.
@@ -92,6 +96,19 @@ class Bridge:
             self.keep(row, tuple([x[k] for x in inputs]), residual[k], tuple([j[k] for j in jacobians]))
         return residual, jacobians
 
+    def _try(self, rows: Index, inputs: tuple[Array, ...]) -> None:
+        """`prepare` for a point that may be a trial: of rows that are not finite nothing is kept but their inputs."""
+        self.calls += 1
+        with np.errstate(over="ignore", invalid="ignore"):
+            residual, jacobians = shaped(self.batch, rows, inputs, *self.batch.compute(rows, inputs))
+        finite = np.isfinite(residual).all(axis=1)
+        for block in jacobians:
+            finite &= np.isfinite(block).all(axis=(1, 2))
+        for k, row in enumerate(rows.tolist()):
+            self.keep(row, tuple([x[k] for x in inputs]), residual[k], tuple([j[k] for j in jacobians]))
+            if not finite[k]:
+                self._answers[row] = None
+
     def keep(self, row: int, inputs: tuple[Array, ...], residual: Array, jacobians: tuple[Array, ...]) -> None:
         """Keep an answer that the caller computed itself and put through `checked`.
 
@@ -110,9 +127,17 @@ class Bridge:
         assert found is not None
         return found
 
-    def answer(self, row: int, keys: Sequence[int], values: gtsam.Values) -> tuple[Array, tuple[Array, ...]]:
+    def answer(
+        self, row: int, keys: Sequence[int], values: gtsam.Values, *, trial: bool = False
+    ) -> tuple[Array, tuple[Array, ...]]:
         """Residual (r,) and Jacobians (r, d), whitened, of a row at GTSAM's values.
 
+        Args:
+            row: of the batch.
+            keys: GTSAM's, of its variables.
+            values: that hold them.
+            trial: whether the residual alone is asked for; there are no Jacobians then, and one that is not finite is
+                infinite.
         Raises: ValueError: as `prepare`.
         """
         vectors = [values.atVector(key) for key in keys]
@@ -120,7 +145,13 @@ class Bridge:
         if asked != self._inputs[row]:
             self.misses += 1
             self._evaluate(row, keys, values)
+        if self._answers[row] is None:
+            if not trial:
+                raise ValueError(_not_finite(f"{type(self.batch).__name__}.compute: residual and Jacobians", row))
+            return np.full(self.batch.dim, np.inf), ()
         residual, blocks = self.kept(row)
+        if trial:
+            return residual, ()
         return residual, tuple([_widened(block, len(v)) for block, v in zip(blocks, vectors, strict=True)])
 
     def _seen(self, key: int, vector: Array) -> Array:
@@ -141,12 +172,16 @@ class Bridge:
             if r == row or tuple(p.tobytes() for p in point) != self._inputs[r]:
                 rows.append(r)
                 columns.append(point)
-        self.prepare(np.array(rows), tuple(np.stack(column) for column in zip(*columns, strict=True)))
+        self._try(np.array(rows), tuple(np.stack(column) for column in zip(*columns, strict=True)))
 
 
 def _widened(block: Array, width: int) -> Array:
     """A Jacobian (r, d) with columns of zeros behind it, so that it has `width` of them."""
-    return block if block.shape[1] == width else np.pad(block, ((0, 0), (0, width - block.shape[1])))
+    if block.shape[1] == width:
+        return block
+    wide = np.zeros((len(block), width))
+    wide[:, : block.shape[1]] = block
+    return wide
 
 
 def _vector(values: gtsam.Values, variable: int, known: dict[int, Array]) -> Array | None:
@@ -163,7 +198,7 @@ def _callback(bridge: Bridge, row: int, keys: Sequence[int]) -> Callback:
     """The error function of one factor. `values` and `jacobians` are GTSAM's: valid inside the call only."""
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: gtsam.JacobianVector | None) -> Array:
-        residual, blocks = bridge.answer(row, keys, values)
+        residual, blocks = bridge.answer(row, keys, values, trial=jacobians is None)
         if jacobians is not None:
             for i, block in enumerate(blocks):
                 jacobians[i] = block
@@ -179,6 +214,23 @@ def checked(
 
     Raises: ValueError: names the batch, the array, the row and the rule.
     """
+    residual, jacobians = shaped(batch, rows, inputs, residual, jacobians)
+    named = [("residual", residual), *((f"Jacobian {i}", block) for i, block in enumerate(jacobians))]
+    for label, array in named:
+        if not np.isfinite(array).all():
+            k = int(np.argwhere(~np.isfinite(array))[0][0])
+            row = k if isinstance(rows, slice) else int(rows[k])
+            raise ValueError(_not_finite(f"{type(batch).__name__}.compute: {label}", row))
+    return residual, jacobians
+
+
+def shaped(
+    batch: FactorBatch, rows: Index | slice, inputs: tuple[Array, ...], residual: Array, jacobians: tuple[Array, ...]
+) -> tuple[Array, tuple[Array, ...]]:
+    """What a batch returned, contiguous, after checks of number, shapes and type.
+
+    Raises: ValueError: names the batch, the array and the rule.
+    """
     name, count = type(batch).__name__, len(inputs[0])
     if len(jacobians) != len(inputs):
         raise ValueError(
@@ -188,24 +240,24 @@ def checked(
     expected: list[tuple[str, Array, tuple[int, ...]]] = [("residual", residual, (count, batch.dim))]
     expected += [(f"Jacobian {i}", block, (count, batch.dim, inputs[i].shape[-1])) for i, block in enumerate(jacobians)]
     for label, array, shape in expected:
-        _check_array(f"{name}.compute: {label}", array, shape, rows)
+        _check_array(f"{name}.compute: {label}", array, shape)
     return np.ascontiguousarray(residual), tuple(np.ascontiguousarray(block) for block in jacobians)
 
 
-def _check_array(what: str, array: Array, shape: tuple[int, ...], rows: Index | slice) -> None:
+def _check_array(what: str, array: Array, shape: tuple[int, ...]) -> None:
     if not isinstance(array, np.ndarray):
         raise ValueError(f"{what} must be a numpy array of shape {shape}; got {type(array).__name__}")
     if array.shape != shape:
         raise ValueError(f"{what} must have shape {shape}; got {array.shape}")
     if array.dtype != np.float64:
         raise ValueError(f"{what} must be float64; got {array.dtype}. Convert the model with .double().")
-    if not np.isfinite(array).all():
-        k = int(np.argwhere(~np.isfinite(array))[0][0])
-        row = k if isinstance(rows, slice) else int(rows[k])
-        raise ValueError(
-            f"{what} must be finite; row {row} is not. Look at the start values and at the heights of surfaces "
-            "that its contacts name."
-        )
+
+
+def _not_finite(what: str, row: int) -> str:
+    return (
+        f"{what} must be finite; row {row} is not. Look at the start values and at the heights of surfaces "
+        "that its contacts name."
+    )
 
 
 def nonlinear_graph(graph: BallGraph) -> tuple[gtsam.NonlinearFactorGraph, list[Bridge]]:
@@ -216,6 +268,21 @@ def nonlinear_graph(graph: BallGraph) -> tuple[gtsam.NonlinearFactorGraph, list[
         for factor in bridge.factors():
             result.push_back(factor)
     return result, bridges
+
+
+def linear_graph(linearized: Sequence[Rows]) -> gtsam.GaussianFactorGraph:
+    """The rows that `ballfg.factors.solve` eliminates, for GTSAM's elimination and marginals.
+
+    They tell the curvature of robust losses too, which GTSAM's own linearisation leaves out.
+    """
+    result = gtsam.GaussianFactorGraph()
+    for rows in linearized:
+        residual, jacobians = weighted(rows)
+        unit = gtsam.noiseModel.Unit.Create(residual.shape[1])
+        for i, variables in enumerate(rows.variables.tolist()):
+            terms = [term for v, block in zip(variables, jacobians, strict=True) for term in (key_of(v), block[i])]
+            result.push_back(gtsam.JacobianFactor(*terms, -residual[i], unit))
+    return result
 
 
 def to_gtsam(values: Values) -> gtsam.Values:
@@ -229,7 +296,7 @@ def to_gtsam(values: Values) -> gtsam.Values:
 
 
 def from_gtsam(values: gtsam.Values) -> Values:
-    """The way back from `to_gtsam`."""
+    """The way back from `to_gtsam`; other variables than x0, x1, ... and c0 are left out."""
     states = np.array(gtsam.utilities.extractVectors(values, "x"))
     coefficients = np.array(values.atVector(COEFFICIENT_KEY)) if values.exists(COEFFICIENT_KEY) else np.zeros(0)
     biases = states[:, STATE_DIM:] if states.shape[1] > STATE_DIM else None

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ballfg.factors.batch import FactorBatch, Rows, Values
+from ballfg.factors.linear.covariance import Covariances, marginal_covariances
 from ballfg.factors.linear.step import Step, solve
 
 
@@ -163,6 +164,10 @@ class LevenbergMarquardt:
         return point.minimum(
             solve(point.linearized, point.values), Convergence.TOO_MANY_ITERATIONS, self.max_iterations
         )
+
+    def covariances(self, graph: BallGraph, minimum: Minimum) -> Covariances | None:
+        """Covariances at a minimum of a graph; None where they are not determined."""
+        return None if minimum.step is None else marginal_covariances(minimum.step.root).definite()
 
 
 class _Point:

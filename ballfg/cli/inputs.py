@@ -8,7 +8,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Generic, TypeVar
 
@@ -63,6 +63,19 @@ MethodName = Annotated[
         help="Estimator: smoother, online, ekf, sliding-window, or one that an installed package registers.",
     ),
 ]
+
+
+class Solver(enum.StrEnum):
+    """What solves the factor graph of an estimate, by the name of the option."""
+
+    BALLFG = "ballfg"
+    GTSAM = "gtsam"
+
+
+SolverName = Annotated[
+    Solver | None,
+    typer.Option("--solver", help="Solver of the factor graph.", show_default="gtsam for online, else ballfg"),
+]
 ModelFile = Annotated[
     Path | None, typer.Option("--model", help="Model file; by default the nominal model of the ball.")
 ]
@@ -107,12 +120,18 @@ class Inputs(Generic[D]):
     observed: float
     """s from the start of each track from which the noise may be learned, where nobody states it."""
 
-    def estimator(self, method: str) -> Estimator:
-        """The estimator of a name, with the noise of the dataset. Raises: ValueError: if there is none of that name."""
-        from ballfg.estimation import fitted_settings, make_estimator
+    def estimator(self, method: str, solver: Solver | None = None) -> Estimator:
+        """The estimator of a name, with the noise of the dataset.
 
+        Args: method: its name.  solver: of its factor graph; its usual one where None.
+        Raises: ValueError: if there is none of that name, or the solver cannot solve it.
+        """
+        from ballfg.estimation import Settings, fitted_settings, make_estimator
+
+        chosen = None if solver is None else solver.value
+        make_estimator(method, self.model, self.surfaces, Settings(solver=chosen))  # refuses before it takes long
         settings = fitted_settings(self.dataset, self.model, self.observed, progress)
-        return make_estimator(method, self.model, self.surfaces, settings)
+        return make_estimator(method, self.model, self.surfaces, replace(settings, solver=chosen))
 
 
 def know_effects(files: Iterable[Path] | None) -> None:

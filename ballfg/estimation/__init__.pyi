@@ -43,6 +43,7 @@ from .smoother.problem import TrackProblem as TrackProblem
 from .smoother.smoother import Smoother as Smoother
 from .smoother.time_offsets import TimeOffsets as TimeOffsets
 from .smoother.time_offsets import estimate_time_offsets as estimate_time_offsets
+from .smoother.track_graph import TrackGraph as TrackGraph
 from .track_prediction import TrackPrediction as TrackPrediction
 from .track_prediction import check_observe as check_observe
 from .track_prediction import predict_tracks as predict_tracks

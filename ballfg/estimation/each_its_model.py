@@ -21,6 +21,7 @@ class EachItsModel(Estimator):
 
     name = "each-its-model"
     undoes_measurement = True
+    has_graph = True
 
     def __init__(
         self, make: Callable[[BallModel], Estimator], model: BallModel, surfaces: Surfaces | float, settings: Settings

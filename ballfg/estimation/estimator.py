@@ -31,13 +31,15 @@ class Estimator(ABC):
         surfaces: that it may bounce on; of a number (m), a table of that height with the floor below it.
         settings: noise and priors; those of measured tracks (`Settings.for_measured`) where None.
 
-    Raises: ValueError: if the model has measurement effects and the estimator does not undo them. TypeError: an
-        argument of another type.
+    Raises: ValueError: if the model has measurement effects and the estimator does not undo them, or if GTSAM is to
+        solve an estimator without a factor graph. TypeError: an argument of another type.
     """
 
     name: ClassVar[str]
     undoes_measurement: ClassVar[bool] = False
     """Whether it takes a model that does not measure plainly."""
+    has_graph: ClassVar[bool] = False
+    """Whether GTSAM can solve it (`Settings.solver`)."""
 
     def __init__(self, model: BallModel | Ball, surfaces: Surfaces | float, settings: Settings | None = None) -> None:
         model = nominal_model(model) if isinstance(model, Ball) else model
@@ -51,6 +53,11 @@ class Estimator(ABC):
             raise ValueError(
                 f"model must have no measurement effects for the estimator '{self.name}' by itself. "
                 "Use make_estimator, which undoes them, or leave the model's section measurement empty."
+            )
+        if settings.solver == "gtsam" and not self.has_graph:
+            raise ValueError(
+                f"settings.solver must be 'ballfg' or None for the estimator '{self.name}', which has no factor graph; "
+                "got 'gtsam'. Use the smoother or the online estimator."
             )
         self.model = model
         self.surfaces = known

@@ -18,8 +18,11 @@ from ballfg.prediction.state import BallState, World
 from ballfg.state import SIGMA_NAMES, STATE_DIM, STATE_NAMES
 
 if TYPE_CHECKING:
+    import gtsam
     from matplotlib.figure import Figure
     from pandas import DataFrame
+
+    from ballfg.estimation.smoother.track_graph import TrackGraph
 
 
 class Status(enum.Enum):
@@ -136,6 +139,15 @@ class Estimate:
         return BallState(
             float(self.times[sample]), mean, joint, self.coefficient_names, self.world, self.name, other_side
         )
+
+    @classmethod
+    def from_gtsam(cls, graph: TrackGraph, values: gtsam.Values) -> Estimate:
+        """The estimate of a track at values that GTSAM found, with the marginals of all factors of the graph.
+
+        Args: graph: from `bf.graph`, with further factors or without.  values: of all variables of the factors.
+        Raises: RuntimeError: GTSAM's, if the factors leave a variable undetermined.
+        """
+        return graph.estimate(values)
 
     @property
     def last(self) -> BallState:

@@ -4,12 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.checks import check_array, check_flag, check_instance, check_number, check_range, shown, type_name
+from ballfg.checks import (
+    check_array,
+    check_choice,
+    check_flag,
+    check_instance,
+    check_number,
+    check_range,
+    shown,
+    type_name,
+)
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.earlier_names import todays_name, todays_names
 from ballfg.dynamics.model import BallModel
@@ -17,6 +26,9 @@ from ballfg.estimation.launcher import Launcher, SpinLabel
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.tracks import Track
+
+Solver = Literal["ballfg", "gtsam"]
+SOLVERS: Final[tuple[Solver, ...]] = get_args(Solver)
 
 
 @dataclass(frozen=True)
@@ -84,6 +96,10 @@ class Settings:
     """Look for hits, outliers and tracker shifts. False: the track is one undisturbed flight with contacts that the
     model explains."""
 
+    solver: Solver | None = None
+    """What solves the factor graph: "ballfg", the solver of this package; "gtsam", GTSAM's Levenberg-Marquardt and
+    marginals, and iSAM2 for the online estimator. None is "gtsam" for the class `Online`, else "ballfg"."""
+
     def __post_init__(self) -> None:
         self._check_types()
         for name, least in (("position_noise", "positive numbers"), ("memory", "numbers, zero or more,")):
@@ -111,6 +127,8 @@ class Settings:
         for name, kind in _TYPES.items():
             check_instance(name, getattr(self, name), kind, "Give one, or leave it out.")
         check_flag("find_events", self.find_events)
+        if self.solver is not None:
+            check_choice("solver", self.solver, SOLVERS)
         if self.launcher is not None and not callable(getattr(self.launcher, "label", None)):
             got = f"{type_name(self.launcher)} {shown(self.launcher)}"
             raise TypeError(f"launcher must be a Launcher or None; got {got}. Read one from its file.")

@@ -137,8 +137,9 @@ class Tracker:
         self.gap = check_range("gap", gap, 1e-3, 60.0)
         self.confirm = check_count("confirm", confirm, 1, 20)
         self.most = check_count("most", most, 1, 1000)
-        self.estimator = Online(model, surfaces, settings, solver="chain")
+        self.estimator = Online(model, surfaces, settings)
         own = self.estimator.settings
+        self.estimator.solver = own.solver or "ballfg"  # in the time that several balls leave
         noise = own.position_scale * np.hypot(own.position_noise, own.memory)
         self.gate = Gate(self.estimator.physics, self.estimator.surfaces.heights(), noise, own.stamp_jitter)
         self.counts = Counts()

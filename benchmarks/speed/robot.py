@@ -1,6 +1,7 @@
 """What a robot asks for while a ball flies: an estimate through bounces, a long stream, events ahead, many rollouts."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Final
 
@@ -12,7 +13,7 @@ from ballfg.benchmarks.metrics import median_and_quartiles
 from ballfg.benchmarks.speed.stopwatch import Stopwatch, milliseconds
 from ballfg.dynamics import Architecture, BallModel, Surfaces, build, nominal_model, rollout
 from ballfg.estimation import Online, Settings, Smoother
-from ballfg.estimation.online.online import Solver
+from ballfg.estimation.settings import Solver
 from ballfg.prediction import next_contact, plane_crossing
 from ballfg.prediction.ahead import carried_by
 from ballfg.simulation import SimulationConfig, simulate
@@ -68,8 +69,8 @@ def time_stream(watch: Stopwatch, solver: Solver, flights: int) -> None:
     nominal, table = nominal_model(RADIUS), SimulationConfig().ball.surfaces
     learned = build(Architecture.of("mnn+gs", residual=True), radius=RADIUS, base=nominal).requires_grad_(False)
     for name, model in (("mnn+gs", learned), ("nominal", nominal)):
-        settings = Settings.for_measured(model, position_noise=(STREAM_NOISE,) * 3)
-        online = Online(model, table, settings, solver=solver)
+        settings = Settings.for_measured(model, position_noise=(STREAM_NOISE,) * 3, solver=solver)
+        online = Online(model, table, settings)
         online.warm_up()
         spent, begin = [], 0.0
         for shot in shots:
@@ -85,7 +86,7 @@ def time_stream(watch: Stopwatch, solver: Solver, flights: int) -> None:
 def time_events(watch: Stopwatch) -> None:
     """From a state in flight, with sigmas: the path of 0.3 s, the next bounce, the crossing of a plane."""
     nominal = nominal_model(RADIUS)
-    online = Online(nominal, GROUND, gaussian_settings(0.002, StepNoise(), 20.0), solver="chain")
+    online = Online(nominal, GROUND, replace(gaussian_settings(0.002, StepNoise(), 20.0), solver="ballfg"))
     times = np.arange(40) / STREAM_RATE
     start = (0.0, 0.0, 0.3, 4.0, 0.1, 1.0, 0.0, 50.0, 0.0)
     for time, position in zip(times, _path(nominal, start, times), strict=True):

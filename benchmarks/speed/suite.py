@@ -2,12 +2,11 @@
 
 import copy
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from typing import Final
 
-import gtsam
 import numpy as np
 import torch
 
@@ -32,12 +31,12 @@ from ballfg.dynamics import (
 )
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.estimation import Online, Settings, Smoother, dataset_settings, dataset_surfaces
-from ballfg.estimation.online.online import Solver
+from ballfg.estimation.settings import Solver
 from ballfg.estimation.smoother.initial import initial_states
 from ballfg.estimation.smoother.problem import Events
 from ballfg.factors.batch import Values
-from ballfg.factors.bridge import nonlinear_graph, to_gtsam
 from ballfg.factors.graph import BallGraph
+from ballfg.factors.gtsam_solver import GtsamLevenbergMarquardt
 from ballfg.factors.linear.covariance import marginal_covariances
 from ballfg.learning.end_to_end.pretrain import pretrain
 from ballfg.prediction import Belief, Propagator
@@ -60,7 +59,7 @@ DRAG, MAGNUS = 0.112, 0.0055
 HORIZON = 0.3
 """s that are predicted, at `RATE`."""
 NO_SURFACE = Surfaces(-1e3)
-ONLINE: Final[Mapping[Solver, str]] = {"isam2": "online_update", "chain": "online_chain_update"}
+ONLINE: Final[Mapping[Solver, str]] = {"gtsam": "online_update", "ballfg": "online_chain_update"}
 """What holds the window of the online estimator, and how its rows are called."""
 
 
@@ -157,13 +156,13 @@ def _time_model(watch: Stopwatch, name: str, model: BallModel, track: Track) -> 
     graph, values = _problem(smoother, track)
     watch.control(name)
     _time_minimisation(watch, name, smoother, graph, values)
-    _time_gtsam(watch, name, graph, values)
+    watch.time(name, "lm_time_gtsam", lambda: GtsamLevenbergMarquardt().minimize(graph, values))
     watch.time(name, "estimate_time", lambda: smoother.estimate(track))
     states, dt = torch.from_numpy(values.states[:-1].copy()), torch.full((SAMPLES - 1,), 1 / RATE, dtype=torch.float64)
     watch.time(name, "jacobians_time_79", lambda: fly_jacobian(model, states, dt))
     watch.time(name, "jacobian_time_1", lambda: fly_jacobian(model, states[:1], dt[:1]))
     for solver, metric in ONLINE.items():
-        _time_online(watch, name, metric, Online(model, NO_SURFACE, settings, solver=solver), track)
+        _time_online(watch, name, metric, Online(model, NO_SURFACE, replace(settings, solver=solver)), track)
     _time_prediction(watch, name, smoother, track)
 
 
@@ -201,20 +200,6 @@ def _time_minimisation(watch: Stopwatch, name: str, smoother: Smoother, graph: B
     watch.time(name, "lm_time", lambda: optimizer.minimize(graph, values))
     watch.time(name, "covariances_time", lambda: marginal_covariances(step.root))
     watch.add(name, "lm_iterations", minimum.iterations)
-
-
-def _time_gtsam(watch: Stopwatch, name: str, graph: BallGraph, values: Values) -> None:
-    """GTSAM's own Levenberg-Marquardt on CustomFactors that are answered from batches, to the same minimum."""
-    start = to_gtsam(values)
-
-    def minimise() -> None:
-        factors, _ = nonlinear_graph(graph)
-        parameters = gtsam.LevenbergMarquardtParams()
-        parameters.setRelativeErrorTol(1e-12)
-        parameters.setAbsoluteErrorTol(1e-12)
-        gtsam.LevenbergMarquardtOptimizer(factors, start, parameters).optimize()
-
-    watch.time(name, "lm_time_gtsam", minimise)
 
 
 def _time_online(watch: Stopwatch, name: str, metric: str, online: Online, track: Track) -> None:

@@ -71,6 +71,20 @@ def test_parquet_holds_the_same_and_the_smoother_is_the_default(dataset: Path, t
     assert read.equals(pq.read_table(tmp_path / "states.parquet"))
 
 
+@pytest.mark.parametrize("method", ["smoother", "online"])
+def test_gtsam_gives_the_same_table(dataset: Path, tmp_path: Path, method: str) -> None:
+    tables = []
+    for solver in ("ballfg", "gtsam"):
+        out = tmp_path / f"{solver}.csv"
+        assert status("estimate", dataset, "--method", method, "--solver", solver, "--out", out, "--jobs", 1) == 0
+        table = pa_csv.read_csv(out)
+        tables.append(np.stack([table[name].to_numpy() for name in COLUMNS[2:]], axis=1))
+    own, other = tables
+    assert not np.array_equal(own, other)
+    assert (np.abs(own - other)[:, :9] / own[:, 9:]).max() < 1e-3
+    np.testing.assert_allclose(other[:, 9:], own[:, 9:], rtol=1e-3)
+
+
 def test_the_same_bytes_on_one_process_or_two(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ballfg.estimation.batch.START_UP", 0.0)  # a second process, however little work there is
     folder = tmp_path / "many"
@@ -168,6 +182,8 @@ def test_bad_model_files(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFi
     ("options", "message"),
     [
         (["--method", "kalman"], "method must be one of smoother, online, ekf, sliding-window; got 'kalman'"),
+        (["--solver", "isam2"], "'isam2' is not one of 'ballfg', 'gtsam'"),
+        (["--solver", "gtsam", "--method", "ekf"], "settings.solver must be 'ballfg' or None for the estimator 'ekf'"),
         (["--jobs", "0"], "'--jobs'"),
         (["--model", "none.yaml"], "none.yaml does not exist"),
         (["--bogus"], "--bogus"),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ballfg.factors.batch import COEFFICIENTS, Rows, Values
+from ballfg.factors.bridge import key_of, linear_graph
 from ballfg.factors.dynamics import ContactFactors, FlightFactors
 from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, _Point, _tried
 from ballfg.factors.linear.covariance import marginal_covariances
@@ -161,7 +162,7 @@ def test_gtsam_s_cholesky_does_fail_there(model) -> None:
     """The reason for QR: should this pass one day, QR may go."""
     graph, values = track(model, np.zeros(0), noise=ProcessNoise(spin=1e-5))
     with pytest.raises(RuntimeError, match="Indetermin"):
-        in_gtsam(graph.linearize(values), N).eliminateMultifrontal()  # prefers Cholesky
+        linear_graph(graph.linearize(values)).eliminateMultifrontal()  # prefers Cholesky
 
 
 def test_the_elimination_is_gtsam_s(problem) -> None:
@@ -171,33 +172,24 @@ def test_the_elimination_is_gtsam_s(problem) -> None:
     step = solve(linearized, values)
     n, p = len(values.states), len(values.coefficients)
     ordering = gtsam.Ordering()
-    for key in range(n + (p > 0)):
+    keys = [key_of(variable) for variable in (*range(n), COEFFICIENTS)[: n + (p > 0)]]
+    for key in keys:
         ordering.push_back(key)
-    net = in_gtsam(linearized, n).eliminateSequential(ordering, gtsam.EliminateQR)
+    net = linear_graph(linearized).eliminateSequential(ordering, gtsam.EliminateQR)
     solution = net.optimize()
     for i in range(n):
-        np.testing.assert_allclose(step.states[i], solution.at(i), rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(step.states[i], solution.at(keys[i]), rtol=1e-6, atol=1e-9)
         theirs, own = net.at(i).R(), step.root.states[i]
         signs = np.sign(np.diag(theirs)) * np.sign(np.diag(own[:, :9]))
-        blocks = [theirs, *np.split(net.at(i).S(), [9] if i + 1 < n and net.at(i).S().shape[1] > p else [0], axis=1)]
+        parents = np.roll(net.at(i).S(), -p, axis=1)  # GTSAM has the coefficients first
+        blocks = [theirs, *np.split(parents, [9] if i + 1 < n and parents.shape[1] > p else [0], axis=1)]
         if not blocks[1].shape[1]:
             blocks[1] = np.zeros((9, 9))
         given = np.concatenate((*blocks, net.at(i).d()[:, None]), axis=1)
         size = np.abs(given).max(axis=1, keepdims=True)
         np.testing.assert_allclose(signs[:, None] * own / size, given / size, atol=1e-8)
     if p:
-        np.testing.assert_allclose(step.coefficients, solution.at(n), rtol=1e-6)
-
-
-def in_gtsam(linearized, n: int) -> gtsam.GaussianFactorGraph:
-    gaussian = gtsam.GaussianFactorGraph()
-    for rows in linearized:
-        residual, jacobians = weighted(rows)
-        for i, variables in enumerate(rows.variables.tolist()):
-            terms = [(n if v == COEFFICIENTS else v, b[i]) for v, b in zip(variables, jacobians, strict=True)]
-            unit = gtsam.noiseModel.Unit.Create(len(residual[i]))
-            gaussian.push_back(gtsam.JacobianFactor(*(x for term in terms for x in term), -residual[i], unit))
-    return gaussian
+        np.testing.assert_allclose(step.coefficients, solution.at(keys[n]), rtol=1e-6)
 
 
 def test_a_factor_between_states_apart_is_refused(model) -> None:

@@ -136,6 +136,7 @@ def calls_of_estimates(_folder: Path) -> dict[str, Call]:
         "estimate": Call(bf.estimate, {"measured": track, **options}),
         "estimate of arrays": Call(arrays, {"times": track.times, "positions": track.positions}),
         "estimate of a dataset": Call(bf.estimate, {"measured": dataset, **options}),
+        "graph": Call(bf.graph, {"measured": track, **dict.fromkeys(("model", "settings")), "surfaces": 0.76}),
         "predict": Call(bf.predict, {"known": track, **options, "horizon": 0.05, "conformal": None}),
         "predict of a dataset": Call(bf.predict, {"known": dataset, **options, **ahead}),
         "diagnose": Call(bf.diagnose, {"measured": "/nonexistent", "model": None, "jobs": 1}),
@@ -145,7 +146,7 @@ def calls_of_estimates(_folder: Path) -> dict[str, Call]:
         "Smoother": Call(bf.Smoother, {**parts, "optimizer": None}),
         "ExtendedKalmanFilter": Call(bf.ExtendedKalmanFilter, {**parts, "smooth": False, "initialise": "prior"}),
         "SlidingWindow": Call(estimation.SlidingWindow, parts),
-        "Online": Call(bf.Online, {**parts, "lag": 128, "cameras": (), "solver": "isam2"}),
+        "Online": Call(bf.Online, {**parts, "lag": 128, "cameras": (), "solver": None}),
         "Online.push": Call(
             push, {"time": 0.03, "position": track.positions[3], "sigma": [0.003] * 3, "observations": ()}
         ),

@@ -17,6 +17,7 @@ import os
 import re
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -289,8 +290,8 @@ def call_push(folder: Path, _: int) -> Numbers:
     data, states = bf.read(folder / "shots"), []
     settings = dataset_settings(data, bf.nominal_model())
     for track in list(data)[:3]:
-        for solver in ("chain", "isam2"):
-            live = bf.Online(bf.nominal_model(), dataset_surfaces(data), settings, solver=solver)
+        for solver in ("ballfg", "gtsam"):
+            live = bf.Online(bf.nominal_model(), dataset_surfaces(data), replace(settings, solver=solver))
             states += [live.push(t, p) for t, p in zip(track.times, track.positions, strict=True)]
     return of_states(states)
 
@@ -326,7 +327,7 @@ def call_sightings(_: Path, shift: int) -> Numbers:
     found |= {"t": estimate.times, "states": estimate.states, "states.sigma": estimate.sigmas}
     offsets = estimate_time_offsets([track], ball.model, ball.surfaces, settings)
     found |= {"offsets": np.array([c.time_offset for c in offsets.cameras]), "offsets.sigma": 1e-4}
-    live = bf.Online(ball.model, ball.surfaces, settings, cameras=RIG, solver="chain")
+    live = bf.Online(ball.model, ball.surfaces, replace(settings, solver="ballfg"), cameras=RIG)
     sightings = made.sightings
     rows = zip(sightings.times, sightings.camera, sightings.pixels, sightings.covariances, strict=True)
     states = [s for t, c, p, v in rows if (s := live.push_sighting(t, sightings.cameras[c], p, v)) is not None]

@@ -8,7 +8,7 @@ from tests.faults.arguments import GROUPS, Call, faults_of
 WRONG_BY_PURPOSE = {"read", "load_model", "diagnose", "register", "register_estimator", "register_observation"}
 """Calls whose own arguments are refused too: what they need is files or classes."""
 
-MADE = {"BallState", "Dataset", "Diagnosis", "Estimate", "Status"}
+MADE = {"BallState", "Dataset", "Diagnosis", "Estimate", "Status", "TrackGraph"}
 """Public classes that the package makes, not the user."""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -53,12 +54,13 @@ def _parts(model: BallModel) -> list[Callable[[], object]]:
     from ballfg.dynamics import Surfaces
     from ballfg.estimation import Online, Settings, Smoother, estimate_noise
     from ballfg.estimation.online.warm_up import falling_ball
+    from ballfg.estimation.settings import SOLVERS
     from ballfg.tracks import Track
 
     table = Surfaces.table_tennis(0.0)
     settings = Settings.for_measured(model, position_noise=(0.003,) * 3)
     smoother = Smoother(model, table, settings)
-    streams = [Online(model, table, settings, solver=solver) for solver in ("chain", "isam2")]
+    streams = [Online(model, table, replace(settings, solver=solver)) for solver in SOLVERS]
     track = Track(*falling_ball(streams[0]), name="falling")
     noise = partial(estimate_noise, model, table, settings, [track], errors=False)
     return [partial(smoother.estimate, track), noise, *(online.warm_up for online in streams)]

@@ -30,6 +30,7 @@ def estimate(
     ],
     out: inputs.OutTable,
     method: inputs.MethodName = "smoother",
+    solver: inputs.SolverName = None,
     model: inputs.ModelFile = None,
     ball: inputs.BallName = None,
     source: Annotated[
@@ -70,7 +71,7 @@ def estimate(
         open_dataset = inputs.open_inputs if positions else inputs.open_sighted
         opened = open_dataset(dataset, model, effects_file, ball=ball)
         count = len(opened.dataset)
-        work = partial(_estimated, opened.model, opened.estimator(method))
+        work = partial(_estimated, opened.model, opened.estimator(method, solver))
         results = map_tracks(work, opened.dataset, count, workers)
         for result in progress(results, count, "tracks estimated"):
             for columns in result.columns:

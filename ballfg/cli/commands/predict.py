@@ -23,6 +23,7 @@ def predict(
     observe: Annotated[float, typer.Option(help="Observed time from the start of each track, s.")],
     out: inputs.OutTable,
     method: inputs.MethodName = "smoother",
+    solver: inputs.SolverName = None,
     model: inputs.ModelFile = None,
     ball: inputs.BallName = None,
     effects_file: inputs.EffectsFiles = None,
@@ -64,7 +65,7 @@ def predict(
                 raise ValueError("save_conformal must come with --conformal, whose scales it keeps. Add --conformal.")
         opened = inputs.open_inputs(dataset, model, effects_file, observe, ball)
         count = len(opened.dataset)
-        estimator = opened.estimator(method)
+        estimator = opened.estimator(method, solver)
         scales = None
         if conformal is not None:
             scales = _conformal_scales(conformal, opened.dataset, estimator, method, observe, workers)

@@ -76,6 +76,7 @@ class InvertMeasurement(Estimator):
 
     name = "invert-measurement"
     undoes_measurement = True
+    has_graph = True
 
     def __init__(self, kind: type[Estimator], model: BallModel, surfaces: Surfaces | float, settings: Settings) -> None:
         super().__init__(model, surfaces, settings)

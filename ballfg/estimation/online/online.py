@@ -3,9 +3,10 @@
 import copy
 import gc
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,7 +41,7 @@ from ballfg.estimation.online.windows.window import IsamWindow
 from ballfg.estimation.plausible import plausible, possible
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import physics_of
-from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
+from ballfg.estimation.settings import Settings, Solver, sample_sigmas, total_sigmas
 from ballfg.estimation.sides.hypotheses import HypothesisModel, SampleMeasurement
 from ballfg.estimation.sides.monitor import ContactMonitor, ContactState
 from ballfg.estimation.smoother.motion import FLIGHT
@@ -55,8 +56,9 @@ from ballfg.vision.camera import Camera
 
 LAG = 128
 """States that stay when the window is cut: 0.7 s at 180 Hz, after which new samples say nothing about an old state."""
-Solver = Literal["isam2", "chain"]
-WINDOWS: Final[Mapping[Solver, type[StreamWindow]]] = {"isam2": IsamWindow, "chain": ChainWindow}
+WINDOWS: Final[Mapping[Solver, type[StreamWindow]]] = {"gtsam": IsamWindow, "ballfg": ChainWindow}
+EARLIER: Final[Mapping[str, Solver]] = {"isam2": "gtsam", "chain": "ballfg"}
+"""Names that solvers had as an argument of `Online`."""
 
 
 class Online(Estimator):
@@ -65,21 +67,25 @@ class Online(Estimator):
     Use `push` on a live stream of positions, `push_sighting` on one of what cameras saw, or `estimate` on a track,
     which ends by minimising over the window to a tight tolerance.
 
+    The settings' solver holds the linear system: "gtsam", which is what None means here, is iSAM2, which can be opened
+    up and takes further factors; "ballfg" gives the same answers in less time.
+
     Args:
         model: the ball.  surfaces: that it may bounce on.
         settings: noise and priors; time offsets of cameras are not estimated here, see `estimate_time_offsets`.
         lag: the window is cut to this many states whenever it holds twice as many.
         cameras: that sightings come from.
-        solver: what holds the linear system: "isam2", GTSAM's, which can be opened up and takes further factors;
-            "chain", which gives the same answers in less time.
+        solver: earlier name of the settings' solver, "isam2" or "chain"; deprecated.
 
     Attributes:
+        solver: "ballfg" or "gtsam"; read when a window begins.
         window: the samples, states and factors that are held; None before the first observation.
 
     Raises: ValueError: a lag below 2, time offsets in the settings, or as `Estimator`.
     """
 
     name = "online"
+    has_graph = True
 
     def __init__(
         self,
@@ -88,10 +94,18 @@ class Online(Estimator):
         settings: Settings | None = None,
         lag: int = LAG,
         cameras: Sequence[Camera] = (),
-        solver: Solver = "isam2",
+        solver: str | None = None,
     ) -> None:
         super().__init__(model, surfaces, settings)
-        check_choice("solver", solver, WINDOWS)
+        self.solver: Solver = self.settings.solver or "gtsam"
+        if solver is not None:
+            check_choice("solver", solver, EARLIER)
+            self.solver = EARLIER[solver]
+            warnings.warn(
+                f"Online(solver='{solver}') ends with version 0.2; write Settings(solver='{self.solver}').",
+                DeprecationWarning,
+                stacklevel=2,
+            )
         check_count("lag", lag, 2)
         if self.settings.time_offsets:
             raise ValueError(
@@ -99,7 +113,6 @@ class Online(Estimator):
                 "passed. Find the offsets beforehand with estimate_time_offsets and give the cameras that it returns."
             )
         self.cameras = tuple(check_each("cameras", cameras, Camera, "Read them with read_cameras."))
-        self.solver = solver
         self.ball = trackwise_model(self.model, self.settings)
         self.physics = physics_of(self.model)
         self.lag = lag

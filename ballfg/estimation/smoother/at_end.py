@@ -11,7 +11,6 @@ from ballfg.estimation.result import Estimate
 from ballfg.estimation.sides.hypotheses import HypothesisModel, SampleMeasurement
 from ballfg.estimation.sides.monitor import ContactMonitor, with_contact_states
 from ballfg.estimation.smoother.problem import TrackProblem
-from ballfg.factors.linear.covariance import marginal_covariances
 from ballfg.factors.linear.definite import definite
 from ballfg.state import STATE_DIM
 from ballfg.tracks import Track
@@ -67,12 +66,11 @@ def _before_contact(estimate: Estimate, model: HypothesisModel, track: Track) ->
 def _filtered(smoother: Smoother, track: Track) -> tuple[Array, Array] | None:
     """Mean and covariance of state, coefficients and bias at the end of a track; None where they are not known."""
     problem = smoother.problem(track)
-    minimum = smoother.settle(problem).minimum
-    if minimum.step is None:
-        return None
-    known, values, p = marginal_covariances(minimum.step.root).definite(), minimum.values, problem.width
+    solution = smoother.settle(problem)
+    known = smoother.optimizer.covariances(solution.graph, solution.minimum)
     if known is None:
         return None
+    values, p = solution.minimum.values, problem.width
     biases = np.zeros(0) if values.biases is None else values.biases[-1]
     mean = np.concatenate((values.states[-1], values.coefficients[:p], biases))
     width = STATE_DIM + len(biases)

@@ -35,7 +35,8 @@ from ballfg.estimation.smoother.solution import (
 )
 from ballfg.factors.batch import FactorBatch, Values
 from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt
-from ballfg.factors.linear.covariance import marginal_covariances
+from ballfg.factors.gtsam_solver import GtsamLevenbergMarquardt
+from ballfg.factors.linear.covariance import Covariances
 from ballfg.factors.prior import PriorFactors
 from ballfg.factors.tracker import BiasStartFactors
 from ballfg.state import STATE_DIM
@@ -87,10 +88,11 @@ class Smoother(Estimator):
 
     Args:
         model: the ball.  surfaces: what it may bounce on.  settings: noise and priors.
-        optimizer: settings of the minimisation.
+        optimizer: settings of the minimisation; where None, those of the settings' solver.
     """
 
     name = "smoother"
+    has_graph = True
 
     def __init__(
         self,
@@ -100,7 +102,8 @@ class Smoother(Estimator):
         optimizer: LevenbergMarquardt | None = None,
     ) -> None:
         super().__init__(model, surfaces, settings)
-        self.optimizer = LevenbergMarquardt() if optimizer is None else optimizer
+        usual = GtsamLevenbergMarquardt if self.settings.solver == "gtsam" else LevenbergMarquardt
+        self.optimizer = usual() if optimizer is None else optimizer
         check_instance("optimizer", self.optimizer, LevenbergMarquardt, "Leave it out for the usual one.")
 
     def estimate(self, track: Track, factors: Sequence[FactorBatch] = (), *, move_stamps: bool = True) -> Estimate:
@@ -130,8 +133,8 @@ class Smoother(Estimator):
         return replace(estimate, status=Status.NOT_CONVERGED)
 
     def is_long(self, track: Track) -> bool:
-        """Whether a track is smoothed in pieces. Where stamps move, a track is smoothed at once whatever its length."""
-        return len(track) >= LONG and not self.settings.time_offsets
+        """Whether a track is smoothed in pieces; where stamps move, or GTSAM solves it, it is smoothed at once."""
+        return len(track) >= LONG and not self.settings.time_offsets and self.settings.solver != "gtsam"
 
     def in_sections(self, track: Track) -> Iterator[Estimate]:
         """The estimate of a long track section by section, of any other as a whole."""
@@ -236,11 +239,23 @@ class Smoother(Estimator):
 
     def result(self, problem: TrackProblem, solution: Solution) -> Estimate:
         """What a solution says about the track."""
+        known = self.optimizer.covariances(solution.graph, solution.minimum)
+        estimate = with_both_sides(self, problem, self.at_minimum(problem, solution, known))
+        segmentation = solution.events.segmentation
+        hops = problem.hops if segmentation is problem.segmentation else None
+        hops = self.low_hops(problem.track, segmentation) if hops is None else hops
+        estimate = replace(estimate, notes=estimate.notes + uncounted_note(hops, problem.track.times))
+        return with_low_hops(estimate, hops, self.model)
+
+    def at_minimum(self, problem: TrackProblem, solution: Solution, known: Covariances | None) -> Estimate:
+        """The estimate at a minimum, before a second look at the end of the track and at low hops.
+
+        Args: problem: of a track.  solution: of it.  known: covariances there; None where they are not determined.
+        """
         minimum, segmentation = solution.minimum, solution.events.segmentation
         track, values = problem.track, solution.minimum.values
         n, p = len(track), len(values.coefficients)
         contacts = timed_contacts(track.times, solution)
-        known = None if minimum.step is None else marginal_covariances(minimum.step.root).definite()
         covariances = prior_covariances(problem) if known is None else known
         own, rest = slice(0, problem.width), slice(problem.width, p)
         estimate = Estimate(
@@ -267,11 +282,7 @@ class Smoother(Estimator):
         )
         estimate = plausible(estimate, track, problem.sigma, self.settings)
         estimate = replace(estimate, notes=estimate.notes + rival_note(solution, estimate.covariances[0]))
-        estimate = with_both_sides(self, problem, widened_near_contacts(estimate, problem.ball))
-        hops = problem.hops if segmentation is problem.segmentation else None
-        hops = self.low_hops(track, segmentation) if hops is None else hops
-        estimate = replace(estimate, notes=estimate.notes + uncounted_note(hops, track.times))
-        return with_low_hops(estimate, hops, self.model)
+        return widened_near_contacts(estimate, problem.ball)
 
 
 def _leads_nowhere(solution: Solution, before: Solution) -> bool:

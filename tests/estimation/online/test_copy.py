@@ -9,7 +9,7 @@ import pytest
 
 from ballfg.dynamics import nominal_model
 from ballfg.estimation import Online, Settings
-from ballfg.estimation.online.online import Solver
+from ballfg.estimation.settings import SOLVERS, Solver
 from ballfg.simulation import SimulationConfig, simulate
 from ballfg.tracks import Track
 
@@ -21,12 +21,12 @@ def track() -> Track:
 
 
 @pytest.mark.parametrize("memory", [0.0, 0.002])
-@pytest.mark.parametrize("solver", ["isam2", "chain"])
+@pytest.mark.parametrize("solver", SOLVERS)
 def test_going_back_gives_the_states_of_the_samples_in_order(track: Track, memory: float, solver: Solver) -> None:
     """Through bounces and cuts of the window, with other samples pushed into copies in between."""
     model = nominal_model()
     settings = replace(Settings.for_measured(model), memory=(memory,) * 3, stamp_jitter=0.05 * memory)
-    live, straight = (Online(model, 0.0, settings, lag=12, solver=solver) for _ in range(2))
+    live, straight = (Online(model, 0.0, replace(settings, solver=solver), lag=12) for _ in range(2))
     kept, since = live.copy(), 0
     for k, (time, position) in enumerate(zip(track.times, track.positions, strict=True)):
         expected = straight.push(time, position)
