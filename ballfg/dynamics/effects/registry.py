@@ -4,15 +4,13 @@ from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
-from types import ModuleType
 from typing import Final
 
-from ballfg.checks import check_path
 from ballfg.dynamics import effects
 from ballfg.dynamics.effect import Effect, Kind
 from ballfg.dynamics.effects import generic
 from ballfg.dynamics.effects.checks import BASES, REMEDY, check_effect
-from ballfg.files.python_file import run_file
+from ballfg.files.python_file import defined_classes, load_classes
 from ballfg.registry import Registry
 
 GENERIC: Final[dict[str, type[Effect]]] = {
@@ -40,18 +38,9 @@ EFFECTS: Final = Registry[Effect](
 def _own() -> Iterator[type[Effect]]:
     """The effects of the modules of this folder, by kind, module and place in it."""
     names = sorted(f"{__package__}.{module.name}" for module in iter_modules(effects.__path__))
-    found = [cls for name in names if name != __name__ for cls in defined_effects(import_module(name))]
+    found = [cls for name in names if name != __name__ for cls in defined_classes(import_module(name), BASES)]
     kinds = [base.kind for base in BASES]
     yield from sorted((cls for cls in found if cls not in GENERIC.values()), key=lambda cls: kinds.index(cls.kind))
-
-
-def defined_effects(module: ModuleType) -> list[type[Effect]]:
-    """The effects that a module defines, in their order; those whose class begins with `_` are left out."""
-    return [
-        item
-        for name, item in vars(module).items()
-        if isinstance(item, type) and issubclass(item, Effect) and item.__module__ == module.__name__ and name[0] != "_"
-    ]
 
 
 for _effect in _own():
@@ -82,14 +71,4 @@ def load_effects(path: str | Path) -> tuple[type[Effect], ...]:
         FileNotFoundError: if there is no such file.
         ValueError: if it is no Python, does not run, defines no effect, or one that `register` refuses.
     """
-    path = check_path("path", path).resolve()
-    if not path.is_file():
-        raise FileNotFoundError(f"effects file {path} does not exist; effects of one's own are one Python file.")
-    module = run_file(path, "effects")
-    own = defined_effects(module)
-    if not own:
-        raise ValueError(f"{path} must define an effect, a class; it defines none. {REMEDY}")
-    try:
-        return tuple(register(effect) for effect in own)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {error}") from error
+    return load_classes(EFFECTS, path)
