@@ -1,17 +1,17 @@
 """The front door: estimate and predict for arrays, tracks, datasets and folders alike; the graph of a track."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import TypeAlias, TypedDict, Unpack, overload
+from typing import TYPE_CHECKING, TypeAlias, TypedDict, Unpack, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ballfg.checks import check_count, check_instance, check_path, type_name
-from ballfg.diagnosis import Diagnosis
-from ballfg.diagnosis import diagnose as diagnose_dataset
 from ballfg.dynamics import BallModel, Surfaces, inertia_factor, load_model, nominal_model
 from ballfg.estimation import (
     ConformalScales,
@@ -36,6 +36,9 @@ from ballfg.parallel.executor import MOST_JOBS
 from ballfg.parallel.work import on_one_thread
 from ballfg.prediction import Ahead, BallState
 from ballfg.tracks import TABLE_TENNIS, Ball, Dataset, Track
+
+if TYPE_CHECKING:
+    from ballfg.diagnosis import Diagnosis
 
 Folder: TypeAlias = str | PathLike[str]
 Tracks: TypeAlias = Dataset | SightedDataset
@@ -209,6 +212,8 @@ def diagnose(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) 
             f"measured must be a dataset or its folder; got {what}. Read one with bf.read, or make one of tracks with "
             "bf.import_tracks or ballfg.tracks.dataset_in_memory."
         )
+    from ballfg.diagnosis import diagnose as diagnose_dataset  # half of the package, which an estimate does not need
+
     # as the commands do: threads gain nothing with such small batches, and beside other work wait for each other
     return on_one_thread(partial(diagnose_dataset, data, jobs=jobs), _model(model, data))
 

@@ -56,6 +56,11 @@ EffectsFiles = Annotated[
     typer.Option("--effects-file", help="Trusted Python file that defines custom effects; may be repeated."),
 ]
 """The option of every command that reads or names effects."""
+ObservationsFiles = Annotated[
+    list[Path] | None,
+    typer.Option("--observations-file", help="Trusted Python file that defines custom observations; may be repeated."),
+]
+"""The option of every command that reads the tables of a dataset."""
 MethodName = Annotated[
     str,
     typer.Option(
@@ -140,6 +145,14 @@ def know_effects(files: Iterable[Path] | None) -> None:
 
     for file in files or ():
         load_effects(file)
+
+
+def know_observations(files: Iterable[Path] | None) -> None:
+    """Registers the observations that files define, so that their tables are read with a dataset."""
+    from ballfg.estimation import load_observations
+
+    for file in files or ():
+        load_observations(file)
 
 
 def open_inputs(

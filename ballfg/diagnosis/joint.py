@@ -42,8 +42,6 @@ ROOM: Final = "room"
 """The label that tells the rooms apart."""
 MOST_TRACKS: Final = 60
 """Tracks of a room that are used, evenly over it: rooms must not wait for the largest of them."""
-OF_ROOMS: Final = ("gravity", "buoyancy", "wind", "wind_shear", "gust_region", "table_height", "table_tilt")
-"""Effects of flight and bounce that belong to a room; all others belong to the ball, and measurement to the rig."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +100,7 @@ def diagnose_jointly(
     first = _first_fit(model, halves, way)
     predicting = _Predicting(rooms, jobs)
     effects = tuple(catalogue or EFFECTS.values())
-    of_ball = tuple(e for e in effects if e.kind != "measurement" and e.name not in OF_ROOMS)
+    of_ball = tuple(e for e in effects if e.belongs_to == "ball")
     loop = SearchLoop(
         halves, of_ball, predicting, predicting.judge, tell, jobs=jobs, of_some=effects, ways=lambda searched: [way]
     )

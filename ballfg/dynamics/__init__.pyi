@@ -5,7 +5,9 @@ from .effect import Effect as Effect
 from .effect import Flight as Flight
 from .effect import FlightEffect as FlightEffect
 from .effect import Impact as Impact
+from .effect import Range as Range
 from .effect import Scene as Scene
+from .effect import Usual as Usual
 from .effect import length as length
 from .effect import vector as vector
 from .effects.registry import EFFECTS as EFFECTS

@@ -21,6 +21,30 @@ from ballfg.state import POSITION, SPIN, VELOCITY
 
 
 @dataclass(frozen=True)
+class Range:
+    """Smallest and largest plausible strength of an effect, in its unit, and the source of both."""
+
+    low: float
+    high: float
+    source: str
+
+
+SEEN = "larger ones are seen by eye in a picture of the table"
+"""Source of the ranges of errors of cameras and frames."""
+
+
+@dataclass(frozen=True)
+class Usual:
+    """The strength that an effect usually has, and where the number comes from."""
+
+    change: Mapping[str, float]
+    """By coefficient, in its unit: the step from absence; from the default of one whose prior has no spread."""
+    source: str
+    graded: bool = True
+    """It comes in sizes; else it is there or not."""
+
+
+@dataclass(frozen=True)
 class Coefficient:
     """One number of an effect: its name, nominal value, prior spread, unit, bounds and where they come from."""
 
@@ -64,6 +88,7 @@ def per_row(value: Tensor) -> Tensor:
 
 
 Kind = Literal["flight", "bounce", "measurement"]
+Owner = Literal["ball", "room", "rig"]
 Vector = tuple[float, float, float]
 
 
@@ -180,7 +205,7 @@ class Impact:
 
 
 class Effect(nn.Module, ABC):
-    """Base of all effects. A subclass names itself, its coefficients and, in words, what it is.
+    """Base of all effects. A subclass names itself, its coefficients, and all that is known of it.
 
     Each coefficient becomes a float64 `nn.Parameter` attribute of its name. Code must let it have shape () or any
     shape that broadcasts against (..., 1), so that one call can carry another value for each track.
@@ -189,7 +214,15 @@ class Effect(nn.Module, ABC):
         name: as in a model file.  kind: the section of a model file that takes it.
         sentence: what it is, and what looks exactly the same.
         decide: what to measure to tell it from what it is mistaken for.
+        plain: a noun for readers who are no specialists, such as `a wind`; its name with spaces where it is empty.
+        says: a sentence for them, with fields such as `{k:.2g}` for what was fitted (`ballfg.dynamics.wording`); where
+            it is empty, the first of `sentence` with all coefficients.
         coefficients: its numbers; an instance may have priors of its own (`set_sigmas`).
+        plausible: range of its strengths, for a table-tennis ball, its table and its room. A value outside stands for
+            something else, and a diagnosis never names it. None: the limit is ten sigmas from the default.
+        usual: the strength that it usually has; None where nobody knows.
+        belongs_to: the ball, which takes it to every room; the room; or the rig that measures there.
+        imitated: other effects, or free coefficients of a model, do exactly the same: tracks alone cannot name it.
         needs: names of effects that must be in the same model, since this one changes them.
         multiplies_spin: its strength multiplies a spin that nobody may know: without labels it has no slope at absence.
 
@@ -200,7 +233,13 @@ class Effect(nn.Module, ABC):
     kind: ClassVar[Kind]
     sentence: ClassVar[str]
     decide: ClassVar[str]
+    plain: ClassVar[str] = ""
+    says: ClassVar[str] = ""
     coefficients: ClassVar[tuple[Coefficient, ...]]
+    plausible: ClassVar[Range | None] = None
+    usual: ClassVar[Usual | None] = None
+    belongs_to: ClassVar[Owner] = "ball"
+    imitated: ClassVar[bool] = False
     needs: ClassVar[tuple[str, ...]] = ()
     multiplies_spin: ClassVar[bool] = False
 

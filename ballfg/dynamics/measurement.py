@@ -5,7 +5,7 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from ballfg.dynamics.effect import Effect, Kind
+from ballfg.dynamics.effect import Effect, Kind, Owner
 from ballfg.state import POSITION
 
 Later = Callable[[Tensor], Tensor]
@@ -21,6 +21,7 @@ class MeasurementEffect(Effect):
     """
 
     kind: ClassVar[Kind] = "measurement"
+    belongs_to: ClassVar[Owner] = "rig"
     rank: ClassVar[int] = 99
 
     def positions(self, states: Tensor, later: Later) -> Tensor:

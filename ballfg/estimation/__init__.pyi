@@ -21,6 +21,7 @@ from .observations.reading import RadarSpeed as RadarSpeed
 from .observations.reading import Reading as Reading
 from .observations.reading import SpinReading as SpinReading
 from .observations.registry import OBSERVATIONS as OBSERVATIONS
+from .observations.registry import load_observations as load_observations
 from .observations.registry import register_observation as register_observation
 from .observations.sighted_dataset import SightedDataset as SightedDataset
 from .observations.sighted_dataset import read_sighted as read_sighted

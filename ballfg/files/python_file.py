@@ -1,13 +1,19 @@
-"""Running a user's Python file: an effect or a detector of one's own."""
+"""Running a user's Python file: effects, observations or a detector of one's own."""
 
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from inspect import isabstract
 from pathlib import Path
 from traceback import extract_tb
 from types import ModuleType
+from typing import Any, TypeVar
 
+from ballfg.checks import check_path
 from ballfg.interrupts import is_interrupt
+from ballfg.registry import Registry
+
+T = TypeVar("T")
 
 
 def run_file(path: Path, what: str) -> ModuleType:
@@ -26,6 +32,38 @@ def run_file(path: Path, what: str) -> ModuleType:
     finally:
         del sys.modules[module.__name__]
     return module
+
+
+def load_classes(registry: Registry[T], path: str | Path) -> tuple[type[T], ...]:
+    """Run a Python file and register the classes that it defines; those that begin with `_` are left out.
+
+    Args: registry: decides which classes it takes.  path: of a file that you trust: all of its code runs.
+    Returns: the classes, in the order in which they stand there.
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is no Python, does not run, defines no such class, or one that the registry refuses.
+    """
+    path, sort = check_path("path", path).resolve(), registry.sort
+    if not path.is_file():
+        raise FileNotFoundError(f"{sort}s file {path} does not exist; {sort}s of one's own are one Python file.")
+    own = defined_classes(run_file(path, f"{sort}s"), registry.base)
+    if not own:
+        article = "an" if sort[0] in "aeiou" else "a"
+        raise ValueError(f"{path} must define {article} {sort}, a class; it defines none. {registry.remedy}")
+    try:
+        return tuple(registry.register(cls) for cls in own)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def defined_classes(module: ModuleType, base: type[Any] | tuple[type[Any], ...]) -> list[type[Any]]:
+    """The classes of a base that a module defines itself, in their order; not those that are abstract or private."""
+    return [
+        item
+        for name, item in vars(module).items()
+        if isinstance(item, type) and issubclass(item, base) and item.__module__ == module.__name__
+        if name[0] != "_" and not isabstract(item)
+    ]
 
 
 @contextmanager

@@ -1,9 +1,9 @@
 """The planted effects: every catalogue effect at its typical size, pairs of them, and physics of no catalogue.
 
-Typical sizes are those that docs/physics.md lists under what matters, or the nominal value of an effect that the
-declared model is made to lack.
+Typical sizes are those that the effects themselves call usual.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.diagnosis.search.hypothesis import Hypothesis
-from ballfg.dynamics import EFFECTS
+from ballfg.dynamics import EFFECTS, nominal_model
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Plant:
         """The right one: this effect in its true shape."""
         coefficients = EFFECTS[self.name].coefficients
         if not self.sized:
-            whole = {c.name: c.default for c in coefficients} | dict(self.amounts)
+            whole = {c.name: c.default for c in coefficients} | {c: self.base + a for c, a in self.amounts}
             return Hypothesis(EFFECTS[self.name], whole)
         shape = {c.name: c.default for c in coefficients if c.absent is None}
         return Hypothesis(EFFECTS[self.name], shape, tuple(c.name for c in coefficients if c.absent is not None))
@@ -54,39 +54,27 @@ class Plant:
         return np.array([amounts.get(c, 0.0) for c in self.hypothesis().strengths])
 
 
-PLANTS: Final[dict[str, Plant]] = {
-    plant.name: plant
-    for plant in (
-        Plant("wind", (("x", 0.2),)),
-        Plant("restitution_speed", (("slope", 0.02),)),
-        Plant("frame_tilt", (("y", 0.0087),)),
-        Plant("magnus", (("k", 0.0028),), left_out=True),
-        Plant("drag_spin", (("gain", 0.3),)),
-        Plant("spin_decay", (("rate", 0.2),)),
-        Plant("time_offset", (("x", 0.002),)),
-        Plant("spin_label_scale", (("s", 0.1),)),
-        Plant("wind_shear", (("x", 0.5),)),
-        Plant("gust_region", (("x", 1.0),)),
-        Plant("drag", (("k", 0.12),), left_out=True),
-        Plant("drag_speed", (("slope", 0.03),)),
-        Plant("magnus_saturation", (("strength", 0.5),)),
-        Plant("restitution", (("e", -0.07),), base=1.0, left_out=True),
-        Plant("friction", (("mu", 0.25),), left_out=True),
-        Plant("tangential_restitution", (("e_t", 0.15),), left_out=True),
-        Plant("table_height", (("offset", -0.003),), left_out=True),
-        Plant("table_tilt", (("y", 0.0087),)),
-        Plant("scale", (("x", 0.01),)),
-        Plant("radial_bias", (("offset", 0.01),)),
-        Plant("distortion", (("k", 0.008),)),
-        Plant("spin_label_offset", (("y", 15.0),)),
-        Plant("spin_label_frame", (("yy", -1.0),), sized=False),
-        Plant("gravity", (("g", 0.1),), base=9.81, hidden=True),
-        Plant("buoyancy", (("a", 0.146),), hidden=True),
-        Plant("time_scale", (("s", 0.01),), hidden=True),
-        Plant("velocity_lag", (("lag", 0.003),), hidden=True),
-    )
-}
-"""By name; the first ones serve for a quick look. Sizes: SI units."""
+FIRST: Final = (
+    "wind", "restitution_speed", "frame_tilt", "magnus", "drag_spin", "spin_decay", "time_offset", "spin_label_scale",
+)  # fmt: skip
+"""The effects that serve for a quick look."""
+
+
+def _plants() -> Iterator[Plant]:
+    """One for each effect whose usual strength is known; those for a quick look first."""
+    nominal = nominal_model()
+    for name in (*FIRST, *(name for name in EFFECTS if name not in FIRST)):
+        effect = EFFECTS[name]
+        if effect.usual is None:
+            continue
+        changed = next(c for c in effect.coefficients if c.name in effect.usual.change)
+        base = changed.default if changed.sigma == 0.0 or changed.absent is None else changed.absent
+        left_out = changed.sigma > 0.0 and (name in nominal.flight or name in nominal.bounce)
+        yield Plant(name, tuple(effect.usual.change.items()), base, left_out, effect.imitated, effect.usual.graded)
+
+
+PLANTS: Final[dict[str, Plant]] = {plant.name: plant for plant in _plants()}
+"""By name, at the strengths that the effects call usual."""
 
 PAIRS: Final = (
     ("wind", "restitution_speed"),

@@ -37,6 +37,7 @@ def design(
     out: Annotated[Path | None, typer.Option(help="Table of the shots, .csv or .parquet.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Random seed, of the random shots to compare with.")] = 0,
     effects_file: inputs.EffectsFiles = None,
+    observations_file: inputs.ObservationsFiles = None,
     jobs: inputs.Jobs = inputs.CORES,
 ) -> None:
     """Choose the launcher's next shots: those that best tell two effects apart, or shrink an error bar most.
@@ -55,6 +56,7 @@ def design(
     if out is not None:
         TableWriter(out)  # refuses a path that cannot be written
         inputs.check_out(out, dataset)
+    inputs.know_observations(observations_file)
     opened = inputs.open_inputs(dataset, model, effects_file)
     if not isinstance(opened.model, AnalyticModel):
         raise ValueError(f"--model must be analytic: effects are added to it; {model} is a learned one. Give another.")

@@ -9,7 +9,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg.cli.inputs import CORES, Address, Cluster, DatasetFolders, EffectsFiles, Jobs, open_inputs, workers
+from ballfg.cli.inputs import (
+    CORES,
+    Address,
+    Cluster,
+    DatasetFolders,
+    EffectsFiles,
+    Jobs,
+    ObservationsFiles,
+    know_observations,
+    open_inputs,
+    workers,
+)
 from ballfg.progress import announce
 
 if TYPE_CHECKING:
@@ -21,6 +32,7 @@ def diagnose(
     out: Annotated[Path, typer.Option(help="Folder of the report, new or empty.")],
     model: Annotated[Path | None, typer.Option(help="Model file. Default: the nominal model of the ball.")] = None,
     effects_file: EffectsFiles = None,
+    observations_file: ObservationsFiles = None,
     jobs: Jobs = CORES,
     cluster: Cluster = None,
     address: Address = None,
@@ -52,6 +64,7 @@ def diagnose(
         raise ValueError(f"out must not hold the model itself; {model} would be replaced. Choose another folder.")
     with reserved(out):  # until the report is there: a diagnosis takes minutes
         check_report_folder(out, force=force)
+        know_observations(observations_file)
         inputs, *others = [open_inputs(dataset, model, effects_file) for dataset in datasets]
         if not isinstance(inputs.model, AnalyticModel):
             raise ValueError(
@@ -66,7 +79,7 @@ def diagnose(
                 diagnosis, rooms = joint.whole, joint.rooms
             else:
                 diagnosis = find(inputs.dataset, inputs.model, jobs=processes, watch=announce)
-        typed = _typed(datasets, model, effects_file, out)
+        typed = _typed(datasets, model, effects_file, observations_file, out)
         models = tuple(map(room_file, rooms)) or (MODEL,)
         origin = Origin(typed, tuple(map(str, datasets)), "" if model is None else str(model), str(out), models)
         write_report(diagnosis, out, rooms, origin)
@@ -77,11 +90,18 @@ def diagnose(
     print(f"\nwrote {', '.join(name for name in files if (out / name).is_file())} to {out}")
 
 
-def _typed(datasets: Sequence[Path], model: Path | None, effects: Sequence[Path] | None, out: Path) -> str:
+def _typed(
+    datasets: Sequence[Path],
+    model: Path | None,
+    effects: Sequence[Path] | None,
+    observations: Sequence[Path] | None,
+    out: Path,
+) -> str:
     """The command line, without options that do not change the result."""
     words = ["ballfg", "diagnose", *map(str, datasets)]
     words += [] if model is None else ["--model", str(model)]
     words += [word for path in effects or () for word in ("--effects-file", str(path))]
+    words += [word for path in observations or () for word in ("--observations-file", str(path))]
     return shlex.join([*words, "--out", str(out)])
 
 

@@ -42,6 +42,7 @@ def estimate(
         ),
     ] = None,
     effects_file: inputs.EffectsFiles = None,
+    observations_file: inputs.ObservationsFiles = None,
     jobs: inputs.Jobs = inputs.CORES,
     cluster: inputs.Cluster = None,
     address: inputs.Address = None,
@@ -69,6 +70,7 @@ def estimate(
         inputs.check_out(out, dataset)
         positions = has_positions(dataset) if source is None else source is inputs.Source.POSITIONS
         open_dataset = inputs.open_inputs if positions else inputs.open_sighted
+        inputs.know_observations(observations_file)
         opened = open_dataset(dataset, model, effects_file, ball=ball)
         count = len(opened.dataset)
         work = partial(_estimated, opened.model, opened.estimator(method, solver))

@@ -64,6 +64,7 @@ def live(
     ] = None,
     viewer: Annotated[bool, typer.Option("--viewer", help="Show it live in rerun (extra: viewer).")] = False,
     effects_file: inputs.EffectsFiles = None,
+    observations_file: inputs.ObservationsFiles = None,
 ) -> None:
     """States with covariances, next bounce, apex and the crossing of a plane for each position, in real time.
 
@@ -89,6 +90,7 @@ def live(
     if out is not None:
         _check_out(out)
     inputs.know_effects(effects_file)
+    inputs.know_observations(observations_file)
     bag = replay is not None and _is_bag(replay)
     data = _dataset(like if bag or replay is None else replay)
     tracker = Tracker(*_scene(data, model, ball, table, noise), lag=lag)
@@ -125,9 +127,13 @@ def _dataset(folder: Path | None) -> Dataset | None:
     """The dataset of a replay, or the one that the stream is like."""
     if folder is None:
         return None
+    from ballfg.estimation.observations.files import tables_of_readings
     from ballfg.tracks import read_dataset
 
-    return read_dataset(folder)
+    data = read_dataset(folder)
+    unused = "is not used: live estimates are made from positions alone"
+    inputs.print_notes(f"{name} {unused}" for name in tables_of_readings(folder))
+    return data
 
 
 def _scene(

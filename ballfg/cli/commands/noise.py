@@ -38,6 +38,7 @@ def noise(
     dataset: inputs.DatasetFolder,
     model: inputs.ModelFile = None,
     effects_file: inputs.EffectsFiles = None,
+    observations_file: inputs.ObservationsFiles = None,
     tracks: Annotated[int, typer.Option(min=5, help="Number of tracks that are used, evenly over the dataset.")] = 20,
     out: Annotated[
         Path | None, typer.Option(metavar="<path>", help="Model file to write: the model with this noise.")
@@ -56,6 +57,7 @@ def noise(
     from ballfg.tracks import read_dataset
 
     inputs.know_effects(effects_file)
+    inputs.know_observations(observations_file)
     data = with_readings(read_dataset(dataset))
     ball = inputs.open_model(data, model)
     if out is not None and out.resolve() == (dataset / "dataset.yaml").resolve():

@@ -27,6 +27,7 @@ def predict(
     model: inputs.ModelFile = None,
     ball: inputs.BallName = None,
     effects_file: inputs.EffectsFiles = None,
+    observations_file: inputs.ObservationsFiles = None,
     conformal: Annotated[
         Path | None,
         typer.Option(
@@ -63,6 +64,7 @@ def predict(
             check_file(save_conformal, "save_conformal")
             if conformal is None:
                 raise ValueError("save_conformal must come with --conformal, whose scales it keeps. Add --conformal.")
+        inputs.know_observations(observations_file)
         opened = inputs.open_inputs(dataset, model, effects_file, observe, ball)
         count = len(opened.dataset)
         estimator = opened.estimator(method, solver)

@@ -12,7 +12,7 @@ from ballfg.diagnosis.search.candidates import ALIKE, Refit, Scored, delta_bic, 
 from ballfg.diagnosis.search.evaluation import got_worse, held_out_gain, on_all, on_others
 from ballfg.diagnosis.search.hypothesis import Hypothesis
 from ballfg.diagnosis.search.parsimony import halves_differ, insignificant
-from ballfg.diagnosis.search.plausible import implausible, in_table
+from ballfg.diagnosis.search.plausible import implausible, range_of
 from ballfg.diagnosis.search.process_noise import PredictiveModel
 from ballfg.diagnosis.search.ranking import NO_NAME, as_left, finding_of, fitted_values, ranking
 from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_findings, stamp_hypotheses
@@ -234,7 +234,7 @@ class SearchLoop:
         known = [implausible(hypothesis.known_as(n), values[n], radius) for n in hypothesis.strengths]
         if any(known):
             return next(text for text in known if text)
-        ranged = all(in_table(hypothesis.known_as(n), radius) for n in hypothesis.strengths)
+        ranged = all(range_of(hypothesis.known_as(n), radius) for n in hypothesis.strengths)
         if not ranged and hypothesis.strain(fit.unknowns.values) > self.plausible:
             return f"more than {self.plausible:g} times its typical distance from the usual value"
         return ""

@@ -1,9 +1,12 @@
 """Which effect classes are accepted: what each must say, and what must not contradict itself."""
 
+from typing import NamedTuple
+
 from torch import nn
 
-from ballfg.dynamics.effect import BounceEffect, Coefficient, Effect, FlightEffect
+from ballfg.dynamics.effect import BounceEffect, Coefficient, Effect, FlightEffect, Range, Usual
 from ballfg.dynamics.measurement import MeasurementEffect
+from ballfg.dynamics.wording import said
 
 REMEDY = "docs/add_an_effect.md has an example."
 BASES = (FlightEffect, BounceEffect, MeasurementEffect)
@@ -14,16 +17,45 @@ def check_effect(effect: type[Effect]) -> None:
 
     Raises: ValueError: the message names the class, the attribute and the rule.
     """
-    said = effect.__qualname__
+    where = effect.__qualname__
     for word in ("sentence", "decide"):
         if not (isinstance(getattr(effect, word, None), str) and getattr(effect, word).strip()):
-            raise ValueError(f"{said}.{word} must be a text; it is missing. {REMEDY}")
+            raise ValueError(f"{where}.{word} must be a text; it is missing. {REMEDY}")
     if not effect.name.isidentifier():
-        raise ValueError(f"{said}.name must be letters, digits and _; got '{effect.name}'. Rename it.")
+        raise ValueError(f"{where}.name must be letters, digits and _; got '{effect.name}'. Rename it.")
     kind = next(base.kind for base in BASES if issubclass(effect, base))
     if effect.kind != kind:
-        raise ValueError(f"{said}.kind must be that of its base, '{kind}'; got '{effect.kind}'. Leave it out.")
+        raise ValueError(f"{where}.kind must be that of its base, '{kind}'; got '{effect.kind}'. Leave it out.")
     _check_coefficients(effect)
+    _check_knowledge(effect)
+
+
+def _check_knowledge(effect: type[Effect]) -> None:
+    """What a class need not say, and must say rightly where it does."""
+    owners = ("rig",) if effect.kind == "measurement" else ("ball", "room")
+    if effect.belongs_to not in owners:
+        raise ValueError(
+            f"{effect.name}.belongs_to must be {' or '.join(owners)}; got {effect.belongs_to!r}. Correct it."
+        )
+    if not (effect.plausible is None or isinstance(effect.plausible, Range)):
+        raise ValueError(f"{effect.name}.plausible must be a Range; got {effect.plausible!r}. {REMEDY}")
+    strengths = [c.name for c in effect.coefficients if c.absent is not None]
+    if not (effect.usual is None or (isinstance(effect.usual, Usual) and set(effect.usual.change) <= set(strengths))):
+        raise ValueError(
+            f"{effect.name}.usual must be a Usual of {', '.join(strengths)}; got {effect.usual!r}. {REMEDY}"
+        )
+    try:
+        said(effect.says, {c.name: _Example(c.default, c.sigma) for c in effect.coefficients})
+    except (KeyError, ValueError, IndexError, AttributeError, TypeError) as error:
+        raise ValueError(
+            f"{effect.name}.says must have fields such as {{{strengths[0]}:.2g}}; got '{effect.says}' ({error!r}). "
+            f"{REMEDY}"
+        ) from error
+
+
+class _Example(NamedTuple):
+    value: float
+    sigma: float
 
 
 def _check_coefficients(effect: type[Effect]) -> None:

@@ -7,7 +7,7 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from ballfg.dynamics.effect import Coefficient, Flight, FlightEffect, Scene, length, vector
+from ballfg.dynamics.effect import Coefficient, Flight, FlightEffect, Range, Scene, Usual, length, vector
 from ballfg.state import STANDARD_GRAVITY, Z
 
 TINY_SPEED: Final = 1e-9
@@ -28,38 +28,35 @@ class Gravity(FlightEffect):
     """a = (0, 0, -g). Buoyancy of the air is the same as a smaller g."""
 
     name = "gravity"
+    plain = "the ball's weight"
+    says = "The ball is pulled down with {g:.3g} m/s²."
+    belongs_to = "room"
+    imitated = True
     sentence = (
         "The weight of the ball: a constant downward acceleration; the same as buoyancy and, once drag and Magnus "
         "force are free, as another time scale."
     )
     decide = "Look up the local g, known to four digits: a ball that falls otherwise shows a wrong clock or length."
     coefficients = (Coefficient("g", STANDARD_GRAVITY, 0.0, "m/s^2", 0.0, 30.0),)
+    plausible = Range(9.4, 9.9, "9.76 to 9.83 m/s^2 on the ground, less the buoyancy of 0.15 m/s^2")
+    usual = Usual({"g": 0.1}, "1 %, as of a length that is wrong by as much")
 
     def acceleration(self, flight: Flight) -> Tensor:
         """(..., 3) m/s^2, straight down."""
         return self.g * _DOWN.to(self.g.device)
 
 
-class Buoyancy(FlightEffect):
-    """An acceleration (0, 0, a): rho V g / m, 0.146 m/s^2 for a ball of 40 mm and 2.7 g in air of 1.2 kg/m^3."""
-
-    name = "buoyancy"
-    sentence = "The displaced air carries a part of the weight: exactly the same as a smaller g."
-    decide = "Weigh the ball and measure its diameter: rho V g / m is known; tracks show only the sum with gravity."
-    coefficients = (Coefficient("a", 0.0, 0.15, "m/s^2", -5.0, 5.0),)
-
-    def acceleration(self, flight: Flight) -> Tensor:
-        """(..., 3) m/s^2, straight up."""
-        return self.a * _UP.to(self.a.device)
-
-
 class Drag(FlightEffect):
     """a = -k |v| v, with k = rho Cd A / (2 m): 0.14 1/m for Cd = 0.49; fits of real tracks give 0.08 to 0.16."""
 
     name = "drag"
+    plain = "air drag"
+    says = "The air brakes the ball (drag coefficient {k:.3g} 1/m)."
     sentence = "Quadratic air drag with a constant coefficient."
     decide = "Vary the speed of still-air shots: drag grows with its square and points backwards, whatever the spin."
     coefficients = (Coefficient("k", 0.12, 0.035, "1/m", 0.0, 2.0, varies=True),)
+    plausible = Range(0.03, 0.25, "fits of measured tracks give 0.08 to 0.16 1/m; Cd of a sphere is 0.1 to 0.8")
+    usual = Usual({"k": 0.12}, "literature and fits of measured tracks, docs/physics.md")
 
     def acceleration(self, flight: Flight) -> Tensor:
         """(..., 3) m/s^2, opposite to the velocity; zero, with zero derivative, at rest."""
@@ -67,55 +64,20 @@ class Drag(FlightEffect):
         return -(k * flight.speed) * flight.velocity
 
 
-class DragSpeed(FlightEffect):
-    """k (1 + slope (|v| - reference)) in place of the declared drag's k."""
-
-    name = "drag_speed"
-    sentence = (
-        "The drag coefficient changes with speed (with the Reynolds number); another reference is the same as another "
-        "drag and slope."
-    )
-    decide = "Shoot without spin at very different speeds, in both directions so that a wind cancels."
-    coefficients = (
-        Coefficient("slope", 0.0, 0.02, "s/m", -0.2, 0.2),
-        Coefficient("reference", 5.0, 0.0, "m/s", 0.0, 20.0, absent=None),
-    )
-    needs = ("drag",)
-
-    @classmethod
-    def shapes(cls, scene: Scene) -> Sequence[Mapping[str, float]]:
-        """The reference in the middle of the data."""
-        return ({"reference": scene.speed},)
-
-    def adjust(self, flight: Flight) -> Flight:
-        """The flight with more drag where it is fast."""
-        return flight.more_drag(self.slope * (flight.speed - self.reference))
-
-
-class DragSpin(FlightEffect):
-    """k (1 + gain S) in place of the declared drag's k, with the spin ratio S = R |w| / |v|."""
-
-    name = "drag_spin"
-    sentence = "The drag coefficient grows with the ratio of surface speed to flight speed."
-    decide = "Shoot at one speed with and without spin; sidespin and topspin must slow the ball alike."
-    coefficients = (Coefficient("gain", 0.0, 0.3, "1", -10.0, 10.0),)
-    needs = ("drag",)
-
-    def adjust(self, flight: Flight) -> Flight:
-        """The flight with more drag where it spins; the force, with S |v| = R |w|, has no pole at rest."""
-        return flight.more_drag(self.gain * flight.spin_ratio)
-
-
 class Magnus(FlightEffect):
     """a = k (spin x v), k dimensionless: sources differ by 3.6 times (0.0010 to 0.0036)."""
 
     name = "magnus"
+    plain = "a force by spin (Magnus force)"
+    says = "Spin bends the flight (Magnus coefficient {k:.3g})."
     multiplies_spin = True
     sentence = "Lift of a spinning ball, proportional to spin x velocity."
     decide = (
         "Shoot with spins of opposite sign at one speed: the lift changes its sign with the spin, nothing else does."
     )
     coefficients = (Coefficient("k", 0.0028, 0.0008, "1", -0.1, 0.1),)
+    plausible = Range(0.0005, 0.005, "code of robots and fits of measured tracks give 0.0010 to 0.0046")
+    usual = Usual({"k": 0.0028}, "the measured set spindoe, docs/physics.md")
 
     def acceleration(self, flight: Flight) -> Tensor:
         """(..., 3) m/s^2, perpendicular to velocity and spin."""
@@ -123,32 +85,17 @@ class Magnus(FlightEffect):
         return k * torch.linalg.cross(flight.spin, flight.velocity)
 
 
-class MagnusSaturation(FlightEffect):
-    """k / (1 + strength S) in place of the declared Magnus k, with the spin ratio S = R |w| / |v|.
-
-    Measured lift coefficients have this shape: Cl = 1 / (2 + |v| / (R |w|)) is S / (1 + 2 S), strength 2
-    (A. Stepanek, "The aerodynamics of tennis balls - the topspin lob", American Journal of Physics 56, 1988).
-    """
-
-    name = "magnus_saturation"
-    sentence = "Lift grows more slowly than the spin: it saturates with the spin ratio."
-    decide = "Shoot at one speed with little, medium and much spin: the lift per spin must fall."
-    coefficients = (Coefficient("strength", 0.0, 0.5, "1", 0.0, 20.0),)
-    needs = ("magnus",)
-
-    def adjust(self, flight: Flight) -> Flight:
-        """The flight with the lift multiplied by 1 / (1 + strength S)."""
-        lost = self.strength * (flight.radius * length(flight.spin))
-        return flight.more_lift(-lost / (flight.speed + lost).clamp_min(TINY_SPEED))
-
-
 class SpinDecay(FlightEffect):
     """dw/dt = -rate w. No measured value was found for table tennis; 0 switches it off, 0.2 1/s is a slow decay."""
 
     name = "spin_decay"
+    plain = "a spin that fades in flight"
+    says = "The spin fades in flight, by {rate:lost} in one second."
     sentence = "Viscous torque of the air: the spin falls exponentially."
     decide = "Film a mark on the ball at launch and at the end of a long flight, or label the spin at both ends."
     coefficients = (Coefficient("rate", 0.2, 0.2, "1/s", 0.0, 20.0),)
+    plausible = Range(0.0, 2.0, "at 2 1/s two thirds of the spin are gone in half a second")
+    usual = Usual({"rate": 0.2}, "an estimate, 5 s until a third is left: no measured value was found")
 
     def spin_rate(self, flight: Flight) -> Tensor:
         """(..., 3) rad/s^2, opposite to the spin."""
@@ -159,9 +106,16 @@ class Wind(FlightEffect):
     """All air forces act on v - u, with a constant air velocity u; drag alone becomes -k |v - u| (v - u)."""
 
     name = "wind"
+    plain = "a wind"
+    says = "The air moves at {size:.2g} m/s {direction}."
+    belongs_to = "room"
     sentence = "The air moves at a constant velocity: drag and Magnus force act on the velocity relative to the air."
     decide = "Shoot in the opposite direction, or across: the wind keeps its direction, drag turns with the shot."
     coefficients = tuple(Coefficient(axis, 0.0, 0.3, "m/s", -20.0, 20.0) for axis in "xyz")
+    plausible = Range(
+        -0.5, 0.5, "ISO 7730 allows up to 0.25 m/s in rooms where people stay; an open window brings 0.5 m/s"
+    )
+    usual = Usual({"x": 0.2}, "ISO 7730 allows up to 0.25 m/s in rooms where people stay")
 
     def air_velocity(self, flight: Flight) -> Tensor:
         """(3,) or (..., 3) m/s, the same everywhere."""
@@ -172,6 +126,9 @@ class WindShear(FlightEffect):
     """Air velocity (x, y, 0) (p_z - reference): a horizontal wind that grows linearly with height."""
 
     name = "wind_shear"
+    plain = "a wind that grows with height"
+    says = "The air moves faster higher up: {size:.2g} m/s more for each metre, {direction}."
+    belongs_to = "room"
     sentence = (
         "The air moves horizontally, in proportion to the height above a reference; another reference is the same as a "
         "wind on top."
@@ -181,6 +138,8 @@ class WindShear(FlightEffect):
         *(Coefficient(axis, 0.0, 0.3, "1/s", -20.0, 20.0) for axis in "xy"),
         Coefficient("reference", 1.0, 0.5, "m", -100.0, 100.0, absent=None),
     )
+    plausible = Range(-1.0, 1.0, "a draught of 0.5 m/s in the lower half metre of a room and still air above it")
+    usual = Usual({"x": 0.5}, "an estimate: half of the strongest that is plausible")
 
     @classmethod
     def shapes(cls, scene: Scene) -> Sequence[Mapping[str, float]]:
@@ -197,6 +156,9 @@ class GustRegion(FlightEffect):
     """Air velocity u exp(-|p - c|^2 / (2 size^2)) round a centre c, smooth so that integration stays accurate."""
 
     name = "gust_region"
+    plain = "a wind in one part of the room"
+    says = "In one part of the room the air moves at {size:.2g} m/s {direction}."
+    belongs_to = "room"
     sentence = (
         "The air moves in one part of the room and is still elsewhere; a region much larger than the flights is a wind."
     )
@@ -208,6 +170,10 @@ class GustRegion(FlightEffect):
         Coefficient("center_z", 1.1, 0.5, "m", -100.0, 100.0, absent=None),
         Coefficient("size", 0.4, 0.2, "m", 0.01, 100.0, absent=None),
     )
+    plausible = Range(
+        -2.0, 2.0, "a fan at a few metres: ASHRAE 55 has up to 1.2 m/s at a person, twice that is the fan's own jet"
+    )
+    usual = Usual({"x": 1.0}, "a fan at a few metres: ASHRAE 55 has up to 1.2 m/s at a person")
 
     @classmethod
     def shapes(cls, scene: Scene) -> Sequence[Mapping[str, float]]:
@@ -226,3 +192,94 @@ class GustRegion(FlightEffect):
         distance = (flight.position - center).square().sum(-1, keepdim=True)
         share = torch.exp(-distance / (2 * self.size.square()))
         return share * vector(self.x, self.y, self.z)
+
+
+class DragSpeed(FlightEffect):
+    """k (1 + slope (|v| - reference)) in place of the declared drag's k."""
+
+    name = "drag_speed"
+    plain = "a drag that changes with speed"
+    says = "The drag coefficient {slope:grows|falls} with the ball's speed, by {slope:%} for each m/s."
+    sentence = (
+        "The drag coefficient changes with speed (with the Reynolds number); another reference is the same as another "
+        "drag and slope."
+    )
+    decide = "Shoot without spin at very different speeds, in both directions so that a wind cancels."
+    coefficients = (
+        Coefficient("slope", 0.0, 0.02, "s/m", -0.2, 0.2),
+        Coefficient("reference", 5.0, 0.0, "m/s", 0.0, 20.0, absent=None),
+    )
+    plausible = Range(-0.1, 0.1, "Cd of a sphere below the drag crisis changes by half over 5 m/s at most")
+    usual = Usual({"slope": 0.03}, "an estimate: a third of the steepest that is plausible")
+    needs = ("drag",)
+
+    @classmethod
+    def shapes(cls, scene: Scene) -> Sequence[Mapping[str, float]]:
+        """The reference in the middle of the data."""
+        return ({"reference": scene.speed},)
+
+    def adjust(self, flight: Flight) -> Flight:
+        """The flight with more drag where it is fast."""
+        return flight.more_drag(self.slope * (flight.speed - self.reference))
+
+
+class DragSpin(FlightEffect):
+    """k (1 + gain S) in place of the declared drag's k, with the spin ratio S = R |w| / |v|."""
+
+    name = "drag_spin"
+    plain = "a drag that changes with spin"
+    says = (
+        "A ball that spins has {gain:more|less} drag: {gain:%} at a spin whose surface speed equals the flight speed."
+    )
+    sentence = "The drag coefficient grows with the ratio of surface speed to flight speed."
+    decide = "Shoot at one speed with and without spin; sidespin and topspin must slow the ball alike."
+    coefficients = (Coefficient("gain", 0.0, 0.3, "1", -10.0, 10.0),)
+    plausible = Range(-1.0, 3.0, "Cd of a fast spinning ball is up to twice that of one without spin")
+    usual = Usual({"gain": 0.3}, "an estimate: a third of what doubles the drag")
+    needs = ("drag",)
+
+    def adjust(self, flight: Flight) -> Flight:
+        """The flight with more drag where it spins; the force, with S |v| = R |w|, has no pole at rest."""
+        return flight.more_drag(self.gain * flight.spin_ratio)
+
+
+class MagnusSaturation(FlightEffect):
+    """k / (1 + strength S) in place of the declared Magnus k, with the spin ratio S = R |w| / |v|.
+
+    Measured lift coefficients have this shape: Cl = 1 / (2 + |v| / (R |w|)) is S / (1 + 2 S), strength 2
+    (A. Stepanek, "The aerodynamics of tennis balls - the topspin lob", American Journal of Physics 56, 1988).
+    """
+
+    name = "magnus_saturation"
+    plain = "a force by spin that saturates"
+    says = "The sideways force of a spinning ball grows more slowly than its spin."
+    sentence = "Lift grows more slowly than the spin: it saturates with the spin ratio."
+    decide = "Shoot at one speed with little, medium and much spin: the lift per spin must fall."
+    coefficients = (Coefficient("strength", 0.0, 0.5, "1", 0.0, 20.0),)
+    plausible = Range(0.0, 3.0, "Stepanek 1988: Cl = S / (1 + 2 S)")
+    usual = Usual({"strength": 0.5}, "an estimate: a quarter of Stepanek's law")
+    needs = ("magnus",)
+
+    def adjust(self, flight: Flight) -> Flight:
+        """The flight with the lift multiplied by 1 / (1 + strength S)."""
+        lost = self.strength * (flight.radius * length(flight.spin))
+        return flight.more_lift(-lost / (flight.speed + lost).clamp_min(TINY_SPEED))
+
+
+class Buoyancy(FlightEffect):
+    """An acceleration (0, 0, a): rho V g / m, 0.146 m/s^2 for a ball of 40 mm and 2.7 g in air of 1.2 kg/m^3."""
+
+    name = "buoyancy"
+    plain = "a lift by the displaced air"
+    says = "Something carries a part of the ball's weight: {a:abs .2g} m/s² of acceleration."
+    belongs_to = "room"
+    imitated = True
+    sentence = "The displaced air carries a part of the weight: exactly the same as a smaller g."
+    decide = "Weigh the ball and measure its diameter: rho V g / m is known; tracks show only the sum with gravity."
+    coefficients = (Coefficient("a", 0.0, 0.15, "m/s^2", -5.0, 5.0),)
+    plausible = Range(0.0, 0.3, "rho V g / m is 0.146 m/s^2")
+    usual = Usual({"a": 0.146}, "rho V g / m of a ball of 40 mm and 2.7 g")
+
+    def acceleration(self, flight: Flight) -> Tensor:
+        """(..., 3) m/s^2, straight up."""
+        return self.a * _UP.to(self.a.device)

@@ -1,13 +1,16 @@
-"""The effects a model file may name: one line for each. docs/add_an_effect.md shows how to add one, here or outside."""
+"""The effects that a model file may name: all that the modules of this folder define, and those of other packages."""
 
+from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
+from pkgutil import iter_modules
 from typing import Final
 
-from ballfg.checks import check_path
+from ballfg.dynamics import effects
 from ballfg.dynamics.effect import Effect, Kind
-from ballfg.dynamics.effects import bounce, flight, generic, measurement
+from ballfg.dynamics.effects import generic
 from ballfg.dynamics.effects.checks import BASES, REMEDY, check_effect
-from ballfg.files.python_file import run_file
+from ballfg.files.python_file import defined_classes, load_classes
 from ballfg.registry import Registry
 
 GENERIC: Final[dict[str, type[Effect]]] = {
@@ -31,36 +34,16 @@ EFFECTS: Final = Registry[Effect](
 )
 """Every effect that a search for causes may find, by the name that model files use."""
 
-for _effect in (
-    flight.Gravity,
-    flight.Drag,
-    flight.Magnus,
-    flight.SpinDecay,
-    flight.Wind,
-    flight.WindShear,
-    flight.GustRegion,
-    flight.DragSpeed,
-    flight.DragSpin,
-    flight.MagnusSaturation,
-    flight.Buoyancy,
-    bounce.Restitution,
-    bounce.Friction,
-    bounce.TangentialRestitution,
-    bounce.TableHeight,
-    bounce.RestitutionSpeed,
-    bounce.TableTilt,
-    measurement.TimeOffset,
-    measurement.VelocityLag,
-    measurement.FrameTilt,
-    measurement.Scale,
-    measurement.RadialBias,
-    measurement.Distortion,
-    measurement.TimeScale,
-    measurement.CountedFrames,
-    measurement.SpinLabelFrame,
-    measurement.SpinLabelScale,
-    measurement.SpinLabelOffset,
-):
+
+def _own() -> Iterator[type[Effect]]:
+    """The effects of the modules of this folder, by kind, module and place in it."""
+    names = sorted(f"{__package__}.{module.name}" for module in iter_modules(effects.__path__))
+    found = [cls for name in names if name != __name__ for cls in defined_classes(import_module(name), BASES)]
+    kinds = [base.kind for base in BASES]
+    yield from sorted((cls for cls in found if cls not in GENERIC.values()), key=lambda cls: kinds.index(cls.kind))
+
+
+for _effect in _own():
     EFFECTS.register(_effect)
 
 register = EFFECTS.register
@@ -88,18 +71,4 @@ def load_effects(path: str | Path) -> tuple[type[Effect], ...]:
         FileNotFoundError: if there is no such file.
         ValueError: if it is no Python, does not run, defines no effect, or one that `register` refuses.
     """
-    path = check_path("path", path).resolve()
-    if not path.is_file():
-        raise FileNotFoundError(f"effects file {path} does not exist; effects of one's own are one Python file.")
-    module = run_file(path, "effects")
-    own = [
-        item
-        for name, item in vars(module).items()
-        if isinstance(item, type) and issubclass(item, Effect) and item.__module__ == module.__name__ and name[0] != "_"
-    ]
-    if not own:
-        raise ValueError(f"{path} must define an effect, a class; it defines none. {REMEDY}")
-    try:
-        return tuple(register(effect) for effect in own)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {error}") from error
+    return load_classes(EFFECTS, path)

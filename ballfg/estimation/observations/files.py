@@ -5,6 +5,7 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -14,6 +15,9 @@ from ballfg.estimation.observations.observation import Observation
 from ballfg.estimation.observations.registry import OBSERVATIONS
 from ballfg.tracks import TableWriter, Track, csv_files
 from ballfg.tracks.rows import KEY
+
+LONGEST_HEADER: Final = 4096
+"""Bytes of a table's first line that are looked at."""
 
 
 @dataclass
@@ -46,14 +50,37 @@ def read_readings(folder: str | PathLike[str], trajectories: Collection[str]) ->
 
     Args: folder: of a dataset.  trajectories: names of its tracks.
     Raises: ValueError: a missing column, a row of an unknown trajectory, or a cell that is no number; the message names
-        file, line and column.
+        file, line and column. A table of readings that belongs to no registered sort.
     """
     tables, known = ReadingTables(), set(trajectories)
-    for sort in OBSERVATIONS.values():
-        path = Path(folder) / (sort.file or "")
-        if path.is_file():
-            tables.rows[sort] = _read(path, sort, known, tables.notes)
+    for name, sort in tables_of_readings(folder).items():
+        tables.rows[sort] = _read(Path(folder) / name, sort, known, tables.notes)
     return tables
+
+
+def tables_of_readings(folder: str | PathLike[str]) -> dict[str, type[Observation]]:
+    """The tables of readings in the folder of a dataset, by name, with the sort that each belongs to.
+
+    Results and other tables may lie there too: readings are told by their columns `trajectory`, `t` and `sigma`.
+
+    Raises: ValueError: if a table of readings belongs to no registered sort.
+    """
+    sorts = {sort.file: sort for sort in OBSERVATIONS.values() if sort.file is not None}
+    found = {name: sort for name, sort in sorts.items() if (Path(folder) / name).is_file()}
+    for path in sorted(Path(folder).glob("*.csv")):
+        if path.name not in found and path.is_file() and _has_readings(path):
+            raise ValueError(
+                f"{path} must belong to an observation; none that is known reads it: "
+                f"{', '.join(f'{file} ({sort.name})' for file, sort in sorts.items())}. "
+                "Name the file of its class with --observations-file, register the class, or move the table away."
+            )
+    return found
+
+
+def _has_readings(path: Path) -> bool:
+    with path.open("rb") as file:
+        header = file.readline(LONGEST_HEADER).removeprefix(b"\xef\xbb\xbf")
+    return {KEY.encode(), b"t", b"sigma"} <= {cell.strip().strip(b'"') for cell in header.split(b",")}
 
 
 def write_readings(folder: str | PathLike[str], tracks: Iterable[Track]) -> list[Path]:

@@ -1,11 +1,13 @@
 """The sorts of observation by name: those of the package, of the user, and of other installed packages."""
 
+from pathlib import Path
 from typing import Final
 
 from ballfg.estimation.observations.observation import Observation
 from ballfg.estimation.observations.positions import Positions
 from ballfg.estimation.observations.reading import RadarSpeed, SpinReading
 from ballfg.estimation.observations.sightings import CameraSightings
+from ballfg.files.python_file import load_classes
 from ballfg.registry import Registry
 
 OBSERVATIONS: Final[Registry[Observation]] = Registry(
@@ -15,3 +17,15 @@ register_observation = OBSERVATIONS.register
 """Lets an observation be read from the folder of a dataset; may decorate the class."""
 for _own in (Positions, CameraSightings, RadarSpeed, SpinReading):
     register_observation(_own)
+
+
+def load_observations(path: str | Path) -> tuple[type[Observation], ...]:
+    """Run a Python file and register the observations that it defines; those whose class begins with `_` are left out.
+
+    Args: path: of a file that you trust: all of its code runs.
+    Returns: the classes, in the order in which they stand there.
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is no Python, does not run, defines no observation, or one that cannot be registered.
+    """
+    return load_classes(OBSERVATIONS, path)
