@@ -1,8 +1,8 @@
 """What a user may decide about an import, what was guessed in its place, and the question where no guess is safe."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from typing import Any, Final
+from dataclasses import dataclass, field
+from typing import Final
 
 from ballfg.checks import check_choice, check_instance, check_number, check_text, short_text, shown
 from ballfg.importing.fall import AXES, LENGTHS, TIMES
@@ -76,11 +76,6 @@ class Choices:
             check_number("--table-height", self.table_height, "m")
         for option, text in (("ball", self.ball), ("key", self.key), ("topic", self.topic), ("name", self.name)):
             check_text(f"--{option}", text, optional=True)
-
-    def decided(self) -> dict[str, Any]:
-        """The options that were given."""
-        values = {one.name: getattr(self, one.name) for one in fields(self)}
-        return {key: value for key, value in values.items() if value not in (None, {})}
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
-from typing import Any, Literal, Self, TypeVar
+from typing import Any, TypeVar
 
 import torch
 import torch.distributed as dist
@@ -25,30 +25,13 @@ TOLD_BY_FIRST = 1
 """Exit status of a process that prints nothing because the first one prints the reason."""
 
 
-@dataclass(frozen=True)
-class Trouble:
-    """The exception that ended a rank's work, in a form that can be sent."""
-
-    rank: int
-    what: Literal["interrupt", "input", "fault"]
-    text: str
-
-    @classmethod
-    def of(cls, rank: int, error: BaseException) -> Self:
-        """The form of an exception that is sent to the other ranks."""
-        if isinstance(error, KeyboardInterrupt):
-            return cls(rank, "interrupt", "")
-        if isinstance(error, (ValueError, TypeError, OSError)):
-            return cls(rank, "input", str(error))
-        return cls(rank, "fault", "".join(traceback.format_exception(error)))
-
-    def exception(self) -> BaseException:
-        """The exception that the first rank raises for another one."""
-        if self.what == "interrupt":
-            return KeyboardInterrupt()
-        if self.what == "input":
-            return ValueError(self.text)
-        return RuntimeError(f"process {self.rank} failed:\n{self.text}")
+def for_others(rank: int, error: BaseException) -> BaseException:
+    """The exception that the first rank raises in place of one of another rank; a plain one, which can be sent."""
+    if isinstance(error, KeyboardInterrupt):
+        return KeyboardInterrupt()
+    if isinstance(error, (ValueError, TypeError, OSError)):
+        return ValueError(str(error))
+    return RuntimeError(f"process {rank} failed:\n{''.join(traceback.format_exception(error))}")
 
 
 @dataclass
@@ -106,15 +89,15 @@ class Ranks:
                 result = work()
         except (Exception, KeyboardInterrupt) as raised:
             error = raised
-        told: list[Trouble | None] = [None] * self.size
-        dist.all_gather_object(told, None if error is None else Trouble.of(self.rank, error))
+        told: list[BaseException | None] = [None] * self.size
+        dist.all_gather_object(told, None if error is None else for_others(self.rank, error))
         trouble = next((each for each in told if each is not None), None)
         if trouble is not None and not self.first:
             raise SystemExit(TOLD_BY_FIRST) from error
         if error is not None:
             raise error
         if trouble is not None:
-            raise trouble.exception()
+            raise trouble
         return result  # type: ignore[return-value]
 
     @contextmanager

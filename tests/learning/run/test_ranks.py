@@ -22,7 +22,7 @@ from ballfg.learning.run import launch as launching
 from ballfg.learning.run.checkpoint import read_checkpoint
 from ballfg.learning.run.launch import launch
 from ballfg.learning.run.metrics import read_metrics
-from ballfg.learning.run.ranks import Ranks, SharedMemory, Trouble, join_ranks
+from ballfg.learning.run.ranks import Ranks, SharedMemory, for_others, join_ranks
 from ballfg.learning.run.training import run_training
 from ballfg.progress import progress
 from tests.faults.kills import in_fork
@@ -246,11 +246,11 @@ def test_memory_of_other_ranks_does_not_grow_old() -> None:
 
 
 def test_trouble_travels_in_kind() -> None:
-    assert isinstance(Trouble.of(1, KeyboardInterrupt()).exception(), KeyboardInterrupt)
-    told = Trouble.of(1, FileNotFoundError("no data. Give some.")).exception()
+    assert isinstance(for_others(1, KeyboardInterrupt()), KeyboardInterrupt)
+    told = for_others(1, FileNotFoundError("no data. Give some."))
     assert isinstance(told, ValueError)
     assert str(told) == "no data. Give some."
-    fault = Trouble.of(1, ZeroDivisionError("x")).exception()
+    fault = for_others(1, ZeroDivisionError("x"))
     assert isinstance(fault, RuntimeError)
     assert "process 1 failed:\n" in str(fault)
     assert "ZeroDivisionError: x" in str(fault)
