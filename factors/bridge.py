@@ -101,7 +101,7 @@ class Bridge:
         self.calls += 1
         with np.errstate(over="ignore", invalid="ignore"):
             residual, jacobians = shaped(self.batch, rows, inputs, *self.batch.compute(rows, inputs))
-        finite = np.isfinite(residual).all(axis=1)
+        finite = np.asarray(np.isfinite(residual).all(axis=1))
         for block in jacobians:
             finite &= np.isfinite(block).all(axis=(1, 2))
         for k, row in enumerate(rows.tolist()):
@@ -281,7 +281,7 @@ def linear_graph(linearized: Sequence[Rows]) -> gtsam.GaussianFactorGraph:
         unit = gtsam.noiseModel.Unit.Create(residual.shape[1])
         for i, variables in enumerate(rows.variables.tolist()):
             terms = [term for v, block in zip(variables, jacobians, strict=True) for term in (key_of(v), block[i])]
-            result.push_back(gtsam.JacobianFactor(*terms, -residual[i], unit))
+            result.push_back(gtsam.JacobianFactor(*terms, -residual[i], unit))  # type: ignore[call-overload]
     return result
 
 

@@ -107,7 +107,7 @@ class Marginals:
 
     def covariances(self) -> Covariances | None:
         """Those of x0, x1, ... and of c0; None where they are not determined, to double precision."""
-        keys = []
+        keys: list[int] = []
         while self._values.exists(STATE_KEY + len(keys)):
             keys.append(STATE_KEY + len(keys))
         states = np.array([self._tree.marginalCovariance(key) for key in keys])

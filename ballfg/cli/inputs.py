@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Generic, TypeVar
+from typing import TYPE_CHECKING, Annotated, Generic, Literal, TypeVar
 
 import typer
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from ballfg.dynamics.surfaces import Surfaces
     from ballfg.estimation import Estimator, Status
     from ballfg.estimation.observations.sighted_dataset import SightedDataset
+    from ballfg.estimation.settings import Solver
     from ballfg.tracks import Dataset
 
 
@@ -70,15 +71,8 @@ MethodName = Annotated[
 ]
 
 
-class Solver(enum.StrEnum):
-    """What solves the factor graph of an estimate, by the name of the option."""
-
-    BALLFG = "ballfg"
-    GTSAM = "gtsam"
-
-
 SolverName = Annotated[
-    Solver | None,
+    Literal["ballfg", "gtsam"] | None,
     typer.Option("--solver", help="Solver of the factor graph.", show_default="gtsam for online, else ballfg"),
 ]
 ModelFile = Annotated[
@@ -133,10 +127,9 @@ class Inputs(Generic[D]):
         """
         from ballfg.estimation import Settings, fitted_settings, make_estimator
 
-        chosen = None if solver is None else solver.value
-        make_estimator(method, self.model, self.surfaces, Settings(solver=chosen))  # refuses before it takes long
+        make_estimator(method, self.model, self.surfaces, Settings(solver=solver))  # refuses before it takes long
         settings = fitted_settings(self.dataset, self.model, self.observed, progress)
-        return make_estimator(method, self.model, self.surfaces, replace(settings, solver=chosen))
+        return make_estimator(method, self.model, self.surfaces, replace(settings, solver=solver))
 
 
 def know_effects(files: Iterable[Path] | None) -> None:
