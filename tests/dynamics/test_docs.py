@@ -22,27 +22,6 @@ def blocks(page, language):
     )
 
 
-def coefficient_table():
-    lines = [
-        "| effect | section | coefficient | default | absent | sigma | unit | bounds | what |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    for name, effect in EFFECTS.items():
-        for c in effect.coefficients:
-            absent = "shape" if c.absent is None else f"{c.absent:g}"
-            what = effect.sentence if c is effect.coefficients[0] else ""
-            numbers = (f"{c.default:g}", absent, f"{c.sigma:g}", c.unit, f"{c.low:g} to {c.high:g}")
-            lines.append(f"| {' | '.join((name, effect.kind, c.name, *numbers, what))} |")
-    return "\n".join(lines)
-
-
-def test_coefficient_table_is_that_of_the_registry():
-    text = (DOCS / "models.md").read_text(encoding="utf-8")
-    shown = re.search(r"<!-- coefficients -->\n(.*?)\n?<!-- end -->", text, re.DOTALL)
-    assert shown
-    assert shown[1] == coefficient_table(), "put this table into docs/models.md:\n" + coefficient_table()
-
-
 def test_model_file_example_loads():
     text, variations = blocks("models.md", "yaml")
     content = yaml.safe_load(text)
