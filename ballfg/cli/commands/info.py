@@ -26,6 +26,7 @@ REGISTRIES = (
     ("observations", "ballfg.estimation", "OBSERVATIONS"),
     ("estimators", "ballfg.estimation", "ESTIMATORS"),
     ("trainees", "ballfg.learning", "TRAINEES"),
+    ("formats", "ballfg.importing", "FORMATS"),
 )
 """Title, module and attribute of each registry, in the order in which they are shown."""
 WIDTH = 110
