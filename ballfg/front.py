@@ -6,44 +6,28 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias, TypedDict, Unpack, overload
+from typing import TYPE_CHECKING, TypeAlias, TypedDict, Unpack, cast, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ballfg.checks import check_count, check_instance, check_path, type_name
 from ballfg.dynamics import BallModel, Surfaces, inertia_factor, load_model, nominal_model
-from ballfg.estimation import (
-    ConformalScales,
-    Estimate,
-    Estimator,
-    Settings,
-    SightedDataset,
-    Smoother,
-    TrackGraph,
-    TrackPrediction,
-    check_calibration_tracks,
-    check_observe,
-    dataset_surfaces,
-    estimate_tracks,
-    fitted_settings,
-    load_conformal,
-    make_estimator,
-    predict_tracks,
-    read,
-)
-from ballfg.parallel.executor import MOST_JOBS
-from ballfg.parallel.work import on_one_thread
+from ballfg.estimation import Estimate, Estimator, Settings, make_estimator
+from ballfg.machine import MOST_JOBS
 from ballfg.prediction import Ahead, BallState
-from ballfg.tracks import TABLE_TENNIS, Ball, Dataset, Track
+from ballfg.tracks import TABLE_TENNIS, Ball, Track
+from ballfg.tracks.info import TrackFolder
 
 if TYPE_CHECKING:
     from ballfg.diagnosis import Diagnosis
+    from ballfg.estimation import ConformalScales, SightedDataset, TrackGraph, TrackPrediction
+    from ballfg.tracks import Dataset
 
 Folder: TypeAlias = str | PathLike[str]
-Tracks: TypeAlias = Dataset | SightedDataset
+Tracks: TypeAlias = "Dataset | SightedDataset"
 Model: TypeAlias = BallModel | Ball | Folder | None
-Conformal: TypeAlias = Tracks | ConformalScales | Folder | None
+Conformal: TypeAlias = "Tracks | ConformalScales | Folder | None"
 OneTrack: TypeAlias = Track | NDArray[np.float64] | tuple[ArrayLike, ArrayLike]
 """A track; or an array (n, 4) of t (s), x, y, z (m); or times (n,) s and positions (n, 3) m."""
 
@@ -102,6 +86,8 @@ def estimate(
     estimator = estimator_for(data, method, model, surfaces, settings)
     if isinstance(data, Track):
         return estimator.estimate(data)
+    from ballfg.estimation import estimate_tracks
+
     return {one.name: one for one in estimate_tracks(estimator, data, len(data), jobs)}
 
 
@@ -151,6 +137,8 @@ def predict(
         _refuse(conformal)
         estimator = estimator_for(data, method, model, surfaces, settings)
         return estimator.estimate(data).predict(horizon)
+    from ballfg.estimation import check_observe, predict_tracks
+
     check_observe(observe)
     observe = float(observe)
     estimator = estimator_for(data, method, model, surfaces, settings, observe)
@@ -176,6 +164,8 @@ def _scales(
     observe: float,
 ) -> ConformalScales | None:
     """The scales of predictions of `data`: those given, or from the calibration tracks that are given."""
+    from ballfg.estimation import ConformalScales, check_calibration_tracks, load_conformal
+
     if isinstance(conformal, str | PathLike) and check_path("conformal", conformal).is_file():
         conformal = load_conformal(Path(conformal))
     if isinstance(conformal, ConformalScales):
@@ -203,7 +193,11 @@ def diagnose(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) 
         FileNotFoundError: a folder or model file that is not there.
     """
     check_count("jobs", jobs, 1, MOST_JOBS)
-    data = read(measured) if isinstance(measured, str | PathLike) else measured
+    from ballfg.estimation import SightedDataset
+    from ballfg.parallel.work import on_one_thread
+    from ballfg.tracks import Dataset
+
+    data = _opened(measured) if isinstance(measured, str | PathLike) else measured
     if isinstance(data, SightedDataset):
         raise ValueError("measured must have a table of positions; a diagnosis of detections alone is not possible")
     if not isinstance(data, Dataset):
@@ -238,6 +232,8 @@ def graph(
     track = _opened(measured)
     if not isinstance(track, Track):
         raise TypeError("measured must be one track; got a dataset. Choose a track of it by its name.")
+    from ballfg.estimation import Smoother, TrackGraph
+
     found = estimator_for(track, "smoother", model, surfaces, settings).of(track)
     return TrackGraph.of(Smoother(found.model, found.surfaces, found.settings), track)
 
@@ -256,6 +252,8 @@ def estimator_for(
     """
     source = data.dataset if isinstance(data, Track) else data
     ball = _model(model, source)
+    if source is not None:
+        from ballfg.estimation import dataset_surfaces, fitted_settings
     if surfaces is None:
         surfaces = 0.0 if source is None else dataset_surfaces(source)
     if settings is None:
@@ -276,9 +274,11 @@ def _model(model: Model, source: Tracks | None) -> BallModel:
 
 def _opened(measured: object) -> Track | Tracks:
     if isinstance(measured, str | PathLike):
+        from ballfg.estimation import read
+
         return read(measured)
-    if isinstance(measured, Track | Dataset | SightedDataset):
-        return measured
+    if isinstance(measured, Track | TrackFolder):
+        return cast("Track | Tracks", measured)
     if isinstance(measured, np.ndarray) and measured.ndim == 2 and measured.shape[1] == 4:
         return Track(measured[:, 0], measured[:, 1:])
     if isinstance(measured, tuple) and len(measured) == 2:

@@ -13,6 +13,9 @@ DATE: Final = "SOURCE_DATE_EPOCH"
 """Environment variable with a date in seconds since 1970 that stands for now, so that a page can be made again byte
 for byte (reproducible-builds.org)."""
 
+MOST_JOBS: Final = 10_000
+"""Processes. No machine has cores for more."""
+
 
 def usable_cores() -> int:
     """How many cores this process may use."""

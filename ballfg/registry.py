@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass, field
 from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, packages_distributions, version
+from pkgutil import resolve_name
 from types import ModuleType
 from typing import Any, Generic, TypeVar, cast
 
@@ -48,6 +49,7 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         remedy: a sentence that ends messages about classes which cannot be registered.
         check: refuses a class of somebody else by an exception that says what is wrong with it.
         reserved: classes by name that are not in the registry; their names are taken.
+        own: places of classes of this package by name, `module:Class`, each of which is imported when it is asked for.
     """
 
     sort: str
@@ -57,6 +59,7 @@ class Registry(Mapping[str, type[T]], Generic[T]):
     remedy: str
     check: Callable[[type[T]], None] | None = None
     reserved: Mapping[str, type[T]] = field(default_factory=dict)
+    own: Mapping[str, str] = field(default_factory=dict)
 
     _classes: dict[str, type[T]] = field(init=False, default_factory=dict)
     _packages: dict[str, Source] = field(init=False, default_factory=dict)
@@ -65,18 +68,20 @@ class Registry(Mapping[str, type[T]], Generic[T]):
     def __getitem__(self, name: str) -> type[T]:
         if not isinstance(name, str):
             raise KeyError(name)
+        if name not in self._classes and name in self.own:
+            self._classes[name] = resolve_name(self.own[name])
         if name not in self._classes:
             self.load_entry_points()
         return self._classes[name]
 
     def __iter__(self) -> Iterator[str]:
         self.load_entry_points()
-        own = [name for name, cls in self._classes.items() if _is_own(cls)]
+        own = dict.fromkeys([*self.own, *(name for name, cls in self._classes.items() if _is_own(cls))])
         return iter([*own, *sorted(set(self._classes) - set(own))])
 
     def __len__(self) -> int:
         self.load_entry_points()
-        return len(self._classes)
+        return len({*self.own, *self._classes})
 
     def __repr__(self) -> str:
         return f"Registry of {self.sort}s: {', '.join(self)}"
@@ -102,7 +107,7 @@ class Registry(Mapping[str, type[T]], Generic[T]):
             raise ValueError(f"{cls.__qualname__}.name must be a text; it is missing. {self.remedy}")
         if self.check is not None and not _is_own(cls):
             self.check(cls)
-        taken = self._classes.get(name) or self.reserved.get(name)
+        taken = self[name] if name in self.own else self._classes.get(name) or self.reserved.get(name)
         if taken is not None and _place(taken) != _place(cls):
             article = "an" if self.sort[0] in "aeiou" else "a"
             raise ValueError(

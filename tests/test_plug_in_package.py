@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -144,6 +145,8 @@ def test_estimate_uses_its_observation_and_its_estimator(
         return printed(with_package(*words))
 
     truth = column(shots / "truth.csv", "z")
+    bare = shutil.copytree(shots, tmp_path / "bare")
+    (bare / "heights.csv").unlink()
     error, sigma = {}, {}
     for name, ballfg, method in (
         ("plain", here, "smoother"),
@@ -152,7 +155,7 @@ def test_estimate_uses_its_observation_and_its_estimator(
         ("filter", here, "ekf"),
     ):
         out = tmp_path / f"{name}.csv"
-        said = ballfg("estimate", shots, "--method", method, "--out", out, "--jobs", 2)
+        said = ballfg("estimate", bare if ballfg is here else shots, "--method", method, "--out", out, "--jobs", 2)
         assert f"by {method}" in said
         error[name] = np.sqrt(np.mean((column(out, "z") - truth) ** 2))
         sigma[name] = np.median(column(out, "sigma_z"))
@@ -198,5 +201,6 @@ def test_the_benchmark_on_simulated_tracks_has_its_rows(with_package: Interprete
         assert float(own) == pytest.approx(float(smoother), rel=0.2)
 
 
-def test_without_the_package_its_table_is_left_alone(shots: Path) -> None:
-    assert not any(track.observations for track in read(shots))
+def test_without_the_package_its_table_is_refused(shots: Path) -> None:
+    with pytest.raises(ValueError, match=r"heights\.csv must belong to an observation"):
+        read(shots)

@@ -2,14 +2,15 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Final
+from importlib import resources
+from importlib.resources.abc import Traversable
+from typing import Any, Final
 
 from ballfg.checks import check_text, did_you_mean
 from ballfg.dynamics.model import THIN_SHELL
-from ballfg.tracks import TABLE_TENNIS, TENNIS, Ball
+from ballfg.files.strict_yaml import parse_yaml
+from ballfg.tracks import Ball
 
-SOLID: Final = 2.0 / 5.0
-"""Moment of inertia over m R^2 of a ball that is filled evenly; baseballs and golf balls are nearly so."""
 SHUTTLE: Final = (
     "a badminton shuttle is no ball: it turns its cork ahead, and its drag depends on how it is turned. "
     "No model here describes that; choose another ball."
@@ -38,46 +39,27 @@ class KnownBall:
     court: tuple[float, float] | None = None
 
 
-KNOWN_BALLS: Final[Mapping[str, KnownBall]] = {
-    "table_tennis": KnownBall(TABLE_TENNIS, "ITTF Laws of Table Tennis 2.3", court=(2.74, 1.525)),
-    "tennis": KnownBall(
-        TENNIS,
-        "ITF Rules of Tennis, App. I",
-        {"drag": 0.3, "magnus": 0.3, "restitution": 0.06, "friction": 0.15},  # courts differ more than balls do
-        court=(23.77, 10.97),
-    ),
-    "basketball": KnownBall(
-        Ball(0.121, 0.6),  # circumference 750 to 770 mm, 580 to 620 g
-        "FIBA Basketball Equipment 2020, size 7",
-        {"drag": 0.3, "magnus": 0.5, "restitution": 0.05, "friction": 0.3},
-        court=(28.0, 15.0),
-    ),
-    "volleyball": KnownBall(
-        Ball(0.105, 0.27),  # circumference 650 to 670 mm, 260 to 280 g
-        "FIVB Official Volleyball Rules, rule 3",
-        {"drag": 0.45, "magnus": 0.5, "restitution": 0.08, "friction": 0.3},
-        court=(18.0, 9.0),
-    ),
-    "football": KnownBall(
-        Ball(0.1098, 0.43),  # circumference 680 to 700 mm, 410 to 450 g
-        "IFAB Laws of the Game, law 2",
-        {"drag": 0.5, "magnus": 0.4, "restitution": 0.15, "friction": 0.4},
-        court=(105.0, 68.0),  # the usual size of a stadium; law 1 leaves a range
-    ),
-    "baseball": KnownBall(
-        Ball(0.0369, 0.1453),  # circumference 9 to 9.25 in, 5 to 5.25 oz
-        "MLB Official Baseball Rules 3.01",
-        {"drag": 0.25, "magnus": 0.3, "restitution": 0.2, "friction": 0.4},
-        SOLID,
-    ),
-    "golf": KnownBall(
-        Ball(0.021335, 0.04593),  # at least 42.67 mm across, at most 45.93 g
-        "R&A and USGA Equipment Rules, part 4",
-        {"drag": 0.3, "magnus": 0.4, "restitution": 0.4, "friction": 0.5},
-        SOLID,
-    ),
+def _read_ball(path: Traversable) -> tuple[KnownBall, dict[str, Any]]:
+    """A ball and the content of its model file, from one file."""
+    content = dict(parse_yaml(path.read_text(encoding="utf-8"), path.name))
+    stated = content.pop("ball")
+    ball = Ball(stated.pop("radius"), stated.pop("mass"))
+    court = stated.pop("court", None)
+    return KnownBall(ball, court=None if court is None else (court[0], court[1]), **stated), content
+
+
+_FILES: Final = {
+    path.name.removesuffix(".yaml"): _read_ball(path)
+    for path in sorted(resources.files("ballfg.dynamics").iterdir(), key=lambda path: path.name)
+    if path.name.endswith(".yaml")
 }
-"""The known balls by name."""
+KNOWN_BALLS: Final[Mapping[str, KnownBall]] = {name: known for name, (known, _) in _FILES.items()}
+"""The known balls by name: one for each file beside this module."""
+
+
+def nominal_content(name: str) -> dict[str, Any]:
+    """What the model file of a known ball declares; name: in `KNOWN_BALLS`."""
+    return _FILES[name][1]
 
 
 def known_ball(name: str) -> str:

@@ -12,8 +12,6 @@ from ballfg.dynamics.analytic import AnalyticModel, after_needs
 from ballfg.dynamics.effect import Effect, Kind
 from ballfg.dynamics.effects.registry import effect_class
 from ballfg.dynamics.model import THIN_SHELL, BallModel
-from ballfg.dynamics.networks.learned import LearnedModel
-from ballfg.dynamics.networks.learned_file import BASE, has_learned_part, read_learned, write_learned
 from ballfg.dynamics.variation import Variation
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.files.whole_file import write_text
@@ -64,6 +62,9 @@ def load_model(
     analytic = model_from_dict(
         {**content, "learned": None}, radius=radius, inertia_factor=inertia_factor, where=str(path)
     )
+    from ballfg.dynamics.networks.learned import LearnedModel  # networks are imported where a file names one
+    from ballfg.dynamics.networks.learned_file import read_learned
+
     model = read_learned(path.parent / learned, analytic)
     abroad = room is not None and model.trained is not None and model.trained.is_foreign(room)
     if abroad and isinstance(model, LearnedModel) and model.fading is not None:
@@ -178,7 +179,7 @@ def model_to_dict(model: AnalyticModel) -> dict[str, Any]:
 
 def _listed(variations: Mapping[str, Variation]) -> dict[str, Any]:
     """The section of coefficients that differ between tracks, if any do; those of a learned model are its base's."""
-    section = {name.removeprefix(BASE): variation.to_mapping() for name, variation in variations.items()}
+    section = {name.removeprefix("base."): variation.to_mapping() for name, variation in variations.items()}
     return {VARIATIONS: section} if section else {}
 
 
@@ -190,6 +191,8 @@ def save_model(model: BallModel, path: str | Path) -> None:
 
     Raises: TypeError: if the model is neither analytic nor learned, or corrects one that is not analytic.
     """
+    from ballfg.dynamics.networks.learned_file import has_learned_part, write_learned
+
     path = check_path("path", path)
     content = model_to_dict(_analytic_part(model)) | _listed(model.variations)
     if model.noise is not None:
@@ -201,6 +204,8 @@ def save_model(model: BallModel, path: str | Path) -> None:
 
 def _analytic_part(model: BallModel) -> AnalyticModel:
     """The effects that the file declares: none beside a learned model without a base."""
+    from ballfg.dynamics.networks.learned import LearnedModel
+
     part = model.base if isinstance(model, LearnedModel) else model
     if isinstance(model, LearnedModel) and part is None:
         return AnalyticModel((), radius=model.radius, inertia_factor=model.inertia_factor)

@@ -2,16 +2,14 @@
 
 import math
 from collections.abc import Mapping
-from importlib import resources
 from typing import Final, cast
 
 from ballfg.checks import is_number, shown, type_name
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.effect import Effect
-from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball
+from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball, nominal_content
 from ballfg.dynamics.model import THIN_SHELL
 from ballfg.dynamics.model_file import model_from_dict
-from ballfg.files.strict_yaml import parse_yaml
 from ballfg.tracks import TABLE_TENNIS, Ball
 
 TOLERANCE: Final = 0.15
@@ -95,9 +93,9 @@ def known_name(ball: Ball) -> str | None:
 
 
 def _known_model(name: str, radius: float) -> AnalyticModel:
-    text = resources.files("ballfg.dynamics").joinpath(f"{name}.yaml").read_text(encoding="utf-8")
-    known, where = KNOWN_BALLS[name], f"{name}.yaml"
-    model = model_from_dict(parse_yaml(text, where), radius=radius, inertia_factor=known.inertia_factor, where=where)
+    known = KNOWN_BALLS[name]
+    content, where = nominal_content(name), f"{name}.yaml"
+    model = model_from_dict(content, radius=radius, inertia_factor=known.inertia_factor, where=where)
     _set_spread(model, known.spreads)
     return model
 

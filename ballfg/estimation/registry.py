@@ -6,23 +6,24 @@ from typing import Final
 from ballfg.checks import check_instance, shown
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.each_its_model import EachItsModel
 from ballfg.estimation.estimator import Estimator
-from ballfg.estimation.filters.ekf import ExtendedKalmanFilter
-from ballfg.estimation.filters.sliding_window import SlidingWindow
-from ballfg.estimation.measurement.invert_measurement import InvertMeasurement
-from ballfg.estimation.online.online import Online
 from ballfg.estimation.settings import Settings
-from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.registry import Registry
 
 ESTIMATORS: Final[Registry[Estimator]] = Registry(
-    "estimator", group="ballfg.estimators", base=Estimator, remedy="docs/estimators.md has an example."
+    "estimator",
+    group="ballfg.estimators",
+    base=Estimator,
+    remedy="docs/estimators.md has an example.",
+    own={
+        "smoother": "ballfg.estimation.smoother.smoother:Smoother",
+        "online": "ballfg.estimation.online.online:Online",
+        "ekf": "ballfg.estimation.filters.ekf:ExtendedKalmanFilter",
+        "sliding-window": "ballfg.estimation.filters.sliding_window:SlidingWindow",
+    },
 )
 register_estimator = ESTIMATORS.register
 """Lets an estimator be named by commands and benchmarks; may decorate the class."""
-for _own in (Smoother, Online, ExtendedKalmanFilter, SlidingWindow):
-    register_estimator(_own)
 
 
 def make_estimator(name: str, model: BallModel, surfaces: Surfaces | float, settings: Settings) -> Estimator:
@@ -40,10 +41,16 @@ def make_estimator(name: str, model: BallModel, surfaces: Surfaces | float, sett
         raise ValueError(f"method must be one of {', '.join(ESTIMATORS)}; got {shown(name)}")
     check_instance("model", model, BallModel, "Load one with load_model.")
     make = partial(_estimator, ESTIMATORS[name], surfaces, settings)
-    return EachItsModel(make, model, surfaces, settings) if model.variations else make(model)
+    if not model.variations:
+        return make(model)
+    from ballfg.estimation.each_its_model import EachItsModel
+
+    return EachItsModel(make, model, surfaces, settings)
 
 
 def _estimator(kind: type[Estimator], surfaces: Surfaces | float, settings: Settings, model: BallModel) -> Estimator:
     if not model.measures_plainly:
+        from ballfg.estimation.measurement.invert_measurement import InvertMeasurement
+
         return InvertMeasurement(kind, model, surfaces, settings)
     return kind(model, surfaces, settings)

@@ -8,6 +8,7 @@ from contextvars import ContextVar
 from typing import Any, Protocol
 
 from ballfg.checks import check_count, shown
+from ballfg.machine import MOST_JOBS
 from ballfg.parallel.work import is_inside
 
 CLUSTERS = ("dask", "ray")
@@ -53,10 +54,6 @@ class Executor(Protocol):
     def stop(self) -> None:
         """Ends what was begun, at once: after an error, or Ctrl-C."""
         ...
-
-
-MOST_JOBS = 10_000
-"""Processes. No machine has cores for more."""
 
 
 def executor(jobs: int, *, helped: bool = True) -> Executor | None:

@@ -79,7 +79,8 @@ def ball_kind(name: str) -> BallKind:
 def _known(name: str) -> BallKind:
     """A known ball with its nominal model on its ground, before its launcher."""
     surfaces = TABLE if name == "table_tennis" else COURT
-    return BallKind(name.replace("_", "-"), KNOWN_BALLS[name].ball, nominal_model(name), surfaces, LAUNCHERS[name])
+    launcher = LAUNCHERS.get(name, TENNIS_LAUNCHER)
+    return BallKind(name.replace("_", "-"), KNOWN_BALLS[name].ball, nominal_model(name), surfaces, launcher)
 
 
 def ball_from_mapping(content: Any, default_name: str = "ball") -> BallKind:

@@ -4,9 +4,11 @@ Repairs: rows out of time order are sorted, exact repeats are dropped. Two diffe
 close together are one measurement with a stamp that is off (rounded or late): their mean takes their place.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Final
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -14,7 +16,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ballfg.arrays import Array
 from ballfg.checks import shown
 from ballfg.state import STANDARD_GRAVITY, Z
-from ballfg.tracks.grouping import RowGroup
+
+if TYPE_CHECKING:
+    from ballfg.tracks.grouping import RowGroup
 
 MERGE_DISTANCE = 0.1
 """m: two rows at one stamp farther apart than this are refused; one frame of a ball at 15 m/s and 150 Hz."""
@@ -114,7 +118,7 @@ def tidy(group: RowGroup, where: Where, findings: Findings | None = None) -> Arr
         values, rows = values[order], rows[order]
         steps = np.diff(values[:, 0])
     if (steps == 0).any():
-        values = _one_per_stamp(RowGroup(group.name, rows, values), where, findings)
+        values = _one_per_stamp(replace(group, rows=rows, values=values), where, findings)
     if len(values) < 2:
         raise ValueError(
             f"{where(int(rows[0]))}: trajectory {shown(group.name)} must have at least two samples at different times; "

@@ -14,28 +14,12 @@ from ballfg.files.whole_folder import of_one_state
 from ballfg.tracks.checks import Findings, check_scale, tidy
 from ballfg.tracks.detections_file import DETECTIONS_FILE
 from ballfg.tracks.grouping import Index, RowGroup, groups, scan
-from ballfg.tracks.info import INFO_FILE, Ball, DatasetInfo, read_info
+from ballfg.tracks.info import INFO_FILE, DatasetInfo, TrackFolder, read_info
 from ballfg.tracks.labels import LABELS_FILE, LabelTable, read_labels
 from ballfg.tracks.rows import CsvRows, ParquetRows, RowSource
 from ballfg.tracks.track import Track
 
 TRACK_FILES = ("tracks.csv", "tracks.parquet")
-
-
-class TrackFolder:
-    """What every dataset tells of its ball and table."""
-
-    info: DatasetInfo
-
-    @property
-    def ball(self) -> Ball:
-        """The ball that `dataset.yaml` states."""
-        return self.info.ball
-
-    @property
-    def table(self) -> float:
-        """m, height of the table's surface."""
-        return self.info.table_height
 
 
 class Dataset(TrackFolder):

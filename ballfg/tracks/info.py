@@ -173,6 +173,22 @@ class DatasetInfo:
         return content if self.imported is None else content | {"import": dict(self.imported)}
 
 
+class TrackFolder:
+    """What every dataset tells of its ball and table."""
+
+    info: DatasetInfo
+
+    @property
+    def ball(self) -> Ball:
+        """The ball that `dataset.yaml` states."""
+        return self.info.ball
+
+    @property
+    def table(self) -> float:
+        """m, height of the table's surface."""
+        return self.info.table_height
+
+
 def read_info(path: Path) -> tuple[DatasetInfo, list[str]]:
     """Reads a `dataset.yaml`.
 

@@ -101,3 +101,17 @@ def test_the_earlier_name_of_the_option_works(capsys: pytest.CaptureFixture[str]
         said = capsys.readouterr().out
         assert "--effects-file" in said
         assert not re.search(r"--effects(?!-file)", said)
+
+
+def test_all_that_is_known_of_an_effect_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert status("effects") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == list(EFFECTS)
+    assert status("effects", "wind", "drag_speed") == 0
+    said = " ".join(capsys.readouterr().out.split())
+    for effect in (EFFECTS["wind"], EFFECTS["drag_speed"]):
+        for words in (effect.sentence, effect.decide, effect.plain, effect.usual.source, effect.plausible.source):
+            assert words in said
+    assert "needs: drag" in said
+    assert status("effects", "wnd") == 2
+    assert "there is no effect 'wnd'" in capsys.readouterr().err

@@ -13,7 +13,7 @@ import pytest
 import ballfg.diagnosis
 from ballfg.diagnosis import fit_model, hold_out, hypotheses, scene_of, score_all
 from ballfg.diagnosis.report.report import content
-from ballfg.dynamics import EFFECTS, Effect, load_effects, load_model
+from ballfg.dynamics import EFFECTS, load_effects, load_model
 from ballfg.simulation import SimulationConfig, parse_effects, write_simulation
 from ballfg.tracks import read_dataset
 from tests.diagnosis.made_diagnosis import found
@@ -24,35 +24,12 @@ def blocks(page: str, language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL)
 
 
-def plausible(effect: type[Effect]) -> str:
-    """Sizes of the strengths, those that are alike together: `x, y: 0.3 m/s`."""
-    groups: dict[str, list[str]] = {}
-    for c in effect.coefficients:
-        if c.absent is not None:
-            size = f"{c.sigma:g} {c.unit}".removesuffix(" 1") if c.sigma else "as good as known"
-            groups.setdefault(size, []).append(c.name)
-    return "; ".join(f"{', '.join(names)}: {size}" for size, names in groups.items())
-
-
-def catalogue() -> str:
-    lines = ["| effect | kind | what it is | plausible size | what decides |", "|---|---|---|---|---|"]
-    lines += [f"| `{n}` | {e.kind} | {e.sentence} | {plausible(e)} | {e.decide} |" for n, e in EFFECTS.items()]
-    return "\n".join(lines)
-
-
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """An empty folder; what is registered there is forgotten."""
     monkeypatch.chdir(tmp_path)
     with EFFECTS.restored():
         yield tmp_path
-
-
-def test_catalogue_is_that_of_the_registry() -> None:
-    text = (DOCS / "diagnose.md").read_text(encoding="utf-8")
-    shown = re.search(r"<!-- catalogue -->\n(.*?)\n?<!-- end -->", text, re.DOTALL)
-    assert shown
-    assert shown[1] == catalogue(), "put this table into docs/diagnose.md:\n" + catalogue()
 
 
 def test_report_has_the_keys_that_the_guide_shows() -> None:

@@ -23,32 +23,6 @@ def blocks(page, language):
     )
 
 
-def numbers(coefficient):
-    absent = "shape" if coefficient.absent is None else f"{coefficient.absent:g}"
-    bounds = f"{coefficient.low:g} to {coefficient.high:g}"
-    return f"{coefficient.default:g}", absent, f"{coefficient.sigma:g}", coefficient.unit, bounds
-
-
-def coefficient_table():
-    """Coefficients of an effect whose numbers are equal share a row."""
-    lines = [
-        "| effect | section | coefficients | default | absent | sigma | unit | bounds |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for name, effect in EFFECTS.items():
-        for same, coefficients in groupby(effect.coefficients, numbers):
-            names = ", ".join(c.name for c in coefficients)
-            lines.append(f"| {' | '.join((name, effect.kind, names, *same))} |")
-    return "\n".join(lines)
-
-
-def test_coefficient_table_is_that_of_the_registry():
-    text = (DOCS / "models.md").read_text(encoding="utf-8")
-    shown = re.search(r"<!-- coefficients -->\n(.*?)\n?<!-- end -->", text, re.DOTALL)
-    assert shown
-    assert shown[1] == coefficient_table(), "put this table into docs/models.md:\n" + coefficient_table()
-
-
 def test_model_file_example_loads():
     text, variations = blocks("models.md", "yaml")
     content = yaml.safe_load(text)

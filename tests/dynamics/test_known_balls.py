@@ -9,8 +9,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from ballfg.dynamics import KNOWN_BALLS, Surfaces, advance, fly, known_ball, known_name, nominal_model
+from ballfg.dynamics import KNOWN_BALLS, Surfaces, advance, fly, known_ball, known_balls, known_name, nominal_model
 from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.dynamics.known_balls import _read_ball
+from ballfg.tracks import TABLE_TENNIS, TENNIS, Ball
 
 AIR = 1.2
 """kg/m^3."""
@@ -151,3 +153,18 @@ def test_a_solid_ball_keeps_more_of_its_way_when_it_grips() -> None:
             after = advance(model, state, torch.full((1,), 1e-3, dtype=torch.float64), Surfaces(0.0))
         # slip stops at v = R w; the impulse J gives v = 1 - J and R w = J / c
         assert float(after[0, 3]) == pytest.approx(kept, rel=1e-2)
+
+
+def test_a_ball_is_one_file(tmp_path: Path) -> None:
+    path = tmp_path / "squash.yaml"
+    path.write_text(
+        "ball: {radius: 0.02, mass: 0.024, source: WSF, spreads: {drag: 0.3}, court: [9.75, 6.4]}\n"
+        "flight: {gravity: {}, drag: {k: 0.02}}\nbounce: {restitution: {e: 0.4}}\n",
+        encoding="utf-8",
+    )
+    known, content = _read_ball(path)
+    assert (known.ball, known.spreads, known.court) == (Ball(0.02, 0.024), {"drag": 0.3}, (9.75, 6.4))
+    assert set(content) == {"flight", "bounce"}
+    files = {file.stem for file in Path(known_balls.__file__).parent.glob("*.yaml")}
+    assert files == set(KNOWN_BALLS)
+    assert (KNOWN_BALLS["table_tennis"].ball, KNOWN_BALLS["tennis"].ball) == (TABLE_TENNIS, TENNIS)

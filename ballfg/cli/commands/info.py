@@ -1,4 +1,6 @@
-"""`ballfg info` and `ballfg balls`: what is installed, on which machine, what is registered, which balls are known."""
+"""`ballfg info`, `balls` and `effects`: what is installed and registered, and what is known of balls and effects."""
+
+from __future__ import annotations
 
 import importlib
 import math
@@ -8,18 +10,23 @@ import re
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, requires, version
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ballfg.cli import inputs
 from ballfg.machine import usable_cores
 from ballfg.registry import PACKAGE, Registry, source_of
+
+if TYPE_CHECKING:
+    from ballfg.dynamics import Effect
 
 REGISTRIES = (
     ("effects", "ballfg.dynamics", "EFFECTS"),
     ("observations", "ballfg.estimation", "OBSERVATIONS"),
     ("estimators", "ballfg.estimation", "ESTIMATORS"),
     ("trainees", "ballfg.learning", "TRAINEES"),
+    ("formats", "ballfg.importing", "FORMATS"),
 )
 """Title, module and attribute of each registry, in the order in which they are shown."""
 WIDTH = 110
@@ -130,3 +137,46 @@ def _ball_lines() -> Iterator[str]:
             "-" if known.court is None else "{:g} x {:g}".format(*known.court),
         )
         yield f"{name:<13}" + "".join(f"{number:>14}" for number in numbers) + f"  {known.source}"
+
+
+def effects(
+    names: Annotated[list[str] | None, typer.Argument(help="Effects to describe; by default all are listed.")] = None,
+    effects_file: inputs.EffectsFiles = None,
+) -> None:
+    """List the effects, or tell all that is known of some: coefficients, usual strength, plausible range, sources.
+
+    Example: ballfg effects wind magnus
+    """
+    from ballfg.dynamics import EFFECTS
+
+    inputs.know_effects(effects_file)
+    for chosen in [EFFECTS.lookup(name) for name in names or ()]:
+        typer.echo("\n".join(_described(chosen)) + "\n")
+    if not names:
+        for name, effect in EFFECTS.items():
+            typer.echo(f"{name:<24}{effect.kind:<13}{effect.belongs_to:<6}{effect.plain or name.replace('_', ' ')}")
+
+
+def _described(effect: type[Effect]) -> Iterator[str]:
+    """All that is known of an effect, in lines."""
+    yield f"{effect.name}: {effect.plain or effect.name.replace('_', ' ')}, an effect of {effect.kind}"
+    told = {
+        "what": effect.sentence,
+        "law": (effect.__doc__ or "").partition("\n")[0],
+        "of": f"the {effect.belongs_to}",
+        "needs": ", ".join(effect.needs),
+        "decide": effect.decide,
+    }
+    for c in effect.coefficients:
+        absent = "a shape" if c.absent is None else f"absent at {c.absent:g}"
+        told[c.name] = (
+            f"default {c.default:g}, {absent}, prior sigma {c.sigma:g}, {c.low:g} to {c.high:g}, unit {c.unit}"
+        )
+    if effect.usual is not None:
+        change = ", ".join(f"{name} {step:+g}" for name, step in effect.usual.change.items())
+        told["usual"] = f"{change} ({effect.usual.source})"
+    if effect.plausible is not None:
+        told["plausible"] = f"{effect.plausible.low:g} to {effect.plausible.high:g} ({effect.plausible.source})"
+    for word, line in told.items():
+        if line:
+            yield textwrap.fill(f"{word}: {line}", WIDTH, initial_indent="  ", subsequent_indent="      ")

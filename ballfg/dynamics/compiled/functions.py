@@ -22,7 +22,6 @@ from ballfg.dynamics.compiled.places import Numbers, numbers_of
 from ballfg.dynamics.compiled.translation.recipe import Recipe
 from ballfg.dynamics.model import BallModel, is_substituted, substitute
 from ballfg.dynamics.networks.architecture import Architecture
-from ballfg.dynamics.networks.layers import MNN
 from ballfg.progress import doing
 from ballfg.state import STATE_DIM
 
@@ -246,6 +245,7 @@ def _traced(model: BallModel, function: Callable[[BallModel, Tensor], Tensor]) -
     """A function that was traced anew, and its source."""
     from ballfg.dynamics.compiled.translation.source import function_source
     from ballfg.dynamics.compiled.translation.trace import trace  # torch's tracer takes a second to import
+    from ballfg.dynamics.networks.layers import MNN
 
     scalars = [name for name, parameter in model.named_parameters() if parameter.dim() == 0]
     arrays, tables = list(numbers_of(model).arrays), [table.detach() for table in numbers_of(model).tables()]

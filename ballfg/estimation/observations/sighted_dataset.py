@@ -9,9 +9,8 @@ from typing import Final
 from ballfg.checks import shown
 from ballfg.estimation.observations.sightings import NeverSeenByTwoError, sighted_track
 from ballfg.files.whole_folder import of_one_state
-from ballfg.tracks.dataset import TrackFolder
 from ballfg.tracks.detections_file import DETECTIONS_FILE, read_sightings
-from ballfg.tracks.info import INFO_FILE, DatasetInfo, read_info
+from ballfg.tracks.info import INFO_FILE, DatasetInfo, TrackFolder, read_info
 from ballfg.tracks.labels import LABELS_FILE, LabelTable, read_labels
 from ballfg.tracks.sightings import Sightings
 from ballfg.tracks.track import Track

@@ -13,6 +13,7 @@ from ballfg.importing.formats.containers import read_bag, read_excel, read_hdf5,
 from ballfg.importing.formats.matlab import read_matlab
 from ballfg.importing.formats.nested import nested_tables
 from ballfg.importing.formats.raw import RawTable
+from ballfg.importing.formats.registry import FORMATS, Format
 from ballfg.importing.formats.text_files import decoded, read_text_table
 
 TEXT: Final = (".csv", ".tsv", ".txt", ".dat", ".tab", ".asc", "")
@@ -86,14 +87,21 @@ def _of_path(path: Path, topic: str | None) -> list[RawTable]:
 
 
 def _is_table(file: Path) -> bool:
-    known = file.suffix.lower() in (*TEXT[:-1], *JSON, *BAGS, *READERS)
+    known = file.suffix.lower() in (*TEXT[:-1], *JSON, *BAGS, *READERS, *_added())
     return known and not file.name.startswith(".") and file.name not in _OWN and "readme" not in file.name.lower()
+
+
+def _added() -> dict[str, type[Format]]:
+    """The formats of users and other packages by the endings of their files."""
+    return {ending: added for added in FORMATS.values() for ending in added.endings}
 
 
 def _of_file(path: Path, topic: str | None) -> list[RawTable]:
     ending = path.suffix.lower()
     if path.stat().st_size == 0:
         raise ValueError(f"{path} must hold rows of numbers; the file is empty. Export it again.")
+    if added := _added().get(ending):
+        return nested_tables(added.read(path), path.stem, str(path))
     if ending in BAGS:
         return read_bag(path, topic)
     if ending in READERS:
