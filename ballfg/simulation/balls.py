@@ -79,7 +79,7 @@ def ball_kind(name: str) -> BallKind:
 def _known(name: str) -> BallKind:
     """A known ball with its nominal model on its ground, before its launcher."""
     surfaces = TABLE if name == "table_tennis" else COURT
-    launcher = LAUNCHERS.get(name, TENNIS_LAUNCHER)
+    launcher = LAUNCHERS.get(name, LAUNCHERS["tennis"])
     return BallKind(name.replace("_", "-"), KNOWN_BALLS[name].ball, nominal_model(name), surfaces, launcher)
 
 
