@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -44,9 +43,8 @@ def test_the_lower_minimum_is_found(kept: tuple, monkeypatch: pytest.MonkeyPatch
     away = estimate.states[0, 6:] - truth[0, 6:]
     assert away @ np.linalg.solve(estimate.covariances[0, 6:, 6:], away) < 16.3  # 0.1 % of chi-square, 3 axes
 
-    def one_start(solution: Solution, *_: object) -> Iterator[Solution]:
+    def one_start(solution: Solution, *_: object) -> Solution:
         return solution
-        yield
 
     monkeypatch.setattr(room, "with_other_spins", one_start)
     assert excess(truth, track, settings) > 30.0

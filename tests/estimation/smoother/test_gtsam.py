@@ -16,6 +16,7 @@ from ballfg.dynamics import EFFECTS
 from ballfg.estimation.online.windows.chain import ChainWindow
 from ballfg.estimation.online.windows.window import IsamWindow
 from ballfg.estimation.segmentation import Contact, Segmentation
+from ballfg.estimation.smoother.low_hops import LowHops
 from ballfg.factors import GtsamLevenbergMarquardt, LevenbergMarquardt, Loss
 from ballfg.simulation import SimulationConfig
 from ballfg.tracks import DatasetInfo, dataset_in_memory
@@ -203,5 +204,6 @@ def test_tracks_without_a_graph_are_refused() -> None:
 class Impossible(bf.Smoother):
     """Says that the ball bounces on a surface 60 m below."""
 
-    def segment(self, track: bf.Track) -> Segmentation:
-        return replace(super().segment(track), contacts=(Contact(8, float(track.times[8]), -60.0),))
+    def _segmented(self, track: bf.Track) -> tuple[Segmentation, tuple[LowHops, ...]]:
+        found, hops = super()._segmented(track)
+        return replace(found, contacts=(Contact(8, float(track.times[8]), -60.0),)), hops

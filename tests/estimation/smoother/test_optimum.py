@@ -176,7 +176,7 @@ def solved():
         sigma = effective_sigmas(track, segmentation, SETTINGS)
         solution, closer = (
             smoother.settle(smoother.problem(track, segmentation, sigma)),
-            tight.solve(tight.problem(track, segmentation, sigma)),
+            tight.settle(tight.problem(track, segmentation, sigma)),
         )
         reference = Reference(track, solution.events.contacts)
         start = solution.minimum.values.states + np.repeat((5e-4, 5e-2, 5.0), 3) * rng.standard_normal((len(track), 9))

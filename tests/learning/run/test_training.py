@@ -76,7 +76,8 @@ def test_a_resumed_run_is_the_uninterrupted_one(finished: Path, tmp_path: Path, 
     written = folder / "config.yaml"
     assert "jobs: " in written.read_text()
     written.write_text(written.read_text().replace("jobs: ", "workers: "))  # as an older version wrote it
-    run(config(epochs=4, jobs=2, checkpoint_every=2), folder, resume=True)
+    with pytest.warns(DeprecationWarning, match="'workers' is the earlier name of 'jobs'"):
+        run(config(epochs=4, jobs=2, checkpoint_every=2), folder, resume=True)
     assert "epoch 1/" not in capsys.readouterr().out
     for name in ("weights", "optimizer", "memory", "best"):
         file = f"checkpoint/{name}.safetensors"
