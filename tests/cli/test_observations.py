@@ -11,24 +11,7 @@ from ballfg.estimation import OBSERVATIONS, load_observations, read
 from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate, write_simulation
 from ballfg.tracks import TableWriter
 from tests.commands import status
-
-LASER = '''
-"""A laser above the table tells the height of the ball."""
-
-from ballfg.estimation import Reading
-
-
-class LaserHeight(Reading):
-    """The height of the ball, m."""
-
-    name = "height"
-    file = "heights.csv"
-    columns = ("height",)
-
-    def predicted(self, state):
-        """(..., 1) m."""
-        return state[..., 2:3]
-'''
+from tests.test_plug_in_package import OBSERVATION
 
 
 @pytest.fixture
@@ -48,7 +31,7 @@ def shots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
                     "sigma": np.full(n, 1e-4),
                 }
             )
-    (tmp_path / "laser.py").write_text(LASER, encoding="utf-8")
+    (tmp_path / "laser.py").write_text(OBSERVATION, encoding="utf-8")
     return tmp_path / "shots"
 
 
