@@ -28,7 +28,7 @@ test: $(READY)  ## all tests that need no more than ten minutes on two cores
 check: $(READY)  ## format, lint, types (of the installed package: its folders lie apart in the source tree)
 	$(BIN)/ruff format --check $(SOURCES)
 	$(BIN)/ruff check $(SOURCES)
-	rm -rf build/typed && $(BIN)/pip install --quiet --no-deps --no-build-isolation --target build/typed .
+	rm -rf build/typed build/lib && $(BIN)/pip install --quiet --no-deps --no-build-isolation --target build/typed .
 	$(BIN)/mypy --config-file pyproject.toml --cache-dir .mypy_cache build/typed/ballfg
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
