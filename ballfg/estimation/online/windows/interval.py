@@ -9,7 +9,7 @@ import torch
 
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.integrate import steps_over
+from ballfg.dynamics.motion.limits import steps_over
 from ballfg.estimation.smoother.motion import FLIGHT, Motion
 from ballfg.factors.batch import merge
 from ballfg.factors.bridge import Bridge, checked
