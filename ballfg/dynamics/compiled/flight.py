@@ -6,6 +6,7 @@ values: derivatives in d directions at once, of which there may be none. The rul
 """
 
 import numpy as np
+from numba.extending import register_jitable
 
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNT, FOUR, FUNCTION, LAW, NOTHING, ONE, REAL, THREE, TWO, Law
@@ -13,6 +14,18 @@ from ballfg.dynamics.motion.limits import STAGES
 
 TOGETHER = 96
 """Balls whose layers of a network stay in a processor's own memory."""
+
+
+@register_jitable
+def white_acceleration(dt, density):
+    """What white acceleration noise gathers over dt s along an axis: the only place that says so.
+
+    Args: dt: s, a number or an array.  density: m^2/s^3, the square of one in m/s^2/sqrt(Hz).
+    Returns: variance of the position (m^2), covariance with the velocity (m^2/s), variance of the velocity (m^2/s^2).
+    Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001,
+        section 6.2.2 (continuous white noise acceleration model).
+    """
+    return density * dt**3 / 3.0, density * dt**2 / 2.0, density * dt
 
 
 @machine_code(NOTHING(ONE, ONE))

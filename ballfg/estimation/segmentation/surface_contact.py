@@ -8,6 +8,7 @@ import numpy as np
 from ballfg.arrays import Index
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, FLAG, NOTHING, REAL, several
+from ballfg.dynamics.surfaces import within
 from ballfg.estimation.segmentation.bank import (
     BANK,
     FLYING,
@@ -142,8 +143,7 @@ def _is_tried(
     if surface == 0:
         x = h.mean[0, 0] - h.shift[0] + h.mean[0, 1] * time
         y = h.mean[1, 0] - h.shift[1] + h.mean[1, 1] * time
-        low_x, high_x, low_y, high_y = scene.extent[0], scene.extent[1], scene.extent[2], scene.extent[3]
-        if not (low_x <= x <= high_x and low_y <= y <= high_y):
+        if not within(x, y, scene.extent):
             return False
     if strict:
         return 0.0 <= time < dt
