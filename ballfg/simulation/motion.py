@@ -85,18 +85,9 @@ def _next_frames(
     noise: MotionNoise,
     rng: np.random.Generator,
 ) -> Tensor:
-    """(n, count, 9) the frames after a state (n, 9), which are `dt` s apart."""
-    if count == 1:
-        return _next_frame(model, state, dt, surfaces, noise, rng)[:, None]
-    return rollout(model, state, dt * torch.arange(1, count + 1, dtype=torch.float64), surfaces)
-
-
-def _next_frame(
-    model: BallModel, state: Tensor, dt: float, surfaces: Surfaces, noise: MotionNoise, rng: np.random.Generator
-) -> Tensor:
-    """(n, 9) one frame later."""
+    """(n, count, 9) the frames after a state (n, 9), which are `dt` s apart; one frame where noise disturbs them."""
     if not noise.in_flight:
-        return advance(model, state, torch.full((len(state),), dt, dtype=torch.float64), surfaces)
+        return rollout(model, state, dt * torch.arange(1, count + 1, dtype=torch.float64), surfaces)
     steps = math.ceil(dt / NOISE_STEP - 1e-9)
     h = torch.full((len(state),), dt / steps, dtype=torch.float64)
     for _ in range(steps):
@@ -106,7 +97,7 @@ def _next_frame(
         disturbance[resting, Z] = 0.0  # the surface takes it up
         disturbance[resting, VZ] = 0.0
         state = state + disturbance
-    return state
+    return state[:, None]
 
 
 def process_noise(count: int, dt: float, noise: MotionNoise, rng: np.random.Generator) -> Tensor:

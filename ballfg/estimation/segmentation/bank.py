@@ -84,7 +84,7 @@ class Sample(NamedTuple):
 
     position: Array
     sigma: Array
-    index: int
+    number: int
     time: float
 
 

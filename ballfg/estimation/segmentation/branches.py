@@ -58,7 +58,7 @@ def start(work: Work, tip: int, score: float, sample: Sample, scene: Record, sur
     update(work, 0, sample, scene)
     lost = bank[add(work, flying, 0)]
     lost.score += scene.log_shares[AS_OUTLIER] - 3.0 * math.log(scene.outlier_spread)
-    pass_through(lost, work, OUTLIER, sample.index, -1, sample.time)
+    pass_through(lost, work, OUTLIER, sample.number, -1, sample.time)
 
 
 @machine_code(NOTHING(WORK, BANK, SAMPLE, REAL, SCENE, SURFACES))
@@ -73,7 +73,7 @@ def hit(work: Work, before: Records, sample: Sample, dt: float, scene: Record, s
     reach = scene.hit_spread**2 + (scene.velocity_spread * min(dt, scene.short_gap)) ** 2
     _forget(h, at, reach, scene)
     h.score -= _rarity(scene.hit_rate, dt) + scene.hit_cost * math.exp(-dt / scene.short_gap)
-    pass_through(h, work, HIT, sample.index - 1, -1, sample.time)
+    pass_through(h, work, HIT, sample.number - 1, -1, sample.time)
     _rested(work, row, sample, scene, surfaces)
 
 
@@ -90,7 +90,7 @@ def shift(work: Work, predicted: Records, sample: Sample, dt: float, scene: Reco
         h = bank[add(work, predicted, row)]
         h.score = h.score - _rarity(scene.shift_rate, dt) - scene.shift_cost
         h.age = 0
-        pass_through(h, work, SHIFT, sample.index - 1, -1, sample.time)
+        pass_through(h, work, SHIFT, sample.number - 1, -1, sample.time)
         for axis in range(3):
             h.cov[axis, 0, 0] += scene.shift_spread**2
             # the shift's expectation, not the innovation: after a gap most of that is the path's own uncertainty
@@ -114,7 +114,7 @@ def leave(work: Work, predicted: Records, sample: Sample, dt: float, scene: Reco
     if best < 0:
         return
     h = work.bank[add(work, predicted, best)]
-    pass_through(h, work, LEAVE, sample.index - 1, h.surface, sample.time)
+    pass_through(h, work, LEAVE, sample.number - 1, h.surface, sample.time)
     lift(h, scene)
     h.score = h.score - _rarity(scene.hit_rate, dt) - scene.leave_cost
     h.age = 0
@@ -144,7 +144,7 @@ def _rested(work: Work, row: int, sample: Sample, scene: Record, surfaces: Recor
             down = work.bank[add(work, work.bank, row)]
             put_down(down, surface, surfaces)
             down.score -= scene.start_at_rest_cost
-            pass_through(down, work, REST, sample.index - 1, surface, sample.time)
+            pass_through(down, work, REST, sample.number - 1, surface, sample.time)
 
 
 @machine_code(REAL(REAL, REAL))

@@ -59,12 +59,12 @@ def update(work: Work, first: int, sample: Sample, scene: Record) -> float:
         if apart and bank[row].score + said[AS_OUTLIER] > best - scene.doubt_margin:
             lost = bank[add(work, bank, row)]
             lost.score += said[AS_OUTLIER]
-            pass_through(lost, work, OUTLIER, sample.index, -1, sample.time)
+            pass_through(lost, work, OUTLIER, sample.number, -1, sample.time)
         _take_in(bank[row], sample.position, sample.sigma, component, scene)
         bank[row].score += said[component]
         if component != AS_GOOD:
             kind = WIDE if component == AS_WIDE else OUTLIER
-            pass_through(bank[row], work, kind, sample.index, -1, sample.time)
+            pass_through(bank[row], work, kind, sample.number, -1, sample.time)
     return surprise
 
 

@@ -54,7 +54,7 @@ def explain(
     Args:
         bank: (h,) best first; none before the first sample.
         before: s, stamp of the last sample.
-        time, position, sigma, index: of this one, as in `Sample`.
+        time, position, sigma, index: of this one, as in `Sample`, with its number.
         scene, surfaces: of a `Scene`.
     Returns: the hypotheses worth keeping, best first, and the log that their `tip` points into.
     """
