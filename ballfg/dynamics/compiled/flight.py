@@ -64,9 +64,9 @@ def slopes_at(rates, x, xt, k, kt, a, at):
 
 @machine_code(NOTHING(LAW, TWO, THREE, ONE, TWO, TWO, THREE))
 def step_on(rates, x, xt, h, ht, k, kt):
-    """`flight_step.runge_kutta` of n states, in place, with tangents: h (n,) s, ht (n, d); k, kt: `slopes_at` x."""
+    """`flight_step.runge_kutta` of n states, in place: h (n,) s, ht (n, d); k, kt: the slopes at x, then used up."""
     n, d = len(x), xt.shape[2]
-    a, at, own, ownt = np.empty((n, 6)), np.empty((n, 6, d)), np.empty((n, 9)), np.empty((n, 9, d))
+    a, at = np.empty((n, 6)), np.empty((n, 6, d))
     stage, staget, total, totalt = np.empty((n, 9)), np.empty((n, 9, d)), np.empty((n, 9)), np.empty((n, 9, d))
     put_all(total, k)
     put_all(totalt.reshape(n * 9, d), kt.reshape(n * 9, d))
@@ -76,7 +76,6 @@ def step_on(rates, x, xt, h, ht, k, kt):
                 stage[r, i] = x[r, i] + reach * h[r] * k[r, i]
                 for q in range(d):
                     staget[r, i, q] = xt[r, i, q] + reach * (h[r] * kt[r, i, q] + ht[r, q] * k[r, i])
-        k, kt = own, ownt
         slopes_at(rates, stage, staget, k, kt, a, at)
         for r in range(n):
             for i in range(9):
@@ -135,5 +134,12 @@ def fly_together(rates, state, statet, c, ct, w, dt, dtt, steps):
 def fly_one(rates, x, c, w, xt, ct, duration, durationt, steps):
     """`fly_together` of one ball: x (9,), c (p,), tangents (9, d), (p, d) and (d,)."""
     p, d = len(c), xt.shape[1]
-    dt, dtt = np.full(1, duration), durationt.reshape(1, d)
-    fly_together(rates, x.reshape(1, 9), xt.reshape(1, 9, d), c.reshape(1, p), ct.reshape(1, p, d), w, dt, dtt, steps)
+    one, moved, own = x.reshape(1, 9), xt.reshape(1, 9, d), Law(rates, c.reshape(1, p), ct.reshape(1, p, d), w)
+    k, kt, a, at = np.empty((1, 9)), np.empty((1, 9, d)), np.empty((1, 6)), np.empty((1, 6, d))
+    h, ht = np.empty(1), np.empty((1, d))
+    h[0] = duration / steps
+    for q in range(d):
+        ht[0, q] = durationt[q] / steps
+    for _ in range(steps):
+        slopes_at(own, one, moved, k, kt, a, at)
+        step_on(own, one, moved, h, ht, k, kt)
