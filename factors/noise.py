@@ -1,7 +1,7 @@
 """Process noise: a continuous-time density, discretised for each interval, with more where a ball is hit or bounces.
 
-Over an interval dt white acceleration noise of density q (m/s^2 per sqrt(Hz)) gives position and velocity, per axis,
-the covariance q^2 [[dt^3/3, dt^2/2], [dt^2/2, dt]]; spin is a random walk. So a dropped frame is the same model.
+Over an interval the acceleration adds what `white_acceleration` says; spin is a random walk. So a dropped frame is the
+same model.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ballfg.arrays import Array
 from ballfg.checks import as_float
+from ballfg.dynamics.compiled.flight import white_acceleration
 from ballfg.state import STATE_DIM
 
 
@@ -148,9 +149,9 @@ metres are rounded to 1e-15 m, and of two samples 1 ns apart rounding alone woul
 def _white_acceleration(dt: Array, acceleration: float, spin: float) -> Array:
     """(n, 3, 3) of position, velocity and spin along one axis."""
     covariance = np.zeros((len(dt), 3, 3))
-    covariance[:, 0, 0] = acceleration**2 * np.maximum(dt, SHORTEST) ** 3 / 3
-    covariance[:, 0, 1] = covariance[:, 1, 0] = acceleration**2 * dt**2 / 2
-    covariance[:, 1, 1] = acceleration**2 * dt
+    _, between, covariance[:, 1, 1] = white_acceleration(dt, acceleration**2)
+    covariance[:, 0, 1] = covariance[:, 1, 0] = between
+    covariance[:, 0, 0] = white_acceleration(np.maximum(dt, SHORTEST), acceleration**2)[0]
     covariance[:, 2, 2] = spin**2 * dt
     return covariance
 

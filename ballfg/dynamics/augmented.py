@@ -75,25 +75,13 @@ class AugmentedModel(BallModel):
         return self.model.inside(state[..., :STATE_DIM])
 
     @property
-    def measures_plainly(self) -> bool:
-        """As the model."""
-        return self.model.measures_plainly
+    def measuring(self) -> BallModel:
+        """The model: coefficients that act on stamps and labels do not travel with the state."""
+        return self.model
 
     def measured(self, states: Tensor, later: Later) -> Tensor:
         """(..., 3) m, the positions as they are measured; `later` gives states without coefficients."""
         return self.bound(states).measured(states[..., :STATE_DIM], later)
-
-    def true_stamps(self, stamps: Tensor) -> Tensor:
-        """(...) s, as the model; coefficients that act on stamps do not travel with the state."""
-        return self.model.true_stamps(stamps)
-
-    def stamps(self, times: Tensor) -> Tensor:
-        """(...) s, as the model; coefficients that act on stamps do not travel with the state."""
-        return self.model.stamps(times)
-
-    def labelled(self, spin: Tensor) -> Tensor:
-        """(..., 3) rad/s, as the model; coefficients that act on labels do not travel with the state."""
-        return self.model.labelled(spin)
 
     def roll(self, state: Tensor) -> Rates:
         """Rates of a ball that rests on a surface."""

@@ -141,31 +141,36 @@ class BallModel(nn.Module, ABC):
         save_model(self, path)
 
     @property
+    def measuring(self) -> "BallModel | None":
+        """The model inside this one that says how the ball is measured; None: it is taken to be written as it is."""
+        return None
+
+    @property
     def measures_plainly(self) -> bool:
         """Whether positions, stamps and spin labels are taken to be written down as they are."""
-        return True
+        return self.measuring is None or self.measuring.measures_plainly
 
     def measured(self, states: Tensor, later: Later) -> Tensor:
         """(..., 3) m, the positions as they are measured, before noise.
 
         Args: states: (..., 9) true states.  later: a delay (s, not negative) to the true states that much later.
         """
-        return states[..., POSITION]
+        return states[..., POSITION] if self.measuring is None else self.measuring.measured(states, later)
 
     def true_stamps(self, stamps: Tensor) -> Tensor:
         """(...) s of true time since the first stamp of a track, from the time written since then.
 
         Where each of n tracks has its own coefficients, of shape (n, 1), stamps have the shape (..., n, 1).
         """
-        return stamps
+        return stamps if self.measuring is None else self.measuring.true_stamps(stamps)
 
     def stamps(self, times: Tensor) -> Tensor:
         """(...) s as written since the first stamp of a track, from true times (...) s; undoes `true_stamps`."""
-        return times
+        return times if self.measuring is None else self.measuring.stamps(times)
 
     def labelled(self, spin: Tensor) -> Tensor:
         """(..., 3) rad/s as a label says, before noise, from the true spin (..., 3) rad/s; affine in it."""
-        return spin
+        return spin if self.measuring is None else self.measuring.labelled(spin)
 
     def roll(self, state: Tensor) -> Rates:
         """Rates of a ball that rests on a surface: (..., 3) m/s^2, vertically zero, and (..., 3) rad/s^2.

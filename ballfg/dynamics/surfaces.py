@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import torch
+from numba.extending import register_jitable
 from torch import Tensor
 
 from ballfg.checks import check_array, check_number
@@ -19,6 +20,12 @@ TABLE_LENGTH: Final = 2.74
 """m (ITTF Laws 2.1.1)."""
 TABLE_WIDTH: Final = 1.525
 """m (ITTF Laws 2.1.1)."""
+
+
+@register_jitable
+def within(x: Any, y: Any, ends: Any) -> Any:
+    """Whether places lie within ends (x_low, x_high, y_low, y_high) m, in torch and in machine code."""
+    return (x >= ends[0]) & (x <= ends[1]) & (y >= ends[2]) & (y <= ends[3])
 
 
 @dataclass(frozen=True)
@@ -70,9 +77,8 @@ class Surfaces:
         """(...) bool of states (..., 9): the ball's x, y lie within the table's extent."""
         if self.extent is None:
             return torch.ones(state.shape[:-1], dtype=torch.bool, device=state.device)
-        x, y = state[..., 0], state[..., 1]
-        low_x, high_x, low_y, high_y = self.extent
-        return (x >= low_x) & (x <= high_x) & (y >= low_y) & (y <= high_y)
+        over: Tensor = within(state[..., 0], state[..., 1], self.extent)
+        return over
 
     def height_below(self, state: Tensor) -> Tensor:
         """(...) m, height of the surface below a ball in states (..., 9), straight down; -inf where there is none.

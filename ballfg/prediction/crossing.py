@@ -18,7 +18,9 @@ from ballfg.checks import check_number
 from ballfg.dynamics.compiled.beliefs.events import FOUND, LOOKS, NONE, TIME_TOLERANCE
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import contact_time
-from ballfg.dynamics.motion.integrate import MAX_STEP, RateFunction, batch_jacobian, derivative, fly
+from ballfg.dynamics.motion.flight_step import RateFunction, derivative
+from ballfg.dynamics.motion.integrate import batch_jacobian, fly
+from ballfg.dynamics.motion.limits import MAX_STEP
 from ballfg.dynamics.motion.rollout import advance, is_resting
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.prediction.belief import Belief

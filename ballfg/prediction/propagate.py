@@ -21,7 +21,8 @@ from ballfg.arrays import Array
 from ballfg.dynamics.compiled.beliefs.course import BOUNCES, Carrier, Course, density_of
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.advance_jacobian import advance_jacobian
-from ballfg.dynamics.motion.integrate import fly_jacobian, steps_over_each
+from ballfg.dynamics.motion.integrate import fly_jacobian
+from ballfg.dynamics.motion.limits import steps_over_each
 from ballfg.dynamics.motion.rollout import LONGEST_MOTION
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.factors.noise import ProcessNoise

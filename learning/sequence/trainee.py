@@ -3,13 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import ClassVar, cast
 
 import torch
 from torch import Tensor
 
 from ballfg.learning.augment import augmentation
 from ballfg.learning.config.training import TrainConfig
+from ballfg.learning.registry import TraineeKind
 from ballfg.learning.sequence.architecture import SequenceArchitecture, SequenceKind
 from ballfg.learning.sequence.data import Batch, Example, LauncherSettings, collate, example
 from ballfg.learning.sequence.model import SequenceModel
@@ -150,3 +151,27 @@ def _usable(shot: Shot) -> tuple[Track, int]:
     sigmas = None if track.sigmas is None else track.sigmas[keep]
     kept = replace(track, times=track.times[keep], positions=track.positions[keep], sigmas=sigmas)
     return kept, int(keep[: shot.observed].sum())
+
+
+class SequenceModelKind(TraineeKind):
+    """A network from observations to the rest of a track."""
+
+    unused: ClassVar[tuple[str, ...]] = ("architecture", "model", "noise", "gradient", "options")
+    augmented = True
+
+    @classmethod
+    def build(cls, config: TrainConfig) -> Prepared:
+        """The model with its data, ready to train."""
+        return build_sequence(config)
+
+
+class Lstm(SequenceModelKind):
+    """A recurrent network."""
+
+    name = "lstm"
+
+
+class Diffusion(SequenceModelKind):
+    """A conditional diffusion model."""
+
+    name = "diffusion"

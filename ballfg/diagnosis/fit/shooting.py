@@ -13,7 +13,8 @@ from torch import Tensor
 
 from ballfg.dynamics import BallModel, contact_time, fly
 from ballfg.dynamics.model import take_rows
-from ballfg.dynamics.motion.integrate import MAX_STEP, derivative, rk4_step
+from ballfg.dynamics.motion.flight_step import derivative, rk4_step
+from ballfg.dynamics.motion.limits import MAX_STEP
 from ballfg.dynamics.motion.paths import hermite
 from ballfg.state import VELOCITY
 

@@ -15,6 +15,7 @@ from ballfg.dynamics.motion.limits import (
     SEARCH_STEPS,
     TIME_TOLERANCE,
     TYPICAL_JERK,
+    steps_over,
 )
 
 LEAST = 1e-300
@@ -39,7 +40,7 @@ def _common_steps(durations):
     for duration in durations:
         if abs(duration) > longest:
             longest = abs(duration)
-    return max(1, math.ceil(longest / MAX_STEP - 1e-9))
+    return steps_over(longest)
 
 
 @machine_code(NOTHING(FUNCTION, FUNCTION, TWO, TWO, TWO, ONE, ONE, ONE, REAL, ONE, ONE))

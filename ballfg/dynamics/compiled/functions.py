@@ -18,9 +18,12 @@ from torch import Tensor, nn
 
 from ballfg.arrays import Array
 from ballfg.dynamics.compiled.build import Code, built, digest, read_note, write_note
+from ballfg.dynamics.compiled.flight import fly_together
 from ballfg.dynamics.compiled.places import Numbers, numbers_of
 from ballfg.dynamics.compiled.translation.recipe import Recipe
 from ballfg.dynamics.model import BallModel, is_substituted, substitute
+from ballfg.dynamics.motion.flight_step import step_jacobian
+from ballfg.dynamics.motion.limits import MAX_STEP
 from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.progress import doing
 from ballfg.state import STATE_DIM
@@ -172,7 +175,9 @@ def _compiled(model: BallModel, key: Hashable | None) -> CompiledModel | None:
     try:
         with doing("machine code for this model"):
             rates, impact, surface = (_function(model, part, key) for part in PARTS)
-        return CompiledModel(rates, impact, surface, model.radius)
+            made = CompiledModel(rates, impact, surface, model.radius)
+            _compare_steps(model, made)
+        return made
     except ImportError:
         raise
     except Exception as error:  # a user's own effect may do anything, and torch runs it all the same
@@ -291,9 +296,29 @@ def _compare(model: BallModel, function: Callable[[BallModel, Tensor], Tensor], 
     made.compute(*given, y, yt)
     for k in range(COMPARED):
         x, c = torch.from_numpy(states[k]), torch.from_numpy(coefficients[k])
-        right = of_both(x, c).detach().numpy()
+        right = of_both(x, c).detach()
         rows = torch.cat([j.reshape(made.size, -1) for j in torch.autograd.functional.jacobian(of_both, (x, c))], dim=1)
-        for got, wanted, limit in ((y[k], right, VALUES_AGREE), (yt[k], rows.numpy(), SLOPES_AGREE)):
-            scale = np.maximum(1.0, np.abs(wanted))
-            if not (np.abs(got - wanted) <= limit * scale).all():
-                raise NotTheSameError(f"compiled {function.__name__} of {type(model).__name__} differs from torch")
+        _agree(f"{function.__name__} of {type(model).__name__}", (y[k], yt[k]), (right, rows))
+
+
+def _compare_steps(model: BallModel, made: CompiledModel) -> None:
+    """Hold a step of compiled flight, and its Jacobian, against the definition in torch, at a few states.
+
+    Raises: NotTheSameError: if they differ.
+    """
+    states = np.random.default_rng(0).normal(size=(COMPARED, STATE_DIM)) * np.repeat((1.0, 5.0, 100.0), 3)
+    start = torch.tensor(states)
+    right = step_jacobian(model, start, start.new_full((COMPARED, 1), MAX_STEP))
+    moved, names = np.tile(np.eye(STATE_DIM), (COMPARED, 1, 1)), made.rates.names
+    c = np.tile([numbers_of(model).value(name) for name in names], (COMPARED, 1)).reshape(COMPARED, len(names))
+    given = (c, np.zeros((*c.shape, STATE_DIM)), made.weights(model)[0], np.full(COMPARED, MAX_STEP))
+    fly_together(made.rates.compute, states, moved, *given, np.zeros((COMPARED, STATE_DIM)), 1)
+    _agree(f"flight of {type(model).__name__}", (states, moved), right)
+
+
+def _agree(name: str, got: tuple[Array, Array], right: tuple[Tensor, Tensor]) -> None:
+    """Refuse values and derivatives that are not those of torch. Raises: NotTheSameError."""
+    for own, tensor, limit in zip(got, right, (VALUES_AGREE, SLOPES_AGREE), strict=True):
+        wanted = tensor.numpy()
+        if not (np.abs(own - wanted) <= limit * np.maximum(1.0, np.abs(wanted))).all():
+            raise NotTheSameError(f"compiled {name} differs from torch")

@@ -16,8 +16,7 @@ from ballfg.dynamics.compiled.functions import CompiledModel, Function, compiled
 from ballfg.dynamics.compiled.places import numbers_of
 from ballfg.dynamics.compiled.roll_out import roll_out as roll_out_rows
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.integrate import step_count
-from ballfg.dynamics.motion.limits import BEYOND
+from ballfg.dynamics.motion.limits import BEYOND, step_count
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import STATE_DIM
 

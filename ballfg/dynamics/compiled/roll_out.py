@@ -21,7 +21,7 @@ from ballfg.dynamics.compiled.signatures import (
     THREE_WEIGHTS,
     TWO,
 )
-from ballfg.dynamics.motion.limits import LONGEST_FALL, LONGEST_MOTION, MAX_CONTACTS, MAX_STEP, REST_SPEED
+from ballfg.dynamics.motion.limits import LONGEST_FALL, LONGEST_MOTION, MAX_CONTACTS, REST_SPEED, steps_over
 
 
 @machine_code(FLAG(THREE_FUNCTIONS, THREE_VALUES, THREE_WEIGHTS, ONE, REAL, REAL, ONE, ONE))
@@ -80,7 +80,7 @@ def roll_out(rates, impact, surface, values, weights, start, durations, world, s
         longest = 0.0
         for r in range(m):
             longest = max(longest, min(durations[r, j], LONGEST_MOTION))
-        steps = max(1, math.ceil(longest / MAX_STEP - 1e-9))
+        steps = steps_over(longest)
         for r in range(m):
             step[r] = min(durations[r, j], LONGEST_MOTION) / steps
         for _ in range(steps):

@@ -1,6 +1,6 @@
 """Types of what machine code takes."""
 
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from numba import types
 
@@ -17,6 +17,19 @@ FLAG: Final[Any] = types.boolean
 NOTHING: Final[Any] = types.void
 FUNCTION: Final[Any] = types.FunctionType(types.void(TWO, TWO, ONE, THREE, THREE, TWO, THREE))
 """A compiled function of a model, `compute(x, c, w, xt, ct, y, yt)`, of many states."""
+
+
+class Law(NamedTuple):
+    """A compiled function of a model, of n balls with coefficients c (n, p) and their tangents ct (n, p, d)."""
+
+    compute: Any
+    c: Any
+    ct: Any
+    w: Any
+    """(k,) weights."""
+
+
+LAW: Final[Any] = types.NamedTuple((FUNCTION, TWO, THREE, ONE), Law)
 
 
 def several(kind: Any, count: int) -> Any:

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import contact_time, fly_through_jacobian
-from ballfg.dynamics.motion.integrate import batch_jacobian, fly_jacobian, step_count
-from ballfg.dynamics.motion.limits import LONGEST_MOTION, MAX_CONTACTS, REST_SPEED
+from ballfg.dynamics.motion.integrate import batch_jacobian, fly_jacobian
+from ballfg.dynamics.motion.limits import LONGEST_MOTION, MAX_CONTACTS, REST_SPEED, step_count
 from ballfg.dynamics.motion.rollout import advance, next_surface, roll, stays
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import VZ

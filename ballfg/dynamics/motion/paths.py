@@ -16,8 +16,9 @@ from torch.autograd.function import once_differentiable
 
 from ballfg.dynamics.model import BallModel, take_rows
 from ballfg.dynamics.motion.contact import contact_time
-from ballfg.dynamics.motion.integrate import MAX_STEP, derivative, fly, fly_jacobian, rk4_step
-from ballfg.dynamics.motion.limits import LONGEST_MOTION, REST_SPEED
+from ballfg.dynamics.motion.flight_step import derivative, rk4_step
+from ballfg.dynamics.motion.integrate import fly, fly_jacobian
+from ballfg.dynamics.motion.limits import LONGEST_MOTION, MAX_STEP, REST_SPEED
 from ballfg.dynamics.motion.rollout import next_surface, rollout, stays
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import POSITION, VELOCITY, VZ

@@ -18,10 +18,12 @@ import math
 import torch
 from torch import Tensor
 
+from ballfg.dynamics.compiled import motion
 from ballfg.dynamics.model import BallModel, take_rows
 from ballfg.dynamics.motion.contact import contact_time
-from ballfg.dynamics.motion.integrate import RateFunction, fly, followed, rk4_step, step_count
-from ballfg.dynamics.motion.limits import LONGEST_MOTION, MAX_CONTACTS, REST_GAP, REST_SPEED
+from ballfg.dynamics.motion.flight_step import rk4_step
+from ballfg.dynamics.motion.integrate import fly, followed
+from ballfg.dynamics.motion.limits import LONGEST_MOTION, MAX_CONTACTS, REST_GAP, REST_SPEED, step_count
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import VZ, Z
 
@@ -44,9 +46,8 @@ def roll(model: BallModel, state: Tensor, dt: Tensor, height: Tensor | float) ->
     state = place_on(model, state, height)
     steps = step_count(dt)
     h = (dt / steps).unsqueeze(-1)
-    rates: RateFunction = model.roll
     for _ in range(steps):
-        state = rk4_step(rates, state, h)
+        state = rk4_step(model.roll, state, h)
     return state
 
 
@@ -175,8 +176,6 @@ def _by_machine_code(model: BallModel, state: Tensor, steps: Tensor, surfaces: S
     """
     if not steps.numel() or followed(state, steps):
         return None
-    from ballfg.dynamics.compiled import motion  # which needs the models, and these this file
-
     functions = motion.functions_of(model)
     if functions is None:
         return None

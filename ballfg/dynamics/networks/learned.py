@@ -7,7 +7,6 @@ from torch import Tensor, nn
 
 from ballfg.dynamics.effect import Coefficient, per_row
 from ballfg.dynamics.effects.bounce import TableHeight
-from ballfg.dynamics.measurement import Later
 from ballfg.dynamics.model import THIN_SHELL, BallModel, Rates
 from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.dynamics.networks.fading import DOUBT, DOUBTS, Fading
@@ -19,7 +18,7 @@ from ballfg.dynamics.networks.learned_parts import (
     RawContact,
     RawFlight,
 )
-from ballfg.state import POSITION, SPIN, VZ
+from ballfg.state import SPIN, VZ
 
 START_OFFSET: Final = -0.003
 """m by which an untrained model takes surfaces to lie above their declared heights: as in the nominal model."""
@@ -132,25 +131,9 @@ class LearnedModel(BallModel):
         return None if self.base is None else self.base.surface_slope(state)
 
     @property
-    def measures_plainly(self) -> bool:
-        """As the base; a model without one does."""
-        return self.base is None or self.base.measures_plainly
-
-    def measured(self, states: Tensor, later: Later) -> Tensor:
-        """(..., 3) m, the positions as the base measures them."""
-        return states[..., POSITION] if self.base is None else self.base.measured(states, later)
-
-    def true_stamps(self, stamps: Tensor) -> Tensor:
-        """(...) s, as the base."""
-        return stamps if self.base is None else self.base.true_stamps(stamps)
-
-    def stamps(self, times: Tensor) -> Tensor:
-        """(...) s as written, from true times (...) s: as the base."""
-        return times if self.base is None else self.base.stamps(times)
-
-    def labelled(self, spin: Tensor) -> Tensor:
-        """(..., 3) rad/s as labelled, from the true spin (..., 3) rad/s: as the base."""
-        return spin if self.base is None else self.base.labelled(spin)
+    def measuring(self) -> BallModel | None:
+        """The base."""
+        return self.base
 
     def extra_repr(self) -> str:
         """Kind, radius and inertia factor for `print(model)`."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.integrate import rate_jacobian
+from ballfg.dynamics.motion.flight_step import rate_jacobian
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities

@@ -15,7 +15,8 @@ from torch import Tensor
 from ballfg.arrays import Array, Index
 from ballfg.checks import check_array, check_instance, shown
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.integrate import batch_jacobian, rk4_step
+from ballfg.dynamics.motion.flight_step import rk4_step
+from ballfg.dynamics.motion.integrate import batch_jacobian
 from ballfg.estimation.observations.observation import Context, Observation
 from ballfg.factors.batch import FactorBatch
 from ballfg.factors.loss import Loss

@@ -1,14 +1,14 @@
 """Hypotheses, the events they pass through and the surfaces, as machine code keeps them: one record each."""
 
-from typing import Any, Final, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
-from numba import from_dtype
+from numba import from_dtype, types
 from numpy.typing import NDArray
 
-from ballfg.arrays import Index
+from ballfg.arrays import Array, Index
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, NOTHING, REAL
+from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, NOTHING, ONE, REAL
 
 FLYING: Final = -1
 """Value of `surface` for a ball in the air."""
@@ -71,21 +71,42 @@ USED, WRITTEN = range(2)
 """Places in the `fill` of a bank and its log: rows of each that are in use."""
 
 
-@machine_code(COUNT(BANK, COUNTS, BANK, COUNT))
-def add(bank: Records, fill: Index, source: Records, place: int) -> int:
+class Work(NamedTuple):
+    """Hypotheses that become more during a sample, the events that they pass through, how many there are of each."""
+
+    bank: Records
+    log: Records
+    fill: Index
+
+
+class Sample(NamedTuple):
+    """What is measured: position (3,) m, its noise sigma (3,) m, number of the sample, and its stamp, s."""
+
+    position: Array
+    sigma: Array
+    number: int
+    time: float
+
+
+WORK: Final[Any] = types.NamedTuple((BANK, LOG, COUNTS), Work)
+SAMPLE: Final[Any] = types.NamedTuple((ONE, ONE, COUNT, REAL), Sample)
+
+
+@machine_code(COUNT(WORK, BANK, COUNT))
+def add(work: Work, source: Records, place: int) -> int:
     """Puts a copy of one hypothesis of `source` behind the others of a bank; returns its row."""
-    row = fill[USED]
-    bank[row] = source[place]
-    fill[USED] += 1
+    row = work.fill[USED]
+    work.bank[row] = source[place]
+    work.fill[USED] += 1
     return row
 
 
-@machine_code(NOTHING(ONE_HYPOTHESIS, LOG, COUNTS, COUNT, COUNT, COUNT, REAL))
-def pass_through(h: Record, log: Records, fill: Index, kind: int, index: int, surface: int, time: float) -> None:
+@machine_code(NOTHING(ONE_HYPOTHESIS, WORK, COUNT, COUNT, COUNT, REAL))
+def pass_through(h: Record, work: Work, kind: int, index: int, surface: int, time: float) -> None:
     """Lets a hypothesis pass through an event, which is written to the log; arguments as in `LOGGED`."""
-    row = fill[WRITTEN]
-    fill[WRITTEN] += 1
-    event = log[row]
+    row = work.fill[WRITTEN]
+    work.fill[WRITTEN] += 1
+    event = work.log[row]
     event.kind, event.index, event.surface, event.before, event.time = kind, index, surface, h.tip, time
     for axis in range(3):
         event.offset[axis] = 0.0

@@ -8,7 +8,19 @@ import numpy as np
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, NOTHING, ONE, REAL
-from ballfg.estimation.segmentation.bank import BANK, LOG, ONE_HYPOTHESIS, USED, Record, Records, add, pass_through
+from ballfg.estimation.segmentation.bank import (
+    BANK,
+    ONE_HYPOTHESIS,
+    SAMPLE,
+    USED,
+    WORK,
+    Record,
+    Records,
+    Sample,
+    Work,
+    add,
+    pass_through,
+)  # fmt: skip
 from ballfg.estimation.segmentation.events import OUTLIER, WIDE
 from ballfg.estimation.segmentation.scene import SCENE
 
@@ -18,37 +30,22 @@ SURPRISE: Final = 3
 """Behind the evidences of the components: squared whitened innovation of a good sample."""
 
 
-@machine_code(REAL(BANK, COUNTS, LOG, COUNT, ONE, ONE, COUNT, REAL, SCENE))
-def update(
-    bank: Records,
-    fill: Index,
-    log: Records,
-    first: int,
-    position: Array,
-    sigma: Array,
-    sample: int,
-    time: float,
-    scene: Record,
-) -> float:
+@machine_code(REAL(WORK, COUNT, SAMPLE, SCENE))
+def update(work: Work, first: int, sample: Sample, scene: Record) -> float:
     """Takes a sample into every hypothesis from row `first` on: its noise component, the Kalman update, the evidence.
 
     Where the prediction is too vague to tell, the sample is also tried as an outlier: those hypotheses come last. That
     is so where little is known of where the ball is: its second sample, the first ones after a hit or a gap.
     Explanations that are far behind already are not multiplied.
 
-    Args:
-        bank, fill, log: predicted hypotheses; afterwards the updated ones.
-        first: row.
-        position: (3,) m.  sigma: (3,) m, stated noise.
-        sample: its index.  time: s, its stamp.
-        scene: of a `Scene`.
+    Args: work: predicted hypotheses; afterwards the updated ones.  first: row.  sample.  scene: of a `Scene`.
     Returns: squared whitened innovation, as of a good sample, of the hypothesis that is the best afterwards.
     """
-    n, best, surprise = fill[USED], -math.inf, 0.0
+    bank, n, best, surprise = work.bank, work.fill[USED], -math.inf, 0.0
     evidence = np.empty((n - first, 4))
     for row in range(first, n):
         said = evidence[row - first]
-        weigh(bank[row], position, sigma, scene, said)
+        weigh(bank[row], sample.position, sample.sigma, scene, said)
         for component in range(3):
             if bank[row].score + said[component] > best:
                 best, surprise = bank[row].score + said[component], said[SURPRISE]
@@ -60,13 +57,14 @@ def update(
         margin = said[component] - said[AS_OUTLIER]
         apart = 0.0 < margin < scene.outlier_doubt
         if apart and bank[row].score + said[AS_OUTLIER] > best - scene.doubt_margin:
-            lost = bank[add(bank, fill, bank, row)]
+            lost = bank[add(work, bank, row)]
             lost.score += said[AS_OUTLIER]
-            pass_through(lost, log, fill, OUTLIER, sample, -1, time)
-        _take_in(bank[row], position, sigma, component, scene)
+            pass_through(lost, work, OUTLIER, sample.number, -1, sample.time)
+        _take_in(bank[row], sample.position, sample.sigma, component, scene)
         bank[row].score += said[component]
         if component != AS_GOOD:
-            pass_through(bank[row], log, fill, WIDE if component == AS_WIDE else OUTLIER, sample, -1, time)
+            kind = WIDE if component == AS_WIDE else OUTLIER
+            pass_through(bank[row], work, kind, sample.number, -1, sample.time)
     return surprise
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.integrate import steps_over_each
+from ballfg.dynamics.motion.limits import steps_over_each
 from ballfg.estimation.segmentation import Segmentation
 from ballfg.estimation.smoother.motion import Motion, eventful_motions, kicks_of
 from ballfg.factors.dynamics import ContactFactors, DynamicsFactors, FlightFactors, RestFactors

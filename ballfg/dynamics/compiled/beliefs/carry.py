@@ -17,7 +17,7 @@ from ballfg.dynamics.compiled.beliefs.edges import (
 )
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.contacts import contact_times, contacts
-from ballfg.dynamics.compiled.flight import fly_one
+from ballfg.dynamics.compiled.flight import fly_one, white_acceleration
 from ballfg.dynamics.compiled.signatures import (
     COUNT,
     FLAG,
@@ -60,12 +60,13 @@ def through(jacobian, covariance, after):
 @machine_code(NOTHING(TWO, REAL, ONE))
 def add_flight(covariance, h, noise):
     """Add what h s of free flight gather; noise (5,) as in `carry`."""
-    acceleration, spin = noise[0] ** 2, noise[1] ** 2
+    position, between, velocity = white_acceleration(h, noise[0] ** 2)
+    spin = noise[1] ** 2
     for i in range(3):
-        covariance[i, i] += acceleration * h**3 / 3.0
-        covariance[3 + i, i] += acceleration * h**2 / 2.0
-        covariance[i, 3 + i] += acceleration * h**2 / 2.0
-        covariance[3 + i, 3 + i] += acceleration * h
+        covariance[i, i] += position
+        covariance[3 + i, i] += between
+        covariance[i, 3 + i] += between
+        covariance[3 + i, 3 + i] += velocity
         covariance[6 + i, 6 + i] += spin * h
 
 

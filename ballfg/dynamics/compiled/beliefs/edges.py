@@ -18,6 +18,7 @@ from ballfg.dynamics.compiled.signatures import (
     TWO,
 )
 from ballfg.dynamics.motion.limits import BEYOND, DEEPEST, LEAST_SIGMA, NEGLIGIBLE, REST_GAP, REST_SPEED
+from ballfg.dynamics.surfaces import within
 
 
 @machine_code(REAL(FUNCTION, ONE, ONE, ONE, REAL, REAL))
@@ -39,7 +40,7 @@ def level_below(z, world):
 @machine_code(FLAG(ONE, ONE))
 def over_table(x, world):
     """Whether a state (9,) lies within the table's ends."""
-    return world[3] <= x[0] <= world[4] and world[5] <= x[1] <= world[6]
+    return within(x[0], x[1], world[3:7])
 
 
 @machine_code(FLAG(ONE, REAL, REAL, ONE))

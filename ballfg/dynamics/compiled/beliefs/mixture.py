@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from ballfg.dynamics.compiled.beliefs.carry import add_impact, through
-from ballfg.dynamics.compiled.beliefs.edges import gap_of, level_below
+from ballfg.dynamics.compiled.beliefs.edges import gap_of, level_below, over_table
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.contacts import contacts
 from ballfg.dynamics.compiled.flight import evaluate, fly_one
@@ -171,9 +171,8 @@ def mix(
                 low = level[time, r]
                 below[:], belows[:] = beside[time, r], besides[time, r]
                 c0 = _below(surface, below, belows, s[r], st[r], ws, low, world[2], k)
-            inside = world[3] <= at[0] <= world[4] and world[5] <= at[1] <= world[6]
             under = level_below(at[2], world)
-            if at[5] < 0.0 and math.isfinite(under) and (under != world[0] or inside):
+            if at[5] < 0.0 and math.isfinite(under) and (under != world[0] or over_table(at, world)):
                 c1 = _below(surface, at, spread, s[r], st[r], ws, under, world[2], own)
                 if abs(c1) < abs(c0):  # of two contacts of a ball the nearer one
                     c0, low = c1, under

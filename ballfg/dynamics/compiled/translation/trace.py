@@ -17,11 +17,11 @@ from torch import Tensor
 from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 
-from ballfg.dynamics.compiled.translation.array_rules import ARRAY_RULES, EACH, each_of
+from ballfg.dynamics.compiled.translation.array_rules import ARRAY_RULES, each_of
 from ballfg.dynamics.compiled.translation.arrays import SMALL, Arrays, Load, View
 from ballfg.dynamics.compiled.translation.program import Number, Operation, Program
 from ballfg.dynamics.compiled.translation.recipe import Recipe
-from ballfg.dynamics.compiled.translation.rules import RULES, Numbers, Rules, UnknownOperationError
+from ballfg.dynamics.compiled.translation.rules import EACH, RULES, Numbers, Rules, UnknownOperationError
 from ballfg.dynamics.compiled.translation.weights import Known, Weights
 
 MOST_READ = 500

@@ -8,8 +8,9 @@ import numpy as np
 import torch
 
 from ballfg.arrays import Array
+from ballfg.dynamics.compiled.flight import white_acceleration
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.integrate import steps_over
+from ballfg.dynamics.motion.limits import steps_over
 from ballfg.estimation.smoother.motion import FLIGHT, Motion
 from ballfg.factors.batch import merge
 from ballfg.factors.bridge import Bridge, checked
@@ -74,8 +75,9 @@ class IntervalMaker:
 
     def _flight(self, index: int, dt: float) -> Interval:
         scale = np.empty(STATE_DIM)
-        scale[POSITION] = self.noise.acceleration * math.sqrt(dt**3 / 3)
-        scale[VELOCITY] = self.noise.acceleration * math.sqrt(dt)
+        position, _, velocity = white_acceleration(dt, 1.0)
+        scale[POSITION] = self.noise.acceleration * math.sqrt(position)
+        scale[VELOCITY] = self.noise.acceleration * math.sqrt(velocity)
         scale[SPIN] = self.noise.spin * math.sqrt(dt)
         batch = copy.copy(self._template)
         batch.variables = batch.variables.copy()
