@@ -1,4 +1,4 @@
-"""From a scalar program to a compiled function, kept on disk under the hash of its source."""
+"""Compiles generated source to machine code and keeps it on disk under the hash of that source."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ ONE, TWO, THREE = (types.Array(types.float64, dimensions, "C") for dimensions in
 
 @machine_code(types.void(TWO, TWO, ONE, THREE, THREE, TWO, THREE))
 '''
-"""What comes before `compute` in a file."""
+"""Beginning of each generated file, before `compute`."""
 HELPERS: Final = ("add_product", "tanh_all")
 """Functions of `layers.py` that generated ones may call."""
 

@@ -1,4 +1,4 @@
-"""What layers of networks need inside of generated functions: matrix products and tanh, each compiled once for all."""
+"""Computes matrix products and tanh for the network layers in generated functions, each compiled only once."""
 
 from typing import Final
 

@@ -1,4 +1,4 @@
-"""Types of what machine code takes."""
+"""Declares the argument types of compiled functions."""
 
 from typing import Any, Final
 
@@ -20,7 +20,7 @@ FUNCTION: Final[Any] = types.FunctionType(types.void(TWO, TWO, ONE, THREE, THREE
 
 
 def several(kind: Any, count: int) -> Any:
-    """A tuple of so many results of one kind."""
+    """A tuple of `count` equal types."""
     return types.UniTuple(kind, count)
 
 

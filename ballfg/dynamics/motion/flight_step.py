@@ -1,4 +1,4 @@
-"""One Runge-Kutta step whose second derivatives cost one evaluation of the rates instead of four in a row.
+"""Differentiates a Runge-Kutta step twice at the cost of one evaluation of the rates instead of four.
 
 Autograd through a step goes through its four stages one after the other, and back, once for every derivative. But where
 the stages lie is known after the step, and so are the rates' Jacobians A_k there. All else is the chain rule of the
@@ -29,11 +29,11 @@ def flight_step(model: BallModel, state: Tensor, h: Tensor) -> Tensor:
 
 
 class _Work:
-    """What all derivatives of a step share.
+    """The values that all derivatives of a step share.
 
     Attributes:
         after: (n, 9) the state after the step.
-        parameters: of the model, those that are learned.
+        parameters: the learned parameters of the model.
     """
 
     def __init__(self, model: BallModel, state: Tensor, h: Tensor) -> None:
@@ -64,7 +64,7 @@ class _Work:
             return leaf, derivative(self.rates, leaf)
 
     def bent(self, cotangents: Tensor, upstream: Tensor) -> Tensor:
-        """(4, n, 9) sum_k A_k^T c_k stage by stage, with a graph; kept for the `upstream` that the c_k belong to."""
+        """(4, n, 9) sum_k A_k^T c_k stage by stage, with a graph; cached for the `upstream` of the c_k."""
         if self._bent is None or self._bent[0] is not upstream:
             leaf, rates = self.traced
             with torch.enable_grad():
@@ -73,7 +73,7 @@ class _Work:
         return self._bent[1]
 
     def tangents(self, v: Tensor) -> tuple[Tensor, Tensor]:
-        """Tangents t_k (4, n, 9) of the stages for one v (n, 9) of the state, and that of the state after the step."""
+        """Tangents t_k (4, n, 9) of the stages and of the state after the step, for a tangent v (n, 9) of the state."""
         a, h, half = self.jacobians, self.h, self.h / 2
         rates, stages = [_times(a[0], v)], [v]
         for k, reach in ((1, half), (2, half), (3, h)):
@@ -83,9 +83,9 @@ class _Work:
         return torch.stack(stages), after
 
     def cotangents(self, u: Tensor | None, pulled: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Cotangents c_k (4, n, 9) of the stages' rates, and the state's, (n, 9), for one of the state after the step.
+        """Cotangents c_k (4, n, 9) of the stages' rates and of the state (n, 9), for one of the state after the step.
 
-        Args: u: (n, 9) that one; None for zero.  pulled: (4, n, 9) what acts on the stages besides; None for nothing.
+        Args: u: (n, 9) that cotangent; None for zero.  pulled: (4, n, 9) further ones of the stages; None for zero.
         """
         a, h, half = self.transposed, self.h, self.h / 2
         zero = torch.zeros_like(self.after)
@@ -107,9 +107,9 @@ class _Work:
         return torch.stack((c1, c2, c3, c4)), total if u is None else u + total
 
     def curved(self, cotangents: Tensor, upstream: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Along v (n, 9): tangents of the stages, of the state after; change of the cotangents, of the gradient.
+        """Along v (n, 9): tangents of the stages and of the state after; changes of the cotangents and of the gradient.
 
-        Kept for the last v: two nodes of the graph ask for the same.
+        Cached for the last v: two nodes of the graph ask for the same.
         """
         kept = self._curved
         if kept is None or kept[0].data_ptr() != v.data_ptr() or self._bent is None or self._bent[0] is not upstream:
@@ -145,7 +145,7 @@ class _Step(torch.autograd.Function):
 
 
 class _StepByParameters(torch.autograd.Function):
-    """Zero, with the derivative by the parameters: a node of its own, so that autograd passes it by where it can."""
+    """Zero, with the derivative by the parameters: a separate node that autograd can skip."""
 
     @staticmethod
     def forward(ctx: Any, work: _Work, *parameters: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Free flight over a time step: classic Runge-Kutta of order four, and its exact Jacobian.
+"""Integrates free flight by Runge-Kutta steps of order four, with their exact Jacobian.
 
 The Jacobian is that of the discrete step, not of the differential equation: torch autograd gives the derivative of the
 model's rates at the four stages in one batch, and the chain rule through the stages does the rest. It costs
@@ -19,7 +19,7 @@ from ballfg.dynamics.motion.limits import MAX_STEP
 from ballfg.state import POSITION, SPIN, VELOCITY
 
 HEAVY = 300_000
-"""Parameters times states from which arithmetic, not the number of torch calls, decides what a Jacobian costs."""
+"""Parameters times states above which arithmetic, not the number of torch calls, dominates a Jacobian's cost."""
 
 RateFunction = Callable[[Tensor], Rates]
 
@@ -35,7 +35,7 @@ def derivative(rates: RateFunction, state: Tensor) -> Tensor:
 
 
 def rk4_step(rates: RateFunction, state: Tensor, h: Tensor, slope: Tensor | None = None) -> Tensor:
-    """One Runge-Kutta step of h (..., 1) s from `state` (..., 9); `slope` is its derivative, where that is known."""
+    """One Runge-Kutta step of h (..., 1) s from `state` (..., 9); `slope` is its derivative, if known."""
     return stages_of(rates, state, h, slope)[0]
 
 
@@ -82,7 +82,7 @@ def steps_over_each(durations: Array) -> Index:
 
 
 def fly(model: BallModel, state: Tensor, dt: Tensor) -> Tensor:
-    """The state after `dt` of free flight; surfaces are not there.
+    """The state after `dt` of free flight, without surfaces.
 
     Args:
         model: the ball.
@@ -105,7 +105,7 @@ def fly(model: BallModel, state: Tensor, dt: Tensor) -> Tensor:
 
 
 def followed(*tensors: Tensor | float) -> bool:
-    """Whether torch must do the work: it follows tensors for derivatives or to record them, or they lie elsewhere.
+    """True if torch must compute: it records derivatives or a trace, or the tensors lie on another device.
 
     Machine code takes float64 in the memory of the processor.
     """
@@ -115,7 +115,7 @@ def followed(*tensors: Tensor | float) -> bool:
 
 
 def is_plain(tensor: Tensor) -> bool:
-    """Whether machine code can read it: float64 in the memory of the processor."""
+    """True if machine code can read a tensor: float64 in the memory of the processor."""
     return type(tensor) is Tensor and tensor.dtype is torch.float64 and tensor.is_cpu
 
 
