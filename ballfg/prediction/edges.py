@@ -1,4 +1,4 @@
-"""Balls that come down near the edge of a table: one bounces, its neighbour within the uncertainty falls past.
+"""Accounts for balls near the edge of a table: one bounces, its neighbour within the uncertainty falls past.
 
 The mean takes one of the two ways. The covariance gets the second moment, about the mean, of the share that takes the
 other (docs/derivations/prediction.md).
@@ -21,7 +21,7 @@ from ballfg.state import STATE_DIM, VELOCITY, VZ, Z
 
 @torch.no_grad()
 def edge_doubt(model: BallModel, mean: Tensor, covariance: Tensor, h: Tensor, surfaces: Surfaces) -> Tensor | float:
-    """What the balls that take the other way add to the covariance at the end of a step.
+    """Covariance at the end of a step from the balls that take the other way than the mean.
 
     Args:
         model: of the ball.
@@ -29,7 +29,7 @@ def edge_doubt(model: BallModel, mean: Tensor, covariance: Tensor, h: Tensor, su
         covariance: (1, d, d) of it.
         h: (1,) s, the step; at most one contact with the table.
         surfaces: table and floor.
-    Returns: (9, 9); 0 where the ball does not come down to the table's level in the step, or far from every edge.
+    Returns: (9, 9); 0 if the ball does not come down to the table's level in the step, or far from every edge.
     """
     height = mean.new_tensor([surfaces.table_height])
     beside = fly(model, mean, h)
@@ -47,12 +47,12 @@ def edge_doubt(model: BallModel, mean: Tensor, covariance: Tensor, h: Tensor, su
 
 
 def _probability_over_table(touch: Tensor, covariance: Tensor, surfaces: Surfaces) -> float:
-    """Probability that a ball which is at `touch` (d,) in the mean when it comes down is then above the table.
+    """Probability that a ball with mean `touch` (d,) when it comes down is above the table.
 
     A ball that is higher comes down later, farther along its way.
     """
     assert surfaces.extent is not None
-    below = []  # for each end, the probability that the ball comes down below it along its axis
+    below = []  # # for each end, the probability that the ball comes down outside of it
     for k, (end, sigma) in enumerate(zip(surfaces.extent, surfaces.edge_sigmas, strict=True)):
         axis = k // 2
         along = torch.zeros_like(touch)
