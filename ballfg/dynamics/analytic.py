@@ -36,7 +36,7 @@ class AnalyticModel(BallModel):
         groups = {"flight": self.flight, "bounce": self.bounce, "measurement": self.measurement}
         for effect in sorted(after_needs(effects), key=_rank):
             groups[effect.kind][effect.name] = effect
-        # # names, not effects: `substitute` exchanges the effects
+        # names, not effects: `substitute` exchanges the effects
         self._moving_air = _overriding(self.flight, FlightEffect, "air_velocity")
         self._adjusting = _overriding(self.flight, FlightEffect, "adjust")
         self._turning = _overriding(self.flight, FlightEffect, "spin_rate")

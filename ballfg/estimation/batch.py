@@ -32,7 +32,7 @@ def estimate_tracks(estimator: Estimator, tracks: Iterable[Track], count: int, j
 
     Args: tracks, count, jobs: as for `map_tracks`.
     """
-    if estimator.model.variations:  # # the world of an estimate depends on its track
+    if estimator.model.variations:  # the world of an estimate depends on its track
         yield from map_tracks(estimator.estimate, tracks, count, jobs)
         return
     for estimate in map_tracks(partial(_without_world, estimator), tracks, count, jobs):

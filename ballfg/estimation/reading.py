@@ -51,5 +51,5 @@ def unused_model(folder: str | PathLike[str], ball: Ball) -> tuple[str, ...]:
         if read_mapping(path) == model_to_dict(nominal_model(ball)):
             return ()
     except ValueError:
-        pass  # # an unreadable file counts as another model; reading it raises where a user gives it as the model
+        pass  # an unreadable file counts as another model; reading it raises where a user gives it as the model
     return (f"{path} lies beside the tracks and is not used. Give it as the model to use it.",)

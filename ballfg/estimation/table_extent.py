@@ -99,14 +99,14 @@ def _bounces(times: Array, positions: Array, contact: float, radius: float) -> A
     end, rise, _ = _arcs(times, positions, (i + 1, i + 1 + reach, i + 1 + 2 * reach), i)
     turn = (rise - fall)[:, Z]
     ahead = np.divide((start - end)[:, Z], turn, out=np.full(len(i), -1.0), where=turn > 0.0)
-    after = ahead[:, None]  # # s until both arcs are at one height; negative if the ball does not turn upwards
+    after = ahead[:, None]  # s until both arcs are at one height; negative if the ball does not turn upwards
     place = start + after * fall - after**2 / 2 * _UPWARD_GRAVITY
     fall, rise = fall - after * _UPWARD_GRAVITY, rise - after * _UPWARD_GRAVITY
     least = math.sqrt(2 * STANDARD_GRAVITY * radius)  # m/s, of a ball that rises by a radius
     pushed = np.linalg.norm((rise - fall)[:, :Z], axis=1)
     found = (after[:, 0] >= 0.0) & (after[:, 0] <= times[i + 1] - times[i]) & (np.abs(place[:, Z] - contact) < radius)
     found &= (fall[:, Z] < -least) & (rise[:, Z] > least) & (rise[:, Z] < least - fall[:, Z])
-    found &= pushed < 2 * least - 2 * fall[:, Z]  # # a hit pushes more than a friction of 1
+    found &= pushed < 2 * least - 2 * fall[:, Z]  # a hit pushes more than a friction of 1
     found[1:] &= ~found[:-1]  # the neighbouring interval saw the same bounce
     return place[found]
 

@@ -142,7 +142,7 @@ def _block(
 ) -> list[TrackPrediction]:
     """Predictions of a block, without a model that all tracks share, so that processes need not send it."""
     for track in tracks:
-        estimator.prepared(track)  # # checks the whole track for metres and seconds
+        estimator.prepared(track)  # checks the whole track for metres and seconds
     counted = [track.since_first() for track in tracks]
     parts = [track.opening(observe(track)) for track in counted]
     estimates = [estimator.estimate(part) for part in parts]

@@ -52,7 +52,7 @@ def _probability_over_table(touch: Tensor, covariance: Tensor, surfaces: Surface
     A ball that is higher comes down later, farther along its way.
     """
     assert surfaces.extent is not None
-    below = []  # # for each end, the probability that the ball comes down outside of it
+    below = []  # for each end, the probability that the ball comes down outside of it
     for k, (end, sigma) in enumerate(zip(surfaces.extent, surfaces.edge_sigmas, strict=True)):
         axis = k // 2
         along = torch.zeros_like(touch)

@@ -69,7 +69,7 @@ class Step:
         if not (np.isfinite(states).all() and np.isfinite(coefficients).all()):
             return None
         n, w, p = len(states), root.width, len(coefficients)
-        # # |J d|^2 and the share of the damping rows in it
+        # |J d|^2 and the share of the damping rows in it
         promised = float((root.states[..., -1] ** 2).sum() + (root.coefficients[:, -1] ** 2).sum())
         if damping:
             held = (diagonal[:n, :w] * states**2).sum() + (diagonal[n, :p] * coefficients**2).sum()

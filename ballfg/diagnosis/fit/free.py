@@ -61,7 +61,7 @@ def declared_deviations(
     for name, variation in model.variations.items():
         coefficient, base = listed[name], float(parameters[name].detach())
         for level, value in variation.values.items():
-            # # a track's value is linear in the stated ones, so that a unit of one of them gives its weight
+            # a track's value is linear in the stated ones, so that a unit of one of them gives its weight
             alone = replace(variation, values={other: float(other == level) for other in variation.values})
             weights = {track.name: alone.value(track) or 0.0 for track in tracks}
             unknown, width = f"{name}[{level}]", coefficient.high - coefficient.low

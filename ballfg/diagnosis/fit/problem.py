@@ -216,7 +216,7 @@ class Fit:
         The derivative by a deviation is that by its coefficient, times the weight of each stretch.
         """
         problem, deviations = self.problem, self.problem.deviations
-        if not problem.shared:  # # first states only: columns of coefficients stay zero
+        if not problem.shared:  # first states only: columns of coefficients stay zero
             found = sensitivity(problem.model, problem.stretches, self.unknowns.starts, self.values, ())
             none = [(0, 0)] * (found.labels.ndim - 1) + [(0, len(problem.free))]
             return Sensitivity(np.pad(found.positions, [(0, 0), *none]), np.pad(found.labels, none))

@@ -107,7 +107,7 @@ def sensitivity(
     """
     wanted = [_Direction(component=number) for number in range(STATE_DIM if by_start else 0)]
     wanted += [_Direction(None, name, shape) for name, shape in zip(names, shapes or [{}] * len(names), strict=True)]
-    # # a fit takes many steps with one model, a score test one step each with many
+    # a fit takes many steps with one model, a score test one step each with many
     functions = compiled(model) if by_start and not shapes else None
     if functions is not None:
         return _compiled_derivatives(functions, model, stretches, starts, values, wanted)
@@ -225,7 +225,7 @@ def _tangent(dual: Tensor) -> Tensor:
 
 def _true_times(model: BallModel, stretches: Stretches) -> Tensor:
     """(k, r) s of true time, of the samples."""
-    # # stamps run along the first axis: a coefficient of shape (r, 1) then fits (k, r, 1)
+    # stamps run along the first axis: a coefficient of shape (r, 1) then fits (k, r, 1)
     return model.true_stamps(stretches.times.T.unsqueeze(-1)).squeeze(-1)
 
 

@@ -111,7 +111,7 @@ class ExtendedKalmanFilter(Estimator):
         whitened = record.innovations(run.H, mean, covariance, track.positions) if self.smooth else record.whitened
         estimate = self._result(track, run, mean, covariance, whitened)
         found = run.states_near_contacts()
-        if self.smooth:  # # later samples show the side, except at the end
+        if self.smooth:  # later samples show the side, except at the end
             estimate = widened_near_contacts(estimate, self.ball)
             found = {k: state for k, state in found.items() if k == len(track) - 1}
         return with_contact_states(estimate, found).dated(written.times)

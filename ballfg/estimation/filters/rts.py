@@ -155,6 +155,6 @@ def fly_back(
         mean[k, :width], mean[k, width:] = after[0].numpy(), fading[0][k] * mean[k + 1, width:]
         covariance[k] = F @ widened @ F.T
         covariance[k, width:, width:] += np.diag(fading[1][k] ** 2)
-        if not (np.isfinite(mean[k]).all() and np.isfinite(covariance[k]).all()):  # # drag accelerates back in time
+        if not (np.isfinite(mean[k]).all() and np.isfinite(covariance[k]).all()):  # drag accelerates back in time
             mean[: k + 1], covariance[: k + 1] = np.nan, np.nan
             return

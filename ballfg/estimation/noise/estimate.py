@@ -119,7 +119,7 @@ def estimate_noise(
     if linear is None:
         return None
     known = (position_known or own_sigmas, tracker_known)
-    # # the batches are small: threads gain nothing, and slow each other down on a busy machine
+    # the batches are small: threads gain nothing, and slow each other down on a busy machine
     return on_one_thread(partial(_searched, parts, settings, known, errors, watch), linear)
 
 

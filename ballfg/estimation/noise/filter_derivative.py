@@ -94,7 +94,7 @@ def _before_prediction(transition, decay, kicks, memory, before, spread, m, p, t
         for s in range(w):
             to_decay += 2.0 * work[1, i, s] * spread[s, i]
     pull(transition, decay, work[1], p)
-    for i in range(w):  # # rounding would make it asymmetric, more so from step to step
+    for i in range(w):  # rounding would make it asymmetric, more so from step to step
         for j in range(i):
             p[i, j] = p[j, i] = 0.5 * (p[i, j] + p[j, i])
     after = m.copy()

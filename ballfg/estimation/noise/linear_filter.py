@@ -81,7 +81,7 @@ class LinearFilter:
         """(t, n, 3, 3) m^2, covariance of the white error of a measured position."""
         way = self.tracks.velocities
         along = noise.stamp_jitter[:, None, None, None] * way[..., :, None] * way[..., None, :]
-        white = (noise.position[:, None, :] * self.tracks.white).clamp_min(LEAST_NOISE)  # # an axis may have no noise
+        white = (noise.position[:, None, :] * self.tracks.white).clamp_min(LEAST_NOISE)  # an axis may have no noise
         return along + torch.diag_embed(white.square())
 
     def losses(self, noise: Noise) -> Tensor:

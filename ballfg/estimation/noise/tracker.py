@@ -186,7 +186,7 @@ def _score(tracks: LinearFilter, fit: MarginalFit, name: str, time: float) -> Ar
 def _p_value(score: Array, freedom: float) -> float:
     """One-sided; freedom: share of the scatter that remains after the projection."""
     spread = np.sqrt(len(score) * score.var(ddof=1) / max(freedom, 0.1))
-    if not spread > 0.0:  # # identical tracks have no scatter
+    if not spread > 0.0:  # identical tracks have no scatter
         return 1.0
     from scipy import stats  # it takes half a second to import
 

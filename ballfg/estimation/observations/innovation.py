@@ -78,7 +78,7 @@ def leave_position_out(states: Array, covariances: Array, measured: Array, noise
     scale = 1.0 / np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
     both = scale[:, :, None] * scale[:, None, :]
     others = (information - jacobian.swapaxes(-1, -2) @ jacobian) * both
-    # # a sample that alone determines its position leaves nothing: bound C, the whitened distance goes to zero
+    # a sample that alone determines its position leaves nothing: bound C, the whitened distance goes to zero
     covariance = _inverse_of_rest(others) * both
     distance = measured - states[:, POSITION] - (covariance @ pull[..., None])[..., 0]
     return whitened(distance, np.asarray(covariance + noise, dtype=np.float64))
@@ -115,7 +115,7 @@ def leave_one_out(rows: Rows, covariances: Covariances) -> Array:
         both = np.broadcast_to(covariances.coefficients, (len(state), *covariances.coefficients.shape))
         joint = np.block([[joint, cross], [cross.swapaxes(-1, -2), both]])
     gain = joint @ pulled.swapaxes(-1, -2)
-    # # a measurement that alone determines its value leaves nothing: bound C, the whitened distance goes to zero
+    # a measurement that alone determines its value leaves nothing: bound C, the whitened distance goes to zero
     left = _inverse_of_rest(unit - pulled @ gain)
     others = joint + gain @ left @ gain.swapaxes(-1, -2)
     pull = pulled.swapaxes(-1, -2) @ residual[..., None]

@@ -132,7 +132,7 @@ def rough_path(rays: Rays, moments: Array, windows: Sequence[tuple[float, float]
 
 def _parabolas(rays: Rays, moments: Array, begin: Array, end: Array) -> Path:
     """The free falls through the sightings from begin (n,) to end (n,) s about moments (n,) s."""
-    slack = 1e-3 * rays.period  # # a sighting at the very end of a window belongs to it
+    slack = 1e-3 * rays.period  # a sighting at the very end of a window belongs to it
     low = np.searchsorted(rays.times, moments + begin - slack)
     high = np.searchsorted(rays.times, moments + end + slack)
     rows = low[:, None] + np.arange(max(int((high - low).max()), 1))

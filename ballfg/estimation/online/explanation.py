@@ -28,7 +28,7 @@ def explain(window: StreamWindow, samples: list[Sample], events: EventTracker) -
     segmentation = events.segmentation(window.first, times, positions)
     motions = motions_of(events.moved(segmentation, window.first), times)
     measured = np.array([s.measured for s in samples])
-    factors = np.where(measured, SIGMA_FACTOR[segmentation.quality], 1.0)  # # the loss sets wrong sightings aside
+    factors = np.where(measured, SIGMA_FACTOR[segmentation.quality], 1.0)  # the loss sets wrong sightings aside
     settled = max(held - LATEST_CHANGE, 0)
     motions[: max(settled - 1, 0)] = [s.motion for s in samples[1:settled]]
     factors[:settled] = [s.factor for s in samples[:settled]]

@@ -235,7 +235,7 @@ class Online(Estimator):
                 state = self._observe(sample)
         return state and replace(state, time=self.stamp_of(state.time))
 
-    @np.errstate(over="ignore", invalid="ignore")  # # samples that no ball flew give a status, not warnings
+    @np.errstate(over="ignore", invalid="ignore")  # samples that no ball flew give a status, not warnings
     def _observe(self, sample: Sample) -> OnlineState:
         """Takes in a sample."""
         self._tell_whole_error(sample)
@@ -419,7 +419,7 @@ class Online(Estimator):
         smoother = Smoother(self.model, self.surfaces, self.settings)
         first = self.window.first
         found = self.events.segmentation(first, track.times[first:], track.positions[first:])
-        found = self.events.moved(found, first)  # # the window's states fit the refined contacts
+        found = self.events.moved(found, first)  # the window's states fit the refined contacts
         result = final_estimate(smoother, self.window, track, found, self._frozen)
         self.reset()
         lost = any(state.status is Status.FAILED for state in states)

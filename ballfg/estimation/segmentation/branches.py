@@ -1,4 +1,4 @@
-"""Events that no surface explains: starts, hits, tracker shifts, a resting ball that leaves."""
+"""Adds hypotheses with events that no surface explains: starts, hits, tracker shifts, a ball that leaves its rest."""
 
 import math
 from typing import Final
@@ -27,11 +27,11 @@ from ballfg.estimation.segmentation.motion import lift, put_down
 from ballfg.estimation.segmentation.scene import SCENE
 
 SHORTEST_STEP: Final = 1e-3
-"""s. An event is not made dearer than this by stamps that lie closer."""
+"""s. Least interval for the price of an event."""
 SHIFTED_PREDICTIONS: Final = 3
-"""How many of the best predictions are tried with a shift; beside a bounce the right one may be the third."""
+"""Number of best predictions that are tried with a shift; beside a bounce the right one may be the third."""
 MOST_ADDED: Final = 2 + 2 * SHIFTED_PREDICTIONS
-"""Hypotheses that these events add at most, besides one for each surface."""
+"""Largest number of hypotheses from these events, besides one for each surface."""
 
 
 @machine_code(NOTHING(BANK, COUNTS, LOG, COUNT, REAL, ONE, ONE, COUNT, REAL, SCENE, SURFACES))
@@ -48,14 +48,14 @@ def start(
     scene: Record,
     surfaces: Records,
 ) -> None:
-    """Hypotheses after a first sample: a flying ball, one that rests on a surface nearby, or the sample an outlier.
+    """Hypotheses after a first sample: the ball flies, rests on a surface nearby, or the sample is an outlier.
 
-    All expect the ball within the spread of outliers of the sample, so that their evidence compares.
+    All expect the ball within the spread of outliers around the sample, so that their evidences are comparable.
 
     Args:
-        bank, fill, log: empty; afterwards those hypotheses.
-        tip: the last event before.
-        score: nats, carried on.
+        bank, fill, log: empty; filled with those hypotheses.
+        tip: the previous event.
+        score: nats, of the previous hypothesis.
         position: (3,) m.
         sigma: (3,) m, its noise.
         sample: index of the sample.
@@ -86,7 +86,7 @@ def hit(
     scene: Record,
     surfaces: Records,
 ) -> None:
-    """Adds the best explanation of the past, its velocity forgotten: in the air, and on a surface if it is near one.
+    """Adds the best explanation of the past with a forgotten velocity, in the air and on nearby surfaces.
 
     Over a short interval the ball reappears close to where it was; over a long one it may be anywhere.
     """
@@ -113,9 +113,9 @@ def shift(
     time: float,
     scene: Record,
 ) -> None:
-    """Adds the best predictions, with the measurements jumping by an unknown offset: off from now on, or until now.
+    """Adds the best predictions with an unknown offset of the measurements, from now on or until now.
 
-    Which of the two shows at the next surface only.
+    Only the next surface shows which of the two holds.
     """
     n, first = len(predicted), fill[USED]
     rows = np.empty(n, np.int64)
@@ -127,7 +127,7 @@ def shift(
         pass_through(h, log, fill, SHIFT, interval, -1, time)
         for axis in range(3):
             h.cov[axis, 0, 0] += scene.shift_spread**2
-            # the shift's expectation, not the innovation: after a gap most of that is the path's own uncertainty
+            # the shift's expectation, not the innovation: after a gap the path's own uncertainty dominates that
             known = scene.shift_spread**2 / (h.cov[axis, 0, 0] + sigma[axis] ** 2)
             offset = (position[axis] - h.mean[axis, 0]) * known
             h.shift[axis] += offset
@@ -165,7 +165,7 @@ def leave(
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, ONE, REAL, SCENE))
 def _forget(h: Record, position: Array, variance: float, scene: Record) -> None:
-    """Makes a hypothesis a flying one at a position (3,) m with a variance m^2, of which nothing else is known."""
+    """Makes a hypothesis fly at a position (3,) m with a variance m^2, with all else unknown."""
     h.surface, h.age = FLYING, 0
     for axis in range(3):
         h.shift[axis] = 0.0
@@ -191,7 +191,7 @@ def _rested(
     scene: Record,
     surfaces: Records,
 ) -> None:
-    """Adds a flying hypothesis as one that rests, for each surface that the sample is near."""
+    """Adds a flying hypothesis as a resting one, for each surface near the sample."""
     for surface in range(len(surfaces)):
         if abs(position[2] - surfaces[surface].centre) < scene.rest_range:
             down = bank[add(bank, fill, bank, row)]
@@ -202,5 +202,5 @@ def _rested(
 
 @machine_code(REAL(REAL, REAL))
 def _rarity(rate: float, dt: float) -> float:
-    """nats, minus log probability that an event of a rate (1/s) falls into an interval."""
+    """nats, minus log probability of an event with a rate (1/s) in an interval."""
     return -math.log(-math.expm1(-rate * max(dt, SHORTEST_STEP)))

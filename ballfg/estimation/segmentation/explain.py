@@ -1,4 +1,4 @@
-"""One sample explained: every hypothesis branches, is weighed, and the unlikely are dropped; in machine code."""
+"""Explains one sample in machine code: every hypothesis branches, is weighed, and the unlikely are dropped."""
 
 import math
 from typing import Any, Final
@@ -31,7 +31,7 @@ from ballfg.estimation.segmentation.scene import SCENE
 from ballfg.estimation.segmentation.surface_contact import step
 
 EXPLAINED: Final[Any] = types.Tuple((BANK, LOG))
-"""Hypotheses, best first, and the events that they and others pass through during a sample."""
+"""Hypotheses, best first, and the events of all hypotheses during a sample."""
 
 
 @machine_code(EXPLAINED(BANK, REAL, REAL, ONE, ONE, COUNT, SCENE, SURFACES))
@@ -55,7 +55,7 @@ def explain(
         sigma: (3,) m.
         sample: its index.
         scene, surfaces: of a `Scene`.
-    Returns: the hypotheses worth keeping, best first, and the log that their `tip` points into.
+    Returns: the likely hypotheses, best first, and the log for their `tip`.
     """
     h, dt, now = len(bank), time - before, bank.copy()
     for row in range(h):
@@ -91,7 +91,7 @@ def _predict(
     scene: Record,
     surfaces: Records,
 ) -> None:
-    """All hypotheses at the next stamp, through the contacts that may have happened on the way."""
+    """All hypotheses at the next stamp, through the possible contacts on the way."""
     most = int(scene.most)
     for k in range(steps):
         step(work, fill, log, dt / steps, interval, before + k * dt / steps, steps > 1, scene, surfaces)
@@ -118,7 +118,7 @@ def _weigh(
     scene: Record,
     surfaces: Records,
 ) -> None:
-    """Takes the sample into all predictions, and into those events that only a surprise suggests."""
+    """Updates all predictions by the sample, and adds those events that only a surprise suggests."""
     predicted, interval = work[: fill[USED]].copy(), sample - 1
     surprise = update(work, fill, log, 0, position, sigma, sample, time, scene)
     others = fill[USED]

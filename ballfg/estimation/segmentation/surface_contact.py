@@ -1,4 +1,4 @@
-"""Contacts: a hypothesis that may meet a surface branches: it did not, it bounced, it stayed down."""
+"""Branches hypotheses at a possible contact with a surface: no contact, a bounce, or rest."""
 
 import math
 from typing import Any, Final
@@ -28,17 +28,17 @@ from ballfg.estimation.segmentation.scene import SCENE
 SLOWEST_CLOSING: Final = 0.2
 """m/s. Bounds the time margin of a slow contact."""
 LEAST_FALL: Final = 0.05
-"""m/s. A path that meets a surface more slowly grazes it: no contact."""
+"""m/s. A path that meets a surface more slowly grazes it without a contact."""
 POSITION_JITTER: Final = 1e-3
-"""m, by which the horizontal position is less certain after a contact."""
+"""m, additional uncertainty of the horizontal position after a contact."""
 KNOWN_SPEED: Final = 1.0
-"""m/s. A path whose vertical speed is less certain, as after a single sample, is not said to land slowly."""
+"""m/s. A path with a less certain vertical speed, as after a single sample, is not taken to land slowly."""
 BOUNCE_JITTER: Final = 0.03
 """m/s, of the normal velocity after a bounce, whatever its speed."""
 SLIDE_JITTER: Final = 0.05
 """m/s, of the tangential velocity, likewise."""
 WEAKEST_FALL: Final = 0.2
-"""Share of gravity below which the slack is not believed to hold the ball up."""
+"""Share of gravity below which the slack cannot hold the ball up."""
 
 
 @machine_code(NOTHING(BANK, COUNTS, LOG, REAL, COUNT, REAL, FLAG, SCENE, SURFACES))
@@ -53,15 +53,15 @@ def step(
     scene: Record,
     surfaces: Records,
 ) -> None:
-    """All hypotheses after dt s, branched at the contacts that may have happened.
+    """All hypotheses after dt s, branched at the possible contacts.
 
     Args:
-        bank, fill, log: hypotheses at time `start`; those after the step.
+        bank, fill, log: hypotheses at time `start`; overwritten by those after the step.
         dt: s.
-        interval: index of the interval that this step is, or is a part of.
+        interval: index of the interval of this step, or of which it is a part.
         start: s, on the track's clock.
-        strict: only contacts inside the step; otherwise also such as the uncertainty of the path lets in. Parts of an
-            interval are strict, or each contact would be tried by two of them.
+        strict: only contacts inside the step; otherwise also those that the path's uncertainty allows. Parts of an
+            interval are strict, else two of them would try each contact.
         scene, surfaces: of a `Scene`.
     """
     h, lowest = fill[USED], math.inf
@@ -90,7 +90,7 @@ def _branch(
     scene: Record,
     surfaces: Records,
 ) -> None:
-    """Adds the hypotheses that meet one surface on the way: those that stay down, then those that bounce."""
+    """Adds the hypotheses that meet one surface on the way: first those that rest, then those that bounce."""
     h = len(before)
     landed, times, count = np.empty(h, HYPOTHESIS), np.empty(h), 0
     for row in range(h):
@@ -122,7 +122,7 @@ def _meeting(h: Record, centre: float, scene: Record) -> Any:
     height, rise = h.mean[2, 0] - h.shift[2] - centre, h.mean[2, 1]
     drag = scene.drag * math.sqrt(h.mean[0, 1] ** 2 + h.mean[1, 1] ** 2 + rise**2)
     pull = max(scene.gravity - h.mean[2, 2] + drag * rise, WEAKEST_FALL * scene.gravity)
-    speed = math.sqrt(max(rise * rise + 2.0 * pull * height, 0.0))  # zero where the path stays below
+    speed = math.sqrt(max(rise * rise + 2.0 * pull * height, 0.0))  # zero if the path stays below
     return (rise + speed) / pull, speed
 
 
@@ -136,7 +136,7 @@ def _is_tried(
     strict: bool,
     scene: Record,
 ) -> bool:
-    """Whether a meeting lies in the step, and on the surface as far as is known."""
+    """True if a contact lies in the step, and on the surface as far as known."""
     if h.surface != FLYING or not speed > LEAST_FALL:
         return False
     if surface == 0:
@@ -149,7 +149,7 @@ def _is_tried(
         return 0.0 <= time < dt
     reach = 3.0 * math.sqrt(h.cov[2, 0, 0]) + 2.0 * scene.surface_sigma
     margin = min(reach / max(speed, SLOWEST_CLOSING), scene.contact_window)
-    # one sample between two contacts, or one contact would be tried in two intervals running
+    # one sample between two contacts, or two successive intervals would try one contact
     return -margin < time < dt + margin and h.age >= 1
 
 
@@ -157,8 +157,8 @@ def _is_tried(
 def _bounce(h: Record, surface: Record, scene: Record) -> None:
     """A hypothesis at a contact, bounced: mirrored in z, slowed by the friction of an unknown spin.
 
-    Friction changes the tangential velocity by mu (1 + e) v_n at most, either way: half of that is expected, but no
-    more than a ball without spin would lose, and half is the spread.
+    Friction changes the tangential velocity by mu (1 + e) v_n at most, either way: half of that is expected, up to the
+    loss of a ball without spin, and half is the spread.
     """
     e, speed = scene.restitution, abs(h.mean[2, 1])
     friction = 0.5 * scene.friction * (1.0 + e) * speed

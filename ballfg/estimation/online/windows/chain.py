@@ -136,7 +136,7 @@ class ChainWindow(StreamWindow):
         if self.biased and not linked:
             self._priors[0].append(BiasStartFactors(np.zeros(1, dtype=np.int64), self.settings.bias_sigmas))
         self._room(0)
-        self._renew([0], moved=False)  # # only the first one's rows change; all are eliminated again
+        self._renew([0], moved=False)  # only the first one's rows change; all are eliminated again
         self._solve()
 
     def joint_covariances(self, count: int) -> list[Array]:
@@ -186,7 +186,7 @@ class ChainWindow(StreamWindow):
         Args: moved: True if the factors of the model or a camera have been evaluated anew.
         """
         sample, interval = self.samples[k], self.intervals[k] if k < len(self.intervals) else None
-        if moved:  # # bridges are shared with copies of the window, results are not
+        if moved:  # bridges are shared with copies of the window, results are not
             asked = [(m.batch, m.bridge) for m in sample.measurements]
             asked += [] if interval is None else [(interval.batch, interval.bridge)]
             self._answers[k] = [(batch, _batched(bridge.kept(0))) for batch, bridge in asked]

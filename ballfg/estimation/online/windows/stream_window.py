@@ -302,7 +302,7 @@ class StreamWindow(ABC):
         ends = [k + 1 for k in begins]
         if new is not None:
             touched.append(new)
-            begins.append(len(self.theta) - 1)  # # this call computes its end: `store` completes it
+            begins.append(len(self.theta) - 1)  # this call computes its end: `store` completes it
         if not touched:
             return np.empty(0), 0, 0
         pieces, calls = evaluate(touched, self.theta[begins], self.theta[ends], self.coefficient_theta)
