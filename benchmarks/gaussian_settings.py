@@ -1,4 +1,4 @@
-"""Settings for Gaussian noise of known size, and process noise that is the same at every step."""
+"""Defines settings for Gaussian noise of known size, and process noise that is equal at every step."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Figures from errors and outcomes: root mean squares, NEES, coverage, shares, quantiles, and their intervals."""
+"""Computes figures from errors: root mean squares, NEES, coverage, shares, quantiles, and their intervals."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -56,7 +56,7 @@ def chi_square_band(dof: int, count: int, level: float = BAND) -> tuple[float, f
 
 
 def inside(errors: Array, sigmas: Array, level: float) -> NDArray[np.bool_]:
-    """Whether each error lies in the central interval of a normal distribution that should hold `level` of them."""
+    """True for errors in the central interval of a normal distribution that should hold `level` of them."""
     return np.asarray(np.abs(errors) <= norm.ppf((1 + level) / 2) * sigmas)
 
 

@@ -1,6 +1,6 @@
-"""The registry of trainees, which a config's key `kind` can name, and those that come with the package.
+"""Registers the trainees, which a config's key `kind` names.
 
-A kind of one's own is a subclass of `TraineeKind` and one call of `register_trainee`, or an entry point of the group
+A user's kind is a subclass of `TraineeKind` and one call of `register_trainee`, or an entry point of the group
 `ballfg.trainees`. Models are imported when they are built, so that a config is checked at once.
 """
 
@@ -24,7 +24,7 @@ class TraineeKind(ABC):
     unused: ClassVar[tuple[str, ...]] = ()
     """Keys of the config without effect on this kind; a config that sets one is refused."""
     augmented: ClassVar[bool] = False
-    """Whether training tracks are rotated and shifted unless the config says otherwise."""
+    """True if training tracks are rotated and shifted unless the config says otherwise."""
 
     @classmethod
     @abstractmethod

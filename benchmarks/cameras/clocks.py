@@ -1,4 +1,4 @@
-"""Cameras whose shutters do not open together: velocities from camera factors and from points, and clock offsets."""
+"""Evaluates unsynchronised cameras: velocities from camera factors and from points, and clock offsets."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -28,13 +28,13 @@ from ballfg.vision import Camera, SeenBall, triangulate
 from ballfg.vision.association.gathering import nearest
 
 NAIVE, FACTORS = "smoother, as if synchronised", "smoother, camera factors"
-"""Two of the ways to estimate, which are compared with each other."""
+"""Two of the ways to estimate, for comparison."""
 NEAR_BOUNCE: Final = 1.0
 """Frame intervals about a bounce that do not count: a stamp's velocity is before it or after it by chance."""
 BLIND: Final = 20.0
-"""px, what a ball of 10 m/s moves in half a frame at 120 Hz, 3 m away."""
+"""px, motion of a ball of 10 m/s in half a frame at 120 Hz, 3 m away."""
 OTHER_BALL: Final = 0.5
-"""m. A state that far from a flight is of another one."""
+"""m. Distance of a state from a flight beyond which it belongs to another one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class Velocities:
 
 
 def sighted(filmed: Filmed) -> list[Track]:
-    """The balls of a recording with the sightings that they were made from."""
+    """The balls of a recording with their sightings."""
     tracking = filmed.tracking
     pairs = zip(tracking.names, tracking.balls, strict=True)
     return [sighted_track(name, ball.sightings, tracking.cameras) for name, ball in pairs]

@@ -1,6 +1,6 @@
-"""The planted effects: every catalogue effect at its typical size, pairs of them, and physics of no catalogue.
+"""Lists the planted effects: every catalogue effect at its usual size, pairs, and physics of no catalogue.
 
-Typical sizes are those that the effects themselves call usual.
+Typical sizes are the effects' own usual ones.
 """
 
 from collections.abc import Iterator

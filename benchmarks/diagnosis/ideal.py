@@ -1,4 +1,4 @@
-"""The ideal test: the size at which the best test of an effect alone finds it, with everything else known.
+"""The ideal test finds an effect alone, with everything else known; its size is the reference for the loop.
 
 It looks at all tracks, knows the noise, and asks for one effect in its true shape. Its statistic is the score test's:
 chi-square where the effect is absent, non-central where it acts, with size^2 d' F d as non-centrality. F is the

@@ -1,4 +1,4 @@
-"""The record of a diagnosis: names, evidence, errors and seconds, as a JSON file that a later run reads."""
+"""Keeps the record of a diagnosis, names, evidence, errors and seconds, as a JSON file for later runs."""
 
 import hashlib
 import math
@@ -31,7 +31,7 @@ class Found:
 
 @dataclass(frozen=True)
 class Ranked:
-    """A candidate of a round: what it would explain, its evidence, and what became of it."""
+    """A candidate of a round: its explained residual, its evidence, and its outcome."""
 
     name: str
     explained: float
@@ -80,7 +80,7 @@ def read_record(path: Path, digest: str) -> Record | None:
 
 
 def record_of(case: Case, digest: str, diagnosis: Diagnosis, true: Errors | None, seconds: float) -> Record:
-    """The part of a diagnosis that is kept."""
+    """The kept part of a diagnosis."""
     errors = {"before": diagnosis.before, "after": diagnosis.after}
     left = diagnosis.unexplained
     if left.fallback is not None:

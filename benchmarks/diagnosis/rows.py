@@ -1,4 +1,4 @@
-"""Rows of results from the records of the loop's cases; docs/benchmarks.md says what each metric is."""
+"""Makes rows of results from the records of the loop's cases; docs/benchmarks.md explains the metrics."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial

@@ -1,4 +1,4 @@
-"""Running cases and ideal tests, each in a process of its own; finished ones are kept."""
+"""Runs cases and ideal tests, each in a process of its own, and keeps finished ones."""
 
 import sys
 import time

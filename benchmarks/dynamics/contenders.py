@@ -1,4 +1,4 @@
-"""The contenders of the dynamics comparison: the contract, models in the factor graph, and those without training."""
+"""Defines the contenders of the dynamics comparison: their interface, graph models, untrained ones."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -46,7 +46,7 @@ class Job:
 
     @property
     def measured(self) -> bool:
-        """Whether the tracks are measured ones."""
+        """True if the tracks are measured ones."""
         return self.tasks[0].truth is None
 
 
@@ -74,7 +74,7 @@ class Contender(Protocol):
 
 
 def as_it_is(track: Track) -> Track:
-    """The track without a change."""
+    """The track itself."""
     return track
 
 

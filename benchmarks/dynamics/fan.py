@@ -1,4 +1,4 @@
-"""One launch with many spins: the paths that a dynamics model predicts for each launcher setting."""
+"""Predicts one launch with many spins, one path for each launcher setting."""
 
 from dataclasses import dataclass
 from typing import Final

@@ -1,4 +1,4 @@
-"""Making and judging the methods of the dynamics comparison, each in a process of its own; finished ones are kept."""
+"""Trains and judges the methods of the dynamics comparison, each in a process, and keeps finished ones."""
 
 import sys
 from collections.abc import Sequence

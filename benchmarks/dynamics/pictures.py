@@ -1,4 +1,4 @@
-"""Pictures of the dynamics comparison: errors by method, apex errors by flight, and a launch fanned out by its spin."""
+"""Draws the dynamics comparison: errors by method, apex errors by flight, and a launch fanned out by its spin."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Training configs of the learned methods: equal in everything that is not the method.
+"""Defines the training configs of the learned methods, equal in everything but the method.
 
 On measured tracks there are few shots, real noise, and launchers whose spin nobody measured: there the models in the
 factor graph have a recipe of their own, which was found on the shots to learn from, parted into folds.

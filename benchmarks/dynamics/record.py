@@ -1,4 +1,4 @@
-"""The record of a finished contender: its errors on every validation track, as a JSON file that a later run reads."""
+"""Keeps the record of a finished contender, its errors on every validation track, as a JSON file."""
 
 import hashlib
 from collections.abc import Sequence

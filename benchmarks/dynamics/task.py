@@ -1,4 +1,4 @@
-"""The tracks of the dynamics comparison: shots to train on, shots to judge by, and the settings that all models get."""
+"""Holds the tracks of the dynamics comparison: shots for training and for judging, and common settings."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ SPLIT_LABEL: Final = "split"
 
 @dataclass(frozen=True)
 class Shot:
-    """One track and what it is judged by.
+    """One track with its reference.
 
     Attributes:
         track: stamps, measured positions and labels: all that a model may see.

@@ -1,4 +1,4 @@
-"""The synthetic launcher tracks of the dynamics comparison, whose truth is richer than any model that is compared.
+"""Simulates the launcher tracks of the dynamics comparison, with a truth richer than any compared model.
 
 Seven things act at once that the analytic model has not, or has with another value. Their sizes come from what is
 known of spheres and from measured tracks; `EFFECTS` has them:
@@ -70,7 +70,7 @@ EFFECTS: Final = (
     "restitution_speed.slope=0.02",
     "tangential_restitution.e_t=0.25",
 )
-"""What acts although no compared model declares it, or declares another value."""
+"""Effects that act although no compared model declares them, or declares another value."""
 _SPLIT_STREAM: Final = 6
 """Keeps the draw of the split apart from other draws of the same seed."""
 

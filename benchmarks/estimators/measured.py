@@ -1,4 +1,4 @@
-"""The comparison on measured tracks, where no truth exists: predict what was measured later."""
+"""Compares estimators on measured tracks without known truth, by predictions of later samples."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,9 +29,9 @@ from ballfg.progress import progress
 from ballfg.tracks import Dataset
 
 OBSERVE = 0.25
-"""s of each track that the estimators see."""
+"""s, observed part of each track."""
 HORIZON = 0.3
-"""s that are predicted after it."""
+"""s, predicted part after it."""
 END = 0.05
 """s at the end of the horizon over which `prediction_end_error` is taken."""
 CALIBRATION = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)

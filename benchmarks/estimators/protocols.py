@@ -1,4 +1,4 @@
-"""Tracks with known truth by the paper's protocol and by the fair one, and the estimators that are compared on them."""
+"""Makes tracks with known truth by the paper's and by the fair protocol, with the compared estimators."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Coverage of 90 % intervals on measured datasets, and on simulated ones whose trackers have a memory and jitter."""
+"""Measures the coverage of 90 % intervals on measured datasets, and on simulated ones with memory and jitter."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Networks elsewhere: each pair of measured datasets trains a residual MNN, which predicts all others.
+"""Tests networks in other rooms: each pair of measured datasets trains a residual MNN, which predicts all others.
 
 The noise is that of the observed parts of the judged tracks, as in `ballfg predict`; for comparison the nominal model,
 judged in the same way. Nothing of the judged datasets is used but these parts.

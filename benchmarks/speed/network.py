@@ -1,4 +1,4 @@
-"""A small network in place of the aerodynamics, fitted to the analytic model; it stands for learned models."""
+"""Fits a small network to the analytic model's aerodynamics, as a stand-in for learned models."""
 
 import math
 from collections.abc import Sequence

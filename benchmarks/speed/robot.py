@@ -1,4 +1,4 @@
-"""What a robot asks for while a ball flies: an estimate through bounces, a long stream, events ahead, many rollouts."""
+"""Times a robot's requests during a flight: an estimate through bounces, a stream, events ahead, many rollouts."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Wall-clock times of warm, repeated runs, next to a control that shows the momentary speed of the machine."""
+"""Measures wall-clock times of warm, repeated runs, next to a control for the machine's present speed."""
 
 import gc
 import time

@@ -1,4 +1,4 @@
-"""The suite of `ballfg-bench speed`: times of an estimate, an update, a prediction and a Jacobian on one thread."""
+"""Runs `ballfg-bench speed`: times of an estimate, an update, a prediction and a Jacobian on one thread."""
 
 import copy
 from collections.abc import Mapping
@@ -65,7 +65,7 @@ ONLINE: Final[Mapping[Solver, str]] = {"gtsam": "online_update", "ballfg": "onli
 
 @dataclass(frozen=True)
 class Size:
-    """How much is computed.
+    """The amount of computation.
 
     Attributes:
         runs: timed runs of each action.  warm_up: runs before them.

@@ -1,4 +1,4 @@
-"""Empirical Bayes over tracks: the mean of a population of coefficients and its spread from track to track.
+"""Estimates the mean and spread of coefficients over a population of tracks by empirical Bayes.
 
 Track i has a Gaussian likelihood of its own coefficients b_i, with the information L_i and the vector h_i = L_i y_i;
 the information is zero in directions that the track does not observe. The tracks are draws b_i ~ N(theta, D) with a

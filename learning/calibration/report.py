@@ -1,4 +1,4 @@
-"""The result of a calibration as `report.json` and as text: coefficients and errors before and after."""
+"""Reports a calibration as `report.json` and as text: coefficients and errors before and after."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

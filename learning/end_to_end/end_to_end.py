@@ -1,4 +1,4 @@
-"""Learning through the estimator: observations, states, rollout, error, and the gradient all the way back.
+"""Trains through the estimator: observations, states, rollout, error, and the gradient all the way back.
 
 The estimate is a function of the model, the launcher's embedding and the noise. Its derivative follows from the
 implicit function theorem (`ballfg.learning.gradient.implicit`). Source: Q. Xiao, Z. Wu, M. Gombolay 2024, section III.

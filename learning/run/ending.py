@@ -1,4 +1,4 @@
-"""The end of a training, in its first process: the model, the page, and in words whether it helped."""
+"""Ends a training in its first process: it writes the model and the page, and says whether it helped."""
 
 import math
 import shlex

@@ -1,4 +1,4 @@
-"""Conditional diffusion baseline: from noise to the rest of a track, given the observations.
+"""The conditional diffusion baseline generates the rest of a track from noise, given the observations.
 
 The network predicts the clean path at every noise level. The last level is pure noise, so that training sees nothing of
 the answer there. Source: J. Ho, A. Jain, P. Abbeel 2020 (training); J. Song, C. Meng, S. Ermon 2021 (sampling without

@@ -1,4 +1,4 @@
-"""The contract of a sequence model: from the observed part of tracks to the rest, no estimator, no dynamics."""
+"""Defines the interface of a sequence model, which predicts the rest of tracks from their observed part."""
 
 import math
 from abc import ABC, abstractmethod

@@ -1,4 +1,4 @@
-"""A trained sequence model for use: predictions from tracks, and its folder with a config and weights."""
+"""Predicts tracks by a trained sequence model, and saves and loads it as a folder."""
 
 import hashlib
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""A sequence model with its tracks, for the training loop."""
+"""Adapts a sequence model with its tracks to the training loop."""
 
 from collections.abc import Sequence
 from dataclasses import replace

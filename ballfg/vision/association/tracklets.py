@@ -1,4 +1,4 @@
-"""Short pieces of one camera's view: candidates that follow each other as one smoothly moving thing would.
+"""Finds short pieces of smooth motion among one camera's candidates.
 
 A piece starts with three candidates in (nearly) successive frames, goes on where its quadratic continuation leads, and
 ends where two answers are equally good or nothing is found for a few frames. At a bounce, for instance, a new one
@@ -102,7 +102,7 @@ def _offer(pieces: list[_Piece], candidates: list[_Seen], focal: float) -> None:
 
 
 def _accept(pieces: list[_Piece], done: list[_Piece]) -> None:
-    """Gives every piece its candidate where that is clear; moves pieces for which it is not to `done`."""
+    """Gives every piece its unambiguous candidate; moves the other pieces to `done`."""
     claims: dict[int, list[float]] = {}
     for piece in pieces:
         for cost, seen in piece.answers:
@@ -125,7 +125,7 @@ def _accept(pieces: list[_Piece], done: list[_Piece]) -> None:
 
 
 def _predicted(seen: list[_Seen], time: float, focal: float) -> tuple[float, float, float]:
-    """Where a piece continues at `time`: u, v, variance (px^2), by a parabola through three of its last samples.
+    """Continuation of a piece at `time`: u, v, variance (px^2), by a parabola through three of its last samples.
 
     Neighbours are a short lever, samples farther apart leave more curvature out; the surer answer counts.
     """

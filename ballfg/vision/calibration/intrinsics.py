@@ -1,4 +1,4 @@
-"""The lens of a camera from views of a board: OpenCV's calibration, and whether the views can tell what it says."""
+"""Calibrates a lens from views of a board, and checks whether the views determine it."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -51,7 +51,7 @@ _FLAGS: Final = {
 
 @dataclass(frozen=True, eq=False)
 class FittedView:
-    """A view with the pose of its board and what the lens leaves of it."""
+    """A view with the pose of its board and the residuals of the lens."""
 
     view: View
 
@@ -80,16 +80,16 @@ class Intrinsics:
     """A calibrated lens."""
 
     camera: Camera
-    """At the world's origin, unturned: its place is not known."""
+    """The camera at the world's origin, unturned: its pose is unknown."""
 
     covariance: Array
     """(4 + k, 4 + k) of fx, fy, cx, cy (px) and the k coefficients of the distortion."""
 
     views: tuple[FittedView, ...]
-    """Those that it rests on."""
+    """The views of the calibration."""
 
     left_out: tuple[FittedView, ...]
-    """Those that disagree with them, in the order in which that was found."""
+    """The views that disagree with it, in the order of their removal."""
 
     missed: tuple[str, ...]
     """Names of the images in which no board was found."""
@@ -104,7 +104,7 @@ class Intrinsics:
 
     @property
     def ray_sigma(self) -> tuple[float, float]:
-        """px, standard deviation of where the lens puts a ray: the most in `RAYS` of the image, and in all of it."""
+        """px, standard deviation of the projected rays: the largest in `RAYS` of the image, and in all of it."""
         sigmas = np.sort(sigma_of_rays(self.camera, self.covariance))
         return float(sigmas[int(RAYS * (len(sigmas) - 1))]), float(sigmas[-1])
 
@@ -154,7 +154,7 @@ def turn(normals: Array) -> float:
 
 
 def coverage(size: tuple[int, int], pixels: Array) -> float:
-    """Share of the cells of an image of `size` that hold any of pixels (n, 2)."""
+    """Share of the cells of an image of `size` that contain any of pixels (n, 2)."""
     cells = np.clip((pixels + 0.5) / np.array(size) * CELLS, 0, np.array(CELLS) - 1).astype(int)
     return len(np.unique(cells, axis=0)) / (CELLS[0] * CELLS[1])
 
@@ -223,7 +223,7 @@ def _pose(camera: Camera, view: View) -> FittedView:
 
 
 def _outlying(fitted: Intrinsics) -> int | None:
-    """The view that disagrees most with the others, if one does."""
+    """The view that disagrees most with the others, or None."""
     errors = np.array([view.rms for view in fitted.views])
     worst = int(errors.argmax())
     return worst if errors[worst] > max(OUTLYING * float(np.median(errors)), MIN_OUTLYING) else None
@@ -271,7 +271,7 @@ def _check_fold(camera: Camera) -> None:
 
 
 def _has_pole(camera: Camera, limit: float) -> bool:
-    """Whether a rational distortion is infinite somewhere up to a squared radius of the plane at z = 1.
+    """True if a rational distortion is infinite somewhere up to a squared radius of the plane at z = 1.
 
     Where a lens needs no denominator, it and the numerator share zeros, but not exactly.
     """

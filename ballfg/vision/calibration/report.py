@@ -1,4 +1,4 @@
-"""What a calibration found: lines and a picture for people, a mapping for programs."""
+"""Reports a calibration as lines and a picture for people, and as a mapping for programs."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -34,19 +34,19 @@ IN_A_LINE: Final = 6
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What was found about one camera."""
+    """The calibration of one camera."""
 
     camera: Camera
 
     lens: Intrinsics | None
-    """None where the lens was known before."""
+    """None if the lens was known before."""
 
     place: Extrinsics | None
-    """None where the camera's place was not asked for."""
+    """None if the camera's pose was not calibrated."""
 
 
 def summary(found: Calibration) -> Iterator[str]:
-    """Lines that say how well the camera is known."""
+    """Lines on the accuracy of the camera's calibration."""
     width, height = found.camera.size
     yield f"{found.camera.name}: {width}x{height}"
     if found.lens is not None:

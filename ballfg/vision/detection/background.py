@@ -1,4 +1,4 @@
-"""What a camera sees without the ball: learned from frames of the recording, followed slowly, in flickering light."""
+"""Learns a camera's background from frames of the recording and follows slow changes and flickering light."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -11,7 +11,7 @@ from ballfg.arrays import Array
 from ballfg.vision.arrays import Array32, Image
 
 SHRINK: Final = 4
-"""Pixels of the image per pixel of the small picture in which candidates are looked for."""
+"""Pixels of the image per pixel of the small picture for the search."""
 GRID: Final = (16, 9)
 """Blocks, across and down, whose brightness tells how bright the light is; their median is no moving thing."""
 BRIGHT: Final = (8.0, 245.0)

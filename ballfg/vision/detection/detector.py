@@ -1,4 +1,4 @@
-"""The detector that ballfg brings: background, regions, a swept disc fitted to each, a score of how ball-like it is."""
+"""Detects small fast balls: background, regions, a swept disc fitted to each, and a score."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ VISIBLE_STREAK: Final = 3.0
 
 @dataclass(frozen=True)
 class DetectorSettings:
-    """What is known about the balls' images.
+    """Assumptions on the balls' images.
 
     Raises: ValueError: sizes that are not positive or out of order, an unknown colour.
     """
@@ -44,13 +44,13 @@ class DetectorSettings:
     """px, least and greatest diameter."""
 
     longest_streak: float = 60.0
-    """px that a ball moves at most while the shutter is open."""
+    """px, largest motion of a ball during an exposure."""
 
     colour: Colour | None = None
-    """Of the ball; None: any, lighter or darker than what is behind it."""
+    """Of the ball; None: any colour that differs from the background's."""
 
     most: int = 6
-    """Candidates per frame that are looked at closely."""
+    """Largest number of closely examined candidates per frame."""
 
     def __post_init__(self) -> None:
         low, high = check_array("diameter", self.diameter, (2,), "Give the smallest and the largest in px.").tolist()
@@ -118,7 +118,7 @@ class BallDetector:
         return fit, score(fit, patch, change, behind, self.settings.diameter, self.settings.colour)
 
     def _plausible(self, values: Array) -> bool:
-        """Whether radius and streak are within a factor of two of what is asked for."""
+        """True if radius and streak are within a factor of two of the limits."""
         low, high = self.settings.diameter
         return bool(low / 4.0 <= values[4] <= high and np.hypot(*values[2:4]) <= self.settings.longest_streak)
 
@@ -148,7 +148,7 @@ def patch_of(change: np.ndarray, behind: np.ndarray, region: Region, noise: Arra
 
 
 def learned(look: Look, fit: StreakFit, blotches: float) -> Look:
-    """What to expect after another ball was seen: means weighted by information, which ages towards the first."""
+    """Expected look after another ball: means weighted by information, which decays towards the first."""
     doubt = max(fit.scatter, 1.0) ** 2 * blotches
     first = Look.unknown()
     old = FORGETS * (look.information - first.information)

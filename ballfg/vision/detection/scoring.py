@@ -1,4 +1,4 @@
-"""How ball-like a fitted candidate is: a product of marks between 0 and 1 for shape, contrast, size and colour."""
+"""Scores the similarity of a fitted candidate to a ball: shape, contrast, size and colour."""
 
 from typing import Final, Literal
 
@@ -18,7 +18,7 @@ STRENGTH: Final = 15.0
 SIZE: Final = 0.2
 """Relative error of the diameter, beyond what is asked for, at which the mark for size is 1/e."""
 UNSETTLED: Final = 0.5
-"""Mark of a fit that did not settle."""
+"""Mark of a fit that did not converge."""
 WHITE: Final = (0.25, 0.2)
 """Saturation (greatest less least channel, over the greatest) up to which a ball is white, and the scale beyond."""
 ORANGE: Final = (8.0, 48.0, 12.0)

@@ -1,4 +1,4 @@
-"""Frames with their stamps: from a video file or a folder of images, stamped by the container or by a CSV file."""
+"""Reads frames with their stamps, from a video file or a folder of images and its CSV file."""
 
 import re
 from abc import ABC, abstractmethod

@@ -1,4 +1,4 @@
-"""One camera's view with what was found in it: candidates, the balls that they were taken for, trails and stamps."""
+"""Draws one camera's view with candidates, associated balls, trails and stamps."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -119,7 +119,7 @@ def ring(view: Image, centre: Array, radius: float, colour: Colour, thickness: i
 
 
 def uncover(view: Image, clean: Image, centre: Array, radius: float) -> None:
-    """Puts back, inside a circle, what was there before something was drawn."""
+    """Restores, inside a circle, the content before drawing."""
     disc = np.zeros(view.shape[:2], np.uint8)
     ring(disc, centre, radius, (255, 255, 255), cv2.FILLED)
     cv2.copyTo(clean, disc, view)

@@ -1,4 +1,4 @@
-"""The suite of `ballfg-bench speed --peers`: the same problems by every library that is installed, in turns."""
+"""Runs `ballfg-bench speed --peers`: the same problems by every installed library, in turns."""
 
 import sys
 import tempfile
@@ -49,7 +49,7 @@ DIFFERENCE_STEPS: Final = (1e-4, 1e-5)
 
 @dataclass(frozen=True)
 class Task:
-    """What is solved.
+    """A problem for all libraries.
 
     Attributes:
         name: of the rows' case.

@@ -1,4 +1,4 @@
-"""ballfg: factors of the same residuals, its own Levenberg-Marquardt, derivatives in machine code."""
+"""Solves the problem by ballfg: factors of the same residuals, its own Levenberg-Marquardt, compiled derivatives."""
 
 import numpy as np
 import torch

@@ -1,4 +1,4 @@
-"""jaxls: Gauss-Newton on sparse problems in JAX, compiled for the problem; CHOLMOD where scikit-sparse is there."""
+"""Solves the problem by jaxls: compiled sparse Gauss-Newton in JAX, with CHOLMOD if scikit-sparse is installed."""
 
 import importlib.util
 import os

@@ -1,4 +1,4 @@
-"""PyPose: Levenberg-Marquardt with a dense Jacobian of the whole problem, by torch's autograd."""
+"""Solves the problem by PyPose: Levenberg-Marquardt with a dense Jacobian from torch's autograd."""
 
 import pypose as pp
 import torch
