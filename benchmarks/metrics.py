@@ -10,11 +10,11 @@ from scipy.stats import binomtest, chi2, norm
 from ballfg.arrays import Array, Index
 
 RESAMPLES = 1000
-"""Of the bootstrap: the ends of a 95 % interval then move by about a tenth of its length."""
+"""Number of bootstrap samples: the ends of a 95 % interval then vary by about a tenth of its length."""
 CONFIDENCE = 0.95
-"""Of the bootstrap's and of Wilson's intervals."""
+"""Level of the bootstrap's and of Wilson's intervals."""
 BAND = 0.99
-"""Of the chi-square bands."""
+"""Level of the chi-square bands."""
 
 Statistic = Callable[[Index], Array]
 """From track numbers (b, m), b resamples of m tracks, to a figure for each resample (b,)."""

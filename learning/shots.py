@@ -28,7 +28,7 @@ class Shot:
         usable: (n,) bool, samples that measure the ball.
         segmentation: events of the observed part.
         settings: of the estimator, before anything is learned.
-        surfaces: what the ball may bounce on.
+        surfaces: table and floor.
         room: name of the dataset.
     """
 

@@ -62,8 +62,8 @@ def _leave(status: int) -> NoReturn:
 def _open_streams() -> None:
     """Redirects streams that the parent process has closed to nowhere.
 
-    Else `print` would fail, messages for stderr would go to stdout among the data, and the next file to be opened would
-    get the number of a stream, so that a library's prints would go into it.
+    Else `print` would fail, and messages for stderr would go to stdout among the data. The next opened file would get a
+    stream's number, and a library's prints would go into it.
     """
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:  # the lowest that is free
         os.set_inheritable(number, True)

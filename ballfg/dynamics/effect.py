@@ -156,13 +156,13 @@ class Flight:
         return moved
 
     def more_drag(self, share: Tensor) -> Flight:
-        """This flight with more drag, by a share (..., 1) of the drag that `Drag` alone gives; shares add up."""
+        """This flight with more drag, by a share (..., 1) of the effect `Drag` alone; shares add up."""
         changed = self._copy()
         changed.drag_gain = 1.0 + share if self.drag_gain is None else self.drag_gain + share
         return changed
 
     def more_lift(self, share: Tensor) -> Flight:
-        """This flight with its Magnus force increased by a share (..., 1) of that of `Magnus` alone; shares add up."""
+        """This flight with more Magnus force, by a share (..., 1) of the effect `Magnus` alone; shares add up."""
         changed = self._copy()
         changed.lift_gain = 1.0 + share if self.lift_gain is None else self.lift_gain + share
         return changed

@@ -33,7 +33,7 @@ def number_of(name: str) -> int | None:
 
 @dataclass(frozen=True)
 class Variation:
-    """How one coefficient differs between tracks.
+    """The differences of one coefficient between tracks.
 
     Attributes:
         by: the label that tells tracks apart, or "track" for their place in the recording, which their names tell.

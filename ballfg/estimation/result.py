@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class Status(enum.Enum):
-    """How an estimation ended; the value is a sentence that says what to do."""
+    """The end of an estimation; the value is a sentence with a remedy."""
 
     OK = "converged"
     NOT_CONVERGED = (

@@ -65,7 +65,7 @@ class TrackPrediction:
 
     @property
     def status(self) -> Status:
-        """How the estimation of the observed part ended."""
+        """The status of the observed part's estimate."""
         return self.estimate.status
 
     def plot(self) -> Figure:

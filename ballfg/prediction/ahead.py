@@ -75,7 +75,7 @@ class Ahead:
         return apex(*self._carried, self.horizon)
 
     def crossing(self, *, x: float | None = None, y: float | None = None, z: float | None = None) -> Crossing | None:
-        """Where and when the ball goes through a plane across one axis.
+        """Place and time of the ball's crossing of a plane across one axis.
 
         Args: x, y, z: m, the place of the plane on its axis; exactly one of them.
         Returns: None if the ball does not get there within the horizon.

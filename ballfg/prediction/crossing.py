@@ -106,7 +106,7 @@ def plane_crossing(
     *,
     after: float = -math.inf,
 ) -> Crossing | None:
-    """Where the ball's centre goes through the plane normal . p = offset, from either side.
+    """The crossing of the plane normal . p = offset by the ball's centre, from either side.
 
     Args:
         propagator, belief, horizon, after: as for `next_crossing`.

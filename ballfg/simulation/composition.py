@@ -55,15 +55,15 @@ class KickedModel(BallModel):
         return self.model
 
     def rates(self, state: Tensor) -> Rates:
-        """Those of the undisturbed model."""
+        """The rates of the undisturbed model."""
         return self.model.rates(state)
 
     def surface_offset(self, state: Tensor) -> Tensor | float:
-        """That of the undisturbed model."""
+        """The surface offset of the undisturbed model."""
         return self.model.surface_offset(state)
 
     def surface_slope(self, state: Tensor) -> Tensor | None:
-        """That of the undisturbed model."""
+        """The surface slope of the undisturbed model."""
         return self.model.surface_slope(state)
 
     def after_bounce(self, state: Tensor) -> Tensor:

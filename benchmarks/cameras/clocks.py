@@ -91,7 +91,7 @@ def _as_if_synchronised(ball: SeenBall, cameras: Sequence[Camera], rate: float) 
     """Times (n,) s and points (n, 3) m of the nearest frames, as one would who believes in one shutter.
 
     The frames are those of the camera that saw most; of the others the nearest sighting within half a frame counts. The
-    pixels' noise is taken to be as large as what the ball moves meanwhile: no view is refused for that.
+    pixels' noise includes the ball's motion meanwhile, so that no view is refused for that.
     """
     seen = ball.sightings
     offsets = np.array([camera.time_offset for camera in cameras])

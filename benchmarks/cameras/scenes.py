@@ -23,7 +23,7 @@ FALSE: Final = 0.05
 MIXED: Final = 3
 """Points of a second ball that make a track one of two balls; where two nearly touch, a point or two may seem to be."""
 SAME_FRAME: Final = 0.5
-"""Of a frame interval: a point that near in time to a frame is that frame's."""
+"""Share of a frame interval within which a point belongs to a frame."""
 
 
 @dataclass(frozen=True)

@@ -86,7 +86,7 @@ class Plan:
 
     Attributes:
         effects, sizes: planted one by one, each in every size.
-        unlabelled: names of those planted where no spin is labelled.
+        unlabelled: names of effects planted in data without spin labels.
         pairs: names of two planted together.
         seeds: of each at its typical size; the true model is fitted to the first of them.
         side_seeds: of each at other sizes, and of pairs.  unlabelled_seeds: where no spin is labelled.

@@ -86,7 +86,7 @@ def ideal_case(name: str, seed: int) -> Case:
 
 
 def fit_declared(case: Case) -> Fit:
-    """The declared model fitted to the tracks of a case whose noise is none; the noise is taken to be as stated."""
+    """The declared model fitted to the tracks of a case without noise, under the stated noise."""
     with TemporaryDirectory() as folder:
         dataset = make_dataset(case, Path(folder) / "tracks")
         model = declared_model(case, dataset.info.ball.radius)

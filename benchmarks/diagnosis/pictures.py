@@ -24,7 +24,7 @@ NOTHING: Final = "nothing"
 FEW_DECADES: Final = 100.0
 """Ratio of the largest to the smallest size up to which more than the decades are numbered."""
 POINTS: Final = 200
-"""Of a drawn curve."""
+"""Number of points of a drawn curve."""
 
 
 def power_picture(

@@ -20,7 +20,7 @@ RANKED = 8
 
 @dataclass(frozen=True)
 class Found:
-    """A finding: its name, effects that it could not be told from, its evidence, and coefficients with their sigmas."""
+    """A finding: its name, indistinguishable effects, its evidence, and coefficients with their sigmas."""
 
     name: str
     alike: tuple[str, ...]
@@ -51,7 +51,7 @@ class Record:
         rounds: leading candidates of each round, best first, and those planted.
         errors: mm, prediction error on the judging half: `before`, `after`, of the true model `true`, and where there
             is a fallback, with it (`fallback`, the one after) and with named effects only (`named`).
-        patterns: p-values of the tests for what is left, by the place that they name.
+        patterns: p-values of the tests for remaining patterns, by their place.
         tracks, judged: numbers of tracks in the dataset and on the judging half.
         seconds: of the diagnosis, wall clock.
     """
@@ -117,7 +117,7 @@ def _leading(listed: tuple[Candidate, ...], planted: tuple[str, ...]) -> tuple[R
 
 
 def case_digest(case: Case) -> str:
-    """Of everything that decides a case: what is planted and how it is taken, or the measured files."""
+    """Digest of a case's settings: the planted effects and the recording, or the measured files."""
     digest = hashlib.sha256(repr((metadata.version("ballfg"), replace(case, data=None))).encode())
     if case.data is not None:
         for path in sorted(case.data.iterdir()):

@@ -142,7 +142,7 @@ def _padded(times: Sequence[Array]) -> Array:
 
 
 def nominal_contender(job: Job, task: Task) -> GraphContender:
-    """The nominal analytic model: what one has before any data. It is told what launcher settings mean for the spin."""
+    """The nominal analytic model, as before any data, with the known spins of launcher settings."""
     label = as_it_is if task.launcher is None else task.launcher.labelled
     model = nominal_model(task.info.ball)
     return GraphContender(job.method, model, task.surfaces, task.settings, label, job.measured)
@@ -157,7 +157,7 @@ def adapting_contender(job: Job, task: Task) -> GraphContender:
 def truth_contender(job: Job, task: Task) -> GraphContender:
     """The true dynamics, with next to no process noise: what noise and spread of the launches leave unknown.
 
-    Raises: ValueError: if the task is of measured tracks, whose truth nobody knows.
+    Raises: ValueError: if the task is of measured tracks, whose truth is unknown.
     """
     if task.truth is None:
         raise ValueError(

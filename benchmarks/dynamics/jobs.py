@@ -51,7 +51,7 @@ def judged(job: Job) -> list[int]:
 
 
 def record_path(job: Job, number: int) -> Path:
-    """Where the record of a job on one of its tasks is kept."""
+    """Path of the record of a job on one of its tasks."""
     ending = "" if len(job.tasks) == 1 else f"-on-{number}"
     return job.folder.with_name(f"{job.folder.name}{ending}.json")
 

@@ -40,7 +40,7 @@ FANNED: Final = ("mnn+gs", "skip+gs", "mlp+gs", "mlp", "a-tune", "nominal")
 MARGIN: Final = 0.1
 """m, shown round the table."""
 GROUP_WIDTH: Final = 0.8
-"""Of a group of bars, where groups are 1 apart."""
+"""Width of a group of bars, for groups 1 apart."""
 
 
 def _colour_of(method: str) -> str:

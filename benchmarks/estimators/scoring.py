@@ -15,7 +15,7 @@ from ballfg.estimation.filters.sliding_window import WINDOW
 from ballfg.state import POSITION, SPIN, VELOCITY
 
 LEVELS = (0.5, 0.9)
-"""Of the intervals whose coverage is reported."""
+"""Levels of the intervals with a reported coverage."""
 
 
 @dataclass(frozen=True)

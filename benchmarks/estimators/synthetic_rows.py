@@ -16,7 +16,7 @@ SETTLED = 20
 BLOCKS = {"state": slice(0, STATE_DIM), "velocity": VELOCITY}
 """Components whose coverage is reported."""
 PLACES = {"first": 0.0, "quarter": 0.25, "middle": 0.5, "three_quarters": 0.75, "last": 1.0}
-"""Where on a track the consistency is tested, as a share of its samples."""
+"""Places of the consistency test on a track, as shares of its samples."""
 
 
 def run_protocol(results: Results, protocol: Protocol, jobs: int, counts: Sequence[int]) -> None:

@@ -29,7 +29,7 @@ TRAINED: Final = "residual mnn+gs"
 
 @dataclass(frozen=True)
 class TrainedPlan:
-    """How much is trained: epochs, and pairs of datasets (None for all)."""
+    """Amount of training: epochs, and pairs of datasets (None for all)."""
 
     epochs: int
     pairs: int | None

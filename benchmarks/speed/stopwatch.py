@@ -12,7 +12,7 @@ from ballfg.benchmarks.results import Results
 from ballfg.benchmarks.speed.banded import BandedProblem
 
 CONTROL_SIZE = 512
-"""Of the square float64 matrices whose product is the control."""
+"""Size of the square float64 matrices whose product is the control."""
 
 
 def milliseconds(action: Callable[[], object]) -> float:

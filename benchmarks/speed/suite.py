@@ -60,7 +60,7 @@ HORIZON = 0.3
 """s that are predicted, at `RATE`."""
 NO_SURFACE = Surfaces(-1e3)
 ONLINE: Final[Mapping[Solver, str]] = {"gtsam": "online_update", "ballfg": "online_chain_update"}
-"""What holds the window of the online estimator, and how its rows are called."""
+"""Solvers of the online estimator's window, and the names of their rows."""
 
 
 @dataclass(frozen=True)

@@ -152,7 +152,7 @@ def population_settings(problem: Problem, step: Step) -> Settings:
 def fitted_noise(
     problem: Problem, model: AnalyticModel, settings: Settings, watch: Watch = unwatched
 ) -> NoiseEstimate | None:
-    """The noise that the fitted tracks show about the calibrated model; None where it cannot be told.
+    """The noise of the fitted tracks about the calibrated model; None if undetermined.
 
     Args: model: with the calibrated coefficients.  settings: with the population as the prior of each coefficient.
     """

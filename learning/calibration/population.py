@@ -18,7 +18,7 @@ from scipy.optimize import lsq_linear
 from ballfg.arrays import Array
 
 MAX_STEPS = 20_000
-"""Of the iteration: some tens are usual, thousands where the spread is close to zero. A step takes 50 us."""
+"""Largest number of iterations: some tens are usual, thousands for a spread close to zero. A step takes 50 us."""
 STEP_TOLERANCE = 1e-11
 """Relative change of every variance at which the iteration ends."""
 NO_SPREAD = 1e-10

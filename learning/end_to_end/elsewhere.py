@@ -57,7 +57,7 @@ def fading_of(model: LearnedModel, tracks: Sequence[Tensor]) -> Fading:
 def noise_elsewhere(base: BallModel, shots: Sequence[Shot]) -> TrackNoise | None:
     """The noise of motion, bounces and spins that whole tracks of the training rooms show about the analytic model.
 
-    Acceleration is the least of the rooms: tracks with hits that nobody found show more. Others are means.
+    Acceleration is the least of the rooms: undetected hits raise it. Others are means.
 
     Returns: its coefficients as the learned model names them; None where no track is long enough.
     """

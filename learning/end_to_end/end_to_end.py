@@ -81,7 +81,7 @@ class EndToEnd(Trainee):
     Args:
         shots: all of them; batches are numbers of shots.
         method: of the gradient through the estimate; by default `ImplicitGradient`.
-        augment: whether shots are rotated and shifted in training.
+        augment: True to rotate and shift shots in training.
         optimizer: solves the estimates, with its tolerance.
         linear_solver: for the Hessians of a batch.
         anchor: distance of the model from the analytic one; None if it is not part of the loss.

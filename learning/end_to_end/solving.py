@@ -122,7 +122,7 @@ class BatchSolver:
     warm: WarmStarts = field(default_factory=WarmStarts)
 
     def __call__(self, numbers: Sequence[int], poses: Mapping[int, Pose]) -> tuple[list[Solved], list[tuple[str, str]]]:
-        """Estimates of some shots; name and reason of those that did not converge.
+        """Estimates of some shots; name and reason of each failure to converge.
 
         Args: numbers: of the shots.  poses: for those that are not seen as measured.
         """
@@ -146,7 +146,7 @@ class BatchSolver:
         shot = self.shots[number]
         key = id(shot.settings), shot.surfaces, pose is not None
         if key not in smoothers:
-            # hits were looked for once, in the shots: what a model in training cannot explain yet is no hit
+            # hits were searched once, in the shots: an unexplained motion of a model in training is no hit
             settings = replace(self.learnables.noise.settings(shot.settings), find_events=False)
             if pose is not None:
                 x, y, z = settings.memory

@@ -83,7 +83,7 @@ def page(
         curves: loss and errors over the epochs.
         learned: coefficients and noise before and after.
         shot: a validation track predicted by the written model; None where there is none.
-        next_command: what to type next; empty where no command takes the model.
+        next_command: the command to type next, or empty.
         origin: date, versions, command: what the page comes from, by its name.
         untrained: RMSE of the analytic model on the validation tracks, m; None where it is not known.
     """

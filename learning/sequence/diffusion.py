@@ -36,7 +36,7 @@ START_SEED = 0
 NOISE_STREAM = 1
 """Makes the noise differ from the augmentation of the same seed, epoch and track."""
 HEADS = 4
-"""Of the attention between tokens and of the final pooling."""
+"""Number of heads of the attention between tokens and of the final pooling."""
 WAVES = 8
 """Periods of the features of a place in time."""
 SHORTEST_PERIOD, PERIOD_RANGE = 4.0, 256.0
@@ -44,7 +44,7 @@ SHORTEST_PERIOD, PERIOD_RANGE = 4.0, 256.0
 LONG = 100.0
 """Grid steps by which a place in time is divided, to be of order one."""
 DILATIONS = (1, 2, 4, 8, 16, 32, 1, 2)
-"""Of the blocks; together they look back 132 grid steps."""
+"""Dilations of the blocks; together they look back 132 grid steps."""
 
 
 def place_features(steps: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ class Coefficients:
     tangents: Mapping[str, Array]
 
     def of(self, function: Function, rows: Index, directions: int) -> tuple[Array, Array]:
-        """Those of some rows for a compiled function: (m, p) and (m, p, d)."""
+        """Coefficients of some rows for a compiled function, with tangents: (m, p) and (m, p, d)."""
         m, p = len(rows), len(function.names)
         values, tangents = np.empty((m, p)), np.zeros((m, p, directions))
         for place, name in enumerate(function.names):

@@ -63,7 +63,7 @@ def machine_code(signature: Any) -> Callable[[Callable[..., Any]], Any]:
                 return next(iter(dispatcher.overloads.values())).entry_point
 
         def for_caller(args: Any, kwargs: Any) -> Any:
-            """What numba asks for when it compiles a function that calls this one."""
+            """The machine code, which numba asks for when it compiles a caller of this function."""
             for_call()
             return dispatcher.get_call_template(args, kwargs)
 
@@ -118,7 +118,7 @@ def _built(text: str) -> Code:
 
 
 def _holds(path: Path, text: str) -> bool:
-    """Whether a file has this content, whole."""
+    """True if a file has exactly this content."""
     try:
         return path.read_bytes() == text.encode()
     except OSError:

@@ -27,8 +27,8 @@ def several(kind: Any, count: int) -> Any:
 THREE_FUNCTIONS: Final[Any] = several(FUNCTION, 3)
 """Rates, impact and surface of a model."""
 THREE_VALUES: Final[Any] = several(TWO, 3)
-"""Their coefficients, one row a ball."""
+"""The coefficients of these, one row per ball."""
 THREE_TANGENTS: Final[Any] = several(THREE, 3)
-"""How these move with the tangents."""
+"""The tangents of these coefficients."""
 THREE_WEIGHTS: Final[Any] = several(ONE, 3)
-"""Their weights."""
+"""The weights of the three functions."""

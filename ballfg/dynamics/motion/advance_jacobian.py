@@ -47,7 +47,7 @@ def advance_jacobian(model: BallModel, state: Tensor, dt: float, surfaces: Surfa
 def _advance_step(model: BallModel, start: Tensor, h: float, surfaces: Surfaces) -> Motion:
     """One step of at most `integrate.MAX_STEP`, cut at its contacts, by the rules of `rollout`."""
     state, height = start, surfaces.level_below(start)
-    # the check of the vertical speed spares most states the rest
+    # a check of the vertical speed first: most states need no more
     if abs(float(state[0, VZ])) <= REST_SPEED and bool(stays(model, state, height, surfaces)):
         after, jacobian = batch_jacobian(lambda at: roll(model, at, at.new_tensor([h]), height), state)
         return Motion(after, jacobian[0], ())

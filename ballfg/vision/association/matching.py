@@ -33,7 +33,7 @@ _LEAST_SUPPORT: Final = 1.5
 _LONG: Final = 8
 """Common times from which a pair of pieces says something about the calibration."""
 _SPEEDING: Final = 2.0
-"""By how much faster than both pieces something may move between them: at a bounce or a hit."""
+"""Largest excess of a speed between two pieces over those of both: at a bounce or a hit."""
 _NEARBY: Final = 15.0
 """px, how far apart two successive pieces of one camera may be at least, however slow they are."""
 _NEAREST: Final = 0.1
@@ -70,7 +70,7 @@ class _Pair:
 
     first: int
     second: int
-    misses: Array  # (k,) px, what is left between the rays; NaN where they do not meet in front
+    misses: Array  # px, distance between the rays; NaN where they do not meet in front
     variances: Array  # (k,) px^2, of the misses by noise and interpolation
 
     def support(self, offset: float) -> float:

@@ -25,9 +25,9 @@ _PULL: Final = 7.0
 _GATE: Final = 16.0
 """Squared deviation, in variances of the prediction, up to which a candidate continues a piece: 4 sigma."""
 _MARGIN: Final = 9.0
-"""By how much the best answer's cost must beat the next for it to be clear."""
+"""Least advantage of the best answer's cost over the next for an unambiguous choice."""
 _LEAST_VARIANCE: Final = 0.06
-"""px^2, a candidate is never taken to be better placed than to a quarter of a pixel: compression, shading, the lens."""
+"""px^2, least variance of a candidate, a quarter of a pixel's sigma: compression, shading, the lens."""
 _SCORE_COST: Final = 6.0
 """Cost of a candidate of score 0 against one of score 1."""
 _STILL: Final = 3.0

@@ -23,11 +23,11 @@ DICTIONARIES: Final = tuple(sorted(n.removeprefix("DICT_") for n in dir(cv2.aruc
 _SEARCH: Final = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
 _REFINE: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-3)
 _WINDOW: Final = 0.25
-"""Of the distance to the next corner: half the window of the refinement, which must not see another corner."""
+"""Half the window of the refinement, as a share of the distance to the next corner, which it must not contain."""
 _WINDOW_LIMITS: Final = (2, 8)
 """px, least and largest half window: smaller sees no edges, larger sees the lens bend them."""
 _IN_SQUARE: Final = 0.3
-"""Of a square's side: where, from a corner, the four squares around it are looked at."""
+"""Distance from a corner at which the four squares around it are sampled, as a share of a square's side."""
 _UNLIKE: Final = 0.5
 """Two squares that touch at a corner only may differ by this share of the contrast; more, and it is no such corner."""
 _TRIED: Final = 3
@@ -144,7 +144,7 @@ class View:
     """The corners of a board in one image."""
 
     name: str
-    """Of the image's file."""
+    """Name of the image's file."""
 
     size: tuple[int, int]
     """px, width and height of the image."""

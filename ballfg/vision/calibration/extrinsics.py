@@ -15,11 +15,11 @@ from ballfg.vision.camera import Camera
 MIN_POINTS: Final = 4
 """Three points have up to four poses."""
 FLAT: Final = 0.01
-"""Of the points' extent: less out of line or out of plane than that is none at all."""
+"""Share of the points' extent: points closer to a line or plane count as lying in it."""
 MAX_RMS: Final = 4.0
-"""Times the sigma of a pixel: beyond it a point has a wrong name or stands elsewhere."""
+"""Multiple of the pixels' sigma: with larger residuals a point has a wrong name or place."""
 CLEARLY: Final = 9.0
-"""By which the second best pose must be worse, in sums of squared whitened residuals: three sigmas."""
+"""Least excess of the second best pose, in sums of squared whitened residuals: three sigmas."""
 _REFINE: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 
 

@@ -22,19 +22,19 @@ board: OpenCV then reports tiny deviations of a focal length that is wrong by ha
 MAX_FOCAL_SIGMA: Final = 0.02
 """Relative standard deviation of the focal length: 2 % are 6 cm at a distance of 3 m."""
 MIN_COVERAGE: Final = 0.4
-"""Of the image's cells that hold corners: outside, the distortion is not measured but extrapolated."""
+"""Least share of the image's cells with corners: outside of them, the distortion is extrapolated."""
 CELLS: Final = (8, 5)
-"""Across and down, into which the image is divided for that."""
+"""Number of such cells across and down."""
 OUTLYING: Final = 3.0
 """Times the median of the views' errors: a view beyond it has a wrong corner or moved while it was exposed."""
 MIN_OUTLYING: Final = 0.15
-"""px. A view as good as that is kept, however good the others are."""
+"""px. A view with a smaller error is kept, however good the others are."""
 MAX_LEFT_OUT: Final = 1 / 3
-"""Of the views: if more disagree with the rest, it is not they that are wrong."""
+"""Largest share of views that are left out: if more disagree with the rest, the rest may be wrong."""
 MAX_RAY_SIGMA: Final = 1.0
-"""px, standard deviation of where the lens puts a ray: 3 mm at a distance of 3 m."""
+"""px, largest standard deviation of a projected ray: 3 mm at a distance of 3 m."""
 RAYS: Final = 0.95
-"""Of the image in which that must hold: the outermost corners of a wide lens hardly ever see a board."""
+"""Share of the image to which that applies: the outermost corners of a wide lens rarely see a board."""
 MAX_FOLD: Final = 0.05
 """px. Distortion undone and done again must lead back to each pixel, or the model folds the image there."""
 _CRITERIA: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)

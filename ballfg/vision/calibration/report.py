@@ -22,9 +22,9 @@ BLUE, VERMILION, GREY = "#0072b2", "#d55e00", "#8c8c8c"
 OUTLINED: Final = withStroke(linewidth=1.5, foreground="white")
 """For letters that must be read over any image."""
 ARROW: Final = 0.05
-"""Of the image's width: the length at which a residual of three times the median is drawn."""
+"""Length of a residual of three times the median in the drawing, as a share of the image's width."""
 PARTS: Final = 40
-"""Of a line: how finely it is drawn, since the lens bends it."""
+"""Number of parts of a drawn line, which the lens bends."""
 PANEL: Final = (5.0, 3.4)
 """Inches, width and height of a panel."""
 DPI: Final = 120

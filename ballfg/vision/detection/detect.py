@@ -179,7 +179,7 @@ def _run(video: Video, detector: Detector, seen: list[tuple[float, Candidates]])
 
 
 def _made(found: Detector | type[Detector], path: Path, video: Video) -> Detector:
-    """The detector of a camera, which serves no other; what it raises is told with file, line, video and frame."""
+    """The detector of a single camera; its errors are reported with file, line, video and frame."""
     with blamed(path, f"making the detector of {video.name}"):
         detector = found() if isinstance(found, type) else found
     frames = count()

@@ -26,7 +26,7 @@ compression, which makes the blotches, moves edges."""
 LEARNS: Final = 0.8
 """Score from which a candidate teaches what edge and shading to expect."""
 FORGETS: Final = 0.98
-"""Of what was learned, per teaching candidate: the light on the ball changes as it flies."""
+"""Factor on earlier information per teaching candidate: the light on the ball changes as it flies."""
 SUREST: Final = (0.15, 0.08, 0.08)
 """Least sigmas of the expected edge (px) and shading: they change along a flight, and may be learned wrong."""
 VISIBLE_STREAK: Final = 3.0
@@ -47,7 +47,7 @@ class DetectorSettings:
     """px, largest motion of a ball during an exposure."""
 
     colour: Colour | None = None
-    """Of the ball; None: any colour that differs from the background's."""
+    """Colour of the ball; None: any colour that differs from the background's."""
 
     most: int = 6
     """Largest number of closely examined candidates per frame."""
@@ -75,7 +75,7 @@ class BallDetector:
         """A detector with the background that frames of the recording show.
 
         Args: images: at least three, (h, w, 3) grey levels, spread over the recording; see `Background`.
-            settings: what is known about the ball; the default ones if None.
+            settings: assumptions on the ball; None: the default ones.
         Returns: the detector of that camera.
         Raises: ValueError: too few images, or of several sizes.
         """
@@ -161,7 +161,7 @@ def learned(look: Look, fit: StreakFit, blotches: float) -> Look:
 
 
 def _candidates(rated: Sequence[tuple[StreakFit, float]], floor: float) -> Candidates:
-    """Of the fits of a frame with their scores; floor: px, sigma added to that of each centre."""
+    """Candidates from the fits of a frame and their scores; floor: px, sigma added to each centre's."""
     if not rated:
         return Candidates.none()
     covariances = np.stack([fit.covariance for fit, _ in rated])

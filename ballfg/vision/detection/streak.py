@@ -52,7 +52,7 @@ _ROUNDING: Final = np.float32(1e-6)
 SMALLEST: Final = 1.0
 """px, the least radius: less is a point, and all shapes of it look alike."""
 CENTRE, HALF, RADIUS, CONTRAST, LOOK = slice(0, 2), slice(2, 4), 4, 5, slice(6, 9)
-"""Where the parameters stand in a vector of nine."""
+"""Places of the parameters in a vector of nine."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +137,7 @@ class StreakFit:
 
     @property
     def oddness(self) -> float:
-        """Sigmas, root mean square of three, by which edge and shading are off what is expected of any ball."""
+        """Sigmas, root mean square of three, between edge and shading and those expected of any ball."""
         first = Look.unknown()
         off = self.values[LOOK] - first.mean
         return float(np.sqrt(off @ first.information @ off / len(off)))
@@ -220,7 +220,7 @@ def start(patch: Patch, look: Look) -> Array | None:
 
 
 def fit_streak(patch: Patch, values: Array, look: Look) -> StreakFit:
-    """Least squares from first values (9,), by Gauss-Newton; edge and shading are drawn to what is expected of them.
+    """Least squares from first values (9,), by Gauss-Newton, with a prior on edge and shading.
 
     Where the fit ends far from where it began, the pixels around the end are fitted once more.
     """
@@ -231,7 +231,7 @@ def fit_streak(patch: Patch, values: Array, look: Look) -> StreakFit:
 
 
 def _fitted(patch: Patch, values: Array, look: Look) -> StreakFit:
-    """Of the pixels around the first values."""
+    """The fit to the pixels around the first values."""
     values = values.copy()
     near = _near(patch, values)
     close = patch.at(near[:: 1 + int(len(near) * _nodes(values[HALF]) / MOST_WORK)])

@@ -119,7 +119,7 @@ class OverlayPainter:
         return line
 
     def _place(self, time: float, first: float, last: float) -> int:
-        """Where a time stands, px from the left."""
+        """Place of a time, px from the left."""
         share = (time - first) / (last - first) if last > first else 0.0
         return round(MARGIN + share * (self.size[0] - 1 - 2 * MARGIN))
 

@@ -23,7 +23,7 @@ from ballfg.vision.tracking.recordings import check_sizes
 FEWEST: Final = 2
 """Least number of cameras: a single one does not see the distance of a ball."""
 DIGITS: Final = 3
-"""Of the number that is a track's name, at least: names then sort as their tracks do."""
+"""Least number of digits in a track's name: names then sort as their tracks do."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from ballfg.checks import did_you_mean, listed, shown
 from ballfg.vision.camera import Camera
 
 SAME_SHAPE: Final = 0.01
-"""Share by which a video's proportions may differ from the camera's where it is taken for the same picture, scaled."""
+"""Largest relative difference between the proportions of a video and of its camera, for a scaled picture."""
 
 
 def match_videos(given: Sequence[str], cameras: Sequence[Camera], ignored: Sequence[str] = ()) -> dict[str, Path]:

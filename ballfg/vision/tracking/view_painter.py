@@ -28,7 +28,7 @@ CANDIDATE: Final = 4.5
 UNLIKELY, LIKELY = (130, 130, 130), (255, 255, 255)
 """Colours of candidates of score 0 and 1; those between are mixed."""
 DIMMED: Final = 0.4
-"""Of its brightness is left of the view behind text."""
+"""Share of the view's brightness that remains behind text."""
 CAPTION: Final = 22
 """px, height of the line of text at the top."""
 _SHIFT: Final = 4

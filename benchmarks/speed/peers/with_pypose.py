@@ -12,7 +12,7 @@ STEPS = 20
 MOST_TRACKS = 4
 """At once; four take seconds."""
 DAMPING = 1e-10
-"""Of the first step: as good as none, which is the quickest here."""
+"""Damping of the first step: negligible, which is the quickest here."""
 
 
 class Flight(nn.Module):

@@ -47,7 +47,7 @@ class View:
 
     @property
     def size(self) -> int:
-        """How many numbers it has."""
+        """Number of its entries."""
         return prod(self.shape)
 
     @property

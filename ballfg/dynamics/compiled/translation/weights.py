@@ -40,7 +40,7 @@ class Weights:
     length: int = 0
 
     def take(self, known: Known) -> View:
-        """Where the numbers of a tensor lie among the weights."""
+        """Places of the numbers of a tensor among the weights."""
         shape = tuple(known.example.shape)
         if known.node not in self.taken:
             self.taken[known.node] = self.length
