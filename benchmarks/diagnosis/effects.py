@@ -40,7 +40,7 @@ class Plant:
         return tuple(f"{self.name}.{c}={self.base + size * amount!r}" for c, amount in self.amounts)
 
     def hypothesis(self) -> Hypothesis:
-        """The right one: this effect in its true shape."""
+        """The true hypothesis, with this effect in its true shape."""
         coefficients = EFFECTS[self.name].coefficients
         if not self.sized:
             whole = {c.name: c.default for c in coefficients} | {c: self.base + a for c, a in self.amounts}

@@ -90,7 +90,7 @@ def move_contacts(
     changed = sorted({i for i, _ in set(old) ^ set(new)})
     for interval in changed:
         if interval - 1 in changed:
-            continue  # the contact came from there or went there; the state after both is right already
+            continue  # the contact entered or left this interval; the state after both is right already
         heights = tuple(height for i, height in new if i == interval)
         start = torch.from_numpy(np.concatenate((states[interval], values.coefficients[: model_width(model)]))[None])
         gap = float(model.gap(start, heights[0])[0].detach()) if heights else 0.0
