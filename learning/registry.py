@@ -1,4 +1,4 @@
-"""The registry of trainees, which a config's key `kind` can name, and those that come with the package.
+"""Registers the trainees, which a config's key `kind` names.
 
 A kind of one's own is a subclass of `TraineeKind` and one call of `register_trainee`, or an entry point of the group
 `ballfg.trainees`. Those of the package stand beside what they build, and are imported when they are named.
@@ -24,7 +24,7 @@ class TraineeKind(ABC):
     unused: ClassVar[tuple[str, ...]] = ()
     """Keys of the config without effect on this kind; a config that sets one is refused."""
     augmented: ClassVar[bool] = False
-    """Whether training tracks are rotated and shifted unless the config says otherwise."""
+    """True if training tracks are rotated and shifted unless the config says otherwise."""
 
     @classmethod
     @abstractmethod

@@ -1,4 +1,4 @@
-"""The horizontal surfaces a ball can meet: a table, and the floor for a ball that falls beside it."""
+"""Describes the horizontal surfaces that a ball can meet: a table, and the floor for a ball that falls beside it."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class Surfaces:
     Attributes:
         table_height: m, z of the table's surface.
         floor_height: m, z of the floor; None where there is no floor below (a court is its own floor).
-        extent: (x_low, x_high, y_low, y_high) m of the table; infinite where an end is not known, None where none is:
-            the table is taken to lie under every ball whose centre is above its surface and within the known ends.
+        extent: (x_low, x_high, y_low, y_high) m of the table; infinite for an unknown end. None if no end is known: the
+            table then lies under every ball whose centre is above its surface.
         edge_sigmas: (x_low, x_high, y_low, y_high) m, standard deviations of those ends, for predictions near them.
 
     Raises: ValueError: a height that is not finite, a floor above the table, an extent out of order, a negative sigma.
@@ -61,7 +61,7 @@ class Surfaces:
 
     @classmethod
     def table_tennis(cls, table_height: float) -> Surfaces:
-        """A table of unknown place in the room, with the floor 0.76 m below its surface."""
+        """A table at a height in the room, with the floor 0.76 m below its surface."""
         return cls(table_height, table_height - TABLE_ABOVE_FLOOR)
 
     def __str__(self) -> str:
@@ -83,12 +83,12 @@ class Surfaces:
     def height_below(self, state: Tensor) -> Tensor:
         """(...) m, height of the surface below a ball in states (..., 9), straight down; -inf where there is none.
 
-        A ball whose centre is below the table's surface is beside the table; `level_below` on how deep it may be.
+        A ball whose centre is below the table's surface is beside the table; `level_below` limits its depth.
         """
         return torch.where(self.over_table(state), self.level_below(state), self._lower_level(state))
 
     def level_below(self, state: Tensor) -> Tensor:
-        """(...) m, height of the surface whose level a ball in states (..., 9) falls to, on the table or beside it.
+        """(...) m, height of the surface that a ball in states (..., 9) falls to, on the table or beside it.
 
         -inf where there is none: below the lowest surface by more than `DEEPEST`.
         """

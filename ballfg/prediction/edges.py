@@ -1,4 +1,4 @@
-"""Balls that come down near the edge of a table: one bounces, its neighbour within the uncertainty falls past.
+"""Accounts for balls near the edge of a table: one bounces, its neighbour within the uncertainty falls past.
 
 The mean takes one of the two ways. The covariance gets the second moment, about the mean, of the share that takes the
 other (docs/derivations/prediction.md).
@@ -22,7 +22,7 @@ from ballfg.state import STATE_DIM, VZ
 
 @torch.no_grad()
 def edge_doubt(model: BallModel, mean: Tensor, covariance: Tensor, h: Tensor, surfaces: Surfaces) -> Tensor | float:
-    """What the balls that take the other way add to the covariance at the end of a step.
+    """Covariance at the end of a step from the balls that take the other way than the mean.
 
     Args:
         model: of the ball.
@@ -30,7 +30,7 @@ def edge_doubt(model: BallModel, mean: Tensor, covariance: Tensor, h: Tensor, su
         covariance: (1, d, d) of it.
         h: (1,) s, the step; at most one contact with the table.
         surfaces: table and floor.
-    Returns: (9, 9); 0 where the ball does not come down to the table's level in the step, or far from every edge.
+    Returns: (9, 9); 0 if the ball does not come down to the table's level in the step, or far from every edge.
     """
     height = mean.new_tensor([surfaces.table_height])
     beside = fly(model, mean, h)

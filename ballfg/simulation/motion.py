@@ -1,4 +1,4 @@
-"""The true motion of a block of shots: frame by frame, through contacts, with process noise."""
+"""Simulates the true motion of a block of shots frame by frame, through contacts, with process noise."""
 
 import math
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ from ballfg.simulation.launcher import SimulatedLauncher
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ, Z
 
 NOISE_STEP = 0.005
-"""s. Process noise enters at least this often. In free flight its discretisation is exact for any step; in a step with
-a contact the noise is added after the bounce, so that the step must be short."""
+"""s. Largest step of process noise. In free flight its discretisation is exact for any step; in a step with a contact
+the noise is added after the bounce, so that the step must be short."""
 TOGETHER = 32
-"""Frames that are computed at once; a ball that has left the view is followed for as many more at most."""
+"""Number of frames computed at once; a ball that has left the view is followed for as many more at most."""
 MIN_FRAMES = 5
-"""Every track has this many frames, even of a ball that leaves the view at once."""
+"""Least number of frames of a track, even if the ball leaves the view at once."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Motion:
     """The true states of a block of shots at their frames, frame k at k / rate seconds."""
 
     states: NDArray[np.float64]
-    """(n, k, 9); behind the end of a track not defined."""
+    """(n, k, 9); undefined after the end of a track."""
 
     lengths: NDArray[np.int64]
     """(n,) frames of each track."""
@@ -50,7 +50,7 @@ def simulate_motion(
     Args:
         start: (n, 9) first states.
         rate: Hz.
-        launcher: says where and when a track ends.
+        launcher: determines the end of a track.
         noise: process noise of the flight; that of contacts is in `model`.
         rng: draws the process noise.
     Returns: the frames; the first is `start`.
@@ -94,7 +94,7 @@ def _next_frames(
         state = advance(model, state, h, surfaces)
         disturbance = process_noise(len(state), dt / steps, noise, rng)
         resting = is_resting(model, state, surfaces.height_below(state))
-        disturbance[resting, Z] = 0.0  # the surface takes it up
+        disturbance[resting, Z] = 0.0  # the surface absorbs it
         disturbance[resting, VZ] = 0.0
         state = state + disturbance
     return state[:, None]

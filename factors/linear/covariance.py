@@ -1,4 +1,4 @@
-"""Covariances of states and coefficients from the triangles that eliminations leave behind."""
+"""Computes covariances of states and coefficients from the triangles of eliminations."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ class Covariances:
     cross: Array
 
     def definite(self) -> "Covariances | None":
-        """These, safe from rounding; None where a track leaves something undetermined, to double precision."""
+        """The same, safe from rounding; None if a track leaves an unknown undetermined in double precision."""
         if not variances_positive(self.states).all() or not np.isfinite(self.cross).all():
             return None
         return replace(self, states=definite(self.states))
@@ -39,7 +39,7 @@ class NeighbourCovariances:
 
     Attributes:
         states: (t, n, w, w).
-        cross: (t, n, w, w + p), of each state with the next one and with the coefficients.
+        cross: (t, n, w, w + p), of each state with the next one and the coefficients.
         coefficients: (t, p, p).
     """
 
@@ -48,7 +48,7 @@ class NeighbourCovariances:
     coefficients: Array
 
     def joint(self, track: int, left: Index, right: Index) -> Array:
-        """(m, d, e) covariances of variables of one track, each pair the same, neighbours, or with the coefficients.
+        """(m, d, e) covariances of pairs of one track's variables: equal, neighbours, or with the coefficients.
 
         Args: left: (m,) variable numbers.  right: (m,).
         """

@@ -1,10 +1,10 @@
-"""Elimination of a chain of states by Householder's QR, in machine code.
+"""Eliminates a chain of states by Householder's QR, in machine code.
 
-Every factor looks at one state or at two neighbours, and perhaps at coefficients that all share. Its rows are kept with
-the first of its states, in a matrix with the columns (x_i, x_{i+1}, c, 0, b), as many zeros as make their number a
-multiple of four. State by state these rows are reduced: first x_i goes, against the triangle that the states before
-left; what still looks at x_{i+1} becomes its triangle; the rest is known of the coefficients alone. Normal equations
-would halve the digits: a loose prior on a spin beside its tight process noise leaves none of them.
+Every factor depends on one state or on two neighbours, and perhaps on shared coefficients. Its rows are stored with the
+first of its states, in a matrix with the columns (x_i, x_{i+1}, c, 0, b), with zeros up to a multiple of four columns.
+State by state these rows are reduced: first x_i is eliminated, against the triangle of the earlier states; the rows
+that still contain x_{i+1} become its triangle; the rest depends on the coefficients alone. Normal equations would halve
+the digits: a loose prior on a spin beside its tight process noise leaves none of them.
 """
 
 import math
@@ -17,9 +17,9 @@ from ballfg.dynamics.compiled.flight import put_all
 from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, INDEX, NOTHING, ONE, REAL, THREE, TWO
 
 FOUR_AT_ONCE = 4
-"""Numbers that one instruction multiplies."""
+"""Number of values that one instruction multiplies."""
 BLOCK = 64
-"""States that are reduced with one room for what they leave to each other, which so stays near the processor."""
+"""Number of states that are reduced in one buffer, which so stays in the processor's cache."""
 
 
 @machine_code(COUNT(COUNT))
@@ -30,10 +30,10 @@ def padded(columns: int) -> int:
 
 @machine_code(COUNT(COUNTS, INDEX, COUNT))
 def count_rows(counts: Index, variables: Index, dim: int) -> int:
-    """Add the rows of some factors to those of their first states.
+    """Adds the number of rows of some factors to those of their first states.
 
-    Args: counts: (n + 1,) of each state; last those that look at coefficients alone.  variables: (m, a).  dim: rows of
-    each.
+    Args: counts: (n + 1,) of each state; last those of coefficients alone.  variables: (m, a).  dim: rows of each
+    factor.
     Returns: the number of a factor whose states are not neighbours, or -1.
     """
     n = len(counts) - 1
@@ -51,11 +51,11 @@ def count_rows(counts: Index, variables: Index, dim: int) -> int:
 
 @machine_code(NOTHING(TWO, COUNTS, INDEX, TWO, COUNTS, COUNTS))
 def place_residuals(system: Array, free: Index, variables: Index, residual: Array, rows: Index, firsts: Index) -> None:
-    """Give the rows of some factors their places, and write the right side.
+    """Assigns rows to some factors, and writes the right side.
 
     Args:
         system: (r, k) rows of all factors, zeros to begin with; whitened, each column per unit of its number.
-        free: (n + 1,) the next free row of each state, moved on.
+        free: (n + 1,) the next free row of each state; updated.
         variables: (m, a).  residual: (m, d) whitened.
         rows, firsts: (m,) written: the first row of each factor, and its first state.
     """
@@ -75,7 +75,7 @@ def place_residuals(system: Array, free: Index, variables: Index, residual: Arra
 def place_block(
     system: Array, width: int, rows: Index, firsts: Index, variables: Index, which: int, block: Array
 ) -> None:
-    """Write the Jacobians of some factors by one of their variables.
+    """Writes the Jacobians of some factors by one of their variables.
 
     Args:
         system, rows, firsts, variables: as for `place_residuals`.  width: w, numbers of a state.
@@ -91,7 +91,7 @@ def place_block(
 
 @machine_code(NOTHING(TWO, COUNTS, COUNTS, COUNT, REAL, TWO))
 def damp(system: Array, start: Index, free: Index, width: int, damping: float, diagonal: Array) -> None:
-    """Add a row for every unknown, which holds it back.
+    """Adds a damping row for every unknown.
 
     Args:
         system, width, free: as above.  start: (n + 2,) the first row of each state, and the end.
@@ -116,9 +116,9 @@ def damp(system: Array, start: Index, free: Index, width: int, damping: float, d
 
 @machine_code(NOTHING(TWO, TWO, COUNT, COUNT, COUNT, COUNT, ONE))
 def absorb(upper: Array, system: Array, begin: int, end: int, first: int, count: int, column: Array) -> None:
-    """Reflect rows begin:end of the system into a triangle, until their columns first:first+count are zero.
+    """Reflects rows begin:end of the system into a triangle, until their columns first:first+count are zero.
 
-    Columns up to those are used up, nobody reads them again. Four columns at a time fill one register of a processor.
+    Columns before those are not read again. Four columns at a time fill one register of a processor.
 
     Args:
         upper: (count, all columns), triangular from column `first` on.
@@ -165,7 +165,7 @@ def absorb(upper: Array, system: Array, begin: int, end: int, first: int, count:
 
 @machine_code(NOTHING(TWO, TWO, COUNT))
 def copy_kept(target: Array, source: Array, kept: int) -> None:
-    """Copy the first columns of some rows, and the right side, which is last in both."""
+    """Copies the first columns of some rows, and the right side, which is last in both."""
     for i in range(target.shape[0]):
         for j in range(kept):
             target[i, j] = source[i, j]
@@ -174,13 +174,13 @@ def copy_kept(target: Array, source: Array, kept: int) -> None:
 
 @machine_code(NOTHING(TWO, COUNTS, COUNT, THREE, THREE, THREE))
 def eliminate_on(system: Array, start: Index, width: int, carries: Array, shared: Array, root: Array) -> None:
-    """Reduce the rows of a part of the chain, from a state on to the last, after what the states before have left.
+    """Reduces the rows of a part of the chain, from a state to the last, with the triangles of the earlier states.
 
     Args:
-        system: (r, k) as above; it is used up.  width: w.
+        system: (r, k) as above; overwritten.  width: w.
         start: (m + 1,) the first row of each of m states, and the end.
-        carries: (m + 1, w, k) triangle that the states before leave on the first one; those on the others are written.
-        shared: (m + 1, p, k) triangle of the coefficients before the first state; that after each state is written.
+        carries: (m + 1, w, k) triangle of the earlier states on the first one; those on the others are written.
+        shared: (m + 1, p, k) triangle of the coefficients before the first state; those after each state are written.
         root: (m, w, 2 w + p + 1), written: the rows of R of each state: by itself, by the next one, by the
             coefficients, the right side.
     """
@@ -210,12 +210,12 @@ def eliminate_on(system: Array, start: Index, width: int, carries: Array, shared
 def reduce_block(
     system: Array, start: Index, width: int, first: int, end: int, carries: Array, shared: Array, root: Array
 ) -> None:
-    """Reduce the rows of the states first to end - 1, at most `BLOCK` of them.
+    """Reduces the rows of the states first to end - 1, at most `BLOCK` of them.
 
     Args:
         system, start, width, root: as for `eliminate`.
-        carries, shared: (`BLOCK` + 1, ..) as for `eliminate_on`; their first entries are what the states before have
-            left, and become what these leave.
+        carries, shared: (`BLOCK` + 1, ..) as for `eliminate_on`; their first entries hold the triangles of the earlier
+            states, and then those of these.
     """
     count = end - first
     eliminate_on(system, start[first : end + 1], width, carries[: count + 1], shared[: count + 1], root[first:end])
@@ -225,9 +225,9 @@ def reduce_block(
 
 @machine_code(NOTHING(TWO, COUNTS, COUNT, THREE, TWO))
 def eliminate(system: Array, start: Index, width: int, root: Array, last: Array) -> None:
-    """Reduce all rows to the triangle R with its right side.
+    """Reduces all rows to the triangle R with its right side.
 
-    Args:
+    system, start, width: as above, with the rows of the coefficients alone after those of the last state.
         system, start, width: as above, with the rows of the coefficients alone behind those of the last state.
         root: (n, w, 2 w + p + 1), written: as above.
         last: (p, 2 w + p + 1), written: the rows of the coefficients, at the end.

@@ -1,7 +1,7 @@
-"""Elimination of a chain behind whose coefficients another state waits that only the beginning of the chain tells of.
+"""Eliminates a chain with one further state behind the coefficients, dropped once its columns have faded.
 
-The first state of a section, say. The rows of the chain's later states mean less and less to it. Where what they still
-mean has faded below what the arithmetic resolves, its columns are dropped, and the rest of the chain is reduced in less
+The further state is a section's first one. The rows of the chain's later states depend on it less and less. Where that
+dependence falls below the resolution of the arithmetic, its columns are dropped, and the rest of the chain takes less
 than half the time.
 """
 
@@ -13,12 +13,12 @@ from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, NOTHING, REAL, TH
 from ballfg.factors.linear.elimination import BLOCK, absorb, copy_kept, padded, reduce_block
 
 FADED = 1e-13
-"""Share of what is known of a number already, below which what a state still tells of it is dropped."""
+"""Share of the present information on a number, below which a state's further information is dropped."""
 
 
 @machine_code(REAL(TWO, TWO, COUNT, COUNT, COUNT))
 def _strength(carry: Array, shared: Array, width: int, own: int, held: int) -> float:
-    """How much a chain's next state tells of what waits, compared with what the states before it told."""
+    """Information of a chain's next state on the further state, relative to that of the states before it."""
     p, most = len(shared), 0.0
     for column in range(2 * width + own, 2 * width + own + held):
         told, known = 0.0, 0.0
@@ -33,10 +33,10 @@ def _strength(carry: Array, shared: Array, width: int, own: int, held: int) -> f
 
 @machine_code(NOTHING(TWO, COUNTS, COUNT, COUNT, THREE, TWO))
 def eliminate_fading(system: Array, start: Index, width: int, held: int, root: Array, last: Array) -> None:
-    """Reduce all rows to the triangle R with its right side, as `ballfg.factors.linear.elimination.eliminate` does.
+    """Reduces all rows to the triangle R with its right side, as `ballfg.factors.linear.elimination.eliminate` does.
 
     Args:
-        system, start, width, root, last: as for it.
+        system, start, width, root, last: as for `eliminate`.
         held: number of the last coefficients that fade along the chain.
     """
     n, columns, p = len(start) - 2, system.shape[1], len(last)
@@ -57,10 +57,10 @@ def eliminate_fading(system: Array, start: Index, width: int, held: int, root: A
 def _eliminate_rest(
     system: Array, start: Index, width: int, first: int, carry: Array, shared: Array, own: int, root: Array
 ) -> None:
-    """Reduce the rows from a state on, which say nothing of the coefficients but the first `own`.
+    """Reduces the rows from a state on, which depend on the first `own` coefficients only.
 
-    Args: system, start, width, root: as above.  first: the state.  carry: what the states before it left.
-        shared: of the coefficients; becomes that after the last state.
+    Args: system, start, width, root: as above.  first: the state.  carry: the triangle of the states before it.
+        shared: triangle of the coefficients; updated to that after the last state.
     """
     n, kept = len(start) - 2, 2 * width + own
     columns = padded(kept + 1)

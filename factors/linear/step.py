@@ -1,4 +1,4 @@
-"""The linear subproblem: the step that minimises the linearised objective, by QR, state by state along the track."""
+"""Solves the linear subproblem by QR, state by state along the track, for the step of a minimisation."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class Root:
     """The triangle R of one track, R^T R = J^T J, and the right side y of R d = y.
 
     Attributes:
-        states: (n, w, 2 w + p + 1), of each state: its own triangle, the block that couples it to the next state, that
-            to the coefficients, y. Each per unit of its variable.
-        coefficients: (p, 2 w + p + 1), the same of the coefficients; the first 2 w columns are empty.
+        states: (n, w, 2 w + p + 1), of each state: its own triangle, its coupling to the next state and to the
+            coefficients, y. Each per unit of its variable.
+        coefficients: (p, 2 w + p + 1), the same for the coefficients; the first 2 w columns are empty.
     """
 
     states: Array
@@ -46,8 +46,8 @@ class Step:
     Attributes:
         states: (n, 9 + b) m, m/s, rad/s, and m of biases: part of the step d that minimises |r + J d|^2 (+ damping).
         coefficients: (p,) in their own units, the other part of it.
-        root: the triangle that the elimination leaves.
-        decrease: half of |r|^2 - |r + J d|^2, by which the linear model promises to reduce the objective.
+        root: the triangle of the elimination.
+        decrease: half of |r|^2 - |r + J d|^2, the decrease of the objective predicted by the linear model.
     """
 
     states: Array
@@ -57,7 +57,7 @@ class Step:
 
     @classmethod
     def of(cls, root: Root, states: Array, coefficients: Array, damping: float, diagonal: Array) -> Step | None:
-        """The step R d = y with what it promises; None where it is not finite.
+        """The step R d = y with its predicted decrease; None if it is not finite.
 
         Args:
             root: R and y.
@@ -69,7 +69,7 @@ class Step:
         if not (np.isfinite(states).all() and np.isfinite(coefficients).all()):
             return None
         n, w, p = len(states), root.width, len(coefficients)
-        # |J d|^2 and what the damping rows add to it
+        # |J d|^2 and the share of the damping rows in it
         promised = float((root.states[..., -1] ** 2).sum() + (root.coefficients[:, -1] ** 2).sum())
         if damping:
             held = (diagonal[:n, :w] * states**2).sum() + (diagonal[n, :p] * coefficients**2).sum()
@@ -94,13 +94,13 @@ def weighted(rows: Rows) -> tuple[Array, tuple[Array, ...]]:
 
 
 def solve(linearized: Sequence[Rows], values: Values, damping: float = 0.0) -> Step | None:
-    """Minimise the linearised, reweighted objective.
+    """Minimises the linearised, reweighted objective.
 
     Args:
         linearized: all batches of a graph at `values`.
         values: the point; its shapes give the variables.
         damping: Marquardt's lambda, relative to the diagonal of J^T J.
-    Returns: None where the system is singular or its solution is not finite.
+    Returns: None if the system is singular or its solution is not finite.
     Raises: ValueError: if a factor links states that are not neighbours.
     """
     p, w = len(values.coefficients), values.width
@@ -116,8 +116,8 @@ def damped_rows(linearized: Sequence[Rows], values: Values, damping: float) -> t
     """All rows of the linear problem, ordered by their first states, with those of the damping.
 
     Args: linearized, values, damping: as for `solve`.
-    Returns: rows (r, c) as `elimination` takes them; where the rows of each state begin (n + 2,), those of the
-        coefficients last; diagonal (n + 1, w + p) of J^T J, zeros without damping.
+    Returns: rows (r, c) for `elimination`; first row of each state (n + 2,), that of the coefficients last; diagonal (n
+        + 1, w + p) of J^T J, zeros without damping.
     Raises: ValueError: if a factor links states that are not neighbours.
     """
     n, p, w = len(values.states), len(values.coefficients), values.width
@@ -130,7 +130,7 @@ def damped_rows(linearized: Sequence[Rows], values: Values, damping: float) -> t
 
 
 def _system(pieces: Sequence[Piece], n: int, p: int, width: int, *, further: bool) -> tuple[Array, Index, Index]:
-    """All rows, ordered by their first states; where each state's rows begin, and where free ones do.
+    """All rows, ordered by their first states; the first row and the first free row of each state.
 
     Args: further: leave room for a row for each unknown.
     """
@@ -156,5 +156,5 @@ def _system(pieces: Sequence[Piece], n: int, p: int, width: int, *, further: boo
 
 
 def _plain(array: NDArray[N]) -> NDArray[N]:
-    """An array as machine code takes it: its rows one behind another, and open for writing."""
+    """An array for machine code: contiguous and writable."""
     return array if array.flags.c_contiguous and array.flags.writeable else np.array(array, order="C")

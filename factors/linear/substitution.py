@@ -1,4 +1,4 @@
-"""What the triangle R of a chain of states tells: steps, by substitution, and covariances, in machine code."""
+"""Computes steps and covariances from the triangle R of a chain of states, in machine code."""
 
 import numpy as np
 
@@ -10,11 +10,11 @@ from ballfg.dynamics.compiled.signatures import COUNT, NOTHING, ONE, REAL, THREE
 
 @machine_code(NOTHING(THREE, TWO, TWO, ONE))
 def substitute_back(root: Array, last: Array, states: Array, coefficients: Array) -> None:
-    """Solve R x = y.
+    """Solves R x = y.
 
     Args:
-        root, last: rows of R as `ballfg.factors.linear.elimination.eliminate` leaves them.
-        states: (n, w) and coefficients: (p,), y, which become x.
+        root, last: rows of R from `ballfg.factors.linear.elimination.eliminate`.
+        states: (n, w) and coefficients: (p,), y, overwritten by x.
     """
     n, w = root.shape[:2]
     p = len(coefficients)
@@ -37,9 +37,9 @@ def substitute_back(root: Array, last: Array, states: Array, coefficients: Array
 
 @machine_code(NOTHING(THREE, TWO, TWO, ONE))
 def substitute_forward(root: Array, last: Array, states: Array, coefficients: Array) -> None:
-    """Solve R^T y = x.
+    """Solves R^T y = x.
 
-    Args: root, last: as above.  states: (n, w) and coefficients: (p,), x, which become y.
+    Args: root, last: as above.  states: (n, w) and coefficients: (p,), x, overwritten by y.
     """
     n, w = root.shape[:2]
     p = len(coefficients)
@@ -76,7 +76,7 @@ def invert(upper: Array, inverse: Array) -> None:
 
 @machine_code(NOTHING(TWO, COUNT, REAL, TWO))
 def _part(rows: Array, first: int, scale: float, part: Array) -> None:
-    """Copy columns from the first on, scaled, into an array of their own."""
+    """Copies columns from the first on, scaled, into an array of their own."""
     for a in range(part.shape[0]):
         for b in range(part.shape[1]):
             part[a, b] = scale * rows[a, first + b]

@@ -1,4 +1,4 @@
-"""From a config to a model of the dynamics that is trained through the estimator."""
+"""Builds a model of the dynamics from a config, for training through the estimator."""
 
 import copy
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""A sequence model with its tracks, for the training loop."""
+"""Adapts a sequence model with its tracks to the training loop."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -21,7 +21,7 @@ from ballfg.learning.training_data import read_training_data
 from ballfg.tracks import Track
 
 FOLDER = "model"
-"""Of the predictor, in that of a training."""
+"""Folder of the predictor, in that of a training."""
 
 
 class SequenceTrainee(Trainee):
@@ -35,7 +35,7 @@ class SequenceTrainee(Trainee):
         architecture: kind and size.
         launcher: its labels.
         seed: of initial weights, augmentation and diffusion noise, >= 0.
-        augment: whether training tracks are rotated and shifted.
+        augment: True to rotate and shift training tracks.
     Raises: ValueError: if no track of the training part can be used.
     """
 
@@ -146,7 +146,7 @@ def build_sequence(config: TrainConfig) -> Prepared:
 
 
 def _usable(shot: Shot) -> tuple[Track, int]:
-    """The usable samples of a shot, and the number of those that are observed."""
+    """The usable samples of a shot, and the number of observed ones."""
     keep, track = shot.usable, shot.track
     sigmas = None if track.sigmas is None else track.sigmas[keep]
     kept = replace(track, times=track.times[keep], positions=track.positions[keep], sigmas=sigmas)

@@ -1,4 +1,4 @@
-"""Machine code that moves balls in free flight, round a model's compiled rates.
+"""Moves balls in free flight in machine code, by a model's compiled rates.
 
 Each row of a batch is a ball with coefficients of its own; weights w are the same for all. Tangents travel with the
 values: derivatives in d directions at once, of which there may be none. The rules are those of
@@ -13,7 +13,7 @@ from ballfg.dynamics.compiled.signatures import COUNT, FOUR, FUNCTION, LAW, NOTH
 from ballfg.dynamics.motion.limits import STAGES
 
 TOGETHER = 96
-"""Balls whose layers of a network stay in a processor's own memory."""
+"""Number of balls whose network layers fit into a processor's cache."""
 
 
 @register_jitable

@@ -1,4 +1,4 @@
-"""Types of what machine code takes."""
+"""Declares the argument types of compiled functions."""
 
 from typing import Any, Final, NamedTuple
 
@@ -33,15 +33,15 @@ LAW: Final[Any] = types.NamedTuple((FUNCTION, TWO, THREE, ONE), Law)
 
 
 def several(kind: Any, count: int) -> Any:
-    """A tuple of so many results of one kind."""
+    """A tuple of `count` equal types."""
     return types.UniTuple(kind, count)
 
 
 THREE_FUNCTIONS: Final[Any] = several(FUNCTION, 3)
 """Rates, impact and surface of a model."""
 THREE_VALUES: Final[Any] = several(TWO, 3)
-"""Their coefficients, one row a ball."""
+"""The coefficients of these, one row per ball."""
 THREE_TANGENTS: Final[Any] = several(THREE, 3)
-"""How these move with the tangents."""
+"""The tangents of these coefficients."""
 THREE_WEIGHTS: Final[Any] = several(ONE, 3)
-"""Their weights."""
+"""The weights of the three functions."""

@@ -1,4 +1,4 @@
-"""Contacts with a surface: when the ball touches it, and the flow through one or more contacts.
+"""Finds the times of contacts with a surface and computes the flow through one or more contacts.
 
 The contact time is a function of the state. A search finds it without a graph; two Newton steps then run with one. A
 Newton step from the solution has the solution's exact first derivative, two steps have its derivatives up

@@ -109,7 +109,7 @@ def flight_step(model: BallModel, state: Tensor, h: Tensor) -> Tensor:
 
 
 class _Work:
-    """What all derivatives of a step share.
+    """The values that all derivatives of a step share.
 
     Attributes:
         after: (n, 9) the state after the step.
@@ -172,9 +172,9 @@ class _Work:
         return torch.stack(stages[::-1]), before
 
     def curved(self, cotangents: Tensor, upstream: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Along v (n, 9): tangents of the stages, of the state after; change of the cotangents, of the gradient.
+        """Along v (n, 9): tangents of the stages and of the state after; changes of the cotangents and of the gradient.
 
-        Kept for the last v: two nodes of the graph ask for the same.
+        Cached for the last v: two nodes of the graph ask for the same.
         """
         kept = self._curved
         if kept is None or kept[0].data_ptr() != v.data_ptr() or self._bent is None or self._bent[0] is not upstream:
@@ -210,7 +210,7 @@ class _Step(torch.autograd.Function):
 
 
 class _StepByParameters(torch.autograd.Function):
-    """Zero, with the derivative by the parameters: a node of its own, so that autograd passes it by where it can."""
+    """Zero, with the derivative by the parameters: a separate node that autograd can skip."""
 
     @staticmethod
     def forward(ctx: Any, work: _Work, *parameters: Tensor) -> Tensor:

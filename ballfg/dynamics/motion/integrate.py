@@ -13,7 +13,7 @@ from ballfg.dynamics.motion.limits import step_count
 
 
 def fly(model: BallModel, state: Tensor, dt: Tensor) -> Tensor:
-    """The state after `dt` of free flight; surfaces are not there.
+    """The state after `dt` of free flight, without surfaces.
 
     Args:
         model: the ball.
@@ -34,7 +34,7 @@ def fly(model: BallModel, state: Tensor, dt: Tensor) -> Tensor:
 
 
 def followed(*tensors: Tensor | float) -> bool:
-    """Whether torch must do the work: it follows tensors for derivatives or to record them, or they lie elsewhere.
+    """True if torch must compute: it records derivatives or a trace, or the tensors lie on another device.
 
     Machine code takes float64 in the memory of the processor.
     """
@@ -44,7 +44,7 @@ def followed(*tensors: Tensor | float) -> bool:
 
 
 def is_plain(tensor: Tensor) -> bool:
-    """Whether machine code can read it: float64 in the memory of the processor."""
+    """True if machine code can read a tensor: float64 in the memory of the processor."""
     return type(tensor) is Tensor and tensor.dtype is torch.float64 and tensor.is_cpu
 
 

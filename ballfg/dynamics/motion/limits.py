@@ -1,4 +1,4 @@
-"""Numbers that every integration and every search for a contact keeps to, in torch and in machine code."""
+"""Defines the limits of integrations and contact searches, for torch and machine code alike."""
 
 import math
 from typing import Final
@@ -19,20 +19,19 @@ MAX_STEP: Final = 0.02
 SEARCH_STEPS: Final = 12
 """Upper bound on the search for a contact from a guess; one or two are enough for a contact within 20 ms."""
 TIME_TOLERANCE: Final = 1e-13
-"""s. The search stops when the bound on every contact time's error is below."""
+"""s. The search stops when the error bound of every contact time is below."""
 GAP_TOLERANCE: Final = 1e-10
 """m. A grazing ball whose search stalled this close to the surface has touched it."""
 TYPICAL_JERK: Final = 60.0
 """m/s^3, in the bound on the search's error."""
 DEEPEST: Final = 0.25
-"""m. A ball whose centre is further below the lowest surface is out of this world, and meets nothing. Floors are known
-to some centimetres."""
+"""m. A ball whose centre is further below the lowest surface meets nothing. Floors are known to some centimetres."""
 LEAST_FALL: Final = 1.0
 """m/s^2. The search takes a ball to fall at least as fast as this."""
 LONGEST_FALL: Final = 20.0
 """s. A contact further away counts as none."""
 BEYOND: Final = 0.3
-"""s. A contact that lies further away than its interval's length and this is no continuation of it any more: NaN."""
+"""s. A contact time further outside of its interval than this, and than the interval's length, is set to NaN."""
 MIN_SPEED: Final = 1e-6
 """m/s. Least normal speed that a Newton step divides by; a ball that grazes more gently is at its apex."""
 REST_SPEED: Final = 0.05
@@ -41,12 +40,12 @@ REST_GAP: Final = 1e-5
 """m. A ball this close to a surface and slower than half of `REST_SPEED` rests on it. A ball that left at `REST_SPEED`
 or faster is never both, so that a hop is the same motion however its time is cut."""
 NEGLIGIBLE: Final = 1e-4
-"""Share of balls that pass a table's edge on the other side than the mean, below which they do not count; they would
+"""Share of balls that pass a table's edge on the other side than the mean, below which they are neglected; they would
 add 0.05 m/s to a velocity."""
 LEAST_SIGMA: Final = 1e-12
-"""m. A place known better than this has a sigma of this."""
+"""m. Least standard deviation of a place."""
 LONGEST_MOTION: Final = 20.0
-"""s. A ball that nobody touches lies still by then; over a longer interval it is taken to stay where it is."""
+"""s. An untouched ball lies still by then; over a longer interval it stays in place."""
 MAX_CONTACTS: Final = 32
 """In one step of 20 ms a ball that leaves at `REST_SPEED` under its weight alone bounces at most twice."""
 

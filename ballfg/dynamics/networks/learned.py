@@ -1,4 +1,4 @@
-"""The learned model: networks say how the ball flies and bounces, alone or as a correction of another model."""
+"""The learned model computes flight and bounce by networks, alone or as a correction of another model."""
 
 from typing import Final
 
@@ -21,10 +21,10 @@ from ballfg.dynamics.networks.learned_parts import (
 from ballfg.state import SPIN, VZ
 
 START_OFFSET: Final = -0.003
-"""m by which an untrained model takes surfaces to lie above their declared heights: as in the nominal model."""
+"""m by which an untrained model puts surfaces above their declared heights, as in the nominal model."""
 
 BASE: Final = "base."
-"""What the names of the base's coefficients start with."""
+"""Prefix of the names of the base's coefficients."""
 
 
 class LearnedModel(BallModel):
@@ -34,9 +34,9 @@ class LearnedModel(BallModel):
     tangential change in a bounce. With a base it starts as the base.
 
     Attributes:
-        architecture: what it is made of.
+        architecture: kind and sizes of the networks.
         flight: network of the rates.  contact: network of the bounce.
-        base: the model that is corrected, or None.
+        base: the model to correct, or None.
         offset: () m by which surfaces lie above their declared heights; the base's where there is one.
         fading: how the correction fades outside of the training data; None without a base, and before the training.
 
@@ -107,7 +107,7 @@ class LearnedModel(BallModel):
         return base_acceleration + acceleration, base_spin_rate if spin_rate is None else spin_rate
 
     def after_bounce(self, state: Tensor) -> Tensor:
-        """(..., 9) state just after an impact on a horizontal plane, from the state (..., 9) before it."""
+        """(..., 9) state right after an impact on a horizontal plane, from the state (..., 9) before it."""
         if self.base is None:
             up = -START_RESTITUTION * state[..., VZ : VZ + 1]
             guess = torch.cat((state[..., :VZ], up, state[..., SPIN]), dim=-1)

@@ -1,4 +1,4 @@
-"""Hypotheses, the events they pass through and the surfaces, as machine code keeps them: one record each."""
+"""Defines the records of machine code for hypotheses, their events and the surfaces."""
 
 from typing import Any, Final, NamedTuple, TypeAlias
 
@@ -14,7 +14,7 @@ FLYING: Final = -1
 """Value of `surface` for a ball in the air."""
 
 NO_EVENT: Final = -(2**62)
-"""The `tip` of a hypothesis before which nothing happened."""
+"""The `tip` of a hypothesis without events."""
 
 HYPOTHESIS: Final = np.dtype(
     [
@@ -30,8 +30,8 @@ HYPOTHESIS: Final = np.dtype(
 """One explanation of the past. The axes x, y, z are filtered independently; (p, v, b) are position, velocity, slack.
 
 - mean: axis by (p m, v m/s, b m/s^2).  cov: axis by covariance of (p, v, b).
-- shift: m, by which the tracker is believed to be off; `mean` is what it sees, surfaces appear so moved.
-- score: nats, log evidence less the prices of events; a constant per sample is left out.
+- shift: m, assumed offset of the tracker; `mean` is the measured motion, and surfaces are offset likewise.
+- score: nats, log evidence less the prices of events, apart from a constant per sample.
 - surface: index of the surface on which the ball rests, or `FLYING`.
 - age: samples used since the last event.
 - tip: its last event: the row of a log, or -1 - k for the last event of hypothesis k before the sample.
@@ -47,10 +47,10 @@ LOGGED: Final = np.dtype(
         ("offset", np.float64, (3,)),
     ]
 )
-"""An event that some hypotheses pass through during one sample.
+"""An event of some hypotheses during one sample.
 
-- kind: value of an `EventKind`.  index: the interval, or the sample.  surface: its index, -1 where none is involved.
-- before: the event before, as the `tip` of a hypothesis.  time: s.  offset: m, of a shift.
+- kind: value of an `EventKind`.  index: the interval, or the sample.  surface: its index, -1 without one.
+- before: the previous event, as the `tip` of a hypothesis.  time: s.  offset: m, of a shift.
 """
 
 SURFACE: Final = np.dtype([("centre", np.float64), ("restitution_sigma", np.float64)])
@@ -59,8 +59,8 @@ SURFACE: Final = np.dtype([("centre", np.float64), ("restitution_sigma", np.floa
 Records: TypeAlias = NDArray[np.void]
 """Rows of one of these types."""
 Record: TypeAlias = Any
-"""One row; its fields are attributes in machine code, where a row does not keep its array alive: what may be the last
-use of an array hands on the array and the number of the row."""
+"""One row; its fields are attributes in machine code. A row does not keep its array alive: functions that may hold the
+last reference to an array pass the array and the number of the row."""
 
 BANK: Final[Any] = from_dtype(HYPOTHESIS)[::1]
 ONE_HYPOTHESIS: Final[Any] = from_dtype(HYPOTHESIS)
@@ -68,7 +68,7 @@ LOG: Final[Any] = from_dtype(LOGGED)[::1]
 SURFACES: Final[Any] = from_dtype(SURFACE)[::1]
 
 USED, WRITTEN = range(2)
-"""Places in the `fill` of a bank and its log: rows of each that are in use."""
+"""Indices in the `fill` of a bank and its log: number of used rows of each."""
 
 
 class Work(NamedTuple):

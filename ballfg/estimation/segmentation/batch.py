@@ -1,4 +1,4 @@
-"""Segmentation of a whole track: the forward pass over all samples, then a second look."""
+"""Segments a whole track by a forward pass over all samples and a second look at its contacts."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,11 +28,11 @@ def segment(
     Args:
         times: (n,) s, strictly increasing.
         positions: (n, 3) m, world frame, z up.
-        sigma: (3,) or (n, 3) m, standard deviation of each coordinate. It matters: half the truth makes false shifts.
-            `estimate_position_noise` reads it off the data.
+        sigma: (3,) or (n, 3) m, standard deviation of each coordinate. Half the true noise makes false shifts.
+            `estimate_position_noise` estimates it from the data.
         surfaces: table and floor; the ball's centre bounces a radius and the physics' offset above them.
-        physics: of the ball, see `physics_of`; table tennis where None.
-        settings: noise model and prices of events; defaults where None.
+        physics: of the ball, see `physics_of`; None: table tennis.
+        settings: noise model and prices of events; None: defaults.
     Returns: the best explanation; n = 0 gives an empty one.
     Raises: ValueError: if shapes disagree, something is not finite, or times do not increase.
     Source: docs/derivations/segmentation.md.

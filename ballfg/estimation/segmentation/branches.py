@@ -1,4 +1,4 @@
-"""Events that no surface explains: starts, hits, tracker shifts, a resting ball that leaves."""
+"""Adds hypotheses with events that no surface explains: starts, hits, tracker shifts, a ball that leaves its rest."""
 
 import math
 from typing import Final
@@ -30,18 +30,18 @@ from ballfg.estimation.segmentation.motion import lift, put_down
 from ballfg.estimation.segmentation.scene import SCENE
 
 SHORTEST_STEP: Final = 1e-3
-"""s. An event is not made dearer than this by stamps that lie closer."""
+"""s. Least interval for the price of an event."""
 SHIFTED_PREDICTIONS: Final = 3
-"""How many of the best predictions are tried with a shift; beside a bounce the right one may be the third."""
+"""Number of best predictions that are tried with a shift; beside a bounce the right one may be the third."""
 MOST_ADDED: Final = 2 + 2 * SHIFTED_PREDICTIONS
-"""Hypotheses that these events add at most, besides one for each surface."""
+"""Largest number of hypotheses from these events, besides one for each surface."""
 
 
 @machine_code(NOTHING(WORK, COUNT, REAL, SAMPLE, SCENE, SURFACES))
 def start(work: Work, tip: int, score: float, sample: Sample, scene: Record, surfaces: Records) -> None:
     """Hypotheses after a first sample: a flying ball, one that rests on a surface nearby, or the sample an outlier.
 
-    All expect the ball within the spread of outliers of the sample, so that their evidence compares.
+    All expect the ball within the spread of outliers around the sample, so that their evidences are comparable.
 
     Args:
         work: empty; afterwards those hypotheses.
@@ -81,7 +81,7 @@ def hit(work: Work, before: Records, sample: Sample, dt: float, scene: Record, s
 def shift(work: Work, predicted: Records, sample: Sample, dt: float, scene: Record) -> None:
     """Adds the best predictions, with the measurements jumping by an unknown offset: off from now on, or until now.
 
-    Which of the two shows at the next surface only.
+    Only the next surface shows which of the two holds.
     """
     n, bank, first = len(predicted), work.bank, work.fill[USED]
     rows = np.empty(n, np.int64)
@@ -122,7 +122,7 @@ def leave(work: Work, predicted: Records, sample: Sample, dt: float, scene: Reco
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, ONE, REAL, SCENE))
 def _forget(h: Record, position: Array, variance: float, scene: Record) -> None:
-    """Makes a hypothesis a flying one at a position (3,) m with a variance m^2, of which nothing else is known."""
+    """Makes a hypothesis fly at a position (3,) m with a variance m^2, with all else unknown."""
     h.surface, h.age = FLYING, 0
     for axis in range(3):
         h.shift[axis] = 0.0
@@ -149,5 +149,5 @@ def _rested(work: Work, row: int, sample: Sample, scene: Record, surfaces: Recor
 
 @machine_code(REAL(REAL, REAL))
 def _rarity(rate: float, dt: float) -> float:
-    """nats, minus log probability that an event of a rate (1/s) falls into an interval."""
+    """nats, minus log probability of an event with a rate (1/s) in an interval."""
     return -math.log(-math.expm1(-rate * max(dt, SHORTEST_STEP)))

@@ -1,4 +1,4 @@
-"""Evidence: what a sample says about each hypothesis, and which hypotheses are worth keeping."""
+"""Weighs hypotheses by the evidence of a sample, and keeps the likely ones."""
 
 import math
 from typing import Any, Final
@@ -27,16 +27,16 @@ from ballfg.estimation.segmentation.scene import SCENE
 AS_GOOD, AS_WIDE, AS_OUTLIER = range(3)
 """The components of the noise, as in a scene's `log_shares`."""
 SURPRISE: Final = 3
-"""Behind the evidences of the components: squared whitened innovation of a good sample."""
+"""Index after the evidences of the components: squared whitened innovation of a good sample."""
 
 
 @machine_code(REAL(WORK, COUNT, SAMPLE, SCENE))
 def update(work: Work, first: int, sample: Sample, scene: Record) -> float:
     """Takes a sample into every hypothesis from row `first` on: its noise component, the Kalman update, the evidence.
 
-    Where the prediction is too vague to tell, the sample is also tried as an outlier: those hypotheses come last. That
-    is so where little is known of where the ball is: its second sample, the first ones after a hit or a gap.
-    Explanations that are far behind already are not multiplied.
+    If the prediction is too uncertain to decide, the sample is also tried as an outlier: those hypotheses come last.
+    This happens where the ball's place is hardly known: at its second sample, and at the first ones after a hit or a
+    gap. Explanations that are far behind already are not multiplied.
 
     Args: work: predicted hypotheses; afterwards the updated ones.  first: row.  sample.  scene: of a `Scene`.
     Returns: squared whitened innovation, as of a good sample, of the hypothesis that is the best afterwards.
@@ -70,7 +70,7 @@ def update(work: Work, first: int, sample: Sample, scene: Record) -> float:
 
 @machine_code(REAL(ONE_HYPOTHESIS, COUNT, REAL, COUNT, SCENE))
 def _variance(h: Record, axis: int, sigma: float, component: int, scene: Record) -> float:
-    """m^2, of the innovation of one coordinate, if the sample is of a component."""
+    """m^2, of the innovation of one coordinate, for a sample of a component."""
     if component == AS_OUTLIER:
         return h.cov[axis, 0, 0] + scene.outlier_spread**2
     noise = (scene.stamp_jitter * h.mean[axis, 1]) ** 2 + sigma**2
@@ -79,11 +79,11 @@ def _variance(h: Record, axis: int, sigma: float, component: int, scene: Record)
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, ONE, ONE, SCENE, ONE))
 def weigh(h: Record, position: Array, sigma: Array, scene: Record, said: Array) -> None:
-    """What a sample says about a hypothesis; constants that all share (3/2 log 2 pi) are left out.
+    """Evidence of a sample for a hypothesis, without the common constant (3/2 log 2 pi).
 
     Args:
         h: predicted.  position: (3,) m.  sigma: (3,) m.  scene: of a `Scene`.
-        said: (4,) written: nats, of a good sample, a wide one and an outlier; and the surprise.
+        said: (4,) written: nats, of a good sample, a wide one and an outlier; and the squared innovation.
     """
     said[SURPRISE] = 0.0
     for component in range(3):
@@ -98,7 +98,7 @@ def weigh(h: Record, position: Array, sigma: Array, scene: Record, said: Array) 
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, ONE, ONE, COUNT, SCENE))
 def _take_in(h: Record, position: Array, sigma: Array, component: int, scene: Record) -> None:
-    """The Kalman update with a sample of a component; an outlier says nothing."""
+    """The Kalman update with a sample of a component; an outlier changes nothing."""
     if component == AS_OUTLIER:
         return
     h.age += 1
@@ -116,7 +116,7 @@ def _take_in(h: Record, position: Array, sigma: Array, component: int, scene: Re
 
 @machine_code(NOTHING(BANK, COUNT, COUNT, COUNTS))
 def rank(bank: Records, first: int, stop: int, rows: Index) -> None:
-    """Writes the rows first..stop - 1 of a bank, best first; of equals the earlier first."""
+    """Writes the rows first..stop - 1 of a bank, best first; equal ones in their order."""
     for row in range(first, stop):  # sorted as they come: few hypotheses, most of them in order
         place = row - first
         while place > 0 and bank[rows[place - 1]].score < bank[row].score:
@@ -127,10 +127,10 @@ def rank(bank: Records, first: int, stop: int, rows: Index) -> None:
 
 @machine_code(BANK(BANK, COUNT, SCENE))
 def prune(bank: Records, n: int, scene: Record) -> Any:
-    """The hypotheses worth keeping of the first n, best first. A tracker that has been shifted for long is believed.
+    """Selects the likely ones of the first n hypotheses, best first, and accepts a tracker shift that has lasted long.
 
-    Hypotheses whose last event is old predict the same from now on if they are in the same mode, so the best of them
-    stands for all (the Viterbi step).
+    Hypotheses in the same mode whose last event is old have the same predictions, so the best of them represents all
+    (the Viterbi step).
     """
     rows = np.empty(n, np.int64)
     rank(bank, 0, n, rows)

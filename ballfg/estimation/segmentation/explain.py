@@ -1,4 +1,4 @@
-"""One sample explained: every hypothesis branches, is weighed, and the unlikely are dropped; in machine code."""
+"""Explains one sample in machine code: every hypothesis branches, is weighed, and the unlikely are dropped."""
 
 import math
 from typing import Any, Final
@@ -35,7 +35,7 @@ from ballfg.estimation.segmentation.scene import SCENE
 from ballfg.estimation.segmentation.surface_contact import Step, advance
 
 EXPLAINED: Final[Any] = types.Tuple((BANK, LOG))
-"""Hypotheses, best first, and the events that they and others pass through during a sample."""
+"""Hypotheses, best first, and the events of all hypotheses during a sample."""
 
 
 @machine_code(EXPLAINED(BANK, REAL, REAL, ONE, ONE, COUNT, SCENE, SURFACES))
@@ -56,7 +56,7 @@ def explain(
         before: s, stamp of the last sample.
         time, position, sigma, index: of this one, as in `Sample`, with its number.
         scene, surfaces: of a `Scene`.
-    Returns: the hypotheses worth keeping, best first, and the log that their `tip` points into.
+    Returns: the likely hypotheses, best first, and the log for their `tip`.
     """
     h, dt, now = len(bank), time - before, bank.copy()
     for row in range(h):

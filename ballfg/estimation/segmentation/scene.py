@@ -1,4 +1,4 @@
-"""What stays the same during a segmentation, as machine code takes it: the ball, the surfaces, the settings."""
+"""Holds the constants of a segmentation for machine code: the ball, the surfaces, the settings."""
 
 from dataclasses import dataclass, field, fields
 from typing import Any, Final
@@ -20,7 +20,7 @@ NUMBERS: Final = np.dtype(
         ("extent", np.float64, (4,)),
     ]
 )
-"""The fields of `SegmentationPhysics` and of `SegmentationSettings` in their units, and what follows from them.
+"""The fields of `SegmentationPhysics` and of `SegmentationSettings` in their units, and derived numbers.
 
 - log_shares: log prior of good, wide and outlying samples.  drift: process noise of (p, v, b) per dt, dt^2, dt^3.
 - extent: m, (x low, x high, y low, y high) within which a contact with the table is tried.

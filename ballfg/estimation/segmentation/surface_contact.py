@@ -1,4 +1,4 @@
-"""Contacts: a hypothesis that may meet a surface branches: it did not, it bounced, it stayed down."""
+"""Branches hypotheses at a possible contact with a surface: no contact, a bounce, or rest."""
 
 import math
 from typing import Any, Final, NamedTuple
@@ -30,17 +30,17 @@ from ballfg.estimation.segmentation.scene import SCENE
 SLOWEST_CLOSING: Final = 0.2
 """m/s. Bounds the time margin of a slow contact."""
 LEAST_FALL: Final = 0.05
-"""m/s. A path that meets a surface more slowly grazes it: no contact."""
+"""m/s. A path that meets a surface more slowly grazes it without a contact."""
 POSITION_JITTER: Final = 1e-3
-"""m, by which the horizontal position is less certain after a contact."""
+"""m, additional uncertainty of the horizontal position after a contact."""
 KNOWN_SPEED: Final = 1.0
-"""m/s. A path whose vertical speed is less certain, as after a single sample, is not said to land slowly."""
+"""m/s. A path with a less certain vertical speed, as after a single sample, is not taken to land slowly."""
 BOUNCE_JITTER: Final = 0.03
 """m/s, of the normal velocity after a bounce, whatever its speed."""
 SLIDE_JITTER: Final = 0.05
 """m/s, of the tangential velocity, likewise."""
 WEAKEST_FALL: Final = 0.2
-"""Share of gravity below which the slack is not believed to hold the ball up."""
+"""Share of gravity below which the slack cannot hold the ball up."""
 
 
 class Step(NamedTuple):
@@ -108,7 +108,7 @@ def _meeting(h: Record, centre: float, scene: Record) -> Any:
     height, rise = h.mean[2, 0] - h.shift[2] - centre, h.mean[2, 1]
     drag = scene.drag * math.sqrt(h.mean[0, 1] ** 2 + h.mean[1, 1] ** 2 + rise**2)
     pull = max(scene.gravity - h.mean[2, 2] + drag * rise, WEAKEST_FALL * scene.gravity)
-    speed = math.sqrt(max(rise * rise + 2.0 * pull * height, 0.0))  # zero where the path stays below
+    speed = math.sqrt(max(rise * rise + 2.0 * pull * height, 0.0))  # zero if the path stays below
     return (rise + speed) / pull, speed
 
 
@@ -134,8 +134,8 @@ def _is_tried(h: Record, time: float, speed: float, surface: int, step: Step, sc
 def _bounce(h: Record, surface: Record, scene: Record) -> None:
     """A hypothesis at a contact, bounced: mirrored in z, slowed by the friction of an unknown spin.
 
-    Friction changes the tangential velocity by mu (1 + e) v_n at most, either way: half of that is expected, but no
-    more than a ball without spin would lose, and half is the spread.
+    Friction changes the tangential velocity by mu (1 + e) v_n at most, either way: half of that is expected, up to the
+    loss of a ball without spin, and half is the spread.
     """
     e, speed = scene.restitution, abs(h.mean[2, 1])
     friction = 0.5 * scene.friction * (1.0 + e) * speed

@@ -1,4 +1,4 @@
-"""What torch's operations do to arrays of a program."""
+"""Translates torch's operations on arrays of a program."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What torch's operations do to small tensors that were taken apart into numbers of a program."""
+"""Translates torch's operations on small tensors to operations on numbers of a program."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ aten: Any = torch.ops.aten
 
 
 class UnknownOperationError(Exception):
-    """An operation that no rule takes apart."""
+    """No rule covers an operation."""
 
 
 class Rules:
-    """What torch's operations do to tensors of numbers."""
+    """Rules for torch's operations on tensors of numbers."""
 
     def __init__(self, program: Program) -> None:
         self.program = program
@@ -38,7 +38,7 @@ class Rules:
         return value if isinstance(value, np.ndarray) else np.array(self.program.constant(float(value)), dtype=object)
 
     def each(self, name: str, *operands: Any, constant: float | None = None) -> Numbers:
-        """An operation number by number."""
+        """An elementwise operation."""
         arrays = np.broadcast_arrays(*map(self.numbers, operands))
         made = [
             self.program.apply(name, *(int(a) for a in one), constant=constant)
