@@ -17,7 +17,7 @@ from ballfg.live.clock import Clock, Stamp
 from ballfg.live.gate import FAR, GATE, HIT_GATE, Gate, assign
 from ballfg.live.newcomer import Newcomer
 from ballfg.tracks import Ball as BallKind
-from ballfg.tracks.stamps import elapsed, written
+from ballfg.tracks.stamps import StreamOrigin
 
 GAP = 0.5
 """s. A ball that was not seen for longer is lost; the estimator links nothing over longer gaps either."""
@@ -137,9 +137,9 @@ class Tracker:
         self.gap = check_range("gap", gap, 1e-3, 60.0)
         self.confirm = check_count("confirm", confirm, 1, 20)
         self.most = check_count("most", most, 1, 1000)
-        self.estimator = Online(model, surfaces, settings)
-        own = self.estimator.settings
-        self.estimator.solver = own.solver or "ballfg"  # in the time that several balls leave
+        usual = Online(model, surfaces, settings)
+        own = replace(usual.settings, solver=usual.settings.solver or "ballfg")  # in the time that several balls leave
+        self.estimator = Online(usual.model, usual.surfaces, own)
         noise = own.position_scale * np.hypot(own.position_noise, own.memory)
         self.gate = Gate(self.estimator.physics, self.estimator.surfaces.heights(), noise, own.stamp_jitter)
         self.counts = Counts()
@@ -149,7 +149,7 @@ class Tracker:
         self._clock = Clock(self.lag, self.gap)
         self._balls: list[Ball] = []
         self._newcomers: list[Newcomer] = []
-        self._origin: float | None = None  # s, the stream's first stamp: all others are counted from it
+        self._origin = StreamOrigin()
 
     @property
     def balls(self) -> dict[int, OnlineState]:
@@ -178,10 +178,7 @@ class Tracker:
             if given.shape not in ((3,), points.shape):
                 raise ValueError(f"sigmas must be (3,) or as positions, {points.shape}; got {given.shape}.")
             spreads = list(np.broadcast_to(given, points.shape))
-        stamp = as_float("time", time, "s")
-        if self._origin is None and np.isfinite(stamp):
-            self._origin = stamp
-        since = stamp if self._origin is None else float(elapsed(stamp, self._origin))
+        since = self._origin.elapsed(as_float("time", time, "s"))
         frame = _Frame(since, False, points, spreads, [None] * len(points))
         self.counts.positions += len(points)
         self._refuse_unusable(frame)
@@ -195,7 +192,7 @@ class Tracker:
 
     def _stamp(self, seconds: float) -> float:
         """A stamp on the sender's clock, s, of a moment that is counted from the stream's first stamp."""
-        return float(written(seconds, self._origin or 0.0))
+        return self._origin.written(seconds)
 
     def _dated_state(self, state: OnlineState) -> OnlineState:
         return replace(state, time=self._stamp(state.time))

@@ -1,5 +1,7 @@
 """Stamps as time since a first one, so that nothing depends on where a clock began to count."""
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -43,3 +45,20 @@ def written(seconds: ArrayLike, origin: float) -> Array:
     if whole:
         return np.asarray((first + ticks) / TICKS)
     return np.asarray(origin + since)
+
+
+class StreamOrigin:
+    """The first finite stamp of a stream, from which the time of all others is counted."""
+
+    def __init__(self) -> None:
+        self._first: float | None = None
+
+    def elapsed(self, stamp: float) -> float:
+        """S since the stream's first stamp, which this one is if none came before it."""
+        if self._first is None and math.isfinite(stamp):
+            self._first = stamp
+        return stamp if self._first is None else float(elapsed(stamp, self._first))
+
+    def written(self, seconds: float) -> float:
+        """The stamp, s on the stream's clock, of a moment that is counted from its first stamp."""
+        return float(written(seconds, self._first or 0.0))

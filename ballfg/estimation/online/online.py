@@ -2,7 +2,6 @@
 
 import copy
 import gc
-import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -51,7 +50,7 @@ from ballfg.factors.batch import FactorBatch
 from ballfg.factors.linear.definite import definite, variances_positive
 from ballfg.state import STATE_DIM
 from ballfg.tracks import Ball, Track
-from ballfg.tracks.stamps import elapsed, written
+from ballfg.tracks.stamps import StreamOrigin
 from ballfg.vision.camera import Camera
 
 LAG = 128
@@ -78,7 +77,6 @@ class Online(Estimator):
         solver: earlier name of the settings' solver, "isam2" or "chain"; deprecated.
 
     Attributes:
-        solver: "ballfg" or "gtsam"; read when a window begins.
         window: the samples, states and factors that are held; None before the first observation.
 
     Raises: ValueError: a lag below 2, time offsets in the settings, or as `Estimator`.
@@ -97,15 +95,12 @@ class Online(Estimator):
         solver: str | None = None,
     ) -> None:
         super().__init__(model, surfaces, settings)
-        self.solver: Solver = self.settings.solver or "gtsam"
         if solver is not None:
             check_choice("solver", solver, EARLIER)
-            self.solver = EARLIER[solver]
-            warnings.warn(
-                f"Online(solver='{solver}') ends with version 0.2; write Settings(solver='{self.solver}').",
-                DeprecationWarning,
-                stacklevel=2,
-            )
+            known = EARLIER[solver]
+            self.settings = replace(self.settings, solver=known)
+            note = f"Online(solver='{solver}') ends with version 0.2; write Settings(solver='{known}')."
+            warnings.warn(note, DeprecationWarning, stacklevel=2)
         check_count("lag", lag, 2)
         if self.settings.time_offsets:
             raise ValueError(
@@ -127,7 +122,7 @@ class Online(Estimator):
         self._stream = SightingStream(self.cameras, self.settings.sighting_loss) if self.cameras else None
         self._frozen: list[Frozen] | None = None  # states that left the window, where someone asks for them
         self._counts = np.zeros(2, dtype=np.int64)
-        self._origin: float | None = None  # s, the stream's first stamp: all others are counted from it
+        self._origin = StreamOrigin()
 
     def copy(self) -> "Online":
         """An estimator that has taken in the same observations; what either takes in from now on is its own.
@@ -146,6 +141,7 @@ class Online(Estimator):
         other._stream = copy.deepcopy(self._stream)
         other._frozen = None if self._frozen is None else list(self._frozen)
         other._counts = self._counts.copy()
+        other._origin = copy.copy(self._origin)
         return other
 
     def warm_up(self) -> None:
@@ -186,7 +182,7 @@ class Online(Estimator):
         stamp = as_float("time", time) if is_number(time) else float(check_array("time", time, (), "Give it in s."))
         if self._samples and not self._samples[-1].measured:
             raise ValueError("push must not follow push_sighting in one stream; call reset in between.")
-        since = self._since_first(stamp)
+        since = self._origin.elapsed(stamp)
         if self._samples and not since > self._samples[-1].time:
             last = self.stamp_of(self._samples[-1].time)
             raise ValueError(f"time must be finite and increase; got {stamp} s after {last} s. Sort the samples.")
@@ -199,15 +195,9 @@ class Online(Estimator):
             sample.measurements += [measurement for found in beside.values() for _, measurement in found]
         return replace(self._observe(sample), time=stamp)
 
-    def _since_first(self, stamp: float) -> float:
-        """S since the stream's first stamp."""
-        if self._origin is None and math.isfinite(stamp):
-            self._origin = stamp
-        return stamp if self._origin is None else float(elapsed(stamp, self._origin))
-
     def stamp_of(self, seconds: float) -> float:
         """The stamp on the clock of the stream, s, of a moment that the window counts from its first sample."""
-        return float(written(seconds, self._origin or 0.0))
+        return self._origin.written(seconds)
 
     def push_sighting(self, time: float, camera: str, pixel: ArrayLike, covariance: ArrayLike) -> OnlineState | None:
         """Take in what one camera saw, at its own stamp.
@@ -225,7 +215,7 @@ class Online(Estimator):
             raise ValueError("cameras must be given to use push_sighting; got none. Pass them to Online.")
         if self._samples and self._samples[-1].measured:
             raise ValueError("push_sighting must not follow push in one stream; call reset in between.")
-        since = self._since_first(as_float("time", time, "s"))
+        since = self._origin.elapsed(as_float("time", time, "s"))
         samples, joined = self._stream.take(since, camera, pixel, covariance)
         if joined is not None:
             state: OnlineState | None = self._join(joined)
@@ -260,7 +250,7 @@ class Online(Estimator):
     def _new_window(self, sample: Sample) -> StreamWindow:
         """A window that begins with a sample; only measured positions have a tracker's bias."""
         biased = self.settings.has_memory and sample.measured
-        window = WINDOWS[self.solver](self.ball, self.settings, float(sample.stated.min()), biased)
+        window = WINDOWS[self.settings.solver or "gtsam"](self.ball, self.settings, float(sample.stated.min()), biased)
         self._monitor = ContactMonitor(
             HypothesisModel(self.ball, self.surfaces, self.settings, window.width - STATE_DIM)
         )
