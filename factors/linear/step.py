@@ -12,31 +12,15 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array, Index
 from ballfg.factors.batch import Rows, Values
 from ballfg.factors.linear import elimination
-from ballfg.factors.linear.substitution import substitute_back
+from ballfg.factors.linear.elimination import Root
+from ballfg.factors.linear.substitution import solution_of
 
 N = TypeVar("N", bound=np.generic)
 
 Piece = tuple[Index, Array, tuple[Array, ...]]
 """Variables (m, a), weighted residuals (m, r) and weighted Jacobians of some factors."""
-
-
-@dataclass(frozen=True)
-class Root:
-    """The triangle R of one track, R^T R = J^T J, and the right side y of R d = y.
-
-    Attributes:
-        states: (n, w, 2 w + p + 1), of each state: its own triangle, its coupling to the next state and to the
-            coefficients, y. Each per unit of its variable.
-        coefficients: (p, 2 w + p + 1), the same for the coefficients; the first 2 w columns are empty.
-    """
-
-    states: Array
-    coefficients: Array
-
-    @property
-    def width(self) -> int:
-        """Numbers w of a state, biases among them."""
-        return self.states.shape[1]
+WAITING = -2
+"""The variable number of a state that waits behind the coefficients until all others are eliminated."""
 
 
 @dataclass(frozen=True)
@@ -103,36 +87,39 @@ def solve(linearized: Sequence[Rows], values: Values, damping: float = 0.0) -> S
     Returns: None if the system is singular or its solution is not finite.
     Raises: ValueError: if a factor links states that are not neighbours.
     """
-    p, w = len(values.coefficients), values.width
     system, start, diagonal = damped_rows(linearized, values, damping)
-    root = Root(np.empty((len(values.states), w, 2 * w + p + 1)), np.empty((p, 2 * w + p + 1)))
-    elimination.eliminate(system, start, w, root.states, root.coefficients)
-    states, coefficients = root.states[..., -1].copy(), root.coefficients[:, -1].copy()
-    substitute_back(root.states, root.coefficients, states, coefficients)
-    return Step.of(root, states, coefficients, damping, diagonal)
+    root = Root.empty(len(values.states), values.width, len(values.coefficients))
+    elimination.eliminate(system, start, values.width, 0, root)
+    return Step.of(root, *solution_of(root), damping, diagonal)
 
 
-def damped_rows(linearized: Sequence[Rows], values: Values, damping: float) -> tuple[Array, Index, Array]:
+def damped_rows(
+    linearized: Sequence[Rows], values: Values, damping: float, held: int = 0
+) -> tuple[Array, Index, Array]:
     """All rows of the linear problem, ordered by their first states, with those of the damping.
 
-    Args: linearized, values, damping: as for `solve`.
-    Returns: rows (r, c) for `elimination`; first row of each state (n + 2,), that of the coefficients last; diagonal (n
-        + 1, w + p) of J^T J, zeros without damping.
+    Args:
+        linearized, values, damping: as for `solve`.
+        held: number of the last coefficients, which are not `COEFFICIENTS` but the variable `WAITING`.
+    Returns: rows (r, c) as `elimination` takes them; where the rows of each state begin (n + 2,), those of the
+        coefficients last; diagonal (n + 1, w + p) of J^T J, zeros without damping.
     Raises: ValueError: if a factor links states that are not neighbours.
     """
     n, p, w = len(values.states), len(values.coefficients), values.width
     pieces = [(rows.variables, *weighted(rows)) for rows in linearized]
-    system, start, free = _system(pieces, n, p, w, further=damping > 0.0)
+    system, start, free = _system(pieces, n, p - held, p, w, further=damping > 0.0)
     diagonal = np.zeros((n + 1, w + p))
     if damping:
         elimination.damp(system, start, free, w, damping, diagonal)
     return system, start, diagonal
 
 
-def _system(pieces: Sequence[Piece], n: int, p: int, width: int, *, further: bool) -> tuple[Array, Index, Index]:
-    """All rows, ordered by their first states; the first row and the first free row of each state.
+def _system(
+    pieces: Sequence[Piece], n: int, own: int, p: int, width: int, *, further: bool
+) -> tuple[Array, Index, Index]:
+    """All rows, ordered by their first states; where each state's rows begin, and where free ones do.
 
-    Args: further: leave room for a row for each unknown.
+    Args: own: coefficients before those that wait.  further: leave room for a row for each unknown.
     """
     counts = np.zeros(n + 1, dtype=np.int64)
     for variables, residual, _ in pieces:
@@ -151,7 +138,7 @@ def _system(pieces: Sequence[Piece], n: int, p: int, width: int, *, further: boo
         rows, firsts = np.empty(len(variables), dtype=np.int64), np.empty(len(variables), dtype=np.int64)
         elimination.place_residuals(system, free, _plain(variables), _plain(residual), rows, firsts)
         for which, block in enumerate(jacobians):
-            elimination.place_block(system, width, rows, firsts, _plain(variables), which, _plain(block))
+            elimination.place_block(system, width, own, rows, firsts, _plain(variables), which, _plain(block))
     return system, start, free
 
 

@@ -41,8 +41,8 @@ class GaussNewtonFactors(SquareRootInformation):
         shared = solution[split:].reshape(self.tracks, self.coefficients)
         for k, (root, end) in enumerate(zip(self.roots, ends, strict=True)):
             states = solution[end - self.lengths[k] * self.width : end].reshape(-1, self.width)
-            substitute_forward(root.states, root.coefficients, states, shared[k])
-            substitute_back(root.states, root.coefficients, states, shared[k])
+            substitute_forward(root, states, shared[k])
+            substitute_back(root, states, shared[k])
         return torch.from_numpy(solution)
 
 

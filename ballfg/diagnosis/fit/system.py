@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ballfg.arrays import Array, Index
+from ballfg.factors.linear.elimination import eliminate_each, padded
 from ballfg.state import STATE_DIM
 
 
@@ -83,23 +84,25 @@ class System:
         return np.asarray(found)
 
     def eliminated(self, damping: float = 0.0) -> Eliminated:
-        """The first states solved for in terms of all other unknowns; `damping` as in Levenberg-Marquardt."""
-        hessian, columns, diagonal = self.start_information, self.columns, np.arange(STATE_DIM)
-        hessian[:, diagonal, diagonal] *= 1.0 + damping
-        pulled = self.by_start.swapaxes(-1, -2) @ columns
-        solved = np.linalg.solve(hessian, pulled)
-        gram = columns.swapaxes(-1, -2) @ columns - pulled.swapaxes(-1, -2) @ solved
-        return Eliminated(np.asarray(solved), np.asarray(gram))
+        """The first states solved for in terms of everything else; `damping` as in Levenberg-Marquardt."""
+        columns, diagonal = self.columns, np.arange(STATE_DIM)
+        n, m, end = *columns.shape[:2], STATE_DIM + columns.shape[-1]
+        rows, upper = np.zeros((n, m, padded(end))), np.zeros((n, STATE_DIM, padded(end)))
+        rows[..., :STATE_DIM], rows[..., STATE_DIM:end] = self.by_start, columns
+        squares = (self.by_start**2).sum(axis=1)
+        upper[:, diagonal, diagonal] = np.sqrt((squares == 0.0) + damping * np.where(squares == 0.0, 1.0, squares))
+        eliminate_each(rows, upper)
+        left = rows[..., STATE_DIM:end]
+        solved = np.linalg.solve(upper[..., :STATE_DIM], upper[..., STATE_DIM:end])
+        return Eliminated(np.asarray(solved), np.asarray(left.swapaxes(-1, -2) @ left))
 
     def start_correction(self, residual: Array) -> Array:
-        """(n, 9) step of the first states alone for another residual (n, m), with the same derivatives."""
-        pulled = self.by_start.swapaxes(-1, -2) @ residual[..., None]
-        return np.asarray(np.linalg.solve(self.start_information, pulled)[..., 0])
+        """(n, 9) step of the first states alone against another residual (n, m), with the same derivatives."""
+        return System(residual, self.by_start, self.by_common[..., :0]).eliminated().solved[..., 0]
 
     def projected(self) -> Array:
-        """(n, m, q + 1) columns and residual without the part that first states absorb."""
-        pulled = self.by_start.swapaxes(-1, -2) @ self.columns
-        return np.asarray(self.columns - self.by_start @ np.linalg.solve(self.start_information, pulled))
+        """(n, m, q + 1) columns and residual with the part that first states absorb taken away."""
+        return np.asarray(self.columns - self.by_start @ self.eliminated().solved)
 
 
 def by_track(gram: Array, track: Index) -> Array:

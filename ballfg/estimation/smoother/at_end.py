@@ -74,13 +74,8 @@ def _filtered(smoother: Smoother, track: Track) -> tuple[Array, Array] | None:
     biases = np.zeros(0) if values.biases is None else values.biases[-1]
     mean = np.concatenate((values.states[-1], values.coefficients[:p], biases))
     width = STATE_DIM + len(biases)
-    covariance = np.zeros((width + p,) * 2)
-    own = np.append(np.arange(STATE_DIM), np.arange(STATE_DIM + p, width + p))
-    shared = np.arange(STATE_DIM, STATE_DIM + p)
-    covariance[np.ix_(own, own)] = known.states[-1]
-    covariance[np.ix_(own, shared)], covariance[np.ix_(shared, own)] = known.cross[-1][:, :p], known.cross[-1][:, :p].T
-    covariance[np.ix_(shared, shared)] = known.coefficients[:p, :p]
-    return mean, definite(covariance)
+    order = np.r_[:STATE_DIM, width : width + p, STATE_DIM:width]
+    return mean, definite(known.joint(-1)[np.ix_(order, order)])
 
 
 def _measured(problem: TrackProblem, sample: int) -> SampleMeasurement:

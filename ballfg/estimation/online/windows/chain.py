@@ -23,8 +23,9 @@ from ballfg.estimation.online.windows.linear import LinearFactors
 from ballfg.estimation.online.windows.stream_window import Arrival, StreamWindow
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch
 from ballfg.factors.dynamics import DynamicsFactors
-from ballfg.factors.linear.elimination import eliminate_on, padded
-from ballfg.factors.linear.substitution import covariances_of, substitute_back
+from ballfg.factors.linear.covariance import marginal_covariances
+from ballfg.factors.linear.elimination import Root, eliminate_on, padded
+from ballfg.factors.linear.substitution import solution_of
 from ballfg.factors.prior import coefficient_prior
 from ballfg.factors.tracker import BiasFactors, BiasStartFactors
 from ballfg.state import STATE_DIM
@@ -141,10 +142,8 @@ class ChainWindow(StreamWindow):
 
     def joint_covariances(self, count: int) -> list[Array]:
         """(w + p, w + p) of each of the oldest states, with its bias and the coefficients."""
-        n, w, p = len(self.samples), self.width, self.p
-        states, cross, shared = np.empty((n, w, w)), np.empty((n, w, w + p)), np.empty((p, p))
-        covariances_of(self._chain[2][:n], self._last(), states, cross, shared)
-        return [_joint(states[k], cross[k, :, w:], shared) for k in range(count)]
+        found = marginal_covariances(self._root(0))
+        return [found.joint(k) for k in range(count)]
 
     def summaries(self) -> list[FactorBatch]:
         """The information of removed states, as one linear factor."""
@@ -235,7 +234,7 @@ class ChainWindow(StreamWindow):
         Returns: number of eliminated states.
         Raises: RuntimeError: if the system is singular.
         """
-        n, w, p = len(self.samples), self.width, self.p
+        n = len(self.samples)
         begin = min(self._stale, default=n - 1)
         if n > len(self._chain[2]):
             self._room(n)
@@ -247,22 +246,19 @@ class ChainWindow(StreamWindow):
         np.cumsum([len(part) for part in rows], out=start[1:])
         carries, shared, root = self._chain
         part = (carries[begin : n + 1], shared[begin : n + 1], root[begin:n])
-        eliminate_on(np.concatenate(rows), start, w, *part)
-        last = self._last()
-        delta, coefficients = root[:n, :, -1].copy(), last[:, -1].copy()
-        substitute_back(root[:n], last, delta, coefficients)
+        eliminate_on(np.concatenate(rows), start, self.width, *part)
+        delta, coefficients = solution_of(self._root(0))
         if not (np.isfinite(delta).all() and np.isfinite(coefficients).all()):
             raise RuntimeError("the linear system of the window is singular")
         self.delta, self.coefficient_delta = delta, coefficients
-        states, cross, own = np.empty((1, w, w)), np.empty((1, w, w + p)), np.empty((p, p))
-        covariances_of(root[n - 1 : n], last, states, cross, own)
-        self.newest_covariance = _joint(states[0], cross[0, :, w:], own)
+        self.newest_covariance = marginal_covariances(self._root(n - 1)).joint(0)
         return n - begin
 
-    def _last(self) -> Array:
-        """(p, 2 w + p + 1) the triangle of the coefficients after all states."""
-        shared, end = self._chain[1][len(self.samples)], 2 * self.width + self.p
-        return np.concatenate((shared[:, :end], shared[:, -1:]), axis=1)
+    def _root(self, first: int) -> Root:
+        """The triangle of the states from one on, with the coefficients."""
+        _, shared, root = self._chain
+        n, end = len(self.samples), 2 * self.width + self.p
+        return Root(root[first:n], np.concatenate((shared[n, :, :end], shared[n, :, -1:]), axis=1))
 
 
 def _batched(answer: Answer) -> Answer:
@@ -276,13 +272,3 @@ def _weight(batch: FactorBatch, residual: Array) -> float:
     if batch.loss.name == "squared":
         return 1.0
     return math.sqrt(float(batch.loss.weight(np.sqrt(residual @ residual))))
-
-
-def _joint(state: Array, cross: Array, coefficients: Array) -> Array:
-    """(w + p, w + p) from (w, w), (w, p) and (p, p)."""
-    if not len(coefficients):
-        return state
-    w = len(state)
-    joint = np.empty((w + len(coefficients),) * 2)
-    joint[:w, :w], joint[:w, w:], joint[w:, :w], joint[w:, w:] = state, cross, cross.T, coefficients
-    return joint

@@ -12,7 +12,8 @@ from ballfg.arrays import Array
 from ballfg.estimation.smoother.pieces.reduction import Ends, Point
 from ballfg.factors.batch import COEFFICIENTS, Rows, Values
 from ballfg.factors.linear.covariance import NeighbourCovariances, SquareRootInformation
-from ballfg.factors.linear.step import Root, solve
+from ballfg.factors.linear.elimination import Root
+from ballfg.factors.linear.step import solve
 from ballfg.factors.loss import Loss
 from ballfg.state import STATE_DIM
 
@@ -81,16 +82,11 @@ def _moved(ends: Ends, point: Point, last: Array, coefficients: Array) -> tuple[
 
 
 def _joint(found: NeighbourCovariances, section: int) -> Array:
-    w, p = found.states.shape[-1], found.coefficients.shape[-1]
-    own, shared, behind = slice(0, w), slice(w, w + p), slice(w + p, 2 * w + p)
-    joint = np.empty((2 * w + p, 2 * w + p))
-    joint[own, own], joint[behind, behind] = found.states[0, section + 1], found.states[0, section]
-    joint[shared, shared] = found.coefficients[0]
-    first, last = found.cross[0, section], found.cross[0, section + 1]
-    joint[behind, own], joint[behind, shared], joint[own, shared] = first[:, :w], first[:, w:], last[:, w:]
-    joint[own, behind], joint[shared, behind] = joint[behind, own].T, joint[behind, shared].T
-    joint[shared, own] = joint[own, shared].T
-    return joint
+    """(2 w + p, 2 w + p) of a section's last end, the coefficients, its first end."""
+    (first, last), w = found.states[0, section : section + 2], found.states.shape[-1]
+    across, behind = np.split(found.cross[0, section], [w], axis=1)
+    shared = found.cross[0, section + 1][:, w:]
+    return np.block([[last, shared, across.T], [shared.T, found.coefficients[0], behind.T], [across, behind, first]])
 
 
 def moved_rows(rows: Rows, step: Array) -> Rows:

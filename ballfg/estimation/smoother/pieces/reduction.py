@@ -15,8 +15,8 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.factors.batch import COEFFICIENTS, Rows, Values
 from ballfg.factors.linear.covariance import Covariances, SquareRootInformation
-from ballfg.factors.linear.fading import eliminate_fading
-from ballfg.factors.linear.step import Root, damped_rows
+from ballfg.factors.linear.elimination import Root, eliminate
+from ballfg.factors.linear.step import WAITING, damped_rows
 from ballfg.factors.linear.substitution import substitute_back
 
 
@@ -107,10 +107,9 @@ class Reduction:
         self.width, self.coefficients = values.width, len(values.coefficients)
         w, p, m = self.width, self.coefficients + self.width, len(values.states) - 1
         point = Values(values.states[1:], np.zeros(p), None if values.biases is None else values.biases[1:])
-        moved = [part for rows in linearized for part in _first_behind(rows, self.coefficients, w)]
-        system, start, _ = damped_rows(moved, point, 0.0)
-        self.root = Root(np.empty((m, w, 2 * w + p + 1)), np.empty((p, 2 * w + p + 1)))
-        eliminate_fading(system, start, w, w, self.root.states, self.root.coefficients)
+        system, start, _ = damped_rows([_first_behind(rows) for rows in linearized], point, 0.0, held=w)
+        self.root = Root.empty(m, w, p)
+        eliminate(system, start, w, w, self.root)
         self.inner = 0.5 * float((self.root.states[:-1, :, -1] ** 2).sum())
 
     @property
@@ -170,10 +169,10 @@ def _solved(rows: Array, right: Array) -> Array:
 
     Args: right: (m, w) or (m, w, k), the right side or k of them.
     """
-    none, found = np.empty((0, rows.shape[2])), np.empty_like(right)
+    root, found = Root(rows, np.empty((0, rows.shape[2]))), np.empty_like(right)
     for k in np.ndindex(right.shape[2:]):
         states = right[..., *k].copy()
-        substitute_back(rows, none, states, np.empty(0))
+        substitute_back(root, states, np.empty(0))
         found[..., *k] = states
     return found
 
@@ -187,35 +186,8 @@ def _triangle(covariance: Array) -> Array:
     return np.asarray(np.linalg.inv(lower[::-1, ::-1]) / scale)
 
 
-def _first_behind(rows: Rows, coefficients: int, width: int) -> list[Rows]:
-    """The same factors with state 0 after the coefficients, and the others counted from state 1."""
-    at_first = (rows.variables == 0).any(axis=1)
-    found = []
-    for which in (~at_first, at_first):
-        if which.any():
-            part = replace(
-                rows,
-                variables=rows.variables[which],
-                residual=rows.residual[which],
-                jacobians=tuple(block[which] for block in rows.jacobians),
-            )
-            found.append(_widened(part, coefficients, width))
-    return found
-
-
-def _widened(rows: Rows, coefficients: int, width: int) -> Rows:
-    m, dim = rows.residual.shape
-    shared = np.zeros((m, dim, coefficients + width))
-    variables, blocks, sees_shared = [], [], False
-    for column, block in zip(rows.variables.T, rows.jacobians, strict=True):
-        if column[0] == COEFFICIENTS or column[0] == 0:
-            begin = 0 if column[0] == COEFFICIENTS else coefficients
-            shared[:, :, begin : begin + block.shape[2]] += block
-            sees_shared = True
-        else:
-            variables.append(column - 1)
-            blocks.append(block)
-    if sees_shared:
-        variables.append(np.full(m, COEFFICIENTS))
-        blocks.append(shared)
-    return Rows(np.stack(variables, axis=1), rows.residual, tuple(blocks), rows.loss)
+def _first_behind(rows: Rows) -> Rows:
+    """The same factors with state 0 behind the coefficients, and the others counted from state 1."""
+    states = rows.variables
+    later = np.where(states > 0, states - 1, np.where(states == COEFFICIENTS, COEFFICIENTS, WAITING))
+    return replace(rows, variables=later)
