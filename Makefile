@@ -9,7 +9,7 @@ TOOLS  := build/tools/bin/pip-audit
 OLDEST := tests/factors tests/files tests/importing/test_forms.py tests/live/test_bag.py tests/dynamics/test_model_file.py \
 	tests/dynamics/compiled/test_kept.py \
 	tests/dynamics/networks/test_learned_file.py tests/estimation/smoother tests/prediction tests/pages tests/tracks \
-	tests/vision/test_camera_file.py tests/cli/test_estimate.py tests/cli/test_show.py tests/simulation tests/test_front.py
+	tests/vision/test_camera_file.py tests/cli/test_estimate.py tests/cli/test_show.py tests/simulation tests/front
 
 export OMP_NUM_THREADS ?= 1
 unexport PYTHONDONTWRITEBYTECODE  # interpreters that tests start compile the package once
