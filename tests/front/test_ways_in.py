@@ -72,7 +72,7 @@ def test_prediction_of_an_estimate_a_state_a_track_and_a_folder(
     assert np.abs(miss / found["000"].sigmas).max() < 5.0
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_diagnosis_finds_a_model_that_can_be_saved(tmp_path: Path) -> None:
     shots = bf.read(written(tmp_path / "shots", 6))
     found = bf.diagnose(shots)
