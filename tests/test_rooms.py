@@ -60,12 +60,6 @@ def test_front_door_is_that_of_the_rooms() -> None:
     assert "bf.estimate(" in (ballfg.__doc__ or "")
 
 
-def test_importing_the_package_is_quick() -> None:
-    code = "import time; start = time.process_time(); import ballfg; print(time.process_time() - start)"
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert float(said.stdout) < 0.3
-
-
 def test_rooms_cost_nothing_until_a_name_is_used() -> None:
     code = f"import sys, {', '.join(STUBS)}; print(*sorted({HEAVY!r} & sys.modules.keys()))"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -236,6 +236,7 @@ def numbers(path: Path, *columns: str) -> dict[str, np.ndarray]:
     return {name: np.array(rows) for name, rows in found.items()}
 
 
+@pytest.mark.thorough
 def test_videos_become_the_tracks_that_were_flown(scene: Path, tracked: Path) -> None:
     truth = numbers(scene / "truth.csv", "t", "x", "y", "z")
     visible = numbers(scene / "visible.csv", "t_true")

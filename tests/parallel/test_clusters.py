@@ -155,6 +155,7 @@ def test_versions_are_compared() -> None:
     assert "must be able to import ballfg" in (differences({}) or "")
 
 
+@pytest.mark.thorough
 @needs_ray
 def test_a_killed_ray_worker_loses_and_doubles_nothing(
     dataset: Dataset, estimator: Estimator, alone: list[bytes]

@@ -99,6 +99,7 @@ def test_truth_ends_with_the_flight(together) -> None:
     np.testing.assert_allclose(states[1], flight.knots[0])
 
 
+@pytest.mark.thorough
 def test_camera_factors_beat_what_pretends_to_be_synchronised(apart) -> None:
     found = compare(apart)
     results = Results("cameras", 0)

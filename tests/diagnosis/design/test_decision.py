@@ -47,6 +47,7 @@ def found(folder: Path, tracks: list[Track]) -> dict[str, tuple[str, ...]]:
     return {finding.name: finding.indistinguishable_from for finding in diagnosis.findings}
 
 
+@pytest.mark.thorough
 def test_ten_designed_shots_decide(campaign: Campaign, tmp_path: Path) -> None:
     plan, tracks = campaign
     assert plan.setting_names == AIMED
@@ -54,6 +55,7 @@ def test_ten_designed_shots_decide(campaign: Campaign, tmp_path: Path) -> None:
     assert found(tmp_path, tracks["designed"]) == {PAIR[1]: ()}
 
 
+@pytest.mark.thorough
 def test_thirty_random_shots_do_not(campaign: Campaign, tmp_path: Path) -> None:
     _, tracks = campaign
     assert len(tracks["random"]) == FEW + RANDOM

@@ -74,6 +74,7 @@ def test_scatter_is_not_taken_for_coefficients(scattered) -> None:
     assert settings.spin_label_noise == LABEL_NOISE
 
 
+@pytest.mark.thorough
 def test_right_labels_are_not_accused(scattered) -> None:
     labels, _ = judged(scattered.dataset, whole=False)
     assert len(labels.verdicts) == len(parts(scattered))

@@ -143,6 +143,7 @@ def test_coefficients_of_the_track_are_estimated_as_usual(plain) -> None:
     assert (np.abs(away) < 0.05).all()
 
 
+@pytest.mark.thorough
 def test_a_residual_model_measures_as_its_base(plain, reference) -> None:
     """Untrained, it is its base; one short track."""
     effects = parse_effects(["frame_tilt.x=0.02"])

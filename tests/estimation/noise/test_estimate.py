@@ -50,6 +50,7 @@ def test_error_bars_are_of_the_size_of_the_errors(found):
         assert abs(np.log(value / 0.003)) < 3.0 * found.relative_errors[f"memory.{axis}"]
 
 
+@pytest.mark.thorough
 def test_factors_hold_where_the_curvature_is_not_honest():
     """White noise of 0.5 mm beside 2 mm that last for 10 ms: upwards it is known, downwards hardly."""
     rows = []

@@ -99,7 +99,7 @@ def test_averages_over_heights_are_moments_of_the_mixture() -> None:
     assert (np.linalg.eigvalsh(spread) > 0.0).all()
 
 
-@pytest.mark.parametrize("name", SETTINGS)
+@pytest.mark.parametrize("name", ["exact model", pytest.param("coefficients estimated", marks=pytest.mark.thorough)])
 def test_no_ball_that_hops_out_is_sure_of_a_wrong_state(name) -> None:
     """Eight tracks; `python -m tests.estimation.low_bounces` is the same over hundreds."""
     smoother, fine = Smoother(MODEL, SURFACES, SETTINGS[name]), 0
