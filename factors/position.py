@@ -1,4 +1,4 @@
-"""Position factor: a measured position is the state's position plus noise."""
+"""A position factor compares a measured position with the state's."""
 
 from typing import ClassVar
 
@@ -19,7 +19,7 @@ class PositionFactors(FactorBatch):
         states: (m,) indices of the observed states.
         measured: (m, 3) m.
         sigma: (m, 3) m, standard deviation per axis.
-        loss: a robust one where tracks have outliers.
+        loss: a robust one if tracks have outliers.
 
     Raises: ValueError: a wrong shape, a position that is not finite, or a sigma that is not positive.
     """

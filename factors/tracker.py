@@ -1,8 +1,8 @@
-"""Factors of a tracker whose errors are not white: biases that last from sample to sample, and stamps that jitter.
+"""Models a tracker's lasting errors as biases with a memory, and the jitter of its stamps.
 
 A tracker's error is e_i = b_i + w_i + v_i s_i: a bias b with a memory (an Ornstein-Uhlenbeck process), a white error w,
-and the way that the ball makes at velocity v during the error s of the stamp. The biases are unknowns of the graph, one
-per state, so that the graph stays banded; b_{i+1} = a_i b_i + noise with a_i = exp(-dt_i / memory time).
+and the ball's displacement at velocity v during the stamp's error s. The biases are unknowns of the graph, one per
+state, so that the graph stays banded; b_{i+1} = a_i b_i + noise with a_i = exp(-dt_i / memory time).
 """
 
 from collections.abc import Hashable
@@ -23,7 +23,7 @@ _BIAS = slice(STATE_DIM, STATE_DIM + BIAS_DIM)
 
 
 def bias_step(dt: Array, sigma: Array, memory_time: float) -> tuple[Array, Array]:
-    """How a bias fades over dt: b' = a b + noise, with a = exp(-dt / memory time).
+    """Decay of a bias over dt: b' = a b + noise, with a = exp(-dt / memory time).
 
     Args:
         dt: (m,) s.
@@ -41,9 +41,9 @@ class BiasedPositionFactors(FactorBatch):
         states: (m,) indices of the observed states.
         measured: (m, 3) m.
         sigma: (m, 3) m, standard deviation per axis of the white error.
-        stamps: (m, 3, 3) m^2, covariance of what errors of the stamps move the ball; None where stamps are exact.
-        loss: a robust one where tracks have outliers.
-        biased: whether the graph has biases; without them b is zero.
+        stamps: (m, 3, 3) m^2, covariance of the displacement by the stamps' errors; None if stamps are exact.
+        loss: a robust one if tracks have outliers.
+        biased: True if the graph has biases; without them b is zero.
 
     Raises: ValueError: a wrong shape, or a position that is not finite.
     """
@@ -74,7 +74,7 @@ class BiasedPositionFactors(FactorBatch):
 
     @property
     def group(self) -> Hashable:
-        """Besides the usual: whether the graph has biases."""
+        """Further entry of the group: whether the graph has biases."""
         return (*super().group, self.sees_biases)  # type: ignore[misc]
 
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
@@ -110,7 +110,7 @@ class BiasedPositionFactors(FactorBatch):
 
 
 class BiasFactors(FactorBatch):
-    """r = (b_{i+1} - a_i b_i) / (s sqrt(1 - a_i^2)), a_i = exp(-dt_i / memory time): the bias fades, and is renewed.
+    """r = (b_{i+1} - a_i b_i) / (s sqrt(1 - a_i^2)), a_i = exp(-dt_i / memory time): the bias decays and is renewed.
 
     Args:
         states: (m,) index i; each factor ties the bias at state i to that at state i + 1.
@@ -153,10 +153,10 @@ class BiasFactors(FactorBatch):
 
 
 class BiasStartFactors(FactorBatch):
-    """r = b_i / s: before anything is known of it, the bias lies about zero.
+    """r = b_i / s: the prior of the first bias, about zero.
 
     Args:
-        states: (m,) indices of states that no earlier bias leads to.
+        states: (m,) indices of states without an earlier bias.
         sigma: (3,) m, standard deviation s per axis.
     """
 

@@ -1,4 +1,4 @@
-"""Shots to learn from: what of a track is observed, what is to be predicted, and the events in it."""
+"""Cuts tracks into shots for learning: an observed part, a part to predict, and the events."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -20,15 +20,15 @@ LEAST_PREDICTED = 3
 
 @dataclass(frozen=True)
 class Shot:
-    """One track, cut into what is observed and what is predicted.
+    """One track, cut into an observed part and a part to predict.
 
     Attributes:
-        track: as far as the ball flies undisturbed: up to its first hit.
+        track: the undisturbed part of the flight, up to the first hit.
         observed: number of samples that the estimate sees; they come first.
         usable: (n,) bool, samples that measure the ball.
         segmentation: events of the observed part.
         settings: of the estimator, before anything is learned.
-        surfaces: what the ball may bounce on.
+        surfaces: table and floor.
         room: name of the dataset.
     """
 

@@ -1,4 +1,4 @@
-"""From a config to the data of a training: datasets, split, shots, and the settings of the estimator."""
+"""Reads the data of a training from a config: datasets, split, shots, and the settings of the estimator."""
 
 import sys
 from collections import Counter

@@ -1,4 +1,4 @@
-"""How much of a track lies outside of what a learned model was trained on."""
+"""Measures how much of a track lies outside of the training data of a learned model."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from ballfg.dynamics.model import BallModel
 
 
 def outside_of(model: BallModel, states: Array | Tensor) -> Array | None:
-    """Where states lie with respect to the training data of a model.
+    """The distance of states from the training data of a model, as a weight.
 
     Args:
         model: the ball.
         states: (n, 9) position m, velocity m/s, spin rad/s; or with the coefficients of the model behind them.
-    Returns: (n,) from 0 among the training tracks to 1 far from them; None for a model that does not tell.
+    Returns: (n,) from 0 among the training tracks to 1 far from them; None for a model without such data.
     """
     with torch.no_grad():
         inside = model.inside(torch.as_tensor(states, dtype=torch.float64))
@@ -31,7 +31,7 @@ def outside_share(model: BallModel, tracks: Sequence[Array]) -> float | None:
     Args:
         model: the ball.
         tracks: (n, 9) states of each.
-    Returns: from 0 to 1, the mean over tracks; None for a model that does not tell, or without tracks.
+    Returns: from 0 to 1, the mean over tracks; None for a model without such data, or without tracks.
     """
     shares = [share.mean() for states in tracks if (share := outside_of(model, states)) is not None and len(share)]
     return float(np.mean(shares)) if shares else None

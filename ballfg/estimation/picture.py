@@ -1,4 +1,4 @@
-"""Pictures of an estimate and of a prediction: each component over time, with its uncertainty."""
+"""Plots the components of an estimate or a prediction over time, with their uncertainty."""
 
 from typing import Final
 

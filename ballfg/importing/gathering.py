@@ -1,4 +1,4 @@
-"""The tables of a source become its shots: which tables hold positions, and the names, ends and labels of shots."""
+"""Gathers the shots of a source's tables, with their names, ends and labels."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,15 +18,15 @@ from ballfg.importing.shots import GAP, GAP_STEPS, Counts, Shot, cut, split_at_g
 from ballfg.tracks.track import Label
 
 MOST_SHOTS: Final = 60
-"""Shots from which the units are read, evenly over the source."""
+"""Number of shots for the determination of units, evenly over the source."""
 _INTERRUPTED: Final = 0.5
-"""Share of the files or recordings with gaps, from which on a gap ends a shot and is not a ball out of sight."""
+"""Share of files or recordings with gaps, above which a gap ends a shot instead of hiding a ball."""
 
 
 def understood(tables: Sequence[RawTable], choices: Choices) -> tuple[list[RawTable], Roles, list[RawTable]]:
-    """What each table of a source is.
+    """Determines the role of each table of a source.
 
-    Returns: the tables of positions, which all have the same columns; their roles; and the tables beside them.
+    Returns: the tables of positions, with equal columns; their roles; and the other tables.
     Raises: UndecidedError: no positions, or positions in different columns.
     """
     kinds: dict[tuple[Any, ...], list[RawTable]] = {}
@@ -65,10 +65,10 @@ def understood(tables: Sequence[RawTable], choices: Choices) -> tuple[list[RawTa
 
 
 def shots_of(tables: Sequence[RawTable], roles: Roles, choices: Choices, counts: Counts) -> list[Shot]:
-    """The shots of all tables, in the source's units, with names of their own.
+    """The shots of all tables, in the source's units, with unique names.
 
     Raises:
-        UndecidedError: no times and no rate; it says which rate fits.
+        UndecidedError: no times and no rate; the message has a fitting rate.
         ValueError: no shot with two samples.
     """
     try:
@@ -119,9 +119,9 @@ def relative(shot: Shot) -> tuple[Array, Array]:
 
 
 def split(shots: list[Shot], roles: Roles, frame: Frame, choices: Choices) -> tuple[list[Shot], Guess]:
-    """The shots cut at gaps in time where a gap ends a shot, and the guess that this is.
+    """The shots, cut at gaps in time that end a shot, and the guess for that.
 
-    Args: shots: in the source's units.  roles: of their columns.  frame: its units.  choices: what is decided.
+    Args: shots: in the source's units.  roles: of their columns.  frame: its units.  choices: of the user.
     """
     unit = TIMES[frame.time]
     count = len(shots)
@@ -157,7 +157,7 @@ def split(shots: list[Shot], roles: Roles, frame: Frame, choices: Choices) -> tu
 
 
 def with_labels(shots: list[Shot], beside: Sequence[RawTable]) -> list[Shot]:
-    """The shots with the labels of tables that have one row for each of them."""
+    """The shots with the labels of tables with one row per shot."""
     names = {shot.name for shot in shots}
     for table in beside:
         for key, column in table.columns.items():

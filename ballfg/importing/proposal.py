@@ -1,4 +1,4 @@
-"""The proposal: tables to tracks in SI units with z up, and every guess on the way."""
+"""A proposal holds the tracks of a source in SI units with z up, and every guess on the way."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,20 +23,20 @@ from ballfg.tracks.grouping import RowGroup
 
 @dataclass(frozen=True)
 class Proposal:
-    """What a source was understood to be."""
+    """The interpretation of a source."""
 
     info: DatasetInfo
     tracks: list[Track]
     guesses: list[Guess]
     notes: list[str]
-    """What was left out or put in order, one sentence each."""
+    """Omitted or reordered rows, one sentence each."""
 
 
 def propose(data: Any, choices: Choices) -> Proposal:
-    """Reads a source and guesses what is not decided.
+    """Reads a source and guesses the open choices.
 
-    Args: data: as for `import_tracks`.  choices: what is decided.
-    Raises: UndecidedError: a guess that is not safe. FileNotFoundError: no such file. ValueError: unreadable input.
+    Args: data: as for `import_tracks`.  choices: of the user.
+    Raises: UndecidedError: an unsafe guess. FileNotFoundError: no such file. ValueError: unreadable input.
     """
     tables = tables_of(data, choices.topic, choices.key)
     try:
@@ -49,7 +49,7 @@ def propose(data: Any, choices: Choices) -> Proposal:
 
 
 def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
-    """What tables were understood to be."""
+    """The interpretation of tables."""
     chosen, roles, beside = understood(tables, choices)
     counts = Counts()
     shots = shots_of(chosen, roles, choices, counts)

@@ -1,4 +1,4 @@
-"""Pages and pictures to look at: one self-contained HTML file, figures for papers, recordings for a viewer."""
+"""Makes pages and pictures: self-contained HTML files, figures for papers, recordings for a viewer."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""How often predictions hold: the share of measured coordinates inside their 90 % intervals, by horizon."""
+"""Computes the coverage of predictions: the share of coordinates inside their 90 % intervals, by horizon."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -10,9 +10,9 @@ from ballfg.arrays import Array, Index
 from ballfg.pages.shot import SAME_STAMP, Shot
 
 LEVEL = 0.9
-"""What an interval should hold."""
+"""Nominal coverage of an interval."""
 HALF_WIDTH = NormalDist().inv_cdf((1.0 + LEVEL) / 2.0)
-"""Standard deviations on either side of a prediction that make such an interval."""
+"""Standard deviations on either side of a prediction for that coverage."""
 BIN = 0.05
 """s, width of the bins of the horizon."""
 

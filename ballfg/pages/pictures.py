@@ -1,4 +1,4 @@
-"""Pictures of one shot for papers: views from the side and from above, and each axis by time."""
+"""Draws pictures of one shot for papers: views from the side and from above, and each axis by time."""
 
 from typing import Final
 
@@ -14,7 +14,7 @@ from ballfg.pages.shot import Shot
 
 AXES: Final = ("x", "y", "z")
 ESTIMATE, PREDICTION, MEASURED, TABLE = "#0072b2", "#d55e00", "#555555", "#2f7d6b"
-"""Okabe and Ito's blue and vermilion: they differ for every kind of colour vision."""
+"""Okabe and Ito's blue and vermilion, distinct for every kind of colour vision."""
 MARKERS: Final = {"contact": ("D", "#117733"), "hit": ("X", "#cc3311")}
 
 
@@ -23,7 +23,7 @@ def views(shot: Shot, table: Outline | None = None) -> Figure:
 
     A shot that flies along y is drawn over y: (y, z) and (y, x).
 
-    Args: shot: what is known of it.  table: where the table is, if that is known.
+    Args: shot: with samples, states or predictions.  table: its place, if known.
     """
     figure = Figure(figsize=(7.0, 5.6), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
@@ -99,7 +99,7 @@ def _paths(panel: Axes, shot: Shot, across: int, up: int) -> None:
 
 
 def _bands(places: Array, sigmas: Array) -> Array:
-    """(m - 1, 4, 2) m, one corner-to-corner piece of the band for each step; steps of unknown width are left out."""
+    """(m - 1, 4, 2) m, a quadrilateral of the band for each step; steps of unknown width are left out."""
     if len(places) < 2:
         return np.zeros((0, 4, 2))
     along = np.gradient(places, axis=0)

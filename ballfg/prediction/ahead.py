@@ -1,4 +1,4 @@
-"""The path of one ball ahead: positions with standard deviations, and the events on the way."""
+"""Predicts the path of one ball, with standard deviations and the events on the way."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ if TYPE_CHECKING:
 
 AXES = ("x", "y", "z")
 MOST_STEPS = 100_000
-"""Times of one path. They take some seconds and 100 MB; the longest flight of a ball lasts 10 s."""
+"""Largest number of times in a path. They take some seconds and 100 MB; the longest flight of a ball lasts 10 s."""
 
 
 @dataclass(frozen=True, eq=False)
 class Ahead:
-    """Where a ball will be.
+    """The predicted path of a ball.
 
     Near a contact of uncertain time some of the possible balls have bounced at a stamp and others have not. The state
     there is the mean of all of them, and the covariance is that of all of them about it: an average of a falling and a
     rising velocity, with a sigma of up to half of the jump. `next_contact` has the velocity of the bounce itself.
 
     Attributes:
-        start: the state that the path begins with.
-        horizon: s, how far ahead events are looked for.
+        start: the initial state of the path.
+        horizon: s, range of the search for events.
         times: (k,) s, on the clock of the start.
         states: (k, 9) position m, velocity m/s, spin rad/s.
         covariances: (k, 9, 9) in the products of those units; without measurement noise.
@@ -66,7 +66,7 @@ class Ahead:
 
     @cached_property
     def next_contact(self) -> Crossing | None:
-        """The state just before the next contact with a surface; None if there is none within the horizon."""
+        """The state right before the next contact with a surface; None if there is none within the horizon."""
         return next_contact(*self._carried, self.horizon)
 
     @cached_property
@@ -75,7 +75,7 @@ class Ahead:
         return apex(*self._carried, self.horizon)
 
     def crossing(self, *, x: float | None = None, y: float | None = None, z: float | None = None) -> Crossing | None:
-        """Where and when the ball goes through a plane across one axis.
+        """Place and time of the ball's crossing of a plane across one axis.
 
         Args: x, y, z: m, the place of the plane on its axis; exactly one of them.
         Returns: None if the ball does not get there within the horizon.
@@ -112,7 +112,7 @@ class Ahead:
 
 
 def look_ahead(start: BallState, horizon: float, step: float = 0.01) -> Ahead:
-    """The path of a ball from a state on.
+    """The path of a ball from a state.
 
     Args: start: a state with its model.  horizon: s.  step: s between the times of the path.
     Raises: ValueError: a horizon or step that is not positive, more than `MOST_STEPS` steps, or a state without a

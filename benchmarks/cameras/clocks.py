@@ -1,4 +1,4 @@
-"""Cameras whose shutters do not open together: velocities from camera factors and from points, and clock offsets."""
+"""Evaluates unsynchronised cameras: velocities from camera factors and from points, and clock offsets."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -28,13 +28,13 @@ from ballfg.vision import Camera, SeenBall, triangulate
 from ballfg.vision.association.gathering import nearest
 
 NAIVE, FACTORS = "smoother, as if synchronised", "smoother, camera factors"
-"""Two of the ways to estimate, which are compared with each other."""
+"""Two of the ways to estimate, for comparison."""
 NEAR_BOUNCE: Final = 1.0
 """Frame intervals about a bounce that do not count: a stamp's velocity is before it or after it by chance."""
 BLIND: Final = 20.0
-"""px, what a ball of 10 m/s moves in half a frame at 120 Hz, 3 m away."""
+"""px, motion of a ball of 10 m/s in half a frame at 120 Hz, 3 m away."""
 OTHER_BALL: Final = 0.5
-"""m. A state that far from a flight is of another one."""
+"""m. Distance of a state from a flight beyond which it belongs to another one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class Velocities:
 
 
 def sighted(filmed: Filmed) -> list[Track]:
-    """The balls of a recording with the sightings that they were made from."""
+    """The balls of a recording with their sightings."""
     tracking = filmed.tracking
     pairs = zip(tracking.names, tracking.balls, strict=True)
     return [sighted_track(name, ball.sightings, tracking.cameras) for name, ball in pairs]
@@ -91,7 +91,7 @@ def _as_if_synchronised(ball: SeenBall, cameras: Sequence[Camera], rate: float) 
     """Times (n,) s and points (n, 3) m of the nearest frames, as one would who believes in one shutter.
 
     The frames are those of the camera that saw most; of the others the nearest sighting within half a frame counts. The
-    pixels' noise is taken to be as large as what the ball moves meanwhile: no view is refused for that.
+    pixels' noise includes the ball's motion meanwhile, so that no view is refused for that.
     """
     seen = ball.sightings
     offsets = np.array([camera.time_offset for camera in cameras])

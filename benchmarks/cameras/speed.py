@@ -1,4 +1,4 @@
-"""Times of tracking: three video streams through detection and association, and live updates from sightings."""
+"""Times the tracking of three video streams, and live updates from sightings."""
 
 import time
 from functools import partial

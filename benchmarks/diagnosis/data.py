@@ -1,4 +1,4 @@
-"""From a case to its data: simulated tracks in a folder, the declared model, and the true one."""
+"""Makes the data of a case: simulated tracks in a folder, the declared model, and the true one."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +24,7 @@ def make_dataset(case: Case, folder: Path) -> Dataset:
 
 
 def declared_model(case: Case, radius: float) -> AnalyticModel:
-    """The model that the diagnosis is given: the nominal one for a radius (m), without the effects left out."""
+    """The declared model of a diagnosis: the nominal one for a radius (m), without the effects left out."""
     model = with_effects(nominal_model(radius))
     for name in case.left_out:
         if has_effect(model, name):  # effects that need one go with it

@@ -1,4 +1,4 @@
-"""Measured tracks as tasks: learn from every second shot, observe a quarter of a second, predict what follows."""
+"""Makes tasks of measured tracks: learn from every second shot, observe a quarter of a second, predict the rest."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""The synthetic launcher tracks of the dynamics comparison, whose truth is richer than any model that is compared.
+"""Simulates the launcher tracks of the dynamics comparison, with a truth richer than any compared model.
 
 Seven things act at once that the analytic model has not, or has with another value. Their sizes come from what is
 known of spheres and from measured tracks; `EFFECTS` has them:
@@ -47,7 +47,7 @@ CASE: Final = "synthetic"
 TRACKS: Final = 717
 """As in the paper."""
 TRAIN_SHARE: Final = 0.8
-"""Of 717 tracks 573 are trained on, 144 judge."""
+"""Share of tracks for training: 573 of 717; 144 judge."""
 RATE: Final = 120.0
 """Hz."""
 NOISE: Final = 0.003
@@ -70,7 +70,7 @@ EFFECTS: Final = (
     "restitution_speed.slope=0.02",
     "tangential_restitution.e_t=0.25",
 )
-"""What acts although no compared model declares it, or declares another value."""
+"""Effects that act although no compared model declares them, or declares another value."""
 _SPLIT_STREAM: Final = 6
 """Keeps the draw of the split apart from other draws of the same seed."""
 
@@ -98,7 +98,7 @@ def synthetic_task(seed: int, tracks: int = TRACKS) -> Task:
     return Task(
         case=CASE,
         info=replace(dataset_info(config), name=CASE),
-        # the tracks end where a ball goes beside the table, so that its edges need not be told
+        # the tracks end where a ball falls beside the table, so that no model needs its edges
         surfaces=Surfaces.table_tennis(kind.surfaces.table_height),
         settings=gaussian_settings(NOISE, ProcessNoise(), LABEL_NOISE),
         launcher=Launcher.of_levels(kind.launcher.topspin_scale, kind.launcher.sidespin_scale, LABEL_NOISE),

@@ -1,4 +1,4 @@
-"""Coverage of conformal intervals on measured tracks: random halves calibrate, the other halves are predicted."""
+"""Computes the coverage of conformal intervals on measured tracks, by calibration on random halves."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""Pictures of the comparison of estimators."""
+"""Draws the pictures of the comparison of estimators."""
 
 from collections.abc import Iterable
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Tracks with known truth by the paper's protocol and by the fair one, and the estimators that are compared on them."""
+"""Makes tracks with known truth by the paper's and by the fair protocol, with the compared estimators."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -146,7 +146,7 @@ def _free_flights(model: BallModel, surfaces: Surfaces, count: int, rng: np.rand
 
 
 def fair_protocol(count: int, seed: int, name: str = "fair") -> Protocol:
-    """The launcher's tracks with their bounces; noise is what is declared, for everyone.
+    """The launcher's tracks with their bounces; all estimators know the true noise.
 
     The truth is disturbed with exactly the process noise of the settings; spin labels carry noise; nothing is an
     outlier and nothing hits the ball, so the loss is squared and no such event is looked for. At the newest sample the

@@ -1,4 +1,4 @@
-"""What a robot asks for while a ball flies: an estimate through bounces, a long stream, events ahead, many rollouts."""
+"""Times a robot's requests during a flight: an estimate through bounces, a stream, events ahead, many rollouts."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -27,7 +27,7 @@ BOUNCING: Final = (0.0, 0.0, 0.3, 5.0, 0.5, -0.5, 0.0, 80.0, 20.0)
 LONG: Final = (20, 80, 320, 1280)
 """Observations of one flight."""
 DENSE: Final = 400.0
-"""Hz, at which they are taken, so that the longest flight stays below a sensible speed."""
+"""Hz, rate of these observations, so that the longest flight stays below a plausible speed."""
 STREAM_RATE: Final = 200.0
 """Hz."""
 STREAM_NOISE: Final = 0.003
@@ -35,7 +35,7 @@ STREAM_NOISE: Final = 0.003
 PAUSE: Final = 1.5
 """s between two flights of a stream."""
 STEPS: Final = 300
-"""Of 10 ms, in a rollout."""
+"""Number of steps of 10 ms in a rollout."""
 SLOWEST: Final = 3
 """Runs of what takes seconds."""
 

@@ -1,4 +1,4 @@
-"""The suite of `ballfg-bench speed`: times of an estimate, an update, a prediction and a Jacobian on one thread."""
+"""Runs `ballfg-bench speed`: times of an estimate, an update, a prediction and a Jacobian on one thread."""
 
 import copy
 from collections.abc import Mapping
@@ -60,12 +60,12 @@ HORIZON = 0.3
 """s that are predicted, at `RATE`."""
 NO_SURFACE = Surfaces(-1e3)
 ONLINE: Final[Mapping[Solver, str]] = {"gtsam": "online_update", "ballfg": "online_chain_update"}
-"""What holds the window of the online estimator, and how its rows are called."""
+"""Solvers of the online estimator's window, and the names of their rows."""
 
 
 @dataclass(frozen=True)
 class Size:
-    """How much is computed.
+    """The amount of computation.
 
     Attributes:
         runs: timed runs of each action.  warm_up: runs before them.

@@ -1,4 +1,4 @@
-"""Covariances of states and coefficients from the triangles that eliminations leave behind."""
+"""Computes covariances of states and coefficients from the triangles of eliminations."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,7 +8,7 @@ import numpy as np
 from ballfg.arrays import Array, Index
 from ballfg.factors.batch import COEFFICIENTS
 from ballfg.factors.linear.definite import definite, variances_positive
-from ballfg.factors.linear.step import Root
+from ballfg.factors.linear.elimination import Root
 from ballfg.factors.linear.substitution import covariances_of
 
 
@@ -27,10 +27,18 @@ class Covariances:
     cross: Array
 
     def definite(self) -> "Covariances | None":
-        """These, safe from rounding; None where a track leaves something undetermined, to double precision."""
+        """The same, safe from rounding; None if a track leaves an unknown undetermined in double precision."""
         if not variances_positive(self.states).all() or not np.isfinite(self.cross).all():
             return None
         return replace(self, states=definite(self.states))
+
+    def joint(self, state: int) -> Array:
+        """(9 + b + p, 9 + b + p) of a state and its bias with the coefficients behind them."""
+        own, cross = self.states[state], self.cross[state]
+        w, size = len(own), len(own) + len(self.coefficients)
+        joint = np.empty((size, size))
+        joint[:w, :w], joint[:w, w:], joint[w:, :w], joint[w:, w:] = own, cross, cross.T, self.coefficients
+        return joint
 
 
 @dataclass(frozen=True)
@@ -39,7 +47,7 @@ class NeighbourCovariances:
 
     Attributes:
         states: (t, n, w, w).
-        cross: (t, n, w, w + p), of each state with the next one and with the coefficients.
+        cross: (t, n, w, w + p), of each state with the next one and the coefficients.
         coefficients: (t, p, p).
     """
 
@@ -48,7 +56,7 @@ class NeighbourCovariances:
     coefficients: Array
 
     def joint(self, track: int, left: Index, right: Index) -> Array:
-        """(m, d, e) covariances of variables of one track, each pair the same, neighbours, or with the coefficients.
+        """(m, d, e) covariances of pairs of one track's variables: equal, neighbours, or with the coefficients.
 
         Args: left: (m,) variable numbers.  right: (m,).
         """
@@ -93,11 +101,13 @@ class SquareRootInformation:
         found = NeighbourCovariances(np.zeros((t, n, w, w)), np.zeros((t, n, w, w + p)), np.zeros((t, p, p)))
         for k, (root, length) in enumerate(zip(self.roots, self.lengths, strict=True)):
             states, cross = found.states[k, :length], found.cross[k, :length]
-            covariances_of(root.states, root.coefficients, states, cross, found.coefficients[k])
+            covariances_of(root, states, cross, found.coefficients[k])
         return found
 
 
 def marginal_covariances(root: Root) -> Covariances:
     """Covariances of the states and coefficients of one track."""
-    found = SquareRootInformation([root]).covariances()
-    return Covariances(found.states[0], found.coefficients[0], found.cross[0, :, :, root.width :])
+    (n, w), p = root.states.shape[:2], len(root.coefficients)
+    states, cross, coefficients = np.empty((n, w, w)), np.empty((n, w, w + p)), np.empty((p, p))
+    covariances_of(root, states, cross, coefficients)
+    return Covariances(states, coefficients, cross[:, :, w:])

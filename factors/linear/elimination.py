@@ -1,15 +1,20 @@
-"""Elimination of a chain of states by Householder's QR, in machine code.
+"""Elimination of a chain of states by Householder's QR, in machine code: the package's only one.
 
 Every factor looks at one state or at two neighbours, and perhaps at coefficients that all share. Its rows are kept with
 the first of its states, in a matrix with the columns (x_i, x_{i+1}, c, 0, b), as many zeros as make their number a
 multiple of four. State by state these rows are reduced: first x_i goes, against the triangle that the states before
 left; what still looks at x_{i+1} becomes its triangle; the rest is known of the coefficients alone. Normal equations
 would halve the digits: a loose prior on a spin beside its tight process noise leaves none of them.
+
+`eliminate` reduces a whole chain, `eliminate_on` the end of one, after what the states before have left,
+`eliminate_each` states that nothing links. All of them are made of `absorb`.
 """
 
 import math
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numba import types
 
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.compiled.build import machine_code
@@ -17,9 +22,38 @@ from ballfg.dynamics.compiled.flight import put_all
 from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, INDEX, NOTHING, ONE, REAL, THREE, TWO
 
 FOUR_AT_ONCE = 4
-"""Numbers that one instruction multiplies."""
+"""Number of values that one instruction multiplies."""
 BLOCK = 64
 """States that are reduced with one room for what they leave to each other, which so stays near the processor."""
+FADED = 1e-13
+"""Share of what is known of a number already, below which what a state still tells of it is dropped."""
+
+
+class Root(NamedTuple):
+    """The triangle R of a chain of n states, R^T R = J^T J, and the right side y of R d = y.
+
+    Attributes:
+        states: (n, w, 2 w + p + 1), of each state: its own triangle, the block that couples it to the next state, that
+            to the coefficients, y. Each per unit of its variable.
+        coefficients: (p, 2 w + p + 1), the same of the coefficients; the first 2 w columns are empty.
+    """
+
+    states: Array
+    coefficients: Array
+
+    @classmethod
+    def empty(cls, states: int, width: int, coefficients: int) -> "Root":
+        """Room for the triangle of some states of w numbers, with p coefficients."""
+        columns = 2 * width + coefficients + 1
+        return cls(np.empty((states, width, columns)), np.empty((coefficients, columns)))
+
+    @property
+    def width(self) -> int:
+        """Numbers w of a state, biases among them."""
+        return self.states.shape[1]
+
+
+ROOT: Final[Any] = types.NamedTuple((THREE, TWO), Root)
 
 
 @machine_code(COUNT(COUNT))
@@ -30,10 +64,10 @@ def padded(columns: int) -> int:
 
 @machine_code(COUNT(COUNTS, INDEX, COUNT))
 def count_rows(counts: Index, variables: Index, dim: int) -> int:
-    """Add the rows of some factors to those of their first states.
+    """Adds the number of rows of some factors to those of their first states.
 
-    Args: counts: (n + 1,) of each state; last those that look at coefficients alone.  variables: (m, a).  dim: rows of
-    each.
+    Args: counts: (n + 1,) of each state; last those of coefficients alone.  variables: (m, a).  dim: rows of each
+    factor.
     Returns: the number of a factor whose states are not neighbours, or -1.
     """
     n = len(counts) - 1
@@ -51,11 +85,11 @@ def count_rows(counts: Index, variables: Index, dim: int) -> int:
 
 @machine_code(NOTHING(TWO, COUNTS, INDEX, TWO, COUNTS, COUNTS))
 def place_residuals(system: Array, free: Index, variables: Index, residual: Array, rows: Index, firsts: Index) -> None:
-    """Give the rows of some factors their places, and write the right side.
+    """Assigns rows to some factors, and writes the right side.
 
     Args:
         system: (r, k) rows of all factors, zeros to begin with; whitened, each column per unit of its number.
-        free: (n + 1,) the next free row of each state, moved on.
+        free: (n + 1,) the next free row of each state; updated.
         variables: (m, a).  residual: (m, d) whitened.
         rows, firsts: (m,) written: the first row of each factor, and its first state.
     """
@@ -71,19 +105,21 @@ def place_residuals(system: Array, free: Index, variables: Index, residual: Arra
             system[rows[factor] + i, end] = -residual[factor, i]
 
 
-@machine_code(NOTHING(TWO, COUNT, COUNTS, COUNTS, INDEX, COUNT, THREE))
+@machine_code(NOTHING(TWO, COUNT, COUNT, COUNTS, COUNTS, INDEX, COUNT, THREE))
 def place_block(
-    system: Array, width: int, rows: Index, firsts: Index, variables: Index, which: int, block: Array
+    system: Array, width: int, own: int, rows: Index, firsts: Index, variables: Index, which: int, block: Array
 ) -> None:
-    """Write the Jacobians of some factors by one of their variables.
+    """Writes the Jacobians of some factors by one of their variables.
 
     Args:
-        system, rows, firsts, variables: as for `place_residuals`.  width: w, numbers of a state.
+        system, rows, firsts, variables: as for `place_residuals`; -1 are the coefficients, -2 is what waits behind the
+            first `own` of them.
+        width: w, numbers of a state.
         which: number of the variable.  block: (m, d, w) or (m, d, p) whitened, per unit of the variable.
     """
     for factor in range(len(rows)):
         state, row = variables[factor, which], rows[factor]
-        column = 2 * width if state < 0 else (state - firsts[factor]) * width
+        column = (state - firsts[factor]) * width if state >= 0 else 2 * width + (own if state < -1 else 0)
         for i in range(block.shape[1]):
             for j in range(block.shape[2]):
                 system[row + i, column + j] += block[factor, i, j]
@@ -91,7 +127,7 @@ def place_block(
 
 @machine_code(NOTHING(TWO, COUNTS, COUNTS, COUNT, REAL, TWO))
 def damp(system: Array, start: Index, free: Index, width: int, damping: float, diagonal: Array) -> None:
-    """Add a row for every unknown, which holds it back.
+    """Adds a damping row for every unknown.
 
     Args:
         system, width, free: as above.  start: (n + 2,) the first row of each state, and the end.
@@ -116,9 +152,9 @@ def damp(system: Array, start: Index, free: Index, width: int, damping: float, d
 
 @machine_code(NOTHING(TWO, TWO, COUNT, COUNT, COUNT, COUNT, ONE))
 def absorb(upper: Array, system: Array, begin: int, end: int, first: int, count: int, column: Array) -> None:
-    """Reflect rows begin:end of the system into a triangle, until their columns first:first+count are zero.
+    """Reflects rows begin:end of the system into a triangle, until their columns first:first+count are zero.
 
-    Columns up to those are used up, nobody reads them again. Four columns at a time fill one register of a processor.
+    Columns before those are not read again. Four columns at a time fill one register of a processor.
 
     Args:
         upper: (count, all columns), triangular from column `first` on.
@@ -165,7 +201,7 @@ def absorb(upper: Array, system: Array, begin: int, end: int, first: int, count:
 
 @machine_code(NOTHING(TWO, TWO, COUNT))
 def copy_kept(target: Array, source: Array, kept: int) -> None:
-    """Copy the first columns of some rows, and the right side, which is last in both."""
+    """Copies the first columns of some rows, and the right side, which is last in both."""
     for i in range(target.shape[0]):
         for j in range(kept):
             target[i, j] = source[i, j]
@@ -174,13 +210,13 @@ def copy_kept(target: Array, source: Array, kept: int) -> None:
 
 @machine_code(NOTHING(TWO, COUNTS, COUNT, THREE, THREE, THREE))
 def eliminate_on(system: Array, start: Index, width: int, carries: Array, shared: Array, root: Array) -> None:
-    """Reduce the rows of a part of the chain, from a state on to the last, after what the states before have left.
+    """Reduces the rows of a part of the chain, from a state to the last, with the triangles of the earlier states.
 
     Args:
-        system: (r, k) as above; it is used up.  width: w.
+        system: (r, k) as above; overwritten.  width: w.
         start: (m + 1,) the first row of each of m states, and the end.
-        carries: (m + 1, w, k) triangle that the states before leave on the first one; those on the others are written.
-        shared: (m + 1, p, k) triangle of the coefficients before the first state; that after each state is written.
+        carries: (m + 1, w, k) triangle of the earlier states on the first one; those on the others are written.
+        shared: (m + 1, p, k) triangle of the coefficients before the first state; those after each state are written.
         root: (m, w, 2 w + p + 1), written: the rows of R of each state: by itself, by the next one, by the
             coefficients, the right side.
     """
@@ -192,7 +228,7 @@ def eliminate_on(system: Array, start: Index, width: int, carries: Array, shared
     for i in range(m):
         put_all(upper, carries[i])
         absorb(upper, system, start[i], start[i + 1], 0, width, column)
-        copy_kept(root[i], upper, root.shape[2] - 1)
+        copy_kept(root[i], upper, 2 * width + p)
         for j in range(width):
             for k in range(columns):
                 carry[j, k] = 0.0
@@ -206,35 +242,82 @@ def eliminate_on(system: Array, start: Index, width: int, carries: Array, shared
         absorb(shared[i + 1], system, start[i], start[i + 1], 2 * width, p, column)
 
 
-@machine_code(NOTHING(TWO, COUNTS, COUNT, COUNT, COUNT, THREE, THREE, THREE))
-def reduce_block(
-    system: Array, start: Index, width: int, first: int, end: int, carries: Array, shared: Array, root: Array
-) -> None:
-    """Reduce the rows of the states first to end - 1, at most `BLOCK` of them.
+@machine_code(NOTHING(THREE, THREE))
+def eliminate_each(systems: Array, upper: Array) -> None:
+    """Reduce the rows of states that nothing links, each by itself; what is left of the rows tells nothing of it.
 
     Args:
-        system, start, width, root: as for `eliminate`.
-        carries, shared: (`BLOCK` + 1, ..) as for `eliminate_on`; their first entries are what the states before have
-            left, and become what these leave.
+        systems: (n, r, k) rows of n states, the w columns of the state first; `FOUR_AT_ONCE` divides k.
+        upper: (n, w, k) triangle that is known of each beforehand; becomes that with its rows.
     """
-    count = end - first
-    eliminate_on(system, start[first : end + 1], width, carries[: count + 1], shared[: count + 1], root[first:end])
-    put_all(carries[0], carries[count])
-    put_all(shared[0], shared[count])
+    column = np.empty(systems.shape[1])
+    for i in range(len(systems)):
+        absorb(upper[i], systems[i], 0, systems.shape[1], 0, upper.shape[1], column)
 
 
-@machine_code(NOTHING(TWO, COUNTS, COUNT, THREE, TWO))
-def eliminate(system: Array, start: Index, width: int, root: Array, last: Array) -> None:
+@machine_code(REAL(TWO, TWO, COUNT, COUNT))
+def _told(carry: Array, shared: Array, first: int, count: int) -> float:
+    """How much a chain's next state tells of some columns, compared with what the states before it told."""
+    most = 0.0
+    for column in range(first, first + count):
+        told, known = 0.0, 0.0
+        for row in range(len(carry)):
+            told = max(told, abs(carry[row, column]))
+        for row in range(len(shared)):
+            known = max(known, abs(shared[row, column]))
+        if told > most * known:
+            most = told / known if known > 0.0 else np.inf
+    return most
+
+
+@machine_code(COUNT(TWO, COUNTS, COUNT, COUNT, THREE, THREE, THREE))
+def _reduce(system: Array, start: Index, width: int, held: int, carries: Array, shared: Array, root: Array) -> int:
+    """Reduce states in blocks, to the last or until the next one tells nothing of the last `held` coefficients.
+
+    Args:
+        system, start, width, root: as for `eliminate_on`.  held: 0 to go on to the last.
+        carries, shared: (`BLOCK` + 1, ..) as for it; their first entries are what the states before have left, and
+            become what these leave.
+    Returns: the state that is next.
+    """
+    n, first, waiting = len(root), 0, 2 * width + shared.shape[1] - held
+    while first < n and not (held and first and _told(carries[0], shared[0], waiting, held) <= FADED):
+        count = min(BLOCK, n - first)
+        part = start[first : first + count + 1]
+        eliminate_on(system, part, width, carries[: count + 1], shared[: count + 1], root[first : first + count])
+        put_all(carries[0], carries[count])
+        put_all(shared[0], shared[count])
+        first += count
+    return first
+
+
+@machine_code(NOTHING(TWO, COUNTS, COUNT, COUNT, ROOT))
+def eliminate(system: Array, start: Index, width: int, held: int, root: Root) -> None:
     """Reduce all rows to the triangle R with its right side.
+
+    Behind the coefficients another state may wait that only the beginning of the chain tells of, such as the first one
+    of a section. Where what the chain still tells of it has faded below what the arithmetic resolves, its columns are
+    dropped, and the rest is reduced in less than half the time.
 
     Args:
         system, start, width: as above, with the rows of the coefficients alone behind those of the last state.
-        root: (n, w, 2 w + p + 1), written: as above.
-        last: (p, 2 w + p + 1), written: the rows of the coefficients, at the end.
+        held: number of the last coefficients that fade along the chain.
+        root: written.
     """
-    n, columns, p = len(start) - 2, system.shape[1], len(last)
+    n, columns, p = len(start) - 2, system.shape[1], len(root.coefficients)
     carries, shared = np.zeros((BLOCK + 1, width, columns)), np.zeros((BLOCK + 1, p, columns))
-    for first in range(0, n, BLOCK):
-        reduce_block(system, start, width, first, min(first + BLOCK, n), carries, shared, root)
+    first = _reduce(system, start[: n + 1], width, held, carries, shared, root.states)
+    if first < n:
+        own = p - held
+        kept = 2 * width + own
+        rest, begins = np.zeros((start[n] - start[first], padded(kept + 1))), start[first : n + 1] - start[first]
+        after, known = np.zeros((BLOCK + 1, width, rest.shape[1])), np.zeros((BLOCK + 1, own, rest.shape[1]))
+        copy_kept(rest, system[start[first] : start[n]], kept)
+        copy_kept(after[0], carries[0], kept)
+        root.states[first:] = 0.0
+        _reduce(rest, begins, width, 0, after, known, root.states[first:])
+        more = np.zeros((own, columns))
+        copy_kept(more, known[0], kept)
+        absorb(shared[0], more, 0, own, 2 * width, p, np.empty(own))
     absorb(shared[0], system, start[n], start[n + 1], 2 * width, p, np.empty(start[n + 1] - start[n]))
-    copy_kept(last, shared[0], last.shape[1] - 1)
+    copy_kept(root.coefficients, shared[0], root.coefficients.shape[1] - 1)

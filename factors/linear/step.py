@@ -1,4 +1,4 @@
-"""The linear subproblem: the step that minimises the linearised objective, by QR, state by state along the track."""
+"""Solves the linear subproblem by QR, state by state along the track, for the step of a minimisation."""
 
 from __future__ import annotations
 
@@ -12,31 +12,15 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array, Index
 from ballfg.factors.batch import Rows, Values
 from ballfg.factors.linear import elimination
-from ballfg.factors.linear.substitution import substitute_back
+from ballfg.factors.linear.elimination import Root
+from ballfg.factors.linear.substitution import solution_of
 
 N = TypeVar("N", bound=np.generic)
 
 Piece = tuple[Index, Array, tuple[Array, ...]]
 """Variables (m, a), weighted residuals (m, r) and weighted Jacobians of some factors."""
-
-
-@dataclass(frozen=True)
-class Root:
-    """The triangle R of one track, R^T R = J^T J, and the right side y of R d = y.
-
-    Attributes:
-        states: (n, w, 2 w + p + 1), of each state: its own triangle, the block that couples it to the next state, that
-            to the coefficients, y. Each per unit of its variable.
-        coefficients: (p, 2 w + p + 1), the same of the coefficients; the first 2 w columns are empty.
-    """
-
-    states: Array
-    coefficients: Array
-
-    @property
-    def width(self) -> int:
-        """Numbers w of a state, biases among them."""
-        return self.states.shape[1]
+WAITING = -2
+"""The variable number of a state that waits behind the coefficients until all others are eliminated."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +30,8 @@ class Step:
     Attributes:
         states: (n, 9 + b) m, m/s, rad/s, and m of biases: part of the step d that minimises |r + J d|^2 (+ damping).
         coefficients: (p,) in their own units, the other part of it.
-        root: the triangle that the elimination leaves.
-        decrease: half of |r|^2 - |r + J d|^2, by which the linear model promises to reduce the objective.
+        root: the triangle of the elimination.
+        decrease: half of |r|^2 - |r + J d|^2, the decrease of the objective predicted by the linear model.
     """
 
     states: Array
@@ -57,7 +41,7 @@ class Step:
 
     @classmethod
     def of(cls, root: Root, states: Array, coefficients: Array, damping: float, diagonal: Array) -> Step | None:
-        """The step R d = y with what it promises; None where it is not finite.
+        """The step R d = y with its predicted decrease; None if it is not finite.
 
         Args:
             root: R and y.
@@ -69,7 +53,7 @@ class Step:
         if not (np.isfinite(states).all() and np.isfinite(coefficients).all()):
             return None
         n, w, p = len(states), root.width, len(coefficients)
-        # |J d|^2 and what the damping rows add to it
+        # |J d|^2 and the share of the damping rows in it
         promised = float((root.states[..., -1] ** 2).sum() + (root.coefficients[:, -1] ** 2).sum())
         if damping:
             held = (diagonal[:n, :w] * states**2).sum() + (diagonal[n, :p] * coefficients**2).sum()
@@ -94,45 +78,48 @@ def weighted(rows: Rows) -> tuple[Array, tuple[Array, ...]]:
 
 
 def solve(linearized: Sequence[Rows], values: Values, damping: float = 0.0) -> Step | None:
-    """Minimise the linearised, reweighted objective.
+    """Minimises the linearised, reweighted objective.
 
     Args:
         linearized: all batches of a graph at `values`.
         values: the point; its shapes give the variables.
         damping: Marquardt's lambda, relative to the diagonal of J^T J.
-    Returns: None where the system is singular or its solution is not finite.
+    Returns: None if the system is singular or its solution is not finite.
     Raises: ValueError: if a factor links states that are not neighbours.
     """
-    p, w = len(values.coefficients), values.width
     system, start, diagonal = damped_rows(linearized, values, damping)
-    root = Root(np.empty((len(values.states), w, 2 * w + p + 1)), np.empty((p, 2 * w + p + 1)))
-    elimination.eliminate(system, start, w, root.states, root.coefficients)
-    states, coefficients = root.states[..., -1].copy(), root.coefficients[:, -1].copy()
-    substitute_back(root.states, root.coefficients, states, coefficients)
-    return Step.of(root, states, coefficients, damping, diagonal)
+    root = Root.empty(len(values.states), values.width, len(values.coefficients))
+    elimination.eliminate(system, start, values.width, 0, root)
+    return Step.of(root, *solution_of(root), damping, diagonal)
 
 
-def damped_rows(linearized: Sequence[Rows], values: Values, damping: float) -> tuple[Array, Index, Array]:
+def damped_rows(
+    linearized: Sequence[Rows], values: Values, damping: float, held: int = 0
+) -> tuple[Array, Index, Array]:
     """All rows of the linear problem, ordered by their first states, with those of the damping.
 
-    Args: linearized, values, damping: as for `solve`.
+    Args:
+        linearized, values, damping: as for `solve`.
+        held: number of the last coefficients, which are not `COEFFICIENTS` but the variable `WAITING`.
     Returns: rows (r, c) as `elimination` takes them; where the rows of each state begin (n + 2,), those of the
         coefficients last; diagonal (n + 1, w + p) of J^T J, zeros without damping.
     Raises: ValueError: if a factor links states that are not neighbours.
     """
     n, p, w = len(values.states), len(values.coefficients), values.width
     pieces = [(rows.variables, *weighted(rows)) for rows in linearized]
-    system, start, free = _system(pieces, n, p, w, further=damping > 0.0)
+    system, start, free = _system(pieces, n, p - held, p, w, further=damping > 0.0)
     diagonal = np.zeros((n + 1, w + p))
     if damping:
         elimination.damp(system, start, free, w, damping, diagonal)
     return system, start, diagonal
 
 
-def _system(pieces: Sequence[Piece], n: int, p: int, width: int, *, further: bool) -> tuple[Array, Index, Index]:
+def _system(
+    pieces: Sequence[Piece], n: int, own: int, p: int, width: int, *, further: bool
+) -> tuple[Array, Index, Index]:
     """All rows, ordered by their first states; where each state's rows begin, and where free ones do.
 
-    Args: further: leave room for a row for each unknown.
+    Args: own: coefficients before those that wait.  further: leave room for a row for each unknown.
     """
     counts = np.zeros(n + 1, dtype=np.int64)
     for variables, residual, _ in pieces:
@@ -151,10 +138,10 @@ def _system(pieces: Sequence[Piece], n: int, p: int, width: int, *, further: boo
         rows, firsts = np.empty(len(variables), dtype=np.int64), np.empty(len(variables), dtype=np.int64)
         elimination.place_residuals(system, free, _plain(variables), _plain(residual), rows, firsts)
         for which, block in enumerate(jacobians):
-            elimination.place_block(system, width, rows, firsts, _plain(variables), which, _plain(block))
+            elimination.place_block(system, width, own, rows, firsts, _plain(variables), which, _plain(block))
     return system, start, free
 
 
 def _plain(array: NDArray[N]) -> NDArray[N]:
-    """An array as machine code takes it: its rows one behind another, and open for writing."""
+    """An array for machine code: contiguous and writable."""
     return array if array.flags.c_contiguous and array.flags.writeable else np.array(array, order="C")

@@ -1,4 +1,4 @@
-"""What the triangle R of a chain of states tells: steps, by substitution, and covariances, in machine code."""
+"""Computes steps and covariances from the triangle R of a chain of states, in machine code."""
 
 import numpy as np
 
@@ -6,16 +6,23 @@ from ballfg.arrays import Array
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.flight import put_all
 from ballfg.dynamics.compiled.signatures import COUNT, NOTHING, ONE, REAL, THREE, TWO
+from ballfg.factors.linear.elimination import ROOT, Root
 
 
-@machine_code(NOTHING(THREE, TWO, TWO, ONE))
-def substitute_back(root: Array, last: Array, states: Array, coefficients: Array) -> None:
+def solution_of(root: Root) -> tuple[Array, Array]:
+    """(n, w) states and (p,) coefficients d of R d = y, in the units of the variables."""
+    states, coefficients = root.states[..., -1].copy(), root.coefficients[:, -1].copy()
+    substitute_back(root, states, coefficients)
+    return states, coefficients
+
+
+@machine_code(NOTHING(ROOT, TWO, ONE))
+def substitute_back(triangle: Root, states: Array, coefficients: Array) -> None:
     """Solve R x = y.
 
-    Args:
-        root, last: rows of R as `ballfg.factors.linear.elimination.eliminate` leaves them.
-        states: (n, w) and coefficients: (p,), y, which become x.
+    Args: triangle: R.  states: (n, w) and coefficients: (p,), y, which become x.
     """
+    root, last = triangle.states, triangle.coefficients
     n, w = root.shape[:2]
     p = len(coefficients)
     for j in range(p - 1, -1, -1):
@@ -35,12 +42,13 @@ def substitute_back(root: Array, last: Array, states: Array, coefficients: Array
             states[i, j] = left / root[i, j, j]
 
 
-@machine_code(NOTHING(THREE, TWO, TWO, ONE))
-def substitute_forward(root: Array, last: Array, states: Array, coefficients: Array) -> None:
+@machine_code(NOTHING(ROOT, TWO, ONE))
+def substitute_forward(triangle: Root, states: Array, coefficients: Array) -> None:
     """Solve R^T y = x.
 
-    Args: root, last: as above.  states: (n, w) and coefficients: (p,), x, which become y.
+    Args: triangle: R.  states: (n, w) and coefficients: (p,), x, which become y.
     """
+    root, last = triangle.states, triangle.coefficients
     n, w = root.shape[:2]
     p = len(coefficients)
     for i in range(n):
@@ -76,24 +84,25 @@ def invert(upper: Array, inverse: Array) -> None:
 
 @machine_code(NOTHING(TWO, COUNT, REAL, TWO))
 def _part(rows: Array, first: int, scale: float, part: Array) -> None:
-    """Copy columns from the first on, scaled, into an array of their own."""
+    """Copies columns from the first on, scaled, into an array of their own."""
     for a in range(part.shape[0]):
         for b in range(part.shape[1]):
             part[a, b] = scale * rows[a, first + b]
 
 
-@machine_code(NOTHING(THREE, TWO, THREE, THREE, TWO))
-def covariances_of(root: Array, last: Array, states: Array, cross: Array, coefficients: Array) -> None:
+@machine_code(NOTHING(ROOT, THREE, THREE, TWO))
+def covariances_of(triangle: Root, states: Array, cross: Array, coefficients: Array) -> None:
     """Blocks of (R^T R)^-1, from the last state back to the first.
 
     p(x_i | y) with y = (x_{i+1}, c) is Gaussian with R_i and the coupling S_i to y; with K_i = -R_i^-1 S_i the
     covariance of x_i follows from that of y.
 
     Args:
-        root, last: as above.
+        triangle: R.
         states: (n, w, w), cross: (n, w, w + p) of each state with the next one and the coefficients, coefficients:
             (p, p); written, in the products of the unknowns' units.
     """
+    root, last = triangle.states, triangle.coefficients
     n, w = root.shape[:2]
     p = len(coefficients)
     if p:

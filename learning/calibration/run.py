@@ -1,4 +1,4 @@
-"""A calibration from config to results: `ballfg-train` with the kind `calibrate`, and its checkpoint."""
+"""Runs a calibration from config to results, for `ballfg-train` with the kind `calibrate`."""
 
 import sys
 import time
@@ -145,7 +145,7 @@ def read_checkpoint(folder: Path, problem: Problem) -> list[Step]:
 
 
 def _follow(steps: Sequence[Step], problem: Problem) -> bool:
-    """Whether steps could be those of a problem: numbered from 0, with its coefficients and its tracks."""
+    """True if steps fit a problem: numbered from 0, with its coefficients and its tracks."""
     size, tracks, judged = len(problem.chosen.names), set(problem.split.fit), len(problem.split.judge)
     for number, step in enumerate(steps):
         rows = [step.mean]

@@ -1,4 +1,4 @@
-"""What a residual network has to know to be used in other rooms: where it was trained, and the noise there."""
+"""Prepares a residual network for other rooms: the extent of its training data, and the noise there."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -43,7 +43,7 @@ def training_states(model: BallModel, shots: Sequence[Shot], solved: Sequence[So
 
 
 def fading_of(model: LearnedModel, tracks: Sequence[Tensor]) -> Fading:
-    """How the correction of a trained model fades, from the states (n, 9) of each training track."""
+    """The fading of a trained model's correction, from the states (n, 9) of each training track."""
     contacts = [states_before_contacts(states) for states in tracks]
     fading = Fading.of(tracks, contacts, model.radius)
     flying, bouncing = torch.cat(list(tracks)), torch.cat(contacts)
@@ -57,7 +57,7 @@ def fading_of(model: LearnedModel, tracks: Sequence[Tensor]) -> Fading:
 def noise_elsewhere(base: BallModel, shots: Sequence[Shot]) -> TrackNoise | None:
     """The noise of motion, bounces and spins that whole tracks of the training rooms show about the analytic model.
 
-    Acceleration is the least of the rooms: tracks with hits that nobody found show more. Others are means.
+    Acceleration is the least of the rooms: undetected hits raise it. Others are means.
 
     Returns: its coefficients as the learned model names them; None where no track is long enough.
     """

@@ -1,4 +1,4 @@
-"""Learning through the estimator: observations, states, rollout, error, and the gradient all the way back.
+"""Trains through the estimator: observations, states, rollout, error, and the gradient all the way back.
 
 The estimate is a function of the model, the launcher's embedding and the noise. Its derivative follows from the
 implicit function theorem (`ballfg.learning.gradient.implicit`). Source: Q. Xiao, Z. Wu, M. Gombolay 2024, section III.
@@ -81,7 +81,7 @@ class EndToEnd(Trainee):
     Args:
         shots: all of them; batches are numbers of shots.
         method: of the gradient through the estimate; by default `ImplicitGradient`.
-        augment: whether shots are rotated and shifted in training.
+        augment: True to rotate and shift shots in training.
         optimizer: solves the estimates, with its tolerance.
         linear_solver: for the Hessians of a batch.
         anchor: distance of the model from the analytic one; None if it is not part of the loss.

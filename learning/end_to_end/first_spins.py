@@ -1,4 +1,4 @@
-"""First values of the spins that launcher settings mean, from the analytic model's estimates of the training tracks.
+"""Initialises the spins of launcher settings from the analytic model's estimates of the training tracks.
 
 Without spin labels only the flight shows the spin. From no spin, learning needs many epochs to reach 150 rad/s, and a
 group of shots may end with the wrong sign. The spin with which an analytic model explains a whole track is right

@@ -1,4 +1,4 @@
-"""Solving with the exact Hessian: conjugate gradients, preconditioned with the Gauss-Newton triangle.
+"""Solves with the exact Hessian by conjugate gradients, preconditioned with the Gauss-Newton triangle.
 
 The Hessian of a batch of tracks is block diagonal, one block per track. All blocks are solved in lockstep: one product
 with the whole Hessian serves all of them, while each track has its own step lengths. The Gauss-Newton matrix R^T R,
@@ -41,8 +41,8 @@ class GaussNewtonFactors(SquareRootInformation):
         shared = solution[split:].reshape(self.tracks, self.coefficients)
         for k, (root, end) in enumerate(zip(self.roots, ends, strict=True)):
             states = solution[end - self.lengths[k] * self.width : end].reshape(-1, self.width)
-            substitute_forward(root.states, root.coefficients, states, shared[k])
-            substitute_back(root.states, root.coefficients, states, shared[k])
+            substitute_forward(root, states, shared[k])
+            substitute_back(root, states, shared[k])
         return torch.from_numpy(solution)
 
 

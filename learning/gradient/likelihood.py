@@ -1,4 +1,4 @@
-"""The likelihood of the observations as a function of the noise, which determines the scale of learned noise.
+"""Computes the likelihood of the observations as a function of the noise, for learning its scale.
 
 Scaling all standard deviations does not move the most probable states, so that an error of states cannot determine the
 scale. The likelihood of the observations with all states integrated out does. In Laplace's approximation, exact for a

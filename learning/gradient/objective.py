@@ -1,4 +1,4 @@
-"""The objective of many tracks' graphs as one torch function of states, model, noise and priors.
+"""Evaluates the objective of many tracks' graphs as one torch function of states, model, noise and priors.
 
 The estimator minimises it in numpy, track by track. A gradient through the estimate needs it again in torch, for a
 batch of tracks at once. Factors of the same sort are merged, so that a batch costs few torch calls.

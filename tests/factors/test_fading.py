@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ballfg.factors.linear.elimination import eliminate, padded
-from ballfg.factors.linear.fading import eliminate_fading
+from ballfg.factors.linear.elimination import Root, eliminate, padded
 
 N, W, OWN, HELD = 400, 2, 1, 2
 ROWS = W + 1  # of a state: its motion, its measurement
@@ -34,11 +33,10 @@ def chain(noise: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return system, start
 
 
-def reduced(function, system: np.ndarray, start: np.ndarray, *held: int) -> tuple[np.ndarray, np.ndarray]:
-    p = OWN + HELD
-    root, last = np.full((N, W, 2 * W + p + 1), np.nan), np.full((p, 2 * W + p + 1), np.nan)
-    function(system.copy(), start, W, *held, root, last)
-    return root, last
+def reduced(system: np.ndarray, start: np.ndarray, held: int) -> Root:
+    root = Root.empty(N, W, OWN + HELD)
+    eliminate(system.copy(), start, W, held, root)
+    return root
 
 
 def _signed(rows: np.ndarray, own: int) -> np.ndarray:
@@ -51,7 +49,7 @@ def _signed(rows: np.ndarray, own: int) -> np.ndarray:
 def test_what_fades_may_be_dropped(noise, fades) -> None:
     """With all but no noise of the velocity, the first state tells of all others to the end: nothing is dropped."""
     system, start = chain(noise)
-    whole, parted = reduced(eliminate, system, start), reduced(eliminate_fading, system, start, HELD)
+    whole, parted = reduced(system, start, 0), reduced(system, start, HELD)
     for expected, found, own in zip(whole, parted, (0, 2 * W), strict=True):
         scale = np.abs(expected).max(axis=-1, keepdims=True)
         np.testing.assert_allclose(_signed(found, own) / scale, _signed(expected, own) / scale, rtol=0.0, atol=1e-12)
@@ -62,7 +60,7 @@ def test_what_fades_may_be_dropped(noise, fades) -> None:
 def test_the_covariance_of_what_waits_is_kept() -> None:
     """R^T R of the coefficients and of the first state is that of the dense normal equations."""
     system, start = chain(0.1)
-    last = reduced(eliminate_fading, system, start, HELD)[1][:, 2 * W :]
+    last = reduced(system, start, HELD).coefficients[:, 2 * W :]
     p, size = OWN + HELD, N * W
     dense = np.zeros((len(system), size + p))
     for i in range(N):

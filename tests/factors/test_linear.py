@@ -11,7 +11,8 @@ from ballfg.factors.bridge import key_of, linear_graph
 from ballfg.factors.dynamics import ContactFactors, FlightFactors
 from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, _Point, _tried
 from ballfg.factors.linear.covariance import marginal_covariances
-from ballfg.factors.linear.step import Root, Step, solve, weighted
+from ballfg.factors.linear.elimination import Root
+from ballfg.factors.linear.step import Step, solve, weighted
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.factors.position import PositionFactors

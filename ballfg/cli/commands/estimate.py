@@ -1,4 +1,4 @@
-"""`ballfg estimate`: the states of every track of a dataset."""
+"""Implements `ballfg estimate`, which estimates the states of every track of a dataset."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def estimate(
 
 @dataclass(frozen=True)
 class _Estimated:
-    """What the table and the last lines need of an estimate: a tenth of it, to be sent between machines."""
+    """The parts of an estimate that the table and the last lines need: a tenth of it, for other processes."""
 
     name: str
     columns: list[dict[str, str | np.ndarray]]

@@ -1,4 +1,4 @@
-"""`ballfg import`: a user's own files to a dataset."""
+"""Implements `ballfg import`, which turns a user's own files into a dataset."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 _guess, _file = (partial(typer.Option, rich_help_panel=panel) for panel in ("Instead of a guess", "Files"))
 MOST_QUESTIONS = 8
-"""Questions on a terminal, after which something else is wrong."""
+"""Largest number of questions on a terminal; after more something else is wrong."""
 WIDTH = 160
-"""Characters of a line of the proposal, where no terminal tells."""
+"""Number of characters in a line of the proposal without a terminal."""
 
 
 def import_(
@@ -68,7 +68,7 @@ def import_(
 
 
 def _proposed(sources: list[Path], choices: Choices) -> Proposal:
-    """The proposal; on a terminal the user answers what is not safe to guess."""
+    """The proposal; on a terminal the user answers the unsafe guesses."""
     from ballfg.importing import UndecidedError, propose
 
     for _ in range(MOST_QUESTIONS):
@@ -85,7 +85,7 @@ def _answered(question: UndecidedError, choices: Choices) -> Choices:
     from ballfg.importing import parse_columns
 
     default = question.choices[0] if question.choices else None
-    with idle():  # who is asked may take time to answer
+    with idle():  # the user may take time to answer
         answer = typer.prompt(f"{question}\n--{question.option}", default=default, err=True)
     field = question.option.replace("-", "_")
     if field == "columns":

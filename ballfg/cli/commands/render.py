@@ -1,4 +1,4 @@
-"""`ballfg render`: synthetic videos of balls over a table, with the truth beside them."""
+"""Implements `ballfg render`, which films simulated balls over a table, with their true states."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def render(
 def _clocks(
     names: list[str], rate: float, seed: int, offsets: tuple[str, ...] | list[str], *, unsynchronised: bool
 ) -> dict[str, Clock]:
-    """Clocks by camera, from the command line's words."""
+    """Clocks by camera, from the options."""
     from dataclasses import replace
 
     from ballfg.simulation.scene import Clock, free_running

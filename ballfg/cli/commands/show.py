@@ -1,4 +1,4 @@
-"""`ballfg show`: measured shots, estimates, predictions and a diagnosis as a page to look at."""
+"""Implements `ballfg show`, which writes a page of shots, estimates, predictions and a diagnosis."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def show(
 
 
 def _dataset(folder: Path) -> Dataset | SightedDataset:
-    """The tracks of a folder; roughly triangulated ones where there are only detections."""
+    """The tracks of a folder; roughly triangulated ones if there are only detections."""
     from ballfg.tracks.dataset import has_positions, read_dataset
 
     if has_positions(folder):
@@ -91,7 +91,7 @@ def _check_outputs(out: Path | None, png: Path | None, rerun: Path | None) -> No
 
 
 def _write_picture(shown: Shown, png: Path) -> None:
-    """The first shot that is shown, for papers."""
+    """The first shot of the page, for papers."""
     from ballfg.pages.pictures import views
 
     if not shown.shots:

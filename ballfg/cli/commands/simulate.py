@@ -1,4 +1,4 @@
-"""`ballfg simulate`: synthetic tracks, with or without undeclared effects."""
+"""Implements `ballfg simulate`, which writes synthetic tracks, with or without undeclared effects."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def simulate(
 
 
 def _ball(name: str, model: Path | None) -> BallKind:
-    """The ball, with the model of a file in place of its own if there is one."""
+    """The ball, with the model of a file, if any, in place of its own."""
     from ballfg.dynamics import AnalyticModel, load_model
     from ballfg.simulation import ball_kind, with_model
 

@@ -1,8 +1,8 @@
-"""The linearised problem of all stretches, with the first states eliminated stretch by stretch.
+"""Eliminates the first states from the linearised problem, stretch by stretch.
 
-Common columns are those of everything that acts on all stretches: declared coefficients, launcher settings and
-candidate effects. The best first state absorbs a part of each column; the rest is its projected signature. Tests and
-fits need only the inner products of projected signatures, summed over each track.
+Common columns belong to unknowns that act on all stretches: declared coefficients, launcher settings and candidate
+effects. The best first state absorbs a part of each column; the rest is its projected signature. Tests and fits need
+only the inner products of projected signatures, summed over each track.
 """
 
 from dataclasses import dataclass
@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ballfg.arrays import Array, Index
+from ballfg.factors.linear.elimination import eliminate_each, padded
 from ballfg.state import STATE_DIM
 
 
@@ -28,8 +29,8 @@ class Eliminated:
     def common_step(self, precision: Array, pull: Array, low: Array, high: Array, damping: float = 0.0) -> Array:
         """(q,) best step of the common unknowns within limits.
 
-        An unknown whose step would pass its limit ends there, and the others are solved for beside it: a full step of
-        theirs would count on a move that does not happen.
+        An unknown whose step would pass its limit ends there, and the others are solved again with it fixed: their full
+        step would count on a change that does not happen.
 
         Args:
             precision: (q,) of the priors.
@@ -52,18 +53,18 @@ class Eliminated:
         return step
 
     def start_step(self, common: Array) -> Array:
-        """(n, 9) step of the first states that goes with a step (q,) of the common unknowns."""
+        """(n, 9) step of the first states that follows a step (q,) of the common unknowns."""
         return np.asarray(self.solved[..., -1] - self.solved[..., :-1] @ common)
 
 
 @dataclass(frozen=True)
 class System:
-    """Whitened rows of n stretches: m samples' coordinates and three of the spin each.
+    """Whitened rows of n stretches: m is the number of samples' coordinates plus three for the spin.
 
     Attributes:
         residual: (n, m) measured minus predicted.
         by_start: (n, m, 9) derivative of the prediction by the first state.
-        by_common: (n, m, q) derivative of the prediction by everything that all stretches share.
+        by_common: (n, m, q) derivative of the prediction by the unknowns that all stretches share.
     """
 
     residual: Array
@@ -77,29 +78,31 @@ class System:
 
     @property
     def start_information(self) -> Array:
-        """(n, 9, 9) information of the first states; one for a number that no row tells of, which so stays."""
+        """(n, 9, 9) information of the first states; one for an undetermined number, which so stays."""
         found, diagonal = self.by_start.swapaxes(-1, -2) @ self.by_start, np.arange(STATE_DIM)
         found[:, diagonal, diagonal] += found[:, diagonal, diagonal] == 0.0
         return np.asarray(found)
 
     def eliminated(self, damping: float = 0.0) -> Eliminated:
         """The first states solved for in terms of everything else; `damping` as in Levenberg-Marquardt."""
-        hessian, columns, diagonal = self.start_information, self.columns, np.arange(STATE_DIM)
-        hessian[:, diagonal, diagonal] *= 1.0 + damping
-        pulled = self.by_start.swapaxes(-1, -2) @ columns
-        solved = np.linalg.solve(hessian, pulled)
-        gram = columns.swapaxes(-1, -2) @ columns - pulled.swapaxes(-1, -2) @ solved
-        return Eliminated(np.asarray(solved), np.asarray(gram))
+        columns, diagonal = self.columns, np.arange(STATE_DIM)
+        n, m, end = *columns.shape[:2], STATE_DIM + columns.shape[-1]
+        rows, upper = np.zeros((n, m, padded(end))), np.zeros((n, STATE_DIM, padded(end)))
+        rows[..., :STATE_DIM], rows[..., STATE_DIM:end] = self.by_start, columns
+        squares = (self.by_start**2).sum(axis=1)
+        upper[:, diagonal, diagonal] = np.sqrt((squares == 0.0) + damping * np.where(squares == 0.0, 1.0, squares))
+        eliminate_each(rows, upper)
+        left = rows[..., STATE_DIM:end]
+        solved = np.linalg.solve(upper[..., :STATE_DIM], upper[..., STATE_DIM:end])
+        return Eliminated(np.asarray(solved), np.asarray(left.swapaxes(-1, -2) @ left))
 
     def start_correction(self, residual: Array) -> Array:
         """(n, 9) step of the first states alone against another residual (n, m), with the same derivatives."""
-        pulled = self.by_start.swapaxes(-1, -2) @ residual[..., None]
-        return np.asarray(np.linalg.solve(self.start_information, pulled)[..., 0])
+        return System(residual, self.by_start, self.by_common[..., :0]).eliminated().solved[..., 0]
 
     def projected(self) -> Array:
         """(n, m, q + 1) columns and residual with the part that first states absorb taken away."""
-        pulled = self.by_start.swapaxes(-1, -2) @ self.columns
-        return np.asarray(self.columns - self.by_start @ np.linalg.solve(self.start_information, pulled))
+        return np.asarray(self.columns - self.by_start @ self.eliminated().solved)
 
 
 def by_track(gram: Array, track: Index) -> Array:

@@ -1,6 +1,6 @@
-"""A fallback for patterns that no named effect explains: a description that predicts better, without a name.
+"""Describes a pattern that no named effect explains by a model that predicts better, without a name.
 
-A few generic terms come first, because people can read them. Only if they do not help, a network corrects the model.
+A few generic terms come first, because they are readable. Only if they do not help, a network corrects the model.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,19 +30,19 @@ from ballfg.progress import unwatched
 from ballfg.tracks import Dataset, Track, TrackNoise
 
 HELPS = 0.9
-"""A fallback must reduce the prediction error on the held-out half to this share of the error without it."""
+"""Ratio of the prediction errors on the held-out half with and without an accepted fallback."""
 OBSERVED = 0.4
-"""Share of a typical track that the estimates see in training; the network learns to predict the rest."""
+"""Observed share of a typical track in training; the network learns to predict the rest."""
 VALIDATES = 5
-"""One track of so many decides at which epoch the network is best."""
+"""One in this number of tracks selects the best epoch of the network."""
 LEAST_LEARNED = 10
-"""From fewer shots no network learns to predict others."""
+"""Least number of shots for the training of a network."""
 MOST_LEARNED = 20
-"""Tracks that a network learns from, evenly spread."""
+"""Largest number of tracks for the training, evenly spread."""
 EPOCHS = 30
 """Epochs of the training: half a minute."""
 POSITION_SCALE = 0.03
-"""m, prediction error beyond which a track's part in the loss grows only linearly, so that no few tracks dominate."""
+"""m, prediction error beyond which a track's loss grows only linearly, so that a few tracks cannot dominate."""
 
 
 def fallback(
@@ -57,9 +57,9 @@ def fallback(
 ) -> Fallback | None:
     """A description of the rest without a name; None if nothing predicts better.
 
-    The fit before and the tracks are those of the search half, the noise is what these show about it. The errors `now`,
-    of the model so far, and those that `evaluate` gives are those on the held-out half. With several `jobs` both kinds
-    are made at the same time; readable terms still come first.
+    The previous fit and the tracks are those of the search half, with their noise. The errors `now`, of the model so
+    far, and those from `evaluate` are those on the held-out half. With several `jobs` both kinds are computed in
+    parallel; readable terms still come first.
     """
     makers: list[Callable[[], tuple[BallModel, str] | None]] = [
         partial(_with_terms, before, embedding, noise, dataset, parts),
@@ -83,7 +83,7 @@ def _with_terms(
     dataset: Dataset,
     parts: Sequence[EvaluationTrack],
 ) -> tuple[AnalyticModel, str] | None:
-    """A model with a few generic terms, and them in words."""
+    """A model with a few generic terms, and their description."""
     terms = sparse_terms(before)
     if terms is None:
         return None
@@ -100,7 +100,7 @@ def _with_network(
     dataset: Dataset,
     parts: Sequence[EvaluationTrack],
 ) -> tuple[LearnedModel, str] | None:
-    """A model that a network corrects, and its size in words."""
+    """A model corrected by a network, and its size in words."""
     base = calibrated_model(before, embedding)
     base.noise = noise
     network = learned_residual(base, dataset, [p.track for p in spread_over(parts, len(parts), MOST_LEARNED)])
@@ -112,7 +112,7 @@ def _with_network(
 
 
 def describe(terms: SparseTerms, after: Fit) -> str:
-    """The terms with their fitted coefficients, those that explain most first."""
+    """The terms with their fitted coefficients, sorted by explained residual."""
     units = after.problem.model.declared_coefficients()
     values = {name: after.unknowns.values[name] for name in terms.estimates}
     return ", ".join(f"{name.split('.', 1)[1]} = {value:.3g} {units[name].unit}" for name, value in values.items())
@@ -151,8 +151,8 @@ def learned_residual(
 
 
 def _as_happened(base: AnalyticModel, dataset: Dataset, tracks: Sequence[Track]) -> tuple[list[Track], Settings]:
-    """Tracks with the model's measurement effects undone, where that is possible, and the settings for them."""
-    settings = replace(dataset_settings(dataset, base), coefficients={})  # the network makes up for them
+    """Tracks with the model's measurement effects undone, if possible, and the settings for them."""
+    settings = replace(dataset_settings(dataset, base), coefficients={})  # the network replaces them
     if base.measures_plainly:
         return list(tracks), settings
     through = InvertMeasurement(Smoother, base, dataset_surfaces(dataset), settings)
@@ -161,7 +161,7 @@ def _as_happened(base: AnalyticModel, dataset: Dataset, tracks: Sequence[Track])
 
 
 def _trained(trainee: EndToEnd, count: int, config: TrainConfig) -> bool:
-    """Whether the training came to its end."""
+    """True if the training was completed."""
     numbers = range(count)
     validation = tuple(numbers[VALIDATES - 1 :: VALIDATES])
     train = tuple(n for n in numbers if n not in validation)

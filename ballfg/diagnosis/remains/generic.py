@@ -1,8 +1,8 @@
-"""Tests for any pattern that is left, whatever its cause, and where it lives.
+"""Tests for remaining patterns of any cause, and locates them.
 
-Each block of patterns (module `patterns`) is tested as a candidate effect is: by the scores of its columns, with states
-and declared coefficients projected out and tracks as independent units. Of a large block only the directions that the
-data show best are tested; the residuals have no part in choosing them.
+Each block of patterns (module `patterns`) is tested like a candidate effect: by the scores of its columns, with states
+and declared coefficients projected out and tracks as independent units. Only the most visible directions of a large
+block are tested; their choice does not depend on the residuals.
 """
 
 from dataclasses import dataclass
@@ -28,18 +28,18 @@ from ballfg.diagnosis.search.signatures import signatures_of
 from ballfg.tracks import TrackNoise
 
 TRACKS_PER_DIRECTION = 4
-"""Tracks for each direction of a block that is tested: their scatter must tell the directions' covariance."""
+"""Number of tracks per tested direction of a block: their scatter must determine the directions' covariance."""
 LEAST_INFORMATION = 1.0
-"""Least information of a direction that is tested: its strength is known to the size of a pattern large in practice."""
+"""Least information of a tested direction: its strength is known to the size of a pattern large in practice."""
 MOST_SEEN = 95.0
-"""Percentile over the data that "up to" means."""
+"""Percentile over the data in the words "up to"."""
 
 
 @dataclass(frozen=True)
 class _Test:
     """One test of one fit; p-value not corrected for their number. `quantities` are those of a block, else none.
 
-    The ratio of the pattern's size to that at the start is its share.
+    The ratio of the pattern's size to the initial one is its share.
     """
 
     kind: str
@@ -50,12 +50,12 @@ class _Test:
 
 
 def generic_tests(fit: Fit, reference: Fit | None = None, tracker: TrackNoise | None = None) -> tuple[GenericTest, ...]:
-    """All tests of a fit, p-values corrected for their number.
+    """All tests of a fit, with p-values corrected for their number.
 
     Args:
         fit: of the model so far.
-        reference: the fit of the declared model, to which shares refer; None: `fit` itself.
-        tracker: noise of a tracker whose errors are not white, as found.
+        reference: the fit of the declared model, for shares; None: `fit` itself.
+        tracker: found noise of a tracker with errors that are not white.
     Returns: the tests, the least probable first.
     """
     tests = _tests_of(fit, tracker)
@@ -79,7 +79,7 @@ def _tests_of(fit: Fit, tracker: TrackNoise | None) -> list[_Test]:
 
 
 def _block_tests(fit: Fit, system: System, blocks: list[Block]) -> list[_Test]:
-    """Tests of all blocks that the data show at all."""
+    """Tests of all visible blocks."""
     signatures = signatures_of(fit, system, np.concatenate([block.columns for block in blocks], axis=-1))
     efficient = signatures.efficient()
     information, score, at = efficient.total, efficient.score.sum(axis=0), 0
@@ -94,7 +94,7 @@ def _block_tests(fit: Fit, system: System, blocks: list[Block]) -> list[_Test]:
             words = describe_drift(fit, block, strengths) if block.kind == DRIFT else where(block, strengths)
             seen.append((block, words))
             directions.append(turn)
-    noise = float((fit.noise.position**2).mean())  # shares are of residuals that are not whitened
+    noise = float((fit.noise.position**2).mean())  # shares use residuals that are not whitened
     return [
         _Test(block.kind, block.quantities, words, p.p_value, noise * max(0.0, p.explained - p.rank))
         for (block, words), p in zip(seen, pattern_tests(signatures, directions), strict=True)
@@ -102,7 +102,7 @@ def _block_tests(fit: Fit, system: System, blocks: list[Block]) -> list[_Test]:
 
 
 def _leading(information: Array, tracks: int, own: slice, count: int) -> Array:
-    """(count, r) the directions of a block's columns that the data show best, among all `count` columns."""
+    """(count, r) the most visible directions of a block's columns, among all `count` columns."""
     values, vectors = np.linalg.eigh(information)
     most = max(1, tracks // TRACKS_PER_DIRECTION)
     shown = np.flatnonzero(values >= LEAST_INFORMATION)[::-1][:most]

@@ -1,9 +1,9 @@
-"""Which spin labels contradict their flights, and with what probability.
+"""Finds the spin labels that contradict their flights, with probabilities.
 
-A label is right, with the error that it states, or wrong, with a far larger one. Both are compared with what its flight
-tells of the spin, the scatter of flight and bounces included. The share of wrong labels, the size of their errors, and
-by how much right labels err more than stated are unknown; all labels of the recording tell them together, and they are
-integrated out. So a label is wrong with a probability, and a single doubtful one among many that are right is no case.
+A label is right, with its stated error, or wrong, with a far larger one. Both are compared with the flight's spin,
+including the scatter of flight and bounces. The share of wrong labels, the size of their errors, and the excess of
+right labels' errors are unknown; all labels of the recording determine them together, and they are integrated out. So
+each label has a probability of being wrong, and a single doubtful one among many does not count.
 """
 
 from collections.abc import Sequence
@@ -23,15 +23,15 @@ from ballfg.tracks import TrackNoise
 LABEL: Final = "label"
 """Kind of the test."""
 NONE_WRONG: Final = 0.5
-"""Probability beforehand that all labels are right; else every share of wrong ones is as probable as any other."""
+"""Prior probability that all labels are right; else all shares of wrong ones are equally probable."""
 SHARES: Final = (np.arange(40) + 0.5) / 40
-"""Of wrong labels, each the middle of a fortieth."""
+"""Shares of wrong labels, the middles of fortieths."""
 RIGHT: Final = np.exp(np.linspace(0.0, 1.4, 8))
-"""Errors of right labels, as multiples of those stated: up to four times."""
+"""Errors of right labels, as multiples of the stated ones: up to four times."""
 RIGHT_SPREAD: Final = 0.7
 """Standard deviation of the logarithm of such a multiple: stated noise is known to a factor of two."""
 WRONG: Final = np.exp(np.linspace(-1.1, 1.1, 9))
-"""Errors of wrong labels beside those of right ones, as multiples of `wrong_error`: a third to three times."""
+"""Errors of wrong labels, as multiples of `wrong_error`: a third to three times."""
 
 
 def check_labels(
@@ -42,15 +42,15 @@ def check_labels(
     *,
     jobs: int = 1,
 ) -> LabelCheck | None:
-    """Judge all spin labels of a dataset.
+    """Computes the verdicts on all spin labels of a dataset.
 
     Args:
         model: corrected by the diagnosis, fitted to the tracks.
-        declared: before.
-        holdout: the tracks, those of both halves.
-        tracker: memory of the tracker and jitter of the stamps, if they were found.
+        declared: the model before the diagnosis.
+        holdout: the tracks of both halves.
+        tracker: memory of the tracker and jitter of the stamps, if found.
         jobs: processes.
-    Returns: None where there is no label.
+    Returns: None without labels.
     """
     return judged(label_evidence(model, declared, holdout, tracker, jobs=jobs))
 
@@ -63,7 +63,7 @@ def label_evidence(
     *,
     jobs: int = 1,
 ) -> list[LabelledFlight]:
-    """The labels beside what their flights tell of the spin. Args: as `check_labels`."""
+    """The labels with the spins of their flights. Args: as `check_labels`."""
     parts = (*holdout.search_tracks, *holdout.held_out_tracks)
     tracks = sorted((p for p in parts if p.track.spin_label is not None), key=lambda p: p.track.name)
     if not tracks:
@@ -73,7 +73,7 @@ def label_evidence(
 
 
 def judged(flights: Sequence[LabelledFlight]) -> LabelCheck | None:
-    """What is said of labels beside their flights; None where there are none."""
+    """The verdicts on labels with their flights; None without labels."""
     if not flights:
         return None
     right = np.stack([f.right.log_densities(RIGHT * f.right.error) for f in flights])
@@ -87,14 +87,14 @@ def judged(flights: Sequence[LabelledFlight]) -> LabelCheck | None:
 
 
 def label_test(check: LabelCheck, before: LabelCheck | None = None) -> GenericTest:
-    """The check as a test; before: of the declared model, to which the share of contradicted labels refers."""
+    """The check as a test; before: of the declared model, for the share of contradicted labels."""
     now = len(check.contradicted)
     whole = now if before is None else max(now, len(before.contradicted))
     return GenericTest(LABEL, check.where, check.p_all_right, now / whole if whole else 0.0)
 
 
 def _errors_of_wrong(flight: LabelledFlight) -> Array:
-    """(r w,) rad/s, errors of a label that is wrong, for each error of right ones."""
+    """(r w,) rad/s, errors of a wrong label, for each error of right ones."""
     total = np.hypot(RIGHT[:, None] * flight.right.error, WRONG * flight.wrong.error)
     return np.asarray(total.ravel())
 

@@ -1,10 +1,10 @@
-"""How probable a spin label is after its flight, by the errors that the label may have.
+"""Computes the probability of a spin label given its flight, for several sizes of the label's error.
 
 The smoother gives the spin at the first sample with the covariance of its process noise: flight and bounces scatter,
-and so does the spin that a flight shows. The density of a label given the samples is a ratio of two marginal
-likelihoods, that of samples and label and that of the samples alone, each by Laplace's approximation. The second is
-the same for all errors of the label, so that it drops out. One minimum lies near the label and holds where the label is
-right, one holds where it may be wrong: a ball that slides in a bounce and one that grips are two minima.
+and so does the spin estimated from a flight. The density of a label given the samples is a ratio of two marginal
+likelihoods, that of samples and label and that of the samples alone, each by Laplace's approximation. The second is the
+same for all errors of the label, so that it drops out. A minimum near the label is valid if the label is right, another
+one if it may be wrong: sliding and gripping bounces have different minima.
 """
 
 from collections.abc import Sequence
@@ -34,12 +34,12 @@ MINIMA = (Convergence.CONVERGED, Convergence.AT_KINK)
 
 @dataclass(frozen=True)
 class LabelPosterior:
-    """Spin at the first sample after a label with an error of a given size.
+    """Spin at the first sample given a label with an error of a given size.
 
     Attributes:
         label: (3,) rad/s.
         error: rad/s, standard deviation per axis of the label's error.
-        log_density: of the label given the samples, up to a constant that is the track's.
+        log_density: of the label given the samples, up to a constant of the track.
         mean: (3,) rad/s.
         covariance: (3, 3) of it.
     """
@@ -51,10 +51,10 @@ class LabelPosterior:
     covariance: Array
 
     def log_densities(self, errors: Array) -> Array:
-        """Log densities (k,) of the label for other errors (k,) rad/s, the flight's likelihood taken as Gaussian."""
+        """Log densities (k,) of the label for other errors (k,) rad/s, with a Gaussian likelihood of the flight."""
         information = np.linalg.inv(self.covariance) - np.eye(3) / self.error**2
         values, axes = np.linalg.eigh(information)
-        variances = 1.0 / np.maximum(values, UNINFORMATIVE_SPIN**-2)  # of the spin that the samples alone show
+        variances = 1.0 / np.maximum(values, UNINFORMATIVE_SPIN**-2)  # of the spin from the samples alone
         towards = axes.T @ (self.mean - self.label)
         away = (1.0 + variances / self.error**2) * towards  # from the label to that spin: the label has pulled
 
@@ -71,7 +71,7 @@ class LabelPosterior:
 
     @property
     def off_sigma(self) -> float:
-        """rad/s, standard deviation of the spin along the way from it to the label."""
+        """rad/s, standard deviation of the spin along the direction to the label."""
         way = self.label - self.mean
         return float(np.sqrt(way @ self.covariance @ way) / max(np.linalg.norm(way), np.finfo(float).tiny))
 
@@ -82,8 +82,8 @@ class LabelledFlight:
 
     Attributes:
         name: of the track.
-        right: the spin where the label errs as it states.
-        wrong: the spin where the label may err by far more.
+        right: the spin, if the label has its stated error.
+        wrong: the spin, if the label may have a far larger error.
     """
 
     name: str
@@ -92,9 +92,9 @@ class LabelledFlight:
 
 
 def wrong_error(labels: Array, least: float) -> float:
-    """rad/s, standard deviation per axis of the error of a wrong label: it belongs to another shot of the labels.
+    """rad/s, standard deviation per axis of a wrong label's error, as if it belonged to another shot.
 
-    Args: labels: (n, 3) rad/s.  least: rad/s, of labels that are all alike.
+    Args: labels: (n, 3) rad/s.  least: rad/s, for labels that are all alike.
     """
     usual = np.median((labels**2).sum(axis=-1)) / MEDIAN_CHI_SQUARE
     return max(float(np.sqrt(2.0 * usual)), least)
@@ -107,12 +107,12 @@ MEDIAN_CHI_SQUARE = 2.366
 def labelled_flights(
     model: AnalyticModel, surfaces: Surfaces, settings: Settings, tracks: Sequence[EvaluationTrack], jobs: int = 1
 ) -> list[LabelledFlight]:
-    """The labels of tracks beside their flights; tracks whose minimum is not found are left out.
+    """The labels of tracks with their flights; tracks without a minimum are left out.
 
     Args:
         model: of the ball.
-        surfaces: where it bounces.
-        settings: process noise, and the standard deviation of labels that are right.
+        surfaces: table and floor.
+        settings: process noise, and the standard deviation of right labels.
         tracks: with spin labels.
         jobs: processes.
     """
@@ -150,14 +150,14 @@ def _labelled_flight(
 
 
 def _from_label(problem: TrackProblem, flight: Solution) -> Values:
-    """Values to start from with the label's spin, at the contacts of a solution."""
+    """Initial values with the label's spin, at the contacts of a solution."""
     label = problem.settings.spin_label(problem.track)
     events = flight.events
     return problem.start(initial_states(problem.track, events.contacts, events.segmentation, problem.model, label))
 
 
 def _lowest(optimizer: LevenbergMarquardt, graph: BallGraph, starts: Sequence[Values]) -> Minimum | None:
-    """The lowest point of a graph that some starts lead to; None where that is no minimum."""
+    """The lowest minimum of a graph from some starts; None if the lowest point is no minimum."""
     lowest = min((optimizer.minimize(graph, start) for start in starts), key=lambda found: found.error)
     return lowest if lowest.convergence in MINIMA and lowest.step is not None else None
 

@@ -1,8 +1,8 @@
-"""The ball by which spin labels are judged: its coefficients are fitted with the scatter of flight and bounces.
+"""Fits the ball's coefficients with scatter of flight and bounces, for the verdicts on spin labels.
 
-The diagnosis' own fit flies deterministically. Where real bounces scatter, it bends coefficients and spins to follow
-them, and right labels then seem wrong. Here each track is smoothed with process noise, and the coefficients are the
-mean of a population of tracks. The noise about that model comes from forecasts, as it does for predictions.
+The diagnosis' own fit flies deterministically. If real bounces scatter, it adapts coefficients and spins to them, and
+right labels then seem wrong. Here each track is smoothed with process noise, and the coefficients are the mean of a
+population of tracks. The noise about that model comes from forecasts, as for predictions.
 """
 
 from collections.abc import Sequence
@@ -22,9 +22,9 @@ from ballfg.learning.calibration.population import Evidence, evidence, fit_popul
 from ballfg.tracks import TrackNoise
 
 MOST_ROUNDS = 5
-"""Fits of the population; three are usual, from coefficients far off."""
+"""Largest number of fits of the population; usual are three, from coefficients far off."""
 SETTLED = 0.1
-"""Standard errors by which the population's mean may still move when it is taken as found."""
+"""Change of the population's mean, in standard errors, below which it has converged."""
 
 
 def scattering_model(
@@ -36,15 +36,15 @@ def scattering_model(
     *,
     jobs: int = 1,
 ) -> tuple[AnalyticModel, Settings]:
-    """A corrected model with its coefficients fitted anew, and the settings that predict with it.
+    """A corrected model with refitted coefficients, and the settings for predictions with it.
 
     Args:
-        model: as the diagnosis corrected it.
-        declared: before. Its coefficients of flight and bounce are fitted anew, about its values; effects that were
-            added and values that differ between tracks stay.
+        model: from the diagnosis.
+        declared: the model before. Its coefficients of flight and bounce are refitted, about its values; added effects
+            and values that differ between tracks stay.
         tracks: with spin labels.
-        holdout: of which they are.
-        tracker: memory of the tracker and jitter of the stamps, if they were found.
+        holdout: with these tracks.
+        tracker: memory of the tracker and jitter of the stamps, if found.
         jobs: processes.
     """
     plain = with_effects(model)
@@ -57,7 +57,7 @@ def scattering_model(
         plain = _of_population(plain, declared, names, tracks, holdout, usual, jobs)
     plain.noise = noise_about(plain, tracks, holdout.dataset, tracker, jobs=jobs)
     settings = dataset_settings(holdout.dataset, plain)
-    # what tracks show of the labels' error holds wrong labels too: right ones err as the dataset states
+    # the labels' estimated error includes wrong labels: right ones have the dataset's error
     return plain, replace(settings, spin_label_noise=usual.spin_label_noise)
 
 
@@ -88,7 +88,7 @@ def _of_population(
 
 
 def _told(estimate: Estimate, names: Sequence[str], mean: Array, sigma: Array) -> Evidence:
-    """What one track tells of the named coefficients, without their prior (p,), (p,)."""
+    """Information of one track on the named coefficients, without their prior: (p,), (p,)."""
     columns = [estimate.coefficient_names.index(name) for name in names]
     covariance = estimate.coefficient_covariance[np.ix_(columns, columns)]
     return evidence(estimate.coefficients[columns], covariance, mean, sigma)

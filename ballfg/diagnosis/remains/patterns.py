@@ -1,8 +1,8 @@
-"""Blocks of patterns without a name: a force, a kick or an error of position that depends on a group of quantities.
+"""Builds blocks of unnamed patterns: a force, a kick or a position error that depends on some quantities.
 
-A block has one column for every quantity (centred, in units of its scatter over the data) along every axis: the change
-of the samples that such a pattern makes. Quantities and axes are named in words. One more block is that of declared
-coefficients which change over a recording.
+A block has one column for every quantity (centred, in units of its scatter over the data) along every axis: the
+response of the samples to such a pattern. Quantities and axes are named in words. A further block holds declared
+coefficients that change over a recording.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Names = tuple[str, ...]
 WORLD = ("along x", "along y", "vertically")
 OWN = ("along the flight", "across the flight", "along the lift")
 EVERYWHERE = "everywhere"
-"""The quantity that is the same everywhere."""
+"""The constant quantity."""
 PLACE = ("place along x", "place along y", "height")
 SPINS = ("spin about the flight", "topspin", "sidespin")
 
@@ -46,7 +46,7 @@ MEASUREMENT = (PLACE, ("velocity along x", "velocity along y", "vertical velocit
 DRIFT = "recording"
 """Kind of the block of drift over a recording, as in reports."""
 LEAST_SCATTER = 1e-6
-"""In the unit of a quantity. Less is rounding: all tracks have the same of it."""
+"""In the unit of a quantity. Smaller scatter is rounding: all tracks have the same value."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Block:
         kind: `flight`, `contact`, `measurement` or `recording`.
         quantities: (f,) in words.
         axes: (a,) in words.
-        values: (m, f) of the quantities at the places where the pattern acts.
+        values: (m, f) of the quantities where the pattern acts.
         columns: (n, 3 k + 3, a f) whitened responses of the samples.
     """
 
@@ -69,7 +69,7 @@ class Block:
 
 
 def blocks_of(fit: Fit) -> list[Block]:
-    """All blocks of a fit; those of contacts only where there are contacts."""
+    """All blocks of a fit; those of contacts only if there are contacts."""
     path = fitted_path(fit)
     arcs = list(responses(fit, path))
     after = [arc for arc in arcs if arc.number]
@@ -188,7 +188,7 @@ def drift_block(fit: Fit, system: System) -> Block | None:
     other, though none of them shows a pattern of its own.
 
     Args: system: of the fit, linearised at its minimum.
-    Returns: None if there is nothing free, or one track only.
+    Returns: None without free coefficients, or with one track only.
     """
     free = {name: c for name, c in fit.problem.free.items() if name not in fit.problem.deviations}
     number = fit.problem.stretches.track.astype(np.float64)
@@ -202,7 +202,7 @@ def drift_block(fit: Fit, system: System) -> Block | None:
 
 
 def describe_drift(fit: Fit, block: Block, strengths: Array) -> str:
-    """The coefficient that changes most and its values, in words; strengths: (1, f) of the block's columns."""
+    """The coefficient with the largest change and its values, in words; strengths: (1, f) of the block's columns."""
     most = int(np.argmax(np.abs(strengths[0])))
     name, coefficient = block.quantities[most], fit.problem.free[block.quantities[most]]
     change = np.array((-1.0, 1.0)) * strengths[0, most] * coefficient.sigma

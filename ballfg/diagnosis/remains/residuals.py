@@ -1,7 +1,7 @@
-"""Residuals of a fit, in three kinds: accelerations in flight, kicks at contacts, errors of the measured positions.
+"""Computes the residuals of a fit: accelerations in flight, kicks at contacts, errors of measured positions.
 
-The first two are those that a smoother would find: free accelerations in short bins and free kicks after contacts, all
-estimated at once with the first state of their stretch, under the priors of a white process noise.
+The first two are like a smoother's: free accelerations in short bins and free kicks after contacts, all estimated
+together with the first state of their stretch, under the priors of a white process noise.
 """
 
 from collections import defaultdict
@@ -17,10 +17,10 @@ from ballfg.diagnosis.result import ContactResiduals, FlightResiduals, Measureme
 from ballfg.state import STATE_DIM
 
 BIN = 0.04
-"""s, about how long an acceleration stays the same: a bin never reaches across a contact."""
+"""s, approximate duration of a constant acceleration: no bin extends across a contact."""
 ACCELERATION = 0.6
-"""m/s^2/sqrt(Hz), density of the white acceleration that a bin may hold: 3 m/s^2 over 40 ms. A steady force then
-appears damped by a sixth to a third on arcs of 0.3 s. A wider prior damps less and shows more noise."""
+"""m/s^2/sqrt(Hz), prior density of a bin's white acceleration: 3 m/s^2 over 40 ms. A steady force then appears damped
+by a sixth to a third on arcs of 0.3 s. A wider prior damps less and shows more noise."""
 CONTACT_VELOCITY, CONTACT_SPIN = 0.2, 20.0
 """m/s and rad/s, priors of the kicks after a contact, per axis."""
 
@@ -101,7 +101,7 @@ def _pieces(fit: Fit, arc: ArcResponse) -> list[_Piece]:
 
 
 def _posterior(residual: Array, by_start: Array, pieces: list[_Piece]) -> tuple[Array, Array]:
-    """Posterior mean (d,) and covariance (d, d) of all kicks of a stretch, its first state adapting."""
+    """Posterior mean (d,) and covariance (d, d) of all kicks of a stretch, with a free first state."""
     columns = np.concatenate([by_start, *(piece.columns for piece in pieces)], axis=1)
     sigma = np.concatenate([piece.sigma for piece in pieces])
     precision = columns.T @ columns + np.diag(np.concatenate((np.zeros(STATE_DIM), sigma**-2)))

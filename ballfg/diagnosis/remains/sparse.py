@@ -1,7 +1,7 @@
-"""A sparse regression over generic terms: a few terms, chosen one by one, that describe an effect without a name.
+"""Chooses a few generic terms by sparse regression that describe an effect without a name.
 
-Forward selection on projected Gram matrices: each step takes the term that explains most beside those chosen, until
-none is worth its penalty. Terms that later ones made superfluous are then dropped. Source: J. Chen and Z. Chen 2008,
+Forward selection on projected Gram matrices: each step takes the term with the largest additional gain, until none
+exceeds its penalty. Terms that later ones made superfluous are then dropped. Source: J. Chen and Z. Chen 2008,
 "Extended Bayesian information criteria for model selection with large model spaces", with gamma = 1.
 """
 
@@ -19,9 +19,9 @@ from ballfg.diagnosis.search.signatures import hypothesis_signatures
 from ballfg.dynamics.effects.registry import GENERIC
 
 MOST_TERMS = 12
-"""More terms describe noise, and nobody reads them."""
+"""Largest number of terms; more describe noise, and are unreadable."""
 LEAST_LEFT = 1e-6
-"""Share of a term's information that must be its own beside the terms chosen before."""
+"""Least share of a term's information that is independent of the earlier terms."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class SparseTerms:
     """Chosen terms.
 
     Attributes:
-        hypotheses: the generic effects that hold them, their strengths the chosen terms only.
+        hypotheses: the generic effects of these terms, with the chosen terms as strengths.
         estimates: one-step coefficients by parameter name.
         explained: squared whitened residual that they would explain together.
     """
@@ -43,7 +43,7 @@ def sparse_terms(before: Fit) -> SparseTerms | None:
     """The generic terms that a fit lacks.
 
     Args: before: the fit so far.
-    Returns: the terms; None where none is worth its penalty.
+    Returns: the terms; None if none exceeds its penalty.
     """
     library = _library(before)
     found, _ = hypothesis_signatures(before, library)
@@ -64,7 +64,7 @@ def sparse_terms(before: Fit) -> SparseTerms | None:
 
 
 def fit_with_terms(before: Fit, terms: SparseTerms) -> Fit:
-    """The joint fit with the terms in the model, at the noise of the fit before."""
+    """The joint fit with the terms in the model, at the noise of the previous fit."""
     problem = before.problem
     for hypothesis in terms.hypotheses:
         problem = with_hypothesis(problem, hypothesis)
@@ -75,9 +75,9 @@ def fit_with_terms(before: Fit, terms: SparseTerms) -> Fit:
 
 
 def select(information: Array, score: Array, penalty: float) -> list[int]:
-    """Indices of the terms worth their penalty, in the order chosen, from information (p, p) and score (p,).
+    """Indices of the terms above their penalty, in the order of choice, from information (p, p) and score (p,).
 
-    Args: penalty: least that a term must explain, as twice a log likelihood.
+    Args: penalty: least gain of a term, as twice a log likelihood.
     """
     chosen: list[int] = []
     while len(chosen) < MOST_TERMS:
@@ -90,7 +90,7 @@ def select(information: Array, score: Array, penalty: float) -> list[int]:
 
 
 def _gains(information: Array, score: Array, chosen: list[int]) -> Array:
-    """(p,) squared residual that each further term would explain beside those chosen; zero for the chosen ones."""
+    """(p,) squared residual that each further term would explain beside the chosen ones; zero for these."""
     across = information[:, chosen]
     solved = np.linalg.solve(information[np.ix_(chosen, chosen)], across.T) if chosen else np.zeros((0, len(score)))
     left = score - solved.T @ score[chosen]
@@ -100,7 +100,7 @@ def _gains(information: Array, score: Array, chosen: list[int]) -> Array:
 
 
 def _pruned(information: Array, score: Array, penalty: float, chosen: list[int]) -> list[int]:
-    """The chosen terms less those without which the others explain nearly as much."""
+    """The chosen terms without those that the others nearly replace."""
     while chosen:
         inverse = np.linalg.inv(information[np.ix_(chosen, chosen)])
         loss = (inverse @ score[chosen]) ** 2 / np.diagonal(inverse)
@@ -112,7 +112,7 @@ def _pruned(information: Array, score: Array, penalty: float, chosen: list[int])
 
 
 def _library(before: Fit) -> list[Hypothesis]:
-    """All generic terms about the middle of the data; those of contacts only where there are contacts."""
+    """All generic terms about the middle of the data; those of contacts only if there are contacts."""
     stretches = before.problem.stretches
     positions = stretches.positions.numpy()[stretches.used.numpy()]
     middle = dict(zip(("center_x", "center_y", "center_z"), np.median(positions, axis=0).tolist(), strict=True))

@@ -1,7 +1,7 @@
-"""Memory of the tracker and jitter of the stamps as findings, once the effects have been found.
+"""Reports memory of the tracker and jitter of the stamps as findings, after the search for effects.
 
-A memory would take up any effect that bends flights slowly, so effects are searched first. What they leave is asked
-for errors that last from sample to sample and for stamps that err, by both halves of the tracks.
+A memory would absorb any effect that bends flights slowly, so effects are searched first. The remaining errors are then
+tested for memory and jitter, on both halves of the tracks.
 """
 
 from collections.abc import Sequence
@@ -18,9 +18,9 @@ from ballfg.estimation.noise.tracker import JITTER, MEMORY, NUMBERS, TrackerPart
 from ballfg.tracks import Track, TrackNoise
 
 MOST_TRACKS = 25
-"""Tracks of each half that are asked, evenly spread."""
+"""Number of tested tracks of each half, evenly spread."""
 LONGEST_PART, MOST_SAMPLES = 1.0, 100
-"""s and samples of a track that are asked: computing time grows with them."""
+"""s and samples of a tested track: computing time grows with them."""
 SENTENCES = {
     MEMORY: "The tracker's errors last from sample to sample: a part of them fades over the memory's time.",
     JITTER: "Stamps err: each sample was taken a little before or after the moment that is written.",
@@ -35,9 +35,9 @@ UNITS = {MEMORY: "m", JITTER: "s"}
 
 @dataclass(frozen=True)
 class Tracker:
-    """What tracks show of their tracker: findings, and the noise of its samples where that is not white.
+    """Findings on the tracker, and the noise of its samples if that is not white.
 
-    The noise has a memory and jitter that are declared, too.
+    The noise includes declared memory and jitter.
     """
 
     findings: tuple[Finding, ...] = ()
@@ -45,7 +45,7 @@ class Tracker:
 
 
 def look_at_tracker(model: AnalyticModel, holdout: Holdout, jobs: int = 1) -> Tracker:
-    """The memory and jitter that both halves show beside a corrected model.
+    """The memory and jitter in both halves beside a corrected model.
 
     Args: model: with its noise about the tracks.  holdout: the halves.  jobs: processes.
     """

@@ -1,11 +1,11 @@
-"""A test of whiteness along the tracks: neighbouring samples err alike where the motion differs from the model.
+"""Tests for whiteness along the tracks: neighbouring errors correlate if the motion differs from the model.
 
-Residuals of a good fit are not white themselves: r = M e, with white noise e and the projection M that the fit leaves.
-For a kernel W over pairs of different samples, U = r'(W + c) r over the stretch's own mean square, with c = -tr(M W) /
-tr(M), has mean zero whatever the scale of the noise on that stretch, and cumulants that are traces of powers of
-M (W + c). The sum of U over stretches is compared with the gamma distribution of the same first three cumulants.
+Residuals of a good fit are not white themselves: r = M e, with white noise e and the projection M of the fit. For a
+kernel W over pairs of different samples, U = r'(W + c) r over the stretch's own mean square, with c = -tr(M W) / tr(M),
+has mean zero whatever the scale of the noise on that stretch, and cumulants that are traces of powers of M (W + c). The
+sum of U over stretches is compared with the gamma distribution of the same first three cumulants.
 
-Errors of a tracker whose memory or jitter is known are whitened by their covariance first.
+Errors of a tracker with known memory or jitter are whitened by their covariance first.
 """
 
 from dataclasses import dataclass
@@ -19,11 +19,11 @@ from ballfg.diagnosis.fit.system import System
 from ballfg.tracks import TrackNoise
 
 REACHES = (0.02, 0.06, 0.18)
-"""s. Widths of the Gaussian kernels in the time between two samples: from the size of a contact to that of an arc."""
+"""s. Widths of the Gaussian kernels in the time between two samples: from a contact's duration to an arc's."""
 LEAST_WEIGHT = 0.5
-"""Samples of a smaller robust weight are outliers: their products say nothing about drift."""
+"""Samples with a smaller robust weight are outliers: their products carry no information on drift."""
 LEAST_FREEDOM = 1e-6
-"""Residuals that a fit leaves free in a stretch; one whose samples are all outliers has none."""
+"""Least degrees of freedom of a stretch; one whose samples are all outliers has none."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class Whiteness:
 
     Attributes:
         p_value: one-sided, corrected for the number of reaches.
-        reach: s, of the kernel that shows most.
-        drift: m, root of the mean product of the errors of such pairs: the part that neighbouring samples share.
+        reach: s, of the most significant kernel.
+        drift: m, root of the mean product of such pairs' errors: the common part of neighbouring samples.
         explained: for each reach, the sum of U.
         spread: for each reach, the standard deviation of that sum without drift.
     """
@@ -56,12 +56,12 @@ def whiteness(fit: Fit, system: System, tracker: TrackNoise | None = None) -> Wh
     Args:
         fit: at its minimum.
         system: of the fit, linearised there.
-        tracker: white noise, memory and jitter where the tracker has any; None: errors are taken to be white.
+        tracker: white noise, memory and jitter of the tracker; None: errors are assumed white.
     """
     stretches = fit.problem.stretches
     n, k = stretches.times.shape
     kept = stretches.used.numpy() & (fit.robust.samples >= LEAST_WEIGHT)
-    rows = np.ones(system.residual.shape)  # without outliers, which pull at the fit a little and would look like drift
+    rows = np.ones(system.residual.shape)  # without outliers, whose pull on the fit would look like drift
     rows[:, : 3 * k] = np.repeat(kept, 3, axis=1)
     system = System(system.residual * rows, system.by_start * rows[..., None], system.by_common * rows[..., None])
     if tracker is not None:
@@ -91,14 +91,14 @@ def whiteness(fit: Fit, system: System, tracker: TrackNoise | None = None) -> Wh
 
 
 def _p_value(total: float, variance: float, third: float) -> float:
-    """That sums as large as this come by chance; 1 where the fit has taken up all that could scatter."""
+    """Probability of sums this large by chance; 1 if the fit has absorbed all scatter."""
     if not variance > 0.0:
         return 1.0
     return float(stats.pearson3.sf(total / np.sqrt(variance), third / variance**1.5))
 
 
 def _whitened(fit: Fit, system: System, kept: Mask, tracker: TrackNoise) -> System:
-    """The rows of positions turned and scaled so that the errors of a tracker with a memory and jitter are white."""
+    """The rows of positions, transformed so that the errors of a tracker with memory and jitter are white."""
     stretches = fit.problem.stretches
     (n, k), times = stretches.times.shape, stretches.times.numpy()
     stated = stretches.sigmas.numpy()
@@ -127,7 +127,7 @@ def _whitened(fit: Fit, system: System, kept: Mask, tracker: TrackNoise) -> Syst
 
 
 def _velocities(fit: Fit) -> Array:
-    """(n, k, 3) m/s from one predicted sample to the next; zero where there is none."""
+    """(n, k, 3) m/s from one predicted sample to the next; zero for padding."""
     steps = np.diff(fit.problem.stretches.times.numpy(), axis=1)[..., None]
     moved = np.diff(fit.predicted.positions, axis=1)
     velocities = np.where(steps > 0.0, moved / np.where(steps > 0.0, steps, 1.0), 0.0)
@@ -135,7 +135,7 @@ def _velocities(fit: Fit) -> Array:
 
 
 def _common_step(fit: Fit, system: System) -> Array:
-    """(q,) by how much the unknowns that all stretches share move under the weights of another system."""
+    """(q,) change of the shared unknowns under the weights of another system."""
     problem, values = fit.problem, np.array([fit.unknowns.values[name] for name in fit.problem.free])
     away = np.concatenate((problem.centres - values, -fit.unknowns.launcher.ravel()))
     free = np.full(len(away), np.inf)
@@ -145,7 +145,7 @@ def _common_step(fit: Fit, system: System) -> Array:
 def _summed(residual: Array, taken: Array, kept: Mask, kernel: Array) -> tuple[float, float, float]:
     """Sum of U over stretches, its variance and third cumulant without drift, from residuals (n, k, 3).
 
-    Args: taken: (n, k, 3, d) directions that the fit takes up.  kept: (n, k) samples that count.  kernel: (n, k, k).
+    Args: taken: (n, k, 3, d) directions that the fit absorbs.  kept: (n, k) samples that count.  kernel: (n, k, k).
     """
     freedom = 3.0 * kept.sum(axis=1) - (taken**2).sum(axis=(1, 2, 3))
     tells = freedom > LEAST_FREEDOM
@@ -179,11 +179,11 @@ def _trace(matrices: Array) -> Array:
 
 
 def _absorbed(fit: Fit, system: System, shared: Array) -> Array:
-    """(n, 3 k, 9 + q) directions of the samples' noise that the fit takes up, of unit length over all rows.
+    """(n, 3 k, 9 + q) directions of the samples' noise that the fit absorbs, of unit length over all rows.
 
-    First states take theirs in each stretch; what all stretches share takes a part of unit length over all of them.
+    First states absorb theirs in each stretch; shared unknowns absorb directions of unit length over all of them.
 
-    Args: shared: (n, m, q) columns of what all share, first states projected out.
+    Args: shared: (n, m, q) columns of the shared unknowns, first states projected out.
     """
     own, _ = np.linalg.qr(system.by_start)
     precision = (shared.swapaxes(-1, -2) @ shared).sum(axis=0) + np.diag(fit.problem.common_precision)

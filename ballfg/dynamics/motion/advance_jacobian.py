@@ -1,4 +1,4 @@
-"""Motion with events of one ball, with its Jacobian: what a filter's prediction and a belief's propagation need."""
+"""Moves one ball through events with its Jacobian, for a filter's prediction and a belief's propagation."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -8,8 +8,8 @@ from torch import Tensor
 
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import contact_time, fly_through_jacobian
-from ballfg.dynamics.motion.integrate import batch_jacobian, fly_jacobian, step_count
-from ballfg.dynamics.motion.limits import LONGEST_MOTION, MAX_CONTACTS, REST_SPEED
+from ballfg.dynamics.motion.integrate import batch_jacobian, fly_jacobian
+from ballfg.dynamics.motion.limits import LONGEST_MOTION, MAX_CONTACTS, REST_SPEED, step_count
 from ballfg.dynamics.motion.rollout import advance, next_surface, roll, stays
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import VZ
@@ -22,7 +22,7 @@ class Motion:
     Attributes:
         after: (1, d) the state at the end.
         jacobian: (d, d) its derivative by the state at the start, at fixed duration.
-        contacts: time since the start, s, and the surface's height, m, of each bounce; landing for good is none.
+        contacts: time since the start, s, and the surface's height, m, of each bounce; a final landing does not count.
     """
 
     after: Tensor
@@ -47,7 +47,7 @@ def advance_jacobian(model: BallModel, state: Tensor, dt: float, surfaces: Surfa
 def _advance_step(model: BallModel, start: Tensor, h: float, surfaces: Surfaces) -> Motion:
     """One step of at most `integrate.MAX_STEP`, cut at its contacts, by the rules of `rollout`."""
     state, height = start, surfaces.level_below(start)
-    # the look at the vertical speed spares most states the rest of it
+    # a check of the vertical speed first: most states need no more
     if abs(float(state[0, VZ])) <= REST_SPEED and bool(stays(model, state, height, surfaces)):
         after, jacobian = batch_jacobian(lambda at: roll(model, at, at.new_tensor([h]), height), state)
         return Motion(after, jacobian[0], ())
@@ -73,6 +73,6 @@ def _advance_step(model: BallModel, start: Tensor, h: float, surfaces: Surfaces)
 
 
 def _advanced(model: BallModel, h: float, surfaces: Surfaces, state: Tensor) -> Tensor:
-    """`advance` on a batch with further leading dimensions: coming to rest is rare enough for plain autograd."""
+    """`advance` on a batch with further leading dimensions, by plain autograd: balls rarely come to rest."""
     flat = state.reshape(-1, state.shape[-1])
     return advance(model, flat, torch.full_like(flat[:, 0], h), surfaces).reshape(state.shape)

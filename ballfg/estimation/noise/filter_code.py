@@ -1,4 +1,4 @@
-"""Machine code of a Kalman filter over linearised tracks."""
+"""Filters linearised tracks by a Kalman filter in machine code."""
 
 import math
 
@@ -10,17 +10,17 @@ from ballfg.estimation.noise.transition_code import invert_root, is_something, m
 from ballfg.state import STATE_DIM
 
 NEXT_FROM = 3
-"""Samples that determine a state; the marginal likelihood counts those after them."""
+"""Number of samples that determine a state; the marginal likelihood counts the later ones."""
 GATE = 30.0
 """Squared whitened innovation of three coordinates; beyond it, one in a million, a sample does not update."""
 NEXT_TAIL = 4.0
 """Standard deviations, of the norm of three coordinates, beyond which the score of a next sample grows linearly; a
-missed hit must not decide the noise."""
+missed hit must not dominate the noise."""
 
 
 @machine_code(NOTHING(TWO, ONE, REAL, THREE, ONE, ONE, ONE, TWO, THREE))
 def _predict(transition, departure, decay, kicks, process, memory, m, p, work):
-    """Move mean m (w,) and covariance p (w, w) on by one interval; work (2, w, w) is written to."""
+    """Moves mean m (w,) and covariance p (w, w) on by one interval; overwrites work (2, w, w)."""
     d, w = len(transition), len(m)
     before = m.copy()
     for i in range(STATE_DIM):
@@ -44,7 +44,7 @@ def _predict(transition, departure, decay, kicks, process, memory, m, p, work):
 
 @machine_code(REAL(COUNT, ONE, TWO, ONE, TWO, TWO, TWO, ONE, ONE))
 def _innovate(d, m, p, error, measured, seen, root, new, told):
-    """Compare a sample with its forecast: squared whitened innovation, not a number where S is not positive definite.
+    """Squared whitened innovation of a sample; NaN if the innovation's covariance S is not positive definite.
 
     Writes: seen (w, 3) = P H', root (3, 3), the inverse of that of S, new (3,), the whitened innovation, and told (3,),
     the innovation over S.
@@ -73,7 +73,7 @@ def _innovate(d, m, p, error, measured, seen, root, new, told):
 
 @machine_code(NOTHING(TWO, TWO, ONE, ONE, TWO, TWO))
 def _update(seen, root, new, m, p, gain):
-    """Take in a sample of which the whitened innovation is `new`; writes its gain (w, 3)."""
+    """Updates with a sample whose whitened innovation is `new`; writes its gain (w, 3)."""
     w = len(m)
     whitened = np.zeros((3, w))
     for i in range(w):
@@ -95,8 +95,8 @@ def _update(seen, root, new, m, p, gain):
 def _join(d, gain, prior, measured, p, work):
     """The covariance after the first sample, A P A' + K R K' with A = 1 - K H.
 
-    A difference would lose ten digits: the prior of the position is that much wider than what is left of it. `prior`
-    (w, w) and `work` (2, w, w) are written to.
+    A difference would lose ten digits: the prior of the position is that much wider than the posterior. Overwrites
+    `prior` (w, w) and `work` (2, w, w).
     """
     w = len(p)
     kept, half = work[0], work[1]
@@ -124,12 +124,12 @@ def filter_tracks(
     transitions, departures, kicks, process, decays, memory, measured, errors, used, starts, priors,
     means, covariances, gains, roots, told, squares, following,
 ):  # fmt: skip
-    """The filter over t tracks of n samples; False where a covariance is not positive definite.
+    """Filters t tracks of n samples; False if a covariance is not positive definite.
 
     Args:
         transitions (t, n - 1, d, d), departures (t, n - 1, d), kicks (t, n - 1, 7, 9, 9): the linearised motion.
         process (t, 7): multiples of the kicks.  decays (t, n - 1), memory (t, 3): of the biases.
-        measured (t, n, 3, 3): covariance of what is new in a sample.  errors (t, n, 3), used (t, n): the samples.
+        measured (t, n, 3, 3): covariance of a sample's white error.  errors (t, n, 3), used (t, n): the samples.
         starts (t, w), priors (t, w): mean and variances before the first sample.
     Writes: means (t, n, w), covariances (t, n, w, w), gains (t, n, w, 3), zero where a sample does not update,
         roots (t, n, 3, 3), inverse of the Cholesky root of the innovation's covariance S, told (t, n, 3), S^-1 e,

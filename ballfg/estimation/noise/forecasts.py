@@ -1,10 +1,10 @@
-"""Forecasts of linearised tracks under some noise, and how well they keep their promise.
+"""Scores noise by forecasts of linearised tracks, at 20 to 300 ms ahead.
 
-An interval 0.3 s ahead is not decided by the scatter from sample to sample. So noise is scored by what it says about
-later samples: from many moments of every track a Kalman filter forecasts 20 to 300 ms ahead, and the score is the mean
-negative logarithm of the density of what was then measured (A. P. Dawid, "The prequential approach", 1984), with tails
-that grow linearly. The same score of the next sample alone, the marginal likelihood, is added with a small weight: it
-tells apart the parts of the noise that forecasts leave open.
+The scatter from sample to sample does not determine an interval 0.3 s ahead. So noise is scored by its forecasts: from
+many origins in every track a Kalman filter forecasts 20 to 300 ms ahead, and the score is the mean negative logarithm
+of the density at the later samples (A. P. Dawid, "The prequential approach", 1984), with tails that grow linearly. The
+same score of the next sample alone, the marginal likelihood, is added with a small weight: it separates parts of the
+noise that forecasts leave undetermined.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ from ballfg.tracks.stamps import STAMP_TOLERANCE
 HORIZONS: Final = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
 """s ahead of a start; the first good sample at or after each is scored."""
 START_EVERY: Final = 0.05
-"""s between two starts of forecasts in a track."""
+"""s between two forecast origins in a track."""
 EARLIEST_START: Final = 0.2
-"""s after the first sample. Before that the start of the track decides, and no robot acts on it yet."""
+"""s after the first sample. Before that the start of the track dominates, and no robot acts on it yet."""
 MARGINAL_WEIGHT: Final = 0.1
 TAIL: Final = 3.0
-"""Standard deviations of a coordinate beyond which its score grows linearly; a missed hit must not decide the noise."""
+"""Standard deviations of a coordinate beyond which its score grows linearly, so that a missed hit does not dominate."""
 NINETY: Final = 1.6448536269514722
 """Standard deviations to each side of a central 90 % interval."""
 
 
 @dataclass(frozen=True)
 class Score:
-    """How forecasts compare with what was measured.
+    """The comparison of forecasts with the measured samples.
 
     Attributes:
         by_track: (t,) each track's share of the mean negative logarithm of a density, of forecasts and next samples.
         held: share of forecast coordinates inside the central 90 % intervals.
-        starts: number of moments that forecasts were made from.
+        starts: number of forecast origins.
     """
 
     by_track: Tensor
@@ -60,12 +60,12 @@ class Forecaster:
     Args:
         tracks: linearised.
         velocity_prior: m/s, standard deviation per axis at the start of a track.
-        earliest: s after the first sample, of the first start of a forecast.
-        every: s between starts.
-        biased: whether the noise may have a memory.
+        earliest: s after the first sample, of the first forecast origin.
+        every: s between origins.
+        biased: True if the noise may have a memory.
 
     Attributes:
-        starts: (r, 2) track and sample from which forecasts are made.
+        starts: (r, 2) track and sample of each forecast origin.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class Forecaster:
         return Score(by_track, inside / max(3 * count, 1), len(self.starts))
 
     def _forecast(self, filtered: Filtered, noise: Noise, measured: Tensor) -> tuple[Tensor, float, int]:
-        """(t,) summed scores of forecasts, coordinates inside their 90 % intervals, and the number of forecasts."""
+        """(t,) summed scores of forecasts, number of coordinates in their 90 % intervals, number of forecasts."""
         ahead = self._ahead
         mean, covariance = filtered.means[ahead.track, ahead.start], filtered.covariances[ahead.track, ahead.start]
         process = noise.process.square().expand(self.count, -1)[ahead.track]
@@ -121,14 +121,14 @@ class Forecaster:
 
 @dataclass(frozen=True)
 class _Ahead:
-    """The forecasts that are scored, and what leads to them whatever the noise is: s forecasts.
+    """The s scored forecasts, with the parts that do not depend on the noise.
 
     Attributes:
-        track, start, sample: (s,) the track, the sample from which, and the one of which.
+        track, start, sample: (s,) the track, the sample of the origin, and the forecast sample.
         elapsed: (s,) s between the two.
-        by_state: (s, 3, d) how the position moves with state and coefficients at the start.
-        kicks: (s, 3, 7) m^2, its variance per axis that a unit of each number of `PROCESS_NOISE` gathers on the way.
-        departures: (s, 3) m, what the departures on the way make of it.
+        by_state: (s, 3, d) derivative of the position by state and coefficients at the origin.
+        kicks: (s, 3, 7) m^2, the position's variance per axis for a unit of each number of `PROCESS_NOISE`.
+        departures: (s, 3) m, the sum of the estimate's departures on the way.
     """
 
     track: Tensor
@@ -141,7 +141,7 @@ class _Ahead:
 
     @classmethod
     def of(cls, tracks: LinearTracks, starts: Tensor) -> _Ahead:
-        """All forecasts from some starts (r, 2), track and sample."""
+        """All forecasts from some origins (r, 2), track and sample."""
         (track, start), (samples, own) = starts.T, (tracks.times.shape[1], tracks.transitions.shape[-1])
         begin, reached = tracks.times[track, start], torch.zeros(len(track), dtype=torch.float64)
         horizons, found = torch.tensor(HORIZONS, dtype=torch.float64), []

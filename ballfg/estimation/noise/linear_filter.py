@@ -1,4 +1,4 @@
-"""A Kalman filter over linearised tracks, for any noise: state, coefficients and the tracker's biases together."""
+"""Filters linearised tracks with any noise: state, coefficients and the tracker's biases together."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class Filtered:
-    """What the filter makes of t tracks of n samples.
+    """The filter's results for t tracks of n samples.
 
     Attributes:
         means: (t, n, w) after each sample.
@@ -64,7 +64,7 @@ class LinearFilter:
     Args:
         tracks: linearised.
         velocity_prior: m/s, standard deviation per axis at the start of a track.
-        biased: whether the noise may have a memory; three numbers of the state, and time, are spared if not.
+        biased: True if the noise may have a memory; False saves three numbers of the state, and time.
     """
 
     def __init__(self, tracks: LinearTracks, velocity_prior: float, *, biased: bool = True) -> None:
@@ -78,10 +78,10 @@ class LinearFilter:
         self._scored = int(tracks.used[:, NEXT_FROM:].sum())
 
     def measured(self, noise: Noise) -> Tensor:
-        """(t, n, 3, 3) m^2, of the part of a measured position that is new in each sample."""
+        """(t, n, 3, 3) m^2, covariance of the white error of a measured position."""
         way = self.tracks.velocities
         along = noise.stamp_jitter[:, None, None, None] * way[..., :, None] * way[..., None, :]
-        white = (noise.position[:, None, :] * self.tracks.white).clamp_min(LEAST_NOISE)  # an axis may show none
+        white = (noise.position[:, None, :] * self.tracks.white).clamp_min(LEAST_NOISE)  # an axis may have no noise
         return along + torch.diag_embed(white.square())
 
     def losses(self, noise: Noise) -> Tensor:
@@ -93,7 +93,7 @@ class LinearFilter:
 
         Args:
             noise: all of it.
-            measured: (t, n, 3, 3) m^2, what `measured` makes of it.
+            measured: (t, n, 3, 3) m^2, the result of `measured`.
         Raises: torch.linalg.LinAlgError: the covariance of an innovation is not positive definite.
         """
         tracks, count = self.tracks, self.count
@@ -107,7 +107,7 @@ class LinearFilter:
 
 
 class _Run(torch.autograd.Function):
-    """Machine code as a function that torch can differentiate once."""
+    """The compiled filter as a function that torch can differentiate once."""
 
     @staticmethod
     def forward(ctx: Any, tracks: LinearFilter, *noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -141,5 +141,5 @@ class _Run(torch.autograd.Function):
 
 
 def _dense(derivative: Tensor | None, like: Array) -> Array:
-    """A derivative as machine code takes it; zero where there is none."""
+    """A derivative as a dense array for machine code; zeros for None."""
     return np.zeros(like.shape) if derivative is None else np.asarray(derivative.contiguous().numpy())

@@ -1,9 +1,9 @@
-"""Does a tracker have a memory, do stamps jitter, and by how much: tests and sizes from linearised tracks.
+"""Tests linearised tracks for a tracker's memory and jittering stamps, and estimates their sizes.
 
-Forecasts decide how wide intervals are, but hardly tell how long a tracker's errors last; the density of the next
-samples does. Whether there is a memory is asked of the likelihood without it: its derivative by the variance of the
-memory (score test, C. R. Rao 1948), cleared of what other parts of the noise explain, scatters about zero from track to
-track. The same for jitter. The scatter is the tracks' own, so that noise of another shape does not make a name.
+Forecasts determine the width of intervals, but hardly how long a tracker's errors last; the density of the next samples
+does. The test for a memory uses the likelihood without it: its derivative by the variance of the memory (score test, C.
+R. Rao 1948), cleared of other parts of the noise, scatters about zero from track to track. The same holds for jitter.
+The scatter is the tracks' own, so that noise of another shape is not named.
 """
 
 from __future__ import annotations
@@ -28,33 +28,33 @@ JITTER: Final = "stamp_jitter"
 NUMBERS: Final = {MEMORY: ("memory", "memory_time"), JITTER: ("stamp_jitter",)}
 """Fields of `TrackNoise` for each part of a tracker's noise."""
 TIMES: Final = (0.005, 0.01, 0.02, 0.04)
-"""s. Memories that are looked for; the score falls little between neighbours."""
+"""s. Candidate durations of a memory; the score falls little between neighbours."""
 LONGEST_TIME: Final = 0.06
-"""s. Errors that last longer may be those of the motion, and are no memory."""
+"""s. Longer-lasting errors may belong to the motion and do not count as memory."""
 CANDIDATES: Final = len(TIMES) + 1
 ALWAYS: Final = ("position", "acceleration")
-"""Numbers that act from sample to sample as well: those of the white part, and of forces that the model lacks."""
+"""Numbers that also act from sample to sample: the white part, and forces that the model lacks."""
 FOUND, CONFIRMED = 0.002, 0.05
-"""Probabilities by chance below which a part is found, all tracks and candidates counted; below which a half agrees."""
+"""Significance levels: of a part in all tracks, all candidates counted; of its confirmation in a half."""
 COARSE, MOST_COARSE = 1.0, 15
-"""Tolerance and most evaluations of fits that only answer whether a part is there."""
+"""Tolerance and most evaluations of fits that only test whether a part exists."""
 KNOWN: Final = 2.5
-"""Standard deviations by which every number of a part must differ from zero, or it has no name."""
+"""Standard deviations by which every number of a named part must differ from zero."""
 LEAST_TRACKS: Final = 5
-"""Tracks of a half, fewer of which do not tell how much scores scatter."""
+"""Least number of tracks in a half for the scatter of scores."""
 JITTER_UNIT: Final = 1e-3
 """s. The square of this jitter is the unit of its score."""
 STATED_SPREAD: Final = 0.02
-"""Standard deviation of the logarithm of a white noise that is stated and believed."""
+"""Standard deviation of the logarithm of a stated white noise."""
 FAR: Final = 4.0
-"""Times `STATED_SPREAD` from the stated white noise at which tracks contradict it, however their scores scatter."""
+"""Times `STATED_SPREAD` from the stated white noise at which tracks contradict it, whatever the scatter of scores."""
 AGREES: Final = 11.3
-"""Chi-square of three numbers (99 %) up to which the white noise that is stated is believed."""
+"""Chi-square of three numbers (99 %) up to which tracks agree with the stated white noise."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """How clearly tracks show a part of a tracker's noise.
+    """The evidence of tracks for a part of a tracker's noise.
 
     Attributes:
         name: of the part.
@@ -70,13 +70,13 @@ class Evidence:
 
     @property
     def clear(self) -> bool:
-        """Whether both halves show it."""
+        """True if both halves show it."""
         return self.p_value < FOUND and max(self.halves) < CONFIRMED
 
 
 @dataclass(frozen=True)
 class TrackerPart:
-    """A part of a tracker's noise that both halves of the tracks show.
+    """A part of a tracker's noise that shows in both halves of the tracks.
 
     Attributes:
         evidence: of both halves.
@@ -93,7 +93,7 @@ class TrackerPart:
 
 @dataclass(frozen=True)
 class TrackerNoise:
-    """All parts that were found, and the tracker's noise with them: white part, memory and jitter."""
+    """All parts found, and the tracker's noise with them: white part, memory and jitter."""
 
     parts: tuple[TrackerPart, ...]
     noise: TrackNoise
@@ -102,14 +102,14 @@ class TrackerNoise:
 def tracker_noise(
     tracks: LinearTracks, held_out: Mask, settings: Settings, stated: float | None = None
 ) -> TrackerNoise:
-    """Parts of the tracker's noise that both halves of the tracks show, with their sizes from all tracks.
+    """Parts of the tracker's noise that show in both halves of the tracks, with sizes from all tracks.
 
     Args:
         tracks: linearised.
-        held_out: (t,) bool, those of the half that confirms.
-        settings: all other noise; a memory or jitter in them is known and is not looked for.
-        stated: m, white noise of a dataset that states it. It is believed where the tracks do not contradict it.
-    Returns: no parts where a half has fewer than `LEAST_TRACKS` tracks.
+        held_out: (t,) bool, tracks of the half that confirms.
+        settings: all other noise; a memory or jitter in them is fixed and not tested.
+        stated: m, white noise stated by the dataset; used unless the tracks contradict it.
+    Returns: no parts if a half has fewer than `LEAST_TRACKS` tracks.
     """
     open_parts = {MEMORY: not settings.has_memory, JITTER: settings.stamp_jitter == 0.0}
     asked = [name for name, is_open in open_parts.items() if is_open]
@@ -153,7 +153,7 @@ def _parameters(settings: Settings, tracks: LinearTracks, parts: Iterable[Eviden
 
 
 def _evidence(full: LinearFilter, fit: MarginalFit, name: str, held_out: Mask) -> list[Evidence]:
-    """The score tests of a part that a fit is without."""
+    """The score tests of a part that a fit does not include."""
     times = TIMES if name == MEMORY else (0.0,)
     found = []
     for time in times:
@@ -166,12 +166,12 @@ def _evidence(full: LinearFilter, fit: MarginalFit, name: str, held_out: Mask) -
 
 
 def _cleared(scores: Array, others: Array) -> Array:
-    """Scores (t,) or (t, m) of tracks without what the scores (t, k) of other numbers explain of them."""
+    """Scores (t,) or (t, m) of tracks minus their projection on the scores (t, k) of other numbers."""
     return np.asarray(scores - others @ np.linalg.lstsq(others, scores, rcond=None)[0])
 
 
 def _score(tracks: LinearFilter, fit: MarginalFit, name: str, time: float) -> Array:
-    """(t,) derivative of each track's log likelihood by the variance of a part, where that is zero."""
+    """(t,) derivative of each track's log likelihood by the variance of a part, at zero variance."""
     noise = fit.noise()
     variance = torch.zeros(fit.tracks.count, dtype=torch.float64, requires_grad=True)
     if name == MEMORY:
@@ -184,9 +184,9 @@ def _score(tracks: LinearFilter, fit: MarginalFit, name: str, time: float) -> Ar
 
 
 def _p_value(score: Array, freedom: float) -> float:
-    """One-sided; freedom: share of the scatter that is left after other numbers took theirs."""
+    """One-sided; freedom: share of the scatter that remains after the projection."""
     spread = np.sqrt(len(score) * score.var(ddof=1) / max(freedom, 0.1))
-    if not spread > 0.0:  # tracks that are all the same tell nothing of chance
+    if not spread > 0.0:  # identical tracks have no scatter
         return 1.0
     from scipy import stats  # it takes half a second to import
 
@@ -196,9 +196,9 @@ def _p_value(score: Array, freedom: float) -> float:
 def _sizes(
     fits: list[MarginalFit], found: list[Evidence], held_out: Mask, settings: Settings, stated: float | None
 ) -> TrackerNoise:
-    """The parts found with their sizes and error bars; each of the fits has one part more than the one before.
+    """The parts found with their sizes and error bars; each fit has one part more than the fit before.
 
-    Where numbers are hardly known, the part that was found last has no name after all.
+    If a number is hardly known, the part found last stays unnamed.
     """
     if not found:
         return TrackerNoise((), _noise_of(fits[0]))
@@ -227,9 +227,9 @@ def _noise_of(fit: MarginalFit) -> TrackNoise:
 
 
 def _settled(fit: MarginalFit, settings: Settings, stated: float | None) -> MarginalFit:
-    """The same fit to the end, with the white noise that is stated unless the tracks contradict it.
+    """The same fit until convergence, with the stated white noise unless the tracks contradict it.
 
-    Where errors last no longer than a frame, white noise and memory are told apart by the white noise alone.
+    If errors last no longer than a frame, only the stated white noise separates white noise and memory.
     """
     if stated is not None:
         sure = [replace(p, start=stated, spread=STATED_SPREAD) if p.name == "position" else p for p in fit.parameters]

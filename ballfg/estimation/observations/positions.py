@@ -1,4 +1,4 @@
-"""Positions: the observation that most tracks have, and the usual one alone."""
+"""Positions are the usual observation of a track."""
 
 from __future__ import annotations
 
@@ -55,6 +55,6 @@ class Positions(Observation):
 
 
 def observations_of(track: Track) -> tuple[Observation, ...]:
-    """All observations of a track: its positions, unless they were made from the others, and what it brings beside."""
+    """All observations of a track: its further ones, and its positions unless they were computed from those."""
     measured = () if track.rough else (Positions(track.positions),)
     return (*measured, *track.observations)

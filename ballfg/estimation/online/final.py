@@ -1,4 +1,4 @@
-"""The last word on a track: the window minimised to a tight tolerance, and the states that left it before."""
+"""Computes the final estimate of a streamed track: the window's minimum and the states that left the window."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ from ballfg.tracks import Track
 
 @dataclass(frozen=True)
 class Frozen:
-    """A state as it was when it left the window.
+    """A state at the moment when it left the window.
 
     Attributes:
         sample: its observation.  state: (9,).  joint: (9 + p, 9 + p) covariance with the coefficients.
@@ -39,7 +39,7 @@ def freeze(window: StreamWindow, count: int) -> list[Frozen]:
 
 
 def unknown(sample: Sample, settings: Settings, p: int) -> Frozen:
-    """A state of which nothing but its observation is known, because its window could not be solved."""
+    """A state known by its observation alone, because its window could not be solved."""
     state, sigma = np.zeros(STATE_DIM), np.empty(STATE_DIM + p)
     state[POSITION], sigma[POSITION] = sample.position, sample.sigma
     sigma[VELOCITY], sigma[SPIN] = settings.velocity_prior, settings.spin_prior

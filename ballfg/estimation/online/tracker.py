@@ -1,4 +1,4 @@
-"""Linear factors for iSAM2, and how a state moves with the bias of a tracker behind it."""
+"""Makes linear factors of a tracker's bias for iSAM2, and moves a state with the bias behind it."""
 
 from collections.abc import Sequence
 
@@ -15,7 +15,7 @@ _UNIT3 = gtsam.noiseModel.Unit.Create(3)
 
 
 def linear_factor(keys: Sequence[int], blocks: Sequence[Array], right: Array) -> gtsam.NonlinearFactor:
-    """The factor r = sum A_k x_k - b of one or two states; as it is linear, GTSAM never has to ask for it.
+    """The factor r = sum A_k x_k - b of one or two states; being linear, it needs no callback from GTSAM.
 
     Args: keys: of the states.  blocks: (3, w) each, A_k whitened.  right: (3,) b, whitened.
     """
@@ -30,18 +30,18 @@ def linear_factor(keys: Sequence[int], blocks: Sequence[Array], right: Array) ->
 
 
 def bias_start(key: int, settings: Settings) -> gtsam.NonlinearFactor:
-    """Before anything is known of it, the bias of a state lies about zero."""
+    """The prior of a state's bias, about zero."""
     return _of_biases(BiasStartFactors(np.array([key - STATE_KEY]), settings.bias_sigmas))
 
 
 def bias_link(key: int, dt: float, settings: Settings) -> gtsam.NonlinearFactor:
-    """The bias of a state is that of the state before, dt s earlier, faded and renewed."""
+    """The factor between the biases of two states, dt s apart: the bias decays and is renewed."""
     before = np.array([key - STATE_KEY - 1])
     return _of_biases(BiasFactors(before, np.array([dt]), settings.bias_sigmas, settings.memory_time))
 
 
 def _of_biases(batch: BiasStartFactors | BiasFactors) -> gtsam.NonlinearFactor:
-    """The only factor of a batch on biases."""
+    """The single factor of a batch, on biases."""
     keys = [STATE_KEY + int(i) for i in batch.variables[0]]
     origin = np.zeros((1, STATE_DIM + BIAS_DIM))
     (residual,), blocks = batch.compute(slice(None), (origin,) * len(keys))
@@ -51,7 +51,7 @@ def _of_biases(batch: BiasStartFactors | BiasFactors) -> gtsam.NonlinearFactor:
 def carried_with_bias(
     piece: Array, covariance: Array, bias: Array, dt: float, settings: Settings
 ) -> tuple[Array, Array]:
-    """What leads from a state, its bias and the coefficients to the next state with its bias.
+    """The propagation from a state, its bias and the coefficients to the next state with its bias.
 
     Args:
         piece: (9, 1 + 9 + p) the propagated state and its Jacobian side by side.
@@ -59,7 +59,7 @@ def carried_with_bias(
         bias: (3,) m, at the linearisation point.
         dt: s.
         settings: with a memory.
-    Returns: the same two for state and bias: (12, 1 + 12 + p) and (12, 12).
+    Returns: propagation and noise of state and bias: (12, 1 + 12 + p) and (12, 12).
     """
     width = STATE_DIM + BIAS_DIM
     decay, spread = bias_step(np.array([dt]), settings.bias_sigmas, settings.memory_time)

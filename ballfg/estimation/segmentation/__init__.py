@@ -1,4 +1,4 @@
-"""What happened to the ball: contacts, hits, rests and bad samples of one track, found before anything is estimated.
+"""The segmentation finds contacts, hits, rests and bad samples of one track before its estimation.
 
 `segment` explains a whole track; `Segmenter` does it sample by sample. The model and its numbers are in
 docs/derivations/segmentation.md.

@@ -1,4 +1,4 @@
-"""The last state of a track that ends near a contact: no later sample shows on which side of it the ball is."""
+"""Estimates the last state of a track that ends near a contact, where no later sample shows the side."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ if TYPE_CHECKING:
     from ballfg.estimation.smoother.smoother import Smoother
 
 REACH: Final = 3
-"""Intervals at the end in which a contact may still be in doubt."""
+"""Number of intervals at the end in which a contact may be uncertain."""
 LEAST: Final = 3
-"""Samples that must come before them."""
+"""Least number of samples before them."""
 MEMORY: Final = 256
-"""Samples that say all about a state at their end."""
+"""Number of samples that determine a state at their end."""
 
 
 def with_both_sides(smoother: Smoother, problem: TrackProblem, estimate: Estimate) -> Estimate:
-    """The estimate, its last state that of the more probable side where the track ends near a contact.
+    """The estimate; if the track ends near a contact, its last state is that of the more probable side.
 
     The samples before the contact are estimated by themselves; from there on both hypotheses are followed
     (`ballfg.estimation.sides`).
 
-    Args: smoother: of the track.  problem: of the track.  estimate: without regard to the other side.
+    Args: smoother: of the track.  problem: of the track.  estimate: without the other side.
     """
     track, n = problem.track, len(problem.track)
     disturbed = np.concatenate((estimate.hits, problem.segmentation.restarts))
@@ -51,7 +51,7 @@ def with_both_sides(smoother: Smoother, problem: TrackProblem, estimate: Estimat
 
 
 def _before_contact(estimate: Estimate, model: HypothesisModel, track: Track) -> int | None:
-    """The last sample that is certainly before a contact near the track's end; None where there is no such contact."""
+    """The last sample that is certainly before a contact near the track's end; None without such a contact."""
     n = len(track)
     near = [contact.interval for contact in estimate.contacts if contact.interval >= n - 1 - REACH]
     if near:
@@ -64,7 +64,7 @@ def _before_contact(estimate: Estimate, model: HypothesisModel, track: Track) ->
 
 
 def _filtered(smoother: Smoother, track: Track) -> tuple[Array, Array] | None:
-    """Mean and covariance of state, coefficients and bias at the end of a track; None where they are not known."""
+    """Mean and covariance of state, coefficients and bias at the end of a track; None if undetermined."""
     problem = smoother.problem(track)
     solution = smoother.settle(problem)
     known = smoother.optimizer.covariances(solution.graph, solution.minimum)
@@ -74,17 +74,12 @@ def _filtered(smoother: Smoother, track: Track) -> tuple[Array, Array] | None:
     biases = np.zeros(0) if values.biases is None else values.biases[-1]
     mean = np.concatenate((values.states[-1], values.coefficients[:p], biases))
     width = STATE_DIM + len(biases)
-    covariance = np.zeros((width + p,) * 2)
-    own = np.append(np.arange(STATE_DIM), np.arange(STATE_DIM + p, width + p))
-    shared = np.arange(STATE_DIM, STATE_DIM + p)
-    covariance[np.ix_(own, own)] = known.states[-1]
-    covariance[np.ix_(own, shared)], covariance[np.ix_(shared, own)] = known.cross[-1][:, :p], known.cross[-1][:, :p].T
-    covariance[np.ix_(shared, shared)] = known.coefficients[:p, :p]
-    return mean, definite(covariance)
+    order = np.r_[:STATE_DIM, width : width + p, STATE_DIM:width]
+    return mean, definite(known.joint(-1)[np.ix_(order, order)])
 
 
 def _measured(problem: TrackProblem, sample: int) -> SampleMeasurement:
-    """What was measured at a sample of a track; rough positions stand for pixels."""
+    """The measurements at a sample of a track; rough positions stand for pixels."""
     beside = [one for one in problem.observations if not one.locates]
     rows = [(problem.observed[one.name], row) for one in beside for row in one.filter_rows(sample)]
     factors = [batch.taken(np.array([row])) for batch, row in rows]

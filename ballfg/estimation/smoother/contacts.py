@@ -1,7 +1,7 @@
-"""The search for the arrangement of contacts: each lies in the interval in which the estimate has the ball touch.
+"""Searches the arrangement of contacts in which each lies in the interval of its estimated time.
 
 A minimum is found for one arrangement. Contacts whose estimated time lies outside of their interval then move, and the
-next minimum is asked for, until they stay; the lowest minimum is the answer.
+next minimum is computed, until they stay; the lowest minimum is the result.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from ballfg.factors.dynamics import model_width
 from ballfg.state import VZ
 
 MAX_REFINEMENTS = 6
-"""How often contacts may move to a neighbouring interval; two were the most seen on measured tracks."""
+"""Largest number of moves of contacts to a neighbouring interval; measured tracks needed two."""
 
 
 class ContactSearch:
-    """The arrangements of a track's contacts, from that of its segmentation on.
+    """The arrangements of a track's contacts, beginning with its segmentation.
 
-    Args: problem: of the track.  surfaces: that the ball may touch.  segmentation: its events.
+    Args: problem: of the track.  surfaces: table and floor.  segmentation: its events.
     """
 
     def __init__(self, problem: TrackProblem, surfaces: Surfaces, segmentation: Segmentation) -> None:
@@ -38,13 +38,13 @@ class ContactSearch:
 
     @property
     def best(self) -> Solution:
-        """The lowest minimum so far; where contacts stayed, of those for which they do."""
+        """The lowest minimum so far; among those with consistent contacts, if any."""
         return min(self._seen.values(), key=lambda s: s.minimum.error) if self._best is None else self._best
 
     def after(self, solution: Solution) -> tuple[Events, Values] | None:
-        """The next arrangement with values to start from; None where the search has ended.
+        """The next arrangement with initial values; None at the end of the search.
 
-        Args: solution: for the arrangement before.
+        Args: solution: for the previous arrangement.
         """
         times, ball = self.problem.track.times, self.problem.ball
         places = places_of(solution.events.contacts)
@@ -65,9 +65,9 @@ class ContactSearch:
 
 
 def contacts_at_ends(times: Array, solution: Solution, model: BallModel, surfaces: Surfaces) -> tuple[Contact, ...]:
-    """Contacts that a single sample at either end could show, too little for the segmentation.
+    """Contacts that only a single sample at either end shows, too few for the segmentation.
 
-    The last state has fallen through a surface; or the first, where later samples lead back to, rises from below one.
+    The last state has fallen through a surface; or the first, extrapolated from later samples, rises from below one.
     """
     values, events, last = solution.minimum.values, solution.events, len(times) - 1
     taken = {c.interval for c in events.contacts} | set(events.segmentation.hits.tolist())
@@ -91,7 +91,7 @@ def contacts_at_ends(times: Array, solution: Solution, model: BallModel, surface
 
 
 def refined_contacts(times: Array, solution: Solution) -> tuple[Contact, ...]:
-    """The contacts, each in the interval that its estimated time lies in; those outside the track are dropped."""
+    """The contacts, each in the interval of its estimated time, without those outside the track."""
     refined = []
     for contact in timed_contacts(times, solution):
         if not times[0] <= contact.time <= times[-1]:

@@ -1,4 +1,4 @@
-"""The dynamics factors of a track: one per linked interval, for any arrangement of events in it."""
+"""Makes the dynamics factors of a track, one per linked interval, for any arrangement of events."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.integrate import steps_over_each
+from ballfg.dynamics.motion.limits import steps_over_each
 from ballfg.estimation.segmentation import Segmentation
 from ballfg.estimation.smoother.motion import Motion, eventful_motions, kicks_of
 from ballfg.factors.dynamics import ContactFactors, DynamicsFactors, FlightFactors, RestFactors
@@ -17,9 +17,9 @@ from ballfg.factors.noise import Kicks, ProcessNoise
 
 
 class TrackDynamics:
-    """Makes the dynamics factors of one track. Those of free flight are made once, for all that is tried.
+    """Makes the dynamics factors of one track. Those of free flight are made once, for all arrangements.
 
-    Args: times: (n,) s.  model: the ball, with the coefficients that are estimated.  noise: that it strays by.
+    Args: times: (n,) s.  model: the ball, with the estimated coefficients.  noise: of its motion.
     """
 
     def __init__(self, times: Array, model: BallModel, noise: ProcessNoise) -> None:
@@ -39,7 +39,7 @@ class TrackDynamics:
     def factors(self, events: Segmentation) -> list[DynamicsFactors]:
         """One factor per linked interval, in batches that share a motion and a number of integration steps.
 
-        Args: events: with the contacts where they are to be.
+        Args: events: with contacts in the wanted intervals.
         """
         motions = eventful_motions(events, self.times)
         flying = np.ones(len(self.dt), dtype=bool)
@@ -58,7 +58,7 @@ class TrackDynamics:
         return sorted((batch for batch in found if len(batch)), key=lambda batch: int(batch.variables[0, 0]))
 
     def _flown(self, steps: int, flying: Array, hit: Index) -> FlightFactors:
-        """Flights in some of the intervals; the process noise of some holds a hit."""
+        """Flights in some of the intervals; for `hit` ones the process noise contains a hit."""
         flights = self._flights[steps]
         intervals = flights.variables[:, 0]
         kept = flying[intervals]
@@ -75,7 +75,7 @@ class TrackDynamics:
         return RestFactors(self.model, rows, self.dt[rows], covariance, heights, kicks)
 
     def _kicked(self, rows: Index, motions: list[Motion]) -> tuple[Kicks, Array]:
-        """Contacts and hits of some intervals, as many contacts in each, and the process noise with them."""
+        """Contacts and hits of intervals with equal numbers of contacts, and their process noise."""
         dt = self.dt[rows]
         kicks = kicks_of(motions, dt)
         return kicks, self.noise.flight(dt) + self.noise.kicks(dt, kicks)

@@ -1,4 +1,4 @@
-"""A first guess of all states from the samples and the events, for the minimisation to start from."""
+"""Guesses all states from the samples and the events, as a start of the minimisation."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -25,10 +25,10 @@ def initial_states(
     model: BallModel,
     label: SpinLabel | None,
 ) -> Array:
-    """(n, 9) states from the sliding window: measured positions, mean velocities of windows that no event cuts.
+    """(n, 9) states from the sliding window: measured positions, mean velocities of windows without events.
 
-    The spin is the label's, or zero, up to the first contact; each contact changes it as the model says. A ball that
-    rests is put on its surface and rolls.
+    The spin is the label's, or zero, up to the first contact; each contact changes it by the model. A resting ball is
+    put on its surface and rolls.
     """
     states = np.zeros((len(track), STATE_DIM))
     states[:, POSITION] = bridged_positions(track, segmentation)
@@ -44,7 +44,7 @@ def initial_states(
 
 
 def bridged_positions(track: Track, segmentation: Segmentation) -> Array:
-    """(n, 3) m: measured positions, those of outliers and shifted runs replaced by a line between their neighbours."""
+    """(n, 3) m: measured positions, with lines between neighbours in place of outliers and shifted runs."""
     trusted = segmentation.quality <= Quality.WIDE
     if trusted.all() or not trusted.any():
         return track.positions.copy()
@@ -53,7 +53,7 @@ def bridged_positions(track: Track, segmentation: Segmentation) -> Array:
 
 
 def _start_contact(states: Array, contact: Contact, model: BallModel) -> None:
-    """Put the state before a contact where the contact can be reached, and give later states the spin after it."""
+    """Moves the state before a contact to where it can reach the contact, and gives later states the spin after it."""
     before = torch.from_numpy(states[contact.interval].copy())
     with torch.no_grad():
         gap = float(model.gap(before, contact.height))
@@ -64,7 +64,7 @@ def _start_contact(states: Array, contact: Contact, model: BallModel) -> None:
 
 
 def _start_rest(states: Array, height: float, model: BallModel) -> None:
-    """Put states on a surface, rolling: friction that has saturated does not tell in which direction the spin lies."""
+    """Puts states on a surface, rolling: saturated friction does not determine the direction of the spin."""
     states[:, Z] -= model.gap(torch.from_numpy(states), height).detach().numpy()
     states[:, VZ] = 0.0
     states[:, SPIN.start] = -states[:, VELOCITY.start + 1] / model.radius
@@ -72,25 +72,25 @@ def _start_rest(states: Array, height: float, model: BallModel) -> None:
 
 
 LEAST_FALL = 0.05
-"""m/s, least downward speed that a guess has before a contact."""
+"""m/s, least downward speed of a guess before a contact."""
 
 
 def move_contacts(
     values: Values, times: Array, old: Sequence[tuple[int, float]], new: Sequence[tuple[int, float]], model: BallModel
 ) -> Values:
-    """Values to go on from when contacts have moved: a state after its contact is now before it, or vice versa.
+    """Values for a continued search after contacts moved: a state after its contact is now before it, or vice versa.
 
     Args:
-        values: the states that went with the old contacts.
+        values: the states for the old contacts.
         times: (n,) s.
-        old: interval and height of each contact so far.  new: the same of those to come.
+        old: interval and height of each contact so far.  new: the same of the next contacts.
         model: gives the state at the end of the first interval that gained or lost a contact, from that at its start.
     """
     states = values.states.copy()
     changed = sorted({i for i, _ in set(old) ^ set(new)})
     for interval in changed:
         if interval - 1 in changed:
-            continue  # the contact came from there or went there; the state after both is right already
+            continue  # the contact entered or left this interval; the state after both is right already
         heights = tuple(height for i, height in new if i == interval)
         start = torch.from_numpy(np.concatenate((states[interval], values.coefficients[: model_width(model)]))[None])
         gap = float(model.gap(start, heights[0])[0].detach()) if heights else 0.0

@@ -1,4 +1,4 @@
-"""How a ball gets from one sample to the next: the events of a track, interval by interval."""
+"""Lists the events of a track interval by interval, as the motion from one sample to the next."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from ballfg.factors.noise import Kicks, ProcessNoise
 
 @dataclass(frozen=True)
 class Motion:
-    """How the ball gets from one sample to the next.
+    """The events between two samples.
 
     Attributes:
-        heights: m, the surfaces met, in order.
-        times: s since the interval's start, when they are met, as far as known when the factor was made.
-        rest: m, the surface on which the ball lies all the time; None if it does not.
-        hit: something hits the ball at an unknown moment.
-        linked: False where nothing is known of what happened; the next state starts anew.
+        heights: m, the surfaces of contact, in order.
+        times: s since the interval's start, of contacts, as known when the factor was made.
+        rest: m, the surface of a ball that rests all the time, or None.
+        hit: True if something hits the ball at an unknown moment.
+        linked: False if the motion is unknown; the next state starts anew.
     """
 
     heights: tuple[float, ...] = ()
@@ -31,27 +31,27 @@ class Motion:
     linked: bool = True
 
     def same(self, other: Motion) -> bool:
-        """Whether both are the same events, at whatever moments."""
+        """True if both have the same events, at any times."""
         mine = (self.heights, self.rest, self.hit, self.linked)
         return mine == (other.heights, other.rest, other.hit, other.linked)
 
     def kick_times(self, dt: float) -> tuple[float, ...]:
-        """`times` for the process noise over dt s: in whole `KICK_PARTS`."""
+        """`times` for the process noise over dt s: rounded to `KICK_PARTS`."""
         return tuple(round(time / dt * KICK_PARTS) * dt / KICK_PARTS for time in self.times)
 
     def covariance(self, dt: Array, noise: ProcessNoise) -> Array:
-        """(1, 9, 9) process noise over dt (1,) s: flight, each contact's kick, a hit at an unknown time."""
+        """(1, 9, 9) process noise over dt (1,) s: flight, each contact's noise, a hit at an unknown time."""
         return noise.flight(dt) + noise.kicks(dt, kicks_of([self], dt))
 
 
 FLIGHT = Motion()
 KICK_PARTS = 64
-"""Of an interval, in which contact times enter the process noise. Finer, and an estimate would depend on how a
-segmentation rounds, which knows the axes of the frame: with these parts it turns with the data."""
+"""Parts of an interval to which contact times are rounded for the process noise. With finer ones an estimate would
+depend on the rounding of a segmentation, which knows the axes of the frame: with these parts it turns with the data."""
 
 
 def kicks_of(motions: Sequence[Motion], dt: Array) -> Kicks:
-    """The contacts and hits of m motions with as many contacts each, over dt (m,) s."""
+    """The contacts and hits of m motions with equal numbers of contacts, over dt (m,) s."""
     times = [motion.kick_times(duration) for motion, duration in zip(motions, dt.tolist(), strict=True)]
     return Kicks(np.array(times), np.array([motion.hit for motion in motions]))
 
@@ -66,7 +66,7 @@ def motions_of(segmentation: Segmentation, times: Array) -> list[Motion]:
 
 
 def eventful_motions(segmentation: Segmentation, times: Array) -> dict[int, Motion]:
-    """The motion of every interval in which something happens, in their order.
+    """The motion of every interval with an event, in their order.
 
     Args: segmentation: of n samples.  times: (n,) s.
     """

@@ -1,7 +1,7 @@
-"""Whether another spin at a bounce can be worth a search of a whole long chain: tried first on the samples around it.
+"""Decides from the samples around a bounce whether another spin is worth a search of a whole long chain.
 
-A search of the whole chain for every bounce would take a time that grows with the square of its length. Only what is
-clearly no better near the bounce is left out; what remains is searched for as in a short track.
+A search of the whole chain for every bounce would take a time that grows with the square of its length. Only spins that
+are clearly worse near the bounce are skipped; the others are searched as in a short track.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ if TYPE_CHECKING:
     from ballfg.estimation.smoother.grip import Bounce, OtherSide
 
 LONG_CHAIN: Final = 500
-"""States from which a bounce is looked at by itself first."""
+"""Number of states from which a bounce is first tested by itself."""
 REACH: Final = 8
-"""Samples beyond those whose spin the bounce ties together."""
+"""Number of samples beyond those whose spin the bounce determines."""
 SPIN_SPREAD: Final = 60.0
-"""rad/s, about the spin that was found, of the first state that is kept: it stands for all that came before."""
+"""rad/s, prior about the estimated spin of the first state in the test: it stands for all earlier samples."""
 
 
 def worth_a_search(
     solution: Solution, bounce: Bounce, side: OtherSide, optimizer: LevenbergMarquardt, margin: float
 ) -> bool:
-    """Whether, near a bounce, the minimum on its other side is another one, and higher by less than a margin.
+    """True if the minimum on the other side of a bounce is, nearby, another one and higher by less than a margin.
 
     Args:
         solution: of the whole chain.
         bounce: in it.
-        side: where a search on the other side begins.
+        side: start of a search on the other side.
         optimizer: for both minima.
         margin: of the objective, a log likelihood.
     """
@@ -62,7 +62,7 @@ def _taken(values: Values, first: int, last: int) -> Values:
 
 
 def _around(solution: Solution, first: int, last: int) -> BallGraph:
-    """The factors among some states; the coefficients are known as well as the whole chain knows them."""
+    """The factors among some states; the whole chain's covariance is the prior of the coefficients."""
     values, step = solution.minimum.values, solution.minimum.step
     assert step is not None
     batches: list[FactorBatch] = []

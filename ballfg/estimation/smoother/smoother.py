@@ -1,4 +1,4 @@
-"""The smoother: the most probable states of a whole track, by Levenberg-Marquardt on its factor graph."""
+"""The smoother finds the most probable states of a whole track by Levenberg-Marquardt on its factor graph."""
 
 from __future__ import annotations
 
@@ -43,28 +43,28 @@ from ballfg.state import STATE_DIM
 from ballfg.tracks import Ball, Track
 
 MAX_UNSEEN_HITS = 8
-"""How many hits the estimate may add to those that the segmentation found; measured logs needed three at most."""
+"""Largest number of hits that the estimate adds to the segmentation's; measured logs needed three at most."""
 NOWHERE = (Convergence.STUCK, Convergence.TOO_MANY_ITERATIONS)
 LEAST_GAIN = 0.9
-"""Of the objective. Where a search leads nowhere and the worst of up to eight hits leaves more than this, hits are not
-what is missing: the noise is stated far too small, and every further hit would cost a long search."""
+"""Of the objective. If a search fails and the worst of up to eight hits leaves more than this share, missing hits are
+not the reason: the stated noise is far too small, and every further hit would cost a long search."""
 LONG = 10_000
-"""Samples from which a track is smoothed in pieces that are then joined (docs/derivations/long_tracks.md). At once it
-takes 20 kB a sample."""
+"""Number of samples from which a track is smoothed in pieces that are then joined (docs/derivations/long_tracks.md). In
+one piece it takes 20 kB a sample."""
 
 OFFSET_ROUNDS = 6
-"""How often stamps may be moved by the time offsets that were estimated; 4 ms need three."""
+"""Largest number of corrections of stamps by estimated time offsets; 4 ms need three."""
 FIRST_STEPS = 15
-"""Linear solutions of the first round, after which stamps move anyhow."""
+"""Linear solutions of the first round, after which stamps are corrected in any case."""
 
 
 @dataclass(frozen=True)
 class Earlier:
-    """What is known from samples that came before those of a problem.
+    """The information from samples before those of a problem.
 
     Attributes:
-        start: values to start the minimisation from.
-        summaries: factors that stand for what left; they replace priors on the same variables.
+        start: initial values of the minimisation.
+        summaries: factors with the information of removed states; they replace priors on the same variables.
     """
 
     start: Values
@@ -80,15 +80,15 @@ class Earlier:
 class Smoother(Estimator):
     """Maximum a posteriori estimate of all states of a track.
 
-    Contacts, hits, outliers are found by the segmentation; contacts are then refined by the estimate: one whose
-    estimated time lies outside its interval moves to where it belongs, and the graph is solved again.
+    The segmentation finds contacts, hits and outliers; the estimate then refines contacts: one whose estimated time
+    lies outside its interval moves to the right one, and the graph is solved again.
 
-    Where observations add unknowns that move stamps (`settings.time_offsets` of cameras), stamps move by what was
-    found, until they stay.
+    If observations add unknowns that change stamps (`settings.time_offsets` of cameras), stamps are corrected by their
+    estimates until they converge.
 
     Args:
-        model: the ball.  surfaces: what it may bounce on.  settings: noise and priors.
-        optimizer: settings of the minimisation; where None, those of the settings' solver.
+        model: the ball.  surfaces: table and floor.  settings: noise and priors.
+        optimizer: settings of the minimisation; None: those of the settings' solver.
     """
 
     name = "smoother"
@@ -109,7 +109,7 @@ class Smoother(Estimator):
     def estimate(self, track: Track, factors: Sequence[FactorBatch] = (), *, move_stamps: bool = True) -> Estimate:
         """The states of a track, one per stamp, with the covariances of the Laplace approximation.
 
-        Args: track, factors: as for every estimator.  move_stamps: False leaves stamps where they are.
+        Args: track, factors: as for every estimator.  move_stamps: False leaves stamps unchanged.
         """
         track = self.prepared(track, factors)
         moving = move_stamps and bool(self.settings.time_offsets)
@@ -133,7 +133,7 @@ class Smoother(Estimator):
         return replace(estimate, status=Status.NOT_CONVERGED)
 
     def is_long(self, track: Track) -> bool:
-        """Whether a track is smoothed in pieces; where stamps move, or GTSAM solves it, it is smoothed at once."""
+        """True if a track is smoothed in pieces; with changing stamps or GTSAM's solver it is smoothed at once."""
         return len(track) >= LONG and not self.settings.time_offsets and self.settings.solver != "gtsam"
 
     def in_sections(self, track: Track) -> Iterator[Estimate]:
@@ -151,10 +151,10 @@ class Smoother(Estimator):
         yield self.estimate(track)
 
     def first_look(self) -> Smoother:
-        """The smoother for while stamps are milliseconds off.
+        """The smoother for stamps with errors of milliseconds.
 
-        A flight then seems to be full of hits, which would only let the offsets go; and where contacts do not fit, no
-        step is good, while the offsets are nearly right after a few.
+        A flight then seems to be full of hits, which would absorb the offsets; and with wrong contacts no step reduces
+        the objective, while the offsets are nearly right after a few steps.
         """
         calm = replace(self.settings, find_events=False)
         return Smoother(self.model, self.surfaces, calm, replace(self.optimizer, max_iterations=FIRST_STEPS))
@@ -164,7 +164,7 @@ class Smoother(Estimator):
         return self._segmented(track)[0]
 
     def _segmented(self, track: Track) -> tuple[Segmentation, tuple[LowHops, ...]]:
-        """The events in a track, and the low hops that they allow for."""
+        """The events in a track, and the compatible low hops."""
         settings = self.settings.for_track(track)
         white = sample_sigmas(settings, len(track), track.sigmas)
         sigma = total_sigmas(settings, white, window_velocities(track.times, track.positions))
@@ -175,30 +175,30 @@ class Smoother(Estimator):
         return counted(found, hops, track.times), hops
 
     def low_hops(self, track: Track, events: Segmentation) -> tuple[LowHops, ...]:
-        """The stretches in which the ball hops too low for its bounces to be told one by one."""
+        """The stretches with hops too low for distinguishing single bounces."""
         return low_hops(track, events, self.model, self.surfaces, self.settings)
 
     def problem(
         self, track: Track, segmentation: Segmentation | None = None, sigma: Array | None = None
     ) -> TrackProblem:
-        """What is to be minimised for a track.
+        """The minimisation problem of a track.
 
         Args:
             track: with its observations.
-            segmentation: the events to start from; found in the track where None.
-            sigma: (n, 3) m, of the positions; the settings' or the track's own where None.
+            segmentation: the initial events; None: found in the track.
+            sigma: (n, 3) m, of the positions; None: the settings' or the track's own.
         """
         events, hops = self._segmented(track) if segmentation is None else (segmentation, None)
         return TrackProblem(track, self.model, self.settings, events, sigma, hops)
 
     def settle(self, problem: TrackProblem, earlier: Earlier | None = None) -> Solution:
-        """The minimum with the events that go with it.
+        """The minimum with its events.
 
-        Contacts move to where the estimate has them; where no label chooses the spin, a lower minimum with another one
-        is looked for; where the motion still breaks the model by far more than its noise, a hit went unseen, and is
-        marked. All this is decided at rough minima (`ROUGH`).
+        Contacts move to their estimated intervals; without a label that determines the spin, lower minima with another
+        spin are searched; if the motion still contradicts the model by far more than its noise, an unseen hit is added.
+        All this is decided at rough minima (`ROUGH`).
 
-        Args: problem: of a track.  earlier: what came before, where the track is the end of a longer one.
+        Args: problem: of a track.  earlier: information from before, if the track is the end of a longer one.
         """
         rough = replace(self.optimizer, tolerance=max(ROUGH, self.optimizer.tolerance))
         segmentation, before = problem.segmentation, None
@@ -230,7 +230,7 @@ class Smoother(Estimator):
     def _begin(
         self, problem: TrackProblem, segmentation: Segmentation, earlier: Earlier | None
     ) -> tuple[Events, Values]:
-        """The events that the segmentation found, and values to start from."""
+        """The segmentation's events, and initial values."""
         if earlier is not None:
             return Events(segmentation.contacts, segmentation), earlier.start
         label = self.settings.spin_label(problem.track)
@@ -238,7 +238,7 @@ class Smoother(Estimator):
         return Events(segmentation.contacts, segmentation), problem.start(states)
 
     def result(self, problem: TrackProblem, solution: Solution) -> Estimate:
-        """What a solution says about the track."""
+        """The estimate of a track from a solution."""
         known = self.optimizer.covariances(solution.graph, solution.minimum)
         estimate = with_both_sides(self, problem, self.at_minimum(problem, solution, known))
         segmentation = solution.events.segmentation
@@ -250,7 +250,7 @@ class Smoother(Estimator):
     def at_minimum(self, problem: TrackProblem, solution: Solution, known: Covariances | None) -> Estimate:
         """The estimate at a minimum, before a second look at the end of the track and at low hops.
 
-        Args: problem: of a track.  solution: of it.  known: covariances there; None where they are not determined.
+        Args: problem: of a track.  solution: of it.  known: covariances there; None if undetermined.
         """
         minimum, segmentation = solution.minimum, solution.events.segmentation
         track, values = problem.track, solution.minimum.values
@@ -286,6 +286,6 @@ class Smoother(Estimator):
 
 
 def _leads_nowhere(solution: Solution, before: Solution) -> bool:
-    """Whether one more hit left the search without a minimum, and the objective nearly as high."""
+    """True if one more hit left the search without a minimum and hardly lowered the objective."""
     found, gone = solution.minimum, solution.minimum.convergence in NOWHERE
     return gone and found.error > LEAST_GAIN * before.minimum.error

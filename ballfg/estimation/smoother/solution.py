@@ -1,4 +1,4 @@
-"""A minimised graph, and where it says that the contacts are."""
+"""A solution holds a minimised graph with its events and the estimated times of its contacts."""
 
 from dataclasses import dataclass
 
@@ -16,30 +16,30 @@ from ballfg.factors.linear.covariance import Covariances
 from ballfg.state import STATE_DIM
 
 ROUGH = 1e-2
-"""Posterior standard deviations. Where contacts and hits lie shows at minima that are known to this; only the last one
-is found to the optimizer's own tolerance."""
+"""Posterior standard deviations. Minima of this accuracy show the places of contacts and hits; only the last one is
+found to the optimizer's own tolerance."""
 BROKEN = 8.0
 """Norm of a whitened dynamics residual (9 dimensions) beyond which its interval hides a hit; chance: one in 1e9."""
 
 
 @dataclass(frozen=True)
 class Solution:
-    """A minimised graph and the events it was built on."""
+    """A minimised graph and its events."""
 
     events: Events
     graph: BallGraph
     minimum: Minimum
     rival: Array | None = None
-    """(3,) rad/s, first spin of another minimum that is nearly as low, where one was found."""
+    """(3,) rad/s, first spin of another minimum that is nearly as low, if any."""
 
 
 def places_of(contacts: tuple[Contact, ...]) -> tuple[tuple[int, float], ...]:
-    """Interval and height of each."""
+    """Interval and height of each contact."""
     return tuple((c.interval, c.height) for c in contacts)
 
 
 def timed_contacts(times: Array, solution: Solution) -> tuple[Contact, ...]:
-    """The contacts with the times that the estimate gives them; unchanged where it gives none."""
+    """The contacts with their estimated times; unchanged without an estimate."""
     grouped = contacts_by_interval(solution.events.contacts)
     timed: list[Contact] = []
     for batch in contact_batches(solution.graph):
@@ -53,7 +53,7 @@ def timed_contacts(times: Array, solution: Solution) -> tuple[Contact, ...]:
 
 
 def worst_break(solution: Solution) -> int | None:
-    """The interval whose dynamics factor is broken most, if any is; intervals with a hit have theirs in the noise."""
+    """The interval with the largest broken dynamics residual, if any; a hit widens the noise of its interval."""
     worst, where = BROKEN, None
     for batch, rows in zip((b for b in solution.graph.batches if len(b)), solution.minimum.linearized, strict=True):
         if isinstance(batch, DynamicsFactors):
@@ -66,7 +66,7 @@ def worst_break(solution: Solution) -> int | None:
 
 
 def status_of(minimum: Minimum, linked: int) -> Status:
-    """How the estimate of a track ended.
+    """The status of a track's estimate.
 
     Args: linked: intervals between samples over which the motion of the ball is followed.
     """
@@ -79,7 +79,7 @@ def status_of(minimum: Minimum, linked: int) -> Status:
 
 
 def prior_covariances(problem: TrackProblem) -> Covariances:
-    """What is known of each state by itself, where the graph could not be solved."""
+    """Covariance of each state by itself, for a graph that could not be solved."""
     coefficients = problem.coefficient_sigmas
     _, states = measured_only(problem.track.positions, problem.sigma, problem.settings)
     return Covariances(states, np.diag(coefficients**2), np.zeros((len(states), STATE_DIM, len(coefficients))))

@@ -1,4 +1,4 @@
-"""Synthetic recordings: the simulator's balls, filmed by cameras over a table, with the truth beside the videos."""
+"""Films the simulator's balls by cameras over a table, with their true states beside the videos."""
 
 import lazy_loader
 

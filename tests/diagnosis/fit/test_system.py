@@ -135,3 +135,15 @@ def test_without_priors_the_score_is_of_the_whole_least_squares_problem(system):
     estimate = np.linalg.solve(efficient.information.sum(0), efficient.score.sum(0))
     joint = np.linalg.lstsq(np.column_stack((common, states)), residual, rcond=None)[0]
     np.testing.assert_allclose(estimate, joint[Q : Q + P], atol=1e-11)
+
+
+def test_what_first_states_all_but_absorb_keeps_its_digits():
+    """A column of which they leave 1e-15: normal equations would have it wrong by half."""
+    rng = np.random.default_rng(3)
+    by_start, other = rng.normal(size=(N, M, STATE)), rng.normal(size=(N, M))
+    by_start[..., 8] = by_start[..., 7] + 0.01 * by_start[..., 8]
+    absorbed = (by_start @ rng.normal(size=(STATE, 1)))[..., 0]
+    left = np.stack([off(rows[:, None], states)[:, 0] for rows, states in zip(other, by_start, strict=True)])
+    column = absorbed + 3e-8 * left
+    gram = System(other, by_start, column[..., None]).eliminated().gram
+    np.testing.assert_allclose(gram[:, 0, 0], 9e-16 * (left**2).sum(axis=1), rtol=1e-6)

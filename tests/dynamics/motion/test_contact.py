@@ -11,7 +11,8 @@ from scipy.integrate import solve_ivp
 
 from ballfg.dynamics import contact_time, fly, fly_through, fly_through_jacobian
 from ballfg.dynamics.motion.contact import LONGEST_FALL, MAX_STEP, _newton_step, _scan
-from ballfg.dynamics.motion.integrate import batch_jacobian, derivative
+from ballfg.dynamics.motion.flight_step import derivative
+from ballfg.dynamics.motion.integrate import batch_jacobian
 
 R = 0.02
 

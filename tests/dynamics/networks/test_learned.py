@@ -22,7 +22,8 @@ from ballfg.dynamics import (
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.effect import Coefficient
 from ballfg.dynamics.model import take_rows
-from ballfg.dynamics.motion.integrate import batch_jacobian, rate_jacobian
+from ballfg.dynamics.motion.flight_step import rate_jacobian
+from ballfg.dynamics.motion.integrate import batch_jacobian
 from ballfg.dynamics.networks.learned_parts import HIGHEST_RESTITUTION, START_RESTITUTION
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.estimation.segmentation.physics import physics_of

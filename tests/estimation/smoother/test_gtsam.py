@@ -80,7 +80,7 @@ def test_the_settings_choose_what_holds_the_online_window(solver: Any, window: t
         online.push(time, position)
     assert isinstance(online.window, window)
     live = bf.Tracker(bf.nominal_model(), TABLE, settings(solver=solver))
-    assert live.estimator.solver == (solver or "ballfg")
+    assert live.estimator.settings.solver == (solver or "ballfg")
 
 
 def test_an_online_estimate_by_gtsam_alone_is_the_smoother_s() -> None:
