@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 from ballfg.simulation.cameras import table_rig
-from ballfg.simulation.scene import SceneConfig, record, write_scene
+from ballfg.simulation.scene.config import SceneConfig
+from ballfg.simulation.scene.recording import record
+from ballfg.simulation.scene.writing import write_scene
 from ballfg.tracks import read_dataset
 from ballfg.vision import Camera
 from ballfg.vision.camera_file import read_cameras, write_cameras

@@ -18,8 +18,10 @@ from ballfg.benchmarks.dynamics.fan import Fan
 from ballfg.benchmarks.dynamics.record import Record as ContenderRecord
 from ballfg.benchmarks.dynamics.scoring import PathScore
 from ballfg.benchmarks.results import Row
-from ballfg.dynamics import Architecture, SpinEmbedding, Trained, build, nominal_model, save_model
+from ballfg.dynamics import Architecture, build, nominal_model, save_model
 from ballfg.dynamics.networks.fading import Fading
+from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.dynamics.trained import Trained
 from ballfg.learning.calibration.calibrate import Problem, Step, TrackFit, pose
 from ballfg.learning.calibration.run import write_checkpoint as write_steps
 from ballfg.learning.config.calibration import CalibrationConfig
@@ -28,7 +30,8 @@ from ballfg.learning.run.checkpoint import write_checkpoint
 from ballfg.learning.run.metrics import Epoch, write_metrics
 from ballfg.simulation import SimulationConfig
 from ballfg.simulation.writing import write_simulation
-from ballfg.tracks import TrackNoise, read_dataset
+from ballfg.tracks import read_dataset
+from ballfg.tracks.noise import TrackNoise
 from tests.learning.run.test_checkpoint import made as made_checkpoint
 
 

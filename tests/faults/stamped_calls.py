@@ -13,6 +13,7 @@ import ballfg as bf
 from ballfg.estimation import estimate_noise, estimate_time_offsets
 from ballfg.estimation.configure import dataset_settings, dataset_surfaces
 from ballfg.live.tracker import Tracker
+from ballfg.tracks.sightings import Sightings
 from tests.estimation.observations.sighted_rig import RIG, scene, track_of, world
 from tests.faults.stamped_commands import Numbers, flat
 from tests.faults.stamped_shots import text
@@ -111,7 +112,7 @@ def call_sightings(_: Path, shift: int) -> Numbers:
     made = scene(3, ball)
     ticks = np.round(made.sightings.times * 1e6).astype(np.int64)
     stamps = np.array([float(text(shift + int(tick))) for tick in ticks])
-    made = made._replace(sightings=bf.tracks.Sightings(
+    made = made._replace(sightings=Sightings(
         made.sightings.cameras, made.sightings.camera, stamps, made.sightings.pixels, made.sightings.covariances
     ))  # fmt: skip
     track, settings = track_of(made), bf.Settings()

@@ -11,7 +11,8 @@ import pytest
 
 import ballfg as bf
 from ballfg.cli.main import run
-from ballfg.tracks import DatasetInfo, write_dataset
+from ballfg.tracks import write_dataset
+from ballfg.tracks.info import DatasetInfo
 from tests.front.my_shots import written
 
 

@@ -10,7 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import ballfg as bf
-from ballfg.estimation.segmentation import Contact
+from ballfg.estimation.segmentation.result import Contact
 
 PANDAS = importlib.util.find_spec("pandas") is not None
 
@@ -56,7 +56,7 @@ def test_reprs_are_short_and_say_what_a_thing_holds(shots: bf.Dataset, track: bf
         "Track": (track.observed(speeds), ("'000'", f"{len(track)} samples", "RadarSpeed(2 of 2 samples)")),
         "Dataset": (shots, ("'simulated table-tennis'", "3 tracks", "my_shots")),
         "BallState": (estimate.last, ("t = ", "position (", ") m +- (", "velocity", "spin", "rad/s")),
-        "Ahead": (estimate.predict(0.2), ("20 times to t = ", "+-")),
+        "Forecast": (estimate.predict(0.2), ("20 times to t = ", "+-")),
         "Crossing": (crossing, ("t = ", " ms, at (", ") mm")),
         "RadarSpeed": (speeds, ("2 of 2 samples",)),
     }

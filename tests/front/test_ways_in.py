@@ -11,7 +11,8 @@ import pytest
 
 import ballfg as bf
 from ballfg.dynamics import save_model
-from ballfg.estimation import TrackPrediction, dataset_settings
+from ballfg.estimation import dataset_settings
+from ballfg.estimation.track_prediction import TrackPrediction
 from ballfg.simulation import tennis
 from tests.front.my_shots import same, written
 

@@ -9,7 +9,8 @@ import torch
 import yaml
 from safetensors.torch import load_file
 
-from ballfg.learning import TRAINEES, read_config
+from ballfg.learning import read_config
+from ballfg.learning.registry import TRAINEES
 from ballfg.learning.run.metrics import read_metrics
 from ballfg.simulation import SimulationConfig, write_simulation
 from tests.learning.estimates import directional

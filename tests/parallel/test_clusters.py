@@ -12,8 +12,9 @@ from typing import Any
 import pytest
 
 from ballfg.dynamics import nominal_model
-from ballfg.estimation import Estimate, Estimator, dataset_settings, dataset_surfaces, make_estimator, predict_tracks
+from ballfg.estimation import Estimate, Estimator, dataset_settings, dataset_surfaces, predict_tracks
 from ballfg.estimation.batch import do_all, estimate_tracks
+from ballfg.estimation.registry import make_estimator
 from ballfg.parallel import on_cluster
 from ballfg.parallel.same_versions import HERE, differences, own_versions
 from ballfg.tracks import Dataset, read_dataset

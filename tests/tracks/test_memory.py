@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ballfg.tracks import TABLE_TENNIS, DatasetInfo, Track, write_dataset
+from ballfg.tracks import TABLE_TENNIS, Track, write_dataset
+from ballfg.tracks.info import DatasetInfo
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="peak memory is read from /proc")
 

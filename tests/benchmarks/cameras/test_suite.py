@@ -12,7 +12,8 @@ from ballfg.benchmarks.cameras.scenes import Filmed, Scenario, judge, scenarios,
 from ballfg.benchmarks.cameras.suite import add_clocks, add_points, add_turns, add_velocities
 from ballfg.benchmarks.cameras.turned import TURN, turned, turns
 from ballfg.benchmarks.results import Results
-from ballfg.simulation.scene import Clock, Recording
+from ballfg.simulation.scene.config import Clock
+from ballfg.simulation.scene.recording import Recording
 from ballfg.vision import Detections
 from ballfg.vision.tracking.pipeline import track_detections
 

@@ -4,14 +4,8 @@ import numpy as np
 import pytest
 
 from ballfg.dynamics import load_model
-from ballfg.estimation import (
-    Smoother,
-    dataset_settings,
-    dataset_surfaces,
-    estimate_noise,
-    predict_tracks,
-    spread_over,
-)
+from ballfg.estimation import Smoother, dataset_settings, dataset_surfaces, estimate_noise, predict_tracks
+from ballfg.estimation.noise.estimate import spread_over
 from ballfg.simulation import MeasurementNoise, MotionNoise, SimulationConfig, parse_effects, write_simulation
 from ballfg.tracks import read_dataset
 from tests.estimation.noise import intervals

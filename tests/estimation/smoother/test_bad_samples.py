@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ballfg.estimation.result import Status
-from ballfg.estimation.segmentation import Contact
+from ballfg.estimation.segmentation.result import Contact
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.tracks import Track
 from tests.estimation.smoother.serve import (

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.dynamics import Surfaces, contact_time
+from ballfg.dynamics import Surfaces
+from ballfg.dynamics.motion.contact import contact_time
 from ballfg.estimation.result import Status
-from ballfg.estimation.segmentation import Contact
+from ballfg.estimation.segmentation.result import Contact
 from ballfg.estimation.smoother.initial import initial_states, move_contacts
 from ballfg.estimation.smoother.motion import Motion
 from ballfg.estimation.smoother.smoother import Smoother
