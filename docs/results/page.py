@@ -70,9 +70,7 @@ def _lines(table: dict[str, Any]) -> list[list[str]]:
         of_method = [
             [(line.get("case", table.get("case")), name, metric) for metric in metrics] for name in table["columns"]
         ]
-        cells = (
-            " / ".join(_cell(rows[key], line) for key in keys if key in rows) for keys in of_method
-        )
+        cells = (" / ".join(_cell(rows[key], line) for key in keys if key in rows) for keys in of_method)
         lines.append([line["measure"], line.get("required", ""), *cells])
     return lines
 
