@@ -12,16 +12,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ballfg.checks import check_count, check_instance, check_path, type_name
-from ballfg.dynamics import BallModel, Surfaces, inertia_factor, load_model, nominal_model
-from ballfg.estimation import Estimate, Estimator, Settings, make_estimator
+from ballfg.dynamics import BallModel, Surfaces, load_model, nominal_model
+from ballfg.dynamics.nominal import inertia_factor
+from ballfg.estimation import Estimate, Estimator, Settings
+from ballfg.estimation.registry import make_estimator
 from ballfg.machine import MOST_JOBS
-from ballfg.prediction import Ahead, BallState
+from ballfg.prediction import BallState, Forecast
 from ballfg.tracks import TABLE_TENNIS, Ball, Track
 from ballfg.tracks.info import TrackFolder
 
 if TYPE_CHECKING:
     from ballfg.diagnosis import Diagnosis
-    from ballfg.estimation import ConformalScales, SightedDataset, TrackGraph, TrackPrediction
+    from ballfg.estimation import ConformalScales, TrackGraph
+    from ballfg.estimation.observations.sighted_dataset import SightedDataset
+    from ballfg.estimation.track_prediction import TrackPrediction
     from ballfg.tracks import Dataset
 
 Folder: TypeAlias = str | PathLike[str]
@@ -86,7 +90,7 @@ def estimate(
     estimator = estimator_for(data, method, model, surfaces, settings)
     if isinstance(data, Track):
         return estimator.estimate(data)
-    from ballfg.estimation import estimate_tracks
+    from ballfg.estimation.batch import estimate_tracks
 
     return {one.name: one for one in estimate_tracks(estimator, data, len(data), jobs)}
 
@@ -94,7 +98,7 @@ def estimate(
 @overload
 def predict(
     known: Estimate | BallState | OneTrack, horizon: float = ..., **options: Unpack[PredictOptions]
-) -> Ahead: ...
+) -> Forecast: ...
 @overload
 def predict(
     known: Tracks | Folder, horizon: float = ..., **options: Unpack[PredictOptions]
@@ -110,7 +114,7 @@ def predict(
     settings: Settings | None = None,
     conformal: Conformal = None,
     jobs: int = 1,
-) -> Ahead | dict[str, TrackPrediction]:
+) -> Forecast | dict[str, TrackPrediction]:
     """The path of the ball ahead, with standard deviations.
 
     Args:
@@ -137,7 +141,8 @@ def predict(
         _refuse(conformal)
         estimator = estimator_for(data, method, model, surfaces, settings)
         return estimator.estimate(data).predict(horizon)
-    from ballfg.estimation import check_observe, predict_tracks
+    from ballfg.estimation import predict_tracks
+    from ballfg.estimation.track_prediction import check_observe
 
     check_observe(observe)
     observe = float(observe)
@@ -164,7 +169,8 @@ def _scales(
     observe: float,
 ) -> ConformalScales | None:
     """The scales of predictions of `data`: the given ones, or from the given calibration tracks."""
-    from ballfg.estimation import ConformalScales, check_calibration_tracks, load_conformal
+    from ballfg.estimation import ConformalScales
+    from ballfg.estimation.conformal import check_calibration_tracks, load_conformal
 
     if isinstance(conformal, str | PathLike) and check_path("conformal", conformal).is_file():
         conformal = load_conformal(Path(conformal))
@@ -193,7 +199,7 @@ def diagnose(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) 
         FileNotFoundError: a folder or model file that is not there.
     """
     check_count("jobs", jobs, 1, MOST_JOBS)
-    from ballfg.estimation import SightedDataset
+    from ballfg.estimation.observations.sighted_dataset import SightedDataset
     from ballfg.parallel.work import on_one_thread
     from ballfg.tracks import Dataset
 
@@ -253,7 +259,8 @@ def estimator_for(
     source = data.dataset if isinstance(data, Track) else data
     ball = _model(model, source)
     if source is not None:
-        from ballfg.estimation import dataset_surfaces, fitted_settings
+        from ballfg.estimation import dataset_surfaces
+        from ballfg.estimation.configure import fitted_settings
     if surfaces is None:
         surfaces = 0.0 if source is None else dataset_surfaces(source)
     if settings is None:

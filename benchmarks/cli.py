@@ -302,7 +302,7 @@ def _start(command: str, data: Sequence[Path], quick: bool, seed: int, more: Seq
 
 def _open(data: Path) -> Dataset:
     """A dataset; repairs in it are noted on stderr."""
-    from ballfg.estimation import with_readings
+    from ballfg.estimation.reading import with_readings
     from ballfg.tracks import read_dataset
 
     dataset = with_readings(read_dataset(data))

@@ -59,7 +59,7 @@ class Values:
             return np.concatenate((self.states[variables], self.biases[variables]), axis=1)
         return self.states[variables]
 
-    def moved(self, states: Array, coefficients: Array) -> Values:
+    def retract(self, states: Array, coefficients: Array) -> Values:
         """These values plus a step.
 
         Args: states: (n, 9 + b) m, m/s, rad/s, m.  coefficients: (p,) in their own units.
@@ -153,7 +153,7 @@ class FactorBatch(ABC):
             "Write its method `residual` (docs/custom_factors.md)."
         )
 
-    def rewhitening(self, noise: Noise) -> Tensor | None:
+    def noise_scale(self, noise: Noise) -> Tensor | None:
         """The factor from whitened residuals to residuals whitened with learned noise, differentiable by that noise.
 
         Args: noise: the learned numbers.
@@ -179,7 +179,7 @@ class FactorBatch(ABC):
         other.loss = loss
         return other
 
-    def taken(self, rows: Index | slice) -> Self:
+    def select(self, rows: Index | slice) -> Self:
         """A part of the factors, as a batch of its own; the variables keep their numbers.
 
         Args: rows: (k,) index of the factors, or a slice.

@@ -84,7 +84,7 @@ class DynamicsFactors(FactorBatch):
         """
 
     @abstractmethod
-    def moved(self, state: Tensor) -> Tensor:
+    def transition(self, state: Tensor) -> Tensor:
         """F of all rows, (m, 9 + p) to (m, 9 + p), differentiable in the states and the model's parameters."""
 
     @property
@@ -95,10 +95,10 @@ class DynamicsFactors(FactorBatch):
     def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
         """(m, 9) whitened residuals in torch."""
         start = inputs[0] if len(inputs) == 2 else torch.cat((inputs[0], inputs[2][:, : self.width]), dim=-1)
-        offset = inputs[1] - self.moved(start)[:, :STATE_DIM]
+        offset = inputs[1] - self.transition(start)[:, :STATE_DIM]
         return (torch.from_numpy(self.whitening) @ offset.unsqueeze(-1)).squeeze(-1)
 
-    def rewhitening(self, noise: Noise) -> Tensor | None:
+    def noise_scale(self, noise: Noise) -> Tensor | None:
         """(m, 9, 9) the new whitening times the inverse of the old one."""
         if noise.process is None:
             return None
@@ -143,7 +143,7 @@ class FlightFactors(DynamicsFactors):
         """Flight over dt."""
         return fly_jacobian(self.model, state, self._tensor(self.dt[rows]))
 
-    def moved(self, state: Tensor) -> Tensor:
+    def transition(self, state: Tensor) -> Tensor:
         """Flight over dt."""
         dt = torch.from_numpy(self.dt)
         steps = step_count(dt)
@@ -197,7 +197,7 @@ class ContactFactors(SurfaceFactors):
         after, _, jacobian = fly_through_jacobian(self.model, state, self._tensor(self.dt[rows]), heights)
         return after, jacobian
 
-    def moved(self, state: Tensor) -> Tensor:
+    def transition(self, state: Tensor) -> Tensor:
         """Flight, impact, flight."""
         return fly_through(self.model, state, torch.from_numpy(self.dt), self._surfaces(slice(None)))[0]
 
@@ -225,7 +225,7 @@ class RestFactors(SurfaceFactors):
         dt, height = self._tensor(self.dt[rows]), self._tensor(self.heights[rows])
         return batch_jacobian(partial(_rolled, self.model, dt, height), state)
 
-    def moved(self, state: Tensor) -> Tensor:
+    def transition(self, state: Tensor) -> Tensor:
         """Rolling over dt."""
         return _rolled(self.model, torch.from_numpy(self.dt), torch.from_numpy(self.heights), state)
 

@@ -148,7 +148,7 @@ class LevenbergMarquardt:
                 return point.minimum(step, Convergence.CONVERGED, iteration, float(length), last)
             beyond = RATE_MARGIN * length * (length / last) if np.isfinite(last) else np.inf
             if step is not None and beyond < self.tolerance:
-                return point.moved(step).minimum(step, Convergence.CONVERGED, iteration, float(beyond), float(length))
+                return point.retract(step).minimum(step, Convergence.CONVERGED, iteration, float(beyond), float(length))
             trial = None if step is None else _tried(graph, point, step, damping)
             if step is not None and trial is not None and trial.error <= point.error * (1 + 1e-12):
                 gain = _gain(point, trial, step)
@@ -177,10 +177,10 @@ class _Point:
         self.values, self.linearized, self.error = values, linearized, objective(linearized)
         self.beyond = False
 
-    def moved(self, step: Step) -> "_Point":
+    def retract(self, step: Step) -> "_Point":
         """The point after a step without a linearisation, with the predicted objective."""
         after = copy.copy(self)
-        after.values, after.beyond = self.values.moved(step.states, step.coefficients), True
+        after.values, after.beyond = self.values.retract(step.states, step.coefficients), True
         after.error = self.error - step.decrease
         return after
 
@@ -208,13 +208,13 @@ def _tried(graph: BallGraph, point: _Point, step: Step, damping: float) -> _Poin
     If the objective bends r times as much along the step as the linear model says (friction between slip and grip
     does), the whole step gains (2 - r) of its prediction and 1 / r of it is best. Whole steps then creep or diverge.
     """
-    values = point.values.moved(step.states, step.coefficients)
+    values = point.values.retract(step.states, step.coefficients)
     whole = _Point(values, graph.linearize(values))
     gain = _gain(point, whole, step)
     tells = gain <= WHOLE or (gain >= SHORT and step.decrease > ROUNDING * point.error)
     if damping > 0.0 or not tells or step.decrease > NEAR or not np.isfinite(whole.error):
         return whole
     share = 1.0 / max(2.0 - gain, 1.0 / LONGEST)
-    values = point.values.moved(share * step.states, share * step.coefficients)
+    values = point.values.retract(share * step.states, share * step.coefficients)
     nearer = _Point(values, graph.linearize(values))
     return nearer if nearer.error < min(point.error, whole.error) else whole

@@ -62,7 +62,7 @@ class LauncherSpinFactors(FactorBatch):
         """(m, 3) whitened residuals in torch, differentiable in the embedding too."""
         return _whitened(self.embedding, torch.from_numpy(self.settings), torch.from_numpy(self.sigma), inputs[0])
 
-    def rewhitening(self, noise: Noise) -> Tensor | None:
+    def noise_scale(self, noise: Noise) -> Tensor | None:
         """One factor for all axes of all spins."""
         return None if noise.spin is None else 1.0 / noise.spin
 

@@ -48,7 +48,7 @@ class PositionFactors(FactorBatch):
         """(m, 3) whitened residuals in torch."""
         return (inputs[0][:, POSITION] - torch.from_numpy(self.measured)) * torch.from_numpy(self.information_root)
 
-    def rewhitening(self, noise: Noise) -> Tensor | None:
+    def noise_scale(self, noise: Noise) -> Tensor | None:
         """One factor for all axes of all samples."""
         return None if noise.position is None else 1.0 / noise.position
 

@@ -47,7 +47,7 @@ class PriorFactors(FactorBatch):
 class SpinLabelFactors(PriorFactors):
     """Priors on spins from labels; their standard deviation can be learned."""
 
-    def rewhitening(self, noise: Noise) -> Tensor | None:
+    def noise_scale(self, noise: Noise) -> Tensor | None:
         """One factor for all axes of all labels."""
         return None if noise.spin is None else 1.0 / noise.spin
 

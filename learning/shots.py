@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import Settings, Smoother
-from ballfg.estimation.segmentation import Segmentation
+from ballfg.estimation.segmentation.result import Segmentation
 from ballfg.tracks import Track
 
 LEAST_OBSERVED = 5
@@ -19,7 +19,7 @@ LEAST_PREDICTED = 3
 
 
 @dataclass(frozen=True)
-class Shot:
+class TrainingShot:
     """One track, cut into an observed part and a part to predict.
 
     Attributes:
@@ -64,7 +64,7 @@ def shots_of(
     *,
     samples: int | None,
     seconds: float | None,
-) -> Iterator[tuple[Track, Shot | str]]:
+) -> Iterator[tuple[Track, TrainingShot | str]]:
     """Each track with its shot, or the reason why it gives none. Observed are so many samples, or seconds.
 
     The model finds the events; an analytic one will do.
@@ -74,7 +74,7 @@ def shots_of(
         yield track, _shot(track, smoother, samples, seconds)
 
 
-def _shot(track: Track, smoother: Smoother, samples: int | None, seconds: float | None) -> Shot | str:
+def _shot(track: Track, smoother: Smoother, samples: int | None, seconds: float | None) -> TrainingShot | str:
     track = track.since_first()
     whole = smoother.segment(track)
     end = int(whole.hits[0]) + 1 if len(whole.hits) else len(track)
@@ -86,4 +86,4 @@ def _shot(track: Track, smoother: Smoother, samples: int | None, seconds: float 
     if usable[observed:].sum() < LEAST_PREDICTED:
         return f"fewer than {LEAST_PREDICTED} usable samples follow the observed part before the ball is hit"
     seen = part(track, observed)
-    return Shot(track, observed, usable, smoother.segment(seen), smoother.settings, smoother.surfaces)
+    return TrainingShot(track, observed, usable, smoother.segment(seen), smoother.settings, smoother.surfaces)

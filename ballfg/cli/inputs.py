@@ -125,7 +125,9 @@ class Inputs(Generic[D]):
         Args: method: its name.  solver: of its factor graph; None: the usual one.
         Raises: ValueError: if there is no such estimator, or the solver cannot solve it.
         """
-        from ballfg.estimation import Settings, fitted_settings, make_estimator
+        from ballfg.estimation import Settings
+        from ballfg.estimation.configure import fitted_settings
+        from ballfg.estimation.registry import make_estimator
 
         make_estimator(method, self.model, self.surfaces, Settings(solver=solver))  # refuses before any long work
         settings = fitted_settings(self.dataset, self.model, self.observed, progress)
@@ -142,7 +144,7 @@ def know_effects(files: Iterable[Path] | None) -> None:
 
 def know_observations(files: Iterable[Path] | None) -> None:
     """Registers the observations in files, so that their tables are read with a dataset."""
-    from ballfg.estimation import load_observations
+    from ballfg.estimation.observations.registry import load_observations
 
     for file in files or ():
         load_observations(file)
@@ -161,7 +163,7 @@ def open_inputs(
         observed: s from the start of each track that a noise estimate may use.
         ball: name of the dataset's known ball; None: any ball.
     """
-    from ballfg.estimation import with_readings
+    from ballfg.estimation.reading import with_readings
     from ballfg.tracks import read_dataset
 
     know_effects(effects_files)
@@ -189,7 +191,8 @@ def check_ball(data: Dataset | SightedDataset, name: str) -> None:
 
     Raises: ValueError: if the name is unknown, or the dataset's radius and mass differ from that ball's.
     """
-    from ballfg.dynamics import KNOWN_BALLS, known_ball, known_name
+    from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball
+    from ballfg.dynamics.nominal import known_name
 
     wanted, own = known_ball(name), data.ball
     if known_name(own) != wanted:
@@ -207,8 +210,10 @@ def open_model(data: Dataset | SightedDataset, model: Path | None, ball: str | N
     """
     import torch
 
-    from ballfg.dynamics import inertia_factor, load_model, nominal_model, nominal_note
-    from ballfg.estimation import table_note, unused_model
+    from ballfg.dynamics import load_model, nominal_model
+    from ballfg.dynamics.nominal import inertia_factor, nominal_note
+    from ballfg.estimation.configure import table_note
+    from ballfg.estimation.reading import unused_model
 
     if ball is not None:
         check_ball(data, ball)

@@ -11,21 +11,23 @@ from ballfg.diagnosis.fit.holdout import Holdout, hold_out
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.generic_test import ALARM, GenericTest
 from ballfg.diagnosis.label_verdicts import LabelCheck
-from ballfg.diagnosis.remains.fallback import fallback
-from ballfg.diagnosis.remains.generic import generic_tests
-from ballfg.diagnosis.remains.label_check import check_labels, label_test
-from ballfg.diagnosis.remains.residuals import residuals_of
-from ballfg.diagnosis.remains.tracker import look_at_tracker
 from ballfg.diagnosis.report.wording import refusal, sentence
+from ballfg.diagnosis.residual_tests.fallback import fallback
+from ballfg.diagnosis.residual_tests.generic import generic_tests
+from ballfg.diagnosis.residual_tests.label_check import check_labels, label_test
+from ballfg.diagnosis.residual_tests.residuals import residuals_of
+from ballfg.diagnosis.residual_tests.tracker_errors import look_at_tracker
 from ballfg.diagnosis.result import Diagnosis, Errors, Fallback, Unexplained, Value, Verdict
 from ballfg.diagnosis.search.evaluation import prediction_errors, prediction_floor
 from ballfg.diagnosis.search.loop import Search, SearchLoop
 from ballfg.diagnosis.search.plausible import implausible
 from ballfg.diagnosis.search.process_noise import Predicting, calibrated_model, noise_about
 from ballfg.diagnosis.search.stamp_effects import as_declared
-from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Effect
+from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel
+from ballfg.dynamics.effect import Effect
 from ballfg.estimation import dataset_settings
-from ballfg.tracks import Dataset, TrackNoise
+from ballfg.tracks import Dataset
+from ballfg.tracks.noise import TrackNoise
 
 MOSTLY = 0.1
 """Share of the first pattern below which the found effects count as its explanation."""

@@ -22,21 +22,23 @@ from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout, hold_out
 from ballfg.diagnosis.fit.problem import Fit, Noise, Problem
 from ballfg.diagnosis.fit.stretches import Stretches, joined
 from ballfg.diagnosis.label_verdicts import LabelCheck
-from ballfg.diagnosis.remains.generic import generic_tests
-from ballfg.diagnosis.remains.label_check import judged, label_evidence, label_test
-from ballfg.diagnosis.remains.patterns import DRIFT
-from ballfg.diagnosis.remains.residuals import residuals_of
 from ballfg.diagnosis.report.wording import joined as listed
 from ballfg.diagnosis.report.wording import refusal, sentence
+from ballfg.diagnosis.residual_tests.generic import generic_tests
+from ballfg.diagnosis.residual_tests.label_check import judged, label_evidence, label_test
+from ballfg.diagnosis.residual_tests.patterns import DRIFT
+from ballfg.diagnosis.residual_tests.residuals import residuals_of
 from ballfg.diagnosis.result import Diagnosis, Errors, Finding
 from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.diagnosis.search.hypothesis import effects_of, has_effect, with_effects, without_effect
 from ballfg.diagnosis.search.loop import SearchLoop
 from ballfg.diagnosis.search.process_noise import PredictiveModel, calibrated_model, fitted_model, noise_about
 from ballfg.diagnosis.search.varying import Grouping, Varying
-from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Effect
+from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel
+from ballfg.dynamics.effect import Effect
 from ballfg.estimation import dataset_settings
-from ballfg.tracks import Dataset, TrackNoise
+from ballfg.tracks import Dataset
+from ballfg.tracks.noise import TrackNoise
 
 ROOM: Final = "room"
 """The label that identifies the rooms."""

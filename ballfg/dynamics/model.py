@@ -18,7 +18,8 @@ from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, VELOCITY, VZ, Z
 if TYPE_CHECKING:
     from ballfg.dynamics.trained import Trained
     from ballfg.dynamics.variation import Variation
-    from ballfg.tracks import Track, TrackNoise
+    from ballfg.tracks import Track
+    from ballfg.tracks.noise import TrackNoise
 
 THIN_SHELL: Final = 2.0 / 3.0
 """Moment of inertia of a thin spherical shell divided by m R^2."""

@@ -16,7 +16,7 @@ from ballfg.dynamics.variation import Variation
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.files.whole_file import write_text
 from ballfg.files.whole_folder import of_one_state
-from ballfg.tracks import TrackNoise
+from ballfg.tracks.noise import TrackNoise
 
 KINDS: Final[tuple[Kind, ...]] = ("flight", "bounce", "measurement")
 VARIATIONS: Final = "variations"

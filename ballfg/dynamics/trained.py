@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
-from ballfg.tracks import TrackNoise
+from ballfg.tracks.noise import TrackNoise
 
 
 @dataclass(frozen=True)

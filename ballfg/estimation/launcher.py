@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from ballfg.checks import check_number
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.estimation.filters.window_velocity import window_velocities
-from ballfg.tracks import SPIN_LABELS, Track
+from ballfg.tracks import Track
+from ballfg.tracks.track import SPIN_LABELS
 
 FIRST_SAMPLES = 10
 """Number of samples whose mean direction of flight is the launch direction."""

@@ -4,7 +4,8 @@ from os import PathLike
 from pathlib import Path
 
 from ballfg.checks import check_path
-from ballfg.dynamics import model_to_dict, nominal_model
+from ballfg.dynamics import nominal_model
+from ballfg.dynamics.model_file import model_to_dict
 from ballfg.estimation.observations.files import read_readings
 from ballfg.estimation.observations.sighted_dataset import SightedDataset, read_sighted
 from ballfg.files.strict_yaml import read_mapping

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
-from ballfg.estimation.segmentation import Contact
-from ballfg.prediction.ahead import Ahead
+from ballfg.estimation.segmentation.result import Contact
+from ballfg.prediction.forecast import Forecast
 from ballfg.prediction.state import BallState, World
 from ballfg.state import SIGMA_NAMES, STATE_DIM, STATE_NAMES
 
@@ -182,7 +182,7 @@ class Estimate:
         contacts = tuple(replace(c, time=origin + c.time) for c in self.contacts)
         return replace(self, times=times, contacts=contacts)
 
-    def predict(self, horizon: float, step: float = 0.01) -> Ahead:
+    def predict(self, horizon: float, step: float = 0.01) -> Forecast:
         """The path of the ball from the last sample on; arguments and errors as those of `BallState.predict`."""
         return self.last.predict(horizon, step)
 

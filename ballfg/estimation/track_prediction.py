@@ -17,7 +17,7 @@ from ballfg.checks import as_float
 from ballfg.estimation.batch import map_blocks
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.measurement.as_measured import measured_positions, true_times
-from ballfg.estimation.outside import outside_of
+from ballfg.estimation.out_of_distribution import out_of_distribution
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.settings import sample_sigmas, total_sigmas
 from ballfg.prediction.belief import Belief
@@ -190,7 +190,7 @@ def _predict_alike(
     for k, predicted in enumerate(propagator.walk(belief, torch.from_numpy(times)) if times.size else ()):
         velocities[:, k] = predicted.mean[:, VELOCITY].numpy()
         positions[:, k] = measured_positions(predicted.model, predicted.mean, estimator.surfaces).numpy()
-        share = outside_of(predicted.model, predicted.mean)
+        share = out_of_distribution(predicted.model, predicted.mean)
         if share is not None:
             outside = np.zeros(times.shape) if outside is None else outside
             outside[:, k] = share

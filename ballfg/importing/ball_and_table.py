@@ -6,7 +6,8 @@ from typing import Final
 from ballfg.importing.bounces import surface
 from ballfg.importing.choices import Choices, Guess, UndecidedError
 from ballfg.importing.frame import Frame
-from ballfg.tracks import TABLE_TENNIS, TENNIS, Ball, Track
+from ballfg.tracks import TABLE_TENNIS, Ball, Track
+from ballfg.tracks.info import TENNIS
 
 BALLS: Final = {"table-tennis": TABLE_TENNIS, "tennis": TENNIS}
 _TENNIS_DRAG: Final = 0.045
@@ -25,7 +26,7 @@ def ball_of(choices: Choices, frame: Frame) -> tuple[Ball, Guess]:
         if choices.ball in BALLS:
             ball = BALLS[choices.ball]
         else:
-            from ballfg.simulation import ball_kind
+            from ballfg.simulation.balls import ball_kind
 
             ball = ball_kind(choices.ball).ball
         return ball, Guess("ball", choices.ball, "as given", "stated", f"--ball {choices.ball}")

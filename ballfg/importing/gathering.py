@@ -14,7 +14,7 @@ from ballfg.importing.columns import Roles, roles_of
 from ballfg.importing.fall import TIMES
 from ballfg.importing.formats.raw import RawTable
 from ballfg.importing.frame import Frame, likely_rate
-from ballfg.importing.shots import GAP, GAP_STEPS, Counts, Shot, cut, split_at_gaps
+from ballfg.importing.shots import GAP, GAP_STEPS, Counts, SourceShot, cut, split_at_gaps
 from ballfg.tracks.track import Label
 
 MOST_SHOTS: Final = 60
@@ -64,7 +64,7 @@ def understood(tables: Sequence[RawTable], choices: Choices) -> tuple[list[RawTa
     return chosen, read[0][1], beside
 
 
-def shots_of(tables: Sequence[RawTable], roles: Roles, choices: Choices, counts: Counts) -> list[Shot]:
+def shots_of(tables: Sequence[RawTable], roles: Roles, choices: Choices, counts: Counts) -> list[SourceShot]:
     """The shots of all tables, in the source's units, with unique names.
 
     Raises:
@@ -91,7 +91,7 @@ def shots_of(tables: Sequence[RawTable], roles: Roles, choices: Choices, counts:
         raise ValueError(f"{tables[0].where} must hold two samples of a shot or more; each has less. Check the export.")
     named = Counter(shot.name for _, shots in parts for shot in shots)
     clash = len(parts) > 1 and max(named.values()) > 1
-    found: list[Shot] = []
+    found: list[SourceShot] = []
     for table, shots in parts:
         own = table.name.rpartition("/")[2] or table.source
         for shot in shots:
@@ -104,7 +104,7 @@ def shots_of(tables: Sequence[RawTable], roles: Roles, choices: Choices, counts:
     return _unique(found)
 
 
-def _unique(shots: Iterable[Shot]) -> list[Shot]:
+def _unique(shots: Iterable[SourceShot]) -> list[SourceShot]:
     seen: Counter[str] = Counter()
     found = []
     for shot in shots:
@@ -113,12 +113,12 @@ def _unique(shots: Iterable[Shot]) -> list[Shot]:
     return found
 
 
-def relative(shot: Shot) -> tuple[Array, Array]:
+def relative(shot: SourceShot) -> tuple[Array, Array]:
     """(n,) stamps since the first one and (n, 3) positions of a shot, in the source's units."""
     return np.asarray(shot.stamps - shot.stamps[0], dtype=np.float64), shot.positions
 
 
-def split(shots: list[Shot], roles: Roles, frame: Frame, choices: Choices) -> tuple[list[Shot], Guess]:
+def split(shots: list[SourceShot], roles: Roles, frame: Frame, choices: Choices) -> tuple[list[SourceShot], Guess]:
     """The shots, cut at gaps in time that end a shot, and the guess for that.
 
     Args: shots: in the source's units.  roles: of their columns.  frame: its units.  choices: of the user.
@@ -156,7 +156,7 @@ def split(shots: list[Shot], roles: Roles, frame: Frame, choices: Choices) -> tu
     return _unique(done), Guess("shots", str(len(done)), why, "sure" if longest < gap / 2 else "likely", typed)
 
 
-def with_labels(shots: list[Shot], beside: Sequence[RawTable]) -> list[Shot]:
+def with_labels(shots: list[SourceShot], beside: Sequence[RawTable]) -> list[SourceShot]:
     """The shots with the labels of tables with one row per shot."""
     names = {shot.name for shot in shots}
     for table in beside:

@@ -8,7 +8,8 @@ from ballfg.checks import check_choice, check_flag, check_path
 from ballfg.importing.choices import Choices
 from ballfg.importing.proposal import propose
 from ballfg.importing.writing import write_import
-from ballfg.tracks import Dataset, dataset_in_memory, read_dataset
+from ballfg.tracks import Dataset, read_dataset
+from ballfg.tracks.memory import dataset_in_memory
 
 
 def import_tracks(

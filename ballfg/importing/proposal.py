@@ -14,11 +14,12 @@ from ballfg.importing.formats.raw import RawTable
 from ballfg.importing.formats.sources import tables_of
 from ballfg.importing.frame import Frame, find_frame
 from ballfg.importing.gathering import MOST_SHOTS, relative, shots_of, split, understood, with_labels
-from ballfg.importing.shots import Counts, Shot
+from ballfg.importing.shots import Counts, SourceShot
 from ballfg.importing.stamps import in_seconds, origin_of
-from ballfg.tracks import DatasetInfo, Track
+from ballfg.tracks import Track
 from ballfg.tracks.checks import Findings, tidy
 from ballfg.tracks.grouping import RowGroup
+from ballfg.tracks.info import DatasetInfo
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
     return Proposal(info, tracks, guesses, [*table_notes[:5], *counts.notes(), *notes])
 
 
-def _tracks(shots: Sequence[Shot], frame: Frame) -> tuple[list[Track], list[str]]:
+def _tracks(shots: Sequence[SourceShot], frame: Frame) -> tuple[list[Track], list[str]]:
     """Tracks in m and s with z up, and notes on their repairs."""
     stamps = [shot.stamps for shot in shots]
     far = [origin_of(one, frame.time) for one in stamps]

@@ -29,7 +29,7 @@ GAP_STEPS: Final = 20.0
 
 
 @dataclass(frozen=True)
-class Shot:
+class SourceShot:
     """The samples of one shot in the units of their source."""
 
     name: str
@@ -70,7 +70,7 @@ class Counts:
         return found
 
 
-def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list[Shot]:
+def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list[SourceShot]:
     """The shots of a table, cut at its trajectory column or else where time restarts.
 
     Raises: UndecidedError: no time and no rate. ValueError: text for a time, or no row with a position.
@@ -116,16 +116,16 @@ def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list
             continue
         own = None if sigmas is None else sigmas[part]
         known = {key: value for key, values in labels.items() if (value := values[i]) is not None}
-        found.append(Shot(name, stamps[part], positions[part], own, known, part, table))
+        found.append(SourceShot(name, stamps[part], positions[part], own, known, part, table))
     return found
 
 
-def split_at_gaps(shots: Iterable[Shot], unit: float, gap: float) -> list[Shot]:
+def split_at_gaps(shots: Iterable[SourceShot], unit: float, gap: float) -> list[SourceShot]:
     """The shots, cut at gaps of `gap` s.
 
     Args: unit: s in the unit of the stamps.  gap: s.
     """
-    found: list[Shot] = []
+    found: list[SourceShot] = []
     for shot in shots:
         steps = np.diff(shot.stamps).astype(np.float64) * unit
         places = np.flatnonzero(steps > gap) + 1

@@ -9,7 +9,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.live.outlook import Outlook
 from ballfg.live.tracker import BallUpdate
-from ballfg.prediction import Crossing
+from ballfg.prediction.crossing import Crossing
 from ballfg.state import POSITION, SPIN, VELOCITY
 
 Fields = dict[str, Any]

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from ballfg.arrays import Array
-from ballfg.estimation.segmentation import SegmentationPhysics
+from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.prediction.state import BallState
 
 GATE = 30.0

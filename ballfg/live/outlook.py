@@ -12,8 +12,9 @@ import numpy as np
 from ballfg.checks import shown
 from ballfg.estimation.online.state import OnlineState
 from ballfg.estimation.result import Status
-from ballfg.prediction import BallState, Crossing, apex, next_contact, plane_crossing
-from ballfg.prediction.ahead import carried_by
+from ballfg.prediction import BallState, apex, next_contact, plane_crossing
+from ballfg.prediction.crossing import Crossing
+from ballfg.prediction.forecast import carried_by
 from ballfg.state import VELOCITY
 
 VAGUE = 3.0

@@ -7,7 +7,7 @@ import numpy as np
 from ballfg.live.outlook import Outlook, unusable
 from ballfg.live.tracker import BallUpdate
 from ballfg.pages.recording import check_rerun
-from ballfg.prediction import Crossing
+from ballfg.prediction.crossing import Crossing
 
 EVERY = 3
 """Number of states per drawn path: the eye sees no more, and drawing takes time from the stream."""

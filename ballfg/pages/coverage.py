@@ -7,7 +7,7 @@ from statistics import NormalDist
 import numpy as np
 
 from ballfg.arrays import Array, Index
-from ballfg.pages.shot import SAME_STAMP, Shot
+from ballfg.pages.shot import SAME_STAMP, ShownShot
 
 LEVEL = 0.9
 """Nominal coverage of an interval."""
@@ -33,7 +33,7 @@ class Coverage:
     shots: Index
 
 
-def coverage(shots: Iterable[Shot]) -> Coverage:
+def coverage(shots: Iterable[ShownShot]) -> Coverage:
     """The coverage of the predictions of many shots.
 
     Args: shots: with samples and predictions; samples outside of the predicted part are left out.

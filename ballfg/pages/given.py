@@ -10,7 +10,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from ballfg.checks import listed, short_text, shown
 from ballfg.files.json_file import read_json
 from ballfg.pages.tables import Kind, ResultTable, columns_of, kind_of, read_table
-from ballfg.tracks import Ball, DatasetInfo, Track, read_dataset
+from ballfg.tracks import Ball, Track, read_dataset
+from ballfg.tracks.info import DatasetInfo
 
 REPORT = "report.json"
 """Name of the machine-readable file in a diagnosis folder."""

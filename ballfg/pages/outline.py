@@ -6,7 +6,8 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR, TABLE_LENGTH, TABLE_WIDTH
-from ballfg.tracks import TABLE_TENNIS, TENNIS, DatasetInfo
+from ballfg.tracks import TABLE_TENNIS
+from ballfg.tracks.info import TENNIS, DatasetInfo
 
 NET_HEIGHT = 0.1525
 """m, height above the table, and overhang at its sides (ITTF Laws 2.2)."""

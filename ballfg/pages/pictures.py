@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from ballfg.arrays import Array
 from ballfg.pages.coverage import HALF_WIDTH
 from ballfg.pages.outline import Outline
-from ballfg.pages.shot import Shot
+from ballfg.pages.shot import ShownShot
 
 AXES: Final = ("x", "y", "z")
 ESTIMATE, PREDICTION, MEASURED, TABLE = "#0072b2", "#d55e00", "#555555", "#2f7d6b"
@@ -18,7 +18,7 @@ ESTIMATE, PREDICTION, MEASURED, TABLE = "#0072b2", "#d55e00", "#555555", "#2f7d6
 MARKERS: Final = {"contact": ("D", "#117733"), "hit": ("X", "#cc3311")}
 
 
-def views(shot: Shot, table: Outline | None = None) -> Figure:
+def views(shot: ShownShot, table: Outline | None = None) -> Figure:
     """The shot from the side (x, z) and from above (x, y), with 90 % bands across the path.
 
     A shot that flies along y is drawn over y: (y, z) and (y, x).
@@ -40,7 +40,7 @@ def views(shot: Shot, table: Outline | None = None) -> Figure:
     return figure
 
 
-def by_axis(shot: Shot) -> Figure:
+def by_axis(shot: ShownShot) -> Figure:
     """x, y and z by time: measured, estimated and predicted, with 90 % bands."""
     figure = Figure(figsize=(8.0, 7.0), layout="constrained")
     panels = figure.subplots(3, 1, sharex=True)
@@ -79,7 +79,7 @@ def _table(panel: Axes, table: Outline | None, across: int, up: int) -> None:
         panel.plot((low, high, high, low, low), (near, near, far, far, near), color=TABLE, linewidth=1.2, label="table")
 
 
-def _paths(panel: Axes, shot: Shot, across: int, up: int) -> None:
+def _paths(panel: Axes, shot: ShownShot, across: int, up: int) -> None:
     view = [across, up]
     if len(shot.times):
         panel.plot(*shot.positions[:, view].T, ".", color=MEASURED, markersize=4, label="measured")

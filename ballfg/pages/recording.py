@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ballfg.pages.outline import Outline
-from ballfg.pages.shot import Shot
+from ballfg.pages.shot import ShownShot
 from ballfg.pages.shown import Shown
 
 RADIUS = 0.02
@@ -51,7 +51,7 @@ def _table(rerun: Any, recording: Any, table: Outline) -> None:
     recording.log("table", rerun.Boxes3D(centers=[middle], half_sizes=[half]), static=True)
 
 
-def _shot(rerun: Any, recording: Any, shot: Shot) -> None:
+def _shot(rerun: Any, recording: Any, shot: ShownShot) -> None:
     start, name = shot.start, f"shots/{rerun.escape_entity_path_part(shot.name)}"
     if len(shot.times):
         recording.log(f"{name}/measured", rerun.Points3D(shot.positions, radii=0.004), static=True)

@@ -9,7 +9,7 @@ from ballfg.pages.marks import Mark
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
+class ShownShot:
     """The contents of one track's drawing; arrays without rows stand for missing ones.
 
     Attributes:

@@ -11,7 +11,7 @@ from ballfg.pages.html import Html, explained, items, section, table, tag
 from ballfg.pages.marks import GAP
 from ballfg.pages.outline import NET_HEIGHT, Outline
 from ballfg.pages.page import own, whole_page
-from ballfg.pages.shot import Shot
+from ballfg.pages.shot import ShownShot
 from ballfg.pages.shown import Shown
 from ballfg.state import POSITION, SPIN, VELOCITY
 
@@ -225,7 +225,7 @@ def _table(outline: Outline) -> dict[str, Any]:
     return {"height": outline.height, "extent": list(outline.extent), "net": net, "floor": outline.floor}
 
 
-def _shot(shot: Shot) -> dict[str, Any]:
+def _shot(shot: ShownShot) -> dict[str, Any]:
     start = shot.start
     states = [
         *_plain(shot.states[:, POSITION].T, LENGTH_DECIMALS),
@@ -250,7 +250,7 @@ def _shot(shot: Shot) -> dict[str, Any]:
     }
 
 
-def _noise(shot: Shot) -> list[Any]:
+def _noise(shot: ShownShot) -> list[Any]:
     """The standard deviations of each axis: one number if all are equal, as in most datasets."""
     rows = _plain(shot.noise.T, SIGMA_DECIMALS)
     return [row[0] if len(set(row)) == 1 else row for row in rows]

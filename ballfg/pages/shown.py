@@ -11,7 +11,7 @@ from ballfg.pages.coverage import Coverage, coverage
 from ballfg.pages.given import Given
 from ballfg.pages.marks import marks
 from ballfg.pages.outline import Outline, outline
-from ballfg.pages.shot import SAME_STAMP, Shot
+from ballfg.pages.shot import SAME_STAMP, ShownShot
 from ballfg.pages.tables import ResultTable
 from ballfg.tracks import Track
 
@@ -38,7 +38,7 @@ class Shown:
     """
 
     given: Given
-    shots: tuple[Shot, ...]
+    shots: tuple[ShownShot, ...]
     count: int
     table: Outline | None
     coverage: Coverage | None
@@ -63,7 +63,7 @@ def collect(given: Given, names: Sequence[str] = (), limited: bool = True) -> Sh
             )
     notes = list(_check_results(given))
     wanted = set(names) if names else set(known[:MOST_SHOTS] if limited else known)
-    shots: list[Shot] = []
+    shots: list[ShownShot] = []
     for shot in _all_shots(given, wanted):
         if limited and sum(other.rows for other in shots) + shot.rows > MOST_ROWS:
             if not shots or names:
@@ -117,7 +117,7 @@ def _check_results(given: Given) -> Iterator[str]:
         yield f"The diagnosis is of {shown(named)}, the tracks are of {shown(dataset.info.name)}."
 
 
-def _all_shots(given: Given, wanted: set[str] | None = None) -> Iterator[Shot]:
+def _all_shots(given: Given, wanted: set[str] | None = None) -> Iterator[ShownShot]:
     """Shots in the dataset's order, without marks and noise; the wanted ones, or all."""
     if given.dataset is not None:
         for track in given.dataset:
@@ -129,8 +129,8 @@ def _all_shots(given: Given, wanted: set[str] | None = None) -> Iterator[Shot]:
             yield _shot(given, name, None)
 
 
-def _shot(given: Given, name: str, track: Track | None) -> Shot:
-    shot = Shot(name)
+def _shot(given: Given, name: str, track: Track | None) -> ShownShot:
+    shot = ShownShot(name)
     if track is not None:
         unknown = np.full(track.positions.shape, np.nan)
         noise = unknown if track.sigmas is None else track.sigmas
@@ -158,7 +158,7 @@ def _rows(table: ResultTable, name: str, track: Track | None) -> Array:
     return rows
 
 
-def _with_noise(given: Given, shots: list[Shot]) -> tuple[list[Shot], str]:
+def _with_noise(given: Given, shots: list[ShownShot]) -> tuple[list[ShownShot], str]:
     """The shots with the standard deviations of their samples, and a sentence on their origin."""
     assert given.dataset is not None
     info = given.dataset.info

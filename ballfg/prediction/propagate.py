@@ -57,11 +57,13 @@ class Prediction:
         Args: ball: index of the ball.
         """
         from ballfg.pages.pictures import by_axis
-        from ballfg.pages.shot import Shot
+        from ballfg.pages.shot import ShownShot
 
         sigmas = np.sqrt(np.diagonal(self.covariances[ball], axis1=1, axis2=2)[:, POSITION])
         places = self.states[ball][:, POSITION]
-        return by_axis(Shot(str(ball), predicted_times=self.times[ball], predicted=places, predicted_sigmas=sigmas))
+        return by_axis(
+            ShownShot(str(ball), predicted_times=self.times[ball], predicted=places, predicted_sigmas=sigmas)
+        )
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from ballfg.factors.noise import ProcessNoise
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 
 if TYPE_CHECKING:
-    from ballfg.prediction.ahead import Ahead
+    from ballfg.prediction.forecast import Forecast
 
 
 @dataclass(frozen=True)
@@ -99,13 +99,13 @@ class BallState:
         """(p,) model parameters, in their own units."""
         return self.mean[STATE_DIM:]
 
-    def predict(self, horizon: float, step: float = 0.01) -> Ahead:
+    def predict(self, horizon: float, step: float = 0.01) -> Forecast:
         """The path of the ball from this state.
 
         Args: horizon: s.  step: s between the times of the path.
         Raises: ValueError: a horizon or step that is not positive, or a state without a model.
         """
-        from ballfg.prediction.ahead import look_ahead
+        from ballfg.prediction.forecast import look_ahead
 
         return look_ahead(self, horizon, step)
 

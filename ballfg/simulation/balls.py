@@ -6,8 +6,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from ballfg.checks import check_number, listed, shown
-from ballfg.dynamics import KNOWN_BALLS, AnalyticModel, Surfaces, known_ball, model_from_dict, nominal_model
+from ballfg.dynamics import AnalyticModel, Surfaces, nominal_model
+from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball
 from ballfg.dynamics.model import THIN_SHELL
+from ballfg.dynamics.model_file import model_from_dict
 from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR, TABLE_LENGTH, TABLE_WIDTH
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.simulation.launcher import TABLE_LAUNCHER, SimulatedLauncher

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from ballfg.checks import check_each
-from ballfg.dynamics import AnalyticModel, BallModel, Effect
+from ballfg.dynamics import AnalyticModel, BallModel
+from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.model import Rates
 from ballfg.dynamics.motion.limits import REST_SPEED
 from ballfg.simulation.config import MotionNoise

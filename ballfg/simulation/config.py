@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from ballfg.checks import check_flag, check_instance
-from ballfg.dynamics import Effect
+from ballfg.dynamics.effect import Effect
 from ballfg.simulation.balls import BallKind, table_tennis
 from ballfg.simulation.bounded import bounded, check_bounds
 from ballfg.simulation.settings import Settings, all_settings

@@ -8,13 +8,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ballfg.arrays import Array
-from ballfg.dynamics import BallModel, advance
+from ballfg.dynamics import BallModel
+from ballfg.dynamics.motion.rollout import advance
 from ballfg.simulation.config import MeasurementNoise, SimulationConfig
-from ballfg.simulation.motion import Motion
+from ballfg.simulation.motion import TrueMotion
 from ballfg.simulation.settings import SETTING_LEVELS, Settings
 from ballfg.simulation.streams import Purpose, cut_normal, generator
 from ballfg.state import POSITION, SPIN
-from ballfg.tracks import SPIN_LABELS, Track
+from ballfg.tracks import Track
+from ballfg.tracks.track import SPIN_LABELS
 
 LEAST_SAMPLES = 2
 """Least number of samples in a track: readers refuse shorter ones."""
@@ -36,7 +38,7 @@ class SimulatedTrack:
 
 @torch.no_grad()
 def measure(
-    config: SimulationConfig, model: BallModel, motion: Motion, settings: Settings, block: int, first: int
+    config: SimulationConfig, model: BallModel, motion: TrueMotion, settings: Settings, block: int, first: int
 ) -> list[SimulatedTrack]:
     """The tracks of a block of shots.
 

@@ -8,9 +8,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ballfg.dynamics import BallModel, Surfaces, advance, rollout
+from ballfg.dynamics import BallModel, Surfaces, rollout
 from ballfg.dynamics.compiled.flight import white_acceleration
-from ballfg.dynamics.motion.rollout import is_resting
+from ballfg.dynamics.motion.rollout import advance, is_resting
 from ballfg.simulation.config import MotionNoise
 from ballfg.simulation.launcher import SimulatedLauncher
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ, Z
@@ -25,7 +25,7 @@ MIN_FRAMES = 5
 
 
 @dataclass(frozen=True)
-class Motion:
+class TrueMotion:
     """The true states of a block of shots at their frames, frame k at k / rate seconds."""
 
     states: NDArray[np.float64]
@@ -44,7 +44,7 @@ def simulate_motion(
     launcher: SimulatedLauncher,
     noise: MotionNoise,
     rng: np.random.Generator,
-) -> Motion:
+) -> TrueMotion:
     """Follows shots until they leave the launcher's view or last too long.
 
     Args:
@@ -73,7 +73,7 @@ def simulate_motion(
         alive, state = alive[kept == count], ahead[kept == count, -1]
         if len(alive) == 0:
             break
-    return Motion(states.numpy(), lengths.numpy())
+    return TrueMotion(states.numpy(), lengths.numpy())
 
 
 def _next_frames(

@@ -11,7 +11,7 @@ from ballfg.simulation.measure import SimulatedTrack, measure
 from ballfg.simulation.motion import simulate_motion
 from ballfg.simulation.settings import settings_of_shots
 from ballfg.simulation.streams import Purpose, generator
-from ballfg.tracks import DatasetInfo
+from ballfg.tracks.info import DatasetInfo
 
 
 def simulate(config: SimulationConfig) -> Iterator[SimulatedTrack]:

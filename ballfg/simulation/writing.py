@@ -9,7 +9,9 @@ from typing import Any, Final, Literal, cast
 import yaml
 
 from ballfg.checks import shown
-from ballfg.dynamics import Effect, model_to_dict, save_model
+from ballfg.dynamics import save_model
+from ballfg.dynamics.effect import Effect
+from ballfg.dynamics.model_file import model_to_dict
 from ballfg.files.whole_folder import check_replaceable, whole_folder
 from ballfg.progress import Watch, unwatched
 from ballfg.simulation.config import SimulationConfig

@@ -84,7 +84,7 @@ class Sightings:
     def __len__(self) -> int:
         return len(self.times)
 
-    def taken(self, rows: ArrayLike) -> Sightings:
+    def select(self, rows: ArrayLike) -> Sightings:
         """A part of the rows.
 
         Args: rows: (k,) their numbers, ascending, or (m,) bool.

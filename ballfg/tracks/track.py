@@ -42,7 +42,7 @@ class Measurements(Protocol):
         """Name of the kind of measurement."""
         ...
 
-    def taken(self, samples: NDArray[np.bool_]) -> Self:
+    def select(self, samples: NDArray[np.bool_]) -> Self:
         """The measurements of the selected samples (n,) bool of the track."""
         ...
 
@@ -194,7 +194,7 @@ class Track:
             positions=self.positions[inside],
             sigmas=sigmas,
             labels=labels,
-            observations=tuple(observation.taken(inside) for observation in self.observations),
+            observations=tuple(observation.select(inside) for observation in self.observations),
             part=self.part or not inside.all(),
         )
 

@@ -10,22 +10,15 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array
 from ballfg.benchmarks.cameras.scenes import Filmed, truth_at
 from ballfg.dynamics import nominal_model
-from ballfg.estimation import (
-    Estimate,
-    Online,
-    Settings,
-    Smoother,
-    TimeOffsets,
-    estimate_time_offsets,
-    sighted_track,
-)
+from ballfg.estimation import Estimate, Online, Settings, Smoother, estimate_time_offsets, sighted_track
 from ballfg.estimation.measurement.position_noise import estimate_position_noise
+from ballfg.estimation.smoother.time_offsets import TimeOffsets
 from ballfg.progress import progress
-from ballfg.simulation.scene import Flight
+from ballfg.simulation.scene.flights import Flight
 from ballfg.state import POSITION, VELOCITY, VZ
 from ballfg.tracks import Track
-from ballfg.vision import Camera, SeenBall, triangulate
-from ballfg.vision.association.gathering import nearest
+from ballfg.vision import Camera, triangulate
+from ballfg.vision.association.gathering import SeenBall, nearest
 
 NAIVE, FACTORS = "smoother, as if synchronised", "smoother, camera factors"
 """Two of the ways to estimate, for comparison."""

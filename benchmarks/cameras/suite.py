@@ -16,7 +16,7 @@ from ballfg.benchmarks.metrics import bootstrap, median_and_quartiles, median_an
 from ballfg.benchmarks.results import Results
 from ballfg.benchmarks.resumable import in_processes
 from ballfg.progress import progress
-from ballfg.simulation.scene import Clock
+from ballfg.simulation.scene.config import Clock
 
 LATE: Final = {"right": 0.004}
 """s, delay of the stamps in recordings with a late clock."""

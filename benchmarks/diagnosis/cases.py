@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from ballfg.benchmarks.diagnosis.effects import PAIRS, PLANTS, UNKNOWN
-from ballfg.simulation import SETTING_LEVELS
+from ballfg.simulation.settings import SETTING_LEVELS
 
 STATED_NOISE: Final = 0.003
 """m, noise of positions that every dataset states; in most it is true."""

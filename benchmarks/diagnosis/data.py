@@ -6,8 +6,9 @@ from pathlib import Path
 from ballfg.benchmarks.diagnosis.cases import LABEL_NOISE, STATED_NOISE, Case
 from ballfg.diagnosis.search.hypothesis import has_effect, with_effects, without_effect
 from ballfg.dynamics import AnalyticModel, nominal_model
-from ballfg.simulation import MeasurementNoise, SimulationConfig, dataset_info, parse_effects, simulate, table_tennis
+from ballfg.simulation import MeasurementNoise, SimulationConfig, parse_effects, simulate, table_tennis
 from ballfg.simulation.composition import true_model
+from ballfg.simulation.synthetic import dataset_info
 from ballfg.tracks import Dataset, read_dataset, write_dataset
 
 

@@ -7,8 +7,8 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.benchmarks.dynamics.contenders import GraphContender
-from ballfg.simulation import SETTING_LEVELS, table_tennis
-from ballfg.simulation.settings import Settings
+from ballfg.simulation import table_tennis
+from ballfg.simulation.settings import SETTING_LEVELS, Settings
 from ballfg.state import POSITION, SPIN, VELOCITY
 from ballfg.tracks import Track
 

@@ -17,7 +17,7 @@ from ballfg.benchmarks.estimators.measured import HORIZON
 from ballfg.benchmarks.pictures import BLUE, GREY, ORANGE, curve, save
 from ballfg.benchmarks.results import Row
 from ballfg.dynamics.surfaces import TABLE_LENGTH, TABLE_WIDTH
-from ballfg.simulation import SETTING_LEVELS
+from ballfg.simulation.settings import SETTING_LEVELS
 
 COLOURS: Final = {
     "truth": "#bdbdbd",

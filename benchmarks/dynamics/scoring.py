@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
-from ballfg.benchmarks.dynamics.task import Shot
+from ballfg.benchmarks.dynamics.task import TaskShot
 from ballfg.benchmarks.metrics import square_norms
 from ballfg.prediction.apexes import FLIGHTS, flight_bounds, path_apex
 
@@ -41,7 +41,7 @@ class PathScore:
         return pooled_rmse([self.rest])
 
 
-def score_path(shot: Shot, predicted: Array) -> PathScore:
+def score_path(shot: TaskShot, predicted: Array) -> PathScore:
     """The errors of a path predicted for a shot.
 
     Args:

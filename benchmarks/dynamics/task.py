@@ -7,8 +7,10 @@ from typing import Final
 
 from ballfg.arrays import Array
 from ballfg.dynamics import BallModel, Surfaces
-from ballfg.estimation import Launcher, Settings
-from ballfg.tracks import DatasetInfo, Track, write_dataset
+from ballfg.estimation import Settings
+from ballfg.estimation.launcher import Launcher
+from ballfg.tracks import Track, write_dataset
+from ballfg.tracks.info import DatasetInfo
 
 APEXES: Final = ("before_1", "1_2", "2_3")
 """The flights whose highest point is judged: before the first bounce, between the first two, between the next two."""
@@ -18,7 +20,7 @@ SPLIT_LABEL: Final = "split"
 
 
 @dataclass(frozen=True)
-class Shot:
+class TaskShot:
     """One track with its reference.
 
     Attributes:
@@ -71,8 +73,8 @@ class Task:
     launcher_labels: tuple[str, ...]
     observe: Mapping[str, float]
     truth: BallModel | None
-    train: tuple[Shot, ...]
-    validation: tuple[Shot, ...]
+    train: tuple[TaskShot, ...]
+    validation: tuple[TaskShot, ...]
 
     def write(self, folder: Path, *, validate: bool = True) -> None:
         """Write the tracks of both parts into a new folder, as a dataset with a label `split`.

@@ -24,23 +24,18 @@ import numpy as np
 import torch
 
 from ballfg.arrays import Array
-from ballfg.benchmarks.dynamics.task import Shot, Task
+from ballfg.benchmarks.dynamics.task import Task, TaskShot
 from ballfg.benchmarks.estimators.protocols import gaussian_settings
-from ballfg.dynamics import BallModel, Surfaces, contact_time
-from ballfg.estimation import Launcher
+from ballfg.dynamics import BallModel, Surfaces
+from ballfg.dynamics.motion.contact import contact_time
+from ballfg.estimation.launcher import Launcher
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction.apexes import true_apexes
 from ballfg.progress import progress
-from ballfg.simulation import (
-    MeasurementNoise,
-    SimulatedTrack,
-    SimulationConfig,
-    dataset_info,
-    parse_effects,
-    simulate,
-    table_tennis,
-)
+from ballfg.simulation import MeasurementNoise, SimulationConfig, parse_effects, simulate, table_tennis
 from ballfg.simulation.composition import true_model
+from ballfg.simulation.measure import SimulatedTrack
+from ballfg.simulation.synthetic import dataset_info
 from ballfg.state import POSITION, VZ
 
 CASE: Final = "synthetic"
@@ -117,7 +112,7 @@ def split(count: int, seed: int) -> tuple[list[int], list[int]]:
     return sorted(order[:fitted].tolist()), sorted(order[fitted:].tolist())
 
 
-def true_shot(made: SimulatedTrack, model: BallModel, surfaces: Surfaces) -> Shot:
+def true_shot(made: SimulatedTrack, model: BallModel, surfaces: Surfaces) -> TaskShot:
     """A simulated track up to its fourth bounce, with bounces and apexes of the true motion."""
     bounces = true_bounces(made.true_times, made.true_states, model, surfaces)
     keep = np.ones(len(made.track), dtype=bool)
@@ -126,7 +121,7 @@ def true_shot(made: SimulatedTrack, model: BallModel, surfaces: Surfaces) -> Sho
     times, states = made.true_times[keep], made.true_states[keep]
     track = replace(made.track, times=made.track.times[keep], positions=made.track.positions[keep])
     apexes, apex_times = true_apexes(times, states, bounces)
-    return Shot(
+    return TaskShot(
         track=track,
         reference=states[:, POSITION],
         observed=min(OBSERVED, len(track)),

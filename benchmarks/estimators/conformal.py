@@ -6,8 +6,9 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.benchmarks.metrics import Figure, inside
-from ballfg.estimation import ConformalScales, TrackPrediction
+from ballfg.estimation import ConformalScales
 from ballfg.estimation.conformal import FEWEST, LEVEL
+from ballfg.estimation.track_prediction import TrackPrediction
 
 SPLITS = 200
 """Random splits. The mean of their coverages is then good to 0.3 %; that of a single split has a spread of 3 %."""

@@ -13,18 +13,11 @@ from ballfg.benchmarks.estimators.scoring import LEVELS, sums_and_counts
 from ballfg.benchmarks.metrics import Statistic, bootstrap, inside, pooled_mean, quantile, root_mean_square
 from ballfg.benchmarks.results import CURVE_MARK, Results
 from ballfg.dynamics import BallModel, nominal_model
-from ballfg.estimation import (
-    ESTIMATORS,
-    Estimate,
-    Status,
-    TrackPrediction,
-    dataset_settings,
-    dataset_surfaces,
-    estimate_tracks,
-    make_estimator,
-    predict_tracks,
-)
-from ballfg.estimation.segmentation import Quality
+from ballfg.estimation import Estimate, Status, dataset_settings, dataset_surfaces, predict_tracks
+from ballfg.estimation.batch import estimate_tracks
+from ballfg.estimation.registry import ESTIMATORS, make_estimator
+from ballfg.estimation.segmentation.result import Quality
+from ballfg.estimation.track_prediction import TrackPrediction
 from ballfg.progress import progress
 from ballfg.tracks import Dataset
 

@@ -10,21 +10,16 @@ from numpy.typing import NDArray
 
 from ballfg.arrays import Array
 from ballfg.benchmarks.gaussian_settings import StepNoise, gaussian_settings
-from ballfg.dynamics import BallModel, Surfaces, contact_time, nominal_model, rollout
-from ballfg.estimation import (
-    ESTIMATORS,
-    Estimator,
-    ExtendedKalmanFilter,
-    Online,
-    Settings,
-    SlidingWindow,
-    Smoother,
-)
+from ballfg.dynamics import BallModel, Surfaces, nominal_model, rollout
+from ballfg.dynamics.motion.contact import contact_time
+from ballfg.estimation import Estimator, ExtendedKalmanFilter, Online, Settings, SlidingWindow, Smoother
+from ballfg.estimation.registry import ESTIMATORS
 from ballfg.factors.noise import ProcessNoise
 from ballfg.progress import progress
 from ballfg.simulation import MeasurementNoise, MotionNoise, SimulationConfig, simulate, table_tennis
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ
-from ballfg.tracks import SPIN_LABELS, Track
+from ballfg.tracks import Track
+from ballfg.tracks.track import SPIN_LABELS
 
 PAPER_SAMPLES = 80
 PAPER_RATE = 100.0

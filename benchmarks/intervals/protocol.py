@@ -14,7 +14,8 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.dynamics import BallModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation import Settings, Smoother, Status, estimate_noise, predict_tracks, spread_over
+from ballfg.estimation import Settings, Smoother, Status, estimate_noise, predict_tracks
+from ballfg.estimation.noise.estimate import spread_over
 from ballfg.tracks import Track
 
 OBSERVED: Final = 0.25

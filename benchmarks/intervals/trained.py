@@ -18,7 +18,7 @@ from ballfg.benchmarks.intervals.suite import LEVEL, known_surfaces
 from ballfg.benchmarks.metrics import inside
 from ballfg.benchmarks.results import Results
 from ballfg.dynamics import BallModel, load_model, nominal_model
-from ballfg.estimation import fitted_settings
+from ballfg.estimation.configure import fitted_settings
 from ballfg.learning import TrainConfig, run_training
 from ballfg.progress import progress
 from ballfg.tracks import Dataset, read_dataset

@@ -15,9 +15,10 @@ from ballfg.dynamics import Architecture, BallModel, Surfaces, build, nominal_mo
 from ballfg.estimation import Online, Settings, Smoother
 from ballfg.estimation.settings import Solver
 from ballfg.prediction import next_contact, plane_crossing
-from ballfg.prediction.ahead import carried_by
+from ballfg.prediction.forecast import carried_by
 from ballfg.simulation import SimulationConfig, simulate
-from ballfg.tracks import SPIN_LABELS, Track
+from ballfg.tracks import Track
+from ballfg.tracks.track import SPIN_LABELS
 
 RADIUS: Final = 0.02
 """m."""

@@ -15,19 +15,9 @@ from pydantic import BaseModel, ConfigDict
 from ballfg.arrays import Array
 from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation import (
-    Estimate,
-    NoiseEstimate,
-    Settings,
-    Smoother,
-    Status,
-    dataset_settings,
-    dataset_surfaces,
-    estimate_noise,
-    estimate_tracks,
-    spread_over,
-)
-from ballfg.estimation.batch import map_tracks
+from ballfg.estimation import Estimate, Settings, Smoother, Status, dataset_settings, dataset_surfaces, estimate_noise
+from ballfg.estimation.batch import estimate_tracks, map_tracks
+from ballfg.estimation.noise.estimate import NoiseEstimate, spread_over
 from ballfg.learning.calibration.coefficients import Chosen, choose, with_values
 from ballfg.learning.calibration.population import Evidence, evidence, fit_population
 from ballfg.learning.config.calibration import CalibrationConfig

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ballfg.estimation import NoiseEstimate
+from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.learning.calibration.calibrate import Problem, Step, has_converged
 from ballfg.learning.evaluation import Summary, TrackScore, summary
 

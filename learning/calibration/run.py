@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from ballfg.dynamics import model_to_dict, save_model
+from ballfg.dynamics import save_model
+from ballfg.dynamics.model_file import model_to_dict
 from ballfg.files.damaged import whole_content
 from ballfg.learning.calibration.calibrate import (
     Problem,

@@ -10,7 +10,7 @@ from torch import Tensor
 from ballfg.arrays import Array
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import Smoother
-from ballfg.estimation.segmentation import Contact
+from ballfg.estimation.segmentation.result import Contact
 from ballfg.estimation.smoother.problem import effective_sigmas
 from ballfg.estimation.smoother.smoother import Earlier
 from ballfg.estimation.smoother.solution import Solution
@@ -18,9 +18,10 @@ from ballfg.factors.batch import Values
 from ballfg.factors.graph import Convergence, LevenbergMarquardt
 from ballfg.learning.augment import apply, rotate, undo
 from ballfg.learning.end_to_end.learnables import Learnables
-from ballfg.learning.shots import Shot
+from ballfg.learning.shots import TrainingShot
 from ballfg.state import POSITION, SPIN, VELOCITY
-from ballfg.tracks import SPIN_LABELS, Track
+from ballfg.tracks import Track
+from ballfg.tracks.track import SPIN_LABELS
 
 TRAINING = LevenbergMarquardt(tolerance=1e-4)
 """Posterior standard deviations to the minimum: the gradient is off by as little, far less than batches scatter."""
@@ -116,7 +117,7 @@ class WarmStarts:
 class BatchSolver:
     """Solves shots, given by number, with the present parameters."""
 
-    shots: Sequence[Shot]
+    shots: Sequence[TrainingShot]
     learnables: Learnables
     optimizer: LevenbergMarquardt = TRAINING
     warm: WarmStarts = field(default_factory=WarmStarts)

@@ -42,7 +42,7 @@ def negative_log_likelihood(
         value = log_roots[track] + sum(r.error() for r in rows) + sum(kind.log_spread() for kind in kinds)
         expected = torch.zeros((), dtype=torch.float64)
         for kind, linearized in zip(kinds, rows, strict=True):
-            change = kind.rewhitening(noise)
+            change = kind.noise_scale(noise)
             if change is not None:
                 expected = expected + _expected(kind, linearized, posterior, track, change)
         totals.append(float(value) + expected - expected.detach())

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Final
 
-from ballfg.estimation import spread_over
+from ballfg.estimation.noise.estimate import spread_over
 from ballfg.files.whole_file import write_text
 from ballfg.learning.run import run_folder as files
 from ballfg.learning.run.loop import Task, Training

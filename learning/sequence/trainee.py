@@ -15,7 +15,7 @@ from ballfg.learning.sequence.architecture import SequenceArchitecture, Sequence
 from ballfg.learning.sequence.data import Batch, Example, LauncherSettings, collate, example
 from ballfg.learning.sequence.model import SequenceModel
 from ballfg.learning.sequence.predictor import SequencePredictor
-from ballfg.learning.shots import Shot
+from ballfg.learning.shots import TrainingShot
 from ballfg.learning.trainee import BatchLoss, PredictedShot, Prepared, Trainee
 from ballfg.learning.training_data import read_training_data
 from ballfg.tracks import Track
@@ -145,7 +145,7 @@ def build_sequence(config: TrainConfig) -> Prepared:
     return Prepared(trainee, data.train, data.validation)
 
 
-def _usable(shot: Shot) -> tuple[Track, int]:
+def _usable(shot: TrainingShot) -> tuple[Track, int]:
     """The usable samples of a shot, and the number of observed ones."""
     keep, track = shot.usable, shot.track
     sigmas = None if track.sigmas is None else track.sigmas[keep]

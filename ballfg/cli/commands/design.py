@@ -14,7 +14,7 @@ from ballfg.cli import inputs
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from ballfg.diagnosis import ShotPlan
+    from ballfg.diagnosis.design.plan import ShotPlan
     from ballfg.dynamics import AnalyticModel
     from ballfg.tracks import Dataset
 

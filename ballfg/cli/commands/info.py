@@ -19,7 +19,7 @@ from ballfg.machine import usable_cores
 from ballfg.registry import PACKAGE, Registry, source_of
 
 if TYPE_CHECKING:
-    from ballfg.dynamics import Effect
+    from ballfg.dynamics.effect import Effect
 
 REGISTRIES = (
     ("effects", "ballfg.dynamics", "EFFECTS"),
@@ -121,7 +121,9 @@ def balls() -> None:
 
 
 def _ball_lines() -> Iterator[str]:
-    from ballfg.dynamics import KNOWN_BALLS, model_to_dict, nominal_model
+    from ballfg.dynamics import nominal_model
+    from ballfg.dynamics.known_balls import KNOWN_BALLS
+    from ballfg.dynamics.model_file import model_to_dict
 
     titles = ("name", "radius mm", "mass g", "drag k 1/m", "terminal m/s", "restitution", "court m")
     yield f"{titles[0]:<13}" + "".join(f"{title:>14}" for title in titles[1:]) + "  radius and mass by"

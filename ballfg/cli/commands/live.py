@@ -143,7 +143,8 @@ def _scene(
     from dataclasses import replace
 
     from ballfg.checks import check_number
-    from ballfg.dynamics import KNOWN_BALLS, Surfaces, known_ball, load_model, nominal_model
+    from ballfg.dynamics import Surfaces, load_model, nominal_model
+    from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball
     from ballfg.estimation import dataset_settings, dataset_surfaces
 
     if data is not None:

@@ -13,7 +13,7 @@ from ballfg.progress import progress
 
 if TYPE_CHECKING:
     from ballfg.dynamics import BallModel
-    from ballfg.estimation import NoiseEstimate
+    from ballfg.estimation.noise.estimate import NoiseEstimate
     from ballfg.tracks import Dataset
 
 MEANINGS = {
@@ -53,7 +53,9 @@ def noise(
 
     Example: ballfg noise data/ballgun --out noisy.yaml
     """
-    from ballfg.estimation import dataset_settings, dataset_surfaces, estimate_noise, spread_over, with_readings
+    from ballfg.estimation import dataset_settings, dataset_surfaces, estimate_noise
+    from ballfg.estimation.noise.estimate import spread_over
+    from ballfg.estimation.reading import with_readings
     from ballfg.tracks import read_dataset
 
     inputs.know_effects(effects_file)

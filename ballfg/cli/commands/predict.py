@@ -14,7 +14,8 @@ from ballfg.progress import progress
 if TYPE_CHECKING:
     import numpy as np
 
-    from ballfg.estimation import ConformalScales, Estimator, TrackPrediction
+    from ballfg.estimation import ConformalScales, Estimator
+    from ballfg.estimation.track_prediction import TrackPrediction
     from ballfg.tracks import Dataset
 
 
@@ -52,7 +53,8 @@ def predict(
 
     Example: ballfg predict data/ballgun --observe 0.25 --out predictions.csv
     """
-    from ballfg.estimation import check_observe, predict_tracks
+    from ballfg.estimation import predict_tracks
+    from ballfg.estimation.track_prediction import check_observe
     from ballfg.files.whole_file import check_file
     from ballfg.tracks import TableWriter
 
@@ -96,13 +98,9 @@ def _conformal_scales(
     jobs: int,
 ) -> ConformalScales:
     """Scales from the calibration tracks of a folder, or from a file of scales."""
-    from ballfg.estimation import (
-        ConformalScales,
-        check_calibration_tracks,
-        load_conformal,
-        predict_tracks,
-        with_readings,
-    )
+    from ballfg.estimation import ConformalScales, predict_tracks
+    from ballfg.estimation.conformal import check_calibration_tracks, load_conformal
+    from ballfg.estimation.reading import with_readings
     from ballfg.tracks import read_dataset
 
     if source.is_file():

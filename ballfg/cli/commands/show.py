@@ -12,7 +12,7 @@ from ballfg.files.whole_file import check_file, whole_file, write_text
 
 if TYPE_CHECKING:
     from ballfg.estimation.observations.sighted_dataset import SightedDataset
-    from ballfg.pages import Shown
+    from ballfg.pages.shown import Shown
     from ballfg.tracks import Dataset
 
 
@@ -40,7 +40,9 @@ def show(
 
     The page is one file without links: it opens without a network, on a computer or a phone.
     """
-    from ballfg.pages import collect, recognise, show_page
+    from ballfg.pages.given import recognise
+    from ballfg.pages.show_page import show_page
+    from ballfg.pages.shown import collect
 
     _check_outputs(out, png, rerun)
     what, names = recognise(given, _dataset), track or []
@@ -102,7 +104,7 @@ def _write_picture(shown: Shown, png: Path) -> None:
 
 
 def _write_recording(shown: Shown, rerun: Path) -> None:
-    from ballfg.pages import record
+    from ballfg.pages.recording import record
 
     with whole_file(rerun, "rerun") as temporary:
         record(shown, temporary)

@@ -71,7 +71,7 @@ def track(
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     from ballfg.files.whole_folder import reserved
     from ballfg.simulation.balls import ball_kind
-    from ballfg.tracks import DatasetInfo
+    from ballfg.tracks.info import DatasetInfo
     from ballfg.vision.camera_file import read_cameras
     from ballfg.vision.tracking.dataset import check_result_folder, write_tracking
     from ballfg.vision.tracking.recordings import without as others

@@ -9,9 +9,11 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.stamps import Stamps, look_at_stamps
 from ballfg.diagnosis.fit.stretches import LEAST_SAMPLES, Stretches, stretches_of
-from ballfg.dynamics import AnalyticModel, SpinEmbedding, Surfaces
-from ballfg.estimation import Launcher, Settings, Smoother, dataset_settings, dataset_surfaces
+from ballfg.dynamics import AnalyticModel, Surfaces
+from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.estimation import Settings, Smoother, dataset_settings, dataset_surfaces
 from ballfg.estimation.batch import map_tracks
+from ballfg.estimation.launcher import Launcher
 from ballfg.estimation.measurement.as_measured import plainly_measured
 from ballfg.estimation.measurement.position_noise import estimate_position_noise
 from ballfg.state import STANDARD_GRAVITY

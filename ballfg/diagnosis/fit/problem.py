@@ -12,8 +12,9 @@ from ballfg.diagnosis.fit.free import Deviation
 from ballfg.diagnosis.fit.sensitivity import Predicted, Sensitivity, predict, sensitivity
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.fit.system import System, by_track
-from ballfg.dynamics import AnalyticModel, Coefficient, Variation
+from ballfg.dynamics import AnalyticModel, Coefficient
 from ballfg.dynamics.networks.spin_embedding import SOFT_SPEED
+from ballfg.dynamics.variation import Variation
 from ballfg.factors.loss import Loss
 from ballfg.state import SPIN, STATE_DIM, VELOCITY
 

@@ -18,8 +18,9 @@ from ballfg.diagnosis.fit.moved_shot import Coefficients, shoot_compiled
 from ballfg.diagnosis.fit.shooting import shoot
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.fit.tangents import MovedArc, RepeatedMotion
-from ballfg.dynamics import BallModel, substitute
+from ballfg.dynamics import BallModel
 from ballfg.dynamics.compiled.functions import CompiledModel, compiled
+from ballfg.dynamics.model import substitute
 from ballfg.state import SPIN, STATE_DIM
 
 MOST_ROWS = 3000

@@ -11,9 +11,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ballfg.dynamics import BallModel, contact_time, fly
+from ballfg.dynamics import BallModel
 from ballfg.dynamics.model import take_rows
+from ballfg.dynamics.motion.contact import contact_time
 from ballfg.dynamics.motion.flight_step import derivative, rk4_step
+from ballfg.dynamics.motion.integrate import fly
 from ballfg.dynamics.motion.limits import MAX_STEP
 from ballfg.dynamics.motion.paths import hermite
 from ballfg.state import VELOCITY

@@ -16,8 +16,9 @@ import torch
 from torch import Tensor
 
 from ballfg.arrays import Array, Index, Mask
-from ballfg.estimation import Launcher, Smoother
+from ballfg.estimation import Smoother
 from ballfg.estimation.batch import map_tracks
+from ballfg.estimation.launcher import Launcher
 from ballfg.tracks import Track
 
 LEAST_SAMPLES = 10

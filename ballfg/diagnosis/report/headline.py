@@ -10,14 +10,14 @@ from typing import Final
 import numpy as np
 
 from ballfg.diagnosis.generic_test import ALARM
-from ballfg.diagnosis.remains.label_check import LABEL
-from ballfg.diagnosis.remains.patterns import EVERYWHERE
 from ballfg.diagnosis.report.origin import Origin
 from ballfg.diagnosis.report.plain_effects import BY_GROUP, DRIFT, in_plain_words, plain_name
 from ballfg.diagnosis.report.wording import NONE, fixed, joined, number, probability, sized
+from ballfg.diagnosis.residual_tests.label_check import LABEL
+from ballfg.diagnosis.residual_tests.patterns import EVERYWHERE
 from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Finding, Outcome, Verdict
 from ballfg.dynamics import EFFECTS
-from ballfg.estimation.noise.tracker import NUMBERS
+from ballfg.estimation.noise.tracker_errors import NUMBERS
 
 PLACES: Final = {
     "flight": "in flight",

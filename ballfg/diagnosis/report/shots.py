@@ -24,7 +24,7 @@ BINS: Final = 8
 
 
 @dataclass(frozen=True)
-class Shot:
+class ShotErrors:
     """One held-out track, predicted by the declared and by the corrected model, or twice by an unchanged one."""
 
     before: PredictedPath
@@ -42,17 +42,17 @@ def distances(path: PredictedPath) -> Array:
     return np.asarray(np.linalg.norm(path.predicted - path.measured, axis=-1))
 
 
-def median_shot(before: Errors, after: Errors, changed: bool) -> Shot | None:
+def median_shot(before: Errors, after: Errors, changed: bool) -> ShotErrors | None:
     """The shot with the median gain, or the median error of an unchanged model; None without predictions."""
     later = {path.name: path for path in after.paths}
-    shots = [Shot(path, later[path.name]) for path in before.paths if path.name in later]
+    shots = [ShotErrors(path, later[path.name]) for path in before.paths if path.name in later]
     if not shots:
         return None
     key = (lambda s: s.errors[0] - s.errors[1]) if changed else (lambda s: s.errors[1])
     return sorted(shots, key=key)[(len(shots) - 1) // 2]
 
 
-def shot_picture(shot: Shot, changed: bool) -> Figure:
+def shot_picture(shot: ShotErrors, changed: bool) -> Figure:
     """Side view, top view and error over time of one shot."""
     figure = Figure(figsize=(SHEET, 7.2), layout="constrained")
     side, top, error = figure.subplots(3, 1)

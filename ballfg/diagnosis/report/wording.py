@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from ballfg.diagnosis.result import Finding, Outcome, Refusal, Unexplained, Value, Verdict
-from ballfg.estimation.noise.tracker import NUMBERS
+from ballfg.estimation.noise.tracker_errors import NUMBERS
 
 NONE = "–"
 """Text for a missing number."""

@@ -17,8 +17,10 @@ from ballfg.diagnosis.search.plausible import SIGMAS
 from ballfg.diagnosis.search.score import score_tests
 from ballfg.diagnosis.search.signatures import Signatures
 from ballfg.dynamics import BallModel, Surfaces
-from ballfg.estimation import Settings, Status, TrackPrediction, make_estimator, predict_tracks
+from ballfg.estimation import Settings, Status, predict_tracks
 from ballfg.estimation.noise.forecasts import NINETY
+from ballfg.estimation.registry import make_estimator
+from ballfg.estimation.track_prediction import TrackPrediction
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction.apexes import measured_apexes, path_apex
 from ballfg.tracks import Track

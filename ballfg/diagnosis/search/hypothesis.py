@@ -11,8 +11,8 @@ import numpy as np
 from ballfg.diagnosis.fit.free import LOOSE, Deviation, spread
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.result import Value
-from ballfg.dynamics import AnalyticModel, Coefficient, Effect
-from ballfg.dynamics.effect import Scene, Vector
+from ballfg.dynamics import AnalyticModel, Coefficient
+from ballfg.dynamics.effect import Effect, Scene, Vector
 
 TWINS: Mapping[str, tuple[str, ...]] = {"gravity": ("buoyancy",)}
 """Effects that are equivalent to another one in a model: the other one is listed for both."""
@@ -59,7 +59,7 @@ class Hypothesis:
         """Its unknowns that act on some tracks more than on others; none if the effect is the same for all."""
         return {}
 
-    def told(self, fit: Fit, values: Mapping[str, Value]) -> dict[str, Value]:
+    def reported(self, fit: Fit, values: Mapping[str, Value]) -> dict[str, Value]:
         """Coefficients for a report; values: fitted ones, by coefficient."""
         shape = {c: Value(v, 0.0, self.coefficients[c].unit) for c, v in self.shape.items() if c not in values}
         return {**values, **shape}

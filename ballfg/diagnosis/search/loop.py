@@ -19,7 +19,8 @@ from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_
 from ballfg.diagnosis.search.state import Confirmed, Search, left_out, without_named
 from ballfg.diagnosis.search.trial import try_further, try_hypotheses, try_varying
 from ballfg.diagnosis.search.varying import Grouping, groupings
-from ballfg.dynamics import AnalyticModel, BallModel, Effect
+from ballfg.dynamics import AnalyticModel, BallModel
+from ballfg.dynamics.effect import Effect
 from ballfg.estimation.batch import do_all
 
 MOST_EFFECTS = 4

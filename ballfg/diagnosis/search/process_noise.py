@@ -16,10 +16,14 @@ from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.result import Errors
 from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.diagnosis.search.hypothesis import with_effects
-from ballfg.dynamics import AnalyticModel, BallModel, SpinEmbedding, Trained
+from ballfg.dynamics import AnalyticModel, BallModel
 from ballfg.dynamics.analytic import coefficient_sigmas
-from ballfg.estimation import dataset_settings, dataset_surfaces, estimate_noise, spread_over
-from ballfg.tracks import Dataset, TrackNoise
+from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.dynamics.trained import Trained
+from ballfg.estimation import dataset_settings, dataset_surfaces, estimate_noise
+from ballfg.estimation.noise.estimate import spread_over
+from ballfg.tracks import Dataset
+from ballfg.tracks.noise import TrackNoise
 
 MOST_PREDICTED = 15
 """Number of the search half's tracks whose predictions reveal a misleading effect, evenly spread."""

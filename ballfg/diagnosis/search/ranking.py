@@ -45,7 +45,7 @@ def fitted_values(fit: Fit, hypothesis: Hypothesis) -> dict[str, Value]:
     """The fitted coefficients of an effect, and the fixed ones of its shape."""
     names = {hypothesis.parameter(name): name for name in hypothesis.coefficients}
     values = values_of(fit, [name for name in names if name in fit.problem.free], {})
-    return hypothesis.told(fit, {names[name]: value for name, value in values.items()})
+    return hypothesis.reported(fit, {names[name]: value for name, value in values.items()})
 
 
 def as_left(findings: Sequence[Finding], named: Sequence[Hypothesis], fit: Fit, first: Fit) -> tuple[Finding, ...]:

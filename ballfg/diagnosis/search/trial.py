@@ -21,7 +21,7 @@ from ballfg.diagnosis.search.evaluation import on_others
 from ballfg.diagnosis.search.hypothesis import has_effect, hypotheses, scene_of
 from ballfg.diagnosis.search.label_frames import frame_hypotheses
 from ballfg.diagnosis.search.varying import Grouping, Varying, between, near, varying_hypotheses
-from ballfg.dynamics import Effect
+from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.effects.measurement import SpinLabelFrame
 from ballfg.dynamics.variation import place_of
 from ballfg.estimation.batch import do_all

@@ -18,7 +18,8 @@ from ballfg.diagnosis.fit.free import LOOSE, Deviation, spread
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.result import Value
 from ballfg.diagnosis.search.hypothesis import Hypothesis, has_effect, with_effects
-from ballfg.dynamics import AnalyticModel, Coefficient, Effect, Scene
+from ballfg.dynamics import AnalyticModel, Coefficient, Scene
+from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.variation import TRACK, number_of, place_of
 from ballfg.tracks import Track
 
@@ -203,7 +204,7 @@ class Varying(Hypothesis):
         absent = {c.name: c.absent for c in self.effect.coefficients if c.absent is not None}
         return with_effects(model, self.effect(**absent))
 
-    def told(self, fit: Fit, values: Mapping[str, Value]) -> dict[str, Value]:
+    def reported(self, fit: Fit, values: Mapping[str, Value]) -> dict[str, Value]:
         """The coefficients at each level, for a report; values: fitted deviations, by strength."""
         variations, told = fit.variations(), dict[str, Value]()
         for strength, deviation in values.items():

@@ -26,7 +26,7 @@ from ballfg.dynamics.trained import Trained
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.files.weights import read_tensors
 from ballfg.files.whole_folder import whole_folder
-from ballfg.tracks import TrackNoise
+from ballfg.tracks.noise import TrackNoise
 
 CONFIG, WEIGHTS = "config.yaml", "weights.safetensors"
 LEARNED = ".learned-"

@@ -9,7 +9,7 @@ from scipy.special import chdtri
 
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.advance_jacobian import Motion, advance_jacobian
+from ballfg.dynamics.motion.advance_jacobian import Advance, advance_jacobian
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.innovation import FilterInnovation
 from ballfg.factors.batch import FactorBatch
@@ -42,7 +42,7 @@ class BallFilter(FilterpyEKF):
         self.width = STATE_DIM + model_width(model)
         self.predicted = mean
 
-    def move(self, point: Array, dt: float, decay: float) -> Motion:
+    def move(self, point: Array, dt: float, decay: float) -> Advance:
         """Sets F at the linearisation point, and the mean that `predict_x` will put into x."""
         width = self.width
         motion = advance_jacobian(self.model, torch.from_numpy(point[:width])[None], dt, self.surfaces)

@@ -17,7 +17,7 @@ from scipy.linalg import LinAlgWarning
 from ballfg.arrays import Array
 from ballfg.checks import check_choice, check_flag
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.advance_jacobian import Motion
+from ballfg.dynamics.motion.advance_jacobian import Advance
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.rts import FilterRecord, fly_back, rts_smooth
@@ -26,15 +26,15 @@ from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities
 from ballfg.estimation.observations.observation import Context, refuse_unknowns
 from ballfg.estimation.plausible import plausible
 from ballfg.estimation.result import Estimate, Status
-from ballfg.estimation.segmentation import Contact, Quality
+from ballfg.estimation.segmentation.result import Contact, Quality
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, stamp_covariance, total_sigmas
 from ballfg.estimation.sides.hypotheses import HypothesisModel, SampleMeasurement
 from ballfg.estimation.sides.monitor import ContactMonitor, ContactState, with_contact_states
 from ballfg.estimation.sides.widening import widened_near_contacts
 from ballfg.estimation.smoother.problem import coefficient_means, trackwise_model
 from ballfg.factors.batch import FactorBatch
+from ballfg.factors.correlated_noise import bias_step
 from ballfg.factors.linear.definite import raised
-from ballfg.factors.tracker import bias_step
 from ballfg.state import POSITION, STATE_DIM, VELOCITY, Z
 from ballfg.tracks import Ball, Track
 
@@ -237,7 +237,7 @@ class _Run:
         if self.record.quality[k] == Quality.OUTLIER:
             return SampleMeasurement()
         rows = [(batch, row) for one, batch in self.beside for row in one.filter_rows(k)]
-        factors = [batch.taken(np.array([row])) for batch, row in rows]
+        factors = [batch.select(np.array([row])) for batch, row in rows]
         return SampleMeasurement(self.track.positions[k], self.sigma[k], factors)
 
     def _least(self) -> Array:
@@ -342,7 +342,7 @@ class _Run:
         record.prior_mean[k], record.prior_covariance[k] = ball.x, ball.P
         record.transition[k], record.noise[k] = ball.F, ball.Q
 
-    def _noise(self, k: int, motion: Motion) -> Array:
+    def _noise(self, k: int, motion: Advance) -> Array:
         """(d, d) process noise from sample k - 1 to k: flight, contacts, a hit at an unknown time."""
         process, dt = self.settings.process, np.diff(self.track.times[k - 1 : k + 1])
         covariance = self.flight_noise[k - 1].copy()
@@ -377,7 +377,7 @@ class _Run:
         begins = k == self.record.start
         for observation, batch in self.beside:
             for row in observation.filter_rows(k):
-                one = batch.taken(np.array([row]))
+                one = batch.select(np.array([row]))
                 whitened = ball.correct_by(one, self.settings.find_events or begins)
                 if not begins or ball.passes(whitened):
                     self.innovations[observation.name][row] = whitened

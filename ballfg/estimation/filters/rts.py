@@ -16,7 +16,7 @@ from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.integrate import fly_jacobian
 from ballfg.estimation.observations.innovation import leave_position_out
-from ballfg.estimation.segmentation import Contact, Quality
+from ballfg.estimation.segmentation.result import Contact, Quality
 from ballfg.factors.batch import Rows
 from ballfg.factors.linear.definite import raised
 from ballfg.factors.loss import Loss

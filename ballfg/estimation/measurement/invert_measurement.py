@@ -30,7 +30,8 @@ from ballfg.estimation.settings import Settings, sample_sigmas
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.batch import FactorBatch
 from ballfg.state import POSITION, STATE_DIM
-from ballfg.tracks import SPIN_LABELS, Track
+from ballfg.tracks import Track
+from ballfg.tracks.track import SPIN_LABELS
 
 ROUNDS: Final = 20
 """Largest number of estimates of a track; a lag of 5 ms takes four or five, an offset of 30 ms a dozen."""

@@ -33,7 +33,8 @@ from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.parallel.work import on_one_thread
 from ballfg.progress import Watch, unwatched
-from ballfg.tracks import Track, TrackNoise
+from ballfg.tracks import Track
+from ballfg.tracks.noise import TrackNoise
 
 T = TypeVar("T")
 
@@ -250,7 +251,7 @@ class _Search:
     def minimised(self, tick: Callable[[], object]) -> Array:
         """(k,) logarithms at the minimum."""
 
-        def told(logs: Array) -> tuple[float, Array]:
+        def objective(logs: Array) -> tuple[float, Array]:
             tick()
             return self.value(logs)
 
@@ -258,7 +259,7 @@ class _Search:
         options = {"maxiter": MOST_ITERATIONS, "maxfun": 2 * MOST_ITERATIONS, "ftol": 1e-5}
         from scipy.optimize import minimize  # it takes half a second to import
 
-        found = minimize(told, self.start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+        found = minimize(objective, self.start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
         return np.asarray(found.x)
 
     def profile(self, logs: Array) -> Profile:

@@ -95,7 +95,7 @@ class Forecaster:
         measured = self.filter.measured(noise)
         filtered = self.filter.run(noise, measured)
         total, inside, count = self._forecast(filtered, noise, measured)
-        by_track = total / max(count, 1) + MARGINAL_WEIGHT * filtered.following / max(filtered.count, 1)
+        by_track = total / max(count, 1) + MARGINAL_WEIGHT * filtered.nll / max(filtered.count, 1)
         return Score(by_track, inside / max(3 * count, 1), len(self.starts))
 
     def _forecast(self, filtered: Filtered, noise: Noise, measured: Tensor) -> tuple[Tensor, float, int]:
@@ -111,7 +111,7 @@ class Forecaster:
             gathered = gathered + memory * (1.0 - decay.square())[:, None]
         new = torch.diagonal(measured[ahead.track, ahead.sample], dim1=-2, dim2=-1)
         variance = ((observe @ covariance) * observe).sum(dim=2) + gathered + new
-        predicted = (observe @ mean[..., None])[..., 0] + ahead.departures
+        predicted = (observe @ mean[..., None])[..., 0] + ahead.offsets
         square = (self.tracks.errors[ahead.track, ahead.sample] - predicted).square() / variance
         beyond = TAIL * square.clamp(min=1e-12).sqrt() - 0.5 * TAIL**2
         scores = (torch.where(square < TAIL**2, 0.5 * square, beyond) + 0.5 * variance.log()).sum(dim=1)
@@ -128,7 +128,7 @@ class _Ahead:
         elapsed: (s,) s between the two.
         by_state: (s, 3, d) derivative of the position by state and coefficients at the origin.
         kicks: (s, 3, 7) m^2, the position's variance per axis for a unit of each number of `PROCESS_NOISE`.
-        departures: (s, 3) m, the sum of the estimate's departures on the way.
+        offsets: (s, 3) m, the sum of the estimate's offsets on the way.
     """
 
     track: Tensor
@@ -137,7 +137,7 @@ class _Ahead:
     elapsed: Tensor
     by_state: Tensor
     kicks: Tensor
-    departures: Tensor
+    offsets: Tensor
 
     @classmethod
     def of(cls, tracks: LinearTracks, starts: Tensor) -> _Ahead:
@@ -147,13 +147,13 @@ class _Ahead:
         horizons, found = torch.tensor(HORIZONS, dtype=torch.float64), []
         way = torch.eye(own, dtype=torch.float64).expand(len(track), own, own)
         kicks = torch.zeros((len(track), *tracks.kicks.shape[2:]), dtype=torch.float64)
-        departed = torch.zeros((len(track), own), dtype=torch.float64)
+        shifted = torch.zeros((len(track), own), dtype=torch.float64)
         for ahead in range(1, samples):
             interval = (start + ahead - 1).clamp(max=samples - 2)
             step = tracks.transitions[track, interval]
             moved = step[:, None, :STATE_DIM, :STATE_DIM]
             way, kicks = step @ way, moved @ kicks @ moved.mT + tracks.kicks[track, interval]
-            departed = (step @ departed[..., None])[..., 0] + tracks.departures[track, interval]
+            shifted = (step @ shifted[..., None])[..., 0] + tracks.offsets[track, interval]
             sample = (start + ahead).clamp(max=samples - 1)
             elapsed = tracks.times[track, sample] - begin
             fresh = (start + ahead < samples) & tracks.used[track, sample]
@@ -161,7 +161,7 @@ class _Ahead:
             rows = torch.nonzero(fresh & due)[:, 0]
             reached = torch.where(fresh, elapsed + STAMP_TOLERANCE, reached)
             gathered = torch.diagonal(kicks[rows][..., POSITION, POSITION], dim1=-2, dim2=-1).mT
-            found.append((rows, sample[rows], elapsed[rows], way[rows, POSITION], gathered, departed[rows, POSITION]))
+            found.append((rows, sample[rows], elapsed[rows], way[rows, POSITION], gathered, shifted[rows, POSITION]))
             if bool((reached >= HORIZONS[-1]).all()):
                 break
         rows, *rest = (torch.cat(parts) for parts in zip(*found, strict=True))

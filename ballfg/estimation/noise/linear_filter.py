@@ -48,13 +48,13 @@ class Filtered:
     Attributes:
         means: (t, n, w) after each sample.
         covariances: (t, n, w, w).
-        following: (t,) summed negative logarithms of the density of each next sample.
+        nll: (t,) summed negative logarithms of the density of each next sample.
         count: number of these samples.
     """
 
     means: Tensor
     covariances: Tensor
-    following: Tensor
+    nll: Tensor
     count: int
 
 
@@ -86,7 +86,7 @@ class LinearFilter:
 
     def losses(self, noise: Noise) -> Tensor:
         """(t,) negative logarithms of the marginal likelihood of each track."""
-        return self.run(noise, self.measured(noise)).following
+        return self.run(noise, self.measured(noise)).nll
 
     def run(self, noise: Noise, measured: Tensor) -> Filtered:
         """The filter over all samples, differentiable by the noise.
@@ -102,8 +102,8 @@ class LinearFilter:
         prior = tracks.prior_variances(noise.spin_prior, noise.spin_label, noise.coefficients, self.velocity_prior)
         prior = torch.cat((prior, memory[:, : self.biases]), dim=1)
         process = noise.process.square().expand(count, -1)
-        means, covariances, following = _Run.apply(self, process, decays, memory, prior, measured)
-        return Filtered(means, covariances, following, self._scored)
+        means, covariances, nll = _Run.apply(self, process, decays, memory, prior, measured)
+        return Filtered(means, covariances, nll, self._scored)
 
 
 class _Run(torch.autograd.Function):
@@ -115,14 +115,14 @@ class _Run(torch.autograd.Function):
         process, decays, memory, prior, measured = (tensor.detach().contiguous().numpy() for tensor in noise)
         sizes = ((tracks.width,), (tracks.width, tracks.width), (tracks.width, 3), (3, 3), (3,), ())
         made = [np.empty(shape + size) for size in sizes]
-        following = np.empty(tracks.count)
-        moved = [x.numpy() for x in (linear.transitions, linear.departures, linear.kicks)]
+        nll = np.empty(tracks.count)
+        moved = [x.numpy() for x in (linear.transitions, linear.offsets, linear.kicks)]
         seen = linear.errors.numpy(), tracks._used, tracks._starts
-        if not filter_tracks(*moved, process, decays, memory, measured, *seen, prior, *made, following):
+        if not filter_tracks(*moved, process, decays, memory, measured, *seen, prior, *made, nll):
             raise torch.linalg.LinAlgError("the covariance of an innovation is not positive definite")
         ctx.tracks, ctx.decays, ctx.memory, ctx.made = tracks, decays, memory, made
         ctx.set_materialize_grads(False)
-        return torch.from_numpy(made[0]), torch.from_numpy(made[1]), torch.from_numpy(following)
+        return torch.from_numpy(made[0]), torch.from_numpy(made[1]), torch.from_numpy(nll)
 
     @staticmethod
     @once_differentiable

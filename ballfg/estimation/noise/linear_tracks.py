@@ -1,7 +1,7 @@
 """Linearises tracks about their estimates, so that another noise needs no new estimate.
 
 Near an estimate the motion is linear: a deviation d_k of state and coefficients moves on as F_k d_k + o_k, where o_k is
-the departure of the estimate itself from the model. F and o come from the dynamics factors of the solved graph,
+the offset of the estimate itself from the model. F and o come from the dynamics factors of the solved graph,
 contacts with their saltation included. A Kalman filter over deviations then gives forecasts for any noise.
 """
 
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ballfg.arrays import Array
 from ballfg.estimation.batch import map_tracks
-from ballfg.estimation.segmentation import Quality
+from ballfg.estimation.segmentation.result import Quality
 from ballfg.estimation.settings import sample_sigmas
 from ballfg.estimation.smoother.problem import START_POSITION_SIGMA, TrackProblem, coefficient_means
 from ballfg.estimation.smoother.smoother import Smoother
@@ -47,7 +47,7 @@ class LinearTracks:
         velocities: (t, n, 3) m/s.
         used: (t, n) bool, good samples.
         transitions: (t, n - 1, d, d) F, in the units of state and coefficients.
-        departures: (t, n - 1, d) o, in the units of state and coefficients.
+        offsets: (t, n - 1, d) o, in the units of state and coefficients.
         kicks: (t, n - 1, 7, 9, 9) covariance for a unit of each number of `PROCESS_NOISE`.
         starts: (t, d) mean of the prior at the first sample, as a deviation from the estimate.
         labelled: (t,) bool, True if a label gives the spin at the first sample.
@@ -61,7 +61,7 @@ class LinearTracks:
     velocities: Tensor
     used: Tensor
     transitions: Tensor
-    departures: Tensor
+    offsets: Tensor
     kicks: Tensor
     starts: Tensor
     labelled: Tensor
@@ -96,7 +96,7 @@ class _Piece:
     velocities: Array
     used: Array
     transitions: Array
-    departures: Array
+    offsets: Array
     kicks: Array
     start: Array
     labelled: bool
@@ -136,7 +136,7 @@ def _linearised(problem: TrackProblem, solution: Solution) -> _Piece:
     track, values, width = problem.track, solution.minimum.values, problem.width
     intervals = len(track) - 1
     transitions = np.tile(np.eye(STATE_DIM + width), (intervals, 1, 1))
-    departures = np.zeros((intervals, STATE_DIM + width))
+    offsets = np.zeros((intervals, STATE_DIM + width))
     kicks = np.zeros((intervals, len(PROCESS_NOISE), STATE_DIM, STATE_DIM))
     linked = np.zeros(intervals, dtype=bool)
     for batch in solution.graph.batches:
@@ -146,7 +146,7 @@ def _linearised(problem: TrackProblem, solution: Solution) -> _Piece:
             transitions[where, :STATE_DIM, :STATE_DIM] = (spread @ rows.jacobians[0])[..., :STATE_DIM]
             if width:
                 transitions[where, :STATE_DIM, STATE_DIM:] = (spread @ rows.jacobians[2])[..., :width]
-            departures[where, :STATE_DIM] = (spread @ rows.residual[..., None])[..., 0]
+            offsets[where, :STATE_DIM] = (spread @ rows.residual[..., None])[..., 0]
             kicks[where] = Kicks(batch.kick_times, batch.hit).basis(batch.dt)
             linked[where] = True
     breaks = np.union1d(np.flatnonzero(~linked), solution.events.segmentation.hits).astype(np.int64)
@@ -165,7 +165,7 @@ def _linearised(problem: TrackProblem, solution: Solution) -> _Piece:
         values.states[samples, VELOCITY],
         solution.events.segmentation.quality[samples] == Quality.GOOD,
         transitions[intervals_within],
-        departures[intervals_within],
+        offsets[intervals_within],
         kicks[intervals_within],
         start,
         label is not None,
@@ -202,7 +202,7 @@ def _side_by_side(pieces: Sequence[_Piece], numbers: Array, coefficient_sigmas: 
         velocities=stacked((p.velocities for p in pieces), longest, "edge"),
         used=stacked((p.used for p in pieces), longest, "zero"),
         transitions=stacked((p.transitions for p in pieces), longest - 1, "edge"),
-        departures=stacked((p.departures for p in pieces), longest - 1, "zero"),
+        offsets=stacked((p.offsets for p in pieces), longest - 1, "zero"),
         kicks=stacked((p.kicks for p in pieces), longest - 1, "zero"),
         starts=torch.from_numpy(np.stack([p.start for p in pieces])),
         labelled=torch.tensor([p.labelled for p in pieces]),

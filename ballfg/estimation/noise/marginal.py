@@ -105,7 +105,7 @@ class MarginalFit:
         turn = np.linalg.inv(root).T
         begin = self.logs
 
-        def told(way: Array) -> tuple[float, Array]:
+        def objective(way: Array) -> tuple[float, Array]:
             logs = begin + turn @ way
             value, gradient = self._objective(*self.at(logs), logs)
             return value, turn.T @ gradient
@@ -113,6 +113,6 @@ class MarginalFit:
         options = {"gtol": tolerance, "ftol": 0.0, "maxfun": most, "maxcor": len(begin)}
         from scipy.optimize import minimize  # it takes half a second to import
 
-        found = minimize(told, np.zeros(len(begin)), jac=True, method="L-BFGS-B", options=options)
+        found = minimize(objective, np.zeros(len(begin)), jac=True, method="L-BFGS-B", options=options)
         self.logs = begin + turn @ found.x
         self.losses, self.gradients = self.at(self.logs)

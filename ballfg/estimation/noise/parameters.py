@@ -14,7 +14,7 @@ from ballfg.estimation.noise.linear_filter import Noise
 from ballfg.estimation.noise.linear_tracks import LinearTracks
 from ballfg.estimation.settings import Settings
 from ballfg.factors.noise import PROCESS_NOISE
-from ballfg.tracks import TrackNoise
+from ballfg.tracks.noise import TrackNoise
 
 
 @dataclass(frozen=True)

@@ -104,12 +104,12 @@ class Profile:
         def at(way: Array) -> Array:
             return np.asarray(np.clip(begin + turn @ way, self.low, self.high))
 
-        def told(way: Array) -> tuple[float, Array]:
+        def objective(way: Array) -> tuple[float, Array]:
             value, gradient = self.value(at(way))
             return value, turn.T @ gradient
 
         options = {"gtol": SETTLED, "ftol": 0.0, "maxfun": MOST_EVALUATIONS}
         from scipy.optimize import minimize  # it takes half a second to import
 
-        found = minimize(told, np.zeros(len(begin)), jac=True, method="L-BFGS-B", options=options)
+        found = minimize(objective, np.zeros(len(begin)), jac=True, method="L-BFGS-B", options=options)
         return float(found.fun), at(found.x)

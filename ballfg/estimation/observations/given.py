@@ -28,9 +28,9 @@ class GivenFactors(Observation):
         """The factors."""
         return self.factors
 
-    def taken(self, samples: NDArray[np.bool_]) -> GivenFactors:
+    def select(self, samples: NDArray[np.bool_]) -> GivenFactors:
         """The factors of some samples."""
-        kept = self.factors.taken(np.flatnonzero(samples[self.state]))
+        kept = self.factors.select(np.flatnonzero(samples[self.state]))
         kept.variables = kept.variables.copy()
         kept.variables[:, 0] = (np.cumsum(samples) - 1)[kept.variables[:, 0]]
         return GivenFactors(kept, self.number)

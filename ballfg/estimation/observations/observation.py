@@ -101,7 +101,7 @@ class Observation(ABC):
         """
 
     @abstractmethod
-    def taken(self, samples: NDArray[np.bool_]) -> Self:
+    def select(self, samples: NDArray[np.bool_]) -> Self:
         """The measurements of some samples of the track; the selected samples are renumbered.
 
         Args: samples: (n,) bool, the selected samples of the track.
@@ -176,7 +176,7 @@ class Observation(ABC):
     def single_rows(self, batch: FactorBatch) -> Iterator[tuple[int, FactorBatch]]:
         """The measurements one by one, as on a stream: sample, and a batch of one factor on state 0."""
         for row, sample in enumerate(self.state.tolist()):
-            one = batch.taken(np.array([row]))
+            one = batch.select(np.array([row]))
             one.variables = np.zeros_like(one.variables)
             yield sample, one
 

@@ -12,9 +12,9 @@ from ballfg.estimation.observations.innovation import leave_one_out, leave_posit
 from ballfg.estimation.observations.observation import Context, Observation
 from ballfg.estimation.settings import stamp_covariance
 from ballfg.factors.batch import Rows, Values
+from ballfg.factors.correlated_noise import BiasedPositionFactors
 from ballfg.factors.linear.covariance import Covariances
 from ballfg.factors.position import PositionFactors
-from ballfg.factors.tracker import BiasedPositionFactors
 from ballfg.state import STATE_DIM
 from ballfg.tracks import Track
 
@@ -42,7 +42,7 @@ class Positions(Observation):
             self.state, self.positions, context.sigma, stamps, settings.loss, settings.has_memory
         )
 
-    def taken(self, samples: NDArray[np.bool_]) -> Positions:
+    def select(self, samples: NDArray[np.bool_]) -> Positions:
         """The positions of some samples."""
         return Positions(self.positions[samples])
 

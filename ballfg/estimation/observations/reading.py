@@ -127,7 +127,7 @@ class Reading(Observation):
         """The readings of a track from its rows of the table."""
         return cls.at(track, rows[:, 0], rows[:, 1:-1], rows[:, -1])
 
-    def taken(self, samples: NDArray[np.bool_]) -> Self:
+    def select(self, samples: NDArray[np.bool_]) -> Self:
         """The readings of some samples."""
         kept = samples[self.state]
         number = np.cumsum(samples) - 1

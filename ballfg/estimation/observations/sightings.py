@@ -141,12 +141,12 @@ class CameraSightings(Observation):
         seen.moved = self.moved + offsets - self.time_offsets
         return again.observed(*(other.onto(track, again) for other in track.observations if other is not self))
 
-    def taken(self, samples: NDArray[np.bool_]) -> CameraSightings:
+    def select(self, samples: NDArray[np.bool_]) -> CameraSightings:
         """The sightings of some samples."""
         rows = samples[self.state]
         number = np.cumsum(samples) - 1
         return CameraSightings(
-            self.sightings.taken(rows), self.cameras, number[self.state[rows]], self.delay[rows], self.moved
+            self.sightings.select(rows), self.cameras, number[self.state[rows]], self.delay[rows], self.moved
         )
 
 
@@ -220,7 +220,7 @@ def true_times_of(sightings: Sightings, cameras: Sequence[Camera]) -> Array:
 def in_order(sightings: Sightings, cameras: Sequence[Camera]) -> Sightings:
     """The sightings in order of true time, by the cameras' time offsets."""
     times = true_times_of(sightings, cameras_of(sightings, cameras))
-    return sightings.taken(np.argsort(times, kind="stable"))
+    return sightings.select(np.argsort(times, kind="stable"))
 
 
 @lru_cache(maxsize=64)

@@ -10,10 +10,12 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.online.sample import Sample
-from ballfg.estimation.segmentation import Event, EventKind, Segmentation, SegmentationPhysics, Segmenter
 from ballfg.estimation.segmentation.assembly import BREAKS, contacts_of, intervals_of, quality_of, rests_of
-from ballfg.estimation.segmentation.result import Quality
+from ballfg.estimation.segmentation.events import Event, EventKind
+from ballfg.estimation.segmentation.physics import SegmentationPhysics
+from ballfg.estimation.segmentation.result import Quality, Segmentation
 from ballfg.estimation.segmentation.second_look import SIDE, hits_at_contacts
+from ballfg.estimation.segmentation.segmenter import Segmenter
 from ballfg.estimation.segmentation.settings import SegmentationSettings
 from ballfg.estimation.smoother.motion import Motion
 from ballfg.estimation.smoother.problem import QUALITY_SIGMA
@@ -93,7 +95,7 @@ class EventTracker:
         )
         return found if self.find_events else found.only_contacts()
 
-    def moved(self, segmentation: Segmentation, first: int) -> Segmentation:
+    def with_moved_contacts(self, segmentation: Segmentation, first: int) -> Segmentation:
         """The segmentation with its contacts at their refined places."""
         if not self._moves:
             return segmentation

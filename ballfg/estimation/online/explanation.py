@@ -26,7 +26,7 @@ def explain(window: StreamWindow, samples: list[Sample], events: EventTracker) -
     held = len(window)
     times, positions = np.array([s.time for s in samples]), np.array([s.position for s in samples])
     segmentation = events.segmentation(window.first, times, positions)
-    motions = motions_of(events.moved(segmentation, window.first), times)
+    motions = motions_of(events.with_moved_contacts(segmentation, window.first), times)
     measured = np.array([s.measured for s in samples])
     factors = np.where(measured, SIGMA_FACTOR[segmentation.quality], 1.0)  # the loss sets wrong sightings aside
     settled = max(held - LATEST_CHANGE, 0)

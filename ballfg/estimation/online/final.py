@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from ballfg.arrays import Array, Index
 from ballfg.estimation.online.events import SIGMA_FACTOR
+from ballfg.estimation.online.linear_factors import without_bias
 from ballfg.estimation.online.sample import Sample
-from ballfg.estimation.online.tracker import without_bias
 from ballfg.estimation.online.windows.stream_window import StreamWindow
 from ballfg.estimation.result import Estimate
-from ballfg.estimation.segmentation import Contact, Segmentation
+from ballfg.estimation.segmentation.result import Contact, Segmentation
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Earlier, Smoother
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY

@@ -39,7 +39,7 @@ from ballfg.estimation.online.windows.stream_window import StreamWindow
 from ballfg.estimation.online.windows.window import IsamWindow
 from ballfg.estimation.plausible import plausible, possible
 from ballfg.estimation.result import Estimate, Status
-from ballfg.estimation.segmentation import physics_of
+from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.settings import Settings, Solver, sample_sigmas, total_sigmas
 from ballfg.estimation.sides.hypotheses import HypothesisModel, SampleMeasurement
 from ballfg.estimation.sides.monitor import ContactMonitor, ContactState
@@ -409,7 +409,7 @@ class Online(Estimator):
         smoother = Smoother(self.model, self.surfaces, self.settings)
         first = self.window.first
         found = self.events.segmentation(first, track.times[first:], track.positions[first:])
-        found = self.events.moved(found, first)  # the window's states fit the refined contacts
+        found = self.events.with_moved_contacts(found, first)  # the window's states fit the refined contacts
         result = final_estimate(smoother, self.window, track, found, self._frozen)
         self.reset()
         lost = any(state.status is Status.FAILED for state in states)

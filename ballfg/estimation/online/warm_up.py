@@ -9,7 +9,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.estimation.online.state import OnlineState
-from ballfg.prediction import Crossing
+from ballfg.prediction.crossing import Crossing
 
 if TYPE_CHECKING:
     from ballfg.estimation.online.online import Online

@@ -24,8 +24,8 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.settings import Settings, stamp_covariance
 from ballfg.estimation.sides.gaussians import GaussianMixture
 from ballfg.factors.batch import FactorBatch
+from ballfg.factors.correlated_noise import bias_step
 from ballfg.factors.dynamics import model_width
-from ballfg.factors.tracker import bias_step
 from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, STATE_DIM, VELOCITY, VZ, Z
 
 FAR: Final = 4.5

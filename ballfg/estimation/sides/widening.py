@@ -15,7 +15,7 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.integrate import fly
 from ballfg.estimation.plausible import possible
 from ballfg.estimation.result import Estimate
-from ballfg.estimation.segmentation import Contact
+from ballfg.estimation.segmentation.result import Contact
 from ballfg.state import STATE_DIM, VZ
 
 FAR: Final = 4.0

@@ -82,5 +82,5 @@ def _measured(problem: TrackProblem, sample: int) -> SampleMeasurement:
     """The measurements at a sample of a track; rough positions stand for pixels."""
     beside = [one for one in problem.observations if not one.locates]
     rows = [(problem.observed[one.name], row) for one in beside for row in one.filter_rows(sample)]
-    factors = [batch.taken(np.array([row])) for batch, row in rows]
+    factors = [batch.select(np.array([row])) for batch, row in rows]
     return SampleMeasurement(problem.track.positions[sample], problem.sigma[sample], factors)

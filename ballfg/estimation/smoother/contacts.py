@@ -12,7 +12,7 @@ import torch
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.segmentation import Contact, Segmentation
+from ballfg.estimation.segmentation.result import Contact, Segmentation
 from ballfg.estimation.smoother.initial import move_contacts
 from ballfg.estimation.smoother.problem import Events, TrackProblem
 from ballfg.estimation.smoother.solution import Solution, places_of, timed_contacts

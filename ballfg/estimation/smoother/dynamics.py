@@ -10,7 +10,7 @@ import numpy as np
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.limits import steps_over_each
-from ballfg.estimation.segmentation import Segmentation
+from ballfg.estimation.segmentation.result import Segmentation
 from ballfg.estimation.smoother.motion import Motion, eventful_motions, kicks_of
 from ballfg.factors.dynamics import ContactFactors, DynamicsFactors, FlightFactors, RestFactors
 from ballfg.factors.noise import Kicks, ProcessNoise
@@ -62,7 +62,7 @@ class TrackDynamics:
         flights = self._flights[steps]
         intervals = flights.variables[:, 0]
         kept = flying[intervals]
-        flights = flights if kept.all() else flights.taken(np.flatnonzero(kept))
+        flights = flights if kept.all() else flights.select(np.flatnonzero(kept))
         struck = np.flatnonzero(np.isin(flights.variables[:, 0], hit))
         return flights.with_hits(struck, self.noise) if len(struck) else flights
 

@@ -91,7 +91,7 @@ class HopMoments:
         found[:, 1, 1] = np.maximum(found[:, 1, 1], np.sqrt(np.maximum(about, 0.0) / 3.0))
         return np.asarray(found)
 
-    def taken(self, inside: slice) -> HopMoments:
+    def select(self, inside: slice) -> HopMoments:
         """The moments of some of the samples."""
         between = slice(inside.start, inside.stop - 1)
         return HopMoments(

@@ -11,7 +11,7 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import fly_through
 from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.launcher import SpinLabel
-from ballfg.estimation.segmentation import Contact, Quality, Segmentation
+from ballfg.estimation.segmentation.result import Contact, Quality, Segmentation
 from ballfg.factors.batch import Values
 from ballfg.factors.dynamics import model_width
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ, Z

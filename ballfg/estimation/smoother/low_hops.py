@@ -22,7 +22,8 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.limits import REST_SPEED
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.result import Estimate
-from ballfg.estimation.segmentation import Contact, Rest, Segmentation, SegmentationSettings
+from ballfg.estimation.segmentation.result import Contact, Rest, Segmentation
+from ballfg.estimation.segmentation.settings import SegmentationSettings
 from ballfg.estimation.settings import Settings, sample_sigmas
 from ballfg.estimation.smoother.hop_grid import HopGrid, HopLaw, HopMoments, averaged
 from ballfg.state import POSITION, STATE_DIM, VZ, Z
@@ -70,13 +71,13 @@ class LowHops:
         """Its last sample."""
         return self.first + len(self.known.speed) - 1
 
-    def taken(self, begin: int, end: int) -> LowHops | None:
+    def select(self, begin: int, end: int) -> LowHops | None:
         """The part within samples begin to end - 1 of the track, renumbered from 0; None if empty."""
         first, last = max(self.first, begin), min(self.last, end - 1)
         inside = slice(first - self.first, last + 1 - self.first)
         if first > last:
             return None
-        return replace(self, first=first - begin, level=self.level[inside], known=self.known.taken(inside))
+        return replace(self, first=first - begin, level=self.level[inside], known=self.known.select(inside))
 
     def events(self, times: Array) -> tuple[list[Contact], list[Rest]]:
         """The bounces that can be counted, and the rest that replaces lower hops.

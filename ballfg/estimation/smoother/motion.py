@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.estimation.segmentation import Contact, Segmentation
+from ballfg.estimation.segmentation.result import Contact, Segmentation
 from ballfg.factors.noise import Kicks, ProcessNoise
 
 

@@ -71,7 +71,7 @@ def _around(solution: Solution, first: int, last: int) -> BallGraph:
         inside = ((states >= first) & (states <= last) | (states == COEFFICIENTS)).all(axis=1)
         inside &= (states != COEFFICIENTS).any(axis=1)
         if inside.any():
-            part = batch.taken(np.flatnonzero(inside))
+            part = batch.select(np.flatnonzero(inside))
             part.variables = np.where(part.variables == COEFFICIENTS, COEFFICIENTS, part.variables - first)
             batches.append(part)
     w, p = step.root.width, len(values.coefficients)

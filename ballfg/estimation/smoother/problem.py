@@ -16,12 +16,13 @@ from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.launcher import SpinLabel
 from ballfg.estimation.observations.observation import Context, Observation, Unknowns, unknowns_of
 from ballfg.estimation.observations.positions import observations_of
-from ballfg.estimation.segmentation import Contact, Quality, Segmentation
+from ballfg.estimation.segmentation.result import Contact, Quality, Segmentation
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, total_sigmas
 from ballfg.estimation.smoother.dynamics import TrackDynamics
 from ballfg.estimation.smoother.initial import bridged_positions
 from ballfg.estimation.smoother.low_hops import LowHops
 from ballfg.factors.batch import FactorBatch, Values
+from ballfg.factors.correlated_noise import BIAS_DIM, BiasFactors, BiasStartFactors
 from ballfg.factors.dynamics import ContactFactors, model_width
 from ballfg.factors.graph import BallGraph
 from ballfg.factors.launcher import LauncherSpinFactors
@@ -34,7 +35,6 @@ from ballfg.factors.prior import (
     spin_prior,
     state_prior,
 )
-from ballfg.factors.tracker import BIAS_DIM, BiasFactors, BiasStartFactors
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 from ballfg.tracks import Track
 

@@ -15,7 +15,9 @@ from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.plausible import plausible
 from ballfg.estimation.result import Estimate, Status
-from ballfg.estimation.segmentation import Segmentation, physics_of, segment
+from ballfg.estimation.segmentation.batch import segment
+from ballfg.estimation.segmentation.physics import physics_of
+from ballfg.estimation.segmentation.result import Segmentation
 from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
 from ballfg.estimation.sides.widening import widened_near_contacts
 from ballfg.estimation.smoother.at_end import with_both_sides
@@ -34,11 +36,11 @@ from ballfg.estimation.smoother.solution import (
     worst_break,
 )
 from ballfg.factors.batch import FactorBatch, Values
+from ballfg.factors.correlated_noise import BiasStartFactors
 from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt
 from ballfg.factors.gtsam_solver import GtsamLevenbergMarquardt
 from ballfg.factors.linear.covariance import Covariances
 from ballfg.factors.prior import PriorFactors
-from ballfg.factors.tracker import BiasStartFactors
 from ballfg.state import STATE_DIM
 from ballfg.tracks import Ball, Track
 

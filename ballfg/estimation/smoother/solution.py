@@ -7,7 +7,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.estimation.plausible import measured_only
 from ballfg.estimation.result import Status
-from ballfg.estimation.segmentation import Contact
+from ballfg.estimation.segmentation.result import Contact
 from ballfg.estimation.smoother.motion import contacts_by_interval
 from ballfg.estimation.smoother.problem import Events, TrackProblem, contact_batches
 from ballfg.factors.dynamics import DynamicsFactors

@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 from typing import Final, Literal
 
 from ballfg.checks import check_choice, check_flag
-from ballfg.dynamics import AnalyticModel, Effect
+from ballfg.dynamics import AnalyticModel
+from ballfg.dynamics.effect import Effect
 from ballfg.simulation.balls import BallKind, table_tennis
 from ballfg.simulation.bounded import bounded, check_bounds
 from ballfg.simulation.composition import true_model

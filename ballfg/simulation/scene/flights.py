@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike
 
 from ballfg.arrays import Array
 from ballfg.checks import shown
-from ballfg.dynamics import AnalyticModel, Surfaces, advance
+from ballfg.dynamics import AnalyticModel, Surfaces
+from ballfg.dynamics.motion.rollout import advance
 from ballfg.simulation.config import MotionNoise
 from ballfg.simulation.motion import simulate_motion
 from ballfg.simulation.scene.config import SceneConfig

@@ -9,9 +9,9 @@ import numpy as np
 
 from ballfg.files.whole_folder import check_replaceable, whole_folder
 from ballfg.progress import Watch, unwatched
-from ballfg.tracks import DatasetInfo, TableWriter, write_dataset
+from ballfg.tracks import TableWriter, write_dataset
 from ballfg.tracks.detections_file import DETECTIONS_FILE, SCORE, seen_columns
-from ballfg.tracks.info import INFO_FILE, write_info
+from ballfg.tracks.info import INFO_FILE, DatasetInfo, write_info
 from ballfg.tracks.rows import KEY, SIGMAS, VALUES
 from ballfg.vision.arrays import Image
 from ballfg.vision.camera_file import CAMERAS_FILE, write_cameras

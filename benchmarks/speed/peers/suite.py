@@ -34,7 +34,7 @@ from ballfg.benchmarks.speed.suite import (
 from ballfg.dynamics import rollout
 from ballfg.progress import progress
 from ballfg.state import POSITION, STANDARD_GRAVITY
-from ballfg.tracks import SPIN_LABELS
+from ballfg.tracks.track import SPIN_LABELS
 
 OWN: Final = ("ballfg", "gtsam")
 """Libraries of this environment."""

@@ -6,9 +6,10 @@ from problem import LOSS_STEPS, ROLLOUT_STEPS, Array, Problem
 from torch import Tensor, nn
 
 from ballfg.arrays import Index
-from ballfg.dynamics import BallModel, Surfaces, model_from_dict, rollout
+from ballfg.dynamics import BallModel, Surfaces, rollout
 from ballfg.dynamics.compiled.functions import compiled
 from ballfg.dynamics.model import Rates
+from ballfg.dynamics.model_file import model_from_dict
 from ballfg.factors.batch import FactorBatch, Noise, Values
 from ballfg.factors.graph import BallGraph, LevenbergMarquardt
 from ballfg.factors.position import PositionFactors

@@ -10,7 +10,7 @@ import torch
 
 import ballfg.estimation.smoother.smoother as room
 from ballfg.dynamics.motion.impact import slip_velocity
-from ballfg.estimation.segmentation import Contact
+from ballfg.estimation.segmentation.result import Contact
 from ballfg.estimation.smoother.grip import Bounce, bounces_of, other_sides
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.estimation.smoother.solution import Solution

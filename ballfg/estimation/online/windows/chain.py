@@ -22,12 +22,12 @@ from ballfg.estimation.online.windows.interval import Interval
 from ballfg.estimation.online.windows.linear import LinearFactors
 from ballfg.estimation.online.windows.stream_window import Arrival, StreamWindow
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch
+from ballfg.factors.correlated_noise import BiasFactors, BiasStartFactors
 from ballfg.factors.dynamics import DynamicsFactors
 from ballfg.factors.linear.covariance import marginal_covariances
 from ballfg.factors.linear.elimination import Root, eliminate_on, padded
 from ballfg.factors.linear.substitution import solution_of
 from ballfg.factors.prior import coefficient_prior
-from ballfg.factors.tracker import BiasFactors, BiasStartFactors
 from ballfg.state import STATE_DIM
 
 Answer = tuple[Array, tuple[Array, ...]]

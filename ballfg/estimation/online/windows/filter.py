@@ -3,12 +3,12 @@
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.estimation.online.linear_factors import carried_with_bias
 from ballfg.estimation.online.sample import Sample
-from ballfg.estimation.online.tracker import carried_with_bias
 from ballfg.estimation.online.windows.interval import Interval
 from ballfg.estimation.settings import Settings, stamp_covariance
+from ballfg.factors.correlated_noise import BIAS_DIM
 from ballfg.factors.linear.definite import whitened as whitened_by
-from ballfg.factors.tracker import BIAS_DIM
 from ballfg.state import POSITION, STATE_DIM, VELOCITY
 
 WIDE_VELOCITY = 1.0

@@ -11,9 +11,9 @@ import gtsam
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.estimation.online.linear_factors import bias_link, bias_start, linear_factor
 from ballfg.estimation.online.measurement import prepare
 from ballfg.estimation.online.sample import Sample
-from ballfg.estimation.online.tracker import bias_link, bias_start, linear_factor
 from ballfg.estimation.online.windows.stream_window import COEFFICIENT_THRESHOLD, Arrival, StreamWindow
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY, Bridge
 from ballfg.factors.prior import coefficient_prior

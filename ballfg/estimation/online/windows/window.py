@@ -7,9 +7,9 @@ from typing import Self
 import gtsam
 
 from ballfg.arrays import Array
+from ballfg.estimation.online.linear_factors import bias_start
 from ballfg.estimation.online.measurement import Measurement, prepare
 from ballfg.estimation.online.sample import Sample, Update
-from ballfg.estimation.online.tracker import bias_start
 from ballfg.estimation.online.windows.isam import IsamCore
 from ballfg.estimation.online.windows.linear import LinearFactors
 from ballfg.factors.batch import FactorBatch

@@ -29,7 +29,7 @@ from ballfg.progress import doing
 from ballfg.tracks import Track
 
 if TYPE_CHECKING:
-    from ballfg.estimation.segmentation import Segmentation
+    from ballfg.estimation.segmentation.result import Segmentation
     from ballfg.estimation.smoother.smoother import Smoother
 
 T = TypeVar("T")
@@ -73,7 +73,7 @@ class Told:
 
     def moved(self, step: Point) -> Values:
         """The values after a step of the ends and the coefficients."""
-        return self.values.moved(self.response.steps(step), step.coefficients)
+        return self.values.retract(self.response.steps(step), step.coefficients)
 
     def promised(self, step: Point) -> float:
         """The error after a step of the whole section, predicted by the linear problem."""
@@ -149,7 +149,7 @@ def joined_minimum(smoother: Smoother, track: Track, length: int | None = None) 
     events = joined(looks, [0, *inner, len(track)])
     cuts = [0, *inner, len(track) - 1]
     states = [
-        State(section_of(track, events, first, last, MARGIN), one.taken(first, last + 1))
+        State(section_of(track, events, first, last, MARGIN), one.select(first, last + 1))
         for one, first, last in zip(looks, cuts[:-1], cuts[1:], strict=True)
     ]
     found = _search(smoother, states)

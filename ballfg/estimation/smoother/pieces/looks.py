@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array, Index
-from ballfg.estimation.segmentation import Contact, Rest, Segmentation
+from ballfg.estimation.segmentation.result import Contact, Rest, Segmentation
 from ballfg.estimation.smoother.pieces.section import Section, events_of, part_of, shifted
 from ballfg.estimation.smoother.solution import places_of, timed_contacts
 from ballfg.factors.batch import Values
@@ -53,7 +53,7 @@ class Look:
         bad = self.begin + np.flatnonzero(s.quality)
         return np.concatenate(([c.interval for c in s.contacts], s.hits, bounds, bad)).astype(np.int64)
 
-    def taken(self, begin: int, end: int) -> Values:
+    def select(self, begin: int, end: int) -> Values:
         """The values of the states begin to end - 1 of the track."""
         inside = slice(begin - self.begin, end - self.begin)
         biases = None if self.values.biases is None else self.values.biases[inside]

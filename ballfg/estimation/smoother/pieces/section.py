@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array, Index
-from ballfg.estimation.segmentation import Contact, Rest, Segmentation
+from ballfg.estimation.segmentation.result import Contact, Rest, Segmentation
 from ballfg.estimation.smoother.problem import Events, TrackProblem
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Rows, Values
 from ballfg.tracks import Track
@@ -77,7 +77,7 @@ class Section:
     def own(self, problem: TrackProblem) -> list[FactorBatch]:
         """The section's factors, states counted as in the part. Args: problem: of the part."""
         batches = ((batch, self.owns(first_states(batch))) for batch in problem.graph(self.events).batches)
-        return [batch.taken(np.flatnonzero(own)) for batch, own in batches if own.any()]
+        return [batch.select(np.flatnonzero(own)) for batch, own in batches if own.any()]
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def part_of(track: Track, begin: int, end: int) -> Track:
     if track.observations:
         mask = np.zeros(len(track), dtype=bool)
         mask[begin:end] = True
-        track = replace(track, observations=tuple(one.taken(mask) for one in track.observations))
+        track = replace(track, observations=tuple(one.select(mask) for one in track.observations))
     inside = slice(begin, end)
     return replace(
         track,

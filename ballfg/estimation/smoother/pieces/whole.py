@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array, Index
 from ballfg.estimation.plausible import plausible
 from ballfg.estimation.result import Estimate, Status
-from ballfg.estimation.segmentation import Contact
+from ballfg.estimation.segmentation.result import Contact
 from ballfg.estimation.settings import sample_sigmas
 from ballfg.estimation.sides.widening import Shared, widening_near_contacts
 from ballfg.estimation.smoother.at_end import with_both_sides
@@ -89,7 +89,7 @@ def smoothed(smoother: Smoother, task: tuple[State, Array, Point]) -> Smoothed:
     problem = smoother.problem(section.track, section.segmentation)
     reduction = Reduction(section.linearized(section.own(problem), values), values)
     step = target.since(Point.of(values))
-    values = values.moved(reduction.steps(step), step.coefficients)
+    values = values.retract(reduction.steps(step), step.coefficients)
     known = reduction.covariances(joint)
     covariances = np.ascontiguousarray(known.states[:, :STATE_DIM, :STATE_DIM])
     contacts = _contacts(problem, state, values)
@@ -144,7 +144,7 @@ def _sections(smoother: Smoother, track: Track, found: Joined) -> Iterator[Estim
         if last == len(track) - 1:
             ending = track.between(float(track.times[first]), float(track.times[last]))
             section = with_both_sides(smoother, smoother.problem(ending), section)
-        yield with_low_hops(section, [one for h in hops if (one := h.taken(first, first + count))], smoother.model)
+        yield with_low_hops(section, [one for h in hops if (one := h.select(first, first + count))], smoother.model)
 
 
 def _section(

@@ -10,7 +10,7 @@ import torch
 
 from ballfg.diagnosis.fit.response import fitted_path, responses, weighted
 from ballfg.diagnosis.fit.shooting import shoot
-from ballfg.diagnosis.remains.residuals import ACCELERATION, BIN, residuals_of, since_contact
+from ballfg.diagnosis.residual_tests.residuals import ACCELERATION, BIN, residuals_of, since_contact
 from ballfg.diagnosis.search.hypothesis import Hypothesis
 from ballfg.diagnosis.search.signatures import hypothesis_columns
 from ballfg.dynamics.effect import Flight

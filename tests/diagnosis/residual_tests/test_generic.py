@@ -10,9 +10,9 @@ from scipy import stats
 
 from ballfg.diagnosis.fit.response import fitted_path, responses
 from ballfg.diagnosis.generic_test import ALARM
-from ballfg.diagnosis.remains.generic import generic_tests, where
-from ballfg.diagnosis.remains.patterns import EVERYWHERE, PLAUSIBLE, WORLD, Block, blocks_of
-from ballfg.diagnosis.remains.whiteness import REACHES, whiteness
+from ballfg.diagnosis.residual_tests.generic import generic_tests, where
+from ballfg.diagnosis.residual_tests.patterns import EVERYWHERE, PLAUSIBLE, WORLD, Block, blocks_of
+from ballfg.diagnosis.residual_tests.whiteness import REACHES, whiteness
 from ballfg.diagnosis.search.hypothesis import Hypothesis
 from ballfg.diagnosis.search.score import pattern_tests
 from ballfg.diagnosis.search.signatures import Signatures, hypothesis_columns

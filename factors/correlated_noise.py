@@ -95,7 +95,7 @@ class BiasedPositionFactors(FactorBatch):
             error = error + inputs[0][:, _BIAS]
         return (torch.from_numpy(self.information_root) @ error.unsqueeze(-1)).squeeze(-1)
 
-    def rewhitening(self, noise: Noise) -> Tensor | None:
+    def noise_scale(self, noise: Noise) -> Tensor | None:
         """(m, 3, 3) from the present noise to one whose white part is scaled; errors of stamps stay as they are."""
         if noise.position is None:
             return None

@@ -16,10 +16,12 @@ from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout
 from ballfg.diagnosis.search.hypothesis import with_effects
 from ballfg.diagnosis.search.process_noise import noise_about
 from ballfg.dynamics import AnalyticModel
-from ballfg.estimation import Estimate, Settings, Status, dataset_settings, estimate_tracks, make_estimator
+from ballfg.estimation import Estimate, Settings, Status, dataset_settings
+from ballfg.estimation.batch import estimate_tracks
+from ballfg.estimation.registry import make_estimator
 from ballfg.learning.calibration.coefficients import choose, values_of, with_values
 from ballfg.learning.calibration.population import Evidence, evidence, fit_population
-from ballfg.tracks import TrackNoise
+from ballfg.tracks.noise import TrackNoise
 
 MOST_ROUNDS = 5
 """Largest number of fits of the population; usual are three, from coefficients far off."""

@@ -10,9 +10,9 @@ import torch
 from scipy import stats
 
 from ballfg.diagnosis.generic_test import ALARM
-from ballfg.diagnosis.remains.generic import generic_tests
-from ballfg.diagnosis.remains.whiteness import _p_value, _summed, whiteness
-from ballfg.tracks import TrackNoise
+from ballfg.diagnosis.residual_tests.generic import generic_tests
+from ballfg.diagnosis.residual_tests.whiteness import _p_value, _summed, whiteness
+from ballfg.tracks.noise import TrackNoise
 from tests.diagnosis.conftest import POSITION_NOISE
 
 MEMORY, TIME, JITTER = 0.003, 0.02, 0.001

@@ -8,7 +8,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.estimation.settings import Settings
 from ballfg.factors.bridge import STATE_KEY
-from ballfg.factors.tracker import BIAS_DIM, BiasFactors, BiasStartFactors, bias_step
+from ballfg.factors.correlated_noise import BIAS_DIM, BiasFactors, BiasStartFactors, bias_step
 from ballfg.state import STATE_DIM
 
 _UNIT3 = gtsam.noiseModel.Unit.Create(3)

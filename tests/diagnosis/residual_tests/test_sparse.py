@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from ballfg.diagnosis.fit.fit import values_of
-from ballfg.diagnosis.remains.fallback import describe
-from ballfg.diagnosis.remains.sparse import MOST_TERMS, fit_with_terms, select, sparse_terms
-from ballfg.dynamics import AnalyticModel, model_from_dict, model_to_dict
+from ballfg.diagnosis.residual_tests.fallback import describe
+from ballfg.diagnosis.residual_tests.sparse import MOST_TERMS, fit_with_terms, select, sparse_terms
+from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.effects.generic import GenericFlight
+from ballfg.dynamics.model_file import model_from_dict, model_to_dict
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")  # torch's own
 FORCE = {"y_one": 0.5, "x_x": -0.6}

@@ -9,7 +9,7 @@ import pytest
 
 from ballfg.diagnosis.generic_test import ALARM
 from ballfg.diagnosis.label_verdicts import LabelCheck, LabelVerdict, percent
-from ballfg.diagnosis.remains.label_check import (
+from ballfg.diagnosis.residual_tests.label_check import (
     NONE_WRONG,
     RIGHT,
     RIGHT_SPREAD,
@@ -19,7 +19,7 @@ from ballfg.diagnosis.remains.label_check import (
     judged,
     label_test,
 )
-from ballfg.diagnosis.remains.label_flights import LabelledFlight, LabelPosterior, wrong_error
+from ballfg.diagnosis.residual_tests.label_flights import LabelledFlight, LabelPosterior, wrong_error
 
 STATED, FAR = 4.0, 120.0
 """rad/s, errors of labels that are right and wrong."""

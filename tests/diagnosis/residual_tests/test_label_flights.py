@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from ballfg.diagnosis import hold_out
-from ballfg.diagnosis.remains.label_flights import labelled_flights
-from ballfg.diagnosis.remains.label_model import scattering_model
+from ballfg.diagnosis.residual_tests.label_flights import labelled_flights
+from ballfg.diagnosis.residual_tests.label_model import scattering_model
 from ballfg.diagnosis.search.hypothesis import with_effects
 from ballfg.dynamics import nominal_model
 from ballfg.dynamics.effects.measurement import SpinLabelScale
@@ -74,6 +74,7 @@ def test_scatter_is_not_taken_for_coefficients(scattered) -> None:
     assert settings.spin_label_noise == LABEL_NOISE
 
 
+@pytest.mark.thorough
 def test_right_labels_are_not_accused(scattered) -> None:
     labels, _ = judged(scattered.dataset, whole=False)
     assert len(labels.verdicts) == len(parts(scattered))

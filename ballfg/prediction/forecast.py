@@ -28,7 +28,7 @@ MOST_STEPS = 100_000
 
 
 @dataclass(frozen=True, eq=False)
-class Ahead:
+class Forecast:
     """The predicted path of a ball.
 
     Near a contact of uncertain time some of the possible balls have bounced at a stamp and others have not. The state
@@ -52,7 +52,7 @@ class Ahead:
     def __repr__(self) -> str:
         end, spread = self.positions[-1], self.sigmas[-1]
         numbers = ", ".join(f"{x:.3f} +- {s:.3f}" for x, s in zip(end, spread, strict=True))
-        return f"Ahead({len(self.times)} times to t = {self.times[-1]:.3f} s, there at ({numbers}) m)"
+        return f"Forecast({len(self.times)} times to t = {self.times[-1]:.3f} s, there at ({numbers}) m)"
 
     @property
     def positions(self) -> Array:
@@ -105,13 +105,13 @@ class Ahead:
     def plot(self) -> Figure:
         """A picture of x, y and z over time, each with the band that holds 90 %; without measurement noise."""
         from ballfg.pages.pictures import by_axis
-        from ballfg.pages.shot import Shot
+        from ballfg.pages.shot import ShownShot
 
         name, places = self.start.name, self.positions
-        return by_axis(Shot(name, predicted_times=self.times, predicted=places, predicted_sigmas=self.sigmas))
+        return by_axis(ShownShot(name, predicted_times=self.times, predicted=places, predicted_sigmas=self.sigmas))
 
 
-def look_ahead(start: BallState, horizon: float, step: float = 0.01) -> Ahead:
+def look_ahead(start: BallState, horizon: float, step: float = 0.01) -> Forecast:
     """The path of a ball from a state.
 
     Args: start: a state with its model.  horizon: s.  step: s between the times of the path.
@@ -128,7 +128,7 @@ def look_ahead(start: BallState, horizon: float, step: float = 0.01) -> Ahead:
     count = max(int(np.ceil(horizon / step - 1e-9)), 1)
     since = np.minimum(step * np.arange(1, count + 1), horizon)
     path = propagator.rollout(belief.from_zero(), since)
-    return Ahead(start, horizon, start.time + since, path.states[0], definite(path.covariances[0]))
+    return Forecast(start, horizon, start.time + since, path.states[0], definite(path.covariances[0]))
 
 
 def carried_by(start: BallState) -> tuple[Propagator, Belief]:

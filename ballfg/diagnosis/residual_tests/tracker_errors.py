@@ -12,10 +12,11 @@ import numpy as np
 from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout
 from ballfg.diagnosis.result import Finding, Value
 from ballfg.dynamics import AnalyticModel
-from ballfg.estimation import dataset_settings, spread_over
-from ballfg.estimation.noise.estimate import linearised
-from ballfg.estimation.noise.tracker import JITTER, MEMORY, NUMBERS, TrackerPart, tracker_noise
-from ballfg.tracks import Track, TrackNoise
+from ballfg.estimation import dataset_settings
+from ballfg.estimation.noise.estimate import linearised, spread_over
+from ballfg.estimation.noise.tracker_errors import JITTER, MEMORY, NUMBERS, TrackerPart, tracker_noise
+from ballfg.tracks import Track
+from ballfg.tracks.noise import TrackNoise
 
 MOST_TRACKS = 25
 """Number of tested tracks of each half, evenly spread."""
@@ -34,7 +35,7 @@ UNITS = {MEMORY: "m", JITTER: "s"}
 
 
 @dataclass(frozen=True)
-class Tracker:
+class TrackerErrors:
     """Findings on the tracker, and the noise of its samples if that is not white.
 
     The noise includes declared memory and jitter.
@@ -44,7 +45,7 @@ class Tracker:
     noise: TrackNoise | None = None
 
 
-def look_at_tracker(model: AnalyticModel, holdout: Holdout, jobs: int = 1) -> Tracker:
+def look_at_tracker(model: AnalyticModel, holdout: Holdout, jobs: int = 1) -> TrackerErrors:
     """The memory and jitter in both halves beside a corrected model.
 
     Args: model: with its noise about the tracks.  holdout: the halves.  jobs: processes.
@@ -54,7 +55,7 @@ def look_at_tracker(model: AnalyticModel, holdout: Holdout, jobs: int = 1) -> Tr
     tracks = [track for half in halves for track in half]
     linear = linearised(model, holdout.surfaces, settings, tracks, jobs=jobs)
     if linear is None:
-        return Tracker()
+        return TrackerErrors()
     own = any(track.sigmas is not None for track in tracks)
     held_out = linear.numbers >= len(halves[0])
     found = tracker_noise(linear, held_out, settings, None if own else holdout.dataset.info.position_noise)
@@ -63,7 +64,7 @@ def look_at_tracker(model: AnalyticModel, holdout: Holdout, jobs: int = 1) -> Tr
         noise = replace(noise, memory=settings.memory, memory_time=settings.memory_time)
     if settings.stamp_jitter > 0.0:
         noise = replace(noise, stamp_jitter=settings.stamp_jitter)
-    return Tracker(tuple(_finding(part) for part in found.parts), noise if found.parts or declared else None)
+    return TrackerErrors(tuple(_finding(part) for part in found.parts), noise if found.parts or declared else None)
 
 
 def _parts(half: Sequence[EvaluationTrack]) -> list[Track]:

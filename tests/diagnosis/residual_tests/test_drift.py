@@ -9,8 +9,8 @@ import pytest
 
 from ballfg.diagnosis.fit.stretches import joined
 from ballfg.diagnosis.generic_test import ALARM
-from ballfg.diagnosis.remains.generic import generic_tests
-from ballfg.diagnosis.remains.patterns import DRIFT, drift_block
+from ballfg.diagnosis.residual_tests.generic import generic_tests
+from ballfg.diagnosis.residual_tests.patterns import DRIFT, drift_block
 
 COUNT = 20
 

@@ -21,7 +21,7 @@ from ballfg.estimation.noise.linear_tracks import LinearTracks
 from ballfg.estimation.noise.marginal import MarginalFit
 from ballfg.estimation.noise.parameters import Parameter, parameters_of
 from ballfg.estimation.settings import Settings
-from ballfg.tracks import TrackNoise
+from ballfg.tracks.noise import TrackNoise
 
 MEMORY: Final = "tracker_memory"
 JITTER: Final = "stamp_jitter"

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ballfg.diagnosis.remains import fallback
+from ballfg.diagnosis.residual_tests import fallback
 from ballfg.diagnosis.search.hypothesis import with_effects
 from ballfg.dynamics import EFFECTS, nominal_model
 from ballfg.dynamics.trained import Trained
-from ballfg.simulation import SimulationConfig, dataset_info, simulate
+from ballfg.simulation import SimulationConfig, simulate
+from ballfg.simulation.synthetic import dataset_info
 from ballfg.tracks import read_dataset, write_dataset
 
 COUNT = 12

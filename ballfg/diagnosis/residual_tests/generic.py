@@ -13,7 +13,7 @@ from ballfg.arrays import Array
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.system import System
 from ballfg.diagnosis.generic_test import GenericTest
-from ballfg.diagnosis.remains.patterns import (
+from ballfg.diagnosis.residual_tests.patterns import (
     DRIFT,
     EVERYWHERE,
     PLAUSIBLE,
@@ -22,10 +22,10 @@ from ballfg.diagnosis.remains.patterns import (
     describe_drift,
     drift_block,
 )
-from ballfg.diagnosis.remains.whiteness import whiteness
+from ballfg.diagnosis.residual_tests.whiteness import whiteness
 from ballfg.diagnosis.search.score import pattern_tests
 from ballfg.diagnosis.search.signatures import signatures_of
-from ballfg.tracks import TrackNoise
+from ballfg.tracks.noise import TrackNoise
 
 TRACKS_PER_DIRECTION = 4
 """Number of tracks per tested direction of a block: their scatter must determine the directions' covariance."""

@@ -16,7 +16,7 @@ from scipy import stats
 from ballfg.arrays import Array, Mask
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.system import System
-from ballfg.tracks import TrackNoise
+from ballfg.tracks.noise import TrackNoise
 
 REACHES = (0.02, 0.06, 0.18)
 """s. Widths of the Gaussian kernels in the time between two samples: from a contact's duration to an arc's."""

@@ -15,10 +15,10 @@ from ballfg.arrays import Array
 from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.generic_test import GenericTest
 from ballfg.diagnosis.label_verdicts import LabelCheck, LabelVerdict
-from ballfg.diagnosis.remains.label_flights import LabelledFlight, labelled_flights
-from ballfg.diagnosis.remains.label_model import scattering_model
+from ballfg.diagnosis.residual_tests.label_flights import LabelledFlight, labelled_flights
+from ballfg.diagnosis.residual_tests.label_model import scattering_model
 from ballfg.dynamics import AnalyticModel
-from ballfg.tracks import TrackNoise
+from ballfg.tracks.noise import TrackNoise
 
 LABEL: Final = "label"
 """Kind of the test."""

@@ -10,7 +10,8 @@ import pytest
 from ballfg.diagnosis import diagnose
 from ballfg.diagnosis.report.report import content
 from ballfg.diagnosis.result import Verdict
-from ballfg.dynamics import EFFECTS, load_model, model_to_dict
+from ballfg.dynamics import EFFECTS, load_model
+from ballfg.dynamics.model_file import model_to_dict
 from ballfg.simulation import MeasurementNoise, SimulationConfig, write_simulation
 from ballfg.tracks import read_dataset
 

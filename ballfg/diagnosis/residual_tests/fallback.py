@@ -12,22 +12,26 @@ import numpy as np
 
 from ballfg.diagnosis.fit.holdout import EvaluationTrack
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.remains.sparse import SparseTerms, fit_with_terms, sparse_terms
+from ballfg.diagnosis.residual_tests.sparse import SparseTerms, fit_with_terms, sparse_terms
 from ballfg.diagnosis.result import Errors, Fallback
 from ballfg.diagnosis.search.process_noise import calibrated_model, noise_about
-from ballfg.dynamics import AnalyticModel, Architecture, BallModel, LearnedModel, SpinEmbedding, build
-from ballfg.estimation import Settings, Smoother, dataset_settings, dataset_surfaces, spread_over
+from ballfg.dynamics import AnalyticModel, Architecture, BallModel, build
+from ballfg.dynamics.networks.learned import LearnedModel
+from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.estimation import Settings, Smoother, dataset_settings, dataset_surfaces
 from ballfg.estimation.batch import do_all
 from ballfg.estimation.measurement.as_measured import plainly_measured
 from ballfg.estimation.measurement.invert_measurement import InvertMeasurement
+from ballfg.estimation.noise.estimate import spread_over
 from ballfg.learning.config.training import LossConfig, OptimizerConfig, TrainConfig
 from ballfg.learning.end_to_end.end_to_end import EndToEnd
 from ballfg.learning.end_to_end.learnables import Learnables, NoiseScales
 from ballfg.learning.run.loop import Task, Training, TrainingStoppedError
 from ballfg.learning.run.ranks import Ranks
-from ballfg.learning.shots import Shot, shots_of
+from ballfg.learning.shots import TrainingShot, shots_of
 from ballfg.progress import unwatched
-from ballfg.tracks import Dataset, Track, TrackNoise
+from ballfg.tracks import Dataset, Track
+from ballfg.tracks.noise import TrackNoise
 
 HELPS = 0.9
 """Ratio of the prediction errors on the held-out half with and without an accepted fallback."""
@@ -136,7 +140,7 @@ def learned_residual(
     seconds = OBSERVED * float(np.median([track.duration for track in tracks]))
     plain = cast(AnalyticModel, plainly_measured(base))
     made = shots_of(tracks, plain, dataset_surfaces(dataset), settings, samples=None, seconds=seconds)
-    shots = [shot for _, shot in made if isinstance(shot, Shot)]
+    shots = [shot for _, shot in made if isinstance(shot, TrainingShot)]
     if len(shots) < LEAST_LEARNED:
         return None
     model = build(Architecture.of("mnn+gs", residual=True), radius=base.radius, base=plain, seed=0)

@@ -12,7 +12,7 @@ from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 
 
-def outside_of(model: BallModel, states: Array | Tensor) -> Array | None:
+def out_of_distribution(model: BallModel, states: Array | Tensor) -> Array | None:
     """The distance of states from the training data of a model, as a weight.
 
     Args:
@@ -25,7 +25,7 @@ def outside_of(model: BallModel, states: Array | Tensor) -> Array | None:
     return None if inside is None else 1.0 - inside.numpy()
 
 
-def outside_share(model: BallModel, tracks: Sequence[Array]) -> float | None:
+def out_of_distribution_share(model: BallModel, tracks: Sequence[Array]) -> float | None:
     """Share of flights that lies outside of the training data of a model.
 
     Args:
@@ -33,5 +33,7 @@ def outside_share(model: BallModel, tracks: Sequence[Array]) -> float | None:
         tracks: (n, 9) states of each.
     Returns: from 0 to 1, the mean over tracks; None for a model without such data, or without tracks.
     """
-    shares = [share.mean() for states in tracks if (share := outside_of(model, states)) is not None and len(share)]
+    shares = [
+        share.mean() for states in tracks if (share := out_of_distribution(model, states)) is not None and len(share)
+    ]
     return float(np.mean(shares)) if shares else None
