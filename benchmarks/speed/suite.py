@@ -32,8 +32,8 @@ from ballfg.dynamics import (
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.estimation import Online, Settings, Smoother, dataset_settings, dataset_surfaces
 from ballfg.estimation.settings import Solver
-from ballfg.estimation.smoother.initial import initial_states
 from ballfg.estimation.smoother.problem import Events
+from ballfg.estimation.smoother.settle import initial_states
 from ballfg.factors.batch import Values
 from ballfg.factors.graph import BallGraph
 from ballfg.factors.gtsam_solver import GtsamLevenbergMarquardt

@@ -19,9 +19,8 @@ from ballfg.dynamics import AnalyticModel, Surfaces
 from ballfg.estimation import Settings, Smoother, TrackProblem
 from ballfg.estimation.batch import map_tracks
 from ballfg.estimation.measurement.invert_measurement import InvertMeasurement
-from ballfg.estimation.smoother.initial import initial_states
 from ballfg.estimation.smoother.problem import UNINFORMATIVE_SPIN
-from ballfg.estimation.smoother.solution import Solution
+from ballfg.estimation.smoother.settle import Solution, initial_states
 from ballfg.factors.batch import Values
 from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Minimum
 from ballfg.factors.linear.covariance import SquareRootInformation, marginal_covariances

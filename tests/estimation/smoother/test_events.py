@@ -16,8 +16,8 @@ from ballfg.dynamics import Surfaces, contact_time, nominal_model, rollout
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Contact
 from ballfg.estimation.settings import Settings
-from ballfg.estimation.smoother.initial import initial_states, move_contacts
 from ballfg.estimation.smoother.motion import Motion
+from ballfg.estimation.smoother.settle import initial_states, move_contacts
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.tracks import Track
 

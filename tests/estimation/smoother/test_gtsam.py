@@ -16,7 +16,7 @@ from ballfg.dynamics import EFFECTS
 from ballfg.estimation.online.windows.chain import ChainWindow
 from ballfg.estimation.online.windows.window import IsamWindow
 from ballfg.estimation.segmentation import Contact, Segmentation
-from ballfg.estimation.smoother.low_hops import LowHops
+from ballfg.estimation.smoother.second_look.low_hops import LowHops
 from ballfg.factors import GtsamLevenbergMarquardt, LevenbergMarquardt, Loss
 from ballfg.simulation import SimulationConfig
 from ballfg.tracks import DatasetInfo, dataset_in_memory

@@ -24,7 +24,7 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.segmentation import Contact, Rest, Segmentation, SegmentationSettings
 from ballfg.estimation.settings import Settings, sample_sigmas
-from ballfg.estimation.smoother.hop_grid import HopGrid, HopLaw, HopMoments, averaged
+from ballfg.estimation.smoother.second_look.hop_grid import HopGrid, HopLaw, HopMoments, averaged
 from ballfg.state import POSITION, STATE_DIM, VZ, Z
 from ballfg.tracks import Track
 
