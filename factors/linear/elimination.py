@@ -52,6 +52,14 @@ class Root(NamedTuple):
         """Numbers w of a state, biases among them."""
         return self.states.shape[1]
 
+    @property
+    def log_determinant(self) -> float:
+        """Logarithm of det R, dimensionless."""
+        w, p = self.width, len(self.coefficients)
+        own = np.diagonal(self.states[:, :, :w], axis1=1, axis2=2)
+        shared = np.diagonal(self.coefficients[:, 2 * w : 2 * w + p])
+        return float(np.log(np.abs(own)).sum() + np.log(np.abs(shared)).sum())
+
 
 ROOT: Final[Any] = types.NamedTuple((THREE, TWO), Root)
 
