@@ -9,12 +9,12 @@ TOOLS  := build/tools/bin/pip-audit
 OLDEST := tests/factors tests/files tests/importing/test_forms.py tests/live/test_bag.py tests/dynamics/test_model_file.py \
 	tests/dynamics/compiled/test_kept.py \
 	tests/dynamics/networks/test_learned_file.py tests/estimation/smoother tests/prediction tests/pages tests/tracks \
-	tests/vision/test_camera_file.py tests/cli/test_estimate.py tests/cli/test_show.py tests/simulation tests/test_front.py
+	tests/vision/test_camera_file.py tests/cli/test_estimate.py tests/cli/test_show.py tests/simulation tests/front
 
 export OMP_NUM_THREADS ?= 1
 unexport PYTHONDONTWRITEBYTECODE  # interpreters that tests start compile the package once
 
-.PHONY: bench test check check-speed check-deps check-oldest docs results-page package sbom readme fuzz mutants format clean
+.PHONY: bench test test-all check check-speed check-deps check-oldest docs results-page package sbom readme fuzz mutants format clean
 
 bench: $(READY)  ## the estimator comparison: table, results/results.json, pictures; measured tracks too where they are
 	$(BIN)/ballfg-bench estimators --out results
@@ -22,7 +22,10 @@ bench: $(READY)  ## the estimator comparison: table, results/results.json, pictu
 		$(BIN)/ballfg-bench estimators --data "$(DATA)/$$set" --out results/$$set || exit 1; \
 	else echo "no measured tracks at $(DATA)/$$set: skipped"; fi; done
 
-test: $(READY)  ## all tests that need no more than ten minutes on two cores
+test: $(READY)  ## the tests but for those marked `thorough`: five minutes on two cores
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not thorough"
+
+test-all: $(READY)  ## all tests, twelve minutes: also README and tutorials, cold compilation, long fault tables, videos, campaigns
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 check: $(READY)  ## format, lint, types (of the installed package: its folders lie apart in the source tree)

@@ -1,4 +1,4 @@
-"""From noisy measurements of a flying, bouncing ball to states, predictions and knowledge.
+"""ballfg turns noisy measurements of a flying, bouncing ball into states, predictions and knowledge.
 
 A first estimate::
 

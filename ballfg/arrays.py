@@ -1,4 +1,4 @@
-"""The types of arrays that all rooms share; shapes and units stand in the docstrings."""
+"""Defines the types of arrays that all rooms share; docstrings state shapes and units."""
 
 from typing import TypeAlias
 
@@ -10,4 +10,4 @@ Array: TypeAlias = NDArray[np.float64]
 Index: TypeAlias = NDArray[np.int64]
 """Indices and counts."""
 Mask: TypeAlias = NDArray[np.bool_]
-"""Which of several things are meant."""
+"""Selects some of several things."""

@@ -1,7 +1,7 @@
-"""Checks of arguments and fields: numbers, arrays, text, names.
+"""Checks arguments and fields: numbers, arrays, text, names.
 
-Every message says the argument, the rule, what came instead and the remedy. Configurations that are models of pydantic
-check themselves.
+Every message names the argument, the rule, the value and the remedy. Pydantic models of configurations check
+themselves.
 """
 
 import difflib
@@ -30,23 +30,23 @@ _SYNONYMS = {
 
 
 MAX_SHOWN = 80
-"""Characters of a value in a message."""
+"""Largest number of characters of a value in a message."""
 LARGEST = 1e100
-"""Of a measured number, in any unit. The squares of much larger ones overflow; memory that nobody filled holds such."""
+"""Largest size of a measured number, in any unit: squares of much larger ones overflow."""
 MAX_SAID = 160
-"""Characters of a library's own words in a message."""
+"""Largest number of characters of a library's own words in a message."""
 MAX_LISTED = 12
-"""Names in a list in a message."""
+"""Largest number of names of a list in a message."""
 MAX_NAME = 200
-"""Characters of the name of a track, dataset, camera, label or group: they go to files, pages and terminals."""
+"""Largest number of characters of a name of a track, dataset, camera, label or group, which go to files and pages."""
 MAX_TEXT = 2000
-"""Characters of other text that a file states, such as where data come from."""
+"""Largest number of characters of other text in a file, such as the source of data."""
 MAX_PATH, MAX_PART = 4095, 255
-"""Characters of a path, and of a name in it: no file system has longer ones."""
+"""Largest numbers of characters of a path and of a name in it: no file system has longer ones."""
 _JOINERS = "\u200c\u200d"
-"""Invisible letters that Persian, Indian scripts and emoji are written with."""
+"""Invisible letters in Persian, Indian scripts and emoji."""
 _MAX_COMPARED = 200
-"""Candidates that a misspelt name is compared with; each takes some 20 microseconds."""
+"""Largest number of candidates for a misspelt name; each takes some 20 microseconds."""
 
 
 def type_name(value: object) -> str:
@@ -55,7 +55,7 @@ def type_name(value: object) -> str:
 
 
 def is_visible(text: str) -> bool:
-    """Whether a text shows what it holds: no control or formatting characters, such as those that turn its direction.
+    """True for text without control or formatting characters, such as those that reverse its direction.
 
     Source: Unicode Standard Annex 44, general categories; those that start with C or Z, but for a space.
     """
@@ -63,7 +63,7 @@ def is_visible(text: str) -> bool:
 
 
 def visible(text: str) -> str:
-    """The text with all that a terminal would obey, or not show, as Python writes it."""
+    """The text with Python's escapes for all characters that a terminal would obey or not show."""
     if is_visible(text):
         return text
     return "".join(letter if is_visible(letter) else ascii(letter)[1:-1] for letter in text)
@@ -75,9 +75,9 @@ def one_line(error: object) -> str:
 
 
 def shown(value: object) -> str:
-    """A value in a message: as Python writes it, or its beginning where that is longer than 80 characters.
+    """A value in a message: in Python's notation, or its beginning if that is longer than 80 characters.
 
-    Nothing of a long value is written out in between, so that one that holds a million others costs no time.
+    A long value is never written out in full, so that one with a million elements costs no time.
     """
     short = reprlib.Repr()
     short.maxstring = short.maxother = short.maxlong = MAX_SHOWN
@@ -87,12 +87,12 @@ def shown(value: object) -> str:
 
 
 def short_text(text: str, most: int = MAX_SHOWN) -> str:
-    """The text, or its beginning where it is longer than a message can hold, `most` characters; all of it visible."""
+    """The text, or its beginning if it is longer than `most` characters; all of it visible."""
     return visible(text if len(text) <= most else f"{text[: most - 3]}...")
 
 
 def listed(names: Collection[object]) -> str:
-    """Names in a message: the first ones, and how many more there are; line feeds and their like as in Python."""
+    """Names in a message: the first ones, and the number of further ones; line feeds and the like are escaped."""
     texts = map(str, itertools.islice(names, MAX_LISTED))
     first = [short_text(text if is_visible(text) else repr(text)) for text in texts]
     more = len(names) - len(first)
@@ -100,9 +100,9 @@ def listed(names: Collection[object]) -> str:
 
 
 def check_text(label: str, value: object, *, optional: bool = False) -> None:
-    """Refuses a value that is not text with something in it.
+    """Refuses a value other than non-empty text.
 
-    Raises: TypeError: not text. ValueError: nothing but spaces.
+    Raises: TypeError: not text. ValueError: only spaces.
     """
     if value is None and optional:
         return
@@ -115,27 +115,27 @@ def check_text(label: str, value: object, *, optional: bool = False) -> None:
 
 
 TEXT_RULE = f"text of at most {MAX_TEXT} characters without control or formatting characters"
-"""What text beside names must be."""
+"""The rule for text other than names."""
 
 
 def is_text(value: str) -> bool:
-    """Whether a text, which may have several lines, can be shown: `TEXT_RULE`."""
+    """True for text, of one or several lines, that can be shown: `TEXT_RULE`."""
     return len(value) <= MAX_TEXT and is_visible("".join(value.split()))
 
 
 def is_name(value: str) -> bool:
-    """Whether a text can name a track, a dataset, a camera, a label or a group: `NAME_RULE`."""
+    """True for text that can name a track, a dataset, a camera, a label or a group: `NAME_RULE`."""
     return bool(value) and not value.isspace() and len(value) <= MAX_NAME and is_visible(value)
 
 
 NAME_RULE = f"printable text of one line, 1 to {MAX_NAME} characters without control or formatting characters"
-"""What a name must be."""
+"""The rule for names."""
 
 
 def check_name(label: str, value: object, remedy: str = "Rename it.") -> str:
-    """The name itself.
+    """Checks a name and returns it.
 
-    Raises: TypeError: not text. ValueError: no name that files and terminals can show: `is_name`.
+    Raises: TypeError: not text. ValueError: a name that files and terminals cannot show: `is_name`.
     """
     if not isinstance(value, str):
         raise TypeError(f"{label} must be text; got {type_name(value)} {shown(value)}. Put it in quotes.")
@@ -147,7 +147,7 @@ def check_name(label: str, value: object, remedy: str = "Rename it.") -> str:
 def check_keys(where: str, content: dict[Any, Any], known: Collection[str], needed: Collection[str]) -> None:
     """Refuses a mapping with other keys than the known ones, or without a needed one.
 
-    Args: where: begins the message.  content: the mapping.  known: its possible keys.  needed: those with a value.
+    Args: where: start of the message.  content: the mapping.  known: its possible keys.  needed: required keys.
     Raises: ValueError: naming the key.
     """
     absent = [key for key in known if key not in content]
@@ -163,7 +163,7 @@ def check_keys(where: str, content: dict[Any, Any], known: Collection[str], need
 
 
 def nearest(name: str, candidates: Iterable[str]) -> str | None:
-    """The candidate most like `name` (spaces, case and common synonyms set aside), or None if none is near."""
+    """The candidate most like `name` (apart from spaces, case and common synonyms), or None if none is near."""
     if len(name) > MAX_SHOWN:
         return None
     near = (candidate for candidate in candidates if len(candidate) <= MAX_SHOWN)
@@ -186,7 +186,7 @@ def did_you_mean(name: str, candidates: Iterable[str]) -> str:
 
 
 def is_number(value: object) -> bool:
-    """Whether a value is a real number; a bool is none, and for all of numpy a difference of dates is none."""
+    """True for a real number; a bool is not one, nor is a numpy difference of dates."""
     return isinstance(value, Real) and not isinstance(value, bool | np.timedelta64)
 
 
@@ -203,13 +203,13 @@ def check_number(
     """A finite number as a float.
 
     Args:
-        label: what the message calls it.
-        value: to check.
+        label: name of the argument in the message.
+        value: to be checked.
         unit: of the number.
         above: the value must be greater, if given.
-        least: the smallest value that can be meant, where that is another one than `above`.
-        limit: the largest size that can be meant in this unit.
-        instead: the unit that a larger value is probably in.
+        least: the smallest plausible value, if it differs from `above`.
+        limit: the largest plausible size in this unit.
+        instead: the probable unit of a larger value.
     Raises: TypeError: not a number. ValueError: not finite, or out of range.
     """
     number = as_float(label, value, unit)
@@ -239,7 +239,7 @@ def check_range(label: str, value: Any, low: float, high: float) -> float:
 
 
 def check_count(label: str, value: Any, low: int, high: int | None = None) -> int:
-    """A whole number within [low, high]; without a high one, of any size from low on.
+    """A whole number within [low, high]; without `high`, of any size from `low` on.
 
     Raises: TypeError: not a whole number. ValueError: out of range.
     """
@@ -266,7 +266,7 @@ def _article(kind: type) -> str:
 
 
 def as_float(label: str, value: Any, unit: str = "") -> float:
-    """A real number as a float, which may be NaN or infinite; a truth value is no number.
+    """A real number as a float, which may be NaN or infinite; a bool is refused.
 
     Raises: TypeError: naming the type.
     """
@@ -282,7 +282,7 @@ def as_float(label: str, value: Any, unit: str = "") -> float:
 
 
 def check_iterable(label: str, value: object) -> None:
-    """Refuses a single thing, and a text.
+    """Refuses a single value, and text.
 
     Raises: TypeError: naming the type.
     """
@@ -291,9 +291,9 @@ def check_iterable(label: str, value: object) -> None:
 
 
 def check_each(label: str, values: Iterable[T], kind: type[Any], remedy: str) -> Iterator[T]:
-    """The values one by one, each checked when it is taken.
+    """The values one by one, each checked on its turn.
 
-    Raises: TypeError: at once a single thing; later a value of another type.
+    Raises: TypeError: at once for a single value; later for a value of another type.
     """
     check_iterable(label, values)
     return (check_instance(f"each of {label}", value, kind, remedy) for value in values)
@@ -310,7 +310,7 @@ def check_flag(label: str, value: object) -> bool:
 
 
 def check_choice(label: str, value: object, known: Collection[str]) -> None:
-    """Refuses what is none of the known names.
+    """Refuses a value other than the known names.
 
     Raises: ValueError: listing them.
     """
@@ -319,9 +319,9 @@ def check_choice(label: str, value: object, known: Collection[str]) -> None:
 
 
 def check_path(label: str, value: object) -> Path:
-    """The place of a file or folder.
+    """The path of a file or folder.
 
-    Raises: TypeError: neither text nor a path. ValueError: one that no system can have: with a NUL, or too long.
+    Raises: TypeError: neither text nor a path. ValueError: an impossible path: with a NUL, or too long.
     """
     if not isinstance(value, str | PathLike):
         raise TypeError(f"{label} must be a path; got {type_name(value)} {shown(value)}. Give it as text or Path.")
@@ -345,14 +345,14 @@ def check_array(
 ) -> NDArray[np.float64]:
     """A copy as float64.
 
-    Args: label: what the message calls the array.  value: to check.  shape: the right one, if it is fixed.
-        remedy: last sentence of the message.  most: the largest size of a finite number.
+    Args: label: name of the array in the message.  value: to be checked.  shape: the required one, if fixed.
+        remedy: last sentence of the message.  most: largest size of a finite number.
     Raises: ValueError: not numbers, numbers under a mask or beyond `most`, or another shape.
     """
     try:
         given = np.asanyarray(value)
         problem = _no_numbers(given)
-        plain = given.tolist() if given.dtype.kind == "U" else given  # numpy's words on texts are its own
+        plain = given.tolist() if given.dtype.kind == "U" else given  # numpy has messages of its own for texts
         array = np.array(plain, dtype=None if problem else np.float64)
     except (TypeError, ValueError, OverflowError, RuntimeError) as error:  # the last: a tensor with a gradient
         raise ValueError(
@@ -375,11 +375,11 @@ _NO_NUMBERS = {
     "m": ("time differences", "Divide them by np.timedelta64(1, 's')."),
     "M": ("dates", "Subtract the first one and divide by np.timedelta64(1, 's')."),
 }
-"""What numpy turns into numbers without a word, by kind of array: what it is, and what to do."""
+"""Arrays that numpy converts to numbers silently, by kind: a description, and the remedy."""
 
 
 def _no_numbers(array: NDArray[Any]) -> str:
-    """Why an array holds no numbers though numpy would make some of it, and what to do; empty if it holds numbers."""
+    """The reason why an array does not hold numbers, though numpy would convert it, and the remedy; else empty."""
     if array.dtype.kind in _NO_NUMBERS:
         what, instead = _NO_NUMBERS[array.dtype.kind]
         return f"got {what}. {instead}"

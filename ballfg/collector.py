@@ -1,16 +1,16 @@
-"""How often Python looks for objects that nothing but themselves refers to."""
+"""Makes Python's garbage collector run less often."""
 
 import gc
 from typing import Final
 
 MADE: Final = 50_000
-"""Objects made, beyond those that went, before Python looks among the new ones; 700 by itself."""
+"""Growth in the number of objects before Python collects the new ones; its default is 700."""
 
 
 def collect_rarely() -> None:
-    """Has a program's process look less often.
+    """Lets a program's process collect garbage less often.
 
-    torch and its like make a million objects that stay. To look through them again and again while they are being
-    imported takes a tenth of a command's start.
+    torch and similar packages create a million permanent objects. Scanning them again and again during their import
+    takes a tenth of a command's start.
     """
     gc.set_threshold(MADE, *gc.get_threshold()[1:])

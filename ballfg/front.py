@@ -1,4 +1,4 @@
-"""The front door: estimate and predict for arrays, tracks, datasets and folders alike; the graph of a track."""
+"""The front door estimates, predicts and diagnoses from arrays, tracks, datasets and folders alike."""
 
 from __future__ import annotations
 
@@ -12,16 +12,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ballfg.checks import check_count, check_instance, check_path, type_name
-from ballfg.dynamics import BallModel, Surfaces, inertia_factor, load_model, nominal_model
-from ballfg.estimation import Estimate, Estimator, Settings, make_estimator
+from ballfg.dynamics import BallModel, Surfaces, load_model, nominal_model
+from ballfg.dynamics.nominal import inertia_factor
+from ballfg.estimation import Estimate, Estimator, Settings
+from ballfg.estimation.registry import make_estimator
 from ballfg.machine import MOST_JOBS
-from ballfg.prediction import Ahead, BallState
+from ballfg.prediction import BallState, Forecast
 from ballfg.tracks import TABLE_TENNIS, Ball, Track
 from ballfg.tracks.info import TrackFolder
 
 if TYPE_CHECKING:
     from ballfg.diagnosis import Diagnosis
-    from ballfg.estimation import ConformalScales, SightedDataset, TrackGraph, TrackPrediction
+    from ballfg.estimation import ConformalScales, TrackGraph
+    from ballfg.estimation.observations.sighted_dataset import SightedDataset
+    from ballfg.estimation.track_prediction import TrackPrediction
     from ballfg.tracks import Dataset
 
 Folder: TypeAlias = str | PathLike[str]
@@ -64,16 +68,16 @@ def estimate(
 ) -> Estimate | dict[str, Estimate]:
     """Position, velocity and spin of the ball at every stamp, with covariances.
 
-    Ball, table and noise that are not given are those of the dataset that a track was read from. A track without a
-    dataset is taken for a table-tennis ball above a table at z = 0; the notes of its estimate list signs against that.
+    By default, ball, table and noise are those of a track's dataset. A track without a dataset counts as a table-tennis
+    ball above a table at z = 0; the notes of its estimate list signs against that.
 
     Args:
         measured: a track or its arrays, (n, 4) of t, x, y, z in s and m or times (n,) s and positions (n, 3) m; or a
             dataset or its folder for all tracks.
         method: "smoother", "online", "ekf", "sliding-window", or the name of a registered estimator.
-        model: of the ball, or its file; the nominal model of the ball where None, or of a `Ball` that is given.
-        surfaces: that the ball may bounce on; a number is the height of the table, m.
-        settings: noise and priors; those of measured tracks where None.
+        model: of the ball, or its file; None: the nominal model of the ball; of a `Ball`, its nominal model.
+        surfaces: table and floor; a number is the height of the table, m.
+        settings: noise and priors; None: those of measured tracks.
         jobs: processes for a dataset.
     Returns: the estimate of a track; of a dataset, the estimates of all its tracks by name.
     Raises:
@@ -86,7 +90,7 @@ def estimate(
     estimator = estimator_for(data, method, model, surfaces, settings)
     if isinstance(data, Track):
         return estimator.estimate(data)
-    from ballfg.estimation import estimate_tracks
+    from ballfg.estimation.batch import estimate_tracks
 
     return {one.name: one for one in estimate_tracks(estimator, data, len(data), jobs)}
 
@@ -94,7 +98,7 @@ def estimate(
 @overload
 def predict(
     known: Estimate | BallState | OneTrack, horizon: float = ..., **options: Unpack[PredictOptions]
-) -> Ahead: ...
+) -> Forecast: ...
 @overload
 def predict(
     known: Tracks | Folder, horizon: float = ..., **options: Unpack[PredictOptions]
@@ -110,7 +114,7 @@ def predict(
     settings: Settings | None = None,
     conformal: Conformal = None,
     jobs: int = 1,
-) -> Ahead | dict[str, TrackPrediction]:
+) -> Forecast | dict[str, TrackPrediction]:
     """The path of the ball ahead, with standard deviations.
 
     Args:
@@ -118,15 +122,15 @@ def predict(
             `observe` seconds of each track are estimated, and the measurements after them are predicted.
         horizon: s, how far ahead.
         observe: s from the first stamp of each track of a dataset.
-        conformal: for a dataset: calibration tracks of the same kind or their folder, scales that an earlier prediction
-            has, or their file. The sigmas are scaled so that mean +- 1.645 sigma are conformal 90 % intervals
+        conformal: for a dataset: calibration tracks of the same kind or their folder, the scales of an earlier
+            prediction, or their file. The sigmas are scaled so that mean +- 1.645 sigma are conformal 90 % intervals
             (docs/predict.md); `conformal` of each prediction has the scales and the coverage on the calibration tracks.
-        method, model, surfaces, settings, jobs: as for `estimate`; the calibration tracks are estimated alike.
+        method, model, surfaces, settings, jobs: as for `estimate`, also for the calibration tracks.
     Returns: the path ahead; of a dataset, the predicted measurements of each track by name.
     Raises:
-        TypeError: for anything else in place of what is known or of the calibration tracks.
-        ValueError: a horizon that is not positive, calibration tracks that are too few or of another kind, or what
-            `estimate` raises.
+        TypeError: for `known` or calibration tracks of another type.
+        ValueError: a horizon that is not positive, too few calibration tracks or tracks of another kind, or as from
+            `estimate`.
     """
     check_count("jobs", jobs, 1, MOST_JOBS)
     if isinstance(known, Estimate | BallState):
@@ -137,7 +141,8 @@ def predict(
         _refuse(conformal)
         estimator = estimator_for(data, method, model, surfaces, settings)
         return estimator.estimate(data).predict(horizon)
-    from ballfg.estimation import check_observe, predict_tracks
+    from ballfg.estimation import predict_tracks
+    from ballfg.estimation.track_prediction import check_observe
 
     check_observe(observe)
     observe = float(observe)
@@ -163,8 +168,9 @@ def _scales(
     method: str,
     observe: float,
 ) -> ConformalScales | None:
-    """The scales of predictions of `data`: those given, or from the calibration tracks that are given."""
-    from ballfg.estimation import ConformalScales, check_calibration_tracks, load_conformal
+    """The scales of predictions of `data`: the given ones, or from the given calibration tracks."""
+    from ballfg.estimation import ConformalScales
+    from ballfg.estimation.conformal import check_calibration_tracks, load_conformal
 
     if isinstance(conformal, str | PathLike) and check_path("conformal", conformal).is_file():
         conformal = load_conformal(Path(conformal))
@@ -184,16 +190,16 @@ def diagnose(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) 
 
     Args:
         measured: a dataset or its folder; one half of the tracks finds effects, the other half judges them.
-        model: the analytic model to diagnose, or its file; the nominal model of the ball where None, or of a `Ball`.
+        model: the analytic model to diagnose, or its file; None: the nominal model of the ball; of a `Ball`, likewise.
         jobs: processes.
-    Returns: the effects found, how sure that is, and the corrected model.
+    Returns: the effects found, with their evidence, and the corrected model.
     Raises:
-        TypeError: for anything else in place of a dataset, or if the model is a learned one, or none.
+        TypeError: for another type in place of a dataset, or a model that is learned or no model.
         ValueError: a dataset without a table of positions, too few tracks, or none with a flight that is long enough.
         FileNotFoundError: a folder or model file that is not there.
     """
     check_count("jobs", jobs, 1, MOST_JOBS)
-    from ballfg.estimation import SightedDataset
+    from ballfg.estimation.observations.sighted_dataset import SightedDataset
     from ballfg.parallel.work import on_one_thread
     from ballfg.tracks import Dataset
 
@@ -206,9 +212,9 @@ def diagnose(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) 
             f"measured must be a dataset or its folder; got {what}. Read one with bf.read, or make one of tracks with "
             "bf.import_tracks or ballfg.tracks.dataset_in_memory."
         )
-    from ballfg.diagnosis import diagnose as diagnose_dataset  # half of the package, which an estimate does not need
+    from ballfg.diagnosis import diagnose as diagnose_dataset  # half of the package, which estimates do not need
 
-    # as the commands do: threads gain nothing with such small batches, and beside other work wait for each other
+    # as in the commands: threads gain nothing on such small batches, and slow each other down
     return on_one_thread(partial(diagnose_dataset, data, jobs=jobs), _model(model, data))
 
 
@@ -219,7 +225,7 @@ def graph(
     surfaces: Surfaces | float | None = None,
     settings: Settings | None = None,
 ) -> TrackGraph:
-    """The factor graph of a track as GTSAM's objects, to be solved by GTSAM with factors of one's own.
+    """The factor graph of a track as GTSAM's objects, for GTSAM's solvers and for further factors.
 
     Args:
         measured: a track or its arrays, as for `estimate`.
@@ -227,7 +233,7 @@ def graph(
     Returns: factors, values at the smoother's estimate, keys of the states; `Estimate.from_gtsam` leads back.
     Raises:
         TypeError: for anything else in place of a track.
-        ValueError: a track of which no graph can be made, a model with measurement effects, or as `estimate`.
+        ValueError: a track without a graph, a model with measurement effects, or as `estimate`.
     """
     track = _opened(measured)
     if not isinstance(track, Track):
@@ -248,12 +254,13 @@ def estimator_for(
 ) -> Estimator:
     """The estimator that `estimate` uses; arguments and errors as there.
 
-    Args: observed: s from the start of each track from which the noise may be learned, where nobody states it.
+    Args: observed: s from the start of each track that a noise estimate may use.
     """
     source = data.dataset if isinstance(data, Track) else data
     ball = _model(model, source)
     if source is not None:
-        from ballfg.estimation import dataset_surfaces, fitted_settings
+        from ballfg.estimation import dataset_surfaces
+        from ballfg.estimation.configure import fitted_settings
     if surfaces is None:
         surfaces = 0.0 if source is None else dataset_surfaces(source)
     if settings is None:

@@ -1,7 +1,7 @@
-"""Ctrl-C, SIGTERM and SIGHUP: a program ends the same way for each, cleaned up and with one line.
+"""Ends a program at Ctrl-C, SIGTERM or SIGHUP in the same way: cleaned up, and with one line.
 
 Each raises KeyboardInterrupt in the main thread, at the next step of Python's interpreter: a call into machine code,
-such as a compilation, ends first.
+such as a compilation, is finished first.
 """
 
 import signal
@@ -13,10 +13,10 @@ from typing import Any, Final
 
 SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 ONCE: Final = 5.0
-"""s after a signal in which others change nothing: terminals and services send several, and none may cut cleaning up
-short."""
+"""s after a signal during which further ones have no effect: terminals and services send several, and none may
+interrupt cleaning up."""
 AGAIN: Final = 0.02
-"""s after which an interrupt that Python could not raise comes again."""
+"""s after which an interrupt that Python could not raise is repeated."""
 
 _listening: bool = False
 _number: int | None = None
@@ -24,7 +24,7 @@ _raised: float | None = None
 
 
 def listen() -> None:
-    """Lets the signals end this program."""
+    """Makes the signals end this program."""
     global _listening
     _listening = True
     for number in heeded():
@@ -34,12 +34,12 @@ def listen() -> None:
 
 
 def heeded() -> list[signal.Signals]:
-    """The signals, but for those that whoever started this program wants ignored, as nohup does."""
+    """The signals, except for those that the parent process wants ignored, as nohup does."""
     return [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
 
 
 def let_go() -> None:
-    """Lets the signals end this process without a word: nothing is left to be cleaned up."""
+    """Makes the signals end this process silently: there is nothing to clean up."""
     signal.setitimer(signal.ITIMER_REAL, 0.0)
     for number in SIGNALS:
         if signal.getsignal(number) is _on_signal:
@@ -47,20 +47,20 @@ def let_go() -> None:
 
 
 def interrupted() -> bool:
-    """Whether a signal has asked this program to end."""
+    """True if a signal has asked this program to end."""
     return _number is not None
 
 
 def is_interrupt(error: BaseException) -> bool:
-    """Whether an exception is a signal's, not one that some code has raised by itself."""
+    """True if an exception comes from a signal, not from other code."""
     return isinstance(error, KeyboardInterrupt) and (interrupted() or not _listening)
 
 
 def say_so() -> int:
-    """Prints the line about a program that was interrupted. Returns: its exit status, 128 and the signal's number."""
+    """Prints the line on the interruption. Returns: the exit status, 128 and the signal's number."""
     number = signal.SIGINT if _number is None else signal.Signals(_number)
     by = "" if number == signal.SIGINT else f" by {number.name}"
-    with suppress(OSError):  # the terminal may be gone: that is what SIGHUP says
+    with suppress(OSError):  # the terminal may be gone: SIGHUP means that
         print(f"ballfg: interrupted{by}", file=sys.stderr)
     return 128 + number
 
@@ -79,7 +79,7 @@ def _on_alarm(_alarm: int, _frame: FrameType | None) -> None:
 
 
 def _not_raised(found: Any) -> None:
-    """Where Python cannot raise an interrupt, as while it removes an object, it comes again."""
+    """Repeats an interrupt that Python could not raise, as during the removal of an object."""
     if isinstance(found.exc_value, KeyboardInterrupt) and interrupted():
         signal.setitimer(signal.ITIMER_REAL, AGAIN)
     else:

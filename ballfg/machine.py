@@ -1,4 +1,4 @@
-"""The machine and the installed packages, as results and runs record them."""
+"""Describes the machine and the installed packages for results and runs."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from importlib import metadata
 from typing import Final
 
 DATE: Final = "SOURCE_DATE_EPOCH"
-"""Environment variable with a date in seconds since 1970 that stands for now, so that a page can be made again byte
-for byte (reproducible-builds.org)."""
+"""Environment variable with a date in seconds since 1970 that replaces the present one, so that a page can be
+reproduced byte for byte (reproducible-builds.org)."""
 
 MOST_JOBS: Final = 10_000
-"""Processes. No machine has cores for more."""
+"""Largest number of processes; no machine has more cores."""
 
 
 def usable_cores() -> int:
-    """How many cores this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -1,7 +1,7 @@
-"""Signs of life of long work: a bar on a terminal, plain lines elsewhere; nothing for less than two seconds.
+"""Shows the progress of long work: a bar on a terminal, plain lines elsewhere, nothing for under two seconds.
 
-`progress` counts items. `doing` names a stage that cannot be counted. While a command runs, `alive` says every few
-seconds what is being done and for how long, wherever neither of them has just said something.
+`progress` counts items. `doing` names a stage that cannot be counted. While a command runs, `alive` reports every few
+seconds the stage and its duration, unless one of them has just printed something.
 """
 
 import os
@@ -16,18 +16,18 @@ from typing import Final, Protocol, TypeVar
 T = TypeVar("T")
 
 QUIET: Final = 2.0
-"""s. Work that is over before that shows nothing."""
+"""s. Shorter work shows nothing."""
 LINE_EVERY: Final = 2.5
-"""s between plain lines, at most."""
+"""s, least time between plain lines."""
 BEAT: Final = 0.2
-"""s between two looks at how long nothing was said."""
+"""s between two checks of the time since the last line."""
 VARIABLE: Final = "BALLFG_QUIET"
-"""Environment variable that silences progress, as the option --quiet does; processes that are started inherit it."""
+"""Environment variable that silences progress, as the option --quiet does; child processes inherit it."""
 
 
 @dataclass
 class _Stage:
-    """What is being done."""
+    """A stage of the work."""
 
     text: str
     since: float
@@ -35,7 +35,7 @@ class _Stage:
 
 @dataclass
 class _Signs:
-    """The stages within one another, when something was last said, and whether a bar shows it."""
+    """The nested stages, the time of the last line, and whether a bar is shown."""
 
     stages: list[_Stage] = field(default_factory=list)
     said: float = 0.0
@@ -46,37 +46,37 @@ _SIGNS: Final = _Signs()
 
 
 class Watch(Protocol):
-    """Hands items through as they are done, for instance to show how far the work is: `progress` is one."""
+    """Passes items through and may report their progress: `progress` is one."""
 
     def __call__(self, items: Iterable[T], total: int, what: str, /) -> Iterator[T]:
-        """The same items. `total` is their number, an estimate at times; `what` names them, as `tracks estimated`."""
+        """The same items. `total` is their exact or approximate number; `what` names them, as `tracks estimated`."""
         ...
 
 
 def unwatched(items: Iterable[T], total: int, what: str, /) -> Iterator[T]:
-    """Hands items through and shows nothing."""
+    """Passes items through and shows nothing."""
     return iter(items)
 
 
 def is_quiet() -> bool:
-    """Whether nobody wants to see progress, or nobody can: programs without a window have no stderr."""
+    """True if progress is switched off or cannot be shown: programs without a window have no stderr."""
     return bool(os.environ.get(VARIABLE)) or sys.stderr is None
 
 
 def be_quiet() -> None:
-    """Shows no progress from now on, in this process and in those that it starts."""
+    """Switches progress off, in this process and its children."""
     os.environ[VARIABLE] = "1"
 
 
 def say(line: str) -> None:
-    """Prints a line about the course of the work on stderr, unless progress is not wanted."""
+    """Prints a line about the course of the work on stderr, unless progress is switched off."""
     _SIGNS.said = time.monotonic()
     if not is_quiet():
-        print(f"{line}\n", end="", file=sys.stderr, flush=True)  # at once: two threads speak
+        print(f"{line}\n", end="", file=sys.stderr, flush=True)  # at once: two threads print
 
 
 def announce(line: str) -> None:
-    """Prints a line about what begins now; `alive` repeats it until the next."""
+    """Prints a line about a stage that begins; `alive` repeats it until the next stage."""
     if _SIGNS.stages:
         _SIGNS.stages[-1].text, _SIGNS.stages[-1].since = line, time.monotonic()
     say(line)
@@ -98,14 +98,14 @@ def doing(what: str) -> Iterator[_Stage]:
 
 @contextmanager
 def alive(what: str) -> Iterator[None]:
-    """Says on stderr what is being done whenever nothing was said for `LINE_EVERY` seconds.
+    """Reports the present stage on stderr whenever nothing was printed for `LINE_EVERY` seconds.
 
-    Args: what: the whole work, as its user calls it.
+    Args: what: name of the whole work for users.
     """
     ended = threading.Event()
     beating = threading.Thread(target=_beat, args=(ended,), daemon=True)
     _SIGNS.said = time.monotonic()
-    if os.environ.get("RANK", "0") == "0":  # of processes that train together the first speaks
+    if os.environ.get("RANK", "0") == "0":  # of processes that train together only the first prints
         beating.start()
     with doing(what):
         try:
@@ -118,7 +118,7 @@ def alive(what: str) -> Iterator[None]:
 
 @contextmanager
 def idle() -> Iterator[None]:
-    """Work that waits for others, or speaks for itself: `alive` says nothing."""
+    """Silences `alive` during work that waits for others or reports by itself."""
     _SIGNS.covered += 1
     try:
         yield
@@ -136,9 +136,9 @@ def _beat(ended: threading.Event) -> None:
 
 
 def progress(items: Iterable[T], total: int, what: str, /) -> Iterator[T]:
-    """Hands items through and shows on stderr how far it is.
+    """Passes items through and shows the progress on stderr.
 
-    Args: items: a stream.  total: how many there will be.  what: for instance `tracks estimated`.
+    Args: items: a stream.  total: their number.  what: for instance `tracks estimated`.
     """
     if is_quiet():
         return iter(items)
@@ -182,7 +182,7 @@ def _lines(items: Iterable[T], total: int, what: str) -> Iterator[T]:
             if now < due or done == total:
                 continue
             left = ""
-            if since is None:  # the time up to here went into the start of processes too: count from here on
+            if since is None:  # this time includes the start of processes: count from here on
                 since = now, done
             else:
                 left = f", {(now - since[0]) / (done - since[1]) * (total - done):.0f} s left"

@@ -1,6 +1,6 @@
-"""Registries: classes by name, those of this package, of the user and of other installed packages.
+"""Registries give classes by name: those of this package, of the user and of other installed packages.
 
-A package of one's own takes part by an entry point in its pyproject.toml:
+Another package registers a class by an entry point in its pyproject.toml:
 
     [project.entry-points."ballfg.effects"]
     static_charge = "my_package.charge:StaticCharge"
@@ -26,10 +26,10 @@ class Source:
     """The package that a registered class comes from."""
 
     package: str
-    """Name of the installed package; the name of the module where no installed package holds it."""
+    """Name of the installed package; the name of the module without one."""
 
     version: str | None
-    """None where no installed package holds the class."""
+    """None without an installed package."""
 
     def __str__(self) -> str:
         return self.package if self.version is None else f"{self.package} {self.version}"
@@ -37,19 +37,19 @@ class Source:
 
 @dataclass(eq=False, repr=False)
 class Registry(Mapping[str, type[T]], Generic[T]):
-    """Classes of one sort by their `name`.
+    """Classes of one kind by their `name`.
 
     Classes of this package come first, in the order of their registration; the others follow by name. Entry points of
     installed packages are loaded at the first iteration or missed lookup, never at import.
 
     Args:
-        sort: the word for one of the classes in messages, for instance "estimator".
+        sort: the word for one of the classes in messages, such as "estimator".
         group: of the entry points, for instance "ballfg.estimators".
         base: the class or classes of which each must be a subclass.
-        remedy: a sentence that ends messages about classes which cannot be registered.
-        check: refuses a class of somebody else by an exception that says what is wrong with it.
-        reserved: classes by name that are not in the registry; their names are taken.
-        own: places of classes of this package by name, `module:Class`, each of which is imported when it is asked for.
+        remedy: last sentence of messages about classes that cannot be registered.
+        check: raises an exception for a faulty class from outside of the package.
+        reserved: classes by name outside of the registry; their names are taken.
+        own: places of classes of this package by name, `module:Class`, which are imported on demand.
     """
 
     sort: str
@@ -87,20 +87,20 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         return f"Registry of {self.sort}s: {', '.join(self)}"
 
     def register(self, cls: C) -> C:
-        """Let a class be named wherever those of the package are; may decorate the class.
+        """Registers a class under its name; may decorate the class.
 
-        A class that is defined anew, as when a cell of a notebook runs again, takes the place of the one before.
+        A class that is defined again, as in a repeated notebook cell, replaces the previous one.
 
         Args: cls: a subclass of the registry's base, with a class attribute `name`.
         Returns: the same class.
         Raises:
-            TypeError: if it is no such class.
+            TypeError: if it is not such a class.
             ValueError: if its name is missing or taken, or if the registry's own check refuses it.
         """
         if not (isinstance(cls, type) and issubclass(cls, self.base)):
             names = [base.__name__ for base in (self.base if isinstance(self.base, tuple) else (self.base,))]
             bases = " or ".join(filter(None, (", ".join(names[:-1]), names[-1])))
-            got = " ".join(repr(cls)[:80].split())  # on one line, also where it is an array
+            got = " ".join(repr(cls)[:80].split())  # on one line, also for an array
             raise TypeError(f"{self.sort} must be a subclass of {bases}; got {got}. {self.remedy}")
         name = getattr(cls, "name", None)
         if not (isinstance(name, str) and name.strip()):
@@ -130,12 +130,12 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         )
 
     def source(self, name: str) -> Source:
-        """The package from which the class of a name comes, with its version."""
+        """The package of a registered class, with its version."""
         cls = self[name]
         return self._packages[name] if name in self._packages else source_of(cls)
 
     def load_entry_points(self) -> None:
-        """Register the classes that other installed packages offer; does nothing after the first time.
+        """Registers the classes from entry points of other installed packages, the first time only.
 
         Raises: ValueError: if an entry point cannot be used; the message names it and its package.
         """
@@ -150,7 +150,7 @@ class Registry(Mapping[str, type[T]], Generic[T]):
             raise
 
     def _load(self, point: EntryPoint) -> None:
-        """Register the class that an entry point names; a module registers its classes, a function is called."""
+        """Registers the class of an entry point; a module registers its classes, a function is called."""
         before = dict(self._classes)
         try:
             offered = point.load()
@@ -159,7 +159,7 @@ class Registry(Mapping[str, type[T]], Generic[T]):
                 before.pop(cast("Any", offered).name, None)  # its module may have registered it already
             elif not isinstance(offered, ModuleType):
                 offered()
-        except BaseException as error:  # one that leaves, by sys.exit or otherwise, would take the command with it
+        except BaseException as error:  # sys.exit in it would end the command
             if is_interrupt(error):
                 raise
             raise ValueError(
@@ -171,7 +171,7 @@ class Registry(Mapping[str, type[T]], Generic[T]):
 
     @contextmanager
     def restored(self) -> Iterator[None]:
-        """A block after which everything that was registered in it is forgotten, for tests."""
+        """A block whose registrations are undone at its end, for tests."""
         before = dict(self._classes)
         try:
             yield
@@ -190,7 +190,7 @@ def source_of(cls: type[Any]) -> Source:
 
 
 def _place(cls: type[Any]) -> str:
-    """Module and name of a class: two classes of one place are one class, defined anew."""
+    """Module and name of a class: two classes with equal ones are the same class, defined again."""
     return f"{cls.__module__}.{cls.__qualname__}"
 
 

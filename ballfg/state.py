@@ -1,4 +1,4 @@
-"""The state of a ball: a 9-vector of position, velocity and spin, in SI units.
+"""Defines the state of a ball as a 9-vector of position, velocity and spin, in SI units.
 
 State tensors and arrays have shape (..., 9), float64: position m, velocity m/s, spin (angular velocity)
 rad/s, in a right-handed world frame with z up.

@@ -1,1 +1,1 @@
-"""Benchmarks: the estimators against each other, and what an estimate costs; `ballfg-bench` runs them."""
+"""Benchmarks compare estimators and measure the cost of an estimate; `ballfg-bench` runs them."""

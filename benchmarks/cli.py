@@ -1,4 +1,4 @@
-"""The app `ballfg-bench` and its entry point.
+"""Defines the app `ballfg-bench` and its entry point.
 
 Commands import what they need inside: `ballfg-bench --help` must not wait for torch or GTSAM.
 """
@@ -173,7 +173,7 @@ def loop(
 
     results = _start("loop", data or [], quick, seed)
     for folder in data or []:
-        _open(folder)  # a bad one is better known now than hours later
+        _open(folder)  # refuses a bad folder at once instead of hours later
     plan = QUICK if quick else FULL
     with workers(cluster, address, jobs) as processes, _folder(out) as place:
         shared = [_shared(one, cluster) for one in data or []]
@@ -302,7 +302,7 @@ def _start(command: str, data: Sequence[Path], quick: bool, seed: int, more: Seq
 
 def _open(data: Path) -> Dataset:
     """A dataset; repairs in it are noted on stderr."""
-    from ballfg.estimation import with_readings
+    from ballfg.estimation.reading import with_readings
     from ballfg.tracks import read_dataset
 
     dataset = with_readings(read_dataset(data))

@@ -1,4 +1,4 @@
-"""What the numbers of a benchmark should be, and what follows from them, in sentences under each table."""
+"""Explains the numbers of a benchmark by target values and conclusions in sentences under each table."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -9,13 +9,13 @@ from ballfg.benchmarks.results import CURVE_MARK, Row
 RIGHT: Final = {"nees": 9.0, "nees_velocity": 3.0, "nis_median": 2.37, "nis_mean": 3.0}
 """Value of a metric where stated covariances are right: degrees of freedom; of `nis_median` chi-square's median."""
 GIVEN_SPIN: Final = ("paper",)
-"""Cases in which every method is given the true spin. It is not estimated, and has no error to be counted."""
+"""Cases in which every method is given the true spin, which then has no error."""
 GIVEN: Final = "given"
-"""Stands in a table for the error of what is given."""
+"""Replaces the error of given quantities in a table."""
 NEES_PLACE: Final = re.compile(r"nees_\w+")
 COVERAGE: Final = re.compile(r"(?:conformal_)?coverage_(\d+)(?:_\w+)?")
 NONE_WANTED: Final = ("not_converged", "failed", "places_outside_99")
-"""Counts that should be zero."""
+"""Counts whose target is zero."""
 OF_CASE: Final = {
     "naming, spin labels": "1",
     "naming, no spin labels": "1",
@@ -24,9 +24,9 @@ OF_CASE: Final = {
     "unknown physics": "1",
     "repair": "1",
 }
-"""What all shares and ratios of a table of `ballfg-bench loop` should be."""
+"""Target values of all shares and ratios of a table of `ballfg-bench loop`."""
 JUDGED: Final = ("nees", "coverage_90", "nis_median")
-"""Metrics that tell whether covariances are right, the sharpest first."""
+"""Metrics of the consistency of covariances, the sharpest first."""
 NEAR, NEAR_SHARE = 0.1, 0.03
 """A NEES within 10 % of its target, and a coverage within three points of it, count as right."""
 ALIKE: Final = 1.01
@@ -50,18 +50,18 @@ WORDS: Final = (
     (re.compile(r"coverage_"), "coverage: share of true values or measurements within their intervals"),
     (re.compile(r"^places_outside"), "places_outside_99: places of the track whose nees is outside its 99 % range"),
 )
-"""What metrics mean, for those who meet them first."""
+"""Explanations of metrics for newcomers."""
 CASES: Final = {
     "paper": "free flights, true dynamics and spin known to all, noise on states at every step, as in the paper; the "
     "spin is given, not estimated: it adds nothing to nees, and its intervals always hold",
     "fair": "flights with bounces, the same declared noise and the same settings for all",
     "consistency": "more tracks of the fair protocol; brackets of nees_* are the range that chance allows",
 }
-"""What is compared, by the name of the case."""
+"""The comparison of each case, by its name."""
 
 
 def legend(case: str, rows: Sequence[Row]) -> list[str]:
-    """Words for a table: what its case is, what brackets are, and what its metrics mean."""
+    """Words for a table: its case, the meaning of brackets, and its metrics."""
     metrics = {row.metric for row in rows if CURVE_MARK not in row.metric}
     ranges = any(row.low is not None for row in rows)
     found = [CASES[case]] if case in CASES else []
@@ -73,7 +73,7 @@ def legend(case: str, rows: Sequence[Row]) -> list[str]:
 
 
 def should_be(case: str, metric: str, unit: str) -> str:
-    """The right value of a metric in words; empty where less (or more) is simply better."""
+    """The target value of a metric in words; empty if less (or more) is simply better."""
     if case in OF_CASE:
         return OF_CASE[case]
     if metric in NONE_WANTED:
@@ -83,12 +83,12 @@ def should_be(case: str, metric: str, unit: str) -> str:
 
 
 def is_given(case: str, metric: str) -> bool:
-    """Whether a metric is the error of a quantity that all methods of the case are given."""
+    """True if a metric is the error of a quantity that all methods of the case are given."""
     return case in GIVEN_SPIN and metric.startswith("spin_rmse")
 
 
 def target(metric: str, unit: str, case: str = "") -> float | None:
-    """The value that a metric has where covariances are right; None for other metrics.
+    """The value of a metric for consistent covariances; None for other metrics.
 
     Where the spin is given, three of the nine components of a state have no error: the NEES is that of six, and the
     intervals of three always hold.
@@ -114,7 +114,7 @@ def _of_estimated(metric: str, unit: str) -> float | None:
 
 
 def conclusions(case: str, rows: Sequence[Row]) -> list[str]:
-    """What follows from the rows of one case: the best method of each error, and whose covariances are right."""
+    """Conclusions from the rows of one case: the best method of each error, and the consistency of covariances."""
     shown = [row for row in rows if CURVE_MARK not in row.metric and row.value is not None]
     by_metric: dict[str, dict[str, Row]] = {}
     for row in shown:

@@ -1,4 +1,4 @@
-"""Settings for Gaussian noise of known size, and process noise that is the same at every step."""
+"""Defines settings for Gaussian noise of known size, and process noise that is equal at every step."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ def gaussian_settings(
 
     Args:
         position: m.  process: noise of the motion.  spin_label: rad/s.
-        coefficients: prior standard deviations of those that are estimated with each track; none if left out.
+        coefficients: prior standard deviations of coefficients to estimate with each track; None: none.
     """
     squared = Loss("squared")
     return Settings(

@@ -1,4 +1,4 @@
-"""Figures from errors and outcomes: root mean squares, NEES, coverage, shares, quantiles, and their intervals."""
+"""Computes figures from errors: root mean squares, NEES, coverage, shares, quantiles, and their intervals."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,11 +10,11 @@ from scipy.stats import binomtest, chi2, norm
 from ballfg.arrays import Array, Index
 
 RESAMPLES = 1000
-"""Of the bootstrap: the ends of a 95 % interval then move by about a tenth of its length."""
+"""Number of bootstrap samples: the ends of a 95 % interval then vary by about a tenth of its length."""
 CONFIDENCE = 0.95
-"""Of the bootstrap's and of Wilson's intervals."""
+"""Level of the bootstrap's and of Wilson's intervals."""
 BAND = 0.99
-"""Of the chi-square bands."""
+"""Level of the chi-square bands."""
 
 Statistic = Callable[[Index], Array]
 """From track numbers (b, m), b resamples of m tracks, to a figure for each resample (b,)."""
@@ -56,7 +56,7 @@ def chi_square_band(dof: int, count: int, level: float = BAND) -> tuple[float, f
 
 
 def inside(errors: Array, sigmas: Array, level: float) -> NDArray[np.bool_]:
-    """Whether each error lies in the central interval of a normal distribution that should hold `level` of them."""
+    """True for errors in the central interval of a normal distribution that should hold `level` of them."""
     return np.asarray(np.abs(errors) <= norm.ppf((1 + level) / 2) * sigmas)
 
 

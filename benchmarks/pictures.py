@@ -1,4 +1,4 @@
-"""Helpers that the pictures of all benchmarks share."""
+"""Provides helpers for the pictures of all benchmarks."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The rows of numbers that a benchmark hands over, as `results.json`."""
+"""Holds the rows of numbers of a benchmark, as in `results.json`."""
 
 import json
 import math
@@ -12,7 +12,7 @@ from ballfg.files.whole_file import write_text
 from ballfg.machine import usable_cores, versions
 
 PACKAGES = ("ballfg", "gtsam", "torch", "numpy", "scipy", "filterpy")
-"""The numbers depend on their versions, and on Python's."""
+"""Packages whose versions, like Python's, influence the numbers."""
 RESULTS_FILE = "results.json"
 CURVE_MARK = "@"
 """In a metric's name before the place on a curve, as in `velocity_rmse_newest@20`: pictures show it, tables do not."""
@@ -44,7 +44,7 @@ class Row:
 
 @dataclass
 class Results:
-    """Everything that one run of a benchmark measured.
+    """All numbers of one run of a benchmark.
 
     Attributes:
         command: as typed, with a dataset's folder name in place of its path.

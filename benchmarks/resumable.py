@@ -1,4 +1,4 @@
-"""Long runs that go on where they were stopped: records of finished parts, and processes for the missing ones."""
+"""Resumes long runs: keeps records of finished parts, and computes the missing ones in processes."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,7 +17,7 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 RUNS_FOLDER = "runs"
-"""In a benchmark's output folder: a JSON file for each finished part."""
+"""Folder in a benchmark's output with a JSON file for each finished part."""
 
 
 def in_processes(work: Callable[[T], R], items: Sequence[T], jobs: int, what: str) -> list[R]:

@@ -1,4 +1,4 @@
-"""Rows of numbers as tables on the terminal, with the values they should have and what follows from them."""
+"""Prints rows of numbers as tables, with target values and conclusions."""
 
 import sys
 from collections.abc import Iterable
@@ -11,7 +11,7 @@ from ballfg.benchmarks.results import CURVE_MARK, Row
 def print_table(rows: Iterable[Row], stream: TextIO | None = None) -> None:
     """One table a case, a line per metric and a column per method; drawn on a terminal, plain text elsewhere.
 
-    Where metrics have a right value it stands in a column of its own. Below stands what follows from the numbers.
+    Target values stand in a column of their own, conclusions below the table.
     """
     stream = stream or sys.stdout
     shown = [row for row in rows if CURVE_MARK not in row.metric]

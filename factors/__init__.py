@@ -1,4 +1,4 @@
-"""Factor graphs over one track: factors evaluated in batches, the solver, covariances, the bridge to GTSAM.
+"""Factor graphs describe one track by batches of factors, with a solver, covariances and a bridge to GTSAM.
 
 docs/custom_factors.md is the contract of a batch; docs/derivations/smoother.md has the objective and its minimisation.
 """

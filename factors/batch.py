@@ -1,11 +1,11 @@
-"""A batch of factors: all factors of one sort in a graph, evaluated together.
+"""A batch evaluates all factors of one kind in a graph together.
 
-GTSAM asks one factor at a time; torch is quick only on batches. So factors of one sort are one object here. It computes
-whitened residuals and Jacobians of any of its rows in one call. The solver of this package takes those arrays
+GTSAM calls one factor at a time; torch is quick only on batches. So factors of one kind are one object here. It
+computes whitened residuals and Jacobians of any of its rows in one call. The solver of this package uses those arrays
 as they are (`ballfg.factors.linear.step`); GTSAM's own solvers see one CustomFactor per row (`ballfg.factors.bridge`).
 
-What is learned through an estimate needs the same residuals once more, as a torch function of everything that can be
-learned: the values, the model's parameters, the noise.
+Learning through an estimate also needs the residuals as a torch function of all learned quantities: the values, the
+model's parameters, the noise.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ class Values:
 
     Attributes:
         states: (n, 9) position m, velocity m/s, spin rad/s.
-        coefficients: (p,) the coefficients that are estimated, in their own units; (0,) where there are none.
-        biases: (n, b) m, errors of the tracker that last from sample to sample; b is 3, or 0 where it has no memory.
+        coefficients: (p,) the estimated coefficients, in their own units; (0,) without any.
+        biases: (n, b) m, errors of the tracker that last from sample to sample; b is 3, or 0 without a memory.
     """
 
     states: Array
@@ -51,7 +51,7 @@ class Values:
 
         Args:
             variables: (m,) index of each; all are states, or all are `COEFFICIENTS`.
-            with_biases: whether the biases follow the states.
+            with_biases: True if the biases follow the states.
         """
         if len(variables) and variables[0] == COEFFICIENTS:
             return np.broadcast_to(self.coefficients, (len(variables), len(self.coefficients)))
@@ -59,7 +59,7 @@ class Values:
             return np.concatenate((self.states[variables], self.biases[variables]), axis=1)
         return self.states[variables]
 
-    def moved(self, states: Array, coefficients: Array) -> Values:
+    def retract(self, states: Array, coefficients: Array) -> Values:
         """These values plus a step.
 
         Args: states: (n, 9 + b) m, m/s, rad/s, m.  coefficients: (p,) in their own units.
@@ -87,20 +87,19 @@ class Rows:
     loss: Loss
 
     def error(self) -> float:
-        """Sum of the losses; infinite where a residual is too large to be squared, as a trial step may make it."""
+        """Sum of the losses; infinite if a residual overflows when squared, as after a wild trial step."""
         with np.errstate(over="ignore"):
             return float(self.loss.value(np.linalg.norm(self.residual, axis=-1)).sum())
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise that is learned, as tensors; None where it is what the factors were built with.
+    """Learned noise as tensors; None for a part that stays as the factors were built.
 
     Attributes:
         process: (7,) the numbers of `ballfg.factors.noise.PROCESS_NOISE`.
-        position: () dimensionless, the standard deviation of every measured position in multiples of the one that the
-            factors were built with.
-        spin: () dimensionless, the same for the spin that labels or launcher settings tell.
+        position: () dimensionless, factor on the standard deviation of every measured position.
+        spin: () dimensionless, factor on that of the spins from labels or launcher settings.
     """
 
     process: Tensor | None = None
@@ -109,14 +108,14 @@ class Noise:
 
 
 class FactorBatch(ABC):
-    """m factors of one sort, each between the same number of variables.
+    """m factors of one kind, each between the same number of variables.
 
     Attributes:
         variables: (m, a) index of each factor's variables: that of a state, or `COEFFICIENTS`.
         dim: dimension of a residual.
         loss: the loss on the norm of a whitened residual.
-        row_arrays: names of the attributes that hold one entry a factor.
-        sees_biases: whether its variables are states with the tracker's biases behind them.
+        row_arrays: names of the attributes with one entry per factor.
+        sees_biases: True if its variables are states with the tracker's biases behind them.
     """
 
     sees_biases: ClassVar[bool] = False
@@ -136,7 +135,7 @@ class FactorBatch(ABC):
         """Whitened residuals and Jacobians of some rows.
 
         Args:
-            rows: (k,) index of the factors asked for, or a slice.
+            rows: (k,) index of the factors, or a slice.
             inputs: for each of the a variables its values (k, d), in the variable's own units.
         Returns: residuals (k, dim) whitened, and a Jacobians (k, dim, d) whitened, each per unit of its variable.
         """
@@ -144,7 +143,7 @@ class FactorBatch(ABC):
     def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
         """(m, dim) the whitened residuals of all rows, differentiable in the inputs and in the model.
 
-        Only a gradient through the estimate asks for them; estimation needs `compute` alone.
+        Only a gradient through the estimate needs this; estimation uses `compute` alone.
 
         Args: inputs: for each of the a variables its values (m, d), in the variable's own units.
         Raises: NotImplementedError: if the batch has none.
@@ -154,16 +153,16 @@ class FactorBatch(ABC):
             "Write its method `residual` (docs/custom_factors.md)."
         )
 
-    def rewhitening(self, noise: Noise) -> Tensor | None:
-        """The factor from these whitened residuals to residuals whitened with learned noise, differentiable in that.
+    def noise_scale(self, noise: Noise) -> Tensor | None:
+        """The factor from whitened residuals to residuals whitened with learned noise, differentiable by that noise.
 
         Args: noise: the learned numbers.
-        Returns: (m, dim, dim) lower triangular, or () for all rows; dimensionless. None if this noise is not learned.
+        Returns: (m, dim, dim) lower triangular, or () for all rows; dimensionless. None if this noise is fixed.
         """
         return None
 
     def log_spread(self) -> float:
-        """Half the log determinants of the covariances that residuals are whitened with, of all rows together.
+        """Half the log determinants of the noise covariances of all rows together.
 
         Zero for factors whose noise is never learned.
         """
@@ -180,8 +179,8 @@ class FactorBatch(ABC):
         other.loss = loss
         return other
 
-    def taken(self, rows: Index | slice) -> Self:
-        """Some of the factors, as a batch of their own; their variables keep their numbers.
+    def select(self, rows: Index | slice) -> Self:
+        """A part of the factors, as a batch of its own; the variables keep their numbers.
 
         Args: rows: (k,) index of the factors, or a slice.
         """
@@ -191,7 +190,7 @@ class FactorBatch(ABC):
         return part
 
     def inputs(self, values: Values) -> tuple[Array, ...]:
-        """For each variable of a factor the values (m, d) that `compute` takes, in the variable's own units."""
+        """For each variable of a factor the values (m, d) for `compute`, in the variable's own units."""
         return tuple(values.gather(column, self.sees_biases) for column in self.variables.T)
 
     def linearize(self, values: Values) -> Rows:
@@ -199,7 +198,7 @@ class FactorBatch(ABC):
         return self.rows(values, *self.compute(slice(None), self.inputs(values)))
 
     def rows(self, values: Values, residual: Array, jacobians: tuple[Array, ...]) -> Rows:
-        """The linearised factors from what `compute` returned for all of them.
+        """The linearised factors from the results of `compute` for all of them.
 
         Args:
             values: the point.

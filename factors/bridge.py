@@ -1,8 +1,8 @@
-"""The bridge to GTSAM's own solvers: every row of a batch of factors as a CustomFactor, answered from one call.
+"""The bridge passes every row of a batch of factors to GTSAM as a CustomFactor, evaluated in one call.
 
-GTSAM asks for one factor at a time, in C++ order; torch is quick only on batches. A `Bridge` keeps the last residual
-and Jacobians of every row together with the very bytes of the inputs they belong to. A question about the same inputs
-is answered from there; any other question is a miss. docs/custom_factors.md is the contract.
+GTSAM asks for one factor at a time, in C++ order; torch is quick only on batches. A `Bridge` caches the last residual
+and Jacobians of every row together with the exact bytes of their inputs. A call with the same inputs gets the cached
+result; any other call is a miss. docs/custom_factors.md is the contract.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,26 +31,26 @@ def key_of(variable: int) -> int:
 
 
 class Bridge:
-    """Answers GTSAM's questions about one batch of factors.
+    """Evaluates one batch of factors for GTSAM.
 
     A bridge never refers to the factors that it made: a factor holds its callback, the callback the bridge, the bridge
     the batch. With a reference back the chain would be a cycle through C++, which Python's collector cannot see.
 
-    Where the tracker's biases stand behind GTSAM's states, a batch that does not know of biases sees the states alone;
-    its Jacobians get columns of zeros.
+    If the tracker's biases follow GTSAM's states, a batch without biases sees the states alone; its Jacobians get
+    columns of zeros.
 
     Args:
         batch: whitens its residuals itself; its loss goes into the factors' noise model.
-        on_miss: `changed` evaluates all rows whose inputs differ from what is cached, in one call: right for solvers
-            that move all variables at once. `row` evaluates the asked row alone: for iSAM2, where the caller
-            prepares the rows that will be asked and a miss is a row that it did not foresee.
+        on_miss: `changed` evaluates all rows whose inputs differ from the cached ones, in one call: right for solvers
+            that move all variables at once. `row` evaluates the requested row alone: for iSAM2, where the caller
+            prepares the rows in advance and a miss is an unexpected row.
 
-    A row that is not finite raises, except where an optimizer of the first sort asks for its residual alone, to judge a
-    step: an infinite residual then makes it take a shorter one.
+    A row that is not finite raises, except when an optimizer that moves all variables asks for its residual alone, to
+    judge a step: an infinite residual then makes it take a shorter one.
 
     Attributes:
-        calls: how often the batch was evaluated.
-        misses: how often a callback found nothing prepared.
+        calls: number of evaluations of the batch.
+        misses: number of callbacks without a prepared result.
 
     Raises: ValueError: if `on_miss` is neither of the two.
     """
@@ -81,12 +81,12 @@ class Bridge:
         return [self.factor(row) for row in range(len(self.batch))]
 
     def prepare(self, rows: Index, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
-        """Evaluate rows in one call, check what comes back and keep it for the callbacks.
+        """Evaluates rows in one call, checks the results and caches them for the callbacks.
 
         Args:
             rows: (k,) index of the rows.
             inputs: for each variable of a factor its values (k, d), in the variable's own units.
-        Returns: residuals (k, r) and Jacobians (k, r, d), whitened, as kept.
+        Returns: residuals (k, r) and Jacobians (k, r, d), whitened, as cached.
         Raises: ValueError: if the batch returns a wrong shape, another type than float64 or a value that is not finite.
         """
         inputs = tuple(np.ascontiguousarray(block, dtype=np.float64) for block in inputs)
@@ -97,7 +97,7 @@ class Bridge:
         return residual, jacobians
 
     def _try(self, rows: Index, inputs: tuple[Array, ...]) -> None:
-        """`prepare` for a point that may be a trial: of rows that are not finite nothing is kept but their inputs."""
+        """`prepare` for a trial point: of rows that are not finite, only the inputs are cached."""
         self.calls += 1
         with np.errstate(over="ignore", invalid="ignore"):
             residual, jacobians = shaped(self.batch, rows, inputs, *self.batch.compute(rows, inputs))
@@ -110,7 +110,7 @@ class Bridge:
                 self._answers[row] = None
 
     def keep(self, row: int, inputs: tuple[Array, ...], residual: Array, jacobians: tuple[Array, ...]) -> None:
-        """Keep an answer that the caller computed itself and put through `checked`.
+        """Caches a result that the caller computed itself and checked by `checked`.
 
         Args:
             row: of the batch.
@@ -122,7 +122,7 @@ class Bridge:
         self._answers[row] = residual, jacobians
 
     def kept(self, row: int) -> tuple[Array, tuple[Array, ...]]:
-        """Residual (r,) and Jacobians (r, d), whitened, of a row that was prepared or kept last."""
+        """Residual (r,) and Jacobians (r, d), whitened, of a row that was prepared or cached last."""
         found = self._answers[row]
         assert found is not None
         return found
@@ -135,9 +135,9 @@ class Bridge:
         Args:
             row: of the batch.
             keys: GTSAM's, of its variables.
-            values: that hold them.
-            trial: whether the residual alone is asked for; there are no Jacobians then, and one that is not finite is
-                infinite.
+            values: GTSAM's, with those keys.
+            trial: True if only the residual is needed; there are no Jacobians then, and a residual that is not finite
+                becomes infinite.
         Raises: ValueError: as `prepare`.
         """
         vectors = [values.atVector(key) for key in keys]
@@ -155,7 +155,7 @@ class Bridge:
         return residual, tuple([_widened(block, len(v)) for block, v in zip(blocks, vectors, strict=True)])
 
     def _seen(self, key: int, vector: Array) -> Array:
-        """What the batch sees of one of GTSAM's vectors."""
+        """The part of one of GTSAM's vectors that the batch uses."""
         return vector if self.batch.sees_biases or key == COEFFICIENT_KEY else vector[:STATE_DIM]
 
     def _evaluate(self, row: int, keys: Sequence[int], values: gtsam.Values) -> None:
@@ -185,7 +185,7 @@ def _widened(block: Array, width: int) -> Array:
 
 
 def _vector(values: gtsam.Values, variable: int, known: dict[int, Array]) -> Array | None:
-    """A variable's vector, read from GTSAM once; None where it has none."""
+    """A variable's vector, read from GTSAM once; None if GTSAM does not have it."""
     if variable not in known:
         key = key_of(variable)
         if not values.exists(key):
@@ -210,7 +210,7 @@ def _callback(bridge: Bridge, row: int, keys: Sequence[int]) -> Callback:
 def checked(
     batch: FactorBatch, rows: Index | slice, inputs: tuple[Array, ...], residual: Array, jacobians: tuple[Array, ...]
 ) -> tuple[Array, tuple[Array, ...]]:
-    """What a batch returned, contiguous, after checks; GTSAM would end the interpreter, or compute with it silently.
+    """The results of a batch, contiguous, after checks: GTSAM would crash the interpreter, or compute with wrong ones.
 
     Raises: ValueError: names the batch, the array, the row and the rule.
     """
@@ -227,7 +227,7 @@ def checked(
 def shaped(
     batch: FactorBatch, rows: Index | slice, inputs: tuple[Array, ...], residual: Array, jacobians: tuple[Array, ...]
 ) -> tuple[Array, tuple[Array, ...]]:
-    """What a batch returned, contiguous, after checks of number, shapes and type.
+    """The results of a batch, contiguous, after checks of number, shapes and type.
 
     Raises: ValueError: names the batch, the array and the rule.
     """
@@ -261,7 +261,7 @@ def _not_finite(what: str, row: int) -> str:
 
 
 def nonlinear_graph(graph: BallGraph) -> tuple[gtsam.NonlinearFactorGraph, list[Bridge]]:
-    """A graph for GTSAM's own optimizers, with the bridges that answer for it (they count the calls)."""
+    """A graph for GTSAM's own optimizers, with the bridges that evaluate it (they count the calls)."""
     bridges = [Bridge(batch) for batch in graph.batches if len(batch)]
     result = gtsam.NonlinearFactorGraph()
     for bridge in bridges:
@@ -271,9 +271,9 @@ def nonlinear_graph(graph: BallGraph) -> tuple[gtsam.NonlinearFactorGraph, list[
 
 
 def linear_graph(linearized: Sequence[Rows]) -> gtsam.GaussianFactorGraph:
-    """The rows that `ballfg.factors.solve` eliminates, for GTSAM's elimination and marginals.
+    """The whitened rows that `ballfg.factors.solve` eliminates, for GTSAM's elimination and marginals.
 
-    They tell the curvature of robust losses too, which GTSAM's own linearisation leaves out.
+    They include the curvature of robust losses, which GTSAM's own linearisation leaves out.
     """
     result = gtsam.GaussianFactorGraph()
     for rows in linearized:
@@ -286,7 +286,7 @@ def linear_graph(linearized: Sequence[Rows]) -> gtsam.GaussianFactorGraph:
 
 
 def to_gtsam(values: Values) -> gtsam.Values:
-    """States as vectors x0, x1, ..., biases behind them; coefficients, where there are any, as the vector c0."""
+    """States as vectors x0, x1, ..., biases behind them; coefficients, if any, as the vector c0."""
     result = gtsam.Values()
     for i, state in enumerate(values.gather(np.arange(len(values.states)), with_biases=True)):
         result.insert(STATE_KEY + i, state)
@@ -296,7 +296,7 @@ def to_gtsam(values: Values) -> gtsam.Values:
 
 
 def from_gtsam(values: gtsam.Values) -> Values:
-    """The way back from `to_gtsam`; other variables than x0, x1, ... and c0 are left out."""
+    """The values from GTSAM's, as `to_gtsam` wrote them; other variables than x0, x1, ... and c0 are left out."""
     states = np.array(gtsam.utilities.extractVectors(values, "x"))
     coefficients = np.array(values.atVector(COEFFICIENT_KEY)) if values.exists(COEFFICIENT_KEY) else np.zeros(0)
     biases = states[:, STATE_DIM:] if states.shape[1] > STATE_DIM else None

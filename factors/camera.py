@@ -1,4 +1,4 @@
-"""Camera factor: where a camera saw the ball is where the state's position projects to, plus noise."""
+"""A camera factor compares the pixel of a sighting with the projection of the state's position."""
 
 from collections.abc import Hashable
 from typing import ClassVar
@@ -18,11 +18,11 @@ FIXED = -1
 
 
 class CameraFactors(FactorBatch):
-    """r = W (project(p_i + tau v_i) - z), tau = delay - d: how much later than the state the camera saw the ball.
+    """r = W (project(p_i + tau v_i) - z), tau = delay - d: time from the state to the camera's exposure.
 
     W whitens the pixel noise, W^T W = R^-1. The delay is known. d is a coefficient, the error of the camera's time
-    offset: positive if its stamps are later than was believed. Over the milliseconds that tau lasts the path is
-    straight to some micrometres, unless there is a bounce in them.
+    offset: positive if its stamps are later than assumed. Over the milliseconds of tau the path is straight to some
+    micrometres, unless the ball bounces meanwhile.
 
     Args:
         states: (m,) indices of the observed states.
@@ -30,10 +30,10 @@ class CameraFactors(FactorBatch):
         pixels: (m, 2) px.
         covariances: (m, 2, 2) px^2.
         bank: the cameras.
-        delay: (m,) s, true time of each sighting minus that of its state; zeros where None.
+        delay: (m,) s, true time of each sighting minus that of its state; None: zeros.
         columns: (c,) index of the coefficient that is each camera's d, or `FIXED`. None: the factors do not depend on
             coefficients.
-        loss: a robust one where wrong candidates are among the sightings.
+        loss: a robust one if the sightings contain wrong candidates.
 
     Raises: ValueError: if the shapes of the arrays do not agree.
     """
@@ -70,13 +70,13 @@ class CameraFactors(FactorBatch):
 
     @property
     def group(self) -> Hashable:
-        """Besides the usual: the cameras."""
+        """Further entries of the group: the cameras."""
         return (*super().group, id(self.bank))  # type: ignore[misc]
 
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         """Whitened residuals (k, 2) and Jacobians (k, 2, 9), with time offsets also (k, 2, p).
 
-        A residual is NaN where the ball is not in front of its camera.
+        A residual is NaN if the ball is not in front of its camera.
         """
         state, root, column = inputs[0], self.root[rows], self.column[rows]
         tau = self.delay[rows] - _own(inputs[1:], column)

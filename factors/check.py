@@ -1,4 +1,4 @@
-"""Every Jacobian block of a batch of factors against central differences."""
+"""Checks every Jacobian block of a batch of factors against central differences."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ step^4, rounding of order 1e-16 / step: both stay near 1e-12 relative."""
 
 @dataclass(frozen=True)
 class BlockError:
-    """How far one Jacobian block is from differences of the residual.
+    """The error of one Jacobian block against differences of the residual.
 
     Attributes:
         row: of the batch.  column: which variable of the factor.  variable: its number.
@@ -42,7 +42,7 @@ class BlockError:
 def jacobian_errors(batch: FactorBatch, values: Values, step: float = STEP) -> list[BlockError]:
     """One entry per row and block: `compute`'s Jacobians against five-point central differences of its residuals.
 
-    Args: batch: any.  values: the point, best one at which residuals are not zero.  step: see `STEP`.
+    Args: batch: any.  values: a point, preferably with nonzero residuals.  step: see `STEP`.
     """
     inputs = tuple(np.array(values.gather(column)) for column in batch.variables.T)
     _, jacobians = batch.compute(slice(None), inputs)
@@ -72,7 +72,7 @@ def check_factor(batch: FactorBatch, values: Values, tolerance: float = 1e-6, st
     """The worst relative error of a batch's Jacobians.
 
     Args: batch: any.  values: the point.  tolerance: relative to a block's largest element.  step: see `STEP`.
-    Raises: AssertionError: if a block is further off than that; the message names the worst.
+    Raises: AssertionError: if the error of a block is larger; the message names the worst.
     """
     worst = max(jacobian_errors(batch, values, step), key=lambda error: error.relative)
     if not worst.relative <= tolerance:

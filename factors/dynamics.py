@@ -1,4 +1,4 @@
-"""Dynamics factors: the next state is what the model makes of this one, up to process noise.
+"""A dynamics factor compares a state with the model's prediction from the previous one, up to process noise.
 
 Three classes share everything but the motion over the interval: free flight, flight through named contacts, and rest on
 a surface. A hit is a flight whose process noise contains the hit.
@@ -19,7 +19,8 @@ from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import fly_through, fly_through_jacobian
 from ballfg.dynamics.motion.flight_step import flight_step
-from ballfg.dynamics.motion.integrate import batch_jacobian, fly_jacobian, step_count, steps_over
+from ballfg.dynamics.motion.integrate import batch_jacobian, fly_jacobian
+from ballfg.dynamics.motion.limits import step_count, steps_over
 from ballfg.dynamics.motion.rollout import roll
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Noise, Values
 from ballfg.factors.noise import Kicks, ProcessNoise, along_all_axes, whitening, whitening_tensor
@@ -27,12 +28,12 @@ from ballfg.state import STATE_DIM
 
 
 def model_width(model: BallModel) -> int:
-    """How many coefficients of a model travel with the state: those of an `AugmentedModel`."""
+    """Number of a model's coefficients that travel with the state: those of an `AugmentedModel`."""
     return model.width if isinstance(model, AugmentedModel) else 0
 
 
 def _identity(model: BallModel) -> tuple[Hashable, ...]:
-    """What models that are one have in common: every track has an `AugmentedModel` of its own around the same model."""
+    """The identity of a model: the `AugmentedModel`s of all tracks share that of their base."""
     return (id(model.model), model.names) if isinstance(model, AugmentedModel) else (id(model), ())
 
 
@@ -44,8 +45,8 @@ class DynamicsFactors(FactorBatch):
             motion does not depend on the others, which are unknowns of observations.
         states: (m,) index i; each factor ties state i to state i + 1.
         dt: (m,) s.
-        covariance: (m, 9, 9) m, m/s, rad/s and their products, of the process noise gathered over dt; or (m, 3, 3) of
-            position, velocity and spin along any axis, where all are alike and independent.
+        covariance: (m, 9, 9) m, m/s, rad/s and their products, of the process noise over dt; or (m, 3, 3) of position,
+            velocity and spin along any axis, if all axes are alike and independent.
         kicks: the contacts and hits in that covariance, for learning it; free flight by default.
 
     Raises: ValueError: if a dt is not positive.
@@ -77,27 +78,27 @@ class DynamicsFactors(FactorBatch):
 
     @abstractmethod
     def propagate(self, state: Tensor, rows: Index | slice) -> tuple[Tensor, Tensor]:
-        """F and its Jacobian: augmented states (k, 9 + p) to (k, 9 + p) and (k, 9 + p, 9 + p).
+        """F and its Jacobian: (k, 9 + p) and (k, 9 + p, 9 + p) from augmented states (k, 9 + p).
 
         Args: state: (k, 9 + p).  rows: (k,) index of the factors, or a slice.
         """
 
     @abstractmethod
-    def moved(self, state: Tensor) -> Tensor:
+    def transition(self, state: Tensor) -> Tensor:
         """F of all rows, (m, 9 + p) to (m, 9 + p), differentiable in the states and the model's parameters."""
 
     @property
     def group(self) -> Hashable:
-        """Besides the usual: the model, and how many contacts and kicks there are in an interval."""
+        """Further entries of the group: the model, and the numbers of contacts and kicks in an interval."""
         return (*super().group, *_identity(self.model), self.kick_times.shape[1])  # type: ignore[misc]
 
     def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
         """(m, 9) whitened residuals in torch."""
         start = inputs[0] if len(inputs) == 2 else torch.cat((inputs[0], inputs[2][:, : self.width]), dim=-1)
-        offset = inputs[1] - self.moved(start)[:, :STATE_DIM]
+        offset = inputs[1] - self.transition(start)[:, :STATE_DIM]
         return (torch.from_numpy(self.whitening) @ offset.unsqueeze(-1)).squeeze(-1)
 
-    def rewhitening(self, noise: Noise) -> Tensor | None:
+    def noise_scale(self, noise: Noise) -> Tensor | None:
         """(m, 9, 9) the new whitening times the inverse of the old one."""
         if noise.process is None:
             return None
@@ -142,7 +143,7 @@ class FlightFactors(DynamicsFactors):
         """Flight over dt."""
         return fly_jacobian(self.model, state, self._tensor(self.dt[rows]))
 
-    def moved(self, state: Tensor) -> Tensor:
+    def transition(self, state: Tensor) -> Tensor:
         """Flight over dt."""
         dt = torch.from_numpy(self.dt)
         steps = step_count(dt)
@@ -153,15 +154,15 @@ class FlightFactors(DynamicsFactors):
 
     @property
     def group(self) -> Hashable:
-        """Besides: the number of integration steps."""
+        """Further entry of the group: the number of integration steps."""
         return (*super().group, steps_over(float(self.dt.max())))  # type: ignore[misc]
 
 
 class SurfaceFactors(DynamicsFactors):
-    """Motion in which surfaces take part.
+    """Motion in contact with surfaces.
 
     Args:
-        model: as for `DynamicsFactors`, and so are the others but for the heights.
+        model: as for `DynamicsFactors`, like the others except for the heights.
         states: (m,) index i.
         dt: (m,) s.
         covariance: (m, 9, 9) m, m/s, rad/s and their products.
@@ -185,7 +186,7 @@ class SurfaceFactors(DynamicsFactors):
 
 
 class ContactFactors(SurfaceFactors):
-    """Flight with contacts in the interval, at surfaces that are named; how many is the same for all rows.
+    """Flight with contacts in the interval, at given surfaces; all rows have the same number of contacts.
 
     Args: heights: (m, c) m, the surface of each of c contacts, in order.
     """
@@ -196,7 +197,7 @@ class ContactFactors(SurfaceFactors):
         after, _, jacobian = fly_through_jacobian(self.model, state, self._tensor(self.dt[rows]), heights)
         return after, jacobian
 
-    def moved(self, state: Tensor) -> Tensor:
+    def transition(self, state: Tensor) -> Tensor:
         """Flight, impact, flight."""
         return fly_through(self.model, state, torch.from_numpy(self.dt), self._surfaces(slice(None)))[0]
 
@@ -205,7 +206,7 @@ class ContactFactors(SurfaceFactors):
         return tuple(self._tensor(column) for column in self.heights[rows].T)
 
     def contact_times(self, values: Values) -> Array:
-        """(m, c) s since the start of each interval; NaN where the ball never gets to the surface."""
+        """(m, c) s since the start of each interval; NaN if the ball never reaches the surface."""
         own = np.broadcast_to(values.coefficients[: self.width], (len(self), self.width))
         start = np.concatenate((values.states[self.variables[:, 0]], own), axis=-1)
         heights = self._surfaces(slice(None))
@@ -224,7 +225,7 @@ class RestFactors(SurfaceFactors):
         dt, height = self._tensor(self.dt[rows]), self._tensor(self.heights[rows])
         return batch_jacobian(partial(_rolled, self.model, dt, height), state)
 
-    def moved(self, state: Tensor) -> Tensor:
+    def transition(self, state: Tensor) -> Tensor:
         """Rolling over dt."""
         return _rolled(self.model, torch.from_numpy(self.dt), torch.from_numpy(self.heights), state)
 

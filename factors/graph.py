@@ -1,4 +1,4 @@
-"""A factor graph over one track: its factors, its objective, and the loop that minimises it."""
+"""A factor graph holds the factors of one track and its objective; Levenberg-Marquardt minimises it."""
 
 import copy
 import enum
@@ -17,29 +17,29 @@ class BallGraph:
     """Factors over n states and p shared coefficients.
 
     Attributes:
-        batches: the factors; those of one sort are one object.
+        batches: the factors; those of one kind are one object.
     """
 
     batches: tuple[FactorBatch, ...]
 
     def linearize(self, values: Values) -> list[Rows]:
-        """All factors at a point, one call a batch; not finite where a trial step left all that a ball can do."""
+        """All factors at a point, one call a batch; not finite after a trial step to an impossible state."""
         with np.errstate(over="ignore", invalid="ignore"):
             return [batch.linearize(values) for batch in self.batches if len(batch)]
 
     def error(self, values: Values) -> float:
-        """The objective: sum of all losses; half the squared whitened residuals where none is robust."""
+        """The objective: sum of all losses; half the squared whitened residuals without a robust loss."""
         return objective(self.linearize(values))
 
 
 def objective(linearized: Sequence[Rows]) -> float:
-    """Sum of all losses; infinite where a residual is not a number."""
+    """Sum of all losses; infinite if a residual is not a number."""
     total = sum(rows.error() for rows in linearized)
     return total if np.isfinite(total) else np.inf
 
 
 class Convergence(enum.Enum):
-    """How a minimisation ended."""
+    """The reason why a minimisation ended."""
 
     CONVERGED = "converged"
     AT_KINK = "no step reduces the objective: the minimum lies where a loss or the friction bends"
@@ -51,18 +51,18 @@ class Convergence(enum.Enum):
 
 @dataclass(frozen=True)
 class Minimum:
-    """Where Levenberg-Marquardt ended.
+    """The result of a minimisation by Levenberg-Marquardt.
 
     Attributes:
         values: the point.
-        error: objective there; after a last step without another linearisation, the one that the step promised.
-        step: the last undamped linear solution, there or one step before: its triangle holds the covariances.
-        convergence: why it stopped.
+        error: objective there; the predicted one if the last step was taken without another linearisation.
+        step: the last undamped linear solution, there or one step before, whose triangle gives the covariances.
+        convergence: the reason for the end.
         iterations: number of linear solutions.
-        linearized: the factors, linearised at the point or, where it is `beyond` them, one step before.
-        beyond: whether the last step was taken without another linearisation.
-        distance: about how far it is from the exact minimum, in posterior standard deviations; infinite if unknown.
-        last: length of the last step that was taken, for a search that goes on; infinite if it says nothing.
+        linearized: the factors, linearised at the point or, if it is `beyond` them, one step before.
+        beyond: True if the last step was taken without another linearisation.
+        distance: approximate distance to the exact minimum, in posterior standard deviations; infinite if unknown.
+        last: length of the last step, for a continued search; infinite if unknown.
     """
 
     values: Values
@@ -76,28 +76,28 @@ class Minimum:
     last: float = np.inf
 
     def bare(self) -> "Minimum":
-        """Without the linearised factors, which take 1 kB a factor, for those who keep many."""
+        """Without the linearised factors, which take 1 kB a factor, for callers that keep many."""
         return replace(self, linearized=(), beyond=True)
 
 
 AT_KINK = 1e-3
 """Posterior standard deviations. A step this short that does not reduce the objective ends the search too: the minimum
-lies where a loss or the friction bends."""
+lies at a kink of a loss or of the friction."""
 NEAR = 0.5
-"""What a step promises when it is one posterior standard deviation long. Along shorter ones the objective is a parabola
-well enough to say which share of the step is best."""
+"""Predicted decrease of a step of one posterior standard deviation. Along shorter steps the objective is close enough
+to a parabola for choosing the best share of the step."""
 WHOLE = 0.5
-"""A step that keeps more than this share of its promise is as good as the linear model can make it."""
+"""A step with more than this share of its predicted decrease is as good as the linear model allows."""
 SHORT = 1.5
-"""A step that brings more than this multiple of its promise is too short: the objective bends half as much."""
+"""A step with more than this multiple of its predicted decrease is too short: the objective bends half as much."""
 ROUNDING = 1e-14
-"""Of the objective, to which its sum is rounded: what a step brings says nothing where it promises less."""
+"""Relative rounding of the objective: a smaller predicted decrease cannot be verified."""
 RATE_MARGIN = 10.0
-"""How many times slower than so far the lengths of the steps may fall for the next one to be left out."""
+"""Factor by which the convergence may slow down, for the last step to be left out all the same."""
 LONGEST = 10.0
-"""Of a whole step, that is tried where it is too short."""
+"""Largest multiple of a whole step, for a step that is too short."""
 MOST_DAMPING = 1e8
-"""Marquardt's lambda at which a step is as good as none."""
+"""Marquardt's lambda at which a step is negligible."""
 
 
 @dataclass(frozen=True)
@@ -105,8 +105,8 @@ class LevenbergMarquardt:
     """Settings of the minimisation.
 
     Attributes:
-        tolerance: stop when the distance to the minimum, in posterior standard deviations, is shorter.
-        max_iterations: linear solutions.
+        tolerance: the search ends when the distance to the minimum, in posterior standard deviations, is shorter.
+        max_iterations: largest number of linear solutions.
         first_damping: Marquardt's lambda after a Gauss-Newton step failed. Small: a tight process noise makes the
             diagonal of J^T J large where the chain as a whole is free to move.
     """
@@ -118,17 +118,17 @@ class LevenbergMarquardt:
     def minimize(
         self, graph: BallGraph, start: Values | Minimum, within: Callable[[Values], bool] | None = None
     ) -> Minimum:
-        """Minimise a graph's objective from a starting point.
+        """Minimises a graph's objective from a starting point.
 
-        Each iteration tries the Gauss-Newton step; where it does not reduce the objective, lambda grows until a
-        step does. The length of an undamped step in the metric of J^T J, |J d|, is the distance to the minimum in
-        posterior standard deviations: free of units, and what `tolerance` bounds. When the lengths fall so quickly that
-        the next step would be within the tolerance, the present one is the last.
+        Each iteration tries the Gauss-Newton step; if that does not reduce the objective, lambda grows until a step
+        does. The length of an undamped step in the metric of J^T J, |J d|, is the distance to the minimum in posterior
+        standard deviations: free of units, and bounded by `tolerance`. When the lengths fall so quickly that the next
+        step would be within the tolerance, the present one is the last.
 
         Args:
-            graph: what is minimised.
-            start: where from; a minimum found with a larger tolerance is gone on from.
-            within: whether a point may be gone on from; the search ends as `LEFT` at one that may not.
+            graph: the factors.
+            start: values; the search continues from a minimum that was found with a larger tolerance.
+            within: True for points from which the search may continue; at another one it ends as `LEFT`.
         """
         found = (
             Minimum(start, np.inf, None, Convergence.CONVERGED, 0, beyond=True) if isinstance(start, Values) else start
@@ -148,7 +148,7 @@ class LevenbergMarquardt:
                 return point.minimum(step, Convergence.CONVERGED, iteration, float(length), last)
             beyond = RATE_MARGIN * length * (length / last) if np.isfinite(last) else np.inf
             if step is not None and beyond < self.tolerance:
-                return point.moved(step).minimum(step, Convergence.CONVERGED, iteration, float(beyond), float(length))
+                return point.retract(step).minimum(step, Convergence.CONVERGED, iteration, float(beyond), float(length))
             trial = None if step is None else _tried(graph, point, step, damping)
             if step is not None and trial is not None and trial.error <= point.error * (1 + 1e-12):
                 gain = _gain(point, trial, step)
@@ -166,21 +166,21 @@ class LevenbergMarquardt:
         )
 
     def covariances(self, graph: BallGraph, minimum: Minimum) -> Covariances | None:
-        """Covariances at a minimum of a graph; None where they are not determined."""
+        """Covariances at a minimum of a graph; None if they are undetermined."""
         return None if minimum.step is None else marginal_covariances(minimum.step.root).definite()
 
 
 class _Point:
-    """Values, the graph linearised there or, where they are `beyond` it, one step before, and the objective."""
+    """Values, the graph linearised there or, if they are `beyond` it, one step before, and the objective."""
 
     def __init__(self, values: Values, linearized: Sequence[Rows]) -> None:
         self.values, self.linearized, self.error = values, linearized, objective(linearized)
         self.beyond = False
 
-    def moved(self, step: Step) -> "_Point":
-        """The point after a step that is not looked at, with the objective that it promises."""
+    def retract(self, step: Step) -> "_Point":
+        """The point after a step without a linearisation, with the predicted objective."""
         after = copy.copy(self)
-        after.values, after.beyond = self.values.moved(step.states, step.coefficients), True
+        after.values, after.beyond = self.values.retract(step.states, step.coefficients), True
         after.error = self.error - step.decrease
         return after
 
@@ -192,29 +192,29 @@ class _Point:
         distance: float = np.inf,
         last: float = np.inf,
     ) -> Minimum:
-        """The end of a search here."""
+        """The result of a search that ends at this point."""
         known = self.linearized, self.beyond
         return Minimum(self.values, self.error, step, convergence, iterations, *known, distance, last)
 
 
 def _gain(before: _Point, after: _Point, step: Step) -> float:
-    """What a step brought, as a share of its promise."""
+    """The decrease by a step, as a share of its prediction."""
     return (before.error - after.error) / max(step.decrease, np.finfo(float).tiny)
 
 
 def _tried(graph: BallGraph, point: _Point, step: Step, damping: float) -> _Point:
-    """Where a step leads: all of it, or a multiple where an undamped one brought far less or more than its promise.
+    """The point after a step, or after a multiple of it if an undamped one gained far less or more than predicted.
 
-    Where the objective bends r times as much along the step as the linear model says (friction between slip and grip
-    does), the whole step brings (2 - r) of its promise and 1 / r of it is best. Whole steps then creep or diverge.
+    If the objective bends r times as much along the step as the linear model says (friction between slip and grip
+    does), the whole step gains (2 - r) of its prediction and 1 / r of it is best. Whole steps then creep or diverge.
     """
-    values = point.values.moved(step.states, step.coefficients)
+    values = point.values.retract(step.states, step.coefficients)
     whole = _Point(values, graph.linearize(values))
     gain = _gain(point, whole, step)
     tells = gain <= WHOLE or (gain >= SHORT and step.decrease > ROUNDING * point.error)
     if damping > 0.0 or not tells or step.decrease > NEAR or not np.isfinite(whole.error):
         return whole
     share = 1.0 / max(2.0 - gain, 1.0 / LONGEST)
-    values = point.values.moved(share * step.states, share * step.coefficients)
+    values = point.values.retract(share * step.states, share * step.coefficients)
     nearer = _Point(values, graph.linearize(values))
     return nearer if nearer.error < min(point.error, whole.error) else whole

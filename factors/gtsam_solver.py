@@ -1,4 +1,4 @@
-"""GTSAM's Levenberg-Marquardt and marginals on the graphs of this package, in place of its own solver."""
+"""Minimises the graphs of this package by GTSAM's Levenberg-Marquardt, with GTSAM's marginals."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from ballfg.factors.linear.covariance import Covariances
 from ballfg.factors.linear.step import solve
 
 LEAST_DAMPING = 1e-12
-"""GTSAM divides its lambda by ten after each step; from zero it could not grow again."""
+"""GTSAM divides its lambda by ten after each step; zero could not grow again."""
 LEAST_CHANGE = 1e-15
-"""Of the error, relative and absolute, at which GTSAM gives up: below what double precision resolves."""
+"""Change of the error, relative and absolute, at which GTSAM stops: below double precision."""
 
 
 @dataclass(frozen=True)
 class GtsamLevenbergMarquardt(LevenbergMarquardt):
     """Settings of a minimisation by `gtsam.LevenbergMarquardtOptimizer`.
 
-    GTSAM's tolerances bound the change of the error, which says little of the distance to the minimum. So its
-    iterations go on until that distance, as `LevenbergMarquardt` measures it, is within the tolerance. Near it GTSAM
-    converges linearly, because it leaves the curvature of robust losses out.
+    GTSAM's tolerances bound the change of the error, which hardly relates to the distance to the minimum. So its
+    iterations continue until that distance, as `LevenbergMarquardt` measures it, is within the tolerance. Near the
+    minimum GTSAM converges linearly, because it leaves out the curvature of robust losses.
 
     Attributes:
-        tolerance: stop when the distance to the minimum, in posterior standard deviations, is shorter.
-        max_iterations: of GTSAM.
-        first_damping: its first lambda.
+        tolerance: the search ends when the distance to the minimum, in posterior standard deviations, is shorter.
+        max_iterations: largest number of GTSAM's iterations.
+        first_damping: GTSAM's first lambda.
     """
 
     tolerance: float = 2e-6
@@ -41,7 +41,7 @@ class GtsamLevenbergMarquardt(LevenbergMarquardt):
     def minimize(
         self, graph: BallGraph, start: Values | Minimum, within: Callable[[Values], bool] | None = None
     ) -> Minimum:
-        """Minimise a graph's objective from a starting point; arguments as for `LevenbergMarquardt`."""
+        """Minimises a graph's objective from a starting point; arguments as for `LevenbergMarquardt`."""
         first, values = (0, start) if isinstance(start, Values) else (start.iterations, start.values)
         rows = graph.linearize(values)
         error = objective(rows)
@@ -79,7 +79,7 @@ class GtsamLevenbergMarquardt(LevenbergMarquardt):
         return parameters
 
     def covariances(self, graph: BallGraph, minimum: Minimum) -> Covariances | None:
-        """GTSAM's marginals at a minimum of a graph; None where they are not determined."""
+        """GTSAM's marginals at a minimum of a graph; None if they are undetermined."""
         if minimum.step is None:
             return None
         return Marginals(linear_graph(graph.linearize(minimum.values)), to_gtsam(minimum.values)).covariances()
@@ -106,7 +106,7 @@ class Marginals:
         self.distance = float(np.sqrt(2.0 * max(here - linear.error(step), 0.0)))
 
     def covariances(self) -> Covariances | None:
-        """Those of x0, x1, ... and of c0; None where they are not determined, to double precision."""
+        """Marginals of x0, x1, ... and of c0; None if they are undetermined in double precision."""
         keys: list[int] = []
         while self._values.exists(STATE_KEY + len(keys)):
             keys.append(STATE_KEY + len(keys))

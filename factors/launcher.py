@@ -1,4 +1,4 @@
-"""Launcher factor: the first spin is what a launcher's settings mean, along the direction of flight."""
+"""A launcher factor compares the first spin with the one that a launcher's settings give along the flight."""
 
 from collections.abc import Hashable
 from functools import partial
@@ -24,7 +24,7 @@ class LauncherSpinFactors(FactorBatch):
         settings: (m, k) of the launcher, in the launcher's own units.
         embedding: from settings to spin; its weights may be learned.
         sigma: (m, 3) rad/s.
-        loss: a robust one where some settings are wrong.
+        loss: a robust one if some settings are wrong.
 
     Raises: ValueError: a wrong shape, or a sigma that is not positive.
     """
@@ -48,7 +48,7 @@ class LauncherSpinFactors(FactorBatch):
 
     @property
     def group(self) -> Hashable:
-        """Besides the usual: the embedding."""
+        """Further entry of the group: the embedding."""
         return (*super().group, id(self.embedding))  # type: ignore[misc]
 
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
@@ -62,7 +62,7 @@ class LauncherSpinFactors(FactorBatch):
         """(m, 3) whitened residuals in torch, differentiable in the embedding too."""
         return _whitened(self.embedding, torch.from_numpy(self.settings), torch.from_numpy(self.sigma), inputs[0])
 
-    def rewhitening(self, noise: Noise) -> Tensor | None:
+    def noise_scale(self, noise: Noise) -> Tensor | None:
         """One factor for all axes of all spins."""
         return None if noise.spin is None else 1.0 / noise.spin
 

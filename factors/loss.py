@@ -1,4 +1,4 @@
-"""Robust losses on the norm of a whitened residual, vectorised; the same functions as GTSAM's m-estimators."""
+"""Robust losses reduce the weight of large whitened residuals; they equal GTSAM's m-estimators."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ballfg.arrays import Array
 from ballfg.checks import check_choice, check_number
 
 LEAST_STRETCH = 0.05
-"""Where the loss is straight or concave along the residual, this much curvature keeps the step finite."""
+"""Least curvature along the residual, for a finite step where the loss is straight or concave."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Loss:
 
     @property
     def convex(self) -> Loss:
-        """The loss itself where it has one minimum only; in place of a logarithmic one the linear one."""
+        """The loss itself if it is convex; Huber's in place of Cauchy's."""
         return Loss("huber", self.scale) if self.name == "cauchy" else self
 
     def value(self, norm: Array) -> Array:
@@ -73,7 +73,7 @@ class Loss:
     def stretch(self, norm: Array) -> Array:
         """(n,) curvature along the residual over that across it, rho''(d) d / rho'(d), at least `LEAST_STRETCH`.
 
-        Reweighting alone takes it for 1 and creeps up to a minimum at which some residuals are in the loss's tail.
+        Reweighting alone assumes 1 and creeps up to a minimum with residuals in the loss's tail.
 
         Args: norm: (n,) whitened norms d.
         Returns: (n,) dimensionless.

@@ -1,7 +1,7 @@
-"""Process noise: a continuous-time density, discretised for each interval, with more where a ball is hit or bounces.
+"""Process noise is a continuous-time density, discretised for each interval, with more at hits and bounces.
 
-Over an interval dt white acceleration noise of density q (m/s^2 per sqrt(Hz)) gives position and velocity, per axis,
-the covariance q^2 [[dt^3/3, dt^2/2], [dt^2/2, dt]]; spin is a random walk. So a dropped frame is the same model.
+Over an interval the acceleration adds what `white_acceleration` says; spin is a random walk. So a dropped frame is the
+same model.
 """
 
 from __future__ import annotations
@@ -15,20 +15,21 @@ from torch import Tensor
 
 from ballfg.arrays import Array
 from ballfg.checks import as_float
+from ballfg.dynamics.compiled.flight import white_acceleration
 from ballfg.state import STATE_DIM
 
 
 @dataclass(frozen=True)
 class ProcessNoise:
-    """How far a real ball strays from its model.
+    """Noise of a real ball's motion about its model.
 
     Attributes:
-        acceleration: m/s^2/sqrt(Hz), density of the acceleration that the model lacks.
+        acceleration: m/s^2/sqrt(Hz), density of the unmodelled acceleration.
         spin: rad/s/sqrt(s), density of the spin's random walk. Must be positive: the square-root information of a
             chain of exactly equal spins is singular to working precision.
         contact_velocity: m/s, standard deviation per axis of an impact's outgoing velocity.
-        contact_tangential: m/s, the same in addition for its two components along the surface: friction varies, and
-            no track tells it.
+        contact_tangential: m/s, in addition for its two components along the surface: friction varies, and no track
+            determines it.
         contact_spin: rad/s, the same for its spin.
         hit_velocity: m/s, of the velocity after a hit (racket, arm, net).
         hit_spin: rad/s, of the spin after a hit.
@@ -53,11 +54,11 @@ class ProcessNoise:
                 )
 
     def flight(self, dt: Array) -> Array:
-        """(n, 9, 9) covariance gathered in free flight over dt (n,) s."""
+        """(n, 9, 9) covariance from free flight over dt (n,) s."""
         return along_all_axes(self.flight_along_one(dt))
 
     def flight_along_one(self, dt: Array) -> Array:
-        """(n, 3, 3) the same of position (m), velocity (m/s) and spin (rad/s) along one axis, over dt (n,) s.
+        """(n, 3, 3) of position (m), velocity (m/s) and spin (rad/s) along one axis, from free flight over dt (n,) s.
 
         All axes are alike and independent.
         """
@@ -85,7 +86,7 @@ class ProcessNoise:
     def kick(dt: Array, time: Array, velocity: tuple[float, float, float], spin: float) -> Array:
         """(n, 9, 9) covariance at the end of intervals dt (n,) s of a jump in velocity and spin at `time` (n,) s.
 
-        The velocity's jump (standard deviation per axis) has moved the ball by then.
+        The velocity's jump (standard deviation per axis) has displaced the ball by then.
         """
         reach = np.zeros((len(dt), STATE_DIM, 6))
         left = np.clip(dt - time, 0.0, dt)
@@ -97,7 +98,7 @@ class ProcessNoise:
 
 
 PROCESS_NOISE = tuple(field.name for field in fields(ProcessNoise))
-"""Its numbers, in the order in which `variances` and `Kicks.basis` hold them."""
+"""Names of its numbers, in the order of `variances` and `Kicks.basis`."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ class Kicks:
 
     Attributes:
         times: (m, c) s since the interval's start, of c contacts in each.
-        hit: (m,) bool, whether something hits the ball at an unknown moment.
+        hit: (m,) bool, True if something hits the ball at an unknown moment.
     """
 
     times: Array
@@ -121,9 +122,9 @@ class Kicks:
         return Kicks(self.times[rows], self.hit[rows])
 
     def basis(self, dt: Array) -> Array:
-        """(m, 7, 9, 9) what a unit of each number of `PROCESS_NOISE` adds to the covariance over dt (m,) s.
+        """(m, 7, 9, 9) covariance over dt (m,) s for a unit of each number of `PROCESS_NOISE`.
 
-        The covariance is linear in the squares of those numbers, which is what a gradient with respect to them needs.
+        The covariance is linear in the squares of those numbers, so that gradients by them are simple.
         """
         basis = np.zeros((len(dt), len(PROCESS_NOISE), STATE_DIM, STATE_DIM))
         basis[:, 0] = along_all_axes(_white_acceleration(dt, 1.0, 0.0))
@@ -141,22 +142,22 @@ class Kicks:
 
 
 SHORTEST = 1e-7
-"""s. The position strays over a shorter interval as over this one: by 2e-12 m for 0.1 m/s^2/sqrt(Hz). Positions of some
-metres are rounded to 1e-15 m, and of two samples 1 ns apart rounding alone would break the motion."""
+"""s. A shorter interval gets the position noise of this one: 2e-12 m for 0.1 m/s^2/sqrt(Hz). Positions of some metres
+are rounded to 1e-15 m; for two samples 1 ns apart rounding alone would contradict the motion."""
 
 
 def _white_acceleration(dt: Array, acceleration: float, spin: float) -> Array:
     """(n, 3, 3) of position, velocity and spin along one axis."""
     covariance = np.zeros((len(dt), 3, 3))
-    covariance[:, 0, 0] = acceleration**2 * np.maximum(dt, SHORTEST) ** 3 / 3
-    covariance[:, 0, 1] = covariance[:, 1, 0] = acceleration**2 * dt**2 / 2
-    covariance[:, 1, 1] = acceleration**2 * dt
+    _, between, covariance[:, 1, 1] = white_acceleration(dt, acceleration**2)
+    covariance[:, 0, 1] = covariance[:, 1, 0] = between
+    covariance[:, 0, 0] = white_acceleration(np.maximum(dt, SHORTEST), acceleration**2)[0]
     covariance[:, 2, 2] = spin**2 * dt
     return covariance
 
 
 def along_all_axes(one: Array) -> Array:
-    """(n, 9, 9) matrices of states from those (n, 3, 3) of position, velocity and spin along any axis."""
+    """(n, 9, 9) matrices of states from (n, 3, 3) of position, velocity and spin along any axis."""
     found = np.zeros((len(one), 3, 3, 3, 3))
     for axis in range(3):
         found[:, :, axis, :, axis] = one

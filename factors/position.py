@@ -1,4 +1,4 @@
-"""Position factor: a measured position is the state's position plus noise."""
+"""A position factor compares a measured position with the state's."""
 
 from typing import ClassVar
 
@@ -19,7 +19,7 @@ class PositionFactors(FactorBatch):
         states: (m,) indices of the observed states.
         measured: (m, 3) m.
         sigma: (m, 3) m, standard deviation per axis.
-        loss: a robust one where tracks have outliers.
+        loss: a robust one if tracks have outliers.
 
     Raises: ValueError: a wrong shape, a position that is not finite, or a sigma that is not positive.
     """
@@ -48,7 +48,7 @@ class PositionFactors(FactorBatch):
         """(m, 3) whitened residuals in torch."""
         return (inputs[0][:, POSITION] - torch.from_numpy(self.measured)) * torch.from_numpy(self.information_root)
 
-    def rewhitening(self, noise: Noise) -> Tensor | None:
+    def noise_scale(self, noise: Noise) -> Tensor | None:
         """One factor for all axes of all samples."""
         return None if noise.position is None else 1.0 / noise.position
 

@@ -1,4 +1,4 @@
-"""Priors: a state, its spin alone, or the shared coefficients are known to some standard deviation."""
+"""Prior factors tie a state, its spin alone, or the shared coefficients to a mean with standard deviations."""
 
 from collections.abc import Hashable
 from typing import ClassVar
@@ -15,7 +15,7 @@ from ballfg.state import SPIN, STATE_DIM
 
 
 class PriorFactors(FactorBatch):
-    """r = W (x_i - mean_i), W (r, d): rows of W may look at a part of the variable only.
+    """r = W (x_i - mean_i), W (r, d): rows of W may use a part of the variable only.
 
     Args:
         variables: (m,) index of each state, or `COEFFICIENTS`.
@@ -47,7 +47,7 @@ class PriorFactors(FactorBatch):
 class SpinLabelFactors(PriorFactors):
     """Priors on spins from labels; their standard deviation can be learned."""
 
-    def rewhitening(self, noise: Noise) -> Tensor | None:
+    def noise_scale(self, noise: Noise) -> Tensor | None:
         """One factor for all axes of all labels."""
         return None if noise.spin is None else 1.0 / noise.spin
 
@@ -57,7 +57,7 @@ class SpinLabelFactors(PriorFactors):
 
 
 class CoefficientPriorFactors(PriorFactors):
-    """The coefficients of a track lie about the model's own values.
+    """Priors on the coefficients of a track, with the model's own values as means.
 
     Args:
         model: with the coefficients.
@@ -77,7 +77,7 @@ class CoefficientPriorFactors(PriorFactors):
 
     @property
     def group(self) -> Hashable:
-        """Besides the usual: the model."""
+        """Further entry of the group: the model."""
         return (*super().group, id(self.model))  # type: ignore[misc]
 
     def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:

@@ -1,4 +1,4 @@
-"""Learning: models trained through the estimator, calibration of coefficients, `ballfg-train`.
+"""Learning trains models through the estimator and calibrates coefficients; `ballfg-train` runs it.
 
 docs/learn.md explains the choices, docs/train.md is the guide of the command. The sub-rooms import one way: config and
 gradient; run; end_to_end and sequence; calibration.

@@ -1,4 +1,4 @@
-"""`python -m ballfg.learning` is `ballfg-train`, so that torchrun can start it as a module."""
+"""Runs `ballfg-train` as `python -m ballfg.learning`, so that torchrun can start it as a module."""
 
 from ballfg.cli.entry import train
 

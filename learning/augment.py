@@ -1,4 +1,4 @@
-"""Augmentation: the same shot in another place, by a rotation about the vertical and a horizontal shift."""
+"""Augments a shot by a rotation about the vertical and a horizontal shift."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The command `ballfg-train` and its entry point.
+"""Defines the command `ballfg-train` and its entry point.
 
 Heavy libraries are imported inside functions: `ballfg-train --help` must not wait for torch or GTSAM.
 """

@@ -1,4 +1,4 @@
-"""The error of a model's predictions on tracks that were not fitted: observe the first part, predict the rest."""
+"""Measures a model's prediction errors on other tracks: it observes the first part and predicts the rest."""
 
 from collections.abc import Sequence
 
@@ -52,7 +52,7 @@ class Summary(BaseModel):
 
 
 def judge_track(estimator: Estimator, track: Track, observed_share: float, horizon: float) -> TrackScore | None:
-    """The score of one track; None where nothing is left to predict, or the estimate failed.
+    """The score of one track; None if it has nothing to predict, or the estimate failed.
 
     Args:
         observed_share: share of the duration that is observed, above 0 and below 1.

@@ -1,7 +1,7 @@
-"""The registry of trainees, which a config's key `kind` can name, and those that come with the package.
+"""Registers the trainees, which a config's key `kind` names.
 
 A kind of one's own is a subclass of `TraineeKind` and one call of `register_trainee`, or an entry point of the group
-`ballfg.trainees`. Models are imported when they are built, so that a config is checked at once.
+`ballfg.trainees`. Those of the package stand beside what they build, and are imported when they are named.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class TraineeKind(ABC):
     unused: ClassVar[tuple[str, ...]] = ()
     """Keys of the config without effect on this kind; a config that sets one is refused."""
     augmented: ClassVar[bool] = False
-    """Whether training tracks are rotated and shifted unless the config says otherwise."""
+    """True if training tracks are rotated and shifted unless the config says otherwise."""
 
     @classmethod
     @abstractmethod
@@ -35,93 +35,21 @@ class TraineeKind(ABC):
         """
 
 
+NETWORKS = {"mlp": "Mlp", "mlp+gs": "MlpGramSchmidt", "skip+gs": "SkipGramSchmidt", "mnn+gs": "MnnGramSchmidt"}
+"""Kinds that are a network for the dynamics, and their classes."""
+SEQUENCES = {"lstm": "Lstm", "diffusion": "Diffusion"}
+"""Kinds that map observations to the rest of a track, without estimator and dynamics."""
+
 TRAINEES: Registry[TraineeKind] = Registry(
-    "trainee", group="ballfg.trainees", base=TraineeKind, remedy="docs/learn.md has an example."
+    "trainee",
+    group="ballfg.trainees",
+    base=TraineeKind,
+    remedy="docs/learn.md has an example.",
+    own={
+        **{name: f"ballfg.learning.end_to_end.build:{cls}" for name, cls in {"a-tune": "ATune", **NETWORKS}.items()},
+        **{name: f"ballfg.learning.sequence.trainee:{cls}" for name, cls in SEQUENCES.items()},
+    },
 )
 """All kinds by name."""
 
 register_trainee = TRAINEES.register
-
-NETWORKS = ("mlp", "mlp+gs", "skip+gs", "mnn+gs")
-"""Kinds that are a network for the dynamics."""
-SEQUENCES = ("lstm", "diffusion")
-"""Kinds that map observations to the rest of a track, without estimator and dynamics."""
-
-
-class Network(TraineeKind):
-    """A network for the dynamics, trained through the estimator."""
-
-    unused: ClassVar[tuple[str, ...]] = ("options",)
-
-    @classmethod
-    def build(cls, config: TrainConfig) -> Prepared:
-        """The model with its data, ready to train."""
-        from ballfg.learning.end_to_end.build import build_end_to_end
-
-        return build_end_to_end(config)
-
-
-class Sequence(TraineeKind):
-    """A network from observations to the rest of a track."""
-
-    unused: ClassVar[tuple[str, ...]] = ("architecture", "model", "noise", "gradient", "options")
-    augmented = True
-
-    @classmethod
-    def build(cls, config: TrainConfig) -> Prepared:
-        """The model with its data, ready to train."""
-        from ballfg.learning.sequence.trainee import build_sequence
-
-        return build_sequence(config)
-
-
-@register_trainee
-class ATune(Network):
-    """The coefficients of the analytic model."""
-
-    name = "a-tune"
-    unused = ("architecture", "options")
-    augmented = True
-
-
-@register_trainee
-class Mlp(Network):
-    """A network on raw states, which learns the symmetry of the room from rotated and shifted tracks."""
-
-    name = "mlp"
-    augmented = True
-
-
-@register_trainee
-class MlpGramSchmidt(Network):
-    """A network on Gram-Schmidt features, which do not change with a rotation or a shift."""
-
-    name = "mlp+gs"
-
-
-@register_trainee
-class SkipGramSchmidt(Network):
-    """The same with skip connections."""
-
-    name = "skip+gs"
-
-
-@register_trainee
-class MnnGramSchmidt(Network):
-    """The same with multiplications of hidden states."""
-
-    name = "mnn+gs"
-
-
-@register_trainee
-class Lstm(Sequence):
-    """A recurrent network."""
-
-    name = "lstm"
-
-
-@register_trainee
-class Diffusion(Sequence):
-    """A conditional diffusion model."""
-
-    name = "diffusion"

@@ -1,4 +1,4 @@
-"""Shots to learn from: what of a track is observed, what is to be predicted, and the events in it."""
+"""Cuts tracks into shots for learning: an observed part, a part to predict, and the events."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import Settings, Smoother
-from ballfg.estimation.segmentation import Segmentation
+from ballfg.estimation.segmentation.result import Segmentation
 from ballfg.tracks import Track
 
 LEAST_OBSERVED = 5
@@ -19,16 +19,16 @@ LEAST_PREDICTED = 3
 
 
 @dataclass(frozen=True)
-class Shot:
-    """One track, cut into what is observed and what is predicted.
+class TrainingShot:
+    """One track, cut into an observed part and a part to predict.
 
     Attributes:
-        track: as far as the ball flies undisturbed: up to its first hit.
+        track: the undisturbed part of the flight, up to the first hit.
         observed: number of samples that the estimate sees; they come first.
         usable: (n,) bool, samples that measure the ball.
         segmentation: events of the observed part.
         settings: of the estimator, before anything is learned.
-        surfaces: what the ball may bounce on.
+        surfaces: table and floor.
         room: name of the dataset.
     """
 
@@ -64,7 +64,7 @@ def shots_of(
     *,
     samples: int | None,
     seconds: float | None,
-) -> Iterator[tuple[Track, Shot | str]]:
+) -> Iterator[tuple[Track, TrainingShot | str]]:
     """Each track with its shot, or the reason why it gives none. Observed are so many samples, or seconds.
 
     The model finds the events; an analytic one will do.
@@ -74,7 +74,7 @@ def shots_of(
         yield track, _shot(track, smoother, samples, seconds)
 
 
-def _shot(track: Track, smoother: Smoother, samples: int | None, seconds: float | None) -> Shot | str:
+def _shot(track: Track, smoother: Smoother, samples: int | None, seconds: float | None) -> TrainingShot | str:
     track = track.since_first()
     whole = smoother.segment(track)
     end = int(whole.hits[0]) + 1 if len(whole.hits) else len(track)
@@ -86,4 +86,4 @@ def _shot(track: Track, smoother: Smoother, samples: int | None, seconds: float 
     if usable[observed:].sum() < LEAST_PREDICTED:
         return f"fewer than {LEAST_PREDICTED} usable samples follow the observed part before the ball is hit"
     seen = part(track, observed)
-    return Shot(track, observed, usable, smoother.segment(seen), smoother.settings, smoother.surfaces)
+    return TrainingShot(track, observed, usable, smoother.segment(seen), smoother.settings, smoother.surfaces)

@@ -1,4 +1,4 @@
-"""The split of tracks into those that are fitted and those that judge, made before anything is estimated."""
+"""Splits tracks into fitted and judging ones, before any estimate."""
 
 import hashlib
 from collections import defaultdict

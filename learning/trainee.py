@@ -1,4 +1,4 @@
-"""The contract between a trained model and the loop that trains it."""
+"""Defines the interface between a trained model and the loop that trains it."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ class BatchLoss:
 
 @dataclass(frozen=True)
 class PredictedShot:
-    """A track as a model predicts it.
+    """The predicted and measured positions of a track.
 
     Attributes:
         name: of the track.

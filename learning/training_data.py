@@ -1,4 +1,4 @@
-"""From a config to the data of a training: datasets, split, shots, and the settings of the estimator."""
+"""Reads the data of a training from a config: datasets, split, shots, and the settings of the estimator."""
 
 import sys
 from collections import Counter
@@ -7,12 +7,15 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from ballfg.dynamics import AnalyticModel, inertia_factor, load_model, nominal_model
+from ballfg.dynamics import AnalyticModel, load_model, nominal_model
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
-from ballfg.estimation import Settings, dataset_settings, dataset_surfaces, table_note, with_readings
+from ballfg.dynamics.nominal import inertia_factor
+from ballfg.estimation import Settings, dataset_settings, dataset_surfaces
+from ballfg.estimation.configure import table_note
 from ballfg.estimation.launcher import Launcher
+from ballfg.estimation.reading import with_readings
 from ballfg.learning.config.training import TrainConfig
-from ballfg.learning.shots import Shot, shots_of
+from ballfg.learning.shots import TrainingShot, shots_of
 from ballfg.learning.split import training_split
 from ballfg.tracks import Ball, Dataset, Track, read_dataset
 
@@ -34,7 +37,7 @@ class TrainingData:
         embedding: the spin that the launcher's settings mean; None without settings.
     """
 
-    shots: Sequence[Shot]
+    shots: Sequence[TrainingShot]
     train: Sequence[int]
     validation: Sequence[int]
     analytic: AnalyticModel
@@ -151,9 +154,9 @@ def _shots(
     tracks: Sequence[tuple[int, Track]],
     analytic: AnalyticModel,
     settings: Sequence[Settings],
-) -> tuple[list[Shot], dict[int, int]]:
+) -> tuple[list[TrainingShot], dict[int, int]]:
     """Shots, and the number of each track's shot; reasons for tracks without one go to stderr."""
-    shots: list[Shot] = []
+    shots: list[TrainingShot] = []
     kept: dict[int, int] = {}
     reasons: Counter[str] = Counter()
     for number, dataset in enumerate(datasets):

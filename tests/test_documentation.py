@@ -19,6 +19,10 @@ KINDS = ("Track", "Observation", "Estimator", "Smoother", "Online", "Filter", "S
 """Endings of the names of classes that code must use by their interface."""
 BLIND = ("estimation", "factors", "prediction", "learning", "diagnosis")
 """Rooms that must not ask which of those classes they hold."""
+SENTENCES = [path for path in MODULES.values() if path.stat().st_size]
+NOUN_AND_GLOSS = re.compile(r"[^\s:]+: |(?![A-Z][a-z]+s )(?:[^\s:]+ ){1,3}[^\s:]+: ")
+"""A colon after at most four words, unless the first is a verb such as `Reads`."""
+CLAUSE = re.compile(r"(?:What|Where|Whether|How|Which|Why|When|From|By|Of|Between|Beside|Do|Does) ")
 TEST_FOLDERS = [folder for folder in (ROOT / "tests").iterdir() if f"ballfg.{folder.name}" in MODULES]
 
 
@@ -51,6 +55,16 @@ def test_names_in_documents_are_public(document: Path) -> None:
         room = importlib.import_module(module)
         missing = set(names) - set(getattr(room, "__all__", None) or vars(room))
         assert not missing, f"{document.relative_to(ROOT)}:{line}: {module} hands out no {', '.join(sorted(missing))}"
+
+
+def test_modules_say_in_a_sentence_what_they_do() -> None:
+    firsts = {path: (ast.get_docstring(ast.parse(path.read_text("utf-8"))) or "").split("\n")[0] for path in SENTENCES}
+    wrong = [
+        f"{path.relative_to(ROOT)}: {first}"
+        for path, first in firsts.items()
+        if not first.endswith(".") or NOUN_AND_GLOSS.match(first) or CLAUSE.match(first)
+    ]
+    assert not wrong, "no sentence, a `Noun: gloss`, or a clause without a verb:\n" + "\n".join(wrong)
 
 
 def test_folders_are_small() -> None:

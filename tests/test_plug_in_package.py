@@ -171,7 +171,7 @@ def test_an_unknown_method_is_told_of_those_there_are(with_package: Interpreter,
     assert "smoother, online, ekf, sliding-window, back-and-forth; got 'guess'" in answer.err
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_diagnose_finds_its_effect(with_package: Interpreter, tmp_path: Path) -> None:
     """Charged balls, simulated, searched and found with nothing named but the effect to plant."""
     charged, found = tmp_path / "charged", tmp_path / "diagnosis"

@@ -8,17 +8,32 @@ import pytest
 from tests.tutorials import run_document
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+README = ROOT / "README.md"
+DOCUMENTS = [README, *sorted((ROOT / "docs").rglob("*.md"))]
 
 
+def first_python() -> str:
+    """The code of the first estimate, after the word `python` of its fence."""
+    text = README.read_text(encoding="utf-8")
+    return text[text.index("```python\n") :].split("```")[1]
+
+
+def test_the_first_estimate_runs_as_it_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    code = first_python()
+    assert len([line for line in code.splitlines()[1:] if line.strip()]) <= 15
+    monkeypatch.chdir(tmp_path)
+    printed = run_document(f"```\nballfg example\n```\n```{code}```\n```text\n```\n")
+    assert "converged\n" in printed
+    assert re.search(r"bounces at 0\.\d{3} s \+- \d+\.\d ms, x = ", printed)
+
+
+@pytest.mark.thorough
 def test_every_block_runs_as_it_stands(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """From top to bottom in one folder; but for the installation, which has taken place, and `ballfg compile`."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    text, code = README.read_text(encoding="utf-8"), first_python()
     setup = text[text.index("```\npython3 -m venv") : text.index("## The first ten minutes")]
-    code = text[text.index("```python\n") :].split("```")[1]
-    assert len([line for line in code.splitlines()[1:] if line.strip()]) <= 15
     monkeypatch.chdir(tmp_path)
     run_document(
         text.replace(setup, "").replace(code, f"{code}printed = [estimate.status.value, bounce.time]\nprint(printed)\n")

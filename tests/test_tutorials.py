@@ -6,8 +6,13 @@ import pytest
 
 from tests.tutorials import TUTORIALS, run_document
 
+LONG = ("4_train", "5_what_is_missing", "6_the_papers_comparison")
 
-@pytest.mark.parametrize("document", TUTORIALS, ids=lambda path: path.stem)
+
+@pytest.mark.parametrize(
+    "document",
+    [pytest.param(path, marks=[pytest.mark.thorough] * (path.stem in LONG), id=path.stem) for path in TUTORIALS],
+)
 def test_runs_as_it_stands(document: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     text = document.read_text(encoding="utf-8")

@@ -1,1 +1,1 @@
-"""The command `ballfg`: one file a sub-command; they parse, call and print."""
+"""The command `ballfg` has one file per sub-command, which parses, calls and prints."""

@@ -1,6 +1,6 @@
-"""The entry points of the installed programs: what they need of their process, before anything large is imported.
+"""Starts the installed programs and prepares their process before any large import.
 
-Ctrl-C, SIGTERM and SIGHUP are one line even while they are being imported.
+Ctrl-C, SIGTERM and SIGHUP give one line even during those imports.
 """
 
 import atexit
@@ -43,7 +43,7 @@ def _run(module: str) -> None:
             _leave(end.code)
         raise
     except Exception:
-        if interrupted():  # a library has made another exception of the interrupt
+        if interrupted():  # a library has replaced the interrupt by another exception
             _leave(say_so())
         raise
     finally:
@@ -51,19 +51,19 @@ def _run(module: str) -> None:
 
 
 def _leave(status: int) -> NoReturn:
-    """Ends the process without what Python does at its end: to take torch and its like apart takes half a second."""
+    """Ends the process without Python's shutdown, which takes half a second for torch and similar packages."""
     let_go()
     atexit._run_exitfuncs()
-    with suppress(OSError):  # whoever reads it may be gone
+    with suppress(OSError):  # the reader may be gone
         sys.stdout.flush()
     os._exit(status)
 
 
 def _open_streams() -> None:
-    """Let streams that whoever started the process has closed lead nowhere.
+    """Redirects streams that the parent process has closed to nowhere.
 
-    Else `print` would find none, messages for stderr would go to stdout, among the data, and the next file to be opened
-    would take the number of one, so that what a library prints would go into it.
+    Else `print` would fail, and messages for stderr would go to stdout among the data. The next opened file would get a
+    stream's number, and a library's prints would go into it.
     """
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:  # the lowest that is free
         os.set_inheritable(number, True)
@@ -74,7 +74,7 @@ def _open_streams() -> None:
 
 
 def _check_folder() -> None:
-    """Where the current folder has been removed, libraries end the process on import, with words of their own."""
+    """Refuses a removed current folder, in which libraries end the process on import with messages of their own."""
     try:
         os.getcwd()
     except OSError as error:

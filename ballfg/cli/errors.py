@@ -1,4 +1,4 @@
-"""What a user sees when something is wrong: one line on stderr and an exit status."""
+"""Turns errors that a user can mend into one line on stderr and an exit status."""
 
 import errno
 import sys
@@ -12,27 +12,27 @@ from ballfg.interrupts import interrupted, say_so
 BAD_INPUT = 2
 """Exit status for input that cannot be used."""
 NOT_ESTIMATED = 3
-"""Exit status where everything was written, but some tracks could not be estimated."""
+"""Exit status if everything was written, but some tracks could not be estimated."""
 INTERRUPTED = 130
-"""Exit status after Ctrl-C, as shells have it."""
+"""Exit status after Ctrl-C, as in shells."""
 
 _LONGEST: Final = 2000
-"""Characters of a message; a file of one endless line would fill the terminal."""
+"""Largest number of characters of a message; a file of one endless line would fill the terminal."""
 _NAME: Final = 200
-"""Characters of a name that is no text; Linux has no longer ones in a folder than 255 bytes."""
+"""Largest number of characters of a name that is not text; Linux limits names in a folder to 255 bytes."""
 USER_ERRORS = (ValueError, TypeError, OSError, MemoryError)
-"""What a user can mend: input, paths, a full disk, too little memory. Anything else is a fault of the program and keeps
-its traceback."""
+"""Errors that a user can mend: input, paths, a full disk, too little memory. All others are faults of the program and
+keep their traceback."""
 NO_MEMORY: Final = "can't allocate memory"
-"""What torch says where Python and numpy raise MemoryError."""
+"""torch's message in place of a MemoryError."""
 
 
 def guarded(command: Callable[[], object]) -> int:
-    """Runs a command and turns what a user can mend into one line `ballfg: error: ...` and an exit status.
+    """Runs a command and turns a user's errors into one line `ballfg: error: ...` and an exit status.
 
     Args: command: takes no arguments; may raise.
-    Returns: 0, 2 for bad input, 3 where some tracks could not be estimated, 128 and the signal's number after Ctrl-C,
-        SIGTERM or SIGHUP, or the status that the command returned.
+    Returns: 0, 2 for bad input, 3 if some tracks could not be estimated, 128 and the signal's number after Ctrl-C,
+        SIGTERM or SIGHUP, or the command's own status.
     """
     try:
         result = command()
@@ -41,18 +41,18 @@ def guarded(command: Callable[[], object]) -> int:
     except (KeyboardInterrupt, typer.Abort):
         return say_so()
     except SystemExit as error:
-        if isinstance(error.__context__, BrokenPipeError):  # the way of click and rich where nobody reads on
+        if isinstance(error.__context__, BrokenPipeError):  # raised by click and rich if nobody reads the output
             raise
         return _left(error)
     except Exception as error:
-        return say_so() if interrupted() else _refused(error)  # libraries make other exceptions of an interrupt
+        return say_so() if interrupted() else _refused(error)  # libraries replace an interrupt by other exceptions
     if result == INTERRUPTED:
         return say_so()
     return result if isinstance(result, int) else 0
 
 
 def _left(error: SystemExit) -> int:
-    """The exit status of a command that ends itself; code of somebody else that does it is named."""
+    """The exit status of a command that ends itself; foreign code that does so is named."""
     where = error.__traceback__
     while where is not None and where.tb_next is not None:
         where = where.tb_next
@@ -63,14 +63,14 @@ def _left(error: SystemExit) -> int:
 
 
 def _refused(error: Exception) -> int:
-    """The exit status of what a user can mend, with its line; everything else is raised again."""
+    """The exit status of a user's error, with its line; all others are raised again."""
     if isinstance(error, USER_ERRORS):
-        if type(error).__name__ == "LinAlgError":  # numpy makes it a ValueError, but no user can mend it
+        if type(error).__name__ == "LinAlgError":  # numpy derives it from ValueError, but no user can mend it
             raise error
         return _bad_input(_in_words(error))
-    # errors in the use of a command: typer's own base class has moved between versions, their method has not
+    # errors in the use of a command: typer's base class differs between versions, their method does not
     message, cause = getattr(error, "format_message", None), error.__context__
-    if isinstance(cause, OSError) and cause.errno == errno.ELOOP:  # as `Path.resolve` has it before Python 3.13
+    if isinstance(cause, OSError) and cause.errno == errno.ELOOP:  # from `Path.resolve` before Python 3.13
         return _bad_input(_in_words(cause))
     if message is None and NO_MEMORY in str(error):
         return _bad_input(_in_words(MemoryError(f"torch {NO_MEMORY}")))
@@ -80,7 +80,7 @@ def _refused(error: Exception) -> int:
 
 
 def check_words(words: Sequence[str]) -> None:
-    """Refuses words of a command that no line of text can hold, names of files above all, before anything is done.
+    """Refuses arguments that text cannot represent, such as odd file names, before any work.
 
     Raises: UnicodeEncodeError.
     """

@@ -1,4 +1,4 @@
-"""What estimate and predict share: opening a dataset, a model and an estimator from the command line's words."""
+"""Opens the dataset, model and estimator that a command line names, for estimate and predict."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 
 
 MOST_FAILURES = 10
-"""Tracks that could not be estimated which are named, before the others are counted."""
+"""Number of failed tracks that are named; further ones are counted."""
 MOST_DOUBTS = 3
-"""Tracks whose doubts are printed, before the others are counted."""
+"""Number of tracks whose doubts are printed; further ones are counted."""
 
 
 def check_dataset(folder: Path) -> Path:
-    """Refuses a mistyped path at once: before torch and GTSAM are imported, which takes seconds."""
+    """Refuses a mistyped path at once: before the import of torch and GTSAM, which takes seconds."""
     if not folder.is_dir():
         from ballfg.tracks import read_dataset
 
@@ -56,12 +56,12 @@ EffectsFiles = Annotated[
     list[Path] | None,
     typer.Option("--effects-file", help="Trusted Python file that defines custom effects; may be repeated."),
 ]
-"""The option of every command that reads or names effects."""
+"""The option of every command that uses effects."""
 ObservationsFiles = Annotated[
     list[Path] | None,
     typer.Option("--observations-file", help="Trusted Python file that defines custom observations; may be repeated."),
 ]
-"""The option of every command that reads the tables of a dataset."""
+"""The option of every command that reads a dataset's tables."""
 MethodName = Annotated[
     str,
     typer.Option(
@@ -82,7 +82,7 @@ BallName = Annotated[
     str | None,
     typer.Option("--ball", help="Known ball, by its name in ballfg balls; by default the one that the dataset states."),
 ]
-"""The option of commands that read a dataset. The dataset's own ball counts; another one is refused."""
+"""The option of commands that read a dataset. It must agree with the dataset's own ball."""
 CORES = usable_cores()
 Jobs = Annotated[int, typer.Option("--jobs", min=1, help="Number of processes.", show_default="one per core")]
 Cluster = Annotated[
@@ -95,11 +95,11 @@ Address = Annotated[
 OutTable = Annotated[Path, typer.Option("--out", help="Output table, .csv or .parquet.")]
 Seed = Annotated[int, typer.Option("--seed", help="Random seed.")]
 DATASET_TABLES = ("tracks", "labels", "detections", "truth")
-"""Names, without their endings, of the tables that a dataset's folder holds."""
+"""Names, without their endings, of the tables in a dataset's folder."""
 
 
 class Source(enum.StrEnum):
-    """What an estimate is made from, by the name of the option."""
+    """Sources of an estimate, by the name of the option."""
 
     POSITIONS = "positions"
     DETECTIONS = "detections"
@@ -111,29 +111,31 @@ Opened = TypeVar("Opened", "Dataset", "SightedDataset")
 
 @dataclass(frozen=True)
 class Inputs(Generic[D]):
-    """A dataset, of positions or of what cameras saw, and how to look at it."""
+    """A dataset, of positions or of sightings, with model and surfaces."""
 
     dataset: D
     model: BallModel
     surfaces: Surfaces
     observed: float
-    """s from the start of each track from which the noise may be learned, where nobody states it."""
+    """s from the start of each track that a noise estimate may use."""
 
     def estimator(self, method: str, solver: Solver | None = None) -> Estimator:
         """The estimator of a name, with the noise of the dataset.
 
-        Args: method: its name.  solver: of its factor graph; its usual one where None.
-        Raises: ValueError: if there is none of that name, or the solver cannot solve it.
+        Args: method: its name.  solver: of its factor graph; None: the usual one.
+        Raises: ValueError: if there is no such estimator, or the solver cannot solve it.
         """
-        from ballfg.estimation import Settings, fitted_settings, make_estimator
+        from ballfg.estimation import Settings
+        from ballfg.estimation.configure import fitted_settings
+        from ballfg.estimation.registry import make_estimator
 
-        make_estimator(method, self.model, self.surfaces, Settings(solver=solver))  # refuses before it takes long
+        make_estimator(method, self.model, self.surfaces, Settings(solver=solver))  # refuses before any long work
         settings = fitted_settings(self.dataset, self.model, self.observed, progress)
         return make_estimator(method, self.model, self.surfaces, replace(settings, solver=solver))
 
 
 def know_effects(files: Iterable[Path] | None) -> None:
-    """Registers the effects that files define, so that model files and options can name them."""
+    """Registers the effects in files, so that model files and options can name them."""
     from ballfg.dynamics import load_effects
 
     for file in files or ():
@@ -141,8 +143,8 @@ def know_effects(files: Iterable[Path] | None) -> None:
 
 
 def know_observations(files: Iterable[Path] | None) -> None:
-    """Registers the observations that files define, so that their tables are read with a dataset."""
-    from ballfg.estimation import load_observations
+    """Registers the observations in files, so that their tables are read with a dataset."""
+    from ballfg.estimation.observations.registry import load_observations
 
     for file in files or ():
         load_observations(file)
@@ -155,13 +157,13 @@ def open_inputs(
     observed: float = math.inf,
     ball: str | None = None,
 ) -> Inputs[Dataset]:
-    """Open and check everything before any work starts; what was repaired is said on stderr.
+    """Opens and checks everything before any work; repairs are reported on stderr.
 
     Args:
-        observed: s from the start of each track from which the noise may be learned, where nobody states it.
-        ball: name of the known ball that the dataset has to be of; None: of any.
+        observed: s from the start of each track that a noise estimate may use.
+        ball: name of the dataset's known ball; None: any ball.
     """
-    from ballfg.estimation import with_readings
+    from ballfg.estimation.reading import with_readings
     from ballfg.tracks import read_dataset
 
     know_effects(effects_files)
@@ -171,7 +173,7 @@ def open_inputs(
 def open_sighted(
     dataset: Path, model: Path | None, effects_files: Iterable[Path] | None = None, ball: str | None = None
 ) -> Inputs[SightedDataset]:
-    """`open_inputs` for what cameras saw."""
+    """`open_inputs` for sightings."""
     from ballfg.estimation import read_sighted
 
     know_effects(effects_files)
@@ -185,11 +187,12 @@ def _inputs(data: Opened, model: Path | None, observed: float = math.inf, ball: 
 
 
 def check_ball(data: Dataset | SightedDataset, name: str) -> None:
-    """A dataset states its ball; a name can only agree with it.
+    """Checks that a named ball agrees with the dataset's.
 
-    Raises: ValueError: if the name is not known, or the dataset's radius and mass are not that ball's.
+    Raises: ValueError: if the name is unknown, or the dataset's radius and mass differ from that ball's.
     """
-    from ballfg.dynamics import KNOWN_BALLS, known_ball, known_name
+    from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball
+    from ballfg.dynamics.nominal import known_name
 
     wanted, own = known_ball(name), data.ball
     if known_name(own) != wanted:
@@ -201,18 +204,20 @@ def check_ball(data: Dataset | SightedDataset, name: str) -> None:
 
 
 def open_model(data: Dataset | SightedDataset, model: Path | None, ball: str | None = None) -> BallModel:
-    """The model of a file, or the nominal one; what the user should know of data and model is said on stderr.
+    """The model of a file, or the nominal one; prints notes on data and model on stderr.
 
-    Args: ball: name of the known ball that the data have to be of; None: of any.
+    Args: ball: name of the data's known ball; None: any ball.
     """
     import torch
 
-    from ballfg.dynamics import inertia_factor, load_model, nominal_model, nominal_note
-    from ballfg.estimation import table_note, unused_model
+    from ballfg.dynamics import load_model, nominal_model
+    from ballfg.dynamics.nominal import inertia_factor, nominal_note
+    from ballfg.estimation.configure import table_note
+    from ballfg.estimation.reading import unused_model
 
     if ball is not None:
         check_ball(data, ball)
-    torch.set_num_threads(1)  # the batches are small: threads cost more than they bring
+    torch.set_num_threads(1)  # the batches are small: threads cost more time than they save
     notes = [*data.notes, *filter(None, [table_note(data)])]
     if model is None:
         notes += [note for note in (nominal_note(data.ball), *unused_model(data.path, data.ball)) if note]
@@ -224,7 +229,7 @@ def open_model(data: Dataset | SightedDataset, model: Path | None, ball: str | N
 
 
 def check_out(out: Path, dataset: Path) -> None:
-    """A result must not take the place of the measurements.
+    """Refuses a result in the place of the measurements.
 
     Raises: ValueError: if `out` is a table of the dataset.
     """
@@ -233,7 +238,7 @@ def check_out(out: Path, dataset: Path) -> None:
 
 
 def print_notes(notes: Iterable[str]) -> None:
-    """Prints what the user should know, on stderr."""
+    """Prints notes for the user on stderr."""
     from ballfg.checks import visible
 
     for note in notes:
@@ -242,9 +247,9 @@ def print_notes(notes: Iterable[str]) -> None:
 
 @contextmanager
 def workers(cluster: str | None, address: str | None, jobs: int) -> Iterator[int]:
-    """Where the work of a command runs, until the block ends: on a cluster, or in `jobs` processes of this machine.
+    """Runs the block's work on a cluster, or in `jobs` processes of this machine.
 
-    Returns: how many processes work.
+    Returns: the number of processes.
     Raises: ValueError, ConnectionError: as `ballfg.parallel.on_cluster`.
     """
     if cluster is None and address is None:
@@ -254,12 +259,12 @@ def workers(cluster: str | None, address: str | None, jobs: int) -> Iterator[int
 
     with on_cluster(cluster, address) as found:
         print(f"{cluster} cluster: {found} workers", file=sys.stderr)
-        yield max(2, found or 0)  # several processes, even where there is one worker beside this one
+        yield max(2, found or 0)  # several processes, even for one worker beside this one
 
 
 @dataclass
 class Outcome:
-    """How tracks ended: sums, so that memory does not grow with their number."""
+    """Counts of tracks by their status: sums, so that memory does not grow with their number."""
 
     statuses: Counter[str] = field(default_factory=Counter)
     doubts: list[str] = field(default_factory=list)
@@ -274,7 +279,7 @@ class Outcome:
         """Counts a track.
 
         Args:
-            name: of the track.  status: how it ended.  notes: doubts about its frame.
+            name: of the track.  status: of its estimate.  notes: doubts about its frame.
             outside: share of it outside of a network's training data, 0 to 1; None without a network.
         """
         from ballfg.checks import shown
@@ -292,7 +297,7 @@ class Outcome:
             self.outside, self.far, self.shares = self.outside + 1, self.far + (outside > 0.5), self.shares + outside
 
     def print(self) -> None:
-        """Prints how many tracks ended how, most first, and on stderr the first doubts about their frame."""
+        """Prints the counts of tracks by status, most first, and on stderr the first doubts about their frame."""
         for text, number in self.statuses.most_common():
             print(f"  {number} track{'s' if number > 1 else ''}: {text}")
         print_notes(self.doubts)
@@ -300,7 +305,7 @@ class Outcome:
             print_notes([f"the same doubts about {self.doubtful - MOST_DOUBTS} more tracks"])
 
     def end(self) -> None:
-        """Ends a command whose output is written whole: with a table of the tracks that could not be estimated.
+        """Ends a command whose output is complete, with a table of the tracks that could not be estimated.
 
         Raises: typer.Exit: with the status `NOT_ESTIMATED`, if there are any.
         """
@@ -315,7 +320,7 @@ class Outcome:
         raise typer.Exit(NOT_ESTIMATED)
 
     def print_outside(self) -> None:
-        """Prints how much of the tracks lies outside of a network's training data; nothing without a network."""
+        """Prints the share of the tracks outside of a network's training data; nothing without a network."""
         if self.outside:
             mean, text = 100 * self.shares / self.outside, "outside of the network's training data"
             print(f"  {text}: {mean:.0f} % on average, {self.far} tracks for the greater part")

@@ -1,4 +1,4 @@
-"""The app `ballfg` and its entry point. A new sub-command is a file of its own and one line here.
+"""Defines the app `ballfg` and its entry point. A new sub-command is a file of its own and one line here.
 
 Command files import what they need inside the command: `ballfg --help` must not wait for torch or GTSAM.
 """
@@ -27,7 +27,7 @@ from ballfg.cli.commands.track import track
 from ballfg.cli.start import start
 
 EARLIER_OPTIONS = {"effects": "effects-file"}
-"""Options, without their dashes, that scripts may still write under an earlier name; `--help` shows today's alone."""
+"""Earlier names of options, without dashes, that scripts may still use; `--help` shows only today's."""
 
 app = typer.Typer(
     name="ballfg",

@@ -1,4 +1,4 @@
-"""The start of each program: its words, an option --quiet for all commands, signs of life, an exit status."""
+"""Starts each program: parses its arguments, adds the option --quiet, shows progress, returns an exit status."""
 
 import os
 import sys
@@ -12,15 +12,15 @@ from ballfg.cli.errors import check_words, guarded
 from ballfg.progress import alive, be_quiet
 
 UNREAD = 141
-"""Exit status where the reader of stdout has left, as `head` does: what shells show of a program that SIGPIPE ends."""
+"""Exit status after the reader of stdout has left, as `head` does; shells show it for a program ended by SIGPIPE."""
 
 
 def start(app: typer.Typer, name: str, arguments: Sequence[str] | None) -> NoReturn:
     """Runs a program with the given arguments, by default the command line's, and exits.
 
-    Args: app: the program.  name: its name, as users type it.  arguments: its words.
-    Raises: SystemExit: always; status 0, 2 on bad input, 130 after Ctrl-C, 141 where nobody reads on, or what the
-        command returns.
+    Args: app: the program.  name: its name for users.  arguments: of the command line.
+    Raises: SystemExit: always; status 0, 2 on bad input, 130 after Ctrl-C, 141 if nobody reads the output, or the
+        command's own.
     """
     command = _command(app)
     given = sys.argv[1:] if arguments is None else list(arguments)
@@ -34,14 +34,14 @@ def start(app: typer.Typer, name: str, arguments: Sequence[str] | None) -> NoRet
 
 
 def _while_read(run: Callable[[], int]) -> int:
-    """The exit status of a program, or `UNREAD` without a word where nobody reads what it prints any more."""
+    """The exit status of a program, or silently `UNREAD` if nobody reads its output any more."""
     try:
         status = run()
         sys.stdout.flush()
         return status
     except BrokenPipeError:
         pass
-    except SystemExit as leaving:  # click's way, with status 1
+    except SystemExit as leaving:  # raised by click, with status 1
         if not isinstance(leaving.__context__, BrokenPipeError):
             raise
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # else the interpreter complains when it flushes the rest
@@ -50,7 +50,7 @@ def _while_read(run: Callable[[], int]) -> int:
 
 @cache
 def _command(app: typer.Typer) -> Any:
-    """A program's command line, each command with --quiet; read from the signatures once in a process."""
+    """A program's command line, each command with --quiet; built once in a process."""
     command, quiet = typer.main.get_command(app), _quiet()
     for one in _commands(command):
         one.params.append(quiet)
@@ -58,7 +58,7 @@ def _command(app: typer.Typer) -> Any:
 
 
 def _commands(command: Any) -> Iterator[Any]:
-    """Those that do something: a group's own, or the command itself."""
+    """A group's commands, or the command itself."""
     own = getattr(command, "commands", None)
     yield from own.values() if own else (command,)
 
@@ -71,7 +71,7 @@ def _asked(quiet: bool) -> None:
 def _template(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", callback=_asked, help="Show no progress.")] = False,
 ) -> None:
-    """A command whose option all others get: typer makes options of functions alone."""
+    """A command whose option all others copy: typer makes options from functions only."""
 
 
 def _quiet() -> Any:

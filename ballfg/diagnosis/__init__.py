@@ -1,6 +1,6 @@
-"""Find effects that a model of the ball lacks.
+"""The diagnosis finds effects that a model of the ball lacks.
 
-`diagnose` does the whole diagnosis and `write_report` writes its result. The other functions are single steps of it.
+`diagnose` runs the whole diagnosis and `write_report` writes its result. The other functions are single steps.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""The diagnosis of a dataset: search for effects, evaluate them, test the rest, and say it in one sentence."""
+"""Diagnoses a dataset: it searches effects, evaluates them, tests the rest, and states the answer in one sentence."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -11,26 +11,28 @@ from ballfg.diagnosis.fit.holdout import Holdout, hold_out
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.generic_test import ALARM, GenericTest
 from ballfg.diagnosis.label_verdicts import LabelCheck
-from ballfg.diagnosis.remains.fallback import fallback
-from ballfg.diagnosis.remains.generic import generic_tests
-from ballfg.diagnosis.remains.label_check import check_labels, label_test
-from ballfg.diagnosis.remains.residuals import residuals_of
-from ballfg.diagnosis.remains.tracker import look_at_tracker
 from ballfg.diagnosis.report.wording import refusal, sentence
+from ballfg.diagnosis.residual_tests.fallback import fallback
+from ballfg.diagnosis.residual_tests.generic import generic_tests
+from ballfg.diagnosis.residual_tests.label_check import check_labels, label_test
+from ballfg.diagnosis.residual_tests.residuals import residuals_of
+from ballfg.diagnosis.residual_tests.tracker_errors import look_at_tracker
 from ballfg.diagnosis.result import Diagnosis, Errors, Fallback, Unexplained, Value, Verdict
 from ballfg.diagnosis.search.evaluation import prediction_errors, prediction_floor
 from ballfg.diagnosis.search.loop import Search, SearchLoop
 from ballfg.diagnosis.search.plausible import implausible
 from ballfg.diagnosis.search.process_noise import Predicting, calibrated_model, noise_about
 from ballfg.diagnosis.search.stamp_effects import as_declared
-from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Effect
+from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel
+from ballfg.dynamics.effect import Effect
 from ballfg.estimation import dataset_settings
-from ballfg.tracks import Dataset, TrackNoise
+from ballfg.tracks import Dataset
+from ballfg.tracks.noise import TrackNoise
 
 MOSTLY = 0.1
-"""Effects that leave less than this share of the first pattern are taken to explain it."""
+"""Share of the first pattern below which the found effects count as its explanation."""
 DESCRIBABLE = ("flight", "contact", "measurement")
-"""Tests of patterns that a model can follow which is the same for every track."""
+"""Tests of patterns that one model for all tracks can describe."""
 
 
 def diagnose(
@@ -45,10 +47,10 @@ def diagnose(
 
     Args:
         dataset: tracks. Every second one is searched; the others are held out to evaluate the effects found.
-        model: the analytic model that the tracks are held against.
-        jobs: processes that work on tracks at the same time.
-        watch: is told of each stage, in lines.
-        catalogue: effects to look for; by default all that are registered.
+        model: the analytic model to compare the tracks with.
+        jobs: number of processes.
+        watch: called with a line for each stage.
+        catalogue: candidate effects; by default all registered ones.
     Returns: the verdict, the findings with their evidence, errors before and after, and the corrected model.
     Raises:
         TypeError: if the model is a learned one.
@@ -108,7 +110,7 @@ def diagnose(
 def _labels(
     search: Search, model: AnalyticModel, holdout: Holdout, tracker: TrackNoise | None, jobs: int
 ) -> tuple[LabelCheck | None, tuple[GenericTest, ...]]:
-    """What is said of the spin labels, and that as a test; neither where there are none."""
+    """The verdicts on the spin labels, and their test; None without labels."""
 
     def checked(fit: Fit) -> LabelCheck | None:
         return check_labels(calibrated_model(fit, holdout.launcher.embedding), model, holdout, tracker, jobs=jobs)
@@ -127,7 +129,7 @@ def _with_own_noise(
     tell: Callable[[str], None],
     jobs: int,
 ) -> tuple[AnalyticModel, TrackNoise | None, Search]:
-    """The corrected model with its own noise, the tracker's noise if it is not white, and the search with both.
+    """The corrected model with its own noise, the tracker's noise if it is not white, and the updated search.
 
     Errors of the declared model are those with the same tracker.
     """
@@ -151,7 +153,7 @@ def _with_own_noise(
 
 
 def strange(calibrated: Mapping[str, Value], radius: float) -> list[str]:
-    """Sentences on declared coefficients whose fitted values are not plausible."""
+    """Sentences on declared coefficients with implausible fitted values."""
     texts = [implausible(name.partition(".")[2], value, radius) for name, value in calibrated.items()]
     words = "Something that the model does not describe has moved it: a clock, lengths or spin labels, say"
     return [f"The fitted {text}. {words}." for text in texts if text]
@@ -173,25 +175,25 @@ def alarms(tests: Sequence[GenericTest]) -> list[GenericTest]:
 
 
 def share_left(tests: Sequence[GenericTest]) -> float:
-    """The largest share of a first pattern that is still there, 0 to 1."""
+    """The largest share of a first pattern that remains, 0 to 1."""
     return max((test.share for test in alarms(tests)), default=0.0)
 
 
 def what_is_left(tests: tuple[GenericTest, ...], helped: Fallback | None = None) -> Unexplained:
-    """The pattern that is left, in words, with all tests; helped: its description without a name."""
+    """The remaining pattern, in words, with all tests; helped: its description without a name."""
     left = sorted(alarms(tests), key=lambda test: test.name == "time")  # a place says more than a correlation
     return Unexplained(left[0].where if left else "", share_left(tests), tests, helped)
 
 
 def verdict_of(search: Search, tests: Sequence[GenericTest]) -> Verdict:
-    """Effects explain the first pattern if they leave none, or next to nothing of it."""
+    """Effects explain the first pattern if they leave none, or almost none, of it."""
     if not search.findings:
         return Verdict.UNEXPLAINED if alarms(tests) else Verdict.NOTHING
     return Verdict.FOUND if share_left(tests) < MOSTLY else Verdict.UNEXPLAINED
 
 
 def _noise(fit: Fit, holdout: Holdout) -> dict[str, Value]:
-    """Position noise along each axis, as estimated and as the dataset states it or its scatter shows."""
+    """Position noise along each axis, as estimated, and as stated by the dataset or derived from its scatter."""
     stated, count = holdout.settings.position_noise, float(fit.problem.stretches.used.sum())
     return {
         axis: Value(shown, shown / np.sqrt(2.0 * count), "m", stated[a])

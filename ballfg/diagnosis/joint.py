@@ -1,8 +1,8 @@
-"""Several rooms diagnosed together: the ball is the same in all of them, rooms and rigs are their own.
+"""Diagnoses several rooms together, with one ball for all, and rooms and rigs of their own.
 
 One fit holds the flights of all rooms. Coefficients of flight are shared; those of bounce and measurement have a value
-for each room, held together by their priors. An effect of the ball is looked for in all rooms alike, and any effect in
-each room by itself. What all rooms want is the ball's and predicts in a room that had no part.
+for each room, tied together by their priors. Effects of the ball are searched in all rooms together, and all effects in
+each room by itself. Effects common to all rooms belong to the ball and serve predictions in new rooms.
 """
 
 import copy
@@ -22,26 +22,28 @@ from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout, hold_out
 from ballfg.diagnosis.fit.problem import Fit, Noise, Problem
 from ballfg.diagnosis.fit.stretches import Stretches, joined
 from ballfg.diagnosis.label_verdicts import LabelCheck
-from ballfg.diagnosis.remains.generic import generic_tests
-from ballfg.diagnosis.remains.label_check import judged, label_evidence, label_test
-from ballfg.diagnosis.remains.patterns import DRIFT
-from ballfg.diagnosis.remains.residuals import residuals_of
 from ballfg.diagnosis.report.wording import joined as listed
 from ballfg.diagnosis.report.wording import refusal, sentence
+from ballfg.diagnosis.residual_tests.generic import generic_tests
+from ballfg.diagnosis.residual_tests.label_check import judged, label_evidence, label_test
+from ballfg.diagnosis.residual_tests.patterns import DRIFT
+from ballfg.diagnosis.residual_tests.residuals import residuals_of
 from ballfg.diagnosis.result import Diagnosis, Errors, Finding
 from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.diagnosis.search.hypothesis import effects_of, has_effect, with_effects, without_effect
 from ballfg.diagnosis.search.loop import SearchLoop
 from ballfg.diagnosis.search.process_noise import PredictiveModel, calibrated_model, fitted_model, noise_about
 from ballfg.diagnosis.search.varying import Grouping, Varying
-from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Effect
+from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel
+from ballfg.dynamics.effect import Effect
 from ballfg.estimation import dataset_settings
-from ballfg.tracks import Dataset, TrackNoise
+from ballfg.tracks import Dataset
+from ballfg.tracks.noise import TrackNoise
 
 ROOM: Final = "room"
-"""The label that tells the rooms apart."""
+"""The label that identifies the rooms."""
 MOST_TRACKS: Final = 60
-"""Tracks of a room that are used, evenly over it: rooms must not wait for the largest of them."""
+"""Largest number of tracks per room, evenly spread: rooms must not wait for the largest of them."""
 
 
 @dataclass(frozen=True)
@@ -74,16 +76,16 @@ def diagnose_jointly(
     watch: Callable[[str], None] | None = None,
     catalogue: Sequence[type[Effect]] | None = None,
 ) -> JointDiagnosis:
-    """Find the effects that a model of the ball lacks in several rooms, and those of single rooms.
+    """Finds the effects that a model of the ball lacks in several rooms, and those of single rooms.
 
     Args:
-        datasets: one for each room, of names of their own, at least two.
-        model: the analytic model that all tracks are held against.
+        datasets: one for each room, with unique names, at least two.
+        model: the analytic model to compare all tracks with.
         jobs: processes.
-        watch: is told of each stage, in lines.
-        catalogue: effects to look for; by default all that are registered.
+        watch: called with a line for each stage.
+        catalogue: candidate effects; by default all registered ones.
     Returns: the findings, the model of the ball and those of the rooms.
-    Raises: ValueError: for fewer than two datasets, equal names, a dataset whose stamps are wrong, too few tracks, or a
+    Raises: ValueError: for fewer than two datasets, equal names, a dataset with wrong stamps, too few tracks, or a
         model that differs between tracks.
     """
     if model.variations:
@@ -142,7 +144,7 @@ def diagnose_jointly(
 def _labels(
     rooms: Sequence[Room], models: Mapping[str, AnalyticModel], declared: AnalyticModel, jobs: int
 ) -> LabelCheck | None:
-    """What is said of the spin labels of all rooms; each is compared with its flight in its own room."""
+    """The verdicts on the spin labels of all rooms; each is compared with its flight in its own room."""
     found = []
     for room in rooms:
         flights = label_evidence(models[room.name], declared, room.holdout, jobs=jobs)
@@ -191,7 +193,7 @@ def _way(rooms: Sequence[Room]) -> Grouping:
 
 
 def _first_fit(model: AnalyticModel, halves: Holdout, way: Grouping) -> Fit:
-    """The fit of the declared model; coefficients of bounce and measurement may differ as far as their priors say."""
+    """The fit of the declared model; coefficients of bounce and measurement may differ within their priors."""
     model = copy.deepcopy(model).requires_grad_(False)
     problem = Problem(model, reachable(model, halves.search), declared_free(model))
     free, deviations = dict(problem.free), dict[str, Deviation]()
@@ -206,7 +208,7 @@ def _first_fit(model: AnalyticModel, halves: Holdout, way: Grouping) -> Fit:
 
 
 def _of_a_new_room(fit: Fit, declared: AnalyticModel) -> AnalyticModel:
-    """The ball's model: what all rooms share, without effects that only single rooms have."""
+    """The ball's model: the shared coefficients and effects of all rooms."""
     model = fitted_model(fit)
     for deviation in fit.problem.deviations.values():
         name = deviation.coefficient.split(".")[1]
@@ -216,7 +218,7 @@ def _of_a_new_room(fit: Fit, declared: AnalyticModel) -> AnalyticModel:
 
 
 class _Predicting:
-    """Makes the models of all rooms from a fit, and judges them on their held-out halves."""
+    """Makes the models of all rooms from a fit, and evaluates them on their held-out halves."""
 
     def __init__(self, rooms: Sequence[Room], jobs: int) -> None:
         self.rooms, self.jobs = rooms, jobs
@@ -225,7 +227,7 @@ class _Predicting:
         self._judged: WeakKeyDictionary[BallModel, dict[str, Errors]] = WeakKeyDictionary()
 
     def __call__(self, fit: Fit) -> PredictiveModel:
-        """The model with its rooms' models behind it, and the errors on the search half of each."""
+        """The model with its rooms' models attached, and the errors on the search half of each."""
         models, column = {}, 0
         for room in self.rooms:
             launcher = fit.unknowns.launcher[column : column + room.settings]
@@ -236,7 +238,7 @@ class _Predicting:
         return PredictiveModel(model, _pooled(self._errors(models, "search_tracks")))
 
     def models(self, model: BallModel) -> dict[str, AnalyticModel]:
-        """The models of the rooms behind one that was made here."""
+        """The room models of a model from this class."""
         return self._models[model]
 
     def judge(self, model: BallModel) -> Errors:
@@ -280,7 +282,7 @@ class _Predicting:
 
 
 def _pooled(by_room: dict[str, Errors]) -> Errors:
-    """Errors of all rooms, each counting alike: geometric means of lengths, means of the rest."""
+    """Errors of all rooms with equal weights: geometric means of lengths, means of the rest."""
     every = list(by_room.values())
 
     def middle(name: str) -> float:
@@ -303,7 +305,7 @@ def _pooled(by_room: dict[str, Errors]) -> Errors:
 
 
 def _of_whom(findings: Sequence[Finding]) -> list[str]:
-    """Which effects are the ball's, and which single rooms have."""
+    """The effects of the ball, and those of single rooms."""
     names = [finding.name for finding in findings]
     own = tuple(n for n in names if n.endswith("_by_group"))
     shared = tuple(n for n in names if n not in own)

@@ -1,4 +1,4 @@
-"""The verdicts on spin labels: which are wrong, how surely, and by how much."""
+"""Holds the verdicts on spin labels: the probability that each is wrong, and its error."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -8,18 +8,18 @@ import numpy as np
 from ballfg.diagnosis.generic_test import ALARM
 
 SURE: Final = 0.95
-"""Probability from which on a label is called wrong."""
+"""Probability from which a label is reported as wrong."""
 
 
 @dataclass(frozen=True)
 class LabelVerdict:
-    """What is said of one spin label.
+    """The verdict on one spin label.
 
     Attributes:
         track: its name.
         probability: that the label is wrong.
-        off: rad/s, its distance from the spin that the flight shows.
-        sigma: rad/s, standard deviation of that spin along this distance, by noise and by the scatter of flight and
+        off: rad/s, distance of the label from the flight's spin.
+        sigma: rad/s, standard deviation of that spin along this distance, from noise and from the scatter of flight and
             bounces.
     """
 
@@ -31,7 +31,7 @@ class LabelVerdict:
 
 @dataclass(frozen=True)
 class LabelCheck:
-    """What is said of all spin labels.
+    """The verdicts on all spin labels.
 
     Attributes:
         p_all_right: probability that every label is right.
@@ -43,14 +43,14 @@ class LabelCheck:
 
     @property
     def contradicted(self) -> tuple[LabelVerdict, ...]:
-        """Verdicts on labels that are wrong as good as surely; none where all of them may well be right."""
+        """Verdicts on labels that are almost surely wrong; none if all labels may well be right."""
         if not self.p_all_right < ALARM:
             return ()
         return tuple(verdict for verdict in self.verdicts if verdict.probability >= SURE)
 
     @property
     def where(self) -> str:
-        """In words, which labels contradict their flights."""
+        """A description of the labels that contradict their flights."""
         wrong, labels = self.contradicted, len(self.verdicts)
         if not wrong:
             return (

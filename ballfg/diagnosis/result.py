@@ -1,4 +1,4 @@
-"""The result of a diagnosis: the verdict, effects added with their evidence, errors before and after, the rest."""
+"""Holds the result of a diagnosis: verdict, added effects with evidence, errors before and after, the rest."""
 
 from __future__ import annotations
 
@@ -57,11 +57,11 @@ class Finding:
     Attributes:
         name: of the effect.
         kind: of the effect: `flight`, `bounce` or `measurement`.
-        parameters: its coefficients as fitted to the tracks of both halves, once the search is over.
+        parameters: its coefficients fitted to the tracks of both halves, at the end of the search.
         p_value: of its score test, corrected for the number of candidates tested.
         delta_bic: BIC of the model with it minus BIC without; negative is better.
         indistinguishable_from: candidates that would have explained as much.
-        held_out_gain: log likelihood per track that it adds on the held-out half, natural units.
+        held_out_gain: increase of the log likelihood per track on the held-out half, natural units.
         held_out_p: probability of such a gain there by chance.
         sentence: describes the effect.
         decide: the measurement that tells the effect from others.
@@ -88,10 +88,10 @@ class Candidate:
         estimate: its coefficients after one step from absent.
         explained: squared whitened residual that it would explain.
         p_value: of its score test, corrected for the number of candidates.
-        delta_bic: after a full refit; None where the score did not call for one.
+        delta_bic: after a full refit; None if the score was too low for one.
         outcome: of the round.
-        seen_from: coefficient -> size, in its unit, from which on the score test would have noticed it in 9 of 10
-            such recordings, whatever the other coefficients are; empty where nothing shows it.
+        seen_from: coefficient -> size, in its unit, that the score test would have detected in 9 of 10 such recordings,
+            whatever the other coefficients are; empty if nothing shows it.
     """
 
     name: str
@@ -106,14 +106,14 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Refusal:
-    """An effect that fits better and is no name.
+    """An effect that fits better but is not accepted as a name.
 
     Attributes:
         name: of the effect.
         parameters: its coefficients as fitted.
-        outcome: why it is no name.
-        reason: numbers that show it, in words; empty where the outcome says it all.
-        decide: the measurement that would tell whether it is there.
+        outcome: reason for the refusal.
+        reason: numbers for it, in words; empty if the outcome is sufficient.
+        decide: the measurement that would decide whether it exists.
     """
 
     name: str
@@ -125,12 +125,12 @@ class Refusal:
 
 @dataclass(frozen=True)
 class PredictedPath:
-    """The prediction of one held-out track, to show it.
+    """The prediction of one held-out track, for pictures.
 
     Attributes:
         name: of the track.
         seen: (m, 3) m, measured positions of the observed part.
-        times: (k,) s since the end of the observed part, of the samples predicted.
+        times: (k,) s since the end of the observed part, of the predicted samples.
         predicted, measured: (k, 3) m at these times.
     """
 
@@ -170,7 +170,7 @@ class Errors:
 
 @dataclass(frozen=True)
 class Fallback:
-    """A description of the rest without a name.
+    """A description of the remaining pattern without a name.
 
     Attributes:
         kind: `sparse terms` or `learned residual`.
@@ -188,13 +188,13 @@ class Fallback:
 
 @dataclass(frozen=True)
 class Unexplained:
-    """The pattern that is left at the end.
+    """The remaining pattern at the end.
 
     Attributes:
-        where: one sentence; empty where nothing is left.
-        share_of_residual: part of the pattern at the start that is left, 0 to 1.
+        where: one sentence; empty without a remaining pattern.
+        share_of_residual: remaining part of the initial pattern, 0 to 1.
         tests: all generic tests at the end.
-        fallback: None where none was needed or none helped.
+        fallback: None if none was needed or none helped.
     """
 
     where: str
@@ -205,7 +205,7 @@ class Unexplained:
 
 @dataclass(frozen=True)
 class FlightResiduals:
-    """Accelerations in flight that the model lacks, one for each bin of time of each stretch.
+    """Unmodelled accelerations in flight, one for each bin of time of each stretch.
 
     Attributes:
         stretch: (m,) number of the stretch.
@@ -289,17 +289,17 @@ class Diagnosis:
         after: the same with the corrected model: named effects, and the fallback where there is one.
         tracks_found_on: tracks of the search half.
         tracks_judged_on: tracks of the held-out half.
-        calibrated: declared coefficients as fitted with the corrected model to the tracks of both halves.
+        calibrated: declared coefficients fitted with the corrected model to the tracks of both halves.
         noise: position noise along x, y, z as estimated (m), and as stated.
-        unexplained: the pattern that is left.
-        model: the corrected model. Without a fallback it is fitted to the tracks of both halves once it was judged.
+        unexplained: the remaining pattern.
+        model: the corrected model. Without a fallback it is fitted to the tracks of both halves after its evaluation.
         residuals_before: of the search half with the declared model.
         residuals_after: of the search half with the corrected model.
-        excluded: sentences on tracks that were not used.
-        remarks: sentences on effects that fit better and are no names, and on fitted values that are not plausible.
-        floor_mm: prediction error that the held-out tracks would have if nothing were wrong with the corrected model:
-            what measurement noise and the unknown release alone leave; NaN where that is not known.
-        labels: what is said of each spin label; None where there is none.
+        excluded: sentences on unused tracks.
+        remarks: sentences on refused effects that fit better, and on implausible fitted values.
+        floor_mm: prediction error of the held-out tracks for an exact corrected model, from measurement noise and the
+            unknown release alone; NaN if unknown.
+        labels: verdicts on the spin labels; None without labels.
     """
 
     dataset: str
@@ -329,7 +329,7 @@ class Diagnosis:
     def plot(self) -> Figure:
         """A picture of the prediction error of each held-out track, before and after the model was corrected.
 
-        Where nothing was added to the model, it shows the residuals of the fitted model over their normal distribution.
+        If nothing was added to the model, it shows the residuals of the fitted model over their normal distribution.
         """
         from ballfg.diagnosis.report import pictures
 

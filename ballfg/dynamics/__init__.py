@@ -1,4 +1,4 @@
-"""How a ball moves: the contract, physical effects, learned models, exact contacts, rollouts, model files."""
+"""The room of the ball's motion gives models, effects, contacts, rollouts and model files."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""The analytic model: a ball whose motion and measurement are a sum of named physical effects."""
+"""The analytic model describes motion and measurement of a ball as a sum of named physical effects."""
 
 from collections.abc import Iterable, Iterator
 from typing import cast
@@ -36,7 +36,7 @@ class AnalyticModel(BallModel):
         groups = {"flight": self.flight, "bounce": self.bounce, "measurement": self.measurement}
         for effect in sorted(after_needs(effects), key=_rank):
             groups[effect.kind][effect.name] = effect
-        # names, not effects: `substitute` puts others in their places
+        # names, not effects: `substitute` exchanges the effects
         self._moving_air = _overriding(self.flight, FlightEffect, "air_velocity")
         self._adjusting = _overriding(self.flight, FlightEffect, "adjust")
         self._turning = _overriding(self.flight, FlightEffect, "spin_rate")
@@ -70,7 +70,7 @@ class AnalyticModel(BallModel):
         return acceleration, spin_rate
 
     def after_bounce(self, state: Tensor) -> Tensor:
-        """(..., 9) state just after an impact on a surface, from the state (..., 9) before it."""
+        """(..., 9) state right after an impact on a surface, from the state (..., 9) before it."""
         velocity, spin = state[..., VELOCITY], state[..., SPIN]
         slope = self.surface_slope(state)
         if slope is not None:
@@ -84,7 +84,7 @@ class AnalyticModel(BallModel):
         return torch.cat((state[..., POSITION], velocity, spin), dim=-1)
 
     def surface_offset(self, state: Tensor) -> Tensor | float:
-        """(...) m by which surfaces lie above the heights declared for them, where the ball would touch them.
+        """(...) m by which surfaces lie above their declared heights at the point where the ball would touch them.
 
         A ball that touches a slope does so beside its lowest point: its centre is R sqrt(1 + slope^2) above the slope.
         """
@@ -104,11 +104,11 @@ class AnalyticModel(BallModel):
 
     @property
     def measures_plainly(self) -> bool:
-        """Whether there is no measurement effect."""
+        """True if the model has no measurement effect."""
         return len(self.measurement) == 0
 
     def measured(self, states: Tensor, later: Later) -> Tensor:
-        """(..., 3) m, the positions as they are measured, before noise: one effect after the other."""
+        """(..., 3) m, measured positions before noise; the measurement effects act one after the other."""
         for effect in self._measuring():
             states = torch.cat((effect.positions(states, later), states[..., POSITION.stop :]), dim=-1)
         return states[..., POSITION]
@@ -140,7 +140,7 @@ class AnalyticModel(BallModel):
 
 
 def after_needs(effects: Iterable[Effect]) -> list[Effect]:
-    """The effects in their order, but each behind those that it needs.
+    """Sorts effects such that each follows those that it needs; otherwise their order stays.
 
     Raises: ValueError: if one is given twice, or needs one that is not there.
     """
@@ -165,12 +165,12 @@ def after_needs(effects: Iterable[Effect]) -> list[Effect]:
 
 
 def _rank(effect: Effect) -> tuple[int, str]:
-    """What sorts measurement effects; the order of all others stays."""
+    """The rank of a measurement effect; 0 for all others, so that their order stays."""
     return (effect.rank, effect.name) if isinstance(effect, MeasurementEffect) else (0, "")
 
 
 def _sum(terms: Iterable[Tensor | None]) -> Tensor | None:
-    """The sum of the terms that there are, in their order; None where there is none."""
+    """The sum of the terms that are not None, in their order; None if there is none."""
     total: Tensor | None = None
     for term in terms:  # the innermost loop of every estimate: `functools.reduce` over a list costs 5 % of a flight
         if term is not None:
@@ -179,14 +179,14 @@ def _sum(terms: Iterable[Tensor | None]) -> Tensor | None:
 
 
 def _overriding(group: nn.ModuleDict, base: type[Effect], method: str) -> tuple[str, ...]:
-    """Names of the effects of a group that do something in a method of their base class."""
+    """Names of the effects of a group that override a method of their base class."""
     return tuple(name for name, effect in group.items() if getattr(type(effect), method) is not getattr(base, method))
 
 
 def coefficient_sigmas(model: BallModel) -> dict[str, float]:
     """Prior standard deviations of the coefficients that are estimated with each track, by parameter name.
 
-    Args: model: one that declares nothing of its parameters gives an empty mapping.
+    Args: model: a model without declared coefficients gives an empty mapping.
     Returns: for instance {"flight.drag.k": 0.035}; coefficients that do not vary are left out.
     """
     return {name: c.sigma for name, c in model.declared_coefficients().items() if c.varies}

@@ -1,7 +1,7 @@
-"""A ball whose uncertain coefficients travel with its state, so that one Jacobian serves both.
+"""An augmented model carries uncertain coefficients along with the state, so that one Jacobian serves both.
 
-Augmented states are (..., 9 + p): the state, then p coefficients that do not change in time. Everything that is
-written for a `BallModel` (flight, contacts, rollouts, their Jacobians) works on them unchanged.
+Augmented states are (..., 9 + p): the state, then p coefficients that are constant in time. Flight, contacts, rollouts
+and their Jacobians work on them as on any `BallModel`.
 """
 
 from collections.abc import Sequence
@@ -40,11 +40,11 @@ class AugmentedModel(BallModel):
 
     @property
     def width(self) -> int:
-        """How many columns follow the state."""
+        """Number of columns after the state."""
         return len(self.names)
 
     def means(self) -> Tensor:
-        """(p,) the model's own values, as its parameters are now."""
+        """(p,) the present values of the model's own parameters."""
         parameters = dict(self.model.named_parameters())
         return torch.stack([parameters[name].reshape(()) for name in self.names])
 
@@ -71,29 +71,17 @@ class AugmentedModel(BallModel):
         return None if self._level else self.bound(state).surface_slope(state[..., :STATE_DIM])
 
     def inside(self, state: Tensor) -> Tensor | None:
-        """(...) as the model: a weight that no coefficient changes."""
+        """(...) weight of the model, which does not depend on the coefficients."""
         return self.model.inside(state[..., :STATE_DIM])
 
     @property
-    def measures_plainly(self) -> bool:
-        """As the model."""
-        return self.model.measures_plainly
+    def measuring(self) -> BallModel:
+        """The model: coefficients that act on stamps and labels do not travel with the state."""
+        return self.model
 
     def measured(self, states: Tensor, later: Later) -> Tensor:
         """(..., 3) m, the positions as they are measured; `later` gives states without coefficients."""
         return self.bound(states).measured(states[..., :STATE_DIM], later)
-
-    def true_stamps(self, stamps: Tensor) -> Tensor:
-        """(...) s, as the model; coefficients that act on stamps do not travel with the state."""
-        return self.model.true_stamps(stamps)
-
-    def stamps(self, times: Tensor) -> Tensor:
-        """(...) s, as the model; coefficients that act on stamps do not travel with the state."""
-        return self.model.stamps(times)
-
-    def labelled(self, spin: Tensor) -> Tensor:
-        """(..., 3) rad/s, as the model; coefficients that act on labels do not travel with the state."""
-        return self.model.labelled(spin)
 
     def roll(self, state: Tensor) -> Rates:
         """Rates of a ball that rests on a surface."""

@@ -1,4 +1,4 @@
-"""Names of parameters in files and scripts of earlier versions."""
+"""Translates parameter names of earlier versions in files and scripts."""
 
 import re
 import warnings
@@ -9,17 +9,17 @@ _OF_BOUNCE: Final = re.compile(r"^((?:model\.|base\.)*)contact\.")
 
 
 def todays_name(name: str, known: Container[str] = ()) -> str:
-    """The name of a parameter today: a coefficient of the bounce, as `bounce.restitution.e`, began with `contact.`.
+    """Today's name of a parameter: `bounce.restitution.e`, for instance, was `contact.restitution.e`.
 
     Args:
         name: today's or an earlier one.
-        known: names of today, which stay as they are: a network for the contact still is `contact`.
+        known: today's names, which stay: `contact` is still the name of a learned model's network.
     """
     return name if name in known else _OF_BOUNCE.sub(r"\1bounce.", name)
 
 
 def todays_names(names: Iterable[str], known: Container[str] = ()) -> tuple[str, ...]:
-    """Names of parameters today, with a `DeprecationWarning` for each that a user wrote in its earlier form.
+    """Today's names of parameters, with a `DeprecationWarning` for each earlier name.
 
     Args: names, known: as for `todays_name`.
     """
@@ -31,6 +31,6 @@ def todays_names(names: Iterable[str], known: Container[str] = ()) -> tuple[str,
 
 
 def warn_of(earlier: str, name: str) -> None:
-    """A `DeprecationWarning` that gives the name of today, and the version that refuses the earlier one."""
+    """A `DeprecationWarning` with today's name and the version that will refuse the earlier one."""
     message = f"'{earlier}' is the earlier name of '{name}' and will be refused from version 0.2 on. Write '{name}'."
     warnings.warn(message, DeprecationWarning, stacklevel=3)

@@ -1,8 +1,8 @@
-"""What one physical effect is: a small torch module with named, bounded coefficients and a prior for each.
+"""An effect is a small torch module that describes one physical influence by bounded coefficients with priors.
 
 An effect of kind `flight` adds to the acceleration or the angular acceleration of the free ball, or changes what other
 flight effects act on; one of kind `bounce` changes the coefficients of an impact or the place of the surfaces. The
-third kind, `measurement`, is in `ballfg.dynamics.measurement`. A model is a set of effects; nothing else has to know
+third kind, `measurement`, is in `ballfg.dynamics.measurement`. A model is a set of effects; no other code has to know
 them.
 """
 
@@ -38,10 +38,10 @@ class Usual:
     """The strength that an effect usually has, and where the number comes from."""
 
     change: Mapping[str, float]
-    """By coefficient, in its unit: the step from absence; from the default of one whose prior has no spread."""
+    """Change of each coefficient, in its unit: from absence, or from the default if its prior has no spread."""
     source: str
     graded: bool = True
-    """It comes in sizes; else it is there or not."""
+    """True if the effect has a size; False if it is present or absent."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Coefficient:
     default: float
     """Nominal value for a table-tennis ball."""
     sigma: float
-    """Standard deviation of the prior: how far real balls, tables and cameras stray. 0: as good as known."""
+    """Prior standard deviation, from the spread of real balls, tables and cameras. 0: a constant."""
     unit: str
     """SI unit, `1` where the number has none."""
     low: float
@@ -60,14 +60,14 @@ class Coefficient:
     high: float
     """Largest value accepted."""
     varies: bool = False
-    """Differs from ball to ball or day to day by more than one track needs to tell: estimated with each track."""
+    """True if the coefficient differs between balls or days by more than one track can resolve: fit per track."""
     absent: float | None = 0.0
-    """The value at which the effect is not there. None for a shape (a reference, a centre, a size): while all others of
-    its effect are absent it changes nothing."""
+    """The value at which the effect vanishes. None for a shape (a reference, a centre, a size), which changes nothing
+    while all other coefficients of its effect are absent."""
 
 
 TINY_LENGTH = 1e-12
-"""In the vector's own unit. Below it a length is constant to autograd."""
+"""In the vector's own unit. Autograd takes shorter lengths as constant."""
 
 
 def length(vector: Tensor) -> Tensor:
@@ -83,7 +83,7 @@ def vector(*coefficients: Tensor) -> Tensor:
 
 
 def per_row(value: Tensor) -> Tensor:
-    """() or (...) from a coefficient of shape () or (..., 1): what multiplies quantities without a last axis."""
+    """() or (...) from a coefficient of shape () or (..., 1), to multiply quantities without a last axis."""
     return value.squeeze(-1) if value.dim() else value
 
 
@@ -94,7 +94,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Scene:
-    """Extent of the data that a set of tracks spans; effects say in which shapes they may act there.
+    """Extent of the data in a set of tracks; effects choose their shapes by it.
 
     Attributes:
         low, high, middle: m, of the positions; the middle is the median.
@@ -156,13 +156,13 @@ class Flight:
         return moved
 
     def more_drag(self, share: Tensor) -> Flight:
-        """This flight with the drag larger by a share (..., 1) of the drag that `Drag` alone gives; shares add up."""
+        """This flight with more drag, by a share (..., 1) of the effect `Drag` alone; shares add up."""
         changed = self._copy()
         changed.drag_gain = 1.0 + share if self.drag_gain is None else self.drag_gain + share
         return changed
 
     def more_lift(self, share: Tensor) -> Flight:
-        """This flight with the Magnus force larger by a share (..., 1) of what `Magnus` alone gives; shares add up."""
+        """This flight with more Magnus force, by a share (..., 1) of the effect `Magnus` alone; shares add up."""
         changed = self._copy()
         changed.lift_gain = 1.0 + share if self.lift_gain is None else self.lift_gain + share
         return changed
@@ -205,26 +205,26 @@ class Impact:
 
 
 class Effect(nn.Module, ABC):
-    """Base of all effects. A subclass names itself, its coefficients, and all that is known of it.
+    """Base of all effects. A subclass declares its name, its coefficients and everything known about it.
 
     Each coefficient becomes a float64 `nn.Parameter` attribute of its name. Code must let it have shape () or any
     shape that broadcasts against (..., 1), so that one call can carry another value for each track.
 
     Attributes:
         name: as in a model file.  kind: the section of a model file that takes it.
-        sentence: what it is, and what looks exactly the same.
-        decide: what to measure to tell it from what it is mistaken for.
+        sentence: describes the effect, and which others look exactly the same.
+        decide: the measurement that tells the effect from those it is mistaken for.
         plain: a noun for readers who are no specialists, such as `a wind`; its name with spaces where it is empty.
         says: a sentence for them, with fields such as `{k:.2g}` for what was fitted (`ballfg.dynamics.wording`); where
             it is empty, the first of `sentence` with all coefficients.
         coefficients: its numbers; an instance may have priors of its own (`set_sigmas`).
-        plausible: range of its strengths, for a table-tennis ball, its table and its room. A value outside stands for
-            something else, and a diagnosis never names it. None: the limit is ten sigmas from the default.
-        usual: the strength that it usually has; None where nobody knows.
-        belongs_to: the ball, which takes it to every room; the room; or the rig that measures there.
-        imitated: other effects, or free coefficients of a model, do exactly the same: tracks alone cannot name it.
-        needs: names of effects that must be in the same model, since this one changes them.
-        multiplies_spin: its strength multiplies a spin that nobody may know: without labels it has no slope at absence.
+        plausible: range of strengths for a table-tennis ball, its table and its room. A diagnosis never names an effect
+            outside of its range. None: the limit is ten sigmas from the default.
+        usual: the usual strength; None if unknown.
+        belongs_to: the ball (the effect follows it to every room), the room, or the rig that measures there.
+        imitated: True if other effects or coefficients do exactly the same, so that tracks alone cannot name it.
+        needs: names of effects that this one modifies and that must be in the same model.
+        multiplies_spin: True if its strength multiplies the spin: without spin labels its slope at absence is zero.
 
     Raises: ValueError: if a value is given for an unknown coefficient, or lies out of its bounds.
     """
@@ -280,16 +280,16 @@ class Effect(nn.Module, ABC):
 
     @classmethod
     def shapes(cls, scene: Scene) -> Sequence[Mapping[str, float]]:
-        """Values of the shape coefficients with which the effect is looked for in data that span `scene`.
+        """Values of the shape coefficients at which a search looks for the effect in data that span `scene`.
 
-        By default the shapes are as declared. A reference is best put in the middle of the data, a region over all of
-        their extent. None: it cannot act there.
+        By default the declared shapes. A reference is best put in the middle of the data, a region over all of their
+        extent. None: the effect cannot act there.
         """
         return ({},)
 
 
 class FlightEffect(Effect):
-    """An effect on the free ball. It overrides one or more of the methods; what it leaves alone does nothing.
+    """An effect on the free ball. A subclass overrides one or more of the methods; the others do nothing.
 
     A model asks in three passes: how the air moves, then how large the air forces are, then for the forces. From the
     second pass on every effect sees the velocity against the air.
@@ -320,7 +320,7 @@ class BounceEffect(Effect):
     kind: ClassVar[Kind] = "bounce"
 
     def adjust(self, impact: Impact) -> Impact:
-        """The impact with this effect in it."""
+        """The impact as this effect changes it."""
         return impact
 
     def surface_offset(self, position: Tensor) -> Tensor | None:

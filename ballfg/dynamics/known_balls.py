@@ -1,4 +1,4 @@
-"""The balls with a nominal model of their own: size and mass by the rules of their game, and how sure the model is."""
+"""Lists the balls that have a nominal model, with size and mass from the rules of their game."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ SHUTTLE: Final = (
     "a badminton shuttle is no ball: it turns its cork ahead, and its drag depends on how it is turned. "
     "No model here describes that; choose another ball."
 )
-"""The answer to somebody who asks for badminton."""
+"""The error message for badminton."""
 ALIASES: Final[Mapping[str, str]] = {"soccer": "football", "golf_ball": "golf", "tabletennis": "table_tennis"}
 """Other names of known balls."""
 
@@ -58,12 +58,12 @@ KNOWN_BALLS: Final[Mapping[str, KnownBall]] = {name: known for name, (known, _) 
 
 
 def nominal_content(name: str) -> dict[str, Any]:
-    """What the model file of a known ball declares; name: in `KNOWN_BALLS`."""
+    """The declarations in the model file of a known ball; name: in `KNOWN_BALLS`."""
     return _FILES[name][1]
 
 
 def known_ball(name: str) -> str:
-    """The name in `KNOWN_BALLS` of a ball that a user names, with `-` or blanks for `_`.
+    """The name in `KNOWN_BALLS` of a ball that a user names; `-` and blanks stand for `_`.
 
     Raises: ValueError: no such ball, or a badminton shuttle.
     """

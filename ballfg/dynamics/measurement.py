@@ -1,4 +1,4 @@
-"""What a measurement effect is: what is written down differs from what happened, the ball's motion stays as it is."""
+"""A measurement effect changes the recorded data, while the motion of the ball stays the same."""
 
 from collections.abc import Callable
 from typing import ClassVar
@@ -13,11 +13,11 @@ Later = Callable[[Tensor], Tensor]
 
 
 class MeasurementEffect(Effect):
-    """An effect on positions, stamps or spin labels. It overrides what it changes; the rest is written as it is.
+    """An effect on positions, stamps or spin labels. A subclass overrides the methods of what it changes.
 
     Attributes:
-        rank: effects of a model act in the order of their ranks, those of one rank in that of their names. Below 10:
-            may use `later`. 10 to 99: positions only. From 100 on: stamps and labels.
+        rank: effects of a model act in the order of their ranks, then of their names. Effects below rank 10 may use
+            `later`. 10 to 99: positions only. From 100 on: stamps and labels.
     """
 
     kind: ClassVar[Kind] = "measurement"
@@ -28,22 +28,22 @@ class MeasurementEffect(Effect):
         """(..., 3) m, the positions as they are measured, before noise.
 
         Args:
-            states: (..., 9) true states, their positions those that the effect before this one measures.
+            states: (..., 9) true states, with positions as the previous effect measures them.
             later: the true motion from the true states on.
         """
         return states[..., POSITION]
 
     def true_stamps(self, stamps: Tensor) -> Tensor:
-        """(...) s of true time since the first stamp of a track, from the time written since then.
+        """(...) s of true time since the first stamp of a track, from the recorded time.
 
         Coefficients of shape (n, 1) go with stamps of shape (..., n, 1).
         """
         return stamps
 
     def stamps(self, times: Tensor) -> Tensor:
-        """(...) s as written since the first stamp of a track, from true times (...) s; undoes `true_stamps`."""
+        """(...) s of recorded time since the first stamp of a track, from true times (...) s; undoes `true_stamps`."""
         return times
 
     def label(self, spin: Tensor) -> Tensor:
-        """(..., 3) rad/s as a label says, from the true spin (..., 3) rad/s; affine in it."""
+        """(..., 3) rad/s, the spin that a label states, from the true spin (..., 3) rad/s; affine in it."""
         return spin

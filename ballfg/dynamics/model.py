@@ -1,4 +1,4 @@
-"""The contract that every model of a ball keeps, analytic or learned: how it flies, bounces and rolls."""
+"""Defines the interface of every ball model, analytic or learned: rates of flight, impact, rolling, measurement."""
 
 import functools
 from abc import ABC, abstractmethod
@@ -18,7 +18,8 @@ from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, VELOCITY, VZ, Z
 if TYPE_CHECKING:
     from ballfg.dynamics.trained import Trained
     from ballfg.dynamics.variation import Variation
-    from ballfg.tracks import Track, TrackNoise
+    from ballfg.tracks import Track
+    from ballfg.tracks.noise import TrackNoise
 
 THIN_SHELL: Final = 2.0 / 3.0
 """Moment of inertia of a thin spherical shell divided by m R^2."""
@@ -35,11 +36,11 @@ Rates = tuple[Tensor, Tensor | None]
 M = TypeVar("M", bound=nn.Module)
 
 _SUBSTITUTED = "_substituted"
-"""Attribute of a module that `substitute` made: the names of its own parameters that are given tensors."""
+"""Attribute of a copy by `substitute`: names of the module's own parameters that were replaced by tensors."""
 
 
 class BallModel(nn.Module, ABC):
-    """A ball of some radius that flies, hits surfaces and comes to rest on them, and how it is measured.
+    """A ball with a radius, its flight, its impacts, its rest on surfaces, and its measurement.
 
     States are (..., 9) float64 (see `ballfg.state`). Rates are a pair: acceleration (..., 3) m/s^2, and angular
     acceleration (..., 3) rad/s^2 or None where the spin is constant (a third of a Jacobian's cost is saved then).
@@ -48,11 +49,11 @@ class BallModel(nn.Module, ABC):
     Attributes:
         radius: m.
         inertia_factor: moment of inertia divided by m R^2.
-        trained: the noise and the launcher that were learned together with the model; None where nothing was.
-        noise: how far tracks scatter about the model; None where nobody has looked.
+        trained: the noise and the launcher that were learned together with the model; None if none were.
+        noise: the scatter of tracks about the model; None if unknown.
         variations: coefficients that differ between tracks, by name as in `named_parameters()`.
-        random: whether it draws random numbers, so that the same state has another future each time; what is
-            compiled of such a model is its `in_flight`.
+        random: True if the model draws random numbers, so that the same state has another future each time; machine
+            code then uses its `in_flight`.
 
     Raises: ValueError: if the radius is not within 0.001 to 1 m, or the inertia factor not within 0 to 1.
     """
@@ -75,7 +76,7 @@ class BallModel(nn.Module, ABC):
         self.variations: Mapping[str, Variation] = {}
 
     def for_track(self, track: "Track") -> Self:
-        """The model with the coefficients of one track: itself, unless some of them differ between tracks."""
+        """The model with the coefficients of one track; the model itself if none differ between tracks."""
         model = self
         for name, variation in self.variations.items():
             if (value := variation.value(track)) is not None:
@@ -84,7 +85,7 @@ class BallModel(nn.Module, ABC):
 
     @property
     def in_flight(self) -> "BallModel":
-        """A model that flies and meets surfaces alike and is not random; this one, unless it is."""
+        """The same motion without randomness; the model itself if it is not random."""
         return self
 
     @functools.cached_property
@@ -93,9 +94,9 @@ class BallModel(nn.Module, ABC):
         return sum(p.numel() for p in self.parameters())
 
     def declared_coefficients(self) -> dict[str, Coefficient]:
-        """What is declared of the model's scalar parameters - unit, bounds, prior - by name as in `named_parameters()`.
+        """Declarations (unit, bounds, prior) of the model's scalar parameters, by name as in `named_parameters()`.
 
-        Parameters without a declaration (a network's weights) are not in it; by default none is.
+        Parameters without a declaration, such as a network's weights, are left out.
         """
         return {}
 
@@ -105,10 +106,10 @@ class BallModel(nn.Module, ABC):
 
     @abstractmethod
     def after_bounce(self, state: Tensor) -> Tensor:
-        """State (..., 9) just after an impact on a surface, from the state (..., 9) before it; the position stays."""
+        """State (..., 9) right after an impact on a surface, from the state (..., 9) before it; the position stays."""
 
     def surface_offset(self, state: Tensor) -> Tensor | float:
-        """(...) m by which surfaces lie above the heights declared for them; none, unless a model says so."""
+        """(...) m by which surfaces lie above their declared heights; zero by default."""
         return 0.0
 
     def surface_slope(self, state: Tensor) -> Tensor | None:
@@ -131,41 +132,46 @@ class BallModel(nn.Module, ABC):
         return acceleration[..., Z] if slope is None else acceleration[..., Z] - climb(slope, acceleration)
 
     def inside(self, state: Tensor) -> Tensor | None:
-        """(...) from 1 where a learned model was trained to 0 far from there, of states (..., 9); None: not told."""
+        """(...) weight of states (..., 9): 1 where a learned model was trained, 0 far from there; None: unknown."""
         return None
 
     def save(self, path: str | Path) -> None:
-        """Write a model file, as `save_model`."""
+        """Writes a model file by `save_model`."""
         from ballfg.dynamics.model_file import save_model
 
         save_model(self, path)
 
     @property
+    def measuring(self) -> "BallModel | None":
+        """The model inside this one that says how the ball is measured; None: it is taken to be written as it is."""
+        return None
+
+    @property
     def measures_plainly(self) -> bool:
         """Whether positions, stamps and spin labels are taken to be written down as they are."""
-        return True
+        return self.measuring is None or self.measuring.measures_plainly
 
     def measured(self, states: Tensor, later: Later) -> Tensor:
-        """(..., 3) m, the positions as they are measured, before noise.
+        """(..., 3) m, measured positions before noise.
 
         Args: states: (..., 9) true states.  later: a delay (s, not negative) to the true states that much later.
         """
-        return states[..., POSITION]
+        return states[..., POSITION] if self.measuring is None else self.measuring.measured(states, later)
 
     def true_stamps(self, stamps: Tensor) -> Tensor:
-        """(...) s of true time since the first stamp of a track, from the time written since then.
+        """(...) s of true time since the first stamp of a track, from the recorded time.
 
-        Where each of n tracks has its own coefficients, of shape (n, 1), stamps have the shape (..., n, 1).
+        Coefficients of shape (n, 1), one for each of n tracks, go with stamps of shape (..., n, 1).
         """
-        return stamps
+        return stamps if self.measuring is None else self.measuring.true_stamps(stamps)
 
     def stamps(self, times: Tensor) -> Tensor:
         """(...) s as written since the first stamp of a track, from true times (...) s; undoes `true_stamps`."""
-        return times
+        return times if self.measuring is None else self.measuring.stamps(times)
 
     def labelled(self, spin: Tensor) -> Tensor:
         """(..., 3) rad/s as a label says, before noise, from the true spin (..., 3) rad/s; affine in it."""
-        return spin
+        return spin if self.measuring is None else self.measuring.labelled(spin)
 
     def roll(self, state: Tensor) -> Rates:
         """Rates of a ball that rests on a surface: (..., 3) m/s^2, vertically zero, and (..., 3) rad/s^2.
@@ -188,17 +194,17 @@ class BallModel(nn.Module, ABC):
 
 
 def climb(slope: Tensor, motion: Tensor) -> Tensor:
-    """(...) by which a surface of some slope (..., 2) rises along a motion (..., 3), in the motion's unit."""
+    """(...) rise of a surface of slope (..., 2) along a motion (..., 3), in the motion's unit."""
     return (slope * motion[..., :2]).sum(-1)
 
 
 def _soft_direction(vector: Tensor) -> Tensor:
-    """The direction of (..., 2) vectors, shortened smoothly to zero below `SOFT_SLIP`."""
+    """The direction of (..., 2) vectors, with a length that falls smoothly to zero below `SOFT_SLIP`."""
     return vector / (vector.square().sum(-1, keepdim=True) + SOFT_SLIP**2).sqrt()
 
 
 def substitute(module: M, values: Mapping[str, Tensor]) -> M:
-    """A copy of a module in which some parameters or buffers are the given tensors; everything else is shared.
+    """A copy of a module with some parameters or buffers replaced by tensors; everything else is shared.
 
     Args:
         module: for instance a `BallModel`.
@@ -227,12 +233,12 @@ def substitute(module: M, values: Mapping[str, Tensor]) -> M:
 
 
 def is_substituted(module: nn.Module) -> bool:
-    """Whether `substitute` made a module."""
+    """True if the module is a copy by `substitute`."""
     return any(_SUBSTITUTED in part.__dict__ for part in module.modules())
 
 
 def _with_value(module: M, name: str, value: float) -> M:
-    """A copy of a module in which one scalar parameter, still a parameter, has another value; the rest is shared."""
+    """A copy of a module with another value of one scalar parameter, which stays a parameter; the rest is shared."""
     clone = _shallow_copy(module)
     head, _, rest = name.partition(".")
     if rest:
@@ -248,10 +254,10 @@ def _with_value(module: M, name: str, value: float) -> M:
 
 
 def take_rows(module: M, rows: Tensor, count: int) -> M:
-    """The module for some rows of a batch: parameters that `substitute` gave per row are cut to those rows.
+    """The module for some rows of a batch: substituted parameters with a row each are cut to those rows.
 
     Args:
-        module: for instance a `BallModel`; itself returned where nothing was substituted.
+        module: for instance a `BallModel`; returned itself if nothing was substituted.
         rows: boolean mask (n,) or indices.
         count: n, the size of the whole batch.
     """
@@ -270,7 +276,7 @@ def take_rows(module: M, rows: Tensor, count: int) -> M:
 
 
 def _shallow_copy(module: M) -> M:
-    """A module of its own with the same parts; cheaper than `copy.copy`, since estimators pay for it at each stage."""
+    """A copy of a module with the same parts; cheaper than `copy.copy`, since estimators make one at each stage."""
     clone = object.__new__(type(module))
     own = clone.__dict__
     own.update(module.__dict__)

@@ -1,4 +1,4 @@
-"""Model files: which effects a model declares, with the values of their coefficients, and what is learned, as YAML."""
+"""Reads and writes model files: the effects of a model with their coefficients, and its learned part."""
 
 import difflib
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ from ballfg.dynamics.variation import Variation
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.files.whole_file import write_text
 from ballfg.files.whole_folder import of_one_state
-from ballfg.tracks import TrackNoise
+from ballfg.tracks.noise import TrackNoise
 
 KINDS: Final[tuple[Kind, ...]] = ("flight", "bounce", "measurement")
 VARIATIONS: Final = "variations"
@@ -24,7 +24,7 @@ SECTIONS = (*KINDS, VARIATIONS, "learned")
 LONGEST_NAME: Final = 255
 """Characters of a folder's name."""
 NOISE: Final = "noise"
-"""Entry of the section `measurement` that is no effect: how far tracks scatter about the model."""
+"""Entry of the section `measurement` that is not an effect: the scatter of tracks about the model."""
 
 
 @of_one_state
@@ -37,13 +37,12 @@ def load_model(
         path: YAML file with the sections `flight`, `bounce`, `measurement`, `variations`, `learned` (docs/models.md).
         radius: m, of the ball, usually from the dataset.
         inertia_factor: moment of inertia divided by m R^2.
-        room: name of the dataset that the model is used with. In one that had no part in its training a network that
-            fades keeps half of its correction, or nothing where that did not help tracks held out in training. None:
-            as trained.
-    Returns: the analytic model where `learned` is null; else what the folder holds, a `LearnedModel` or an analytic
-        model with what was learned beside it (`trained`).
+        room: name of the dataset to estimate. In a room outside of its training a network that fades keeps half of its
+            correction, or nothing if that did not help held-out training tracks. None: as trained.
+    Returns: the analytic model if `learned` is null; else the content of the learned folder: a `LearnedModel` or an
+        analytic model with trained noise and launcher (`trained`).
     Raises:
-        FileNotFoundError: if there is no such file, or not the folder that it names.
+        FileNotFoundError: if the model file or the learned folder does not exist.
         ValueError: if it is not YAML, or names a section, effect or coefficient that does not exist, or a value
             outside its bounds; or if the folder does not hold a learned part of this version.
     """
@@ -73,20 +72,20 @@ def load_model(
 
 
 def _is_plain(name: str) -> bool:
-    """Whether a name leads nowhere else."""
+    """True if a name does not lead to another folder."""
     return name not in (".", "..") and Path(name).name == name
 
 
 def model_from_dict(
     content: Any, *, radius: float = 0.02, inertia_factor: float = THIN_SHELL, where: str = "model"
 ) -> AnalyticModel:
-    """The model that a parsed model file without a learned part describes.
+    """The model of a parsed model file without a learned part.
 
     Args:
         content: the sections `flight`, `bounce`, `measurement` and `variations` (docs/models.md).
         radius: m, of the ball.
         inertia_factor: moment of inertia divided by m R^2.
-        where: begins the error messages.
+        where: start of the error messages.
     Raises: ValueError: if it names a section, effect or coefficient that does not exist, or a value out of its bounds.
     """
     if not isinstance(content, Mapping):
@@ -137,7 +136,7 @@ def _variations(section: Any, model: AnalyticModel, where: str) -> dict[str, Var
 
 
 def _without_noise(content: Mapping[str, Any], where: str) -> tuple[Mapping[str, Any], TrackNoise | None]:
-    """The content without `measurement.noise`, which is no effect, and what that says."""
+    """Splits `measurement.noise`, which is not an effect, from the rest of the content."""
     section = content.get("measurement")
     if not isinstance(section, Mapping) or section.get(NOISE) is None:
         return content, None
@@ -168,7 +167,7 @@ def _nearest(name: object, known: tuple[str, ...]) -> str:
 
 
 def model_to_dict(model: AnalyticModel) -> dict[str, Any]:
-    """What a model file says about this model's effects."""
+    """The content of a model file for this model's effects."""
     content: dict[str, Any] = {}
     for kind, group in zip(KINDS, (model.flight, model.bounce, model.measurement), strict=True):
         content[kind] = {name: cast(Effect, effect).values() for name, effect in group.items()}
@@ -178,16 +177,16 @@ def model_to_dict(model: AnalyticModel) -> dict[str, Any]:
 
 
 def _listed(variations: Mapping[str, Variation]) -> dict[str, Any]:
-    """The section of coefficients that differ between tracks, if any do; those of a learned model are its base's."""
+    """The section `variations` of a model file; a learned model lists those of its base."""
     section = {name.removeprefix("base."): variation.to_mapping() for name, variation in variations.items()}
     return {VARIATIONS: section} if section else {}
 
 
 def save_model(model: BallModel, path: str | Path) -> None:
-    """Write a model file, and beside it the folder of its learned part if it has one.
+    """Writes a model file and, beside it, the folder of the learned part if the model has one.
 
-    The final names appear only once file and folder are whole. The folder of an earlier model of that name stays:
-    copies of its file may name it.
+    The final names appear only once file and folder are complete. An earlier model's folder stays: copies of its file
+    may name it.
 
     Raises: TypeError: if the model is neither analytic nor learned, or corrects one that is not analytic.
     """
@@ -203,7 +202,7 @@ def save_model(model: BallModel, path: str | Path) -> None:
 
 
 def _analytic_part(model: BallModel) -> AnalyticModel:
-    """The effects that the file declares: none beside a learned model without a base."""
+    """The effects for the model file: none for a learned model without a base."""
     from ballfg.dynamics.networks.learned import LearnedModel
 
     part = model.base if isinstance(model, LearnedModel) else model

@@ -1,4 +1,4 @@
-"""The nominal model of a ball: that of a known ball, else one that is guessed from radius and mass."""
+"""Chooses the nominal model of a ball: a known ball's model, else a guess from radius and mass."""
 
 import math
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from ballfg.dynamics.model_file import model_from_dict
 from ballfg.tracks import TABLE_TENNIS, Ball
 
 TOLERANCE: Final = 0.15
-"""Relative. A ball whose radius and mass both differ by less from those of a known ball is taken to be one."""
+"""Relative. A ball whose radius and mass differ by less from a known ball's counts as that ball."""
 AIR_DENSITY: Final = 1.2
 """kg/m^3, dry air at 20 degrees C and 1013 hPa."""
 DRAG_COEFFICIENT: Final = 0.5
@@ -27,12 +27,11 @@ WIDE: Final = {"drag": 0.5, "magnus": 0.6, "restitution": 0.2, "friction": 0.5, 
 
 
 def nominal_model(ball: Ball | float | str = TABLE_TENNIS) -> AnalyticModel:
-    """The model to start from when nothing else is known about a ball.
+    """The model to start from when only the ball is known.
 
-    A ball that is as good as a known one (see `TOLERANCE`) gets that one's model, with the ball's own radius. For any
-    other ball drag and Magnus force are computed from radius and mass, the bounce is guessed, and the priors of all of
-    them are wide; `nominal_note` says so in words. A model file does not hold priors: a guessed model that is saved and
-    loaded has the usual ones.
+    A ball that matches a known one (see `TOLERANCE`) gets its model, with the ball's own radius. For any other ball
+    drag and Magnus force follow from radius and mass, the bounce is guessed, and all priors are wide; `nominal_note`
+    says so. A model file does not hold priors: a guessed model that is saved and loaded has the usual ones.
 
     Args: ball: radius m and mass kg; a number is the radius in m of a table-tennis ball, a text the name of a known
         ball, such as "basketball" (`ballfg balls` lists them).
@@ -53,7 +52,7 @@ def nominal_model(ball: Ball | float | str = TABLE_TENNIS) -> AnalyticModel:
 
 
 def nominal_note(ball: Ball) -> str | None:
-    """One sentence on the nominal model of a ball that is not known; None for a known ball."""
+    """A sentence on the nominal model of an unknown ball; None for a known ball."""
     if known_name(ball) is not None:
         return None
     return (
@@ -63,7 +62,7 @@ def nominal_note(ball: Ball) -> str | None:
 
 
 def inertia_factor(ball: Ball) -> float:
-    """Moment of inertia over m R^2: that of the known ball that is near, else a thin shell's; dimensionless."""
+    """Moment of inertia over m R^2 of the matching known ball, else of a thin shell; dimensionless."""
     name = known_name(ball)
     return THIN_SHELL if name is None else KNOWN_BALLS[name].inertia_factor
 
@@ -73,7 +72,7 @@ def air_coefficients(ball: Ball, drag_coefficient: float = DRAG_COEFFICIENT) -> 
 
     Drag: a = rho Cd A v^2 / (2 m), so k = rho Cd A / (2 m). Lift: a = rho Cl A v^2 / (2 m) with
     Cl = 1 / (2 + v / (R w)) = S / (1 + 2 S), S = R w / v; divided by w v that is k = rho A R / (2 m (1 + 2 S)), taken
-    at S = `SPIN_RATIO`. The effect `magnus_saturation` gives what this leaves out.
+    at S = `SPIN_RATIO`. The effect `magnus_saturation` gives the dependence on S.
 
     Source: A. Stepanek, "The aerodynamics of tennis balls - the topspin lob", American Journal of Physics 56, 1988.
     """
@@ -82,7 +81,7 @@ def air_coefficients(ball: Ball, drag_coefficient: float = DRAG_COEFFICIENT) -> 
 
 
 def known_name(ball: Ball) -> str | None:
-    """Name of the known ball that is nearest, if it is near."""
+    """Name of the known ball that matches; None if there is none."""
 
     def distance(name: str) -> float:
         known = KNOWN_BALLS[name].ball

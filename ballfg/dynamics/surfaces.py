@@ -1,12 +1,13 @@
-"""The horizontal surfaces a ball can meet: a table, and the floor for a ball that falls beside it."""
+"""Describes the horizontal surfaces that a ball can meet: a table, and the floor for a ball that falls beside it."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import torch
+from numba.extending import register_jitable
 from torch import Tensor
 
 from ballfg.checks import check_array, check_number
@@ -21,6 +22,12 @@ TABLE_WIDTH: Final = 1.525
 """m (ITTF Laws 2.1.1)."""
 
 
+@register_jitable
+def within(x: Any, y: Any, ends: Any) -> Any:
+    """Whether places lie within ends (x_low, x_high, y_low, y_high) m, in torch and in machine code."""
+    return (x >= ends[0]) & (x <= ends[1]) & (y >= ends[2]) & (y <= ends[3])
+
+
 @dataclass(frozen=True)
 class Surfaces:
     """Table and floor, as heights in the world frame.
@@ -28,8 +35,8 @@ class Surfaces:
     Attributes:
         table_height: m, z of the table's surface.
         floor_height: m, z of the floor; None where there is no floor below (a court is its own floor).
-        extent: (x_low, x_high, y_low, y_high) m of the table; infinite where an end is not known, None where none is:
-            the table is taken to lie under every ball whose centre is above its surface and within the known ends.
+        extent: (x_low, x_high, y_low, y_high) m of the table; infinite for an unknown end. None if no end is known: the
+            table then lies under every ball whose centre is above its surface.
         edge_sigmas: (x_low, x_high, y_low, y_high) m, standard deviations of those ends, for predictions near them.
 
     Raises: ValueError: a height that is not finite, a floor above the table, an extent out of order, a negative sigma.
@@ -54,7 +61,7 @@ class Surfaces:
 
     @classmethod
     def table_tennis(cls, table_height: float) -> Surfaces:
-        """A table of unknown place in the room, with the floor 0.76 m below its surface."""
+        """A table at a height in the room, with the floor 0.76 m below its surface."""
         return cls(table_height, table_height - TABLE_ABOVE_FLOOR)
 
     def __str__(self) -> str:
@@ -70,19 +77,18 @@ class Surfaces:
         """(...) bool of states (..., 9): the ball's x, y lie within the table's extent."""
         if self.extent is None:
             return torch.ones(state.shape[:-1], dtype=torch.bool, device=state.device)
-        x, y = state[..., 0], state[..., 1]
-        low_x, high_x, low_y, high_y = self.extent
-        return (x >= low_x) & (x <= high_x) & (y >= low_y) & (y <= high_y)
+        over: Tensor = within(state[..., 0], state[..., 1], self.extent)
+        return over
 
     def height_below(self, state: Tensor) -> Tensor:
         """(...) m, height of the surface below a ball in states (..., 9), straight down; -inf where there is none.
 
-        A ball whose centre is below the table's surface is beside the table; `level_below` on how deep it may be.
+        A ball whose centre is below the table's surface is beside the table; `level_below` limits its depth.
         """
         return torch.where(self.over_table(state), self.level_below(state), self._lower_level(state))
 
     def level_below(self, state: Tensor) -> Tensor:
-        """(...) m, height of the surface whose level a ball in states (..., 9) falls to, on the table or beside it.
+        """(...) m, height of the surface that a ball in states (..., 9) falls to, on the table or beside it.
 
         -inf where there is none: below the lowest surface by more than `DEEPEST`.
         """

@@ -1,25 +1,24 @@
-"""What training found out beside a model's own parameters: the noise, and what launcher settings mean."""
+"""Holds the noise and the launcher that were learned together with a model."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
-from ballfg.tracks import TrackNoise
+from ballfg.tracks.noise import TrackNoise
 
 
 @dataclass(frozen=True)
 class Trained:
-    """Learned noise and launcher, to be used by whoever estimates with the model.
+    """Learned noise and launcher, for every estimate with the model.
 
     Attributes:
-        process_noise: values by name, names as in `ballfg.factors.noise.ProcessNoise`; what is not named is not
-            learned.
-        position_scale: standard deviation of a measured position in multiples of what its dataset says.
+        process_noise: learned values by name, names as in `ballfg.factors.noise.ProcessNoise`.
+        position_scale: standard deviation of a measured position in multiples of the dataset's.
         launcher: spin of a launch from its settings; None: not learned.
         spin_noise: rad/s, standard deviation per axis of the launcher's spin; None: not learned.
-        rooms: names of the datasets that trained; none: not known.
-        elsewhere: noise of motion, bounces and spins that whole tracks showed in training, for use in other rooms.
+        rooms: names of the training datasets; empty: unknown.
+        elsewhere: noise of motion, bounces and spins estimated from whole training tracks, for other rooms.
 
     Raises: ValueError: if a noise is negative or not finite, or zero where that makes an estimate impossible.
     """
@@ -32,7 +31,7 @@ class Trained:
     elsewhere: TrackNoise | None = None
 
     def is_foreign(self, room: str) -> bool:
-        """Whether a room, by the name of its dataset, had no part in a training whose rooms are known."""
+        """True if a room, by the name of its dataset, is not among the known training rooms."""
         return self.elsewhere is not None and room not in self.rooms
 
     def __post_init__(self) -> None:

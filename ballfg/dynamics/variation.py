@@ -1,4 +1,4 @@
-"""Coefficients that differ between tracks: by a label, or along the recording.
+"""A variation gives a coefficient another value for each group of tracks, by a label or along the recording.
 
 A ball may be a new one after the lunch break, or a table may lean in one of two sessions. A model then holds one value
 for each group of tracks, or for each part of the recording, and `BallModel.for_track` gives the model of one track.
@@ -15,7 +15,7 @@ from ballfg.checks import check_number, listed, shown
 from ballfg.tracks import Track
 
 TRACK: Final = "track"
-"""Stands for the name of a track where others are told apart by a label."""
+"""Takes the place of a label's name: tracks are told apart by their own names."""
 _FIELDS: Final = ("by", "values", "line")
 
 
@@ -26,21 +26,21 @@ def place_of(name: str) -> tuple[tuple[bool, int, str], ...]:
 
 
 def number_of(name: str) -> int | None:
-    """The last number in the name of a track; None where there is none."""
+    """The last number in the name of a track; None if it has none."""
     numbers = re.findall(r"[0-9]+", name)
     return int(numbers[-1]) if numbers else None
 
 
 @dataclass(frozen=True)
 class Variation:
-    """How one coefficient differs between tracks.
+    """The differences of one coefficient between tracks.
 
     Attributes:
         by: the label that tells tracks apart, or "track" for their place in the recording, which their names tell.
-        values: the coefficient by the text of the label; or by the name of the track from which on it holds, until
-            the next one named. A track with another label, or before the first name, has the model's own value.
-        line: of a place in the recording: the coefficient runs in a straight line from each value to the next one
-            over the numbers in the tracks' names, and stays constant beyond them.
+        values: the coefficient by the label's text; or by the name of the track from which it holds until the next
+            named one. A track with another label, or before the first name, has the model's own value.
+        line: for places in the recording: the coefficient is interpolated linearly over the numbers in the tracks'
+            names, and constant beyond them.
 
     Raises:
         ValueError: if there is no value, one is not finite, or a line lacks numbers in its names.
@@ -63,7 +63,7 @@ class Variation:
             )
 
     def value(self, track: Track) -> float | None:
-        """The coefficient for a track; None where that is the model's own value."""
+        """The coefficient of a track; None for the model's own value."""
         if self.by != TRACK:
             label = track.labels.get(self.by)
             return None if label is None else self.values.get(str(label))
@@ -76,7 +76,7 @@ class Variation:
 
     @classmethod
     def from_mapping(cls, content: Any) -> "Variation":
-        """A variation as a model file states it.
+        """A variation from its section in a model file.
 
         Raises:
             ValueError: if an entry is missing, unknown or of another kind.
@@ -93,6 +93,6 @@ class Variation:
         return cls(by, {str(key): check_number(f"values[{shown(str(key))}]", v) for key, v in values.items()}, line)
 
     def to_mapping(self) -> dict[str, Any]:
-        """What `from_mapping` reads."""
+        """The mapping that `from_mapping` reads."""
         line = {"line": True} if self.line else {}
         return {"by": self.by, "values": dict(self.values), **line}

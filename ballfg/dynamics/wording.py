@@ -1,11 +1,11 @@
-"""Sentences with numbers: the fields that an effect may put into its `says`.
+"""Fills the sentences that effects have for readers (`says`) with fitted numbers.
 
 | field | gives |
 |---|---|
 | `{k:.3g}` | a coefficient as fitted, in any format of Python; `{k:abs .3g}` without its sign |
 | `{k:%}`, `{k:points}`, `{k:milli}` | its size in per cent, with or without the sign for it, or in thousandths |
 | `{k:grows|falls}` | the first word if it is positive or zero, else the second |
-| `{k:lost}` | of a rate in 1/s: what is gone after one second, in per cent |
+| `{k:lost}` | of a rate in 1/s: the loss after one second, in per cent |
 | `{size}`, `{direction}`, `{degrees}` | of x, y, z: length, `along -y` or the components, angle in degrees |
 | `{apart}` | largest less smallest of x, y, z |
 | `{axes:long|short}` | for instance `2 % too long along x`: each of x, y, z that differs from zero by two sigmas |
@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 MOSTLY_ALONG: Final = 0.9
-"""Share of a vector's length along one axis from which it is said to point along that axis."""
+"""Share of a vector's length along one axis above which the vector is said to point along it."""
 CLEAR: Final = 2.0
-"""Standard deviations from which a component is said."""
+"""Standard deviations from which a component is mentioned."""
 
 
 class Fitted(Protocol):
@@ -62,7 +62,7 @@ def said(says: str, values: Mapping[str, Fitted]) -> str:
     """A sentence with its fields filled in.
 
     Args: says: with fields.  values: of the coefficients, by name, each in its own unit.
-    Raises: KeyError: a field that there is not. ValueError: a format that there is not.
+    Raises: KeyError: an unknown field. ValueError: an unknown format.
     """
     vector = {axis: values[axis] for axis in "xyz" if axis in values}
     numbers: dict[str, object] = {name: _Number(value.value) for name, value in values.items()}

@@ -1,4 +1,4 @@
-"""Estimators: one a file, one interface, one result type."""
+"""Estimators turn tracks into states; all share one interface and one result type."""
 
 import lazy_loader
 

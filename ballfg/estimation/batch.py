@@ -1,4 +1,4 @@
-"""Many tracks, out of a stream into a stream, and a few long tasks: in this process, in several, or on a cluster."""
+"""Runs a function over a stream of tracks or a few long tasks, in one process, several, or on a cluster."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -20,11 +20,11 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 PROBED = 10
-"""Tracks done in this process first, to see how long one takes; the first of them warms up and does not count."""
+"""Tracks done in this process first, to time one; the first of them warms up and does not count."""
 START_UP = 5.0
-"""s that worker processes take to start (they import torch and gtsam): less work than that stays here."""
+"""s for starting worker processes (they import torch and gtsam): less work than that stays in this process."""
 HAND_OVER = 0.3
-"""s that it takes to hand work to processes that were started before."""
+"""s for handing work to running processes."""
 
 
 def estimate_tracks(estimator: Estimator, tracks: Iterable[Track], count: int, jobs: int) -> Iterator[Estimate]:
@@ -32,7 +32,7 @@ def estimate_tracks(estimator: Estimator, tracks: Iterable[Track], count: int, j
 
     Args: tracks, count, jobs: as for `map_tracks`.
     """
-    if estimator.model.variations:  # the world of each estimate is that of its track
+    if estimator.model.variations:  # the world of an estimate depends on its track
         yield from map_tracks(estimator.estimate, tracks, count, jobs)
         return
     for estimate in map_tracks(partial(_without_world, estimator), tracks, count, jobs):
@@ -40,19 +40,19 @@ def estimate_tracks(estimator: Estimator, tracks: Iterable[Track], count: int, j
 
 
 def _without_world(estimator: Estimator, track: Track) -> Estimate:
-    """The estimate without the model, which need not travel between processes with every track."""
+    """The estimate without its model, so that processes need not send it with every track."""
     return replace(estimator.estimate(track), world=None)
 
 
 def map_tracks(function: Callable[[Track], R], tracks: Iterable[Track], count: int, jobs: int) -> Iterator[R]:
-    """A function of each track, in the order of the tracks, a few tracks ahead of what is taken.
+    """A function of each track, in the order of the tracks, a few tracks ahead of the consumer.
 
-    Worker processes are started only where they save more time than they take to start. A cluster gets all tracks.
+    Worker processes are started only if they save more time than they take to start. A cluster gets all tracks.
 
     Args:
         function: copied to every process, so it must pickle.
         tracks: a stream; it is never held as a whole.
-        count: how many tracks there are, about.
+        count: approximate number of tracks.
         jobs: processes; 1 stays in this one.
     """
     return _mapped(partial(each, function), tracks, count, jobs, None)
@@ -61,14 +61,14 @@ def map_tracks(function: Callable[[Track], R], tracks: Iterable[Track], count: i
 def map_blocks(
     function: Callable[[Sequence[Track]], Iterable[R]], tracks: Iterable[Track], count: int, jobs: int, block: int
 ) -> Iterator[R]:
-    """`map_tracks` for a function of several tracks, whose results may depend on which of them come together.
+    """`map_tracks` for a function of several tracks, whose results may depend on the grouping.
 
     Args:
         function: of `block` tracks, fewer at the end; copied to every process, so it must pickle.
         tracks: a stream; it is never held as a whole.
-        count: how many tracks there are, about.
+        count: approximate number of tracks.
         jobs: processes; 1 stays in this one.
-        block: tracks that come together, whatever the number of processes.
+        block: number of tracks in a group, whatever the number of processes.
     """
     return _mapped(function, tracks, count, jobs, block)
 
@@ -110,7 +110,7 @@ def do_all(tasks: Sequence[Callable[[], R]], jobs: int) -> list[R]:
 
     Args:
         tasks: functions without arguments (`functools.partial`), which must pickle.
-        jobs: processes; with fewer than two of them, or of tasks, all are done in this process.
+        jobs: processes; with fewer than two jobs or tasks, everything runs in this process.
     """
     others = executor(jobs)
     if others is None or len(tasks) < 2:

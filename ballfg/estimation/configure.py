@@ -1,4 +1,4 @@
-"""Settings and surfaces for a dataset: what it states of noise and table, else what its tracks show of them."""
+"""Chooses settings and surfaces for a dataset, from its statements of noise and table or else from its tracks."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,37 +17,37 @@ from ballfg.estimation.measurement.position_noise import estimate_position_noise
 from ballfg.estimation.noise.estimate import estimate_noise, spread_over
 from ballfg.estimation.noise.parameters import with_noise
 from ballfg.estimation.observations.sighted_dataset import SightedDataset
-from ballfg.estimation.outside import outside_share
+from ballfg.estimation.out_of_distribution import out_of_distribution_share
 from ballfg.estimation.settings import MEASURED, Settings
 from ballfg.estimation.smoother.pieces.long_tracks import PiecewiseSmoother
 from ballfg.estimation.table_extent import TableExtent, find_table_extent
 from ballfg.factors.noise import PROCESS_NOISE, ProcessNoise
 from ballfg.progress import Watch, doing, unwatched
-from ballfg.tracks import Dataset, DatasetInfo, Track
+from ballfg.tracks import Dataset, Track
+from ballfg.tracks.info import DatasetInfo
 
 TRACKS_FOR_NOISE = 50
-"""How many tracks the measurement noise is estimated from, when a dataset does not state it."""
+"""Number of tracks for the estimate of the measurement noise when a dataset does not state it."""
 QUICK_TRACKS = 20
-"""How many tracks tell all other noise, evenly over the first `TRACKS_FOR_TABLE`, which may be of several groups."""
+"""Number of tracks for all other noise, spread over the first `TRACKS_FOR_TABLE`, which may be of several groups."""
 KEPT = 8
-"""How many datasets' noise is remembered: their tracks may be estimated one by one."""
+"""Number of datasets whose noise is cached: their tracks may be estimated one by one."""
 LEAST_TRACKS = 5
-"""Fewer tracks do not tell how much tracks differ."""
+"""Least number of tracks that shows how much tracks differ."""
 STATED_EDGE_SIGMA = 0.01
-"""m, of the ends of a table that a dataset states: a ball touches an edge up to its radius beside it."""
+"""m, of a stated table end: a ball touches an edge up to its radius beside it."""
 TRACKS_FOR_TABLE = 200
-"""The same for the table's ends. Few balls miss the table; 200 tracks hold some of them and take 0.1 s."""
+"""Number of tracks for the table's ends. Few balls miss the table; 200 tracks hold some of them and take 0.1 s."""
 
 
 def dataset_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Settings:
-    """Settings for measured tracks; those that cameras saw bring the noise of each sighting themselves.
+    """Settings for measured tracks; tracks from cameras have the noise of each sighting.
 
-    The position noise is the dataset's; where it states none, it is estimated from the scatter of the first tracks
-    about short polynomials. The coefficients of an analytic model are estimated with each track, within their priors; a
-    trained model is taken as it is, with the noise and the launcher that were learned together with it. In a room that
-    had no part in the training, by the name of the dataset, the coefficients of what a network corrects are estimated
-    again, and the noise of motion and bounces is that of the tracks about them. Where the dataset or the model states
-    more of the noise, that holds, the model's before the dataset's.
+    The position noise is the dataset's; if it states none, the scatter of the first tracks about short polynomials
+    gives it. The coefficients of an analytic model are estimated with each track, within their priors; a trained model
+    is fixed, with its learned noise and launcher. In a room outside of the training, by the name of the dataset, the
+    coefficients of the corrected model are estimated again, and the noise of motion and bounces is that of the tracks
+    about them. Other noise that the model or, second, the dataset states takes precedence.
     """
     info, trained = dataset.info, model.trained
     if info.position_noise is not None:
@@ -80,15 +80,14 @@ def dataset_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Set
 def fitted_settings(
     dataset: Dataset | SightedDataset, model: BallModel, observed: float = np.inf, watch: Watch = unwatched
 ) -> Settings:
-    """`dataset_settings`, and where neither dataset nor model states the noise, the noise that the tracks show.
+    """`dataset_settings`, with the noise estimated from the tracks if neither dataset nor model states it.
 
     Args:
-        dataset: a few of its tracks are estimated once (`estimate_noise`); with fewer than `LEAST_TRACKS` of them, or
-            where cameras saw the ball, or with a trained model in its rooms, the settings are those of
-            `dataset_settings`.
+        dataset: `estimate_noise` sees a few of its tracks. The settings are those of `dataset_settings` with fewer than
+            `LEAST_TRACKS` tracks, with sightings of cameras, or with a trained model in its own rooms.
         model: the ball.
-        observed: s from the start of each track that may be looked at.
-        watch: told of each track, and of each step of the search.
+        observed: s, the part of each track that the estimate may use.
+        watch: called for each track and each step of the search.
     """
     settings = dataset_settings(dataset, model)
     at_home = model.trained is not None and not model.trained.is_foreign(dataset.info.name)
@@ -109,7 +108,7 @@ _FITTED: dict[tuple[Dataset | SightedDataset, BallModel, tuple[float, ...], floa
 
 
 def _fitted(dataset: Dataset | SightedDataset, model: BallModel, observed: float, watch: Watch) -> Settings | None:
-    """The settings with the noise that the tracks show; None where they show none."""
+    """The settings with the noise estimated from the tracks; None if the tracks do not determine it."""
     tracks = spread_over(dataset, min(len(dataset), TRACKS_FOR_TABLE), QUICK_TRACKS)
     parts = [track.opening(observed) for track in tracks]
     surfaces, before = dataset_surfaces(dataset), dataset_settings(dataset, model)
@@ -125,25 +124,25 @@ def tracks_settings(
     position_known: bool,
     watch: Watch = unwatched,
 ) -> Settings | None:
-    """The settings with the noise that parts of tracks show; None where they show none.
+    """The settings with the noise estimated from parts of tracks; None if they do not determine it.
 
-    The first parts of tracks make the acceleration noise too large. A network knows it from whole tracks, as far as
-    they flew like these: the noise is the geometric mean of both, weighted with the share inside of its training data.
-    What the parts do not tell is, by the same share, as in the training or as usual. Outside, a correction of the usual
-    size is missing: it widens bounces.
+    The first parts of tracks give too large an acceleration noise. A network has learned it from whole tracks similar
+    to these: the noise is the geometric mean of both, weighted with the share of flights inside of its training data.
+    Other noise moves, by the same share, from the usual values to those of the training. Outside, a correction of the
+    usual size is missing: it widens bounces.
 
     Args:
         model: the ball.
-        surfaces: what it may bounce on.
-        settings: before; of a trained model, with the noise of its training.
+        surfaces: table and floor.
+        settings: prior ones; for a trained model, with the noise of its training.
         parts: of tracks.
-        position_known: whether the white noise of positions is stated.
-        watch: told of each track, and of each step of the search.
+        position_known: True if the white noise of positions is stated.
+        watch: called for each track and each step of the search.
     """
     doubts = {name: sigma for name, sigma in settings.coefficients.items() if name.startswith(DOUBT)}
     plain = replace(settings, coefficients={n: s for n, s in settings.coefficients.items() if n not in doubts})
     smoother = PiecewiseSmoother(model, surfaces, plain)
-    outside = outside_share(model, [smoother.estimate(part).states for part in parts])
+    outside = out_of_distribution_share(model, [smoother.estimate(part).states for part in parts])
     begun = plain if outside is None else with_usual_noise(plain, model, outside)
     found = estimate_noise(model, surfaces, begun, parts, position_known=position_known, errors=False, watch=watch)
     if found is None or outside is None:
@@ -155,7 +154,7 @@ def tracks_settings(
 
 
 def widened(process: ProcessNoise, model: BallModel, outside: float) -> ProcessNoise:
-    """Process noise with what a network's correction does in training, by the share of flights outside of it."""
+    """Process noise plus the network's usual correction, weighted with the share of flights outside of its training."""
     if not isinstance(model, LearnedModel) or model.fading is None:
         return process
     kick = outside * float(model.fading.velocity) / np.sqrt(3.0)
@@ -163,7 +162,7 @@ def widened(process: ProcessNoise, model: BallModel, outside: float) -> ProcessN
 
 
 def with_usual_noise(settings: Settings, model: BallModel, share: float) -> Settings:
-    """Settings whose noise, but for that of positions, moves to the usual one of a model, by a share from 0 to 1."""
+    """Settings whose noise, except for positions, moves to a model's usual one by a share from 0 to 1."""
     usual = Settings.for_measured(model)
     spreads = {name: _between(s, usual.coefficients.get(name, s), share) for name, s in settings.coefficients.items()}
     process = {
@@ -184,13 +183,13 @@ def _between(one: float, other: float, share: float) -> float:
 
 @lru_cache(maxsize=8)
 def _noise_of(dataset: Dataset | SightedDataset) -> tuple[float, float, float]:
-    """m, along x, y, z, from the first tracks; once for a dataset, whose tracks may be estimated one by one."""
+    """m, along x, y, z, from the first tracks; cached, since a dataset's tracks may be estimated one by one."""
     x, y, z = estimate_position_noise(islice(iter(dataset), TRACKS_FOR_NOISE)).tolist()
     return x, y, z
 
 
 def learned_process(trained: Trained) -> ProcessNoise:
-    """The process noise that was learned; what was not is as usual. Raises: ValueError: a number of another name."""
+    """The learned process noise, with usual values for the rest. Raises: ValueError: a number of another name."""
     unknown = sorted(set(trained.process_noise) - set(PROCESS_NOISE))
     if unknown:
         known = ", ".join(PROCESS_NOISE)
@@ -201,7 +200,7 @@ def learned_process(trained: Trained) -> ProcessNoise:
 
 
 def launcher_of(info: DatasetInfo, model: BallModel) -> Launcher | None:
-    """What a trained model knows of a dataset's launcher; a track without the label `group` is of the dataset's own."""
+    """The trained launcher for a dataset; a track without the label `group` belongs to the dataset's own group."""
     trained = model.trained
     if trained is None or trained.launcher is None or trained.spin_noise is None:
         return None
@@ -211,7 +210,7 @@ def launcher_of(info: DatasetInfo, model: BallModel) -> Launcher | None:
 def dataset_surfaces(dataset: Dataset | SightedDataset) -> Surfaces:
     """The dataset's table and the floor below it.
 
-    The table ends where `dataset.yaml` says; where it does not, beside the sides past which balls fell.
+    The table's ends come from `dataset.yaml`, else from the sides past which balls fell.
     """
     info = dataset.info
     surfaces = Surfaces.table_tennis(info.table_height)
@@ -223,12 +222,12 @@ def dataset_surfaces(dataset: Dataset | SightedDataset) -> Surfaces:
 
 @lru_cache(maxsize=8)
 def found_table(dataset: Dataset | SightedDataset) -> TableExtent | None:
-    """The table's ends as the first tracks show them, whatever `dataset.yaml` says; None where they do not."""
+    """The table's ends from the first tracks, whatever `dataset.yaml` says; None if the tracks do not show them."""
     tracks = islice(iter(dataset), TRACKS_FOR_TABLE)
     return find_table_extent(tracks, dataset.info.table_height, dataset.ball.radius)
 
 
 def table_note(dataset: Dataset | SightedDataset) -> str | None:
-    """A sentence on ends of the table that were found from the tracks; None if there are none."""
+    """A sentence on the table's ends that were found from the tracks; None without any."""
     found = found_table(dataset) if dataset.info.table_extent is None else None
     return None if found is None else str(found)

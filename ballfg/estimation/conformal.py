@@ -1,4 +1,4 @@
-"""Split-conformal intervals: factors on predicted sigmas, from the errors on calibration tracks.
+"""Computes split-conformal intervals: factors on predicted sigmas from the errors on calibration tracks.
 
 Source: Lee, Barber, Willett, "Distribution-free inference with hierarchical data", 2023, arXiv:2306.06342;
 docs/predict.md.
@@ -37,7 +37,7 @@ FEWEST: Final = 9
 BIN: Final = 0.05
 """s, width of the bins of the horizon. On the measured tracks a bin holds 3 to 9 samples of a track."""
 EDGE: Final = 1e-5
-"""Part of a bin by which a stamp may lie behind the bin's end: stamps are rounded."""
+"""Share of a bin by which a stamp may exceed the bin's end: stamps are rounded."""
 ROUNDING: Final = 1e-9
 """Tolerance on sums of weights, so that exactly `FEWEST` tracks are enough."""
 TABLE_TOLERANCE: Final = 1e-3
@@ -62,10 +62,10 @@ class ConformalScales:
         scales: (b, 3) dimensionless, along x, y, z; infinite where there are fewer than 9 tracks.
         own: (b, 3) dimensionless, share of the calibration samples in the model's own 90 % intervals, each track with
             the same weight; NaN in a bin without samples.
-        held: (b, 3) dimensionless, share in the conformal intervals when each track is held against the scales of the
+        held: (b, 3) dimensionless, share in the conformal intervals when each track is compared with the scales of the
             others; NaN where there are fewer than 10 tracks.
-        statuses: number of calibration tracks by the sentence that tells how their estimation ended. Those that did not
-            converge count like all others.
+        statuses: number of calibration tracks by the sentence of their status. Tracks whose estimation did not converge
+            count like all others.
     """
 
     source: str
@@ -84,7 +84,7 @@ class ConformalScales:
         """The scales from predictions of the calibration tracks.
 
         Args:
-            predictions: made as those that are to be scaled; model and settings must not come from these tracks.
+            predictions: made in the same way as those to scale; model and settings must not come from these tracks.
             source: name of the calibration dataset.
             observe: s, the observed part of each track.
             method: name of the estimator.
@@ -118,12 +118,12 @@ class ConformalScales:
 
     @property
     def own_coverage(self) -> float:
-        """Share of the calibration samples in the model's own 90 % intervals, in the bins that `coverage` is from."""
+        """Share of the calibration samples in the model's own 90 % intervals, over the bins of `coverage`."""
         return self._overall(self.own)
 
     @property
     def coverage(self) -> float:
-        """Share in the conformal 90 % intervals, each track held against the others; NaN if no bin has 10 tracks."""
+        """Share in the conformal 90 % intervals, each track left out once; NaN if no bin has 10 tracks."""
         return self._overall(self.held)
 
     def _overall(self, shares: Array) -> float:
@@ -204,7 +204,7 @@ def load_conformal(path: str | Path) -> ConformalScales:
 
 
 def check_calibration_tracks(calibration: Dataset | SightedDataset, dataset: Dataset | SightedDataset) -> None:
-    """Refuses calibration tracks that cannot be exchangeable with those to predict.
+    """Refuses calibration tracks that are not exchangeable with the tracks to predict.
 
     Args: calibration: the calibration dataset.  dataset: the one to predict.
     Raises: ValueError: if they are the same folder, or their balls or the heights of their tables differ.
@@ -242,7 +242,7 @@ class _Bin:
 
     @property
     def weights(self) -> Array:
-        """(m,) of each sample: one divided by the samples of its track."""
+        """(m,) weight of each sample: one divided by the number of its track's samples."""
         return np.asarray(1.0 / np.bincount(self.track)[self.track])
 
     def quantile(self) -> Array:
@@ -258,7 +258,7 @@ class _Bin:
         return np.mean(held / samples, axis=1) if self.count else np.full(3, np.nan)
 
     def left_out_share(self) -> Array:
-        """(3,) share of the scores within the quantile of the other tracks; NaN where those are too few for one."""
+        """(3,) share of the scores within the quantile of the other tracks; NaN where too few tracks are left."""
         if self.count <= FEWEST:
             return np.full(3, np.nan)
         held = np.zeros(3)

@@ -1,4 +1,4 @@
-"""An estimator for models whose coefficients differ between tracks: each track is estimated with its own values."""
+"""Estimates each track with its own coefficients, for models whose coefficients differ between tracks."""
 
 from collections.abc import Callable, Sequence
 
@@ -12,7 +12,7 @@ from ballfg.tracks import Track
 
 
 class EachItsModel(Estimator):
-    """One estimator for every set of values that tracks have, made when the first such track comes.
+    """An estimator for each set of coefficients, created when the first track with it comes.
 
     Args:
         make: the estimator of a model that is the same for all tracks.
@@ -31,7 +31,7 @@ class EachItsModel(Estimator):
         self._made: dict[tuple[float | None, ...], Estimator] = {}
 
     def of(self, track: Track) -> Estimator:
-        """The estimator with the coefficients of a track; one and the same for tracks that have the same ones."""
+        """The estimator with the coefficients of a track; tracks with equal coefficients share it."""
         values = tuple(variation.value(track) for variation in self.model.variations.values())
         if values not in self._made:
             self._made[values] = self._make(self.model.for_track(track))

@@ -1,4 +1,4 @@
-"""The one interface of all estimators."""
+"""Defines the interface of all estimators."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
@@ -20,7 +20,7 @@ from ballfg.tracks import Ball, Track
 from ballfg.tracks.checks import check_scale, doubts_about
 
 LEAST_CHECKED = 3
-"""Samples from which a track's scale can be told."""
+"""Least number of samples for a check of a track's scale."""
 
 
 class Estimator(ABC):
@@ -28,8 +28,8 @@ class Estimator(ABC):
 
     Args:
         model: the ball; of a `Ball`, its nominal model.
-        surfaces: that it may bounce on; of a number (m), a table of that height with the floor below it.
-        settings: noise and priors; those of measured tracks (`Settings.for_measured`) where None.
+        surfaces: table and floor; for a number (m), a table of that height with the floor below it.
+        settings: noise and priors; None: those of measured tracks (`Settings.for_measured`).
 
     Raises: ValueError: if the model has measurement effects and the estimator does not undo them, or if GTSAM is to
         solve an estimator without a factor graph. TypeError: an argument of another type.
@@ -37,9 +37,9 @@ class Estimator(ABC):
 
     name: ClassVar[str]
     undoes_measurement: ClassVar[bool] = False
-    """Whether it takes a model that does not measure plainly."""
+    """True if it takes a model that does not measure plainly."""
     has_graph: ClassVar[bool] = False
-    """Whether GTSAM can solve it (`Settings.solver`)."""
+    """True if GTSAM can solve it (`Settings.solver`)."""
 
     def __init__(self, model: BallModel | Ball, surfaces: Surfaces | float, settings: Settings | None = None) -> None:
         model = nominal_model(model) if isinstance(model, Ball) else model
@@ -70,27 +70,27 @@ class Estimator(ABC):
         return f"{type(self).__name__}({effects}, {self.surfaces}, noise {noise} mm)"
 
     def of(self, track: Track) -> "Estimator":
-        """The estimator with the coefficients of a track: this one, unless they differ between tracks."""
+        """The estimator with the coefficients of a track; the same one if none differ between tracks."""
         return self
 
     @abstractmethod
     def estimate(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Estimate:
         """The states of a track, one per stamp.
 
-        A track that is too short, or that no motion explains, gives a status that says so.
+        The status says if a track is too short or no motion explains it.
 
         Args:
             track: stamps, positions, observations, labels.
-            factors: further factors, each on one state of the track, by its index.
+            factors: further factors, each on one state of the track, by the index of its sample.
         Raises:
             TypeError: if track is not a `Track`.
             ValueError: if its numbers cannot be metres and seconds.
         """
 
     def in_sections(self, track: Track) -> Iterator[Estimate]:
-        """The estimate of a track in parts that follow one another, for those who need not hold all of a long one.
+        """The estimate of a track as consecutive parts, so that the caller need not hold all of a long one.
 
-        By default one part, the whole.
+        By default one part, the whole track.
 
         Args: track: as for `estimate`.
         """
@@ -101,8 +101,8 @@ class Estimator(ABC):
 
         Raises:
             TypeError: if track is not a `Track`.
-            ValueError: if its numbers cannot be metres and seconds, were changed to something that is no number after
-                the track was made, or a factor ties several states.
+            ValueError: if its numbers cannot be metres and seconds, were changed to something other than numbers after
+                construction, or a factor ties several states.
         """
         if not hasattr(track, "observations"):
             raise TypeError(

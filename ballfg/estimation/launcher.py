@@ -1,4 +1,4 @@
-"""A launcher whose settings tell the spin of a shot: what a trained model knows of it, for the estimators."""
+"""A launcher gives the spin of a shot from the launcher settings in a track's labels."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ from numpy.typing import NDArray
 from ballfg.checks import check_number
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.estimation.filters.window_velocity import window_velocities
-from ballfg.tracks import SPIN_LABELS, Track
+from ballfg.tracks import Track
+from ballfg.tracks.track import SPIN_LABELS
 
 FIRST_SAMPLES = 10
-"""The launch direction is the mean direction of flight over so many samples."""
+"""Number of samples whose mean direction of flight is the launch direction."""
 
 
 @dataclass(frozen=True)
 class SpinLabel:
-    """A spin that is known before the flight is looked at: (3,) rad/s, and its standard deviation per axis, rad/s."""
+    """A spin known before the flight: (3,) rad/s, and its standard deviation per axis, rad/s."""
 
     spin: NDArray[np.float64]
     sigma: float
@@ -33,7 +34,7 @@ class Launcher:
     Attributes:
         embedding: from the settings to a spin.
         sigma: rad/s, standard deviation per axis of that spin.
-        defaults: labels that hold where a track has none, for instance `group` for a dataset that is one group.
+        defaults: labels for tracks that lack them, for instance `group` for a dataset that is one group.
 
     Raises: ValueError: a sigma that is not positive and finite.
     """
@@ -47,7 +48,7 @@ class Launcher:
 
     @classmethod
     def of_levels(cls, topspin: float, sidespin: float, sigma: float) -> Launcher:
-        """A launcher whose spin per level is known, of the labels `topspin` and `sidespin`.
+        """A launcher with a known spin per level of the labels `topspin` and `sidespin`.
 
         Topspin turns about the horizontal axis across the flight (the top of the ball moves forward), sidespin about
         the vertical.
@@ -65,9 +66,9 @@ class Launcher:
         return None if found is None else found.numpy()
 
     def label(self, track: Track) -> SpinLabel | None:
-        """The spin by the settings and the first samples; None for a track without settings.
+        """The spin from the settings and the first samples; None for a track without settings.
 
-        For estimators that need the spin before they know the velocity; the smoother estimates both together.
+        For estimators that need the spin before the velocity; the smoother estimates both together.
         """
         settings = self.settings(track)
         if settings is None or len(track) < 2:
@@ -79,7 +80,7 @@ class Launcher:
         return SpinLabel(spin.numpy(), self.sigma)
 
     def labelled(self, track: Track) -> Track:
-        """The track with spin labels made from its settings, for methods that know labels only; else as it is."""
+        """The track with spin labels from its settings, for methods that use labels only; else unchanged."""
         label = self.label(track)
         if label is None:
             return track

@@ -1,4 +1,4 @@
-"""Pictures of an estimate and of a prediction: each component over time, with its uncertainty."""
+"""Plots the components of an estimate or a prediction over time, with their uncertainty."""
 
 from typing import Final
 
@@ -9,7 +9,7 @@ from ballfg.estimation.result import Estimate
 from ballfg.estimation.track_prediction import TrackPrediction
 from ballfg.pages.marks import Mark
 from ballfg.pages.pictures import by_axis
-from ballfg.pages.shot import Shot
+from ballfg.pages.shot import ShownShot
 
 PARTS: Final = (("position", "m"), ("velocity", "m/s"), ("spin", "rad/s"))
 AXES: Final = ("x", "y", "z")
@@ -48,7 +48,7 @@ def predicted(prediction: TrackPrediction) -> Figure:
     Args: prediction: of one track.
     """
     return by_axis(
-        Shot(
+        ShownShot(
             prediction.name,
             prediction.times,
             prediction.measured,

@@ -1,4 +1,4 @@
-"""What no ball does: estimates that are no numbers, or out of this world, and what stands in their place."""
+"""Replaces impossible estimates (not numbers, out of bounds) by the measured positions with wide covariances."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from ballfg.tracks.checks import MAX_COORDINATE
 from ballfg.tracks.track import FASTEST_BALL, FASTEST_SPIN
 
 LEAST_POSITION_SIGMA = 0.05
-"""m. A position in a track that no graph explains is not trusted better than that."""
+"""m. Least standard deviation of a position in a track that no graph explains."""
 
 
 def plausible(estimate: Estimate, track: Track, sigma: Array, settings: Settings) -> Estimate:
-    """The estimate, its covariances positive definite, with states that no ball has replaced by what was measured.
+    """The estimate with positive definite covariances, its impossible states replaced by the measurements.
 
     Args:
         estimate: of the track.
         track: gives the positions.
         sigma: (n, 3) m, of the positions.
         settings: give the priors.
-    Returns: the same estimate where nothing is wrong with it, else one whose status says so.
+    Returns: the same estimate if nothing is wrong with it, else one whose status says so.
     """
     wrong = ~(possible(estimate.states) & variances_positive(estimate.covariances))
     lost = not _known(estimate)
@@ -62,7 +62,7 @@ def plausible(estimate: Estimate, track: Track, sigma: Array, settings: Settings
 
 
 def possible(states: Array) -> NDArray[np.bool_]:
-    """(...) bool: whether states (..., 9) are numbers and those of a ball.
+    """(...) bool: True for states (..., 9) that are finite and possible for a ball.
 
     A track lies within `MAX_COORDINATE` m; no ball is faster than `FASTEST_BALL` m/s or spins faster than
     `FASTEST_SPIN` rad/s.
@@ -74,7 +74,7 @@ def possible(states: Array) -> NDArray[np.bool_]:
 
 
 def measured_only(positions: Array, sigma: Array, settings: Settings) -> tuple[Array, Array]:
-    """What a position says without any motion: states (n, 9) of balls without velocity, covariances (n, 9, 9).
+    """States (n, 9) from positions alone, without velocity, with covariances (n, 9, 9).
 
     Args: positions: (n, 3) m.  sigma: (n, 3) m, of theirs.  settings: give the spreads of velocity and spin.
     """
@@ -86,7 +86,7 @@ def measured_only(positions: Array, sigma: Array, settings: Settings) -> tuple[A
 
 
 def _known(estimate: Estimate) -> bool:
-    """Whether the coefficients are numbers with a covariance."""
+    """True if the coefficients are numbers with a covariance."""
     own = estimate.coefficient_covariance
     return bool(
         np.isfinite(estimate.coefficients).all()

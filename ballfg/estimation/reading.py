@@ -1,10 +1,11 @@
-"""A folder opened for estimation: its tracks, or what cameras saw, with all other readings that lie beside them."""
+"""Opens a folder for estimation: its tracks or sightings, with all other readings beside them."""
 
 from os import PathLike
 from pathlib import Path
 
 from ballfg.checks import check_path
-from ballfg.dynamics import model_to_dict, nominal_model
+from ballfg.dynamics import nominal_model
+from ballfg.dynamics.model_file import model_to_dict
 from ballfg.estimation.observations.files import read_readings
 from ballfg.estimation.observations.sighted_dataset import SightedDataset, read_sighted
 from ballfg.files.strict_yaml import read_mapping
@@ -17,12 +18,12 @@ MODEL_FILE = "model.yaml"
 
 @of_one_state
 def read(folder: str | PathLike[str]) -> Dataset | SightedDataset:
-    """The dataset of a folder: its tracks with everything that was measured beside positions.
+    """The dataset of a folder: its tracks with all further measurements.
 
-    Where the folder has no table of tracks, but detections and cameras, the tracks are those that the cameras saw.
+    In a folder with detections and cameras but no table of tracks, the tracks are made from the detections.
 
     Args: folder: holds `dataset.yaml` and tables; docs/tracks.md.
-    Returns: the dataset; its `notes` tell what was ignored, repaired, or lies unused beside the tracks.
+    Returns: the dataset; its `notes` list ignored, repaired and unused files and rows.
     Raises:
         FileNotFoundError: the folder or one of its files is missing.
         ValueError: the content breaks a rule; the message names file, line, column and remedy.
@@ -34,13 +35,13 @@ def read(folder: str | PathLike[str]) -> Dataset | SightedDataset:
 
 
 def with_readings(dataset: Dataset) -> Dataset:
-    """The dataset whose tracks come with the readings that lie in its folder."""
+    """The dataset, its tracks extended by the readings in its folder."""
     readings = read_readings(dataset.path, dataset.names)
     return dataset.with_readings(readings.attached, readings.notes) if readings.rows else dataset
 
 
 def unused_model(folder: str | PathLike[str], ball: Ball) -> tuple[str, ...]:
-    """A note on a model file beside the tracks that differs from the nominal model of the ball; none otherwise.
+    """A note on a model file beside the tracks that differs from the ball's nominal model; None otherwise.
 
     Args: folder: of the dataset.  ball: of the dataset.
     """
@@ -51,5 +52,5 @@ def unused_model(folder: str | PathLike[str], ball: Ball) -> tuple[str, ...]:
         if read_mapping(path) == model_to_dict(nominal_model(ball)):
             return ()
     except ValueError:
-        pass  # a file that cannot be read is another model too; reading fails where somebody gives it as the model
+        pass  # an unreadable file counts as another model; reading it raises where a user gives it as the model
     return (f"{path} lies beside the tracks and is not used. Give it as the model to use it.",)

@@ -1,4 +1,4 @@
-"""The estimators by name: those of the package, of the user, and of other installed packages."""
+"""Registers the estimators by name: those of the package, of the user, and of other installed packages."""
 
 from functools import partial
 from typing import Final
@@ -23,14 +23,14 @@ ESTIMATORS: Final[Registry[Estimator]] = Registry(
     },
 )
 register_estimator = ESTIMATORS.register
-"""Lets an estimator be named by commands and benchmarks; may decorate the class."""
+"""Registers an estimator, so that commands and benchmarks know its name; may decorate the class."""
 
 
 def make_estimator(name: str, model: BallModel, surfaces: Surfaces | float, settings: Settings) -> Estimator:
-    """The estimator of a name.
+    """The estimator with a name.
 
-    It undoes the model's measurement effects, where there are any, and gives each track its own coefficients, where the
-    model says that they differ between tracks.
+    It undoes the model's measurement effects, if any, and gives each track its own coefficients, if they differ between
+    tracks.
 
     Args:
         name: of a registered estimator.

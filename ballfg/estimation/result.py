@@ -1,4 +1,4 @@
-"""What every estimator returns: states with covariances, and how far to trust them."""
+"""An estimate holds the states of a track with covariances, and a status that says how far to trust them."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
-from ballfg.estimation.segmentation import Contact
-from ballfg.prediction.ahead import Ahead
+from ballfg.estimation.segmentation.result import Contact
+from ballfg.prediction.forecast import Forecast
 from ballfg.prediction.state import BallState, World
 from ballfg.state import SIGMA_NAMES, STATE_DIM, STATE_NAMES
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class Status(enum.Enum):
-    """How an estimation ended; the value is a sentence that says what to do."""
+    """The end of an estimation; the value is a sentence with a remedy."""
 
     OK = "converged"
     NOT_CONVERGED = (
@@ -49,7 +49,7 @@ class Status(enum.Enum):
 
     @property
     def failed(self) -> bool:
-        """Whether states are not estimated: they are measured positions and priors, with wide covariances."""
+        """True if states are not estimated: they are measured positions and priors, with wide covariances."""
         return self in (Status.FAILED, Status.IMPLAUSIBLE)
 
 
@@ -62,18 +62,18 @@ class Estimate:
         times: (n,) s, the track's stamps.
         states: (n, 9) position m, velocity m/s, spin rad/s.
         covariances: (n, 9, 9) in the products of those units.
-        other_sides: (n, 9, 9) in the same units, their parts for the chance that a ball is on the other side of a near
-            contact.
+        other_sides: (n, 9, 9) in the same units, the share of the covariances for the chance that the ball is on the
+            other side of a near contact.
         status: how the estimation ended.
         innovations: whitened innovations by name of the observation, (m, dim) each. For a filter: measured minus
             predicted; for a smoother: measured minus its prediction from all other measurements. Each divided by its
-            standard deviation: standard normal where model and noise are right. NaN where a method has none. The
-            observation that tells where the ball is comes first: "position" (n, 3), or "sighting" (m, 2) in pixels.
+            standard deviation: standard normal if model and noise are right. NaN for a method without innovations. The
+            observation that locates the ball comes first: "position" (n, 3), or "sighting" (m, 2) in pixels.
         coefficient_names: of the p model parameters that were estimated with the track.
         coefficients: (p,) in their own units.
         coefficient_covariance: (p, p) in the products of those units.
         cross_covariances: (n, 9, p) between each state and the coefficients.
-        unknown_names: of the q unknowns that observations added: time offsets of cameras, for instance.
+        unknown_names: of the q unknowns that observations added, such as time offsets of cameras.
         unknowns: (q,) in their own units.
         unknown_covariance: (q, q) in the products of those units.
         contacts: with a surface, in order.
@@ -81,7 +81,7 @@ class Estimate:
         quality: (n,) index of `segmentation.Quality`, of each sample.
         error: objective at the minimum; NaN for methods without one.
         iterations: linear solutions of a minimisation, 0 for methods without one.
-        world: model, surfaces and process noise that the states were estimated with; they carry them forward.
+        world: model, surfaces and process noise of the estimate; predictions use them.
         notes: doubts about the track: an axis that does not fall, bounces where no surface is declared.
     """
 
@@ -121,7 +121,7 @@ class Estimate:
         )
 
     def __getitem__(self, sample: int) -> BallState:
-        """The state at a sample, with the coefficients and what is known of them.
+        """The state at a sample, with the coefficients and their covariances.
 
         Args: sample: its index; a negative one counts from the end.
         Raises: IndexError: a sample that the track does not have. TypeError: a slice, or anything else that is no
@@ -142,7 +142,7 @@ class Estimate:
 
     @classmethod
     def from_gtsam(cls, graph: TrackGraph, values: gtsam.Values) -> Estimate:
-        """The estimate of a track at values that GTSAM found, with the marginals of all factors of the graph.
+        """The estimate of a track at values from GTSAM, with the marginals of all factors of the graph.
 
         Args: graph: from `bf.graph`, with further factors or without.  values: of all variables of the factors.
         Raises: RuntimeError: GTSAM's, if the factors leave a variable undetermined.
@@ -156,7 +156,7 @@ class Estimate:
 
     @property
     def whitened(self) -> Array:
-        """(m, dim) whitened innovations of the observation that tells where the ball is."""
+        """(m, dim) whitened innovations of the observation that locates the ball."""
         return next(iter(self.innovations.values()))
 
     @property
@@ -170,11 +170,11 @@ class Estimate:
         return np.asarray((self.whitened**2).sum(axis=-1))
 
     def dated(self, times: Array, origin: float | None = None) -> Estimate:
-        """The estimate on the clock of the data; estimators count stamps from a track's first.
+        """The estimate with the stamps of the data; estimators count stamps from a track's first.
 
         Args:
-            times: (n,) s, the stamps as they were written.
-            origin: s, the first one of the whole track, where these are some of them.
+            times: (n,) s, the original stamps.
+            origin: s, the first stamp of the whole track, if these are a part.
         """
         origin = float(times[0]) if origin is None else origin
         if origin == 0.0:
@@ -182,7 +182,7 @@ class Estimate:
         contacts = tuple(replace(c, time=origin + c.time) for c in self.contacts)
         return replace(self, times=times, contacts=contacts)
 
-    def predict(self, horizon: float, step: float = 0.01) -> Ahead:
+    def predict(self, horizon: float, step: float = 0.01) -> Forecast:
         """The path of the ball from the last sample on; arguments and errors as those of `BallState.predict`."""
         return self.last.predict(horizon, step)
 

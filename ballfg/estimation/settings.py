@@ -1,4 +1,4 @@
-"""What every estimator is told about the noise: of the measurements, of the motion, of what is not measured."""
+"""Holds the noise of measurements and motion and the priors, which all estimators share."""
 
 from __future__ import annotations
 
@@ -33,30 +33,30 @@ SOLVERS: Final[tuple[Solver, ...]] = get_args(Solver)
 
 @dataclass(frozen=True)
 class Settings:
-    """Noise and priors, the same for all estimators, so that a comparison compares the estimators.
+    """Noise and priors, the same for all estimators, so that a comparison isolates the method.
 
-    Raises: ValueError: a standard deviation that is not positive and finite, or that no measurement has.
+    Raises: ValueError: a standard deviation that is not positive and finite, or beyond that of any measurement.
         TypeError: a field of another type.
     """
 
     position_noise: tuple[float, float, float] = (0.0015, 0.0015, 0.0015)
-    """m, standard deviation of the error of a measured x, y, z that is new in each sample, where a track does not
-    bring its own."""
+    """m, standard deviation of the white error of a measured x, y, z, for tracks without standard deviations of their
+    own."""
 
     position_scale: float = 1.0
-    """By which the standard deviations of all positions are multiplied, those that a track brings too."""
+    """Factor on the standard deviations of all positions, including those of a track."""
 
     memory: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """m, standard deviation per axis of the tracker's error that lasts from sample to sample; zeros: there is none."""
+    """m, standard deviation per axis of the tracker's error that lasts from sample to sample; zeros: no such error."""
 
     memory_time: float = 0.02
     """s, over which the correlation of that error falls to 1 / e."""
 
     stamp_jitter: float = 0.0
-    """s, standard deviation of the error of a stamp: the ball was measured where it was that much earlier or later."""
+    """s, standard deviation of the error of a stamp: the true moment of a measurement is earlier or later by that."""
 
     process: ProcessNoise = field(default_factory=ProcessNoise)
-    """How far the ball strays from its model, per root second, per impact, per hit."""
+    """Process noise of the ball's motion: per root second, per impact, per hit."""
 
     spin_prior: float = 60.0
     """rad/s, standard deviation per axis of the spin of a ball without a spin label, about zero."""
@@ -68,37 +68,37 @@ class Settings:
     """m/s, standard deviation per axis of the velocity at the start of a track, about zero."""
 
     coefficients: Mapping[str, float] = field(default_factory=dict)
-    """Model parameters estimated for each track: prior standard deviation by parameter name. Empty: the model is
-    taken to be exact."""
+    """Model parameters estimated for each track: prior standard deviation by parameter name. Empty: the model counts as
+    exact."""
 
     loss: Loss = field(default_factory=lambda: Loss("huber", 3.0))
-    """Loss on each measured position. `Loss("squared")` where there are no outliers. Gross outliers are found and set
-    aside beforehand; Huber's loss bounds what a missed one does and leaves good samples their full weight."""
+    """Loss on each measured position; `Loss("squared")` without outliers. Gross outliers are found and set aside
+    beforehand; Huber's loss bounds the influence of a missed one and leaves good samples their full weight."""
 
     sighting_loss: Loss = field(default_factory=lambda: Loss("cauchy", 5.0))
-    """Loss on each sighting of a camera, on the norm of two whitened pixels. Nobody sets wrong candidates aside
-    beforehand; Cauchy's loss lets go of them, and costs good sightings 7 % of their weight."""
+    """Loss on each sighting of a camera, on the norm of two whitened pixels. Wrong candidates are not set aside
+    beforehand; Cauchy's loss gives them little weight, and costs good sightings 7 % of theirs."""
 
     time_offsets: Mapping[str, float] = field(default_factory=dict)
-    """s, prior standard deviation of the time offset by name of camera, where offsets are estimated with each track;
-    the prior's mean is the camera's own. Leave out one camera: a shift of all of them together cannot be seen."""
+    """s, prior standard deviation of the time offset by name of camera, if offsets are estimated with each track; the
+    prior's mean is the camera's own. Leave out one camera: a common shift of all cannot be observed."""
 
     spin_loss: Loss = field(default_factory=lambda: Loss("huber", 2.0))
-    """Loss on the spin prior: a strong spin is rare but not against nature."""
+    """Loss on the spin prior: a strong spin is rare but possible."""
 
     label_loss: Loss = field(default_factory=lambda: Loss("cauchy", 3.0))
-    """Loss on a spin label: labels were seen to contradict the flight."""
+    """Loss on a spin label: some labels contradict the flight."""
 
     launcher: Launcher | None = None
-    """Tells the spin of tracks without a spin label from their launcher settings."""
+    """Gives the spin of tracks without a spin label from their launcher settings."""
 
     find_events: bool = True
     """Look for hits, outliers and tracker shifts. False: the track is one undisturbed flight with contacts that the
     model explains."""
 
     solver: Solver | None = None
-    """What solves the factor graph: "ballfg", the solver of this package; "gtsam", GTSAM's Levenberg-Marquardt and
-    marginals, and iSAM2 for the online estimator. None is "gtsam" for the class `Online`, else "ballfg"."""
+    """Solver of the factor graph: "ballfg", this package's own; "gtsam", GTSAM's Levenberg-Marquardt and marginals, and
+    iSAM2 for the online estimator. None is "gtsam" for the class `Online`, else "ballfg"."""
 
     def __post_init__(self) -> None:
         self._check_types()
@@ -135,7 +135,7 @@ class Settings:
 
     @classmethod
     def for_measured(cls, model: BallModel, **changes: Any) -> Settings:
-        """Settings for measured tracks: the model's coefficients are known as well as their priors say.
+        """Settings for measured tracks: the model's coefficients are estimated with each track within their priors.
 
         Args:
             model: gives the coefficients and their prior standard deviations.
@@ -146,20 +146,20 @@ class Settings:
 
     @property
     def has_memory(self) -> bool:
-        """Whether the tracker's errors last from sample to sample."""
+        """True if the tracker's errors last from sample to sample."""
         return max(self.memory) > 0.0
 
     @property
     def bias_sigmas(self) -> Array:
-        """(3,) m, standard deviations of the errors that last; an axis without any has as good as none."""
+        """(3,) m, standard deviations of the lasting errors; a tiny one for an axis without any."""
         return np.maximum(self.memory, LEAST_BIAS)
 
     def for_track(self, track: Track) -> Settings:
-        """The settings of a track: positions that were made from other observations have no tracker's errors."""
+        """The settings of a track: positions computed from other observations have no tracker's errors."""
         return replace(self, memory=(0.0, 0.0, 0.0), stamp_jitter=0.0) if track.rough else self
 
     def renamed(self, model: BallModel) -> Settings:
-        """These settings with coefficients under the names that the model has today."""
+        """These settings with today's names of the model's coefficients."""
         earlier = [name for name in self.coefficients if todays_name(name) != name]
         if not earlier:
             return self
@@ -185,52 +185,52 @@ _TYPES: dict[str, type] = {
 }
 
 WIDEST_PRIOR = 1e5
-"""m/s or rad/s, widest spread of an unknown velocity or spin; it says nothing of a ball already."""
+"""m/s or rad/s, widest prior of an unknown velocity or spin; a wider one adds nothing."""
 NARROWEST_PRIOR = 1e-6
-"""m/s or rad/s. What is known better than that is known; double precision does not hold less beside free states."""
+"""m/s or rad/s. Narrowest prior; double precision cannot resolve less beside free states."""
 WIDEST_COEFFICIENT = 1e9
 """Widest prior of a coefficient, in its own unit, and of a time offset, s."""
 NARROWEST_COEFFICIENT = 1e-12
-"""Narrowest prior of a coefficient, in its own unit, and of a time offset, s: squares of less are lost beside others.
-Leave a coefficient out that is known."""
+"""Narrowest prior of a coefficient, in its own unit, and of a time offset, s: its square would be lost to rounding.
+Leave a known coefficient out."""
 MOST_JITTER = 1.0
-"""s. Over a second a ball goes and comes back: stamps of such an error say nothing."""
+"""s. Over a second a ball goes and comes back: stamps with such an error carry no information."""
 
 LEAST_BIAS = 1e-6
-"""m. Errors of this size are none; the linear algebra needs a number above zero."""
+"""m. Errors of this size are negligible; the linear algebra needs a number above zero."""
 
 LEAST_NOISE = 1e-6
-"""m. Nothing measures a ball to a micrometre; double precision does not hold less beside a velocity that is free."""
+"""m. Nothing measures a ball to a micrometre; double precision cannot resolve less beside a free velocity."""
 MOST_NOISE = 1e4
-"""m. A sample of this noise says nothing of a ball, and of a larger one no more than that."""
+"""m. Larger noise is cut to this: such a sample carries no information."""
 
 MEASURED = ProcessNoise(contact_tangential=0.2, contact_spin=10.0)
-"""Process noise on measured tracks: what friction does in a bounce is known to some 0.2 m/s only. Friction and
-tangential restitution as coefficients of a track would say the same, along a kink that no minimisation likes."""
+"""Process noise on measured tracks: the effect of friction in a bounce is known to some 0.2 m/s only. Friction and
+tangential restitution as coefficients of a track would be equivalent, but their kink hinders the minimisation."""
 
 
 def spin_start(label: SpinLabel | None, settings: Settings) -> tuple[Array, float]:
-    """Mean (3,) and standard deviation per axis, rad/s, of the spin at a start: those of the label or the prior."""
+    """Mean (3,) and standard deviation per axis, rad/s, of the spin at a start, from the label or the prior."""
     return (np.zeros(3), settings.spin_prior) if label is None else (label.spin, label.sigma)
 
 
 def sample_sigmas(settings: Settings, count: int, own: Array | None) -> Array:
-    """(n, 3) m, the caller's to change: a track's own sigmas where it has them, else the settings', both scaled.
+    """(n, 3) m, writable: a track's own sigmas, else the settings', both scaled.
 
-    They are those of the white part of a position's error, within `LEAST_NOISE` and `MOST_NOISE`.
+    They hold the white part of a position's error, within `LEAST_NOISE` and `MOST_NOISE`.
     """
     sigmas = np.broadcast_to(np.array(settings.position_noise), (count, 3)) if own is None else own
     return np.clip(settings.position_scale * sigmas, LEAST_NOISE, MOST_NOISE)
 
 
 def stamp_covariance(settings: Settings, velocity: Array) -> Array:
-    """(..., 3, 3) m^2, of the ways that the ball makes during the errors of stamps, at velocities (..., 3) m/s."""
+    """(..., 3, 3) m^2, of the ball's displacement during the errors of stamps, at velocities (..., 3) m/s."""
     way = settings.stamp_jitter * velocity
     return np.asarray(way[..., :, None] * way[..., None, :])
 
 
 def total_sigmas(settings: Settings, white: Array, velocities: Array) -> Array:
-    """Standard deviations of whole position errors: the white part, the one with a memory, and that of the stamps.
+    """Standard deviations of whole position errors: the white part, the lasting part, and that of the stamps.
 
     Args:
         settings: with memory and jitter.

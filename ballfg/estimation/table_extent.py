@@ -1,7 +1,7 @@
-"""The ends of a table, found from tracks: a ball that bounced was above it, a ball that fell past it was beside it.
+"""Finds the ends of a table from tracks: bounces lie above the table, falls beside it.
 
-The table is taken to have the size of the rules, its sides along the axes of the frame, the long side along x or y.
-Every place of its middle on a grid costs as much as the balls that contradict it; exp(-cost) is its probability.
+The table is assumed to have the size of the rules, with its long side along x or y. The cost of each place of its
+centre on a grid is the number of balls that contradict it; exp(-cost) is its probability.
 """
 
 import math
@@ -18,21 +18,21 @@ from ballfg.state import STANDARD_GRAVITY, Z
 from ballfg.tracks import TABLE_TENNIS, Track
 
 BASELINE: Final = 0.01
-"""s, at least, from one to the next of three samples that give a velocity; 3 mm of noise then make 0.2 m/s."""
+"""s, least distance between three samples that give a velocity; 3 mm of noise then give 0.2 m/s."""
 LEAST_BOUNCES: Final = 5
-"""Fewer do not show at which height the ball meets the table."""
+"""Least number of bounces that shows at which height the ball meets the table."""
 MISTAKEN: Final = 0.02
-"""Probability that a bounce or a fall is none: a hit at the table's height, an outlier."""
+"""Probability of a false bounce or fall: a hit at the table's height, an outlier."""
 MOST_CONTRADICTING: Final = 0.1
-"""Share of the balls that may contradict the best place; above it the table has another size or direction."""
+"""Largest share of balls that may contradict the best place; above it the table has another size or direction."""
 EDGE_TOLERANCE: Final = 0.03
-"""m. So near an edge a ball may touch or fall: its radius, half a degree between table and frame, 1 % of scale."""
+"""m. A ball this near to an edge may touch or fall: its radius, half a degree between table and frame, 1 % of scale."""
 GRID_STEP: Final = 0.01
 """m."""
 SURE: Final = 0.9
-"""A side ends the table where at least one ball fell beyond it with this probability."""
+"""A side ends the table if at least one ball fell beyond it with this probability."""
 RADIUS_TOLERANCE: Final = 0.15
-"""Largest relative difference from the radius of a table-tennis ball; balls of 38 and 44 mm are used, too."""
+"""Largest relative difference from the radius of a table-tennis ball; balls of 38 and 44 mm exist, too."""
 _UPWARD_GRAVITY: Final = np.array([0.0, 0.0, STANDARD_GRAVITY])
 
 
@@ -41,7 +41,7 @@ class TableExtent:
     """A table's ends, as far as the tracks show them.
 
     Attributes:
-        sides: (x_low, x_high, y_low, y_high) m; infinite where no ball fell beyond the side.
+        sides: (x_low, x_high, y_low, y_high) m; infinite if no ball fell beyond the side.
         sigmas: m, of each side; 0 where it is infinite.
         bounces: number of bounces on the table.
         falls: number of balls that fell past it.
@@ -99,7 +99,7 @@ def _bounces(times: Array, positions: Array, contact: float, radius: float) -> A
     end, rise, _ = _arcs(times, positions, (i + 1, i + 1 + reach, i + 1 + 2 * reach), i)
     turn = (rise - fall)[:, Z]
     ahead = np.divide((start - end)[:, Z], turn, out=np.full(len(i), -1.0), where=turn > 0.0)
-    after = ahead[:, None]  # s until both arcs are at one height; less than zero where the ball does not turn upwards
+    after = ahead[:, None]  # s until both arcs are at one height; negative if the ball does not turn upwards
     place = start + after * fall - after**2 / 2 * _UPWARD_GRAVITY
     fall, rise = fall - after * _UPWARD_GRAVITY, rise - after * _UPWARD_GRAVITY
     least = math.sqrt(2 * STANDARD_GRAVITY * radius)  # m/s, of a ball that rises by a radius
@@ -114,8 +114,8 @@ def _bounces(times: Array, positions: Array, contact: float, radius: float) -> A
 def _falls(times: Array, positions: Array, contact: float, depth: float) -> Array:
     """(f, 3) m, places at which balls fell past the height of contact.
 
-    A ball `depth` below it did not touch the table. The place is taken a quarter of that depth below contact, where
-    noise does not yet mistake a rolling ball for a falling one.
+    A ball `depth` below it did not touch the table. The place is a quarter of that depth below contact, where noise
+    does not yet make a rolling ball look like a falling one.
     """
     reach = _reach(times)
     i = np.arange(2 * reach, len(times))
@@ -135,14 +135,14 @@ def _falls(times: Array, positions: Array, contact: float, depth: float) -> Arra
 
 
 def _reach(times: Array) -> int:
-    """Samples from one to the next of three that give a velocity."""
+    """Number of samples between neighbours of the three that give a velocity."""
     return max(math.ceil(BASELINE / float(np.median(np.diff(times)))), 1)
 
 
 def _arcs(
     times: Array, positions: Array, samples: tuple[NDArray[np.intp], ...], at: NDArray[np.intp]
 ) -> tuple[Array, Array, Array]:
-    """Free falls through three samples each, as seen at the stamps of the samples `at` (m,).
+    """Free falls through three samples each, evaluated at the stamps of the samples `at` (m,).
 
     Returns: (m, 3) m, (m, 3) m/s, and (m,) m, the largest distance of a sample from the fall along z.
     """
@@ -176,12 +176,12 @@ def _fit(bounces: Array, falls: Array) -> TableExtent | None:
 
 
 def _grid(bounces: Array, size: float) -> Array:
-    """Places m of the table's middle along an axis, from which the bounce in the middle of all lies on it."""
+    """Places m of the table's centre along an axis, such that the median bounce lies on it."""
     return float(np.median(bounces)) + np.arange(-size / 2, size / 2, GRID_STEP)
 
 
 def _contradicting(bounces: Array, falls: Array, x: Array, y: Array, size: tuple[float, float]) -> Array:
-    """(x, y) number of balls that contradict a table of a size (m) with its middle there.
+    """(x, y) number of balls that contradict a table of a size (m) with its centre there.
 
     A ball that is on the wrong side of an edge counts in part, up to the tolerance.
     """
@@ -199,7 +199,7 @@ def _contradicting(bounces: Array, falls: Array, x: Array, y: Array, size: tuple
 
 
 def _side(places: Array, weight: Array, falls: Array, sign: float) -> tuple[float, float]:
-    """A side and its sigma (m), from its probable places; infinite where no ball surely fell beyond it."""
+    """A side and its sigma (m), from its probable places; infinite if no ball surely fell beyond it."""
     beyond = (weight * (sign * (falls[:, None] - places) > -EDGE_TOLERANCE)).sum(axis=1)
     if beyond.max() < SURE:
         return sign * math.inf, 0.0

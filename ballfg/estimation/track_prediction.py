@@ -1,4 +1,4 @@
-"""Prediction of whole tracks: observe the first part, predict what will be measured at every later stamp."""
+"""Predicts the later positions of whole tracks from their observed first parts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ballfg.checks import as_float
 from ballfg.estimation.batch import map_blocks
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.measurement.as_measured import measured_positions, true_times
-from ballfg.estimation.outside import outside_of
+from ballfg.estimation.out_of_distribution import out_of_distribution
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.settings import sample_sigmas, total_sigmas
 from ballfg.prediction.belief import Belief
@@ -32,22 +32,22 @@ if TYPE_CHECKING:
     from ballfg.estimation.conformal import ConformalScales
 
 BLOCK = 64
-"""Tracks that are propagated together, in one process; memory grows with it."""
+"""Number of tracks that are propagated together in one process; memory grows with it."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrackPrediction:
-    """Where the ball of one track will be measured: as the model measures it, at written stamps.
+    """Predicted positions of one track, with the model's measurement effects, at recorded stamps.
 
     Attributes:
         name: of the track.
         times: (k,) s, the stamps after the observed part; none if the track ends before.
         positions: (k, 3) m.
-        sigmas: (k, 3) m, of a measured position: state and measurement noise. Measurement effects do not change them:
-            they are right to the share by which those stretch lengths and to a lag times the velocity's sigma.
-        measured: (k, 3) m, what the track has at those stamps.
+        sigmas: (k, 3) m, of a measured position: state and measurement noise. They neglect measurement effects: a
+            stretch of lengths, and a lag times the velocity's sigma.
+        measured: (k, 3) m, the track's positions at those stamps.
         estimate: from the observed part.
-        conformal: by which the sigmas were scaled; None where they are the model's own.
+        conformal: the scales of the sigmas; None for the model's own sigmas.
         outside: (k,) share from 0, where a network was trained, to 1 far from there; None for other models.
     """
 
@@ -65,7 +65,7 @@ class TrackPrediction:
 
     @property
     def status(self) -> Status:
-        """How the estimation of the observed part ended."""
+        """The status of the observed part's estimate."""
         return self.estimate.status
 
     def plot(self) -> Figure:
@@ -89,7 +89,7 @@ def predict_tracks(
     Args:
         estimator: estimates the observed part of each track.
         tracks: a stream; some tens at a time and process are in memory.
-        count: how many there are, about.
+        count: approximate number of tracks.
         observe: s from the track's first stamp; a stamp at its end is observed. A function gives each track its own.
         horizon: s after the last observed stamp; later stamps are left out.
         jobs: processes.
@@ -140,9 +140,9 @@ def _block(
     horizon: float,
     tracks: Sequence[Track],
 ) -> list[TrackPrediction]:
-    """Predictions of a block; without the model where it is that of all, which need not travel with every track."""
+    """Predictions of a block, without a model that all tracks share, so that processes need not send it."""
     for track in tracks:
-        estimator.prepared(track)  # what is no track in m and s shows in the whole
+        estimator.prepared(track)  # checks the whole track for metres and seconds
     counted = [track.since_first() for track in tracks]
     parts = [track.opening(observe(track)) for track in counted]
     estimates = [estimator.estimate(part) for part in parts]
@@ -154,9 +154,9 @@ def _block(
 
 
 def _dated(prediction: TrackPrediction, times: Array) -> TrackPrediction:
-    """A prediction on the clock of the data.
+    """A prediction with the stamps of the data.
 
-    Args: times: (n,) s, the stamps of the whole track as they were written.
+    Args: times: (n,) s, the original stamps of the whole track.
     """
     observed = len(prediction.estimate.times)
     estimate = prediction.estimate.dated(times[:observed])
@@ -166,7 +166,7 @@ def _dated(prediction: TrackPrediction, times: Array) -> TrackPrediction:
 def _predict_block(
     estimator: Estimator, propagator: Propagator, estimates: list[Estimate], tracks: list[Track], horizon: float
 ) -> Iterator[TrackPrediction]:
-    """Predictions in the order of the tracks; those with the same coefficients are predicted together."""
+    """Predictions in the order of the tracks; tracks with the same coefficients are predicted together."""
     owners = [estimator.of(track) for track in tracks]
     found: dict[int, TrackPrediction] = {}
     for owner in dict.fromkeys(owners):
@@ -190,7 +190,7 @@ def _predict_alike(
     for k, predicted in enumerate(propagator.walk(belief, torch.from_numpy(times)) if times.size else ()):
         velocities[:, k] = predicted.mean[:, VELOCITY].numpy()
         positions[:, k] = measured_positions(predicted.model, predicted.mean, estimator.surfaces).numpy()
-        share = outside_of(predicted.model, predicted.mean)
+        share = out_of_distribution(predicted.model, predicted.mean)
         if share is not None:
             outside = np.zeros(times.shape) if outside is None else outside
             outside[:, k] = share
@@ -206,12 +206,12 @@ def _predict_alike(
 
 
 def _later(track: Track, end: float, horizon: float) -> NDArray[np.bool_]:
-    """(n,) bool: the stamps that are predicted."""
+    """(n,) bool: the stamps to predict."""
     return (track.times > end) & (track.times <= end + horizon + STAMP_TOLERANCE)
 
 
 def _padded(times: list[Array], ends: list[float]) -> Array:
-    """(n, k) s: each row's times, then the last of them again; a row without any holds the end of its observation."""
+    """(n, k) s: each row's times, then repeats of the last; a row without any holds the end of its observation."""
     longest = max(map(len, times))
     rows = [np.concatenate(([end], row)) for row, end in zip(times, ends, strict=True)]
     return np.stack([np.pad(row, (0, longest + 1 - len(row)), mode="edge")[1:] for row in rows])

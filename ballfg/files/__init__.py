@@ -1,1 +1,1 @@
-"""Files: written whole or not at all, read strictly."""
+"""Files are written whole or not at all, and read strictly."""

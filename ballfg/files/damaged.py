@@ -1,6 +1,6 @@
-"""Files that may be damaged or hostile: what a library raises becomes one line, and what they unpack to is bounded.
+"""Bounds the size of damaged or hostile files and turns a library's error into one line.
 
-Every reader passes here before it decodes anything. A small file may unpack to `FREE` bytes, a large one to `RATIO`
+Every reader calls this room before it decodes anything. A small file may unpack to `FREE` bytes, a large one to `RATIO`
 times its size more; text is held whole up to `MAX_TEXT` bytes, an image up to `MAX_PIXELS`.
 """
 
@@ -12,30 +12,30 @@ from typing import Final
 from ballfg.checks import one_line, short_text
 
 FREE: Final = 32_000_000
-"""Bytes that any file may unpack to."""
+"""Number of bytes that any file may unpack to."""
 RATIO: Final = 20
-"""Times its own size that a file may unpack to beyond that. Measurements shrink to a half or third, whole rows of zeros
-to a tenth."""
+"""Multiple of its own size that a file may unpack to beyond that. Measurements shrink to a half or third, whole rows of
+zeros to a tenth."""
 NUMBER: Final = 8
-"""Bytes of a number in memory, whatever it takes in a file."""
+"""Number of bytes of a number in memory, whatever its size in a file."""
 MAX_TEXT: Final = 250_000_000
-"""Bytes of a file of text that is held whole."""
+"""Largest number of bytes of a text file that is held whole."""
 MAX_LINE: Final = 1 << 18
-"""Characters of a line of a table. Those of a result have some 400."""
+"""Largest number of characters in a line of a table. Lines of results have some 400."""
 MAX_COLUMNS: Final = 10_000
-"""Of a table. Marker systems write some hundred."""
+"""Largest number of columns of a table. Marker systems write a few hundred."""
 MAX_PIXELS: Final = 64_000_000
-"""Of an image or a frame: 192 MB of three colours. A frame in 4K has 8 million."""
+"""Largest number of pixels of an image or a frame: 192 MB of three colours. A frame in 4K has 8 million."""
 _SAID: Final = 160
-"""Characters of a library's own words."""
+"""Largest number of characters of a library's own words."""
 
 
 @contextmanager
 def library_reads(path: Path, kind: str, remedy: str = "Copy or export it again.") -> Iterator[None]:
-    """Turns what a library raises at a damaged file, of whatever class, into one line that names the file.
+    """Turns any exception of a library at a damaged file into one line with the file's name.
 
-    Args: path: of the file.  kind: what it must be.  remedy: last sentence of the message.
-    Raises: ValueError: any of it; one that names the file already, as it is.
+    Args: path: of the file.  kind: required type of the file.  remedy: last sentence of the message.
+    Raises: ValueError: for any exception; one that names the file already stays as it is.
     """
     try:
         yield
@@ -47,17 +47,17 @@ def library_reads(path: Path, kind: str, remedy: str = "Copy or export it again.
 
 
 def most_unpacked(path: Path, free: int = FREE) -> int:
-    """Bytes that a file may unpack to."""
+    """Number of bytes that a file may unpack to."""
     return free + RATIO * path.stat().st_size
 
 
 def check_unpacked(path: Path, size: int, free: int = FREE) -> None:
-    """Refuses a file that says it holds far more than its own size can tell; call it before anything is unpacked.
+    """Refuses a file that claims to hold far more than its own size allows; call it before unpacking.
 
     Args:
         path: of the file.
         size: bytes that its content would take in memory, `NUMBER` for each cell of a table.
-        free: bytes that any file may unpack to; fewer for a format that takes long.
+        free: number of bytes that any file may unpack to; fewer for a format with slow readers.
     Raises: ValueError: more than that and 20 times the size of the file.
     """
     most = most_unpacked(path, free)
@@ -69,15 +69,15 @@ def check_unpacked(path: Path, size: int, free: int = FREE) -> None:
 
 
 def check_parts(path: Path, what: str, count: int, most: int) -> None:
-    """Refuses a file with more parts than its reader can look at. Args: what: the parts. Raises: ValueError."""
+    """Refuses a file with too many parts for its reader. Args: what: the parts. Raises: ValueError."""
     if count > most:
         raise ValueError(f"{path} must have at most {most} {what}; got {count}. Split it, or leave some out.")
 
 
 def check_pixels(path: Path, width: int, height: int) -> None:
-    """Refuses an image or video of a size that no camera has, px; call it before anything is decoded.
+    """Refuses an image or video with an impossible size, px; call it before decoding.
 
-    Raises: ValueError: more than `MAX_PIXELS`, or none.
+    Raises: ValueError: more than `MAX_PIXELS`, or zero.
     """
     if not 0 < width * height <= MAX_PIXELS:
         raise ValueError(
@@ -86,7 +86,7 @@ def check_pixels(path: Path, width: int, height: int) -> None:
 
 
 def whole_content(path: Path, most: int = MAX_TEXT) -> bytes:
-    """The bytes of a file of at most `most`. Raises: ValueError: it is larger, as one full of holes is. OSError."""
+    """The bytes of a file of at most `most`. Raises: ValueError: it is larger, such as a sparse file. OSError."""
     size = path.stat().st_size
     if size > most:
         raise ValueError(f"{path} must have at most {most / 1e6:g} MB; it has {size / 1e6:.0f} MB. Split it.")

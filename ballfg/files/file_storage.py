@@ -1,7 +1,7 @@
-"""Files of OpenCV's FileStorage (XML, JSON, YAML) as plain values.
+"""Reads files of OpenCV's FileStorage (XML, JSON, YAML) as plain values.
 
-OpenCV's own parser trusts a matrix's rows, columns and type as they stand, and a file with one of them changed can
-make it write past its memory. So the text is read here: as YAML, of which JSON is a part, or as XML, within bounds.
+OpenCV's own parser trusts a matrix's rows, columns and type, and a file with one of them changed can make it write past
+its memory. So this module reads the text: as YAML, of which JSON is a part, or as XML, within bounds.
 """
 
 import math
@@ -16,15 +16,15 @@ from ballfg.checks import shown
 from ballfg.files.strict_yaml import MAX_DEPTH, YamlError, parse_yaml
 
 Tree: TypeAlias = str | list["Tree"] | dict[str, "Tree"] | None
-"""A value as it is written, a sequence, or a map."""
+"""A scalar as written, a sequence, or a map."""
 
 MAX_BYTES: Final = 1_000_000
-"""Of a file: cameras take some thousand each."""
+"""Largest size of a file: each camera takes a few thousand."""
 ENDINGS: Final = (".xml", ".json", ".yml", ".yaml")
 _SHAPES: Final = (("rows", "cols"), ("sizes",))
-"""Nodes that say how large a matrix is: one of two dimensions, one of any."""
+"""Nodes with the size of a matrix: one of two dimensions, one of any number."""
 _TYPE: Final = re.compile(r"([1-9]?)[ucwsifdh]")
-"""Of a matrix's numbers: how many in each place, and of which kind."""
+"""Type of a matrix: count and kind of the numbers in each place."""
 _MAX_SIDE: Final = 1_000_000
 _TOKEN: Final = re.compile(r'"(?:[^"\\]|\\.)*"|\S+', re.DOTALL)
 
@@ -50,12 +50,12 @@ def read_storage(path: Path) -> dict[str, Tree]:
 
 
 def is_matrix(node: Tree) -> bool:
-    """Whether a node was written as a matrix."""
+    """True if a node was written as a matrix."""
     return isinstance(node, dict) and {"dt", "data"} <= set(node) and any(set(shape) <= set(node) for shape in _SHAPES)
 
 
 def number(node: Tree, where: str) -> float:
-    """The number that a node holds. Raises: ValueError: it holds none; `where` begins the message."""
+    """The number in a node. Raises: ValueError: another value; `where` begins the message."""
     text = node.strip().lower() if isinstance(node, str) else ""
     try:
         return float(text.replace(".nan", "nan").replace(".inf", "inf").replace("_", "x"))
@@ -66,7 +66,7 @@ def number(node: Tree, where: str) -> float:
 def numbers(node: Tree, where: str) -> list[float] | list[list[float]]:
     """The numbers of a matrix or a sequence, flat unless it is a matrix of several rows and columns.
 
-    Raises: ValueError: something else; `where` begins the message.
+    Raises: ValueError: another value; `where` begins the message.
     """
     if isinstance(node, list) and all(isinstance(item, str) for item in node):
         return [number(item, where) for item in node]
@@ -83,7 +83,7 @@ def numbers(node: Tree, where: str) -> list[float] | list[list[float]]:
     if len(items) != wanted:
         raise ValueError(f"{where}, data must hold {wanted} numbers as rows, cols and dt say; got {len(items)}.")
     flat = [number(item, f"{where}, data") for item in items]
-    if kind[0].endswith("f"):  # nine digits of a number of single precision
+    if kind[0].endswith("f"):  # single precision has nine digits
         flat = np.asarray(flat, np.float32).astype(float).tolist()
     if rows <= 1 or wanted <= rows:
         return flat
@@ -92,11 +92,11 @@ def numbers(node: Tree, where: str) -> list[float] | list[list[float]]:
 
 
 class _StorageError(ValueError):
-    """Text that is no file of FileStorage's."""
+    """Text in another format than FileStorage."""
 
 
 def _sides(node: dict[str, Tree], where: str) -> tuple[int, int]:
-    """Rows of a matrix and places in a row."""
+    """Number of rows and columns of a matrix."""
     if "sizes" not in node:
         return _count(node["rows"], f"{where}, rows"), _count(node["cols"], f"{where}, cols")
     sizes = node["sizes"] if isinstance(node["sizes"], list) else [node["sizes"]]
@@ -112,7 +112,7 @@ def _count(node: Tree, where: str) -> int:
 
 
 def _from_yaml(text: str) -> Tree:
-    """A YAML or JSON file: without OpenCV's own first line and tags, and its escape of an apostrophe."""
+    """A YAML or JSON file, without OpenCV's own first line and tags, and its escape of an apostrophe."""
     text = re.sub(r"\A%YAML[^\n]*\n?", "", text)
     text = re.sub(r"!!opencv-[a-z-]+", "", text).replace("\\'", "'")
     content: Tree = parse_yaml(text, "", text_only=True)

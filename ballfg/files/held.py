@@ -1,7 +1,7 @@
-"""Where results are made: in a hidden folder of a random name, while a lock in the user's own state folder is held.
+"""Locks a result in the user's state folder while it is made in a hidden folder of a random name.
 
-The kernel frees the lock when its process ends, however it ends. What a killed process left is cleared by the next
-writer of the same result, as the lock's file tells, which this user alone can write: what lies beside is not believed.
+The kernel frees the lock when its process ends, however it ends. The next writer of the same result clears the remains
+of a killed process, as listed in the lock's file, which only this user can write: files beside it are not trusted.
 """
 
 import errno
@@ -20,22 +20,22 @@ from typing import Any, Final
 from ballfg.files.own_folder import PRIVATE, state_folder
 
 MARK: Final = ".ballfg-"
-"""Start of the names of hidden folders."""
+"""Prefix of the names of hidden folders."""
 NEW, OLD = "new", "old"
-"""In a hidden folder: the folder that is made, and the one that it replaces."""
+"""Entries of a hidden folder: the new folder, and the one that it replaces."""
 PATIENCE: Final = 0.3
 """s after which a lock counts as that of a writer."""
 _DISK: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
 _records: ContextVar[dict[Path, Path | None]] = ContextVar("records")
-"""Of what this line of work holds, results and hidden folders: the files of the locks, None for a result that could not
-be locked. Another thread has none."""
+"""Results and hidden folders that this line of work holds: the files of the locks, None for a result that could not be
+locked. Another thread has none."""
 
 
 @contextmanager
 def held(target: Path, argument: str = "out") -> Iterator[None]:
-    """Keeps other processes of this user from writing a result until the block ends; who holds it may hold it again.
+    """Keeps other processes of this user from writing a result until the block ends; its holder may hold it again.
 
-    Where the state folder has no locks or no room, nothing is locked, and nothing cleared.
+    If the state folder supports no locks or is full, nothing is locked, and nothing cleared.
 
     Args: target: the file or folder, without links.  argument: its name, for the message.
     Raises: ValueError: another process, or another thread, writes it.
@@ -68,7 +68,7 @@ def held(target: Path, argument: str = "out") -> Iterator[None]:
             yield
     finally:
         if not _left(record):
-            record.unlink(missing_ok=True)  # while it is locked: whoever waits for it then makes a new one
+            record.unlink(missing_ok=True)  # while it is locked: a waiting process then makes a new one
         lock.release()
 
 
@@ -76,7 +76,7 @@ def held(target: Path, argument: str = "out") -> Iterator[None]:
 def hidden(parent: Path, target: Path, path: Path) -> Iterator[Path]:
     """A new folder for this user alone, removed at the end.
 
-    Args: parent: where it is made.  target: the result, held.  path: its name, which errors of the disk get.
+    Args: parent: of the new folder.  target: the result, held.  path: name in messages about the disk.
     """
     place, record = parent / f"{MARK}{secrets.token_hex(8)}", _records.get()[target]
     if record is not None:
@@ -94,7 +94,7 @@ def hidden(parent: Path, target: Path, path: Path) -> Iterator[Path]:
 
 
 def is_hidden(path: Path) -> bool:
-    """Whether a path lies in a hidden folder of this line of work: what is written there is no result yet."""
+    """True for a path in a hidden folder of this line of work, which is no result yet."""
     return any(each.name.startswith(MARK) for each in _records.get({}).keys() & {*path.parents})
 
 
@@ -114,20 +114,20 @@ def _write(record: Path, line: int | str, mode: str = "a") -> None:
 
 
 def _read(record: Path) -> Iterator[Any]:
-    """Its whole lines. Where the last one was cut, its folder was not made yet."""
+    """The whole lines. If the last one was cut, its folder was not made yet."""
     with suppress(OSError, ValueError), record.open(encoding="utf-8") as file:
         yield from map(json.loads, file)
 
 
 def _left(record: Path) -> list[Path]:
-    """The hidden folders that are still there, and are this user's."""
+    """The existing hidden folders that belong to this user."""
     places = [Path(line) for line in _read(record) if isinstance(line, str) and os.path.lexists(line)]
     found = ((place, place.lstat()) for place in places)
     return [place for place, one in found if stat.S_ISDIR(one.st_mode) and one.st_uid == os.geteuid()]
 
 
 def _clear_after(record: Path, target: Path) -> None:
-    """Removes what a killed process made; a folder that it had moved away gets its name again."""
+    """Removes the remains of a killed process; a folder that it had moved away gets its name back."""
     for place in _left(record):
         with suppress(OSError):
             if (place / OLD).is_dir() and not os.path.lexists(target):
@@ -137,5 +137,5 @@ def _clear_after(record: Path, target: Path) -> None:
 
 def _remove(place: Path) -> None:
     for folder, _, _ in os.walk(place):
-        os.chmod(folder, PRIVATE)  # nothing can be removed from one that is read-only
+        os.chmod(folder, PRIVATE)  # a read-only folder does not let anything be removed
     shutil.rmtree(place, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""Reading JSON that anybody may have written: one kind of error for all that keeps it from being read."""
+"""Reads untrusted JSON, with a single kind of error."""
 
 import json
 from pathlib import Path
@@ -7,16 +7,16 @@ from typing import Any, Final
 from ballfg.files.damaged import whole_content
 
 MAX_VALUES: Final = 8_000_000
-"""Of a text, as `_COSTS` counts them: some 300 MB in memory. A capture of 30 MB has 5 to 7 million."""
+"""Largest number of values in a text, weighted by `_COSTS`: some 300 MB. A capture of 30 MB has 5 to 7 million."""
 _COSTS: Final = {",": 1, ":": 2, "[": 4, "{": 4}
-"""What a value, a name, a list and a mapping count, by the sign that comes with each; so much memory do they take."""
+"""Weights of a value, a name, a list and a mapping, by the sign of each, in proportion to their memory."""
 TOO_MANY: Final = f"it must hold at most {MAX_VALUES} values, a name counted as 2, a list or mapping as 4"
 
 
 def read_json(path: Path) -> Any:
     """The content of a file.
 
-    Raises: ValueError: it is no JSON in UTF-8, or beyond what can be read; the caller names the file. OSError.
+    Raises: ValueError: not JSON in UTF-8, or too large; the caller names the file. OSError.
     """
     try:
         return parse_json(whole_content(path).decode("utf-8"))
@@ -27,12 +27,12 @@ def read_json(path: Path) -> Any:
 
 
 def has_too_many(text: str) -> bool:
-    """Whether JSON holds more than `MAX_VALUES`; it is not parsed for that."""
+    """True if JSON holds more than `MAX_VALUES`, without parsing it."""
     return 4 * len(text) > MAX_VALUES and sum(text.count(sign) * cost for sign, cost in _COSTS.items()) > MAX_VALUES
 
 
 def parse_json(text: str) -> Any:
-    """The content of JSON. Raises: JSONDecodeError: it is none, or beyond what can be read."""
+    """The content of JSON. Raises: JSONDecodeError: not JSON, or too large."""
     if has_too_many(text):
         raise json.JSONDecodeError(TOO_MANY, text, 0)
     try:

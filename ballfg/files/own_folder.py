@@ -1,4 +1,4 @@
-"""Folders that nobody but this user can change: for locks, and for machine code that is run as it is found."""
+"""Gives folders that only this user can change, for locks and for machine code."""
 
 import atexit
 import grp
@@ -16,10 +16,10 @@ _ROOT: Final = 0
 
 
 def state_folder(name: str) -> Path:
-    """The folder of this user's state under `name`, made if it is missing.
+    """The folder of this user's state under `name`, created if missing.
 
-    Returns: `$XDG_STATE_HOME/ballfg/name`, by default in `~/.local/state`; a folder of this user alone among the
-        temporary files where that cannot be written to, or where somebody else could.
+    Returns: `$XDG_STATE_HOME/ballfg/name`, by default in `~/.local/state`; if that cannot be written to, or if others
+        can, a folder of this user among the temporary files.
     """
     try:
         base = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
@@ -29,9 +29,9 @@ def state_folder(name: str) -> Path:
 
 
 def own_folder(folder: Path) -> Path:
-    """The folder itself, made for this user alone if it is missing.
+    """The folder itself, created for this user alone if missing.
 
-    Raises: OSError: it cannot be made or written to. ValueError: somebody else may change what is in it.
+    Raises: OSError: it cannot be made or written to. ValueError: others may change its content.
     """
     folder.mkdir(parents=True, exist_ok=True, mode=PRIVATE)
     if not is_own(folder):
@@ -43,7 +43,7 @@ def own_folder(folder: Path) -> Path:
 def temporary_folder(name: str) -> Path:
     """A folder among the temporary files that later processes of this user find again.
 
-    Returns: where somebody else has made a folder of that name, one for this process alone, removed at its end.
+    Returns: the folder; if another user has made one of that name, a folder of this process, removed at its end.
     """
     folder = Path(tempfile.gettempdir()) / f"ballfg-{os.getuid()}" / name
     with suppress(OSError):
@@ -58,11 +58,11 @@ def temporary_folder(name: str) -> Path:
 
 
 def is_own(folder: Path) -> bool:
-    """Whether nobody but this user and root can change what a folder holds, or put another one in its place.
+    """True if only this user and root can change a folder's content, or replace the folder.
 
     The folder belongs to this user or to root, and so do all folders around it; others may write to none of them,
-    unless its sticky bit keeps what others own, as that of /tmp does. Links of this user and of root are followed, and
-    judged where they lead; others could let theirs lead elsewhere at any time.
+    except with a sticky bit that protects the files of others, as in /tmp. Links of this user and of root are followed,
+    and their targets judged; other users could change theirs at any time.
     """
     try:
         real = Path(os.path.realpath(folder, strict=True))
@@ -76,9 +76,9 @@ def is_own(folder: Path) -> bool:
 
 
 def own_bytes(path: Path) -> bytes:
-    """The content of a file that only this user and root can change; ask `is_own` about its folder before.
+    """The content of a file that only this user and root can change; check its folder by `is_own` before.
 
-    Raises: OSError: it cannot be read. ValueError: somebody else owns it or may write to it, or it is no file.
+    Raises: OSError: it cannot be read. ValueError: another user owns it or may write to it, or it is not a file.
     """
     with open(path, "rb") as file:
         found = os.fstat(file.fileno())
@@ -89,7 +89,7 @@ def own_bytes(path: Path) -> bytes:
 
 
 def _is_closed(found: os.stat_result, *, sticky: bool) -> bool:
-    """Whether a folder belongs to this user or root, and nobody else can rename what is in it."""
+    """True if a folder belongs to this user or root, and no other user can rename its content."""
     if not stat.S_ISDIR(found.st_mode) or found.st_uid not in (_ROOT, os.geteuid()):
         return False
     if sticky and found.st_mode & stat.S_ISVTX:
@@ -100,7 +100,7 @@ def _is_closed(found: os.stat_result, *, sticky: bool) -> bool:
 
 
 def _is_group_of_one(group: int) -> bool:
-    """Whether a group has this user, or root, as its only member: many systems give each user such a group."""
+    """True if this user, or root, is a group's only member: many systems give each user such a group."""
     try:
         entry, user = grp.getgrgid(group), pwd.getpwuid(os.geteuid())
     except KeyError:

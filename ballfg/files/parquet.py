@@ -1,6 +1,6 @@
-"""Parquet files that anybody may have written: opened when their metadata say that they can be read.
+"""Opens untrusted Parquet files after a check of their metadata.
 
-Texts are read as dictionaries: a name of 1 MB that stands in each row is one name in the file, and one in memory.
+Texts are read as dictionaries: a name of 1 MB in each row is one name in the file, and one in memory.
 """
 
 from pathlib import Path
@@ -13,19 +13,19 @@ from ballfg.checks import MAX_TEXT
 from ballfg.files.damaged import MAX_COLUMNS, NUMBER, check_parts, check_unpacked, library_reads
 
 MAX_FOOTER: Final = 16_000_000
-"""Bytes of the metadata at the end of a file: some 100,000 pieces of columns."""
+"""Largest number of bytes of the metadata at a file's end: some 100,000 pieces of columns."""
 MAX_PIECES: Final = 100_000
-"""Columns times groups of rows."""
+"""Largest number of columns times groups of rows."""
 _BUFFER: Final = 1 << 20
 _REMEDY: Final = "Write it again."
 
 
 def open_parquet(path: Path) -> pq.ParquetFile:
-    """The file, of which nothing is decoded yet; columns of text will come as dictionaries.
+    """The file, not yet decoded; columns of text will come as dictionaries.
 
-    Small buffers and no reading ahead: a file with one huge group of rows is not held whole by those who read batches.
+    Small buffers and no reading ahead: a reader of batches does not hold a file's huge group of rows whole.
 
-    Raises: ValueError: no Parquet file, or one that unpacks to far more than its size; the message names it.
+    Raises: ValueError: not a Parquet file, or one that unpacks to far more than its size; the message names it.
     """
     with library_reads(path, "Parquet", _REMEDY):
         with path.open("rb") as file:
@@ -44,7 +44,7 @@ def open_parquet(path: Path) -> pq.ParquetFile:
 
 
 def texts_of(column: pa.Array | pa.ChunkedArray) -> list[Any]:
-    """The values of a column of texts, (n,), cut behind `MAX_TEXT`; rows of the same text share it."""
+    """The values of a column of texts, (n,), cut after `MAX_TEXT`; rows of the same text share it."""
     chunks = column.chunks if isinstance(column, pa.ChunkedArray) else [column]
     found: list[Any] = []
     for chunk in chunks:
@@ -60,7 +60,7 @@ def texts_of(column: pa.Array | pa.ChunkedArray) -> list[Any]:
 
 
 def _unpacked(about: Any) -> int:
-    """Bytes that all columns would take, by the metadata: those of the pages, and of a number for each value."""
+    """Number of bytes of all columns by the metadata: of the pages, plus a number for each value."""
     size = 0
     for group in range(about.num_row_groups):
         rows = about.row_group(group)

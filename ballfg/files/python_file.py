@@ -1,4 +1,4 @@
-"""Running a user's Python file: effects, observations or a detector of one's own."""
+"""Runs a user's Python file with effects, observations or a detector."""
 
 import sys
 from collections.abc import Iterator
@@ -17,11 +17,11 @@ T = TypeVar("T")
 
 
 def run_file(path: Path, what: str) -> ModuleType:
-    """The module of a file, under a name that no import finds: worker processes then get its contents as a whole.
+    """The module of a file, under a name that no import finds, so that worker processes get its whole content.
 
     Args:
-        path: one that is trusted: all of its code runs.
-        what: the file holds, for the module's name.
+        path: of a trusted file: all of its code runs.
+        what: kind of content, for the module's name.
     Raises: ValueError: if it does not run; the message has the line.
     """
     module = ModuleType(f"ballfg {what} {path}")
@@ -35,9 +35,9 @@ def run_file(path: Path, what: str) -> ModuleType:
 
 
 def load_classes(registry: Registry[T], path: str | Path) -> tuple[type[T], ...]:
-    """Run a Python file and register the classes that it defines; those that begin with `_` are left out.
+    """Runs a Python file and registers its classes, except for names that begin with `_`.
 
-    Args: registry: decides which classes it takes.  path: of a file that you trust: all of its code runs.
+    Args: registry: for classes of one kind.  path: of a file that you trust: all of its code runs.
     Returns: the classes, in the order in which they stand there.
     Raises:
         FileNotFoundError: if there is no such file.
@@ -57,7 +57,7 @@ def load_classes(registry: Registry[T], path: str | Path) -> tuple[type[T], ...]
 
 
 def defined_classes(module: ModuleType, base: type[Any] | tuple[type[Any], ...]) -> list[type[Any]]:
-    """The classes of a base that a module defines itself, in their order; not those that are abstract or private."""
+    """The classes of a base that a module itself defines, in their order, except for abstract or private ones."""
     return [
         item
         for name, item in vars(module).items()
@@ -68,14 +68,14 @@ def defined_classes(module: ModuleType, base: type[Any] | tuple[type[Any], ...])
 
 @contextmanager
 def blamed(path: Path, doing: str) -> Iterator[None]:
-    """Turns whatever the user's code raises, which is the user's to mend, into one line.
+    """Turns any exception of the user's code into one line.
 
-    Args: path: of the file.  doing: what its code was asked for; empty while the file runs.
+    Args: path: of the file.  doing: present task of its code; empty while the file runs.
     Raises: ValueError: with the line.
     """
     try:
         yield
-    except BaseException as error:  # one that leaves, by sys.exit or otherwise, would take the command with it
+    except BaseException as error:  # sys.exit in it would end the command
         if is_interrupt(error):
             raise
         during = f" ({doing})" if doing else ""
@@ -83,7 +83,7 @@ def blamed(path: Path, doing: str) -> Iterator[None]:
 
 
 def _where(error: BaseException, path: Path) -> str:
-    """What happened, and in which line of the file."""
+    """The error, and its line in the file."""
     lines = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == str(path)]
     if not lines and isinstance(error, SyntaxError) and error.filename == str(path):
         lines = [error.lineno]

@@ -1,7 +1,7 @@
-"""Reading YAML files that anybody may have written: plain values only, no key twice, within bounds.
+"""Reads untrusted YAML files: plain values only, no repeated key, within bounds.
 
-The text is looked at as a stream of events first. This takes no recursion and builds nothing, so that nesting, aliases
-that multiply, tags and long numbers are refused before they can cost time or memory.
+A first pass looks at the text as a stream of events. It takes no recursion and builds nothing, so that nesting, aliases
+that multiply, tags and long numbers are refused before they cost time or memory.
 """
 
 import math
@@ -14,21 +14,21 @@ from ballfg.checks import shown, type_name
 
 MAX_BYTES: Final = 16_000_000
 MAX_NODES: Final = 250_000
-"""Values and keys with all aliases written out; they are read in 2 s."""
+"""Largest number of values and keys with all aliases expanded; they take 2 s."""
 MAX_DEPTH: Final = 40
 MAX_DIGITS: Final = 100
-"""Characters of a number."""
+"""Largest number of characters in a number."""
 MAX_KEY: Final = 1000
-"""Characters of a key, which messages name in full."""
+"""Largest number of characters in a key, which messages quote in full."""
 _TAG: Final = "tag:yaml.org,2002:"
 _NUMBERS: Final = (f"{_TAG}int", f"{_TAG}float")
 _PARSER: Final = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-"""libyaml's parser, ten times as fast, where PyYAML was built with it."""
+"""libyaml's parser, ten times as fast, if PyYAML was built with it."""
 _TEXT_LOADER: Final = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 
 
 class _Loader(_PARSER):  # type: ignore[misc, valid-type]
-    """Keys are text as they are written: the track 007 is not the number 7."""
+    """Keys are text: the track 007 is not the number 7."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[str, Any]:
         self.flatten_mapping(node)
@@ -36,12 +36,12 @@ class _Loader(_PARSER):  # type: ignore[misc, valid-type]
 
 
 class YamlError(ValueError):
-    """A file that is not YAML, goes beyond a bound, or has a key twice. Its text is one line with file and place.
+    """A file that is not YAML, exceeds a bound, or repeats a key. Its text is one line with file and place.
 
     Attributes:
-        problem: what is wrong, without the place.
-        line: its number, from 1; None where it is not known.
-        repeated: the key that stands twice, with the keys above it and dots between; None for another problem.
+        problem: the error, without the place.
+        line: its number, from 1; None if unknown.
+        repeated: the repeated key, after the keys above it and dots; None for another problem.
     """
 
     def __init__(self, where: str, problem: str, line: int | None = None, repeated: str | None = None) -> None:
@@ -53,7 +53,7 @@ class YamlError(ValueError):
 def read_yaml(path: Path) -> Any:
     """The content of a YAML file; None if it is empty.
 
-    Raises: ValueError: if it is not YAML, goes beyond a bound, or has a key twice (a `YamlError`).
+    Raises: ValueError: if it is not YAML, exceeds a bound, or repeats a key (a `YamlError`).
     """
     if path.stat().st_size > MAX_BYTES:
         raise YamlError(str(path), f"it must have at most {MAX_BYTES / 1e6:g} MB")
@@ -67,7 +67,7 @@ def read_yaml(path: Path) -> Any:
 def parse_yaml(text: str, where: str, *, text_only: bool = False) -> Any:
     """The content of YAML text; None if it is empty.
 
-    Args: where: begins the message of an error.  text_only: each value is text as it is written.
+    Args: where: start of an error message.  text_only: keep each value as text.
     Raises: ValueError: as `read_yaml`.
     """
     try:
@@ -90,7 +90,7 @@ def parse_yaml(text: str, where: str, *, text_only: bool = False) -> Any:
 def read_mapping(path: Path) -> dict[Any, Any]:
     """The content of a YAML file that must be a mapping.
 
-    Raises: FileNotFoundError: no such file. ValueError: not YAML, a key twice, no mapping; the message names the file.
+    Raises: FileNotFoundError: no such file. ValueError: not YAML, a repeated key, no mapping; with the file's name.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be a file that exists. Correct the path.")
@@ -98,7 +98,7 @@ def read_mapping(path: Path) -> dict[Any, Any]:
 
 
 def mapping(what: str, content: Any) -> dict[Any, Any]:
-    """The content itself. Raises: ValueError: if it is not a mapping with something in it."""
+    """The content itself. Raises: ValueError: if it is not a non-empty mapping."""
     if not isinstance(content, dict) or not content:
         got = "an empty one" if content == {} else type_name(content)
         raise ValueError(f"{what} must be a mapping; got {got}. Write it as 'key: value'.")
@@ -106,7 +106,7 @@ def mapping(what: str, content: Any) -> dict[Any, Any]:
 
 
 def _check_events(where: str, text: str) -> None:
-    """Refuses what would cost more than its text: deep nesting, aliases that multiply or hold themselves, tags."""
+    """Refuses costly text: deep nesting, aliases that multiply or contain themselves, tags."""
     sizes = _Sizes()
     for event in yaml.parse(text, Loader=_PARSER):
         problem = sizes.add(event)
@@ -116,17 +116,17 @@ def _check_events(where: str, text: str) -> None:
 
 
 class _Sizes:
-    """Counts the values of a stream of events, with all aliases written out, without writing them out."""
+    """Counts the values of a stream of events with all aliases expanded, without expanding them."""
 
     def __init__(self) -> None:
         self.nodes = 0
-        self.open: list[tuple[str | None, int]] = []  # anchor of each collection that is open, and nodes before it
-        self.anchors: dict[str, int | None] = {}  # size of what an anchor names; None while it is open
+        self.open: list[tuple[str | None, int]] = []  # anchor of each open collection, and number of nodes before it
+        self.anchors: dict[str, int | None] = {}  # size of an anchor's value; None while it is open
 
     def add(self, event: yaml.Event) -> str:
-        """Counts an event. Returns: what is wrong with it; empty if nothing is."""
+        """Counts an event. Returns: the error; empty without one."""
         if isinstance(event, yaml.AliasEvent):
-            size = self.anchors.get(event.anchor or "", 1)  # the composer refuses an anchor that is not known
+            size = self.anchors.get(event.anchor or "", 1)  # the composer refuses an unknown anchor
             if size is None:
                 return f"alias {shown(event.anchor)} must not stand within what it names"
             self.nodes += size
@@ -144,7 +144,7 @@ class _Sizes:
         return f"it must hold at most {MAX_NODES} values, aliases written out" if self.nodes > MAX_NODES else ""
 
     def _begin(self, event: yaml.ScalarEvent | yaml.CollectionStartEvent) -> None:
-        """Notes the anchor of a value that begins."""
+        """Notes the anchor of a value."""
         collection = isinstance(event, yaml.CollectionStartEvent)
         if collection:
             self.open.append((event.anchor, self.nodes - 1))
@@ -153,11 +153,11 @@ class _Sizes:
 
 
 def _check_values(where: str, loader: Any, node: yaml.Node | None, prefix: str, seen: set[yaml.Node]) -> None:
-    """Refuses at any depth a value that its form promises and that cannot be made, and a key that stands twice.
+    """Refuses, at any depth, a malformed value and a repeated key.
 
-    The safe loader would take the last one of two equal keys in silence.
+    The safe loader would silently take the last of two equal keys.
     """
-    if node is None or node in seen:  # an alias leads to a node again
+    if node is None or node in seen:  # an alias leads to a known node
         return
     seen.add(node)
     if isinstance(node, yaml.ScalarNode):
@@ -181,7 +181,7 @@ def _check_values(where: str, loader: Any, node: yaml.Node | None, prefix: str, 
 
 
 def _check_scalar(where: str, loader: Any, node: yaml.ScalarNode) -> None:
-    """Refuses a number or a date that is none, or beyond what machines hold."""
+    """Refuses a malformed number or date, or one beyond the range of machines."""
     line = node.start_mark.line + 1
     if node.tag in _NUMBERS and len(node.value) > MAX_DIGITS:
         raise YamlError(where, f"a number must have at most {MAX_DIGITS} digits; got {len(node.value)}", line)

@@ -1,4 +1,4 @@
-"""Tensors from safetensors files, the only form in which weights are read."""
+"""Reads tensors from safetensors files, the only format of weights."""
 
 from pathlib import Path
 from typing import Final
@@ -9,13 +9,13 @@ from torch import Tensor
 from ballfg.files.damaged import library_reads
 
 MAX_HEADER: Final = 1_000_000
-"""Bytes of the names and shapes at the beginning of a file; the header of our own networks has some 2,000."""
+"""Largest number of bytes of the names and shapes in a file; the header of this package's networks has some 2,000."""
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
     """The tensors of a file by name.
 
-    Raises: ValueError: a damaged file, the message names it. FileNotFoundError: no such file.
+    Raises: ValueError: a damaged file, with its name. FileNotFoundError: no such file.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path} must be a file of weights; there is none. Copy it again.")

@@ -1,4 +1,4 @@
-"""Writing a file as a whole: it has its name only when it is complete."""
+"""Writes a file as a whole: it gets its name only when it is complete."""
 
 import errno
 import os
@@ -12,10 +12,10 @@ from ballfg.files.held import held, hidden, is_hidden
 
 @contextmanager
 def whole_file(path: Path, argument: str = "out") -> Iterator[Path]:
-    """A path in a hidden folder, with the same name, to write to; it takes its place when the block ends well.
+    """A path in a hidden folder, with the same name, for writing; it replaces the file when the block ends well.
 
-    After an exception, Ctrl-C or a kill what was there before is untouched. A file that is replaced leaves its mode to
-    the new one. A link stays, and the file that it leads to is replaced.
+    After an exception, Ctrl-C or a kill the previous file is untouched. A new file gets the mode of the one that it
+    replaces. A link stays, and its target is replaced.
 
     Raises: FileNotFoundError: the folder of the path does not exist. ValueError: the path is a folder, a device, or a
         link that leads nowhere, or another process is writing it. OSError: it cannot be written; the path is named.
@@ -50,7 +50,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def flush(path: Path) -> None:
-    """Brings a file, or the names in a folder, to the disk: else a power cut leaves a name without content."""
+    """Flushes a file, or the names in a folder, to the disk: else a power cut leaves a name without content."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -62,10 +62,10 @@ def flush(path: Path) -> None:
 
 
 def check_file(path: Path, argument: str = "out") -> None:
-    """Refuses a path to which no file can be written.
+    """Refuses a path that cannot become a file.
 
-    Raises: FileNotFoundError: its folder does not exist. ValueError: it is a folder, a device such as /dev/null, whose
-        place a file would take, or a link that leads nowhere.
+    Raises: FileNotFoundError: its folder does not exist. ValueError: it is a folder, a device such as /dev/null, which
+        a file would replace, or a link that leads nowhere.
     """
     check_parent(path, argument)
     if path.is_dir():

@@ -1,4 +1,4 @@
-"""Folders as a whole: their files have their names only when all of them are complete, and are read together."""
+"""Writes and reads folders as a whole: their files get their names only when all are complete."""
 
 import ctypes
 import errno
@@ -18,20 +18,20 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 DEEPEST: Final = 100
-"""Folders in folders of a result."""
+"""Largest depth of folders in a result."""
 
 
 @contextmanager
 def whole_folder(folder: Path, *, earlier: Iterable[str] = (), argument: str = "out") -> Iterator[Path]:
-    """A hidden folder to write to; what it holds is in `folder` when the block ends well.
+    """A hidden folder for writing; its content is in `folder` when the block ends well.
 
-    After an exception, Ctrl-C or a kill `folder` holds the old result or the new one: one that exists is exchanged, in
-    one step, for a new one that holds its other files too. A disk that cannot exchange folders needs two steps.
+    After an exception, Ctrl-C or a kill `folder` holds the old result or the new one: an existing folder is exchanged,
+    in one step, for a new one that holds its other files too. A disk that cannot exchange folders needs two steps.
 
     Args:
         folder: its parent must exist.
         earlier: names of entries, or patterns of them, that an earlier result may have, such as `a` or `shots/a`;
-            those that are not written again are removed.
+            entries that are not written again are removed.
         argument: the folder's name in a message.
     Raises: FileNotFoundError: the parent does not exist. ValueError: `folder` is a file, or one that cannot be
         exchanged, or another process writes it. OSError: it cannot be written; `folder` is named.
@@ -61,7 +61,7 @@ def whole_folder(folder: Path, *, earlier: Iterable[str] = (), argument: str = "
                 if name not in ours and not (
                     os.path.lexists(there) and path.lstat().st_mtime_ns == there.lstat().st_mtime_ns
                 ):
-                    os.replace(path, there)  # somebody has written it meanwhile
+                    os.replace(path, there)  # another process has written it meanwhile
             os.utime(target)
         flush(target.parent)
 
@@ -70,8 +70,8 @@ def whole_folder(folder: Path, *, earlier: Iterable[str] = (), argument: str = "
 def reserved(folder: Path, argument: str = "out") -> Iterator[None]:
     """Keeps other processes of this user from writing a folder until the block ends; `whole_folder` within it may.
 
-    Long work begins with it, so that a folder that cannot be written to, or that another process writes, is refused
-    before the work and not after it.
+    Long work begins with it, so that an unusable folder, or one that another process writes, is refused before the
+    work.
 
     Raises: as `whole_folder`.
     """
@@ -102,31 +102,31 @@ def check_replaceable(
     force: bool = True,
     is_mark: Callable[[Path], bool] = Path.is_file,
 ) -> None:
-    """Refuses a folder that holds something that must not be lost; a new or an empty one never does.
+    """Refuses a folder with content that must not be lost; a new or an empty one is fine.
 
     Args:
-        folder: to write to.
-        mark: name of the file that tells an earlier result.
-        what: such a result is called in a message.
+        folder: the output.
+        mark: name of the file that identifies an earlier result.
+        what: name of such a result in a message.
         only: all names that an earlier result can have; None: other files may lie beside it.
-        force: an earlier result may be replaced.
-        is_mark: tells the mark from a file of that name that something else wrote.
+        force: True to replace an earlier result.
+        is_mark: distinguishes the mark from a foreign file of that name.
     Raises: ValueError: other content, or an earlier result and no `force`; else as `whole_folder`.
     """
     target = _exchangeable(folder, "out")
-    with held(target):  # what was left between two steps is put back
+    with held(target):  # restores the remains of an exchange in two steps
         names = {entry.name for entry in target.iterdir()} if target.exists() else set()
         present = {name for name in names if not name.startswith(MARK)}
         if present and (not is_mark(folder / mark) or (only is not None and not present <= set(only))):
             raise ValueError(f"out must be new, empty or hold {what}; {folder} holds other files. Choose another name.")
         if present and not force:
             raise ValueError(f"out must be new or empty; {folder} holds {what}. Replace it with --force.")
-        with hidden(target.parent, target, folder):  # a folder that cannot be written to is refused here
+        with hidden(target.parent, target, folder):  # refuses a folder that cannot be written to
             pass
 
 
 def _exchangeable(folder: Path, argument: str) -> Path:
-    """The folder without links. Raises: ValueError: one that must keep its place; else as `check_folder`."""
+    """The folder without links. Raises: ValueError: one that cannot be moved; else as `check_folder`."""
     target = check_folder(folder, argument)
     with suppress(FileNotFoundError):  # the current folder may have been removed
         if os.path.ismount(target) or target in (here := Path.cwd(), *here.parents):
@@ -138,9 +138,9 @@ def _exchangeable(folder: Path, argument: str) -> Path:
 
 
 def _staying(old: Path, new: Path, patterns: Collection[str]) -> Iterator[tuple[Path, Path, str]]:
-    """What stays of an earlier result: each file, its place in the new folder, and its name.
+    """The files of an earlier result that stay: each file, its place in the new folder, and its name.
 
-    Folders are made in the new one, and at the end become as they were. Raises: OSError: one is mounted, or too deep.
+    Folders are made in the new one, and get their modes at the end. Raises: OSError: one is mounted, or too deep.
     """
     folders = [""]
     for within in folders:
@@ -155,7 +155,7 @@ def _staying(old: Path, new: Path, patterns: Collection[str]) -> Iterator[tuple[
                 yield Path(entry), there, name
             elif there.is_dir() or not os.path.lexists(there):
                 folders.append(name)
-    for within in reversed(folders):  # those in it first: it may be read-only
+    for within in reversed(folders):  # inner folders first: the outer one may be read-only
         found = (old / within).stat()
         with suppress(PermissionError):
             os.chown(new / within, found.st_uid, found.st_gid)
@@ -163,7 +163,7 @@ def _staying(old: Path, new: Path, patterns: Collection[str]) -> Iterator[tuple[
 
 
 def _put(place: Path, target: Path) -> Path:
-    """Puts the new folder in the place of the old one. Returns: where the old one is then."""
+    """Puts the new folder in the place of the old one. Returns: the new place of the old one."""
     try:
         exchange(place / NEW, target)
     except OSError:
@@ -191,9 +191,9 @@ def exchange(one: Path, other: Path) -> None:
 
 
 def of_one_state(read: Callable[P, T]) -> Callable[P, T]:
-    """A reader that reads again where its folder was exchanged meanwhile, so that all files are of one result.
+    """A reader that repeats if its folder was exchanged meanwhile, so that all files belong to one result.
 
-    Args: read: its first argument is the folder, or a file in it.
+    Args: read: takes the folder, or a file in it, as its first argument.
     """
 
     @wraps(read)

@@ -1,4 +1,4 @@
-"""A user's own files to a dataset: columns, units, axes, table and shots are guessed, shown and written."""
+"""Imports a user's own files as a dataset: it guesses columns, units, axes, table and shots, and shows them."""
 
 import lazy_loader
 

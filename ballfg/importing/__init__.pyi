@@ -1,11 +1,4 @@
 from .choices import Choices as Choices
-from .choices import Guess as Guess
-from .choices import UndecidedError as UndecidedError
-from .choices import parse_columns as parse_columns
-from .formats.registry import FORMATS as FORMATS
 from .formats.registry import Format as Format
 from .formats.registry import register_format as register_format
 from .importer import import_tracks as import_tracks
-from .proposal import Proposal as Proposal
-from .proposal import propose as propose
-from .writing import write_import as write_import

@@ -1,4 +1,4 @@
-"""Which ball flew, by its drag, and how high the table stands, by the bounces."""
+"""Determines the ball by its drag and the table's height by the bounces."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -6,26 +6,27 @@ from typing import Final
 from ballfg.importing.bounces import surface
 from ballfg.importing.choices import Choices, Guess, UndecidedError
 from ballfg.importing.frame import Frame
-from ballfg.tracks import TABLE_TENNIS, TENNIS, Ball, Track
+from ballfg.tracks import TABLE_TENNIS, Ball, Track
+from ballfg.tracks.info import TENNIS
 
 BALLS: Final = {"table-tennis": TABLE_TENNIS, "tennis": TENNIS}
 _TENNIS_DRAG: Final = 0.045
 """1/m; halfway, in ratio, between the drags of the two balls."""
 _SURE_WINDOWS: Final = 30
-"""Parts of flights from which on their drag tells one ball from the other."""
+"""Number of flight parts from which their drag distinguishes the balls."""
 
 
 def ball_of(choices: Choices, frame: Frame) -> tuple[Ball, Guess]:
-    """The ball, and how sure that is.
+    """The ball, and the confidence in it.
 
-    Args: choices: what is decided.  frame: with the drag (1/m) that the flights show.
-    Raises: FileNotFoundError, ValueError: a ball that was chosen and is not known, or whose file cannot be read.
+    Args: choices: of the user.  frame: with the drag (1/m) of the flights.
+    Raises: FileNotFoundError, ValueError: an unknown chosen ball, or a file that cannot be read.
     """
     if choices.ball is not None:
         if choices.ball in BALLS:
             ball = BALLS[choices.ball]
         else:
-            from ballfg.simulation import ball_kind
+            from ballfg.simulation.balls import ball_kind
 
             ball = ball_kind(choices.ball).ball
         return ball, Guess("ball", choices.ball, "as given", "stated", f"--ball {choices.ball}")
@@ -41,9 +42,9 @@ def ball_of(choices: Choices, frame: Frame) -> tuple[Ball, Guess]:
 
 
 def table_of(tracks: Sequence[Track], ball: Ball, choices: Choices) -> tuple[float, Guess]:
-    """The height of the table's surface in m, and how sure that is.
+    """The height of the table's surface in m, and the confidence in it.
 
-    Args: tracks: in m and s with z up.  ball: whose radius lies between a bounce and the surface.  choices: decided.
+    Args: tracks: in m and s with z up.  ball: its radius lies between a bounce and the surface.  choices: of the user.
     Raises: UndecidedError: no bounce shows it.
     """
     if choices.table_height is not None:

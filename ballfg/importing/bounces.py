@@ -1,4 +1,4 @@
-"""The height of the table, from where the balls bounce."""
+"""Finds the height of the table from the bounces of the balls."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -9,16 +9,16 @@ import numpy as np
 from ballfg.arrays import Array
 
 _ARM: Final = 0.06
-"""s of flight that is fitted on each side of a bounce."""
+"""s of flight for the fit on each side of a bounce."""
 _LEAST_SAMPLES: Final = 3
 _LEAST_SPEED: Final = 0.7
-"""m/s, of the fall before and of the rise after a bounce; slower ones are rolling balls and noise."""
+"""m/s, least speed of the fall before and of the rise after a bounce; slower ones are rolling balls and noise."""
 _MOST_RESIDUAL: Final = 0.02
-"""m, root mean square about the two flights; more is a hit, an outlier, or two balls."""
+"""m, largest root mean square about the two flights; a larger one means a hit, an outlier, or two balls."""
 _SAME: Final = 0.04
 """m: bounces within this distance of each other are on one surface."""
 _SHARE: Final = 0.3
-"""A higher surface with this share of the bounces of the most frequent one is the table: balls bounce on below it."""
+"""Share of the most frequent surface's bounces from which a higher surface is the table: balls bounce on below it."""
 _GRAVITY: Final = 10.0
 """m/s^2, of the fitted arcs: gravity and a little topspin. An error of 5 moves a bounce by 2 mm."""
 
@@ -37,10 +37,10 @@ class Surface:
 
 
 def surface(shots: Iterable[tuple[Array, Array]]) -> Surface | None:
-    """The surface that most balls bounce on, or a higher one that nearly as many do.
+    """The surface of most bounces, or a higher one with nearly as many.
 
     Args: shots: times (n,) s and positions (n, 3) m, z up.
-    Returns: None where no bounce is seen.
+    Returns: None without a bounce.
     """
     heights = np.sort([height for t, p in shots for height in bounce_heights(t, p[:, 2])])
     groups: list[Array] = []
@@ -60,7 +60,7 @@ def surface(shots: Iterable[tuple[Array, Array]]) -> Surface | None:
 
 
 def bounce_heights(times: Array, heights: Array) -> list[float]:
-    """The heights (m) at which one ball bounced: where the arc before meets the arc after.
+    """The heights (m) of one ball's bounces: where the arc before meets the arc after.
 
     Args: times: (n,) s.  heights: (n,) m.
     """
@@ -106,7 +106,7 @@ def _arc(times: Array, heights: Array, origin: float) -> tuple[float, float, flo
 
 
 def _distinct(found: list[tuple[float, float, float]]) -> list[tuple[float, float, float]]:
-    """Of bounces less than the length of an arm apart, the one that fits best."""
+    """The best-fitting of bounces less than the length of an arm apart."""
     kept: list[tuple[float, float, float]] = []
     for bounce in sorted(found):
         if all(abs(bounce[1] - other[1]) > _ARM for other in kept):

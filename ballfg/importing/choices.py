@@ -1,4 +1,4 @@
-"""What a user may decide about an import, what was guessed in its place, and the question where no guess is safe."""
+"""Holds a user's choices for an import, the guesses in their place, and the questions without a safe guess."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -8,15 +8,15 @@ from ballfg.checks import check_choice, check_instance, check_number, check_text
 from ballfg.importing.fall import AXES, LENGTHS, TIMES
 
 ROLES: Final = ("t", "frame", "trajectory", "x", "y", "z", "sigma_x", "sigma_y", "sigma_z")
-"""What a column can be."""
+"""Possible roles of a column."""
 MAX_WHAT: Final = 900
-"""Characters of what is not decided, in a message."""
+"""Largest number of characters of an open question in a message."""
 MAX_CHOICE: Final = 240
-"""Characters of a choice in it: three names of columns of a usual length can be copied whole."""
+"""Largest number of characters of a choice in it, for three column names of usual length."""
 
 
 class UndecidedError(ValueError):
-    """A guess that is not safe: the option that decides it, and what it may be."""
+    """An unsafe guess: its option and the possible values."""
 
     def __init__(self, what: str, option: str, choices: Sequence[str], example: str | None = None) -> None:
         self.option, self.choices = option, tuple(choices)
@@ -29,9 +29,9 @@ class UndecidedError(ValueError):
 
 @dataclass(frozen=True)
 class Choices:
-    """What is decided; None where it is to be guessed.
+    """The user's choices; None for a guess.
 
-    Raises: ValueError: an option that is not one of its kind.
+    Raises: ValueError: an option with an impossible value.
     """
 
     columns: Mapping[str, str] = field(default_factory=dict)
@@ -88,14 +88,14 @@ class Guess:
     sure: str
     """stated, sure, likely or unsure."""
     option: str
-    """As typed to change it; empty where nothing can be changed."""
+    """The option that changes it, as typed; empty if it cannot be changed."""
 
 
 def parse_columns(text: str) -> dict[str, str]:
     """Roles and columns from text such as "t=stamp,x=X".
 
     Returns: role -> name of the column.
-    Raises: ValueError: not of this form.
+    Raises: ValueError: another form.
     """
     found: dict[str, str] = {}
     for part in text.split(","):

@@ -1,4 +1,4 @@
-"""Which column is what: by its name, and where names say nothing, by its numbers."""
+"""Determines the role of each column by its name or else by its numbers."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,15 +16,15 @@ RATES: Final = ("rate", "fps", "frame_rate", "framerate", "hz", "sampling_rate",
 """Names of a constant that is the number of frames per second."""
 UNITS: Final = ("unit", "units", "length_unit", "position_unit")
 _REGULAR: Final = 0.3
-"""Median deviation of the steps of a time column, in median steps; coordinates vary more."""
+"""Largest median deviation of the steps of a time column, in median steps; coordinates vary more."""
 _FORWARD: Final = 0.9
 _PIECES: Final = 0.2
-"""Most changes, per row, of a column that names trajectories."""
+"""Largest number of changes, per row, of a column with the names of trajectories."""
 
 
 @dataclass(frozen=True)
 class Roles:
-    """The columns of one table by what they are."""
+    """The columns of one table by role."""
 
     places: tuple[str, str, str]
     time: tuple[str, ...]
@@ -42,7 +42,7 @@ class Roles:
 def roles_of(table: RawTable, choices: Choices) -> Roles | None:
     """The roles of a table's columns; None if it holds no positions.
 
-    Raises: UndecidedError: several readings. ValueError: positions in an image alone, or a column that does not exist.
+    Raises: UndecidedError: several readings. ValueError: only positions in an image, or an unknown column.
     """
     given = {role: _existing(table, name) for role, name in choices.columns.items()}
     read = {name: meanings(name) for name in table.columns} if table.named else {}
@@ -142,7 +142,7 @@ def _places(
 
 
 def _refuse_images(table: RawTable, groups: Mapping[str, Mapping[str, tuple[str, Meaning]]]) -> None:
-    """Refuses pixels: places in an image need cameras to become places in a room."""
+    """Refuses pixels: without cameras they give no positions in a room."""
     whole = any(len(group) == 3 for group in groups.values())
     pixels = any(meaning.unit == "px" for group in groups.values() for _, meaning in group.values())
     flat = [group for group in groups.values() if set(group) == {"x", "y"}]
@@ -184,7 +184,7 @@ def _named_time(
 
 
 def _one_clock(table: RawTable, names: list[str]) -> bool:
-    """Whether columns tell the same time but for its origin and unit."""
+    """True if columns hold the same time apart from its origin and unit."""
     first, *others = (as_stamps(table.columns[name]) for name in names)
     for other in others:
         if first is None or other is None:
@@ -216,7 +216,7 @@ def _trajectory(
 
 
 def _numeric_rest(table: RawTable, used: set[str]) -> list[str]:
-    """Columns that may be coordinates: numbers that vary, and no counters."""
+    """Possible coordinates: columns of numbers that vary, without counters."""
     found = []
     for name, column in table.columns.items():
         values = numbers(column)
@@ -228,7 +228,7 @@ def _numeric_rest(table: RawTable, used: set[str]) -> list[str]:
 
 
 def _time_by_numbers(table: RawTable, used: set[str]) -> tuple[tuple[str, ...], str | None]:
-    """The column of times that runs forward most regularly, or else a counter of frames."""
+    """The column of times with the most regular steps, or else a counter of frames."""
     found: list[tuple[bool, float, str]] = []
     for name, column in table.columns.items():
         stamps = as_stamps(column)

@@ -1,4 +1,4 @@
-"""Units and the up axis, read off the fall of the ball: gravity is known, and nothing else falls so steadily."""
+"""Determines units and the up axis from the fall of the ball, by the known gravity."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -10,16 +10,16 @@ from ballfg.arrays import Array
 from ballfg.state import STANDARD_GRAVITY
 
 LENGTHS: Final = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
-"""m in a unit of length."""
+"""Units of length in m."""
 TIMES: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-"""s in a unit of time."""
+"""Units of time in s."""
 AXES: Final = ("x", "-x", "y", "-y", "z", "-z")
-"""Where up may be."""
+"""Possible directions of up."""
 
 _WINDOW: Final = 0.12
-"""s over which an acceleration is fitted: 3 mm of noise at 100 Hz make 2 m/s^2, and most flights are longer."""
+"""s for the fit of an acceleration: with 3 mm of noise at 100 Hz its error is 2 m/s^2, and most flights are longer."""
 _STEPS: Final = (1e-4, 0.34)
-"""s between two samples, least and most: nothing faster films a ball, and nothing slower shows its fall."""
+"""s between two samples, least and most: no camera of balls is faster, and slower ones do not show the fall."""
 _LEAST_SAMPLES: Final = 5
 _WIDTH: Final = 0.3
 """Standard deviation, in gravities, of an acceleration about its model: noise, spin and bounces in the window."""
@@ -27,7 +27,7 @@ _DRAGS: Final = np.linspace(0.0, 0.2, 11)
 """1/m; a table-tennis ball has 0.13, a tennis ball 0.02."""
 _MOST_WINDOWS: Final = 4000
 _MOST_SPEED: Final = 120.0
-"""m/s; the fastest smash of any ball game is slower."""
+"""m/s, largest speed; the fastest smash of any ball game is slower."""
 _COINCIDENCE: Final = 0.02
 """Share of windows that fit a wrong axis or unit by chance; it keeps the ratio of two small scores near one."""
 
@@ -40,10 +40,10 @@ class Scale:
     time: str
     up: str
     score: float
-    """Weighted share of the windows whose acceleration is that of a falling ball, 0 to 1."""
+    """Weighted share of the windows with the acceleration of a falling ball, 0 to 1."""
     windows: int
     drag: float
-    """1/m, the quadratic drag with which the windows agree best."""
+    """1/m, the quadratic drag that fits the windows best."""
 
 
 def scales(
@@ -57,8 +57,8 @@ def scales(
     The acceleration of short windows is compared with gravity along the axis and drag against the velocity. The score
     of a combination is the mean of exp(-r^2 / 2), with r the difference in units of 0.3 g.
 
-    Args: shots: times (n,) and positions (n, 3) of each, in their own units.  lengths, times, ups: to choose from.
-    Returns: the combinations; empty where no window is long enough.
+    Args: shots: times (n,) and positions (n, 3) of each, in their own units.  lengths, times, ups: possible values.
+    Returns: the combinations; empty if no window is long enough.
     """
     found: list[Scale] = []
     for time in times:
@@ -82,7 +82,7 @@ def scales(
 
 
 def odds(best: float, other: float) -> float:
-    """How much better one score is than another; at least about 2 decides."""
+    """Ratio of two scores; about 2 is decisive."""
     return (best + _COINCIDENCE) / (other + _COINCIDENCE)
 
 
@@ -99,7 +99,7 @@ def _windows(shots: Sequence[tuple[Array, Array]], unit: float) -> tuple[Array, 
     for i, start in places:
         t, p = (values[start : start + count] for values in shots[i])
         s = (t - t.mean()) * unit
-        if s[-1] - s[0] > 2.5 * count * np.median(steps):  # frames are missing: a bounce may hide in the gap
+        if s[-1] - s[0] > 2.5 * count * np.median(steps):  # missing frames may hide a bounce
             continue
         width = max(float(s[-1] - s[0]), 1e-12)
         design = np.stack([np.ones_like(s), s / width, (s / width) ** 2], axis=1)

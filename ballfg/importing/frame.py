@@ -1,4 +1,4 @@
-"""Units and up axis, from what is stated and from the fall; and the turn to a frame with z up."""
+"""Determines units and up axis from names and from the fall, and rotates positions to a frame with z up."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from ballfg.importing.choices import Choices, Guess, UndecidedError
 from ballfg.importing.fall import AXES, LENGTHS, TIMES, Scale, odds, scales
 
 _LIKELY: Final = 2.0
-"""Odds of the best reading against the next, below which it is not taken."""
+"""Least odds of the best reading against the next."""
 _SURE: Final = 4.0
 _AGAINST: Final = 4.0
-"""Odds against a stated unit, from which on it is doubted."""
+"""Odds against a stated unit from which it is doubted."""
 _LEAST_SCORE: Final = 0.12
-"""Score below which nothing seems to fall."""
+"""Least score of a falling ball."""
 RATES: Final = (24, 25, 30, 50, 60, 90, 100, 120, 125, 150, 180, 200, 240, 250, 300, 360, 400, 480, 500, 600, 960, 1000)
 """Hz, of usual cameras."""
 
@@ -30,23 +30,23 @@ TURNS: Final = {
     "x": ((0, 1, 0), (0, 0, 1), (1, 0, 0)),
     "-x": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
 }
-"""For each axis that points up the rotation to a frame with z up; its determinant is one."""
+"""For each up axis the rotation to a frame with z up; its determinant is one."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """How numbers become metres and seconds in a frame with z up."""
+    """The conversion of numbers to metres and seconds in a frame with z up."""
 
     length: str
     time: str
     up: str
     flip: str | None
     drag: float | None
-    """1/m, that the falls show."""
+    """1/m, from the falls."""
     windows: int = 0
 
     def metres(self, positions: Array) -> Array:
-        """(n, 3) m, in the units of the source, not turned."""
+        """(n, 3) m, in the axes of the source."""
         size = LENGTHS[self.length]
         inverse = round(1.0 / size)
         return positions / inverse if abs(inverse * size - 1.0) < 1e-12 else positions * size
@@ -80,8 +80,8 @@ def find_frame(
 ) -> tuple[Frame, list[Guess]]:
     """The units and the up axis, with a line of the proposal for each.
 
-    Args: shots: stamps (n,) and positions (n, 3).  stated_length, stated_time: as the source's names say.
-        time_why: why the unit of time is known, if it is.
+    Args: shots: stamps (n,) and positions (n, 3).  stated_length, stated_time: from the source's names.
+        time_why: the reason for a known unit of time.
     Raises: UndecidedError: nothing falls, two readings are alike, or names contradict the fall.
     """
     if choices.flip:
@@ -119,10 +119,10 @@ def find_frame(
 
 
 def likely_rate(shots: Sequence[tuple[Array, Array]], length: str | None) -> int | None:
-    """The usual camera rate at which balls fall as they should; stamps are numbers of frames.
+    """The usual camera rate at which balls fall with gravity; stamps are numbers of frames.
 
-    Args: shots: frames (n,) and positions (n, 3).  length: their unit if it is known; else m, cm or mm, which
-        no usual rates confuse.
+    Args: shots: frames (n,) and positions (n, 3).  length: their unit if known; else m, cm or mm, which no usual rates
+        confuse.
     """
     lengths = (length,) if length in LENGTHS else _DECIMAL
     scored = [
@@ -194,7 +194,7 @@ def _contradiction(
     stated: Mapping[str, str | None],
     ups: Sequence[str],
 ) -> None:
-    """Refuses units in names that make nothing fall, where others do."""
+    """Refuses units from names with which nothing falls, if other units fit."""
     given = {"length": choices.length, "time": choices.time}
     doubted = {option: value for option, value in stated.items() if value and not given[option]}
     if not doubted:
@@ -205,7 +205,7 @@ def _contradiction(
     score = found[0].score if found else 0.0
     if not free or free[0].score < _LEAST_SCORE or odds(free[0].score, score) < _AGAINST:
         return
-    # of two stated units, the one that has to change is wrong; where either would do, both are shown in turn
+    # of two stated units, the one that has to change is wrong; if either would do, both are tried in turn
     for option, value in doubted.items():
         others = [one for one in free if getattr(one, option) != value]
         kept = {name: unit for name, unit in doubted.items() if name != option}

@@ -1,4 +1,4 @@
-"""The tables of a source become its shots: which tables hold positions, and the names, ends and labels of shots."""
+"""Gathers the shots of a source's tables, with their names, ends and labels."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,19 +14,19 @@ from ballfg.importing.columns import Roles, roles_of
 from ballfg.importing.fall import TIMES
 from ballfg.importing.formats.raw import RawTable
 from ballfg.importing.frame import Frame, likely_rate
-from ballfg.importing.shots import GAP, GAP_STEPS, Counts, Shot, cut, split_at_gaps
+from ballfg.importing.shots import GAP, GAP_STEPS, Counts, SourceShot, cut, split_at_gaps
 from ballfg.tracks.track import Label
 
 MOST_SHOTS: Final = 60
-"""Shots from which the units are read, evenly over the source."""
+"""Number of shots for the determination of units, evenly over the source."""
 _INTERRUPTED: Final = 0.5
-"""Share of the files or recordings with gaps, from which on a gap ends a shot and is not a ball out of sight."""
+"""Share of files or recordings with gaps, above which a gap ends a shot instead of hiding a ball."""
 
 
 def understood(tables: Sequence[RawTable], choices: Choices) -> tuple[list[RawTable], Roles, list[RawTable]]:
-    """What each table of a source is.
+    """Determines the role of each table of a source.
 
-    Returns: the tables of positions, which all have the same columns; their roles; and the tables beside them.
+    Returns: the tables of positions, with equal columns; their roles; and the other tables.
     Raises: UndecidedError: no positions, or positions in different columns.
     """
     kinds: dict[tuple[Any, ...], list[RawTable]] = {}
@@ -64,11 +64,11 @@ def understood(tables: Sequence[RawTable], choices: Choices) -> tuple[list[RawTa
     return chosen, read[0][1], beside
 
 
-def shots_of(tables: Sequence[RawTable], roles: Roles, choices: Choices, counts: Counts) -> list[Shot]:
-    """The shots of all tables, in the source's units, with names of their own.
+def shots_of(tables: Sequence[RawTable], roles: Roles, choices: Choices, counts: Counts) -> list[SourceShot]:
+    """The shots of all tables, in the source's units, with unique names.
 
     Raises:
-        UndecidedError: no times and no rate; it says which rate fits.
+        UndecidedError: no times and no rate; the message has a fitting rate.
         ValueError: no shot with two samples.
     """
     try:
@@ -91,7 +91,7 @@ def shots_of(tables: Sequence[RawTable], roles: Roles, choices: Choices, counts:
         raise ValueError(f"{tables[0].where} must hold two samples of a shot or more; each has less. Check the export.")
     named = Counter(shot.name for _, shots in parts for shot in shots)
     clash = len(parts) > 1 and max(named.values()) > 1
-    found: list[Shot] = []
+    found: list[SourceShot] = []
     for table, shots in parts:
         own = table.name.rpartition("/")[2] or table.source
         for shot in shots:
@@ -104,7 +104,7 @@ def shots_of(tables: Sequence[RawTable], roles: Roles, choices: Choices, counts:
     return _unique(found)
 
 
-def _unique(shots: Iterable[Shot]) -> list[Shot]:
+def _unique(shots: Iterable[SourceShot]) -> list[SourceShot]:
     seen: Counter[str] = Counter()
     found = []
     for shot in shots:
@@ -113,15 +113,15 @@ def _unique(shots: Iterable[Shot]) -> list[Shot]:
     return found
 
 
-def relative(shot: Shot) -> tuple[Array, Array]:
+def relative(shot: SourceShot) -> tuple[Array, Array]:
     """(n,) stamps since the first one and (n, 3) positions of a shot, in the source's units."""
     return np.asarray(shot.stamps - shot.stamps[0], dtype=np.float64), shot.positions
 
 
-def split(shots: list[Shot], roles: Roles, frame: Frame, choices: Choices) -> tuple[list[Shot], Guess]:
-    """The shots cut at gaps in time where a gap ends a shot, and the guess that this is.
+def split(shots: list[SourceShot], roles: Roles, frame: Frame, choices: Choices) -> tuple[list[SourceShot], Guess]:
+    """The shots, cut at gaps in time that end a shot, and the guess for that.
 
-    Args: shots: in the source's units.  roles: of their columns.  frame: its units.  choices: what is decided.
+    Args: shots: in the source's units.  roles: of their columns.  frame: its units.  choices: of the user.
     """
     unit = TIMES[frame.time]
     count = len(shots)
@@ -156,8 +156,8 @@ def split(shots: list[Shot], roles: Roles, frame: Frame, choices: Choices) -> tu
     return _unique(done), Guess("shots", str(len(done)), why, "sure" if longest < gap / 2 else "likely", typed)
 
 
-def with_labels(shots: list[Shot], beside: Sequence[RawTable]) -> list[Shot]:
-    """The shots with the labels of tables that have one row for each of them."""
+def with_labels(shots: list[SourceShot], beside: Sequence[RawTable]) -> list[SourceShot]:
+    """The shots with the labels of tables with one row per shot."""
     names = {shot.name for shot in shots}
     for table in beside:
         for key, column in table.columns.items():

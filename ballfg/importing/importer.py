@@ -1,4 +1,4 @@
-"""`bf.import_tracks`: tracks of any units, axes and columns as a dataset."""
+"""Implements `bf.import_tracks`: tracks of any units, axes and columns become a dataset."""
 
 from collections.abc import Mapping
 from os import PathLike
@@ -8,7 +8,8 @@ from ballfg.checks import check_choice, check_flag, check_path
 from ballfg.importing.choices import Choices
 from ballfg.importing.proposal import propose
 from ballfg.importing.writing import write_import
-from ballfg.tracks import Dataset, dataset_in_memory, read_dataset
+from ballfg.tracks import Dataset, read_dataset
+from ballfg.tracks.memory import dataset_in_memory
 
 
 def import_tracks(
@@ -30,7 +31,7 @@ def import_tracks(
     file_format: Literal["csv", "parquet"] = "csv",
     force: bool = False,
 ) -> Dataset:
-    """Tracks from a user's own files or data, in SI units with z up; what is not given is guessed.
+    """Tracks from a user's own files or data, in SI units with z up; missing arguments are guessed.
 
     Columns are found by their names or numbers, units and the up axis by the fall of the ball, the table by bounces,
     shots by a column, restarts of time and gaps. `dataset.info.imported` has each guess with its reason.
@@ -46,7 +47,7 @@ def import_tracks(
         flip: axis of the source whose sign is changed first, for a left-handed frame.
         table_height: z of the table's surface in the new frame, m.
         split_gap: s without samples after which a new shot begins.
-        ball: table-tennis, tennis or a ball file; table-tennis where None.
+        ball: table-tennis, tennis or a ball file; None: table-tennis.
         rate: Hz, for sources with numbers of frames in place of times.
         key: name of a table, sheet or group in a source that holds several.
         topic: of a ROS bag.
@@ -55,9 +56,9 @@ def import_tracks(
         force: replace a dataset in `out`.
     Returns: the dataset; it goes into `bf.estimate` as it is.
     Raises:
-        UndecidedError: a guess that is not safe, a ValueError that names the argument (as a command's option).
+        UndecidedError: an unsafe guess, a ValueError that names the argument (as a command's option).
         ValueError: unreadable data, or an argument that breaks its rule.
-        FileNotFoundError: a file that is not there.
+        FileNotFoundError: a missing file.
     """
     check_choice("file_format", file_format, ("csv", "parquet"))
     check_flag("force", force)

@@ -1,4 +1,4 @@
-"""What a column's name says: its role and its unit."""
+"""Determines role and unit of a column from its name."""
 
 import re
 from collections.abc import Mapping
@@ -55,21 +55,21 @@ class Meaning:
     role: str
     """t, frame, trajectory, x, y, z, sigma_x, sigma_y, sigma_z, seconds or nanoseconds (of a stamp in two parts)."""
     rank: int
-    """0 for a name that can mean nothing else; more for vaguer ones."""
+    """0 for an unambiguous name; larger for vaguer ones."""
     unit: str | None = None
-    """As in the name, normalised; text in brackets that is not known stays as it is."""
+    """As in the name, normalised; unknown text in brackets stays as it is."""
     group: str = ""
-    """The other words of the name: x, y and z belong together where theirs are the same."""
+    """The other words of the name: x, y and z with the same ones belong together."""
 
 
 def unit_of_text(text: str) -> str | None:
-    """The unit that a text is, normalised; None if it is none."""
+    """The unit in a text, normalised; None without one."""
     word = text.strip().strip("[](){}").strip().lower()
     return LENGTH_UNITS.get(word) or TIME_UNITS.get(word) or ("px" if word in PIXELS else None)
 
 
 def meanings(name: str) -> list[Meaning]:
-    """What a column of this name may be."""
+    """Possible roles of a column with this name."""
     name, _, copy = name.partition("#")
     bracket = _BRACKET.search(name)
     unit_text = bracket[1] if bracket else None

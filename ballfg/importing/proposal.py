@@ -1,4 +1,4 @@
-"""The proposal: tables to tracks in SI units with z up, and every guess on the way."""
+"""A proposal holds the tracks of a source in SI units with z up, and every guess on the way."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,29 +14,30 @@ from ballfg.importing.formats.raw import RawTable
 from ballfg.importing.formats.sources import tables_of
 from ballfg.importing.frame import Frame, find_frame
 from ballfg.importing.gathering import MOST_SHOTS, relative, shots_of, split, understood, with_labels
-from ballfg.importing.shots import Counts, Shot
+from ballfg.importing.shots import Counts, SourceShot
 from ballfg.importing.stamps import in_seconds, origin_of
-from ballfg.tracks import DatasetInfo, Track
+from ballfg.tracks import Track
 from ballfg.tracks.checks import Findings, tidy
 from ballfg.tracks.grouping import RowGroup
+from ballfg.tracks.info import DatasetInfo
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """What a source was understood to be."""
+    """The interpretation of a source."""
 
     info: DatasetInfo
     tracks: list[Track]
     guesses: list[Guess]
     notes: list[str]
-    """What was left out or put in order, one sentence each."""
+    """Omitted or reordered rows, one sentence each."""
 
 
 def propose(data: Any, choices: Choices) -> Proposal:
-    """Reads a source and guesses what is not decided.
+    """Reads a source and guesses the open choices.
 
-    Args: data: as for `import_tracks`.  choices: what is decided.
-    Raises: UndecidedError: a guess that is not safe. FileNotFoundError: no such file. ValueError: unreadable input.
+    Args: data: as for `import_tracks`.  choices: of the user.
+    Raises: UndecidedError: an unsafe guess. FileNotFoundError: no such file. ValueError: unreadable input.
     """
     tables = tables_of(data, choices.topic, choices.key)
     try:
@@ -49,7 +50,7 @@ def propose(data: Any, choices: Choices) -> Proposal:
 
 
 def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
-    """What tables were understood to be."""
+    """The interpretation of tables."""
     chosen, roles, beside = understood(tables, choices)
     counts = Counts()
     shots = shots_of(chosen, roles, choices, counts)
@@ -79,7 +80,7 @@ def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
     return Proposal(info, tracks, guesses, [*table_notes[:5], *counts.notes(), *notes])
 
 
-def _tracks(shots: Sequence[Shot], frame: Frame) -> tuple[list[Track], list[str]]:
+def _tracks(shots: Sequence[SourceShot], frame: Frame) -> tuple[list[Track], list[str]]:
     """Tracks in m and s with z up, and notes on their repairs."""
     stamps = [shot.stamps for shot in shots]
     far = [origin_of(one, frame.time) for one in stamps]

@@ -1,4 +1,4 @@
-"""Rows to shots: by a column, by file, where time starts again, and at gaps."""
+"""Cuts rows into shots: by a column, by file, where time restarts, and at gaps."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -17,19 +17,19 @@ from ballfg.importing.stamps import Stamps, as_stamps, is_date, joined, missing
 from ballfg.tracks.track import Label
 
 _DISORDER: Final = 3.0
-"""Median steps: a stamp that is earlier by less came late; by more, a new shot begins."""
+"""Median steps: an earlier stamp within this came late; beyond it a new shot begins."""
 _LARGEST: Final = 1e15
-"""In the source's units; a larger number is no place, whatever the unit, and counts as missing."""
+"""In the source's units; a larger number is not a position in any unit, and counts as missing."""
 _ALONE: Final = 5.0
-"""A row of zeros is a missing sample if it lies this many median distances from its neighbours."""
+"""A row of zeros is a missing sample if its distance from its neighbours is this multiple of the median."""
 GAP: Final = 0.5
-"""s without samples, after which a new shot is taken to begin."""
+"""s without samples after which a new shot begins."""
 GAP_STEPS: Final = 20.0
-"""Median steps that such a gap has at least."""
+"""Least number of median steps in such a gap."""
 
 
 @dataclass(frozen=True)
-class Shot:
+class SourceShot:
     """The samples of one shot in the units of their source."""
 
     name: str
@@ -47,7 +47,7 @@ class Shot:
 
 @dataclass
 class Counts:
-    """What was left out or put in order."""
+    """Counts of omitted or reordered rows."""
 
     missing: int = 0
     zeros: int = 0
@@ -70,10 +70,10 @@ class Counts:
         return found
 
 
-def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list[Shot]:
-    """The shots of a table, cut at its trajectory column or else where time starts again.
+def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list[SourceShot]:
+    """The shots of a table, cut at its trajectory column or else where time restarts.
 
-    Raises: UndecidedError: no time and no rate. ValueError: a time that is text, or no row with a position.
+    Raises: UndecidedError: no time and no rate. ValueError: text for a time, or no row with a position.
     """
     lacking = [name for name in _needed(roles) if name not in table.columns]
     if lacking:
@@ -116,16 +116,16 @@ def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list
             continue
         own = None if sigmas is None else sigmas[part]
         known = {key: value for key, values in labels.items() if (value := values[i]) is not None}
-        found.append(Shot(name, stamps[part], positions[part], own, known, part, table))
+        found.append(SourceShot(name, stamps[part], positions[part], own, known, part, table))
     return found
 
 
-def split_at_gaps(shots: Iterable[Shot], unit: float, gap: float) -> list[Shot]:
-    """The shots, cut where no sample came for `gap` s.
+def split_at_gaps(shots: Iterable[SourceShot], unit: float, gap: float) -> list[SourceShot]:
+    """The shots, cut at gaps of `gap` s.
 
     Args: unit: s in the unit of the stamps.  gap: s.
     """
-    found: list[Shot] = []
+    found: list[SourceShot] = []
     for shot in shots:
         steps = np.diff(shot.stamps).astype(np.float64) * unit
         places = np.flatnonzero(steps > gap) + 1
@@ -177,7 +177,7 @@ def _stamps(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> 
 
 
 def _at_restarts(stamps: Stamps, rows: NDArray[np.intp], counts: Counts) -> list[NDArray[np.intp]]:
-    """Cuts where the time jumps back; a few late stamps are sorted, and a table from last to first is turned."""
+    """Cuts where the time jumps back; a few late stamps are sorted, and a table from last to first is reversed."""
     steps = np.diff(stamps[rows]).astype(np.float64)
     if len(steps) and (steps < 0).mean() > 0.5:
         counts.late += len(rows)
@@ -212,7 +212,7 @@ def _text(value: object) -> str:
 
 
 def _lone_zeros(positions: Array, counts: Counts) -> NDArray[np.bool_]:
-    """Rows of zeros that trackers write where they saw no ball."""
+    """Rows of zeros, written by trackers that did not see the ball."""
     zero = (positions == 0.0).all(axis=1)
     if not zero.any() or zero.all():
         return np.zeros(len(zero), dtype=bool)
@@ -226,11 +226,11 @@ def _lone_zeros(positions: Array, counts: Counts) -> NDArray[np.bool_]:
 def _labels(
     table: RawTable, names: Iterable[str], parts: list[NDArray[np.intp]], counts: Counts
 ) -> dict[str, list[Label | None]]:
-    """Columns that are constant in every shot."""
+    """Columns with a constant value in every shot."""
     found: dict[str, list[Label | None]] = {}
     for name in names:
         column = table.columns.get(name)
-        if column is None:  # the first table has it, this one does not
+        if column is None:  # in the first table, but not in this one
             counts.ignored.add(name)
         elif all((column[part] == column[part[0]]).all() for part in parts) and is_name(name) and name != "trajectory":
             found[name] = [_label(column, int(part[0])) for part in parts]

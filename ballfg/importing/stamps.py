@@ -1,4 +1,4 @@
-"""Stamps as numbers that keep their precision: whole nanoseconds stay whole until the first stamp is subtracted."""
+"""Reads stamps without loss of precision: whole nanoseconds stay whole until the first stamp is subtracted."""
 
 import re
 from datetime import UTC, datetime
@@ -12,21 +12,21 @@ from ballfg.importing.formats.raw import MISSING, Column
 from ballfg.tracks.stamps import elapsed
 
 Stamps = NDArray[Any]
-"""(n,) int64 or float64, in a unit that is not known yet."""
+"""(n,) int64 or float64, in an unknown unit."""
 
 NO_STAMP: Final = np.iinfo(np.int64).min
-"""Stands for a missing stamp among whole numbers."""
+"""Marks a missing stamp among whole numbers."""
 _CLOCK: Final = re.compile(r"^(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d+)?)$")
 _FINE: Final = re.compile(r"^(.*:\d{2})[.,](\d+)(.*)$")
 _DIVISORS: Final = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _LATEST: Final = 1e19
-"""No stamp is later: 300 years in ns."""
+"""Largest stamp: 300 years in ns."""
 _FAR: Final = 1e6
-"""s: stamps later than this are counted from the first one, so that a float keeps their microseconds."""
+"""s: larger stamps are counted from the first one, so that a float keeps their microseconds."""
 
 
 def as_stamps(column: Column) -> Stamps | None:
-    """The column as stamps; dates and times of day as whole ns. None where it is no time."""
+    """The column as stamps; dates and times of day as whole ns. None if it is no time."""
     if column.dtype.kind in "if":
         return column
     parsed = [_parsed(str(cell)) for cell in column]
@@ -38,7 +38,7 @@ def as_stamps(column: Column) -> Stamps | None:
 
 
 def is_date(column: Column) -> bool:
-    """Whether the stamps of the column were written as dates or times of day, and so are ns."""
+    """True if the stamps of the column are dates or times of day, and so in ns."""
     return column.dtype.kind == "O"
 
 
@@ -48,12 +48,12 @@ def joined(seconds: Column, nanoseconds: Column) -> Stamps:
 
 
 def missing(stamps: Stamps) -> NDArray[np.bool_]:
-    """(n,) which stamps are missing."""
+    """(n,) True for missing stamps."""
     return stamps == NO_STAMP if stamps.dtype.kind == "i" else ~(np.abs(stamps) <= _LATEST)
 
 
 def origin_of(stamps: Stamps, unit: str) -> int | float:
-    """The stamp that becomes zero: the first one where they count from long ago, else their own zero."""
+    """The stamp that becomes zero: the first one if they are very large, else their own zero."""
     first = stamps.min().item()
     latest = max(abs(first), abs(stamps.max().item()))
     return first if latest / _DIVISORS[unit] > _FAR else 0

@@ -1,4 +1,4 @@
-"""An import as a folder: the dataset, and `import.html`, a page that shows what was understood."""
+"""Writes an import as a folder: the dataset, and the page `import.html` with all guesses."""
 
 import io
 from collections.abc import Sequence
@@ -17,15 +17,15 @@ from ballfg.tracks.writing import DATASET_FILES, TRUTH_FILE, TRUTH_FILES
 
 PAGE: Final = "import.html"
 _MOST_SHOTS: Final = 40
-"""Shots that are drawn, evenly over the dataset."""
+"""Number of drawn shots, evenly over the dataset."""
 _MOST_POINTS: Final = 300
-"""Samples of a shot that are drawn."""
+"""Largest number of drawn samples of a shot."""
 
 
 def write_import(folder: Path, proposal: Proposal, file_format: Literal["csv", "parquet"], force: bool) -> None:
     """Writes the dataset and its page as a whole, or nothing.
 
-    Args: folder: new, empty, or with `force` a dataset to replace, and the truth of a simulated one.
+    Args: folder: new, empty, or with `force` an existing dataset, including the truth of a simulated one.
     Raises: ValueError: a folder with other content. FileNotFoundError: its parent does not exist.
     """
     simulated = (folder / TRUTH_FILE).is_file()
@@ -36,7 +36,7 @@ def write_import(folder: Path, proposal: Proposal, file_format: Literal["csv", "
 
 
 def page(proposal: Proposal) -> str:
-    """The page: the shots from the side and from above, the guesses, and what was left out."""
+    """The page: the shots from the side and from above, the guesses, and omitted rows."""
     info = proposal.info
     samples = sum(len(track) for track in proposal.tracks)
     words = (
@@ -83,6 +83,6 @@ def _drawing(tracks: Sequence[Track], height: float) -> Html:
 
 
 def _across(tracks: Sequence[Track]) -> int:
-    """The horizontal axis along which the balls fly farther."""
+    """The horizontal axis of the longer flights."""
     extents = np.median([np.ptp(track.positions[:, :2], axis=0) for track in tracks], axis=0)
     return int(np.argmax(extents))

@@ -1,4 +1,4 @@
-"""Balls as they fly: a tracker that tells several apart, sources of their positions, and what `ballfg live` writes."""
+"""Follows balls in real time: a tracker of several balls, sources of positions, and the output of `ballfg live`."""
 
 import lazy_loader
 

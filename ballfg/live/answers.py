@@ -1,4 +1,4 @@
-"""What comes out: one JSON line for each position that came in, and for each ball that was lost."""
+"""Writes one JSON line for each incoming position and for each lost ball."""
 
 import json
 import math
@@ -9,18 +9,18 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.live.outlook import Outlook
 from ballfg.live.tracker import BallUpdate
-from ballfg.prediction import Crossing
+from ballfg.prediction.crossing import Crossing
 from ballfg.state import POSITION, SPIN, VELOCITY
 
 Fields = dict[str, Any]
 KINDS = ("state", "newcomer", "lost", "refused", "continued")
-"""Of lines; the last one stands where a command went on with the recording of an earlier one."""
+"""Kinds of lines; the last one marks where a command continued an earlier recording."""
 
 
 def answer(update: BallUpdate, outlook: Outlook | None, tag: tuple[tuple[str, Any], ...]) -> Fields:
     """The fields of a line.
 
-    Args: outlook: None for a line without state.  tag: further fields, of the input.
+    Args: outlook: None for a line without state.  tag: further fields, from the input.
     """
     fields: Fields = {"kind": update.kind}
     if update.ball is not None:
@@ -39,7 +39,7 @@ def answer(update: BallUpdate, outlook: Outlook | None, tag: tuple[tuple[str, An
 
 
 def refusal(reason: str) -> Fields:
-    """The fields of a line about one that could not be read."""
+    """The fields of a line about an unreadable input line."""
     return {"kind": "refused", "reason": reason}
 
 
@@ -85,7 +85,7 @@ def _crossing(event: Crossing | None) -> Fields | None:
 
 
 def _numbers(values: Array) -> list[float | None]:
-    """Numbers of JSON, which knows no NaN."""
+    """Numbers for JSON, which has no NaN."""
     return [_number(x) for x in values.tolist()]
 
 

@@ -1,4 +1,4 @@
-"""States and predictions as ROS 2 messages in an MCAP file, without ROS: the extra `ros`."""
+"""Writes states and predictions as ROS 2 messages to an MCAP file, without ROS; it needs the extra `ros`."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ STATES = "/ball/odometry"
 PATHS = "/ball/path"
 TOPICS = ((STATES, "nav_msgs/msg/Odometry"), (PATHS, "nav_msgs/msg/Path"))
 LATEST = 2.1e9
-"""s; later stamps have no place in a message of ROS, whose seconds have 32 bits."""
+"""s; later stamps do not fit a ROS message, whose seconds have 32 bits."""
 UNKNOWN = 1e6
-"""rad^2, variance of an orientation: a ball's is not estimated."""
+"""rad^2, variance of the orientation, which is not estimated."""
 
 
 class BagWriter:
     """Appends `nav_msgs/Odometry` for each state and `nav_msgs/Path` for its prediction to an MCAP file.
 
-    The messages of half a second are one chunk, which is appended then. The end of the file is written when the context
-    ends. A file without it, which a kill leaves, is continued like one with it.
+    The messages of half a second form one chunk. The end of the file is written when the context ends. A file without
+    it, after a kill, can be continued as well.
 
     Args:
         out: the file.  horizon: s, of the paths.
-        repeats: the input begins at its beginning again, so that it continues nothing.
+        repeats: True if the input starts from its beginning again, so that it continues nothing.
     Raises: ValueError: the package `rosbags` is missing, or the file is no bag to continue; and as `Recording`.
     """
 
@@ -65,7 +65,7 @@ class BagWriter:
             self._recording.append(ending(self._opening, self._chunks, len(TOPICS)))
 
     def _continue(self, repeats: bool) -> None:
-        """Make the file end with its last whole chunk."""
+        """Makes the file end with its last whole chunk."""
         recording, begin = self._recording, len(self._opening)
         if recording.size:
             refuse_repeated(recording.path, repeats)
@@ -78,7 +78,7 @@ class BagWriter:
             return
         try:
             self._chunks = whole_chunks(recording.read, begin, recording.size, len(TOPICS))
-        except ValueError:  # damaged: what follows the damage must not be cut off
+        except ValueError:  # damaged: content after the damage must not be cut off
             raise refused(recording.path) from None
         end, size = self._chunks[-1].end if self._chunks else begin, recording.size
         ended = recording.read(end, size - end) == ending(self._opening, self._chunks, len(TOPICS))
@@ -86,7 +86,7 @@ class BagWriter:
         say_continued(recording.path, end, 0 if ended else size - end)
 
     def _flush(self) -> None:
-        """Append what has come since the last chunk."""
+        """Appends the messages since the last chunk."""
         with self._turn:
             if self._messages:
                 content, chunk = chunk_of(self._messages, len(TOPICS), self._recording.size)
@@ -95,7 +95,7 @@ class BagWriter:
                 self._chunks.append(chunk)
 
     def see(self, update: BallUpdate, outlook: Outlook | None) -> None:
-        """Write a state and its prediction."""
+        """Writes a state and its prediction."""
         state = update.state
         if update.kind != "state" or state is None or abs(state.time) > LATEST:
             return

@@ -1,4 +1,4 @@
-"""One ball of a tracker: its estimator, and what it needs to put a late sample where it belongs."""
+"""A ball of a tracker holds its estimator, and copies of it for the insertion of late samples."""
 
 from bisect import bisect_left, insort
 from collections import deque
@@ -15,24 +15,24 @@ from ballfg.estimation.smoother.motion import Motion
 from ballfg.live.gate import Known
 
 PARTS = 4
-"""Copies of the estimator in one lag: a late sample is pushed with those of the lag and of a quarter of it."""
+"""Number of copies of the estimator within a lag: a late sample costs the pushes of the lag and of a quarter of it."""
 LEAST_APART = 8
-"""Samples between two copies: a copy costs some 0.7 ms."""
+"""Least number of samples between two copies: a copy costs some 0.7 ms."""
 LOOK_BACK = 24
-"""Samples in which an event may still be found, or found to lie elsewhere."""
+"""Number of last samples in which an event may still be found or moved."""
 SAME_EVENT = 0.03
-"""s. Two events of a kind that lie closer are one."""
+"""s. Two events of a kind that lie closer are the same."""
 
 
 @dataclass(frozen=True, order=True)
 class Kept:
-    """A sample that a ball has taken in.
+    """A sample of a ball.
 
     Attributes:
         time: s.
         position: (3,) m.
         sigma: (3,) m, or None.
-        by_hit: the ball took it for one after a hit: it was not where the ball's path led.
+        by_hit: True if the sample was taken as one after a hit: it was off the ball's path.
     """
 
     time: float
@@ -43,11 +43,11 @@ class Kept:
 
 @dataclass(frozen=True)
 class BallEvent:
-    """Something that happened to a ball.
+    """An event of a ball.
 
     Attributes:
-        kind: `bounce`, `hit`, `rest` (it came to lie) or `gap` (too long to link its sides).
-        time: s; of a bounce its own, of a hit the middle of its interval, of the others the sample that shows it.
+        kind: `bounce`, `hit`, `rest` (the ball came to lie) or `gap` (too long for a link).
+        time: s; of a bounce its own, of a hit the middle of its interval, of the others the first sample after it.
         height: m, of the surface; None without one.
     """
 
@@ -57,9 +57,9 @@ class BallEvent:
 
 
 class Ball:
-    """A ball and the samples of the last lag.
+    """A ball with the samples of the last lag.
 
-    Args: number: its name.  fresh: an estimator without samples, which is copied.  lag: s.
+    Args: number: its name.  fresh: an estimator without samples, to be copied.  lag: s.
     """
 
     def __init__(self, number: int, fresh: Online, lag: float) -> None:
@@ -80,7 +80,7 @@ class Ball:
         return self.states[-1].time
 
     def accepts(self, time: float) -> bool:
-        """Whether a sample of that stamp can be put where it belongs."""
+        """True if a sample of that stamp can be inserted in its place."""
         return time > max(self.last - self.lag, self._copies[0][0])
 
     def at(self, time: float) -> Kept | None:
@@ -89,16 +89,16 @@ class Ball:
         return self.recent[place] if place < len(self.recent) and self.recent[place].time == time else None
 
     def known(self, time: float) -> Known:
-        """The newest state before a stamp; the oldest one that is held if there is none."""
+        """The newest state before a stamp; the oldest one in memory if there is none."""
         for state in reversed(self.states):
             if state.time < time:
                 return Known.of(state)
         return Known.of(self.states[0])
 
     def take(self, kept: Kept) -> OnlineState:
-        """Take in a sample, late or not, in place of one with its stamp; returns the newest state.
+        """Takes in a sample, late or not, in place of one with its stamp; returns the newest state.
 
-        Raises: ValueError, RuntimeError: from the estimator, where nothing can be made of the samples.
+        Raises: ValueError, RuntimeError: from the estimator, if the samples cannot be explained.
         """
         if not self.states or kept.time > self.last:
             self.tidy()
@@ -107,13 +107,13 @@ class Ball:
         return self.states[-1]
 
     def forget_after(self, time: float) -> bool:
-        """Drop the samples after a stamp of the last lag; returns whether any are left. Raises: as `take`."""
+        """Drops the samples after a stamp of the last lag; True if any are left. Raises: as `take`."""
         if self.last > time:
             self._rebuild(time, until=time)
         return bool(self.states)
 
     def tidy(self) -> None:
-        """Keep a copy of the estimator where one is due: best done while nothing waits."""
+        """Makes a copy of the estimator if one is due: best while no sample waits."""
         if (
             not self.states
             or self.lag <= 0.0
@@ -142,7 +142,7 @@ class Ball:
         return state
 
     def _rebuild(self, since: float, added: Kept | None = None, until: float = np.inf) -> None:
-        """Go back to the last copy before a stamp, and push what follows in order."""
+        """Goes back to the last copy before a stamp, and pushes the later samples in order."""
         while self._copies[-1][0] >= since and len(self._copies) > 1:
             self._copies.pop()
         base, online = self._copies[-1]
@@ -158,13 +158,13 @@ class Ball:
             self._push(kept)
 
     def start_anew(self, kept: Kept) -> OnlineState:
-        """Forget everything but one sample, after the estimator could make nothing of it. Raises: as `take`."""
+        """Forgets everything but one sample, after a failure of the estimator. Raises: as `take`."""
         self.recent, self.states, self._copies = [], deque(), [(-np.inf, self._fresh)]
         self._online, self._since_copy = self._fresh.copy(), 0
         return self._push(kept)
 
     def news(self) -> tuple[BallEvent, ...]:
-        """Events among the last samples that have not been told yet, in the order of time."""
+        """New events among the last samples, in the order of time."""
         window = self._online.window
         if window is None:
             return ()
@@ -179,7 +179,7 @@ class Ball:
 
 
 def _events(motion: Motion, before: Motion, start: float, end: float) -> Sequence[BallEvent]:
-    """What happened between two samples."""
+    """Events between two samples."""
     if not motion.linked:
         return [BallEvent("gap", end)]
     found = [BallEvent("bounce", start + t, h) for t, h in zip(motion.times, motion.heights, strict=True)]

@@ -1,35 +1,35 @@
-"""The clock of a stream: what is late, what is too late, a stamp gone astray, a sender that began anew."""
+"""Classifies the stamps of a stream: late ones, outdated ones, wrong ones, a restart of the sender."""
 
 import math
 from collections import deque
 from enum import Enum, auto
 
 RESTART_AFTER = 3
-"""Stamps in a row that must lie far behind, and rise, before the clock is taken to have begun anew."""
+"""Number of consecutive rising stamps far behind that mean a restart of the clock."""
 
 
 class Stamp(Enum):
-    """What a stamp is to its stream."""
+    """Classes of stamps in a stream."""
 
     NEW = auto()
-    """Later than all before it, or as late as the last."""
+    """Later than all before it, or equal to the last."""
     LATE = auto()
     """Earlier than the newest, by no more than the lag."""
     OLD = auto()
     """Earlier than that."""
     BACK = auto()
-    """The stamp before it was astray: the stream goes on from before that."""
+    """The previous stamp was wrong: the stream continues from before it."""
     RESTART = auto()
-    """The sender's clock has begun anew."""
+    """The sender's clock has restarted."""
 
 
 class Clock:
-    """The newest stamp of a stream, however wrong some stamps are.
+    """The newest stamp of a stream, robust against wrong stamps.
 
-    A stamp more than the lag ahead is believed once the next agrees with it; if that one goes on from before, the stamp
-    was astray. Stamps far behind are too old, unless several come in a row: then the sender has begun anew.
+    A stamp more than the lag ahead is accepted once the next agrees with it; if that one continues from before, the
+    stamp was wrong. Stamps far behind are too old, unless several come in a row: then the sender has restarted.
 
-    Args: lag: s.  gap: s, longer than a ball stays unseen.
+    Args: lag: s.  gap: s, longest time that a ball may stay unseen.
 
     Attributes:
         newest: s.
@@ -44,7 +44,7 @@ class Clock:
         self._behind: deque[float] = deque(maxlen=RESTART_AFTER)
 
     def tell(self, time: float) -> Stamp:
-        """What a stamp is; the clock then stands at it if it is new."""
+        """Classifies a stamp; a new one becomes the clock's time."""
         if self.safe < self.newest:  # the last stamp is in doubt
             if time >= self.newest - self.lag:
                 self.safe = self.newest
@@ -67,7 +67,7 @@ class Clock:
         self.newest = max(self.newest, time)
 
     def _far_behind(self, time: float) -> Stamp:
-        """A stamp that is too old, or the third of a clock that has begun anew."""
+        """A stamp that is too old, or the third of a restarted clock."""
         if self._behind and not 0.0 < time - self._behind[-1] <= self.gap:
             self._behind.clear()
         self._behind.append(time)

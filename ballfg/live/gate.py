@@ -1,7 +1,7 @@
-"""Which ball a position belongs to: where each ball may be at a stamp, and the best assignment of the positions.
+"""Assigns positions to balls, by the region in which each ball may be at a stamp.
 
 A ball may have flown on, bounced, or been hit. The first two are Gaussians about a parabola with drag; they are coarse
-and cheap, for they decide only between centimetres and decimetres. The estimator weighs the sample itself.
+and cheap, since they decide only between centimetres and decimetres. The estimator weighs the sample itself.
 """
 
 import math
@@ -12,32 +12,32 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from ballfg.arrays import Array
-from ballfg.estimation.segmentation import SegmentationPhysics
+from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.prediction.state import BallState
 
 GATE = 30.0
-"""Squared Mahalanobis distance, 3 degrees of freedom: one good position in a million is further from its ball."""
+"""Squared Mahalanobis distance, 3 degrees of freedom: one good position in a million exceeds it."""
 LONG_GATE = 16.0
-"""The same after a silence of more than `HIT_TIME`, when a ball may be in a wide region, and another one too."""
+"""The same after a silence of more than `HIT_TIME`, when the region of a ball is wide and may hold another ball."""
 HIT_GATE = 9.0
-"""The same for a ball that may have been hit: beyond three standard deviations a position begins another ball."""
+"""The same for a ball that may have been hit: a position beyond three standard deviations begins another ball."""
 HIT_TIME = 0.1
-"""s. After a longer silence a ball is only looked for on its path: a hit could have brought it anywhere."""
+"""s. After a longer silence a ball is searched only on its path: a hit could have moved it anywhere."""
 HIT_SPEED = 10.0
 """m/s per axis, by which a hit moves the ball away from its path, apart from half of its own speed."""
 SLACK = 4.0
-"""m/s^2. Spread of the acceleration that gravity and drag leave out: the Magnus force of a strong spin is 20."""
+"""m/s^2. Spread of the acceleration beside gravity and drag: the Magnus force of a strong spin is 20."""
 SLIDE = 1.0
-"""m/s. Spread of the tangential velocity that a bounce takes or gives."""
+"""m/s. Spread of the change of tangential velocity in a bounce."""
 FLOOR = 0.002
-"""m. Noise of a position is taken to be no less."""
+"""m. Least noise of a position."""
 FAR = 1e6
-"""Cost of what is not possible."""
+"""Cost of an impossible pair."""
 
 
 @dataclass(frozen=True)
 class Known:
-    """What is known of a ball at a time.
+    """The belief on a ball at a time.
 
     Attributes:
         time: s.
@@ -51,12 +51,12 @@ class Known:
 
     @classmethod
     def of(cls, state: BallState) -> "Known":
-        """Of an estimated state."""
+        """The belief of an estimated state."""
         return cls(state.time, state.mean[:6], state.joint[:6, :6])
 
 
 class Gate:
-    """Distances of positions from where balls may be.
+    """Distances of positions from the regions of balls.
 
     Args:
         physics: of the ball.  heights: m, of the surfaces.  noise: (3,) m, of a position.
@@ -72,7 +72,7 @@ class Gate:
     def on_path(self, ball: Known, time: float, positions: Array) -> Array:
         """(n,) squared Mahalanobis distances of positions (n, 3) m from a ball that flew on or bounced.
 
-        After a long silence they are stretched, so that `GATE` holds for them too.
+        After a long silence they are scaled, so that `GATE` applies to them too.
         """
         dt = time - ball.time
         mean, covariance = self._flown(ball, dt)
@@ -83,7 +83,7 @@ class Gate:
         return distance * (GATE / LONG_GATE) if abs(dt) > HIT_TIME else distance
 
     def if_hit(self, ball: Known, time: float, positions: Array) -> Array:
-        """(n,) the same from a ball that something may have hit; infinite after too long a silence."""
+        """(n,) the same from a ball that may have been hit; infinite after too long a silence."""
         dt = time - ball.time
         if abs(dt) > HIT_TIME:
             return np.full(len(positions), np.inf)
@@ -110,7 +110,7 @@ class Gate:
         return ball.mean[:3] + dt * velocity + 0.5 * dt**2 * pull, covariance
 
     def _bounced(self, ball: Known, dt: float, flown: Array, covariance: Array) -> tuple[Array, Array] | None:
-        """The same of a ball that met a surface on the way; None if none was within reach."""
+        """The same for a ball that met a surface on the way; None if none was within reach."""
         z, vz, g = float(ball.mean[2]), float(ball.mean[5]), self.physics.gravity
         sigma = math.sqrt(covariance[2, 2])
         for rise in self.rises:
@@ -126,7 +126,7 @@ class Gate:
 
 
 def assign(costs: Array, limit: float) -> list[tuple[int, int]]:
-    """The assignment of rows to columns with the smallest sum; pairs that cost more than a limit stay apart.
+    """The assignment of rows to columns with the smallest sum; pairs above a limit stay apart.
 
     Args: costs: (n, m) dimensionless.  limit: of one pair.
     """

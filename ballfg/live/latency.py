@@ -1,4 +1,4 @@
-"""Latencies of an endless stream in bounded memory: counts on a logarithmic scale, and the worst."""
+"""Counts the latencies of an endless stream on a logarithmic scale, with the worst, in bounded memory."""
 
 import math
 
@@ -7,15 +7,15 @@ import numpy as np
 SHORTEST = 1e-3
 """ms, the end of the first bin."""
 STEPS = 200
-"""Bins of a factor of ten: a percentile is right to 1.2 %."""
+"""Bins per factor of ten: a percentile is right to 1.2 %."""
 DECADES = 9
-"""From a microsecond to a thousand seconds."""
+"""Number of factors of ten, from a microsecond to a thousand seconds."""
 
 
 class Latencies:
     """A histogram of latencies.
 
-    Attributes: count: of them.  worst: ms.
+    Attributes: count: number of latencies.  worst: ms.
     """
 
     def __init__(self) -> None:
@@ -24,14 +24,14 @@ class Latencies:
         self._bins = np.zeros(STEPS * DECADES + 1, dtype=np.int64)
 
     def add(self, milliseconds: float) -> None:
-        """Count one."""
+        """Counts one latency."""
         place = math.ceil(STEPS * math.log10(max(milliseconds, SHORTEST) / SHORTEST))
         self._bins[min(place, len(self._bins) - 1)] += 1
         self.count += 1
         self.worst = max(self.worst, milliseconds)
 
     def percentile(self, share: float) -> float:
-        """ms, which a share of the latencies, from 0 to 1, does not exceed; NaN without any."""
+        """ms, latency that a share of all, from 0 to 1, does not exceed; NaN without any."""
         if self.count == 0:
             return math.nan
         place = int(np.searchsorted(np.cumsum(self._bins), max(math.ceil(share * self.count), 1)))

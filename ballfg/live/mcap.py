@@ -1,8 +1,8 @@
-"""MCAP files that grow by whole chunks, so that what a killed writer left can be read and continued.
+"""Writes MCAP files that grow by whole chunks, so that a killed writer's file can be read and continued.
 
 Source: the MCAP format specification, version 0 (mcap.dev/spec). A file opens with schemas and channels. Chunks follow,
-each with an index of its messages for every channel. A summary ends the file: readers ask for it, though the chunks
-tell all that is in it.
+each with an index of its messages for every channel. A summary ends the file: readers require it, though the chunks
+contain the same information.
 """
 
 import io
@@ -18,24 +18,24 @@ MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = 1, 2, 3, 4, 5, 6, 7, 8
 STATISTICS, DATA_END = 11, 15
 RECORD = struct.Struct("<BQ")
-"""Before each record: its kind and its number of bytes."""
+"""Header of each record: its kind and its number of bytes."""
 SPAN = struct.Struct("<QQQIIQ")
-"""At the begin of a chunk: first and last time (ns), bytes of the content, checksum (0: none), length of the name of
-the compression (0: none), bytes of the content again."""
+"""Header of a chunk: first and last time (ns), bytes of the content, checksum (0: none), length of the name of the
+compression (0: none), bytes of the content again."""
 INDEX = struct.Struct("<HI")
-"""At the begin of an index: channel, bytes of the entries."""
+"""Header of an index: channel, bytes of the entries."""
 ENTRY = struct.Struct("<QQ")
-"""In an index: time of a message (ns) and its offset in the chunk."""
+"""Entry of an index: time of a message (ns) and its offset in the chunk."""
 WRITER = "ballfg"
 LONGEST_OPENING = 1 << 20
-"""Bytes; of the two topics of `ballfg live` it has 4,000."""
+"""Largest number of bytes of an opening; that of the two topics of `ballfg live` has 4,000."""
 
 Read = Callable[[int, int], bytes]
-"""Bytes of a file, from an offset on, at most as many as asked for."""
+"""Function that reads bytes of a file from an offset on, at most a given number."""
 
 
 class Message(NamedTuple):
-    """A message of a channel, which is a number from 1 on, at a time in ns."""
+    """A message of a channel, numbered from 1, at a time in ns."""
 
     channel: int
     time: int
@@ -44,7 +44,7 @@ class Message(NamedTuple):
 
 @dataclass(frozen=True)
 class Chunk:
-    """Where a chunk lies.
+    """Place of a chunk in the file.
 
     Attributes:
         first, last: ns, times of its messages.
@@ -60,7 +60,7 @@ class Chunk:
 
     @property
     def indexes(self) -> tuple[int, ...]:
-        """Offsets of the index of each channel, and of what follows the last."""
+        """Offsets of the index of each channel, and of the end of the last."""
         found = [self.offset + RECORD.size + SPAN.size + self.content]
         for count in self.counts:
             found.append(found[-1] + RECORD.size + INDEX.size + ENTRY.size * count)
@@ -68,12 +68,12 @@ class Chunk:
 
     @property
     def end(self) -> int:
-        """Offset of what follows the chunk and its indexes."""
+        """Offset of the end of the chunk and its indexes."""
         return self.indexes[-1]
 
 
 def opening(topics: Sequence[tuple[str, str, str]]) -> bytes:
-    """How a file begins: its header, then the schema and the channel of each topic, numbered from 1 on.
+    """The opening of a file: its header, then the schema and the channel of each topic, numbered from 1.
 
     Args: topics: name of each, with the name and the definition of its messages in ROS 2.
     """
@@ -88,9 +88,9 @@ def opening(topics: Sequence[tuple[str, str, str]]) -> bytes:
 
 
 def chunk_of(messages: Sequence[Message], channels: int, offset: int) -> tuple[bytes, Chunk]:
-    """A chunk and its indexes as bytes, and where it lies.
+    """A chunk and its indexes as bytes, and its place.
 
-    Args: messages: at least one.  channels: their number.  offset: bytes, at which it will stand in the file.
+    Args: messages: at least one.  channels: their number.  offset: bytes, of the chunk in the file.
     """
     content = bytearray()
     entries = [bytearray() for _ in range(channels)]
@@ -107,10 +107,10 @@ def chunk_of(messages: Sequence[Message], channels: int, offset: int) -> tuple[b
 
 
 def whole_chunks(read: Read, begin: int, size: int, channels: int) -> list[Chunk]:
-    """The chunks of a file that are whole, with their indexes, up to its ending or to a chunk that is cut off.
+    """The whole chunks of a file, with their indexes, up to its ending or to a chunk that is cut off.
 
     Args: begin: bytes of the opening.  size: bytes of the file.  channels: their number.
-    Raises: ValueError: something else is among them.
+    Raises: ValueError: another record among them.
     """
     found: list[Chunk] = []
     while (chunk := _chunk_at(read, found[-1].end if found else begin, channels)) is not None and chunk.end <= size:
@@ -119,7 +119,7 @@ def whole_chunks(read: Read, begin: int, size: int, channels: int) -> list[Chunk
 
 
 def ending(begin: bytes, chunks: Sequence[Chunk], channels: int) -> bytes:
-    """How a file ends, after its last chunk.
+    """The ending of a file, after its last chunk.
 
     Args: begin: the opening.  chunks: all of the file.  channels: their number.
     """
@@ -129,18 +129,18 @@ def ending(begin: bytes, chunks: Sequence[Chunk], channels: int) -> bytes:
     first, last = min((c.first for c in chunks), default=0), max((c.last for c in chunks), default=0)
     totals = struct.pack("<QHIIIIQQ", sum(counts), channels, channels, 0, 0, len(chunks), first, last)
     each = b"".join(struct.pack("<HQ", number, count) for number, count in enumerate(counts, start=1))
-    declared = begin[len(opening(())) :]  # schemas and channels once more
+    declared = begin[len(opening(())) :]  # schemas and channels again
     parts = [end, declared, *map(_chunk_index, chunks)]
     parts.append(_record(STATISTICS, totals + struct.pack("<I", len(each)) + each))
     return b"".join([*parts, _record(FOOTER, struct.pack("<QQI", offset, 0, 0)), MAGIC])
 
 
 def readable(path: Path) -> Path:
-    """A path that readers can open: of a file that a killed `ballfg live` left, one that adds the missing end.
+    """A path for readers: for the file of a killed `ballfg live`, one that adds the missing end.
 
-    The file itself stays as it is.
+    The file itself does not change.
 
-    Raises: ValueError: such a file, in which something else is among the chunks.
+    Raises: ValueError: such a file with another record among the chunks.
     """
     with path.open("rb") as file:
 
@@ -163,16 +163,16 @@ def readable(path: Path) -> Path:
 
 
 class Unfinished(PosixPath):
-    """A path to a file without end: who opens it reads a copy of its whole chunks, and the end that is missing.
+    """A path to a file without end: its reader gets a copy of its whole chunks, and the missing end.
 
-    Attributes: whole: bytes of the file that count.  ending: what follows them.
+    Attributes: whole: number of valid bytes of the file.  ending: bytes after them.
     """
 
     whole: int
     ending: bytes
 
     def open(self, *_: Any, **__: Any) -> Any:
-        """The file, in binary, to read."""
+        """The file in binary mode, for reading."""
         copy = TemporaryFile()  # noqa: SIM115 - who opened the path closes it
         with super().open("rb") as file:
             copyfileobj(file, copy)
@@ -199,9 +199,9 @@ def _opening_of(read: Read) -> tuple[bytes, int] | None:
 
 
 def _chunk_at(read: Read, offset: int, channels: int) -> Chunk | None:
-    """The chunk at an offset; None if the file ends before its indexes do, or the ending stands there.
+    """The chunk at an offset; None if the file ends before its indexes do, or at the ending.
 
-    Raises: ValueError: something else stands there.
+    Raises: ValueError: another record at the offset.
     """
     head = read(offset, RECORD.size + SPAN.size)
     if head[:1] in (b"", bytes([DATA_END])) or (head[0] == CHUNK and len(head) < RECORD.size + SPAN.size):

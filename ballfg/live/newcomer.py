@@ -1,4 +1,4 @@
-"""A newcomer: positions that may become a ball, with no estimator yet."""
+"""A newcomer holds positions that may become a ball, without an estimator."""
 
 from bisect import insort
 
@@ -9,15 +9,15 @@ from ballfg.live.ball import Kept
 from ballfg.live.gate import Gate, Known
 
 PATIENCE = 0.2
-"""s. A newcomer that was not seen for longer is forgotten."""
+"""s. A newcomer unseen for longer is forgotten."""
 SPEED = 12.0
-"""m/s per axis, of a ball of which only one position is known."""
+"""m/s per axis, spread of the velocity of a ball with one position."""
 BEND = 12.0
-"""m/s^2, by which a path bends away from a line through two positions."""
+"""m/s^2, deviation of a path from a line through two positions."""
 
 
 class Newcomer:
-    """The first positions of what may be a ball."""
+    """The first positions of a possible ball."""
 
     patience = PATIENCE
 
@@ -31,19 +31,19 @@ class Newcomer:
         return self.samples[-1].time
 
     def has(self, time: float) -> bool:
-        """Whether it has a sample of that stamp."""
+        """True if it has a sample of that stamp."""
         return any(kept.time == time for kept in self.samples)
 
     def repeats(self, time: float, position: Array) -> bool:
-        """Whether it has that very sample."""
+        """True if it has exactly that sample."""
         return any(kept.time == time and np.array_equal(kept.position, position) for kept in self.samples)
 
     def take(self, kept: Kept) -> None:
-        """Take in a sample."""
+        """Takes in a sample."""
         insort(self.samples, kept)
 
     def distances(self, time: float, positions: Array) -> Array:
-        """(n,) squared Mahalanobis distances of positions (n, 3) m from where it may be at a time."""
+        """(n,) squared Mahalanobis distances of positions (n, 3) m from its region at a time."""
         if abs(time - self.last) > PATIENCE:
             return np.full(len(positions), np.inf)
         return self.gate.on_path(self._known(), time, positions)

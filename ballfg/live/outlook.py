@@ -1,4 +1,4 @@
-"""What lies ahead of a ball: its next bounce, its apex, the crossing of a plane; never an exception."""
+"""Predicts a ball's next bounce, its apex and the crossing of a plane, without exceptions."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ import numpy as np
 from ballfg.checks import shown
 from ballfg.estimation.online.state import OnlineState
 from ballfg.estimation.result import Status
-from ballfg.prediction import BallState, Crossing, apex, next_contact, plane_crossing
-from ballfg.prediction.ahead import carried_by
+from ballfg.prediction import BallState, apex, next_contact, plane_crossing
+from ballfg.prediction.crossing import Crossing
+from ballfg.prediction.forecast import carried_by
 from ballfg.state import VELOCITY
 
 VAGUE = 3.0
-"""m/s, standard deviation of the velocity beyond which a prediction says nothing."""
+"""m/s, standard deviation of the velocity beyond which predictions carry no information."""
 AXES = ("x", "y", "z")
 
 
@@ -25,10 +26,8 @@ AXES = ("x", "y", "z")
 class Outlook:
     """Events ahead of a ball.
 
-    Attributes:
-        bounce: the next contact, apex: the next highest point, crossing: of the plane; None where there is none within
-            the horizon.
-        note: why something is missing that may well exist; empty if nothing is.
+    bounce: the next contact, apex: the next highest point, crossing: of the plane; None without one within the horizon.
+        note: reason for a missing prediction; empty without one.
     """
 
     bounce: Crossing | None = None
@@ -66,9 +65,9 @@ class Plane:
 
 
 def look_out(state: OnlineState, horizon: float, plane: Plane | None) -> Outlook:
-    """The events ahead of a state; what cannot be predicted is left out, and the note says why.
+    """The events ahead of a state; the note names events that cannot be predicted.
 
-    Args: horizon: s.  plane: to cross, if any.
+    Args: horizon: s.  plane: to cross, or None.
     """
     doubt = unusable(state)
     if doubt:
@@ -89,7 +88,7 @@ def look_out(state: OnlineState, horizon: float, plane: Plane | None) -> Outlook
 
 
 def unusable(state: BallState) -> str:
-    """Why nothing can be predicted from a state; empty if something can."""
+    """The reason why a state allows no prediction; empty if it does."""
     if isinstance(state, OnlineState) and state.status is not Status.OK:
         return f"no prediction: {state.status.value}"
     variances = np.diagonal(state.joint)

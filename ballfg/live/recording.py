@@ -1,4 +1,4 @@
-"""Recordings: files that grow under their own name, are soon on the disk, and are never replaced or removed."""
+"""Recordings grow under their own name, reach the disk within a second, and are never replaced or removed."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from ballfg.files.whole_file import check_file
 from ballfg.live.answers import KINDS, encoded
 
 EVERY = 0.5
-"""s between two times at which what was recorded is brought to the disk: what was read a second ago is there."""
+"""s between two flushes to the disk."""
 BLOCK = 65536
-"""Bytes read at once of what an earlier command has recorded; the first line is shorter."""
+"""Number of bytes of an earlier recording read at once; the first line is shorter."""
 OPENING = b'{"kind":"'
-"""How each line begins."""
+"""Beginning of each line."""
 
 
 class Recording:
-    """A file to which this process appends, and no other one meanwhile. Use it as a context.
+    """A file to which only this process appends. Use it as a context.
 
-    What was appended survives a kill at once, and a power cut after half a second. A link is written to where it leads.
+    Appended content survives a kill at once, and a power cut after half a second. A link is followed.
 
     Args:
-        path: of the file; it is made if it does not exist.
-        flush: appends what is held back; a thread calls it twice a second.
+        path: of the file; created if it does not exist.
+        flush: appends pending content; a thread calls it twice a second.
     Attributes:
-        size: bytes that are whole.
+        size: number of whole bytes.
     Raises: FileNotFoundError: no such folder. ValueError: it is a folder or a device, or another process records to it.
         OSError: it cannot be opened.
     """
@@ -58,12 +58,12 @@ class Recording:
         return os.pread(self._handle, count, offset)
 
     def cut(self, size: int) -> None:
-        """Cut off what follows the first `size` bytes, because it is no whole line or message."""
+        """Cuts off the content after the first `size` bytes, an incomplete line or message."""
         os.ftruncate(self._handle, size)
         self.size = size
 
     def append(self, content: bytes) -> None:
-        """Append whole lines or messages. Raises: OSError: the disk refuses it; what was there before stays whole."""
+        """Appends whole lines or messages. Raises: OSError: the disk refuses it; the earlier content stays whole."""
         self.check()
         done = 0
         try:
@@ -76,7 +76,7 @@ class Recording:
         self._dirty = True
 
     def check(self) -> None:
-        """Raises: OSError: the thread could not bring something to the disk."""
+        """Raises: OSError: the thread could not flush to the disk."""
         if self._error is not None:
             raise self._error
 
@@ -92,7 +92,7 @@ class Recording:
             os.close(self._handle)
 
     def _keep(self) -> None:
-        """The thread that brings everything to the disk."""
+        """The flushing thread."""
         while not self._stop.wait(EVERY):
             try:
                 self._bring_out()
@@ -108,7 +108,7 @@ class Recording:
             try:
                 os.fsync(self._handle)
             except OSError as error:
-                if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # a filesystem that does it in its own way
+                if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # some filesystems do it in their own way
                     raise self._named(error) from None
 
     def _named(self, error: OSError) -> OSError:
@@ -116,10 +116,10 @@ class Recording:
 
 
 def lines_recording(path: Path, repeats: bool) -> Recording:
-    """A recording of JSON lines, at whose end the next line belongs.
+    """A recording of JSON lines, ready for the next line at its end.
 
-    Args: path: of the file.  repeats: the input begins at its beginning again.
-    Raises: ValueError: it is no recording, or the input repeats what is in it; and as `Recording`.
+    Args: path: of the file.  repeats: True if the input starts from its beginning again.
+    Raises: ValueError: another kind of file, or the input repeats its content; and as `Recording`.
     """
     recording = Recording(path)
     try:
@@ -136,7 +136,7 @@ def lines_recording(path: Path, repeats: bool) -> Recording:
 
 
 def refuse_repeated(path: Path, repeats: bool) -> None:
-    """Refuse a file that is there, if the input begins at its beginning again. Raises: ValueError."""
+    """Refuses an existing file if the input starts from its beginning again. Raises: ValueError."""
     if repeats:
         raise ValueError(
             f"out must be a new file for a replay or a file as input, which begin at their beginning again; {path} "
@@ -145,22 +145,22 @@ def refuse_repeated(path: Path, repeats: bool) -> None:
 
 
 def refused(path: Path) -> ValueError:
-    """The error for a file that is something else."""
+    """The error for a file of another kind."""
     return ValueError(
         f"out must be a new file or a recording of ballfg live to continue; {path} is neither. Choose another name."
     )
 
 
 def say_continued(path: Path, size: int, cut: int) -> None:
-    """Tell the user that a recording is continued. Args: size, cut: bytes that stay, and that were cut off."""
+    """Tells the user that a recording is continued. Args: size, cut: numbers of bytes kept and cut off."""
     half = f"; {cut} bytes at its end, which a kill or a full disk had left incomplete, were cut off" if cut else ""
     print(f"ballfg live: continuing {path}, which holds {size} bytes{half}", file=sys.stderr)
 
 
 def _check_lines(recording: Recording) -> None:
-    """Refuse a file whose first line is none of `ballfg live`. Raises: ValueError."""
+    """Refuses a file whose first line is not from `ballfg live`. Raises: ValueError."""
     first, ended, _ = recording.read(0, BLOCK).partition(b"\n")
-    if not ended and recording.size < BLOCK:  # a half line, of a command that was killed at once
+    if not ended and recording.size < BLOCK:  # half a line, of a command that was killed at once
         if not (first.startswith(OPENING) or OPENING.startswith(first)):
             raise refused(recording.path)
         return
@@ -173,7 +173,7 @@ def _check_lines(recording: Recording) -> None:
 
 
 def _cut_half_line(recording: Recording) -> None:
-    """Cut off what follows the last whole line."""
+    """Cuts off the content after the last whole line."""
     size = end = recording.size
     while end:
         begin = max(0, end - BLOCK)
@@ -187,7 +187,7 @@ def _cut_half_line(recording: Recording) -> None:
 
 
 def _lock(handle: int, path: Path) -> None:
-    """Lock a file until it is closed; a filesystem without locks is used without. Raises: ValueError: it is locked."""
+    """Locks a file until it is closed, except on a filesystem without locks. Raises: ValueError: it is locked."""
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

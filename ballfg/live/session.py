@@ -1,4 +1,4 @@
-"""A session of `ballfg live`: samples from an inbox to a tracker, its answers to those who want them."""
+"""Runs a session of `ballfg live`: samples go from an inbox to a tracker, answers to the output."""
 
 import gc
 from collections.abc import Callable, Iterator, Sequence
@@ -15,21 +15,21 @@ from ballfg.live.tracker import BallUpdate, Tracker
 
 
 class Watcher(Protocol):
-    """Somebody who sees every update with its outlook: a viewer, a bag."""
+    """A receiver of every update with its outlook: a viewer, a bag."""
 
     def see(self, update: BallUpdate, outlook: Outlook | None) -> None:
-        """Take note of one update."""
+        """Takes note of one update."""
         ...
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """What is wanted of every state.
+    """The predictions for every state.
 
     Attributes:
-        horizon: s, how far ahead events are looked for.
-        plane: whose crossing is wanted; None without one.
-        patience: s. A live line that waited longer gets no prediction if another one waits: the states catch up.
+        horizon: s, range of the search for events.
+        plane: whose crossing is predicted; None without one.
+        patience: s. A live line that waited longer gets no prediction if another one waits, so that states catch up.
     """
 
     horizon: float = 1.0
@@ -40,11 +40,11 @@ class Wanted:
 class Session:
     """Answers samples until they end.
 
-    Args: write: takes the bytes of one line and brings them out.  watchers: see every update after its line.
+    Args: write: writes the bytes of one line at once.  watchers: get every update after its line.
 
     Attributes:
-        latencies: of the lines with states, from reading the input to having written the line.
-        malformed: lines that could not be read.  behind: states without prediction because their line had waited.
+        latencies: of the lines with states, from reading the input to writing the line.
+        malformed: number of unreadable lines.  behind: number of states without prediction because their line waited.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class Session:
         self._watchers = watchers
 
     def run(self) -> None:
-        """Answer samples until the inbox ends. Raises: OSError: from reading or writing."""
+        """Answers samples until the inbox ends. Raises: OSError: from reading or writing."""
         for group in self.inbox.groups():
             self._take(group)
             self.tracker.tidy()
@@ -96,7 +96,7 @@ class Session:
             self._tell(update, arrival.read, arrival)
 
     def _tell(self, update: BallUpdate, read: float, arrival: Arrival | None = None) -> None:
-        """Write the line of one update."""
+        """Writes the line of one update."""
         outlook = None
         if update.kind == "state" and update.state is not None:
             waited = perf_counter() - read
@@ -114,7 +114,7 @@ class Session:
             watcher.see(update, outlook)
 
     def summary(self) -> Iterator[str]:
-        """What there is to say at the end, one line each."""
+        """The summary at the end, one sentence per line."""
         counts = self.tracker.counts
         yield str(self.latencies)
         yield (
@@ -133,12 +133,12 @@ class Session:
 
 
 def warm_up(tracker: Tracker, wanted: Wanted) -> None:
-    """Estimate and predict a made-up ball through a bounce, so that the first real one meets no compiler.
+    """Estimates and predicts a made-up ball through a bounce, so that a real one waits for no compiler.
 
-    The tracker itself is left alone.
+    The tracker itself is not changed.
     """
     for state in warmed_up(tracker.estimator):
         update = BallUpdate("state", state.time, 1, state.position, state)
         encoded(answer(update, look_out(state, wanted.horizon, wanted.plane), ()), 0.0)
     gc.collect()
-    gc.freeze()  # what lives until the end is not looked through again
+    gc.freeze()  # permanent objects are not scanned again

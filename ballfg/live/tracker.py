@@ -1,4 +1,4 @@
-"""The tracker: positions of any number of balls in, the state of each ball out, one stamp at a time."""
+"""Tracks any number of balls: positions come in, states go out, one stamp at a time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -20,32 +20,32 @@ from ballfg.tracks import Ball as BallKind
 from ballfg.tracks.stamps import StreamOrigin
 
 GAP = 0.5
-"""s. A ball that was not seen for longer is lost; the estimator links nothing over longer gaps either."""
+"""s. A ball unseen for longer is lost; the estimator links nothing over longer gaps either."""
 CONFIRM = 3
-"""Consistent samples that make a ball: the first number of them that a velocity can be checked with."""
+"""Number of consistent samples that make a ball: the least that allow a check of the velocity."""
 MOST_BALLS = 16
-"""Balls that are followed at once."""
+"""Largest number of balls at once."""
 MOST_NEWCOMERS = 32
-"""Places that may become balls. Of more the oldest are dropped, so that clutter costs a bounded time."""
+"""Largest number of possible balls. The oldest are dropped first, so that clutter costs a bounded time."""
 FARTHEST = 1000.0
-"""m, of a coordinate. Beyond it the unit is another one."""
+"""m, of a coordinate. A larger one is in another unit."""
 
 
 @dataclass(frozen=True, eq=False)
 class BallUpdate:
-    """What became of one position, or of one ball.
+    """The result for one position, or for one ball.
 
     Attributes:
-        kind: `state`: a ball took the position in. `newcomer`: it may become a ball. `lost`: a ball was not seen for so
-            long that it is dropped. `refused`: nothing was done with the position.
+        kind: `state`: a ball took the position in. `newcomer`: it may become a ball. `lost`: a ball was unseen for so
+            long that it is dropped. `refused`: the position was not used.
         time: s, the position's stamp; of a lost ball its last.
         ball: number of the ball, from 1; None without one.
         position: (3,) m as measured; None of a lost ball.
         state: the ball's newest state; None without one.
-        samples: how many the ball has taken in.
-        events: bounces, hits, rests and gaps that were found now, some of them some samples ago.
-        late: the sample was put before others: the state is that of a later stamp.
-        reason: why a position was refused, or what went wrong with a state; empty otherwise.
+        samples: number of the ball's samples.
+        events: newly found bounces, hits, rests and gaps, some of them some samples ago.
+        late: True if the sample was inserted before others: the state is that of a later stamp.
+        reason: reason for a refused position, or an error of a state; else empty.
     """
 
     kind: str
@@ -61,15 +61,15 @@ class BallUpdate:
 
 @dataclass
 class Counts:
-    """What a tracker has seen.
+    """Counts of a tracker's input.
 
     Attributes:
-        positions: that came.  balls: that were begun.  lost: of these.
-        late: positions put before others.  old: positions older than the lag, dropped.
-        repeated: positions of a stamp that the ball had already, dropped.
+        positions: received.  balls: begun.  lost: of these.
+        late: positions inserted before others.  old: positions older than the lag, dropped.
+        repeated: positions at a stamp that the ball had already, dropped.
         malformed: positions that are not finite or not in m, dropped.
         stray: stamps that the next one disproved.  restarts: of the sender's clock.
-        failed: samples that the estimator could make nothing of.
+        failed: samples that the estimator could not explain.
     """
 
     positions: int = 0
@@ -86,7 +86,7 @@ class Counts:
 
 @dataclass
 class _Frame:
-    """The positions of one stamp, and what has become of each; its time is counted from the stream's first stamp."""
+    """The positions of one stamp, and the result of each; its time is counted from the stream's first stamp."""
 
     time: float
     late: bool
@@ -96,30 +96,30 @@ class _Frame:
 
     @property
     def open(self) -> list[int]:
-        """Those of which nothing is known yet."""
+        """The positions without a result."""
         return [k for k, update in enumerate(self.updates) if update is None]
 
 
 class Tracker:
-    """Follows balls: begins them, tells them apart, estimates each by `Online`, and drops those that are gone.
+    """Follows balls: begins them, distinguishes them, estimates each by `Online`, and drops the lost ones.
 
-    A position belongs to the ball whose predicted place it fits best. What fits none begins a newcomer, which
-    becomes a ball with its third consistent sample. Positions may come late by up to the lag: they are put where they
-    belong, and the states are those of the positions in order. Work and memory do not grow with the stream.
+    A position belongs to the ball whose predicted place fits best. A position without a fitting ball begins a newcomer,
+    which becomes a ball with its third consistent sample. Positions may come late by up to the lag: they are inserted
+    in their place, and the states are those of the positions in order. Work and memory do not grow with the stream.
 
     Args:
         model: the ball; of a `Ball`, its nominal model.
-        surfaces: that it may bounce on; of a number (m), a table of that height with the floor below it.
-        settings: noise and priors; those of measured tracks where None.
-        lag: s, by which a position may be late.
-        gap: s, after which a ball that was not seen is dropped.
-        confirm: consistent samples that make a ball.
-        most: balls that are followed at once; what else flies is refused.
+        surfaces: table and floor; for a number (m), a table of that height with the floor below it.
+        settings: noise and priors; None: those of measured tracks.
+        lag: s, largest delay of a position.
+        gap: s, after which an unseen ball is dropped.
+        confirm: number of consistent samples that make a ball.
+        most: largest number of balls at once; positions of further ones are refused.
 
     Attributes:
-        counts: of what came and what became of it.
+        counts: of the input and its results.
 
-    Raises: ValueError: a number out of range, or as `Online`. TypeError: a number that is none.
+    Raises: ValueError: a number out of range, or as `Online`. TypeError: not a number.
     """
 
     def __init__(
@@ -157,16 +157,16 @@ class Tracker:
         return {ball.number: self._dated_state(ball.states[-1]) for ball in self._balls}
 
     def push(self, time: float, positions: ArrayLike, sigmas: ArrayLike | None = None) -> list[BallUpdate]:
-        """Take in the positions of one stamp.
+        """Takes in the positions of one stamp.
 
         Positions of one stamp belong to different balls. They may come in one call or in several.
 
         Args:
             time: s, on the sender's clock.
             positions: (3,) or (n, 3) m.
-            sigmas: (3,) or (n, 3) m, their standard deviations; the settings' where None.
-        Returns: balls that were lost until then, and one update a position, in their order. A position that is not
-            usable is refused: nothing is raised for what a sender can get wrong.
+            sigmas: (3,) or (n, 3) m, their standard deviations; None: the settings'.
+        Returns: balls that were lost until then, and one update per position, in their order. An unusable position is
+            refused: a sender's errors raise nothing.
         Raises: ValueError: positions or sigmas of another shape. TypeError: a time that is no number.
         """
         points = np.atleast_2d(check_array("positions", positions, remedy="Give x, y and z in m.", most=np.inf))
@@ -207,12 +207,12 @@ class Tracker:
         )
 
     def tidy(self) -> None:
-        """Do what can wait: call it after the updates were used, and the next push is quicker. Nothing else changes."""
+        """Does the deferrable work: call it after the updates were used, for a quicker next push."""
         for ball in self._balls:
             ball.tidy()
 
     def end(self) -> list[BallUpdate]:
-        """Drop all balls, at the end of a stream: what comes next has nothing to do with them.
+        """Drops all balls at the end of a stream: later samples are unrelated to them.
 
         Returns: one update for each ball.
         """
@@ -236,7 +236,7 @@ class Tracker:
             frame.updates[k] = BallUpdate("refused", frame.time, position=point, reason=reason)
 
     def _turn_clock(self, frame: _Frame) -> list[BallUpdate]:
-        """Find out what the stamp is; drop what it leaves behind."""
+        """Classifies the stamp and drops outdated balls."""
         stamp = self._clock.tell(frame.time)
         gone: list[BallUpdate] = []
         if stamp is Stamp.OLD:
@@ -256,7 +256,7 @@ class Tracker:
         return gone + self._drop_unseen()
 
     def _undo_after(self, time: float) -> list[BallUpdate]:
-        """Take back what a stamp astray has done; a ball of nothing else is lost."""
+        """Reverts the effect of a wrong stamp; a ball without other samples is lost."""
         self._newcomers = [newcomer for newcomer in self._newcomers if newcomer.last <= time]
         gone = []
         for ball in list(self._balls):
@@ -287,7 +287,7 @@ class Tracker:
         return BallUpdate("lost", ball.last, ball.number, state=ball.states[-1], samples=ball.samples)
 
     def _to_balls(self, frame: _Frame, gate: float, hit: bool) -> None:
-        """Give open positions to the balls that they fit: on their path, or as after a hit."""
+        """Assigns open positions to the balls that they fit: on their path, or after a hit."""
         rows, t = frame.open, frame.time
         balls = [ball for ball in self._balls if ball.accepts(t) and abs(t - ball.last) <= self.gap]
         costs = np.full((len(rows), len(balls)), FAR)
@@ -304,7 +304,7 @@ class Tracker:
             self._refuse_repeated(frame)
 
     def _refuse_repeated(self, frame: _Frame) -> None:
-        """A position beside the one that a ball has of that stamp already is the same ball, measured twice."""
+        """Refuses a position beside one of the same ball and stamp: the ball was measured twice."""
         for k in frame.open:
             for ball in self._balls:
                 held = ball.at(frame.time)
@@ -322,7 +322,7 @@ class Tracker:
         frame.updates[k] = BallUpdate("refused", frame.time, position=frame.positions[k], reason=reason)
 
     def _taken(self, ball: Ball, frame: _Frame, k: int, kept: Kept) -> BallUpdate:
-        """A ball's update with a sample; where nothing can be made of it, the ball begins anew with it."""
+        """A ball's update with a sample; after a failure the ball restarts with it."""
         reason, displaced = "", ball.at(kept.time)
         try:
             state = ball.take(kept)
@@ -341,7 +341,7 @@ class Tracker:
         )
 
     def _to_newcomers(self, frame: _Frame) -> None:
-        """Give open positions to the newcomers that they fit; those with enough samples become balls."""
+        """Assigns open positions to the newcomers that they fit; those with enough samples become balls."""
         rows, t = frame.open, frame.time
         newcomers = [newcomer for newcomer in self._newcomers if not newcomer.has(t)]
         costs = np.full((len(rows), len(newcomers)), FAR)
@@ -356,7 +356,7 @@ class Tracker:
                 self._refuse(frame, k, "a newcomer has this position already")
 
     def _grown(self, newcomer: Newcomer, frame: _Frame, k: int) -> BallUpdate:
-        """A newcomer's update with a sample: it may be a ball now."""
+        """A newcomer's update with a sample, which may make it a ball."""
         position, count = frame.positions[k], len(newcomer.samples)
         if count < self.confirm:
             return BallUpdate("newcomer", frame.time, position=position, samples=count, late=frame.late)
@@ -374,7 +374,7 @@ class Tracker:
         return update
 
     def _begin_newcomers(self, frame: _Frame) -> None:
-        """What fits nothing may be a new ball."""
+        """Begins a newcomer for each remaining position."""
         for k in frame.open:
             newcomer = Newcomer(Kept(frame.time, frame.positions[k], frame.sigmas[k]), self.gate)
             self._newcomers.append(newcomer)

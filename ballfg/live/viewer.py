@@ -1,4 +1,4 @@
-"""The balls in the viewer rerun, as they fly: the extra `viewer`."""
+"""Shows flying balls in the viewer rerun; it needs the extra `viewer`."""
 
 from pathlib import Path
 
@@ -7,10 +7,10 @@ import numpy as np
 from ballfg.live.outlook import Outlook, unusable
 from ballfg.live.tracker import BallUpdate
 from ballfg.pages.recording import check_rerun
-from ballfg.prediction import Crossing
+from ballfg.prediction.crossing import Crossing
 
 EVERY = 3
-"""Of so many states one gets its path drawn: the eye sees no more, and the stream has other things to do."""
+"""Number of states per drawn path: the eye sees no more, and drawing takes time from the stream."""
 SIGMAS = 2.0
 """Radius of an event's ball in standard deviations of its place."""
 
@@ -18,7 +18,7 @@ SIGMAS = 2.0
 class Viewer:
     """Shows measured positions, states, paths ahead and their events, on the stream's own clock.
 
-    Args: horizon: s, of the paths.  save: a file .rrd to write to, in place of a window.
+    Args: horizon: s, of the paths.  save: a file .rrd in place of a window.
     Raises: ValueError: the package `rerun-sdk` is missing.
     """
 
@@ -33,7 +33,7 @@ class Viewer:
             self._recording.save(str(save))
 
     def see(self, update: BallUpdate, outlook: Outlook | None) -> None:
-        """Draw one update."""
+        """Draws one update."""
         show, state = self._recording, update.state
         show.set_time("stream", duration=update.time)
         if update.position is not None:
@@ -62,5 +62,5 @@ class Viewer:
         self._recording.log(name, self._rerun.Points3D([event.state[:3]], radii=max(radius, 0.005)))
 
     def close(self) -> None:
-        """Bring out what is still held back."""
+        """Flushes the pending drawings."""
         self._recording.flush()

@@ -1,5 +1,1 @@
-"""Pages and pictures to look at: one self-contained HTML file, figures for papers, recordings for a viewer."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+"""Makes pages and pictures: self-contained HTML files, figures for papers, recordings for a viewer."""

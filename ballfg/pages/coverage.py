@@ -1,4 +1,4 @@
-"""How often predictions hold: the share of measured coordinates inside their 90 % intervals, by horizon."""
+"""Computes the coverage of predictions: the share of coordinates inside their 90 % intervals, by horizon."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -7,12 +7,12 @@ from statistics import NormalDist
 import numpy as np
 
 from ballfg.arrays import Array, Index
-from ballfg.pages.shot import SAME_STAMP, Shot
+from ballfg.pages.shot import SAME_STAMP, ShownShot
 
 LEVEL = 0.9
-"""What an interval should hold."""
+"""Nominal coverage of an interval."""
 HALF_WIDTH = NormalDist().inv_cdf((1.0 + LEVEL) / 2.0)
-"""Standard deviations on either side of a prediction that make such an interval."""
+"""Standard deviations on either side of a prediction for that coverage."""
 BIN = 0.05
 """s, width of the bins of the horizon."""
 
@@ -33,7 +33,7 @@ class Coverage:
     shots: Index
 
 
-def coverage(shots: Iterable[Shot]) -> Coverage:
+def coverage(shots: Iterable[ShownShot]) -> Coverage:
     """The coverage of the predictions of many shots.
 
     Args: shots: with samples and predictions; samples outside of the predicted part are left out.

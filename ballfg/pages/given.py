@@ -1,4 +1,4 @@
-"""What the words of `ballfg show` are: a dataset, states, predictions, a diagnosis, in any order."""
+"""Recognises the arguments of `ballfg show`: a dataset, states, predictions, a diagnosis, in any order."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -10,10 +10,11 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from ballfg.checks import listed, short_text, shown
 from ballfg.files.json_file import read_json
 from ballfg.pages.tables import Kind, ResultTable, columns_of, kind_of, read_table
-from ballfg.tracks import Ball, DatasetInfo, Track, read_dataset
+from ballfg.tracks import Ball, Track, read_dataset
+from ballfg.tracks.info import DatasetInfo
 
 REPORT = "report.json"
-"""The file of a diagnosis folder that programs read."""
+"""Name of the machine-readable file in a diagnosis folder."""
 COULD_BE = (
     "a dataset (a folder with dataset.yaml), states of `ballfg estimate`, predictions of `ballfg predict` "
     "(.csv or .parquet), or a diagnosis of `ballfg diagnose` (its folder or report.json)"
@@ -21,7 +22,7 @@ COULD_BE = (
 
 
 class Folder(Protocol):
-    """A dataset to show: measured tracks, or tracks as cameras saw them."""
+    """A dataset to show: measured tracks, or tracks from sightings."""
 
     path: Path
     info: DatasetInfo
@@ -33,15 +34,15 @@ class Folder(Protocol):
 
     @property
     def names(self) -> list[str]:
-        """Of the tracks, in their order."""
+        """Names of the tracks, in their order."""
 
     @property
     def rough(self) -> bool:
-        """Whether the positions were made from what cameras saw."""
+        """True if the positions were computed from sightings."""
 
     @property
     def has_sigmas(self) -> bool:
-        """Whether the samples bring standard deviations."""
+        """True if the samples have standard deviations."""
 
     def __iter__(self) -> Iterator[Track]:
         """The tracks."""
@@ -49,7 +50,7 @@ class Folder(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Given:
-    """What there is to show; None for what was not given.
+    """The contents to show; None for missing ones.
 
     Attributes:
         dataset: the measured tracks.
@@ -64,12 +65,12 @@ class Given:
 
 
 def recognise(paths: Iterable[Path], opened: Callable[[Path], Folder] = read_dataset) -> Given:
-    """Reads each path as what it is.
+    """Recognises and reads each path.
 
     Args: paths: one of each kind at most, in any order.  opened: reads a dataset.
     Raises:
-        FileNotFoundError: a path that is not there.
-        ValueError: a path that is nothing of the kind, two of one kind, or a file that breaks its format.
+        FileNotFoundError: a missing path.
+        ValueError: an unrecognised path, two of one kind, or a file that breaks its format.
     """
     found: dict[str, Any] = {}
     places: dict[str, Path] = {}
@@ -125,7 +126,7 @@ def _diagnosis(path: Path) -> Mapping[str, Any]:
 
 
 class _Part(BaseModel):
-    """A part of a report; fields that no page shows are left alone."""
+    """A part of a report; other fields are ignored."""
 
     model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=False)
 
@@ -162,7 +163,7 @@ class _Candidate(_Part):
 
 
 class _Report(_Part):
-    """What pages show of a report."""
+    """The parts of a report that pages show."""
 
     verdict: str
     sentence: str

@@ -1,4 +1,4 @@
-"""The elements of a page: escaped text, tables, lists, pictures, bars, words with an explanation."""
+"""Builds the elements of a page: escaped text, tables, lists, pictures, bars, explained words."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DPI = 110
-"""Dots per inch of pictures, which are then about as wide as a page on a common screen."""
+"""Dots per inch of pictures, which then fill a page on a common screen."""
 READABLE = 78
-"""Pixels on the screen for each inch of a picture, at least: words of 10 points are then 11 pixels high. A picture that
-finds less room scrolls within its own box."""
+"""Least pixels on the screen for each inch of a picture: words of 10 points are then 11 pixels high. On a narrower
+screen a picture scrolls within its own box."""
 
 
 class Html(str):
-    """Text that is HTML already. All other text is escaped where it enters a page."""
+    """HTML text. All other text is escaped when it enters a page."""
 
     __slots__ = ()
 
@@ -57,7 +57,7 @@ def tag(name: str, *content: str, kind: str = "", **attributes: str) -> Html:
 
 
 def section(title: str, *content: str) -> Html:
-    """A part of the page with its heading; empty where there is no content."""
+    """A part of the page with its heading; empty without content."""
     parts = [part for part in content if part]
     return tag("section", tag("h2", title), *parts) if parts else Html()
 
@@ -78,12 +78,12 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Html:
 
 
 def typed(words: str) -> Html:
-    """What a reader copies into a terminal, to the letter: a typeset minus sign would not be understood there."""
+    """Text for copying into a terminal, to the letter: a typeset minus sign would not work there."""
     return Html(f"<code>{html.escape(words)}</code>")
 
 
 def explained(word: str, meaning: str, kind: str = "") -> Html:
-    """A word whose meaning appears under the pointer, and below it when it is touched or reached by the keyboard."""
+    """A word whose explanation appears under the pointer, and below it on touch or keyboard focus."""
     return tag("abbr", word, kind=kind, title=meaning, tabindex="0")
 
 
@@ -103,7 +103,7 @@ def bar(share: float, colour: str) -> Html:
 def picture(figure: Figure, caption: str) -> Html:
     """A figure as a PNG inside the page.
 
-    Args: figure: of matplotlib.  caption: below it, and for readers who do not see it.
+    Args: figure: of matplotlib.  caption: below it, and its text for screen readers.
     """
     memory = io.BytesIO()
     figure.savefig(memory, dpi=DPI, format="png")

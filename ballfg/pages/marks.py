@@ -1,4 +1,4 @@
-"""Contacts and hits, found in the states: the tables of an estimate do not list them."""
+"""Finds contacts and hits in states, since the tables of an estimate do not list them."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -14,14 +14,14 @@ NEAR = 0.05
 LARGEST_ACCELERATION = 150.0
 """m/s^2. Air and gravity change a velocity less than this: drag of a table-tennis ball at 25 m/s is 80 m/s^2."""
 SUDDEN = 1.5
-"""m/s. A jump that is smaller is not taken for a hit: velocities err, and bounces change them at the edge of a step."""
+"""m/s. A smaller jump is not taken for a hit: velocities err, and bounces change them at the edge of a step."""
 GAP = 0.1
-"""s. Over a longer step nobody saw what the ball did: it may have bounced several times."""
+"""s. During a longer step the motion is unknown: the ball may have bounced several times."""
 
 
 @dataclass(frozen=True)
 class Mark:
-    """A contact or a hit. `kind`: "contact" or "hit".  `time`: s.  `place`: (3,) m, about where the ball was."""
+    """A contact or a hit. `kind`: "contact" or "hit".  `time`: s.  `place`: (3,) m, approximate place of the ball."""
 
     kind: str
     time: float
@@ -31,12 +31,12 @@ class Mark:
 def marks(times: Array, states: Array, surfaces: Sequence[float], radius: float) -> Iterator[Mark]:
     """Contacts and hits between the states of a track.
 
-    A contact is where the vertical velocity turns from down to up near a surface, a hit where the velocity jumps by
-    more than air, gravity or a contact can explain. Steps of more than `GAP` have none.
+    A contact is a turn of the vertical velocity from down to up near a surface, a hit is a jump of the velocity beyond
+    air, gravity or a contact. Steps of more than `GAP` have none.
 
     Args:
         times: (m,) s.  states: (m, 9).
-        surfaces: m, heights that the ball can bounce on.
+        surfaces: m, heights of table and floor.
         radius: m, of the ball.
     """
     for i, step in enumerate(np.diff(times)):
@@ -53,7 +53,7 @@ def marks(times: Array, states: Array, surfaces: Sequence[float], radius: float)
 
 
 def _contact(before: Array, after: Array, step: float, surfaces: Sequence[float], radius: float) -> float | None:
-    """Seconds after the first of two states at which the ball meets a surface; None if it meets none between them."""
+    """Seconds from the first of two states to a contact with a surface; None without a contact."""
     if not before[VZ] < 0.0 < after[VZ]:
         return None
     for surface in surfaces:

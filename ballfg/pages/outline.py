@@ -1,4 +1,4 @@
-"""Where the table, its net and the floor are drawn."""
+"""Determines where the table, its net and the floor are drawn."""
 
 from dataclasses import dataclass
 
@@ -6,26 +6,27 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR, TABLE_LENGTH, TABLE_WIDTH
-from ballfg.tracks import TABLE_TENNIS, TENNIS, DatasetInfo
+from ballfg.tracks import TABLE_TENNIS
+from ballfg.tracks.info import TENNIS, DatasetInfo
 
 NET_HEIGHT = 0.1525
-"""m above the table, and how far the net reaches over its sides (ITTF Laws 2.2)."""
+"""m, height above the table, and overhang at its sides (ITTF Laws 2.2)."""
 SMALL_BALL = 0.5 * (TABLE_TENNIS.radius + TENNIS.radius)
-"""m. Balls below this radius are table-tennis balls: their table has the size of the rules, and a net."""
+"""m. Balls below this radius count as table-tennis balls: their table has the size of the rules, and a net."""
 MARGIN = 0.2
-"""m by which a surface without known ends reaches beyond the samples."""
+"""m by which a surface with unknown ends extends beyond the samples."""
 
 
 @dataclass(frozen=True)
 class Outline:
-    """Heights and ends of what the ball bounces on.
+    """Heights and ends of table and floor.
 
     Attributes:
         height: m, of the surface.
         extent: (x_low, x_high, y_low, y_high) m.
-        net: whether a net stands across its longer side.
-        floor: m, height of the floor; None where it is not known.
-        words: a sentence on where the ends are from.
+        net: True if a net stands across the longer side.
+        floor: m, height of the floor; None if unknown.
+        words: a sentence on the origin of the ends.
     """
 
     height: float
@@ -36,14 +37,14 @@ class Outline:
 
     @property
     def surfaces(self) -> tuple[float, ...]:
-        """m, heights that a ball can bounce on."""
+        """m, heights of table and floor."""
         return (self.height,) if self.floor is None else (self.height, self.floor)
 
 
 def outline(info: DatasetInfo, positions: Array) -> Outline:
     """The table of a dataset.
 
-    Args: info: what the dataset states.  positions: (n, 3) m, samples that the table lies under, n >= 1.
+    Args: info: of the dataset.  positions: (n, 3) m, samples above the table, n >= 1.
     """
     small = info.ball.radius < SMALL_BALL
     floor = info.table_height - TABLE_ABOVE_FLOOR if small else None
@@ -67,7 +68,7 @@ def outline(info: DatasetInfo, positions: Array) -> Outline:
 
 
 def _finite(extent: tuple[float, float, float, float], positions: Array) -> tuple[float, float, float, float]:
-    """The extent, with the samples' own ends where one is infinite."""
+    """The extent, with infinite ends replaced by the samples' own."""
     low, high = positions[:, :2].min(axis=0) - MARGIN, positions[:, :2].max(axis=0) + MARGIN
     seen = (low[0], high[0], low[1], high[1])
     return _numbers(tuple(end if np.isfinite(end) else other for end, other in zip(extent, seen, strict=True)))

@@ -1,4 +1,4 @@
-"""One self-contained HTML file: style, scripts and data are inside, and nothing is loaded from elsewhere."""
+"""Writes one self-contained HTML file, with style, scripts and data inside."""
 
 import html
 import json
@@ -21,10 +21,10 @@ def whole_page(
 
     Args:
         title: of the window.
-        content: text or HTML of the page, part after part.
-        style: CSS rules of this page, which go beyond those of all pages.
-        data: for the scripts, which find it as JSON in the element `data`; without NaN and infinity.
-        scripts: JavaScript, run in this order once the page is there.
+        content: text or HTML of the page, part by part.
+        style: CSS rules of this page, added to those of all pages.
+        data: for the scripts, as JSON in the element `data`; without NaN and infinity.
+        scripts: JavaScript, run in this order after the page has loaded.
         plotly: embed plotly.js before them; it has 4.8 MB.
     Raises: ValueError: data with NaN or infinity.
     """
@@ -48,7 +48,7 @@ def own(name: str) -> str:
 
 
 def _inside_script(data: Mapping[str, Any]) -> str:
-    """JSON that cannot end the script element: a name such as `</script>` is data like any other."""
+    """JSON that cannot end the script element, even with a name such as `</script>`."""
     plain = json.dumps(data, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
     for sign in "<>&\u2028\u2029":
         plain = plain.replace(sign, f"\\u{ord(sign):04x}")

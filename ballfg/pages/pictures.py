@@ -1,4 +1,4 @@
-"""Pictures of one shot for papers: views from the side and from above, and each axis by time."""
+"""Draws pictures of one shot for papers: views from the side and from above, and each axis by time."""
 
 from typing import Final
 
@@ -10,20 +10,20 @@ from matplotlib.figure import Figure
 from ballfg.arrays import Array
 from ballfg.pages.coverage import HALF_WIDTH
 from ballfg.pages.outline import Outline
-from ballfg.pages.shot import Shot
+from ballfg.pages.shot import ShownShot
 
 AXES: Final = ("x", "y", "z")
 ESTIMATE, PREDICTION, MEASURED, TABLE = "#0072b2", "#d55e00", "#555555", "#2f7d6b"
-"""Okabe and Ito's blue and vermilion: they differ for every kind of colour vision."""
+"""Okabe and Ito's blue and vermilion, distinct for every kind of colour vision."""
 MARKERS: Final = {"contact": ("D", "#117733"), "hit": ("X", "#cc3311")}
 
 
-def views(shot: Shot, table: Outline | None = None) -> Figure:
+def views(shot: ShownShot, table: Outline | None = None) -> Figure:
     """The shot from the side (x, z) and from above (x, y), with 90 % bands across the path.
 
     A shot that flies along y is drawn over y: (y, z) and (y, x).
 
-    Args: shot: what is known of it.  table: where the table is, if that is known.
+    Args: shot: with samples, states or predictions.  table: its place, if known.
     """
     figure = Figure(figsize=(7.0, 5.6), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
@@ -40,7 +40,7 @@ def views(shot: Shot, table: Outline | None = None) -> Figure:
     return figure
 
 
-def by_axis(shot: Shot) -> Figure:
+def by_axis(shot: ShownShot) -> Figure:
     """x, y and z by time: measured, estimated and predicted, with 90 % bands."""
     figure = Figure(figsize=(8.0, 7.0), layout="constrained")
     panels = figure.subplots(3, 1, sharex=True)
@@ -79,7 +79,7 @@ def _table(panel: Axes, table: Outline | None, across: int, up: int) -> None:
         panel.plot((low, high, high, low, low), (near, near, far, far, near), color=TABLE, linewidth=1.2, label="table")
 
 
-def _paths(panel: Axes, shot: Shot, across: int, up: int) -> None:
+def _paths(panel: Axes, shot: ShownShot, across: int, up: int) -> None:
     view = [across, up]
     if len(shot.times):
         panel.plot(*shot.positions[:, view].T, ".", color=MEASURED, markersize=4, label="measured")
@@ -99,7 +99,7 @@ def _paths(panel: Axes, shot: Shot, across: int, up: int) -> None:
 
 
 def _bands(places: Array, sigmas: Array) -> Array:
-    """(m - 1, 4, 2) m, one corner-to-corner piece of the band for each step; steps of unknown width are left out."""
+    """(m - 1, 4, 2) m, a quadrilateral of the band for each step; steps of unknown width are left out."""
     if len(places) < 2:
         return np.zeros((0, 4, 2))
     along = np.gradient(places, axis=0)

@@ -1,4 +1,4 @@
-"""Shots as a recording for the viewer rerun, for logs that are too large for a page: the extra `viewer`."""
+"""Records shots for the viewer rerun, for logs that are too large for a page; it needs the extra `viewer`."""
 
 from pathlib import Path
 from typing import Any
@@ -6,21 +6,21 @@ from typing import Any
 import numpy as np
 
 from ballfg.pages.outline import Outline
-from ballfg.pages.shot import Shot
+from ballfg.pages.shot import ShownShot
 from ballfg.pages.shown import Shown
 
 RADIUS = 0.02
-"""m, of the ball that moves, as large as a table-tennis ball."""
+"""m, of the moving ball, as large as a table-tennis ball."""
 SPIN_LENGTH = 0.001
 """m of an arrow for each rad/s of spin."""
 FLAT = 0.005
-"""m, half the thickness of the table that is drawn."""
+"""m, half the thickness of the drawn table."""
 
 
 def record(shown: Shown, path: Path) -> None:
     """Writes a recording: samples, estimates and predictions of each shot on its own clock.
 
-    Args: shown: what `collect` put together.  path: of the file, .rrd.
+    Args: shown: result of `collect`.  path: of the file, .rrd.
     Raises: ValueError: the package `rerun-sdk` is missing.
     """
     rerun = check_rerun()
@@ -35,7 +35,7 @@ def record(shown: Shown, path: Path) -> None:
 
 
 def check_rerun(option: str = "rerun") -> Any:
-    """The package rerun, which an option of a command needs. Raises: ValueError: it is missing."""
+    """The package rerun for an option of a command. Raises: ValueError: it is missing."""
     try:
         import rerun
     except ImportError as error:
@@ -51,7 +51,7 @@ def _table(rerun: Any, recording: Any, table: Outline) -> None:
     recording.log("table", rerun.Boxes3D(centers=[middle], half_sizes=[half]), static=True)
 
 
-def _shot(rerun: Any, recording: Any, shot: Shot) -> None:
+def _shot(rerun: Any, recording: Any, shot: ShownShot) -> None:
     start, name = shot.start, f"shots/{rerun.escape_entity_path_part(shot.name)}"
     if len(shot.times):
         recording.log(f"{name}/measured", rerun.Points3D(shot.positions, radii=0.004), static=True)

@@ -1,4 +1,4 @@
-"""One shot with all that is known of it: samples, states, predictions, contacts and hits."""
+"""A shot holds samples, states, predictions, contacts and hits of one track for drawing."""
 
 from dataclasses import dataclass, field
 
@@ -9,21 +9,21 @@ from ballfg.pages.marks import Mark
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
-    """What is drawn of one track; arrays without rows stand for what is not known.
+class ShownShot:
+    """The contents of one track's drawing; arrays without rows stand for missing ones.
 
     Attributes:
         name: of the track.
         times: (n,) s, stamps of the samples.
         positions: (n, 3) m, as measured.
-        noise: (n, 3) m, standard deviation of each measured coordinate; NaN where it is not known.
+        noise: (n, 3) m, standard deviation of each measured coordinate; NaN if unknown.
         state_times: (m,) s.
         states: (m, 9) position m, velocity m/s, spin rad/s.
         state_sigmas: (m, 9) in the same units.
         predicted_times: (k,) s.
         predicted: (k, 3) m.
         predicted_sigmas: (k, 3) m, of a measured position.
-        marks: contacts and hits that the states show.
+        marks: contacts and hits in the states.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Shot:
 
     @property
     def rows(self) -> int:
-        """How many samples, states and predictions there are."""
+        """Number of samples, states and predictions."""
         return len(self.times) + len(self.state_times) + len(self.predicted_times)
 
     def residuals(self) -> Array:
@@ -53,7 +53,7 @@ class Shot:
         return self.positions - _at(self.times, self.state_times, self.states[:, :3])
 
     def prediction_errors(self) -> Array:
-        """(k, 3) m, measured less predicted; NaN where nothing was measured."""
+        """(k, 3) m, measured less predicted; NaN without a measurement."""
         return _at(self.predicted_times, self.times, self.positions) - self.predicted
 
 
@@ -68,4 +68,4 @@ def _at(times: Array, known: Array, values: Array) -> Array:
 
 
 SAME_STAMP = 1e-9
-"""s. Tables keep all digits of a stamp, so that those of one sample agree far better than this."""
+"""s. Tables keep all digits of a stamp, so that those of one sample agree far better."""

@@ -1,4 +1,4 @@
-"""The page of `ballfg show`: its sentence, its parts, and the data that its script draws."""
+"""Builds the page of `ballfg show`: its sentence, its parts, and the data for its script."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,24 +11,24 @@ from ballfg.pages.html import Html, explained, items, section, table, tag
 from ballfg.pages.marks import GAP
 from ballfg.pages.outline import NET_HEIGHT, Outline
 from ballfg.pages.page import own, whole_page
-from ballfg.pages.shot import Shot
+from ballfg.pages.shot import ShownShot
 from ballfg.pages.shown import Shown
 from ballfg.state import POSITION, SPIN, VELOCITY
 
 LENGTH_DECIMALS, TIME_DECIMALS, VELOCITY_DECIMALS, SPIN_DECIMALS = 5, 5, 3, 1
 """Digits after the point of m, s, m/s and rad/s in the page: 10 um is far below what trackers resolve."""
 SIGMA_DECIMALS = 6
-"""The same of standard deviations in m: those of a state may be a tenth of a mm."""
+"""Digits of standard deviations in m: those of a state may be a tenth of a mm."""
 LARGEST = 8.0
-"""Standard deviations beyond which a residual is drawn at the edge, so that one outlier does not hide the others."""
+"""Standard deviations beyond which a residual is drawn at the edge, so that an outlier does not hide the others."""
 CANDIDATES = 10
-"""Effects of a diagnosis that are drawn, those first that explain most."""
+"""Number of effects of a diagnosis in the drawing, those that explain most."""
 
 
 def show_page(shown: Shown) -> str:
-    """The whole page, with everything that it needs inside.
+    """The whole page, self-contained.
 
-    Args: shown: what `collect` put together.
+    Args: shown: result of `collect`.
     """
     name = _name(shown)
     header = tag("header", tag("p", name), tag("h1", _sentence(shown)), items(shown.notes))
@@ -54,7 +54,7 @@ def _name(shown: Shown) -> str:
 
 
 def _sentence(shown: Shown) -> str:
-    """What is on the page."""
+    """A sentence on the content of the page."""
     given, count = shown.given, len(shown.shots)
     if not count:
         return "The diagnosis of a model."
@@ -190,7 +190,7 @@ def _number(value: float | None) -> str:
 
 
 def _data(shown: Shown) -> dict[str, Any]:
-    """What the script draws; null stands for numbers that are not known."""
+    """The data for the script; null stands for unknown numbers."""
     held, found = shown.coverage, shown.given.diagnosis
     return {
         "half_width": HALF_WIDTH,
@@ -225,7 +225,7 @@ def _table(outline: Outline) -> dict[str, Any]:
     return {"height": outline.height, "extent": list(outline.extent), "net": net, "floor": outline.floor}
 
 
-def _shot(shot: Shot) -> dict[str, Any]:
+def _shot(shot: ShownShot) -> dict[str, Any]:
     start = shot.start
     states = [
         *_plain(shot.states[:, POSITION].T, LENGTH_DECIMALS),
@@ -250,14 +250,14 @@ def _shot(shot: Shot) -> dict[str, Any]:
     }
 
 
-def _noise(shot: Shot) -> list[Any]:
-    """The standard deviations of each axis: one number where they are all the same, which most datasets state."""
+def _noise(shot: ShownShot) -> list[Any]:
+    """The standard deviations of each axis: one number if all are equal, as in most datasets."""
     rows = _plain(shot.noise.T, SIGMA_DECIMALS)
     return [row[0] if len(set(row)) == 1 else row for row in rows]
 
 
 def _tracks(found: Mapping[str, Any]) -> dict[str, Any]:
-    """Errors of the held-out tracks, after only where the model was changed, and the first round's candidates."""
+    """Errors on the held-out tracks, `after` only if the model was changed, and the first round's candidates."""
     before, after = (found["error"][which].get("by_track_mm", []) for which in ("before", "after"))
     return {"before": before, "after": None if after == before else after, "candidates": _candidates(found)}
 
@@ -270,7 +270,7 @@ def _candidates(found: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def _plain(array: Array, decimals: int) -> list[Any]:
-    """Nested lists of rounded numbers, None for those that are not finite."""
+    """Nested lists of rounded numbers, None for numbers that are not finite."""
     rounded = np.round(array, decimals).astype(object)
     rounded[~np.isfinite(array)] = None
     plain: list[Any] = rounded.tolist()

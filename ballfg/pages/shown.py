@@ -1,4 +1,4 @@
-"""What a page shows: the shots that were chosen, from all that was given, checked against each other."""
+"""Chooses the shots of a page from the given files and checks these against each other."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -11,34 +11,34 @@ from ballfg.pages.coverage import Coverage, coverage
 from ballfg.pages.given import Given
 from ballfg.pages.marks import marks
 from ballfg.pages.outline import Outline, outline
-from ballfg.pages.shot import SAME_STAMP, Shot
+from ballfg.pages.shot import SAME_STAMP, ShownShot
 from ballfg.pages.tables import ResultTable
 from ballfg.tracks import Track
 
 MOST_SHOTS = 40
-"""Shots of one page where none are named: a list to choose from that one can still read."""
+"""Number of shots on a page without named ones: a list that is still readable."""
 MOST_ROWS = 36_000
-"""Samples, states and predictions of one page together: about 3 MB beside the 5 MB of the drawing library."""
+"""Largest number of samples, states and predictions on a page: about 3 MB beside the drawing library's 5 MB."""
 ROBUST = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """What is drawn.
+    """The contents of a page.
 
     Attributes:
-        given: all that there is.
-        shots: those chosen, in the dataset's order.
-        count: how many shots there are in all.
-        table: where the table is; None without a dataset.
-        coverage: of all predicted shots, not of those chosen alone; None without measured tracks or predictions.
-        noise: a sentence on the standard deviation of the measured coordinates; empty where it is not known.
-        notes: sentences on what the reader should know.
+        given: all given files.
+        shots: the chosen ones, in the dataset's order.
+        count: total number of shots.
+        table: its place; None without a dataset.
+        coverage: of all predicted shots, not only the chosen ones; None without measured tracks or predictions.
+        noise: a sentence on the standard deviation of the measured coordinates; empty if unknown.
+        notes: sentences for the reader.
     """
 
     given: Given
-    shots: tuple[Shot, ...]
+    shots: tuple[ShownShot, ...]
     count: int
     table: Outline | None
     coverage: Coverage | None
@@ -47,12 +47,12 @@ class Shown:
 
 
 def collect(given: Given, names: Sequence[str] = (), limited: bool = True) -> Shown:
-    """Chooses shots and puts together what is known of each.
+    """Chooses shots and collects their contents.
 
     Args:
-        names: of the shots; where empty, the first ones.
-        limited: whether at most 40 shots and 36,000 rows are taken, as a page holds.
-    Raises: ValueError: a name that is not there, results that belong to other tracks, or a shot too long for a page.
+        names: of the shots; if empty, the first ones.
+        limited: True to take at most 40 shots and 36,000 rows, for a page.
+    Raises: ValueError: an unknown name, results of other tracks, or a shot too long for a page.
     """
     known = _names(given)
     for name in names:
@@ -63,7 +63,7 @@ def collect(given: Given, names: Sequence[str] = (), limited: bool = True) -> Sh
             )
     notes = list(_check_results(given))
     wanted = set(names) if names else set(known[:MOST_SHOTS] if limited else known)
-    shots: list[Shot] = []
+    shots: list[ShownShot] = []
     for shot in _all_shots(given, wanted):
         if limited and sum(other.rows for other in shots) + shot.rows > MOST_ROWS:
             if not shots or names:
@@ -87,7 +87,7 @@ def collect(given: Given, names: Sequence[str] = (), limited: bool = True) -> Sh
 
 
 def _names(given: Given) -> list[str]:
-    """The shots there are: those of the dataset, else those of the tables."""
+    """The names of all shots: those of the dataset, else those of the tables."""
     if given.dataset is not None:
         return given.dataset.names
     tables = [one for one in (given.states, given.predictions) if one is not None]
@@ -95,9 +95,9 @@ def _names(given: Given) -> list[str]:
 
 
 def _check_results(given: Given) -> Iterator[str]:
-    """Notes on results of a part of the shots.
+    """Notes on results for only a part of the shots.
 
-    Raises: ValueError: results of tracks that the dataset does not have.
+    Raises: ValueError: results of tracks outside of the dataset.
     """
     dataset = given.dataset
     for table in (given.states, given.predictions):
@@ -117,8 +117,8 @@ def _check_results(given: Given) -> Iterator[str]:
         yield f"The diagnosis is of {shown(named)}, the tracks are of {shown(dataset.info.name)}."
 
 
-def _all_shots(given: Given, wanted: set[str] | None = None) -> Iterator[Shot]:
-    """Shots in the dataset's order, without marks and noise; those wanted, or all."""
+def _all_shots(given: Given, wanted: set[str] | None = None) -> Iterator[ShownShot]:
+    """Shots in the dataset's order, without marks and noise; the wanted ones, or all."""
     if given.dataset is not None:
         for track in given.dataset:
             if wanted is None or track.name in wanted:
@@ -129,8 +129,8 @@ def _all_shots(given: Given, wanted: set[str] | None = None) -> Iterator[Shot]:
             yield _shot(given, name, None)
 
 
-def _shot(given: Given, name: str, track: Track | None) -> Shot:
-    shot = Shot(name)
+def _shot(given: Given, name: str, track: Track | None) -> ShownShot:
+    shot = ShownShot(name)
     if track is not None:
         unknown = np.full(track.positions.shape, np.nan)
         noise = unknown if track.sigmas is None else track.sigmas
@@ -158,8 +158,8 @@ def _rows(table: ResultTable, name: str, track: Track | None) -> Array:
     return rows
 
 
-def _with_noise(given: Given, shots: list[Shot]) -> tuple[list[Shot], str]:
-    """The shots with the standard deviations of their samples, and a sentence on where they are from."""
+def _with_noise(given: Given, shots: list[ShownShot]) -> tuple[list[ShownShot], str]:
+    """The shots with the standard deviations of their samples, and a sentence on their origin."""
     assert given.dataset is not None
     info = given.dataset.info
     if given.dataset.rough:

@@ -1,4 +1,4 @@
-"""The tables that `ballfg estimate` and `ballfg predict` write, read back track by track."""
+"""Reads the tables of `ballfg estimate` and `ballfg predict` back, track by track."""
 
 import enum
 from collections.abc import Mapping, Sequence
@@ -20,11 +20,11 @@ from ballfg.tracks.rows import distinct
 
 KEYS = ("trajectory", "t")
 LARGEST = 1e12
-"""Of all numbers of a table, in SI units; beyond it sums and squares leave what a page can hold."""
+"""Largest number in a table, in SI units; sums and squares of larger ones overflow a page's numbers."""
 
 
 class Kind(enum.Enum):
-    """What a table holds; the value names its columns of numbers beside `t`."""
+    """Kinds of tables; the value names the columns of numbers beside `t`."""
 
     STATES = (*STATE_NAMES, *SIGMA_NAMES)
     PREDICTIONS = ("x", "y", "z", "sigma_x", "sigma_y", "sigma_z")
@@ -36,8 +36,8 @@ class ResultTable:
 
     Attributes:
         path: of the file.  kind: of the table.
-        rows: where the rows of each track are, in the order in which the tracks first appear.
-        values: (rows, 1 + c) t in s and the columns of the kind, rows of a track together and in order of time.
+        rows: of each track, in the order in which the tracks first appear.
+        values: (rows, 1 + c) t in s and the columns of the kind, sorted by track and time.
     """
 
     path: Path
@@ -46,12 +46,12 @@ class ResultTable:
     values: Array
 
     def of(self, name: str) -> Array:
-        """(k, 1 + c) rows of a track in the units of the columns; none where the table has no such track."""
+        """(k, 1 + c) rows of a track in the units of the columns; empty for an unknown track."""
         return self.values[self.rows.get(name, slice(0))]
 
 
 def kind_of(columns: Sequence[str]) -> Kind | None:
-    """What a table with these columns holds; None where it is no table of results."""
+    """The kind of a table with these columns; None for another table."""
     for kind in Kind:
         if set(KEYS) | set(kind.value) <= set(columns):
             return kind
@@ -61,7 +61,7 @@ def kind_of(columns: Sequence[str]) -> Kind | None:
 def columns_of(path: Path) -> list[str]:
     """The names of a table's columns.
 
-    Raises: ValueError: the file cannot be read as the table that its ending promises.
+    Raises: ValueError: the file cannot be read in the format of its ending.
     """
     if path.suffix.lower() == ".parquet":
         with open_parquet(path) as file:
@@ -72,7 +72,7 @@ def columns_of(path: Path) -> list[str]:
 def read_table(path: Path, kind: Kind) -> ResultTable:
     """Reads the columns of a kind.
 
-    Raises: ValueError: no rows, a cell that is no number, or a stamp that is not finite.
+    Raises: ValueError: no rows, text in place of a number, or a stamp that is not finite.
     """
     names = [*KEYS, *kind.value]
     types = {"trajectory": pa.dictionary(pa.int32(), pa.string())} | dict.fromkeys(names[1:], pa.float64())

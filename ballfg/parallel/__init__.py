@@ -1,4 +1,4 @@
-"""Where work runs: in this process, in processes of this machine, or on a cluster; docs/scale.md."""
+"""Runs work in this process, in processes of this machine, or on a cluster; docs/scale.md explains the choice."""
 
 import lazy_loader
 

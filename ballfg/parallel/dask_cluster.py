@@ -1,7 +1,7 @@
-"""A dask cluster: chunks are futures of `distributed`, which computes those of a lost worker again elsewhere.
+"""Computes chunks on a dask cluster as futures, which dask computes again after the loss of a worker.
 
-joblib's own dask backend is not used: it takes from the stream as fast as workers compute, however slowly results are
-taken, so that they pile up in memory.
+joblib's own dask backend is not used: it takes from the stream as fast as workers compute, even if results are consumed
+slowly, so that they pile up in memory.
 """
 
 import logging
@@ -18,11 +18,11 @@ from ballfg.parallel.same_versions import HERE, differences, own_versions
 from ballfg.parallel.work import Work, compute, packed
 
 CONNECT: Final = 10.0
-"""s to wait for the scheduler, and for its first worker."""
+"""s, timeout for the scheduler, and for its first worker."""
 NOBODY: Final = 60.0
-"""s without any worker after which the work is given up."""
+"""s without any worker after which the work ends."""
 LOOK: Final = 5.0
-"""s between two looks at the cluster while a chunk is waited for."""
+"""s between two checks of the cluster while a chunk is computed."""
 
 
 class DaskCluster:
@@ -50,7 +50,7 @@ class DaskCluster:
             )
         self._address, self._workers = address, 0
         self._looked, self._nobody_since = -LOOK, math.inf
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters of it is raised here
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # important messages are raised here
         try:
             self._client = distributed.Client(address, timeout=CONNECT, set_as_default=False)
         except (OSError, ValueError, TimeoutError) as error:
@@ -66,16 +66,15 @@ class DaskCluster:
 
     @property
     def slots(self) -> int:
-        """How many workers there were at the last look; each computes one chunk at a time."""
+        """Number of workers at the last check; each computes one chunk at a time."""
         if time.monotonic() - self._looked > LOOK:
             self.look()
         return max(1, self._workers)
 
     def sender(self, function: Callable[[Sequence[Any]], Any]) -> Callable[[Sequence[Any]], "_Chunk"]:
-        """Hands a function of a chunk over; see Executor.
+        """Submits a function of a chunk; see Executor.
 
-        The function is the result of a task of its own, not scattered data: if the worker that holds it dies, dask
-        makes it again.
+        The function is the result of a task of its own, not scattered data: if its worker dies, dask computes it again.
         """
         work = Work.of(function)
         content = self._client.submit(bytes, work.content, key=f"ballfg-{work.name}-{uuid.uuid4().hex[:8]}")
@@ -102,10 +101,10 @@ class DaskCluster:
             )
 
     def stop(self) -> None:
-        """Nothing: chunks are given up one by one, and the cluster goes on without them."""
+        """Does nothing: chunks are cancelled one by one, and the cluster continues without them."""
 
     def close(self) -> None:
-        """Leaves the cluster, which stays as it is."""
+        """Leaves the cluster unchanged."""
         self._client.close()
 
     def _check_workers(self) -> None:
@@ -129,13 +128,13 @@ class _Chunk:
         self._cluster, self._future, self._first = cluster, future, repr(chunk[0])
 
     def done(self) -> bool:
-        """Whether the result is there, or an error."""
+        """True if the result, or an error, is there."""
         return bool(self._future.done())
 
     def result(self) -> Any:
         """The result; see Pending.
 
-        Raises: ChildProcessError: the chunk lost too many workers. ConnectionError: the cluster has left.
+        Raises: ChildProcessError: the chunk lost too many workers. ConnectionError: the cluster is gone.
         """
         from distributed import KilledWorker
 
@@ -158,5 +157,5 @@ class _Chunk:
             ) from None
 
     def cancel(self) -> None:
-        """Gives the chunk up."""
+        """Cancels the chunk."""
         self._future.cancel()

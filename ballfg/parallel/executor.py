@@ -1,4 +1,4 @@
-"""The choice where work runs: made once, by `--jobs` or `--cluster`, and asked by all that share work out."""
+"""Chooses where work runs, by `--jobs` or `--cluster`, for all code that distributes work."""
 
 from __future__ import annotations
 
@@ -12,56 +12,56 @@ from ballfg.machine import MOST_JOBS
 from ballfg.parallel.work import is_inside
 
 CLUSTERS = ("dask", "ray")
-"""Kinds of clusters, by the extra of ballfg that installs their library."""
+"""Kinds of clusters, by ballfg's extra for their library."""
 
 _CLUSTER: ContextVar[Executor | None] = ContextVar("cluster", default=None)
 
 
 class Pending(Protocol):
-    """A chunk that was handed over."""
+    """A submitted chunk."""
 
     def done(self) -> bool:
-        """Whether `result` returns, or raises, at once."""
+        """True if `result` returns, or raises, at once."""
         ...
 
     def result(self) -> Any:
-        """The result of the chunk, as soon as it is there; raises what the function raised."""
+        """The result of the chunk, once it is there; raises the function's exceptions."""
         ...
 
     def cancel(self) -> object:
-        """Gives the chunk up, as far as nobody works on it."""
+        """Cancels the chunk, unless a worker has begun it."""
         ...
 
 
 class Executor(Protocol):
-    """Processes that compute chunks: of this machine, or of a cluster."""
+    """Processes that compute chunks, of this machine or of a cluster."""
 
     batch: int
-    """Tracks in a chunk."""
+    """Number of tracks in a chunk."""
 
     helped: bool
-    """Whether the process that asks is one of them: then it computes chunks itself where it would wait."""
+    """True if the calling process is one of them: it then computes chunks itself instead of waiting."""
 
     @property
     def slots(self) -> int:
-        """How many chunks others compute at the same time."""
+        """Number of chunks that others compute at the same time."""
         ...
 
     def sender(self, function: Callable[[Sequence[Any]], Any]) -> Callable[[Sequence[Any]], Pending]:
-        """Hands a function of a chunk over, and returns what then hands its chunks over, one by one."""
+        """Submits a function of a chunk, and returns a function that submits its chunks one by one."""
         ...
 
     def stop(self) -> None:
-        """Ends what was begun, at once: after an error, or Ctrl-C."""
+        """Ends the present work at once: after an error, or Ctrl-C."""
         ...
 
 
 def executor(jobs: int, *, helped: bool = True) -> Executor | None:
-    """Where work goes: to the cluster of `on_cluster`, else to `jobs` processes; None where it stays in this process.
+    """The executor: of `on_cluster`'s cluster, else of `jobs` processes; None for this process.
 
-    Inside of a chunk it always stays.
+    Work inside of a chunk always stays in its process.
 
-    Args: jobs: number of processes.  helped: whether this one is one of them; else it only waits.
+    Args: jobs: number of processes.  helped: True if this one is one of them; else it only waits.
     """
     check_count("jobs", jobs, 1, MOST_JOBS)
     if is_inside():
@@ -76,18 +76,18 @@ def executor(jobs: int, *, helped: bool = True) -> Executor | None:
 
 @contextmanager
 def on_cluster(kind: str | None, address: str | None = None) -> Iterator[int | None]:
-    """All work of ballfg inside of the `with` block goes to a cluster, in place of processes of this machine.
+    """Sends all work of ballfg inside of the `with` block to a cluster.
 
-    Results are the same, bit for bit, as in one process, where all machines have processors of one type.
+    Results equal those of one process bit for bit, if all machines have processors of one type.
 
     Example:
         with on_cluster("dask", "tcp://10.0.0.1:8786"):
             states = bf.estimate("shots")
 
     Args:
-        kind: "dask" or "ray"; None leaves everything as it is.
-        address: of dask's scheduler, such as tcp://10.0.0.1:8786, or of a ray cluster; by default the ray cluster that
-            this machine belongs to.
+        kind: "dask" or "ray"; None changes nothing.
+        address: of dask's scheduler, such as tcp://10.0.0.1:8786, or of a ray cluster; by default this machine's ray
+            cluster.
     Returns: the number of workers; None without a cluster.
     Raises:
         ValueError: another kind, an address without a kind or the reverse, a library that is not installed, or workers

@@ -1,4 +1,4 @@
-"""The parts of one large piece of work, computed wherever the work around it may run."""
+"""Computes the parts of one large piece of work wherever the work around it may run."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
@@ -17,7 +17,7 @@ _JOBS: ContextVar[int] = ContextVar("jobs", default=1)
 
 
 def with_jobs(jobs: int, function: Callable[[T], R], argument: T) -> R:
-    """What a function gives, whose parts may use several processes."""
+    """The result of a function whose parts may use several processes."""
     token = _JOBS.set(jobs)
     try:
         return function(argument)
@@ -28,10 +28,10 @@ def with_jobs(jobs: int, function: Callable[[T], R], argument: T) -> R:
 def in_parts(function: Callable[[T], R], parts: Sequence[T], together: int) -> Iterator[R]:
     """A function of each part, in order: in the processes of `with_jobs`, on a cluster, or here.
 
-    Each result depends on its part alone, so that it has the same bits wherever it is computed.
+    Each result depends on its part alone, so that it has the same bits on every process.
 
-    Args: function, parts: copied to processes, so they must pickle.  together: parts handed over at once.
-    Raises: what the function raises.
+    Args: function, parts: copied to processes, so they must pickle.  together: number of parts in one task.
+    Raises: the function's exceptions.
     """
     others = executor(_JOBS.get()) if len(parts) > together else None
     if others is None:

@@ -1,8 +1,8 @@
-"""Processes of this machine: kept for the next work, replaced when one dies, and gone with this process.
+"""Computes chunks in processes of this machine, which are reused, replaced after a crash, and end with this process.
 
 Each is an interpreter with two pipes: one for calls and answers, and its standard input, to which only this process can
 write. When this process ends, however it ends, the system closes them, and the other process ends too (`worker.py`).
-There is nothing else that could stay: no semaphore, no file, no process that looks after the others.
+Nothing else can remain: no semaphore, no file, no supervising process.
 """
 
 import atexit
@@ -24,17 +24,17 @@ from ballfg.parallel.work import Work, packed
 
 ONE_THREAD: Final = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 MOST_DEATHS: Final = 3
-"""A chunk that lost so many processes is given up: it is probably what ends them."""
+"""Largest number of processes that a chunk may lose: it is then the probable cause."""
 BEGIN: Final = "import sys; exec(sys.stdin.readline())"
-"""What a process runs; the line that it reads lets it find the modules that this one finds."""
+"""Code of a new process; the line that it reads lets it find the modules of this one."""
 
 Told = Callable[[Any], object]
 
 
 class Processes:
-    """This process and `jobs` - 1 others; or `jobs` others and this one that waits.
+    """This process and `jobs` - 1 others; or `jobs` others while this one waits.
 
-    Args: jobs: number of processes, at least 2.  helped: whether this process is one of them.
+    Args: jobs: number of processes, at least 2.  helped: True if this process is one of them.
     """
 
     batch = 8
@@ -45,20 +45,20 @@ class Processes:
 
     @property
     def slots(self) -> int:
-        """How many chunks others compute at the same time."""
+        """Number of chunks that others compute at the same time."""
         return self._others
 
     @property
     def started(self) -> bool:
-        """Whether so many processes were started before; they may be there still."""
+        """True if this number of processes was started before; they may still exist."""
         return _crew.size >= self._others
 
     def sender(
         self, function: Callable[[Sequence[Any]], Any], told: Told | None = None
     ) -> Callable[[Sequence[Any]], "_Chunk"]:
-        """Hands a function of a chunk over; see Executor.
+        """Submits a function of a chunk; see Executor.
 
-        Args: told: called, in another thread, with what the function tells by `worker.tell` while it computes.
+        Args: told: called, in another thread, with the messages that the function sends by `worker.tell`.
         """
         work = Work.of(function)
         return lambda chunk: _Chunk(_crew.line(self._others), work, chunk, told)
@@ -69,7 +69,7 @@ class Processes:
 
 
 class _Chunk:
-    """A chunk that goes to a new process where the one that had it has died."""
+    """A chunk that goes to a new process if the first one dies."""
 
     def __init__(self, line: "_Line", work: Work, chunk: Sequence[Any], told: Told | None) -> None:
         self._first, self._told = repr(chunk[0]), told
@@ -78,7 +78,7 @@ class _Chunk:
         line.put(self)
 
     def done(self) -> bool:
-        """Whether the result is there, or an error."""
+        """True if the result, or an error, is there."""
         return self._future.done()
 
     def result(self) -> Any:
@@ -89,15 +89,15 @@ class _Chunk:
         return pickle.loads(content)
 
     def cancel(self) -> bool:
-        """Gives the chunk up where no process has begun it."""
+        """Cancels the chunk unless a process has begun it."""
         return self._future.cancel()
 
     def compute(self, crew: "_Crew") -> None:
-        """Has a process compute it."""
+        """Computes it in a process."""
         if self._future.set_running_or_notify_cancel():
             try:
                 self._future.set_result(self._answered(crew))
-            except BaseException as error:  # told to whoever asks for the result
+            except BaseException as error:  # raised where the result is asked for
                 self._future.set_exception(error)
 
     def _answered(self, crew: "_Crew") -> tuple[str, bytes]:
@@ -118,7 +118,7 @@ _Line = SimpleQueue[_Chunk | None]
 
 
 class _Crew:
-    """All processes, and the chunks that wait for them: a line for each number of processes that was asked for."""
+    """All processes, and the waiting chunks: a queue for each requested number of processes."""
 
     def __init__(self) -> None:
         self._processes: set[_Process] = set()
@@ -132,7 +132,7 @@ class _Crew:
         return len(self._processes)
 
     def line(self, size: int) -> _Line:
-        """The line of a number of processes; as many threads take from it, one for each chunk at work."""
+        """The queue of a number of processes, served by as many threads."""
         with self._lock:
             if size not in self._lines:
                 self._lines[size] = SimpleQueue()
@@ -145,7 +145,7 @@ class _Crew:
             chunk.compute(self)
 
     def taken(self) -> "_Process":
-        """A process for one chunk. Raises: CancelledError: all were ended."""
+        """A process for one chunk. Raises: CancelledError: all processes were ended."""
         with self._lock:
             if self._stopped:
                 raise CancelledError
@@ -178,7 +178,7 @@ class _Crew:
         self._processes.discard(process)
 
     def stop(self) -> None:
-        """Ends all processes; threads that wait for one find that it has died."""
+        """Ends all processes; waiting threads find that theirs has died."""
         with self._lock:
             self._stopped = True
             for process in self._processes:
@@ -189,7 +189,7 @@ class _Crew:
                     line.put(None)
 
     def forget(self) -> None:
-        """Closes the pipes of a copy of this process: it must not keep the others alive, nor do they serve it."""
+        """Closes the pipes of a copy of this process, which must neither keep the others alive nor use them."""
         for process in self._processes:
             process.close()
 
@@ -199,7 +199,7 @@ class _Process:
 
     def __init__(self) -> None:
         self._calls, theirs = Pipe()
-        # Ctrl-C at the terminal is for this process alone; the other says so itself as soon as it can
+        # Ctrl-C at the terminal is for this process alone; the other one ignores it as soon as it can
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             with theirs:
@@ -212,7 +212,7 @@ class _Process:
                 )
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        with suppress(OSError):  # of one that died at once: its first call says so
+        with suppress(OSError):  # it died at once: its first call reports that
             print(
                 f"sys.path[:] = {sys.path!r}; from ballfg.parallel.worker import serve; serve({handle})",
                 file=self._process.stdin,
@@ -223,7 +223,7 @@ class _Process:
         return self._process.poll() is None
 
     def answer(self, call: bytes, told: Told | None) -> tuple[str, bytes]:
-        """What the process answers to a call. Raises: EOFError, OSError: it has died."""
+        """The answer of the process to a call. Raises: EOFError, OSError: it has died."""
         self._calls.send_bytes(call)
         while True:
             kind, content = pickle.loads(self._calls.recv_bytes())
@@ -233,7 +233,7 @@ class _Process:
                 told(content)
 
     def kill(self) -> None:
-        """Ends it at once; a thread that waits for its answer finds that it has died."""
+        """Ends it at once; a waiting thread finds that it has died."""
         self._process.kill()
         self._process.wait()
 

@@ -1,4 +1,4 @@
-"""A ray cluster: chunks are ray tasks, which ray starts again where their worker dies."""
+"""Computes chunks on a ray cluster as tasks, which ray restarts after the loss of a worker."""
 
 import pickle
 from collections.abc import Callable, Sequence
@@ -9,13 +9,13 @@ from ballfg.parallel.same_versions import HERE, differences, own_versions
 from ballfg.parallel.work import Work, compute, packed
 
 MOST_DEATHS: Final = 3
-"""Workers that a chunk may lose before it is given up."""
+"""Largest number of workers that a chunk may lose."""
 
 
 class RayCluster:
     """All processors of a ray cluster.
 
-    Args: address: of the cluster; None for the one that this machine belongs to, or that this process has joined.
+    Args: address: of the cluster; None for this machine's, or for the one that this process has joined.
     Raises: ValueError: ray is not installed, or nodes with other versions. ConnectionError: no cluster is there.
     """
 
@@ -44,11 +44,11 @@ class RayCluster:
 
     @property
     def slots(self) -> int:
-        """How many processors there are; each computes one chunk at a time."""
+        """Number of processors; each computes one chunk at a time."""
         return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
 
     def sender(self, function: Callable[[Sequence[Any]], Any]) -> Callable[[Sequence[Any]], "_Chunk"]:
-        """Hands a function of a chunk over; see Executor."""
+        """Submits a function of a chunk; see Executor."""
         work = Work.of(function)
         content = self._ray.put(work.content)
 
@@ -59,17 +59,17 @@ class RayCluster:
         return send
 
     def stop(self) -> None:
-        """Nothing: chunks are given up one by one, and the cluster goes on without them."""
+        """Does nothing: chunks are cancelled one by one, and the cluster continues without them."""
 
     def close(self) -> None:
-        """Leaves the cluster, which stays as it is."""
+        """Leaves the cluster unchanged."""
         if self._joined:
             self._ray.shutdown()
 
     def _check_nodes(self) -> None:
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-        def asked(expression: str) -> Any:  # travels as a whole: a node without ballfg could not import it
+        def asked(expression: str) -> Any:  # sent as a whole: a node without ballfg could not import it
             return eval(expression)
 
         for node in self._ray.nodes():
@@ -88,7 +88,7 @@ class _Chunk:
         self._ray, self._sent, self._first = ray, sent, repr(chunk[0])
 
     def done(self) -> bool:
-        """Whether the result is there, or an error."""
+        """True if the result, or an error, is there."""
         return bool(self._ray.wait([self._sent], timeout=0)[0])
 
     def result(self) -> Any:
@@ -104,5 +104,5 @@ class _Chunk:
             ) from None
 
     def cancel(self) -> None:
-        """Gives the chunk up."""
+        """Cancels the chunk."""
         self._ray.cancel(self._sent)

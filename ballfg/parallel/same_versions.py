@@ -1,4 +1,4 @@
-"""Whether two processes compute the same: the versions of what they compute with."""
+"""Compares the versions of two processes' packages, so that they compute the same."""
 
 import hashlib
 import os
@@ -10,12 +10,12 @@ from ballfg.machine import versions
 PACKAGES = ("ballfg", "torch", "numpy", "scipy", "numba", "gtsam")
 """Packages whose version may change a result."""
 SOURCE = "source of ballfg"
-"""Name of the digest of ballfg's own files: a checkout changes without its version."""
+"""Name of the digest of ballfg's own files: a checkout may change without its version."""
 HERE = (
     "dict(__import__('ballfg.parallel.same_versions', fromlist=['own_versions']).own_versions()) "
     "if (find := __import__('importlib.util').util.find_spec)('ballfg') and find('ballfg.parallel') else {}"
 )
-"""Python expression for the versions of a worker, none without ballfg; it needs nothing but Python to be sent there."""
+"""Python expression for the versions of a worker, none without ballfg; it uses nothing but Python."""
 
 
 @cache
@@ -27,9 +27,9 @@ def own_versions() -> dict[str, str]:
 
 
 def differences(theirs: dict[str, str], whose: str = "a worker") -> str | None:
-    """A message on versions that differ from those of this process; None where they are the same.
+    """A message on versions that differ from those of this process; None if there are none.
 
-    Args: theirs: versions of the other process.  whose: the name of the worker of the two processes.
+    Args: theirs: versions of the other process.  whose: name of its worker.
     """
     own = own_versions()
     if theirs == own:

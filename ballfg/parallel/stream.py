@@ -1,4 +1,4 @@
-"""Chunks out of a stream, computed by an executor: in order with few of them in memory, or as they finish."""
+"""Computes the chunks of a stream by an executor, in order with few in memory, or as they finish."""
 
 import time
 from collections import deque
@@ -15,11 +15,11 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 AHEAD: Final = 3
-"""Chunks per worker that were handed over and are not done."""
+"""Largest number of unfinished chunks per worker."""
 HELPED: Final = 8
-"""Chunks that are done and not yet taken, besides. Memory is bounded by both."""
+"""Largest number of further chunks that are done but not consumed. Both bound the memory."""
 LOOK: Final = 0.02
-"""s between two looks at what has finished."""
+"""s between two checks for finished chunks."""
 
 
 def in_order(
@@ -27,17 +27,17 @@ def in_order(
 ) -> Iterator[R]:
     """The results of chunks, one after the other, in the order of the stream.
 
-    However slowly they are taken, no more than `AHEAD` chunks per worker and `HELPED` more are begun; and no worker has
-    more than `AHEAD` before it.
+    However slowly results are consumed, no more than `AHEAD` chunks per worker and `HELPED` more are begun; and no
+    worker has more than `AHEAD` in its queue.
 
     Args: function: of a chunk; gives its results.  chunks: a stream.  executor: computes them.
-    Raises: what the function raises.
+    Raises: the function's exceptions.
     """
     send = executor.sender(function)
     pending: deque[Pending] = deque()
     try:
         while True:
-            # what is done and waits behind an earlier chunk must not keep new ones from the workers
+            # finished chunks behind an earlier one must not keep new ones from the workers
             most, away = AHEAD * executor.slots, sum(not one.done() for one in pending)
             while away < most and len(pending) < most + HELPED and (chunk := next(chunks, None)) is not None:
                 pending.append(send(chunk))
@@ -63,8 +63,8 @@ def in_order(
 def finished(function: Callable[[T], R], items: Sequence[T], executor: Executor) -> Iterator[tuple[int, R]]:
     """The number and the result of each item, as they finish; this process waits.
 
-    Args: function: of an item; takes seconds or more.  items: that are handed over at once.  executor: computes them.
-    Raises: what the function raises.
+    Args: function: of an item; takes seconds or more.  items: submitted at once.  executor: computes them.
+    Raises: the function's exceptions.
     """
     send = executor.sender(partial(_of_one, function))
     pending = {number: send([item]) for number, item in enumerate(items)}
@@ -84,8 +84,8 @@ def finished(function: Callable[[T], R], items: Sequence[T], executor: Executor)
 def shared(function: Callable[[T], R], items: Sequence[T], executor: Executor) -> list[R]:
     """The results of items that take seconds or more, in their order; this process computes some of them too.
 
-    Args: function: of an item.  items: that are computed.  executor: whose processes take the next item when free.
-    Raises: what the function raises.
+    Args: function: of an item.  items: its arguments.  executor: whose free processes take the next item.
+    Raises: the function's exceptions.
     """
     send = executor.sender(partial(_of_one, function))
     waiting, found, errors = deque(enumerate(items)), dict[int, R](), list[Exception]()

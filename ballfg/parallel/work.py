@@ -1,4 +1,4 @@
-"""A function of a chunk: pickled once, computed wherever its chunks arrive."""
+"""Pickles a function of chunks once and computes it wherever its chunks arrive."""
 
 import hashlib
 import pickle
@@ -17,7 +17,7 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 KEPT = 4
-"""Functions that a worker keeps. What one of them loads - a model, machine code - then serves all of its chunks."""
+"""Number of functions that a worker keeps. Their models and machine code then serve all of their chunks."""
 
 _INSIDE: ContextVar[bool] = ContextVar("inside", default=False)
 _functions: OrderedDict[str, Callable[..., Any]] = OrderedDict()
@@ -26,30 +26,30 @@ _one_at_a_time = Lock()
 
 @dataclass(frozen=True)
 class Work:
-    """A pickled function of a chunk. `name` is the digest of `content`, by which workers know it again."""
+    """A pickled function of a chunk. `name` is the digest of `content`, by which workers recognise it."""
 
     name: str
     content: bytes
 
     @classmethod
     def of(cls, function: Callable[..., Any]) -> "Work":
-        """The work of a function; what no worker could import, such as a user's effects, is in it as a whole."""
+        """The work of a function; it includes code that workers cannot import, such as a user's effects."""
         content = packed(function)
         return cls(hashlib.sha256(content).hexdigest()[:16], content)
 
 
 def packed(thing: object) -> bytes:
-    """A thing pickled, with functions and classes that cannot be imported by name as a whole."""
+    """A pickled object, including functions and classes that cannot be imported by name."""
     return bytes(dumps(thing))
 
 
 def compute(name: str, content: bytes, chunk: bytes, versions: dict[str, str]) -> bytes:
-    """What a worker does: the pickled result of a function of a chunk.
+    """Computes a chunk in a worker: the pickled result of the function.
 
-    One chunk at a time is computed in a process, on one thread; whatever it shares out itself stays in this process.
+    A process computes one chunk at a time, on one thread; nested work stays in this process.
 
-    Args: name, content: of the `Work`.  chunk: pickled.  versions: of the process that asks.
-    Raises: ValueError: the versions differ from those of this process; and what the function raises.
+    Args: name, content: of the `Work`.  chunk: pickled.  versions: of the calling process.
+    Raises: ValueError: the versions differ from those of this process; and the function's exceptions.
     """
     different = differences(versions)
     if different:
@@ -64,7 +64,7 @@ def each(function: Callable[[Any], R], chunk: Sequence[Any]) -> list[R]:
 
 
 def on_one_thread(function: Callable[[T], R], argument: T) -> R:
-    """What a function gives, computed on one torch thread."""
+    """A function's result, computed on one torch thread."""
     import torch
 
     threads = torch.get_num_threads()
@@ -76,7 +76,7 @@ def on_one_thread(function: Callable[[T], R], argument: T) -> R:
 
 
 def alone(function: Callable[[T], R], argument: T) -> R:
-    """What a function gives, computed on one torch thread; nothing in it starts processes of its own."""
+    """A function's result, computed on one torch thread without further processes."""
     token = _INSIDE.set(True)
     try:
         return on_one_thread(function, argument)
@@ -85,7 +85,7 @@ def alone(function: Callable[[T], R], argument: T) -> R:
 
 
 def is_inside() -> bool:
-    """Whether this code runs as part of a chunk."""
+    """True if this code runs as part of a chunk."""
     return _INSIDE.get()
 
 

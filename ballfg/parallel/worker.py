@@ -1,4 +1,4 @@
-"""A process that computes chunks for another one, and ends as soon as the other one has ended."""
+"""Computes chunks for another process, and ends as soon as that one ends."""
 
 import os
 import pickle
@@ -12,15 +12,15 @@ from ballfg.collector import collect_rarely
 from ballfg.parallel.work import compute, packed
 
 IDLE: Final = 300.0
-"""s after which a process without work ends."""
+"""s without work after which a process ends."""
 
 _asker: Connection | None = None
 
 
 def serve(handle: int) -> None:
-    """Computes one chunk after another, until nobody asks any more."""
+    """Computes one chunk after another, until no more come."""
     global _asker
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C at the terminal: the process that asks ends this one
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C at the terminal: the calling process ends this one
     Thread(target=_end_with_asker, daemon=True).start()
     collect_rarely()
     _asker = Connection(handle)
@@ -32,12 +32,12 @@ def serve(handle: int) -> None:
 
 
 def tell(thing: Any) -> None:
-    """Sends something to the process that asks, while a chunk is computed for it; see `Processes.sender`."""
+    """Sends an object to the calling process during a chunk; see `Processes.sender`."""
     _send(("told", thing))
 
 
 def _end_with_asker() -> None:
-    """Standard input ends when the one process that can write to it has ended."""
+    """Ends the process when standard input ends, because its only writer has ended."""
     while os.read(0, 1024):
         pass
     os._exit(0)
@@ -50,14 +50,14 @@ def _send(thing: tuple[str, Any]) -> None:
 
 def _answer(folder: str, name: str, content: bytes, chunk: bytes, versions: dict[str, str]) -> tuple[str, bytes]:
     try:
-        os.chdir(folder)  # the process that asks may have gone elsewhere since it started this one
+        os.chdir(folder)  # the calling process may have changed its folder since it started this one
         return "value", compute(name, content, chunk, versions)
     except BaseException as error:
         return "error", _packed(error)
 
 
 def _packed(error: BaseException) -> bytes:
-    """An exception that can be raised elsewhere, with the lines in which it was raised here."""
+    """An exception that can be raised elsewhere, with its original traceback as text."""
     lines = "".join(traceback.format_exception(error))
     if not isinstance(error, Exception):  # raised elsewhere it would end more than this work
         error = ChildProcessError(f"work must return or raise; it left by {type(error).__name__}. Mend its code.")

@@ -1,4 +1,4 @@
-"""States carried forward: rollouts, the apex, the next contact, a plane - with covariance."""
+"""Predicts states with covariance: rollouts, the apex, the next contact, the crossing of a plane."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""The apex, the highest point of a flight between bounces: of true states, of predicted and of measured positions."""
+"""Finds the apex, the highest point of a flight between bounces, in true, predicted or measured positions."""
 
 from typing import Final
 
@@ -11,15 +11,15 @@ HALF_WIDTH: Final = 0.05
 """s to each side of the highest sample over which a parabola is fitted. Drag bends a path off its parabola by less than
 0.1 mm there; of 3 mm of noise it leaves 1.5 mm at 120 Hz."""
 LEAST_FITTED: Final = 5
-"""Samples that a parabola through noise is fitted to, at least; with fewer the track does not show its apex."""
+"""Least number of samples for the fit of a parabola to noisy positions."""
 FLIGHTS: Final = 3
-"""Flights whose apex is looked for: before the first bounce, after it, after the second."""
+"""Number of flights whose apex is searched: before the first bounce, after it, after the second."""
 
 _NO_POINT: Final = np.full(3, np.nan)
 
 
 def flight_bounds(times: Array, bounces: Array) -> list[tuple[float, float]]:
-    """(start, end) s of the first `FLIGHTS` flights; fewer where the track ends before.
+    """(start, end) s of the first `FLIGHTS` flights; fewer if the track ends before.
 
     Args: times: (n,) s.  bounces: (b,) s, in order.
     """
@@ -59,12 +59,12 @@ def _cubic_apex(times: Array, states: Array) -> tuple[Array, float]:
 def path_apex(times: Array, positions: Array, start: float, end: float) -> tuple[Array, float]:
     """Highest point of a path between two times: the vertex of a parabola round its highest sample.
 
-    All three coordinates are fitted by parabolas in time, z tells when. Where the highest sample is the first or last,
-    or the path does not bend down round it, the highest sample itself is the answer: a prediction that never rises
-    still has a highest point.
+    Parabolas in time fit all three coordinates, and z gives the time. If the highest sample is the first or last, or
+    the path does not bend down round it, the result is that sample: a prediction that never rises still has a highest
+    point.
 
     Args: times: (n,) s.  positions: (n, 3) m.  start, end: s.
-    Returns: position (3,) m and time s; NaN where the path has no sample there.
+    Returns: position (3,) m and time s; NaN if the path has no sample there.
     """
     rows = np.flatnonzero((times >= start) & (times <= end))
     if not len(rows):
@@ -84,7 +84,7 @@ def path_apex(times: Array, positions: Array, start: float, end: float) -> tuple
 
 
 def measured_apexes(times: Array, positions: Array, bounces: Array) -> tuple[Array, Array]:
-    """Apexes that measured positions show: those with `HALF_WIDTH` of the flight, and samples, to each side.
+    """Apexes of measured positions, if the flight and its samples reach `HALF_WIDTH` to each side.
 
     Args: times: (n,) s.  positions: (n, 3) m.  bounces: (b,) s.
     Returns: as `true_apexes`.

@@ -1,4 +1,4 @@
-"""A belief: Gaussian states at one time, with the model coefficients that were estimated along with them."""
+"""A belief holds Gaussian states at one time, with the model coefficients of their estimate."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Belief:
     """Gaussian states and coefficients of n balls, each ball at its own time.
 
     Attributes:
-        model: the ball; an `AugmentedModel` where coefficients are uncertain.
+        model: the ball; an `AugmentedModel` if coefficients are uncertain.
         time: (n,) s.
         mean: (n, 9 + p) states, then coefficients in their own units.
         covariance: (n, 9 + p, 9 + p) in the products of those units.
@@ -39,14 +39,14 @@ class Belief:
     ) -> Belief:
         """The belief of some states that were estimated with the same model.
 
-        A coefficient estimated beyond what its effect accepts (a restitution above 1, say) is held at the bound, and
-        the state is what is most probable with it there.
+        A coefficient beyond the bounds of its effect (a restitution above 1, say) is moved to the bound, and the state
+        to its conditional mean.
 
         Args:
             model: the ball.
             states: n of them.
             coefficients: prior standard deviations by parameter name, as in `Settings.coefficients`. A state without
-                one of them (of the sliding window, of a filter that failed) gets the model's value with this standard
+                one of them (from the sliding window or a failed filter) gets the model's value with this standard
                 deviation. None: the coefficients of the states, the same in all.
         Raises: ValueError: if there is no state, or states have coefficients that are not among these.
         """
@@ -78,7 +78,7 @@ class Belief:
         return len(self.time)
 
     def from_zero(self) -> Belief:
-        """The belief with time counted from now, so that steps are not rounded as large stamps are."""
+        """The belief with time counted from now, against the rounding of large stamps."""
         return replace(self, time=torch.zeros_like(self.time))
 
     @staticmethod
@@ -96,7 +96,7 @@ class Belief:
         )
 
     def take(self, rows: Tensor | slice) -> Belief:
-        """Some of the balls.
+        """A part of the balls.
 
         Args:
             rows: their (m,) indices, a (n,) mask or a slice.
@@ -117,7 +117,7 @@ def _joint(state: BallState, names: tuple[str, ...], prior_mean: Array, prior_si
 
 
 def _held(mean: Array, covariance: Array, low: Array, high: Array) -> Array:
-    """The most probable mean (9 + p,) whose coefficients that lie out of bounds are on them."""
+    """The most probable mean (9 + p,) with its out-of-bounds coefficients fixed at the bounds."""
     change = np.clip(mean[STATE_DIM:], low, high) - mean[STATE_DIM:]
     out = STATE_DIM + np.flatnonzero(change)
     if not len(out):
@@ -128,7 +128,7 @@ def _held(mean: Array, covariance: Array, low: Array, high: Array) -> Array:
 
 
 def _bounds(model: BallModel, names: tuple[str, ...]) -> tuple[Array, Array]:
-    """(p,) smallest and (p,) largest values that the effects of a model accept; infinite where none is declared."""
+    """(p,) smallest and (p,) largest values of coefficients, by a model's effects; infinite without a declaration."""
     declared = model.declared_coefficients()
     low = [declared[name].low if name in declared else -np.inf for name in names]
     high = [declared[name].high if name in declared else np.inf for name in names]

@@ -1,4 +1,4 @@
-"""Where and when: the apex, the next contact, the crossing of a plane - each with the covariance of place and time.
+"""Finds the time and place of an apex, a contact or the crossing of a plane, with their covariance.
 
 An event is a function g of the state that changes sign. At the crossing time the state's covariance is projected onto
 g = 0: a ball that is late is further back but crosses at the same place (docs/derivations/prediction.md).
@@ -18,7 +18,9 @@ from ballfg.checks import check_number
 from ballfg.dynamics.compiled.beliefs.events import FOUND, LOOKS, NONE, TIME_TOLERANCE
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import contact_time
-from ballfg.dynamics.motion.integrate import MAX_STEP, RateFunction, batch_jacobian, derivative, fly
+from ballfg.dynamics.motion.flight_step import RateFunction, derivative
+from ballfg.dynamics.motion.integrate import batch_jacobian, fly
+from ballfg.dynamics.motion.limits import MAX_STEP
 from ballfg.dynamics.motion.rollout import advance, is_resting
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.prediction.belief import Belief
@@ -29,9 +31,9 @@ EventFunction = Callable[[Tensor], Tensor]
 """(..., d) states to (..., 1) values; the event is where the value falls through zero."""
 
 VALUE_JUMP = 1e-6
-"""Value, in the event's own unit, beyond which it jumped through zero in a bounce and did not cross it."""
+"""Largest value, in the event's own unit, of a crossing; a larger one jumped through zero in a bounce."""
 JUST_NOW = 1e-9
-"""s. An event no later than this after the time from which events count is not a new one."""
+"""s. Least delay of a new event after the time from which events count."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +52,7 @@ class Crossing:
     covariance: Array
 
     def later(self, seconds: float) -> "Crossing":
-        """The same event on a clock that is so many seconds ahead."""
+        """The same event on a clock that is ahead by some seconds."""
         return replace(self, time=self.time + seconds)
 
     def __repr__(self) -> str:
@@ -77,7 +79,7 @@ def apex(propagator: Propagator, belief: Belief, horizon: float = 3.0, *, after:
 def next_contact(
     propagator: Propagator, belief: Belief, horizon: float = 3.0, *, after: float = -math.inf
 ) -> Crossing | None:
-    """The state just before the next contact with a surface.
+    """The state right before the next contact with a surface.
 
     Args: as for `next_crossing`; for the second contact give the first one's time as `after`.
     Returns: None if there is none within the horizon. A ball that rests or rolls has none until it falls.
@@ -106,7 +108,7 @@ def plane_crossing(
     *,
     after: float = -math.inf,
 ) -> Crossing | None:
-    """Where the ball's centre goes through the plane normal . p = offset, from either side.
+    """The crossing of the plane normal . p = offset by the ball's centre, from either side.
 
     Args:
         propagator, belief, horizon, after: as for `next_crossing`.
@@ -170,7 +172,7 @@ def next_crossing(
         event: see `EventFunction`; continuous in the state. A jump through zero in a bounce is no crossing.
         horizon: s from the belief's time.
         after: s on the ball's clock; only later events count. An event at the belief's own time is past.
-        either_way: take a rise through zero as well.
+        either_way: count a rise through zero as well.
     Returns: None if there is no crossing within the horizon.
     Raises: ValueError: if the belief does not hold exactly one ball, or the horizon is not a positive number of s.
     """
@@ -186,7 +188,7 @@ def next_crossing(
 def _contact_step(
     propagator: Propagator, belief: Belief, end: float, earliest: float
 ) -> tuple[Crossing | None, Belief]:
-    """A contact within one step, and the belief after the step, or after a contact that came too early."""
+    """A contact within one step, and the belief after the step, or after a contact that came too early to count."""
     model, surfaces = belief.model, propagator.surfaces
     h = torch.tensor([min(end - float(belief.time), MAX_STEP)], dtype=torch.float64)
     found = _contact_within(model, belief.mean, h, surfaces)
@@ -212,7 +214,7 @@ def _crossing_step(
 
 
 def _span(belief: Belief, horizon: float, after: float) -> tuple[float, float]:
-    """End of a search, and the time after which events count, s since the belief's; the arguments are checked."""
+    """End of a search, and the time after which events count, s since the belief's; checks the arguments."""
     if len(belief) != 1:
         raise ValueError(f"belief must hold one ball; got {len(belief)}. Take them one by one.")
     horizon = check_number("horizon", horizon, "s", above=0.0)
@@ -268,7 +270,7 @@ def _mean_at(belief: Belief, times: Tensor, surfaces: Surfaces) -> Tensor:
 
 
 def _rates(propagator: Propagator, belief: Belief) -> RateFunction:
-    """What moves the ball: the air and its weight, or where it rests, friction."""
+    """Rate of change of the state by air and weight or, at rest, friction."""
     level = propagator.surfaces.level_below(belief.mean)
     with torch.no_grad():
         resting = bool(is_resting(belief.model, belief.mean, level))
@@ -277,7 +279,7 @@ def _rates(propagator: Propagator, belief: Belief) -> RateFunction:
 
 
 def _at_event(there: Belief, event: EventFunction, rates: RateFunction) -> Crossing:
-    """The crossing whose mean is `there`."""
+    """The crossing of a belief with mean `there`."""
     _, gradient = batch_jacobian(event, there.mean, outputs=1)
     with torch.no_grad():
         rate = derivative(rates, there.mean)
@@ -285,9 +287,9 @@ def _at_event(there: Belief, event: EventFunction, rates: RateFunction) -> Cross
 
 
 def _projected(there: Belief, gradient: Array, rate: Array) -> Crossing:
-    """The crossing whose mean is `there`, with the covariance projected along the motion onto the event's surface.
+    """The crossing of a belief, with the covariance projected along the motion onto the event's surface.
 
-    Where the motion only touches the surface, nothing fixes the time: its sigma is infinite, the covariance that
+    If the motion only touches the surface, the time is undetermined: its sigma is infinite, and the covariance is that
     at the mean time.
 
     Args: gradient: (d,) of the event.  rate: (d,) of the state.

@@ -1,27 +1,28 @@
-"""Balls that come down near the edge of a table: one bounces, its neighbour within the uncertainty falls past.
+"""Accounts for balls near the edge of a table: one bounces, its neighbour within the uncertainty falls past.
 
 The mean takes one of the two ways. The covariance gets the second moment, about the mean, of the share that takes the
 other (docs/derivations/prediction.md).
 """
 
-import math
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from ballfg.dynamics.compiled.beliefs.edges import share_over_table
+from ballfg.dynamics.compiled.motion import world_of
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import contact_time
 from ballfg.dynamics.motion.integrate import fly
-from ballfg.dynamics.motion.limits import LEAST_SIGMA, NEGLIGIBLE
+from ballfg.dynamics.motion.limits import NEGLIGIBLE
 from ballfg.dynamics.motion.rollout import advance
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.state import STATE_DIM, VELOCITY, VZ, Z
+from ballfg.state import STATE_DIM, VZ
 
 
 @torch.no_grad()
 def edge_doubt(model: BallModel, mean: Tensor, covariance: Tensor, h: Tensor, surfaces: Surfaces) -> Tensor | float:
-    """What the balls that take the other way add to the covariance at the end of a step.
+    """Covariance at the end of a step from the balls that take the other way than the mean.
 
     Args:
         model: of the ball.
@@ -29,7 +30,7 @@ def edge_doubt(model: BallModel, mean: Tensor, covariance: Tensor, h: Tensor, su
         covariance: (1, d, d) of it.
         h: (1,) s, the step; at most one contact with the table.
         surfaces: table and floor.
-    Returns: (9, 9); 0 where the ball does not come down to the table's level in the step, or far from every edge.
+    Returns: (9, 9); 0 if the ball does not come down to the table's level in the step, or far from every edge.
     """
     height = mean.new_tensor([surfaces.table_height])
     beside = fly(model, mean, h)
@@ -38,29 +39,9 @@ def edge_doubt(model: BallModel, mean: Tensor, covariance: Tensor, h: Tensor, su
     touch = fly(model, mean, contact_time(model, mean, height))
     if not float(touch[0, VZ]) < 0.0:
         return 0.0
-    over = _probability_over_table(touch[0], covariance[0], surfaces)
+    over = share_over_table(touch[0].numpy(), covariance[0].numpy(), world_of(surfaces, model.radius))
     other = 1.0 - over if bool(surfaces.over_table(touch)) else over
     if other < NEGLIGIBLE:
         return 0.0
     difference = (advance(model, mean, h, replace(surfaces, extent=None)) - beside)[0, :STATE_DIM]
     return other * torch.outer(difference, difference)
-
-
-def _probability_over_table(touch: Tensor, covariance: Tensor, surfaces: Surfaces) -> float:
-    """Probability that a ball which is at `touch` (d,) in the mean when it comes down is then above the table.
-
-    A ball that is higher comes down later, farther along its way.
-    """
-    assert surfaces.extent is not None
-    below = []  # for each end, the probability that the ball comes down below it along its axis
-    for k, (end, sigma) in enumerate(zip(surfaces.extent, surfaces.edge_sigmas, strict=True)):
-        axis = k // 2
-        along = torch.zeros_like(touch)
-        along[axis], along[Z] = 1.0, -touch[VELOCITY][axis] / touch[VZ]
-        spread = math.sqrt(max(float(along @ covariance @ along), 0.0) + sigma**2)
-        below.append(_normal_cdf((end - float(touch[axis])) / max(spread, LEAST_SIGMA)))
-    return max(below[1] - below[0], 0.0) * max(below[3] - below[2], 0.0)
-
-
-def _normal_cdf(deviation: float) -> float:
-    return math.erfc(-deviation / math.sqrt(2.0)) / 2.0

@@ -1,7 +1,7 @@
-"""Propagation of a belief: mean and covariance through flight, contacts and rest, with process noise.
+"""Propagates a belief: mean and covariance through flight, contacts and rest, with process noise.
 
-The mean is the rollout of the mean. The covariance goes through the derivative of that rollout, contact times included.
-Near a contact of uncertain time the reported mean and covariance are those of the balls on both sides of it
+The mean is the rollout of the mean. The covariance uses the derivative of that rollout, including the contact times.
+Near a contact of uncertain time the reported mean and covariance include the balls on both sides of it
 (docs/derivations/prediction.md).
 """
 
@@ -21,7 +21,8 @@ from ballfg.arrays import Array
 from ballfg.dynamics.compiled.beliefs.course import BOUNCES, Carrier, Course, density_of
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.advance_jacobian import advance_jacobian
-from ballfg.dynamics.motion.integrate import fly_jacobian, steps_over_each
+from ballfg.dynamics.motion.integrate import fly_jacobian
+from ballfg.dynamics.motion.limits import steps_over_each
 from ballfg.dynamics.motion.rollout import LONGEST_MOTION
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.factors.noise import ProcessNoise
@@ -33,12 +34,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 AT_ONCE = 64
-"""Steps of free flight that machine code does before anyone looks: more would keep covariances that nobody needs."""
+"""Largest number of steps of free flight in one call of machine code: more would waste memory on covariances."""
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """Future states. Near a contact, means and covariances of the balls that have bounced and of those that have not.
+    """Future states. Near a contact they include the balls that have bounced and those that have not.
 
     Attributes:
         times: (n, k) s, on each track's clock.
@@ -56,22 +57,24 @@ class Prediction:
         Args: ball: index of the ball.
         """
         from ballfg.pages.pictures import by_axis
-        from ballfg.pages.shot import Shot
+        from ballfg.pages.shot import ShownShot
 
         sigmas = np.sqrt(np.diagonal(self.covariances[ball], axis1=1, axis2=2)[:, POSITION])
         places = self.states[ball][:, POSITION]
-        return by_axis(Shot(str(ball), predicted_times=self.times[ball], predicted=places, predicted_sigmas=sigmas))
+        return by_axis(
+            ShownShot(str(ball), predicted_times=self.times[ball], predicted=places, predicted_sigmas=sigmas)
+        )
 
 
 @dataclass(frozen=True)
 class Found:
-    """What a search for an event ended with.
+    """The result of a search for an event.
 
     Attributes:
         end: `events.NONE`, `FOUND`, or `HARD` before a step of rest, several bounces, or a bounce at a table's edge.
-        belief: there.
+        belief: at the end.
         gradient: (9 + p,) of the event there.
-        rate: (9 + p,) 1/s, how the state changes.
+        rate: (9 + p,) 1/s, the state's rate of change.
     """
 
     end: float
@@ -85,8 +88,8 @@ class Propagator:
     """Carries beliefs forward in time.
 
     Attributes:
-        surfaces: what the ball may bounce on.
-        noise: how far it strays from its model.
+        surfaces: table and floor.
+        noise: process noise of the motion.
     """
 
     surfaces: Surfaces
@@ -112,7 +115,7 @@ class Propagator:
         """The beliefs at given times (n, k) s, one after the other.
 
         Near a contact of uncertain time a belief is the mean and covariance of the balls on both sides of it. Start a
-        later prediction from `forward` instead: it keeps to the mean's side, as the propagation needs it.
+        later prediction from `forward` instead: it stays on the mean's side, as the propagation needs.
 
         Raises: ValueError: as `rollout`.
         """
@@ -136,13 +139,13 @@ class Propagator:
         *,
         either_way: bool = False,
     ) -> Found:
-        """Look for an event on the way of one ball, through flight and plain bounces.
+        """Searches for an event on the way of one ball, through flight and plain bounces.
 
         Args:
             belief: of the ball.
             horizon, earliest: s from the belief's time; only events up to the one and after the other count.
             line: (9,) and an offset: the event is that normal . state falls through it. None: the next contact.
-            either_way: take a rise through the offset as well.
+            either_way: count a rise through the offset as well.
         """
         start = Course.start(belief.mean.detach().numpy(), belief.covariance.detach().numpy())
         carrier = self._carrier(belief)
@@ -155,7 +158,7 @@ class Propagator:
         return Carrier(belief.model, belief.mean.detach().numpy(), self.surfaces, density_of(self.noise))
 
     def _mixed(self, belief: Belief, times: Tensor) -> Iterator[tuple[Course, Tensor]]:
-        """Beliefs at given times (n, k) s, mixed near contacts, a few at a time, and the time elapsed by then."""
+        """Beliefs at given times (n, k) s, mixed near contacts, a few at a time, with the elapsed time."""
         if times.dim() != 2 or len(times) != len(belief) or times.shape[1] == 0:
             raise ValueError(f"times must have shape ({len(belief)}, k) with k >= 1; got {tuple(times.shape)}")
         durations = torch.diff(times, dim=-1, prepend=belief.time[:, None])
@@ -166,7 +169,7 @@ class Propagator:
             yield carrier.mixed(part), elapsed
 
     def _over(self, carrier: Carrier, belief: Belief, durations: Tensor) -> Iterator[tuple[Course, Tensor]]:
-        """Linear beliefs after some durations (n, k) s, a few at a time, and the time (n, j) s elapsed by then."""
+        """Linear beliefs after some durations (n, k) s, a few at a time, with the elapsed time (n, j) s."""
         if not bool(((durations >= 0) & durations.isfinite()).all()):
             low, high = float(durations.min()), float(durations.max())
             raise ValueError(f"dt must be finite and not negative; got {low:g} to {high:g} s")
@@ -192,7 +195,7 @@ class Propagator:
             first = last + 1
 
     def _stay(self, course: Course, dt: Array) -> Course:
-        """The last belief of a course after dt (n,) s in which nothing moves."""
+        """The last belief of a course after dt (n,) s without motion."""
         covariance = course.covariance[-1].copy()
         covariance[:, :STATE_DIM, :STATE_DIM] += self.noise.flight(dt)
         return Course.start(course.mean[-1], covariance)
@@ -213,9 +216,9 @@ class Propagator:
         return course.at(slice(1, None))
 
     def _touch(self, model: BallModel, mean: Tensor, covariance: Tensor, h: float) -> tuple[tuple[Array, Array], float]:
-        """Mean and covariance of a ball (1, d) that reaches a surface's level, or rests, within a step of h s.
+        """Mean and covariance after a step of h s of a ball (1, d) that reaches a surface's level, or rests.
 
-        And the height (m) of the surface that it bounced on; NaN if it did not bounce, or more than once.
+        It also returns the height (m) of the surface of a single bounce, else NaN.
         """
         dt = torch.tensor([h], dtype=torch.float64)
         motion = advance_jacobian(model, mean, h, self.surfaces)
@@ -229,7 +232,7 @@ class Propagator:
         return (motion.after[0].numpy(), spread[0].numpy()), height
 
     def in_flight(self, belief: Belief, dt: Tensor) -> Belief:
-        """The belief after dt (n,) s of free flight; surfaces are not there."""
+        """The belief after dt (n,) s of free flight, without surfaces."""
         after, jacobian = fly_jacobian(belief.model, belief.mean, dt)
         noise = torch.from_numpy(self.noise.flight(dt.numpy()))
         return replace(
@@ -239,7 +242,7 @@ class Propagator:
     def _bounce_noise(self, model: BallModel, mean: Tensor, h: Tensor, times: Tensor, jacobian: Tensor) -> Tensor:
         """(n, 9, 9) covariance gathered in a step with impacts at times (n, k).
 
-        What the flight gathers before the first impact goes through it; each impact adds its own.
+        The flight's noise before the first impact goes through it; each impact adds its own.
         """
         first = times[:, 0].clamp(torch.zeros_like(h), h)
         _, flight = fly_jacobian(model, mean, first)

@@ -1,4 +1,4 @@
-"""The state of a ball at one time as an estimator knows it: the one type that all estimators hand to prediction."""
+"""Holds the estimated state of a ball at one time, the type that all estimators pass to prediction."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from ballfg.factors.noise import ProcessNoise
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 
 if TYPE_CHECKING:
-    from ballfg.prediction.ahead import Ahead
+    from ballfg.prediction.forecast import Forecast
 
 
 @dataclass(frozen=True)
 class World:
-    """All that carries a state forward in time.
+    """The model, surfaces and noise for predictions from a state.
 
     Attributes:
         model: of the ball.
-        surfaces: that it may bounce on.
-        process: how far the ball strays from its model.
+        surfaces: table and floor.
+        process: noise of the motion.
     """
 
     model: BallModel
@@ -34,17 +34,17 @@ class World:
 
 @dataclass(frozen=True, eq=False)
 class BallState:
-    """The state of a ball at one time, with the coefficients of its model that were estimated along, and covariance.
+    """The state of a ball at one time, with the estimated coefficients of its model and the covariance.
 
     Attributes:
         time: s.
         mean: (9 + p,) position m, velocity m/s, spin rad/s, then the coefficients in their own units.
         joint: (9 + p, 9 + p) covariance of that, in the products of those units.
         coefficient_names: of the p model parameters.
-        world: carries the state forward; None where nobody named a model.
+        world: model, surfaces and noise for predictions; None without a model.
         name: of the track.
-        other_side: (9, 9) part of the covariance for the chance that the ball is on the other side of a near contact;
-            None: there is none. A prediction leaves it out, since it follows both sides itself.
+        other_side: (9, 9) part of the covariance for the chance that the ball is on the other side of a near contact,
+            or None. Predictions leave it out, since they follow both sides themselves.
     """
 
     time: float
@@ -99,16 +99,16 @@ class BallState:
         """(p,) model parameters, in their own units."""
         return self.mean[STATE_DIM:]
 
-    def predict(self, horizon: float, step: float = 0.01) -> Ahead:
-        """The path of the ball from here on.
+    def predict(self, horizon: float, step: float = 0.01) -> Forecast:
+        """The path of the ball from this state.
 
         Args: horizon: s.  step: s between the times of the path.
         Raises: ValueError: a horizon or step that is not positive, or a state without a model.
         """
-        from ballfg.prediction.ahead import look_ahead
+        from ballfg.prediction.forecast import look_ahead
 
         return look_ahead(self, horizon, step)
 
     def on(self, world: World) -> BallState:
-        """The same state in a world that carries it forward."""
+        """The same state with another model, surfaces and noise for predictions."""
         return replace(self, world=world)

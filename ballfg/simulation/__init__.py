@@ -1,4 +1,4 @@
-"""Synthetic tracks: a launcher, motion with undeclared effects, noisy measurements, the truth beside them."""
+"""Simulates tracks: a launcher, motion with undeclared effects, noisy measurements, and the true states."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Balls that can be launched: what they are, how they move, and on what they bounce."""
+"""Defines the balls that can be launched, their models, surfaces and launchers."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -6,8 +6,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from ballfg.checks import check_number, listed, shown
-from ballfg.dynamics import KNOWN_BALLS, AnalyticModel, Surfaces, known_ball, model_from_dict, nominal_model
+from ballfg.dynamics import AnalyticModel, Surfaces, nominal_model
+from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball
 from ballfg.dynamics.model import THIN_SHELL
+from ballfg.dynamics.model_file import model_from_dict
 from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR, TABLE_LENGTH, TABLE_WIDTH
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.simulation.launcher import TABLE_LAUNCHER, SimulatedLauncher
@@ -17,29 +19,29 @@ from ballfg.tracks import Ball
 TABLE: Final = Surfaces(TABLE_ABOVE_FLOOR, 0.0, (0.0, TABLE_LENGTH, -TABLE_WIDTH / 2, TABLE_WIDTH / 2))
 """A table-tennis table in a room: the floor at z = 0, x along the table from the launcher's end, y from its middle."""
 COURT: Final = Surfaces(0.0)
-"""A court is its own floor, and a ball beyond its lines bounces as well: it does not end."""
+"""A court is its own floor, and a ball beyond its lines bounces as well, so the surface is unbounded."""
 
 _FILE_KEYS: Final = ("name", "radius", "mass", "inertia_factor", "surface", "flight", "bounce", "launcher")
 
 
 @dataclass(frozen=True)
 class BallKind:
-    """A ball with the model that is declared for it, the surface it bounces on and the machine that launches it."""
+    """A ball with its declared model, its surface and its launcher."""
 
     name: str
-    """Stands in the dataset's name."""
+    """Part of the dataset's name."""
 
     ball: Ball
     """Radius m, mass kg."""
 
     model: AnalyticModel
-    """How it moves; holds the radius too."""
+    """Model of its motion, with the radius."""
 
     surfaces: Surfaces
-    """Where it bounces; z of the table's or the court's surface in `table_height`, m."""
+    """Its surfaces; z of the table's or the court's surface in `table_height`, m."""
 
     launcher: SimulatedLauncher = field(default=TABLE_LAUNCHER)
-    """Where and how fast it starts, and where its track ends."""
+    """Place and speed of its start, and the end of its track."""
 
 
 def table_tennis() -> BallKind:
@@ -55,8 +57,8 @@ def tennis() -> BallKind:
 def ball_kind(name: str) -> BallKind:
     """A known ball by name (`ballfg balls` lists them), or one from a YAML file; docs/simulate.md shows one.
 
-    Raises: FileNotFoundError: neither a name nor a file. ValueError: a file that breaks a rule, the message says which;
-        or badminton, whose shuttle is no ball.
+    Raises: FileNotFoundError: neither a name nor a file. ValueError: a file that breaks a rule, with the rule; or
+        badminton, whose shuttle is no ball.
     """
     path = Path(name)
     if not path.is_file():
@@ -84,7 +86,7 @@ def _known(name: str) -> BallKind:
 
 
 def ball_from_mapping(content: Any, default_name: str = "ball") -> BallKind:
-    """The ball that a parsed ball file describes.
+    """The ball of a parsed ball file.
 
     Args:
         content: `radius` (m), `mass` (kg), `flight` and `bounce` as in a model file; optional `name`,

@@ -1,4 +1,4 @@
-"""Fields of configurations that are numbers within bounds, each bound stated where the field is."""
+"""Declares dataclass fields for numbers within bounds, and checks them."""
 
 from dataclasses import field, fields
 from typing import Any
@@ -12,10 +12,10 @@ def bounded(default: float, low: float, high: float) -> Any:
 
 
 def check_bounds(config: Any, group: str = "") -> None:
-    """Refuses values out of their bounds, and turns whole numbers into floats where the field is one.
+    """Refuses values out of their bounds, and converts whole numbers to floats in float fields.
 
-    Args: config: a frozen dataclass with `bounded` fields.  group: begins the names of its fields in messages.
-    Raises: TypeError: a value that is not a number. ValueError: a value out of its bounds; NaN is.
+    Args: config: a frozen dataclass with `bounded` fields.  group: prefix of its fields' names in messages.
+    Raises: TypeError: a value that is not a number. ValueError: a value out of its bounds, or NaN.
     """
     for spec in fields(config):
         if "bounds" in spec.metadata:

@@ -1,4 +1,4 @@
-"""A rig of cameras over a table-tennis table, for synthetic scenes."""
+"""Makes a rig of cameras over a table-tennis table, for synthetic scenes."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -14,7 +14,7 @@ from ballfg.vision.camera import Camera
 FOCAL_BY_WIDTH: Final = 0.78125
 """Focal length over the image's width: 1000 px at 1280, 65 degrees from side to side."""
 TARGET: Final = (TABLE_LENGTH / 2, 0.0, TABLE_ABOVE_FLOOR + 0.2)
-"""m, what the rig looks at: the middle of the room that balls fly through, 0.2 m over the middle of the table."""
+"""m, target of the rig: the middle of the flights, 0.2 m over the middle of the table."""
 _UP: Final = (0.0, 0.0, 1.0)
 
 _PLACES: Final = {
@@ -23,7 +23,7 @@ _PLACES: Final = {
     "far": (64.0, 23.0),
 }
 """Degrees: azimuth about the vertical from +x, and elevation, of each camera as seen from the target. No two are
-opposite, the three stand at three heights, and each sees all four corners of the table from 3 m."""
+opposite, the three have different heights, and each sees all four corners of the table from 3 m."""
 _LENSES: Final = {
     "left": (-0.16, 0.06, 0.0006, -0.0004, 0.0),
     "right": (-0.11, 0.03, -0.0005, 0.0007, 0.0),
@@ -31,14 +31,14 @@ _LENSES: Final = {
 }
 """k1, k2, p1, p2, k3 of each lens: barrels that move the corners inwards by 35 to 65 px at 1280x720."""
 _OFF_CENTRE: Final = {"left": (0.006, -0.004), "right": (-0.005, 0.007), "far": (0.003, 0.005)}
-"""Where the principal point lies off the middle of the image, as a share of its width."""
+"""Offset of the principal point from the middle of the image, as a share of its width."""
 
 
 def table_rig(size: tuple[int, int] = (1280, 720), distance: float = 3.0) -> list[Camera]:
-    """Three cameras around a table that is as in `ballfg.simulation`: they see where the launcher's balls fly.
+    """Three cameras around a table as in `ballfg.simulation`, with a view of the launcher's balls.
 
-    The cameras differ in height, direction, lens and principal point; focal lengths go with the image's width, so
-    that a smaller rig sees the same.
+    The cameras differ in height, direction, lens and principal point; focal lengths are proportional to the image's
+    width, so that a smaller rig has the same view.
 
     Args:
         size: width and height of the images, px.
@@ -75,16 +75,16 @@ def looking_at(
     distortion: Sequence[float] = (),
     off_centre: tuple[float, float] = (0.0, 0.0),
 ) -> Camera:
-    """A camera at one point that looks at another and is held level.
+    """A camera at one point, directed at another and level.
 
     Args:
-        centre: (3,) m, where it stands.
-        target: (3,) m, what is seen at the principal point.
+        centre: (3,) m, its place.
+        target: (3,) m, the point at the principal point.
         focal: px.
         size: width and height of the image, px.
         distortion: in OpenCV's order.
         off_centre: px, from the middle of the image to the principal point.
-    Raises: ValueError: centre and target one above the other; what `Camera` refuses.
+    Raises: ValueError: centre and target on a vertical line, or arguments that `Camera` refuses.
     """
     rotation = _level_rotation(name, np.asarray(target, dtype=np.float64) - np.asarray(centre, dtype=np.float64))
     middle = [(side - 1) / 2 + shift for side, shift in zip(size, off_centre, strict=True)]

@@ -1,4 +1,4 @@
-"""The true ball: the declared model with the undeclared effects, and kicks at contacts."""
+"""Composes the true ball from the declared model, undeclared effects, and kicks at contacts."""
 
 from collections.abc import Iterable
 from typing import cast
@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from ballfg.checks import check_each
-from ballfg.dynamics import AnalyticModel, BallModel, Effect
+from ballfg.dynamics import AnalyticModel, BallModel
+from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.model import Rates
 from ballfg.dynamics.motion.limits import REST_SPEED
 from ballfg.simulation.config import MotionNoise
@@ -16,10 +17,9 @@ from ballfg.state import SPIN, STATE_DIM, VELOCITY, VZ
 
 
 def true_model(declared: AnalyticModel, undeclared: Iterable[Effect]) -> AnalyticModel:
-    """The declared model with undeclared effects in it; the arguments stay as they are.
+    """The declared model with undeclared effects in it; the arguments are not changed.
 
-    An undeclared effect that the model declares too takes the place of the declared one: the truth then has another
-    value than the model.
+    An undeclared effect replaces a declared one of the same name: the truth then has another value than the model.
 
     Raises: ValueError: if an effect is given twice, or changes one that the model does not have.
     """
@@ -35,7 +35,7 @@ def true_model(declared: AnalyticModel, undeclared: Iterable[Effect]) -> Analyti
 
 
 class KickedModel(BallModel):
-    """A model whose contacts are disturbed: each bounce adds a random kick to velocity and spin.
+    """A model with random kicks to velocity and spin at each bounce.
 
     The upward speed after a bounce is reflected at zero if a kick would push the ball into the surface.
     """
@@ -56,15 +56,15 @@ class KickedModel(BallModel):
         return self.model
 
     def rates(self, state: Tensor) -> Rates:
-        """Those of the undisturbed model."""
+        """The rates of the undisturbed model."""
         return self.model.rates(state)
 
     def surface_offset(self, state: Tensor) -> Tensor | float:
-        """That of the undisturbed model."""
+        """The surface offset of the undisturbed model."""
         return self.model.surface_offset(state)
 
     def surface_slope(self, state: Tensor) -> Tensor | None:
-        """That of the undisturbed model."""
+        """The surface slope of the undisturbed model."""
         return self.model.surface_slope(state)
 
     def after_bounce(self, state: Tensor) -> Tensor:

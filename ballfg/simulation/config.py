@@ -1,10 +1,10 @@
-"""The configuration of a simulation: number of tracks, ball, noise, and undeclared effects."""
+"""Configures a simulation: number of tracks, ball, noise, and undeclared effects."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from ballfg.checks import check_flag, check_instance
-from ballfg.dynamics import Effect
+from ballfg.dynamics.effect import Effect
 from ballfg.simulation.balls import BallKind, table_tennis
 from ballfg.simulation.bounded import bounded, check_bounds
 from ballfg.simulation.settings import Settings, all_settings
@@ -29,7 +29,7 @@ class MeasurementNoise:
     """Probability that a frame is missing, for each frame by itself. Two frames of a track always remain."""
 
     jitter: float = bounded(0.0, 0.0, 1.0)
-    """s, standard deviation of the written stamp about the true time; cut off at 3 sigma. At most 0.15 frames."""
+    """s, standard deviation of the recorded stamp about the true time; cut off at 3 sigma. At most 0.15 frames."""
 
     outliers: float = bounded(0.0, 0.0, 1.0)
     """Probability that a position is an outlier."""
@@ -41,7 +41,7 @@ class MeasurementNoise:
     """rad/s, standard deviation of each component of the spin labels."""
 
     memory: float = bounded(0.0, 0.0, 1.0)
-    """m, standard deviation of an error of each coordinate that lasts from frame to frame; no file states it."""
+    """m, standard deviation of an error of each coordinate that lasts from frame to frame; files do not state it."""
 
     memory_time: float = bounded(0.015, 1e-4, 10.0)
     """s, over which the correlation of that error falls to 1 / e."""
@@ -74,12 +74,12 @@ class MotionNoise:
 
     @property
     def in_flight(self) -> bool:
-        """Whether the free ball is disturbed."""
+        """True if the free ball is disturbed."""
         return self.acceleration > 0 or self.spin > 0
 
     @property
     def in_contact(self) -> bool:
-        """Whether contacts are disturbed."""
+        """True if contacts are disturbed."""
         return self.contact_velocity > 0 or self.contact_spin > 0
 
 
@@ -103,7 +103,7 @@ class SimulationConfig:
     """The ball, the model declared for it, its surface and its launcher."""
 
     settings: Mapping[str, Sequence[int]] = field(default_factory=dict)
-    """Levels by launcher setting (topspin, sidespin, speed), for those that are not to run through all levels."""
+    """Levels by launcher setting (topspin, sidespin, speed), for restricted settings."""
 
     noise: MeasurementNoise = field(default_factory=MeasurementNoise)
     """Noise of the measurement."""
@@ -115,10 +115,10 @@ class SimulationConfig:
     """Effects that act although no model file declares them; applied in this order."""
 
     spin_labels: bool = True
-    """Whether the spin at the first sample is written as a label; the launcher's settings always are."""
+    """True to write the spin at the first sample as a label; the launcher's settings always are."""
 
     block: int = bounded(256, 1, MAX_TRACKS)
-    """Tracks that are computed at once; 256 take 4 MB of states. Another number gives another dataset for one seed."""
+    """Number of tracks computed at once; 256 take 4 MB of states. Another number gives another dataset for one seed."""
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -130,12 +130,12 @@ class SimulationConfig:
         self.combinations()
 
     def combinations(self) -> Settings:
-        """(m, 3) numbers of the launcher's levels that are shot."""
+        """(m, 3) numbers of the levels of all shots."""
         return all_settings(self.settings)
 
 
 def check_jitter(jitter: float, rate: float) -> None:
-    """Refuses jitter (s) so large at a rate (Hz) that stamps could change places.
+    """Refuses jitter (s) so large at a rate (Hz) that stamps could change their order.
 
     Raises: ValueError: the jitter is above `LARGEST_JITTER` of the frame interval.
     """

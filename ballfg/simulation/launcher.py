@@ -1,8 +1,8 @@
-"""A ball launcher: from integer settings to the first state of a shot, and where a shot's track ends.
+"""A simulated launcher turns integer settings into the first state of a shot, and ends its track.
 
 Topspin, sidespin and velocity level (`settings.py`) become a place at the muzzle, a velocity in the x-z plane, and a
-spin of `topspin` about the horizontal axis across the launch (y) and of `sidespin` about the vertical. How many
-rad/s and m/s a level is, the paper leaves open; docs/simulate.md derives the scales that were chosen.
+spin of `topspin` about the horizontal axis across the launch (y) and of `sidespin` about the vertical. The paper does
+not give the rad/s and m/s of a level; docs/simulate.md derives the chosen scales.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class SimulatedLauncher:
         Args:
             settings: (n, 3) numbers of the levels of topspin, sidespin and velocity.
             table_height: m, z of the surface.
-            rng: the shot-to-shot spread.
+            rng: for the shot-to-shot spread.
         Returns: (n, 9) states at the muzzle.
         """
         n = len(settings)
@@ -129,7 +129,7 @@ class SimulatedLauncher:
         return torch.from_numpy(states)
 
     def in_view(self, states: Tensor, surfaces: Surfaces, model: BallModel) -> Tensor:
-        """(...) bool of states (..., 9): the ball is still tracked.
+        """(...) bool of states (..., 9): True while the ball is tracked.
 
         A ball beside the table leaves the view as it comes down to the table's height: from there on the track of a
         table of unknown extent would show a ball that falls through it.

@@ -1,4 +1,4 @@
-"""From the true motion to what is measured: stamps, positions and labels with noise, dropped frames, outliers."""
+"""Adds noise to the true motion: stamps, positions and labels, with dropped frames and outliers."""
 
 from dataclasses import dataclass
 
@@ -8,27 +8,29 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ballfg.arrays import Array
-from ballfg.dynamics import BallModel, advance
+from ballfg.dynamics import BallModel
+from ballfg.dynamics.motion.rollout import advance
 from ballfg.simulation.config import MeasurementNoise, SimulationConfig
-from ballfg.simulation.motion import Motion
+from ballfg.simulation.motion import TrueMotion
 from ballfg.simulation.settings import SETTING_LEVELS, Settings
 from ballfg.simulation.streams import Purpose, cut_normal, generator
 from ballfg.state import POSITION, SPIN
-from ballfg.tracks import SPIN_LABELS, Track
+from ballfg.tracks import Track
+from ballfg.tracks.track import SPIN_LABELS
 
 LEAST_SAMPLES = 2
-"""A track of fewer samples is refused by every reader."""
+"""Least number of samples in a track: readers refuse shorter ones."""
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedTrack:
-    """A track as it was measured, and what really happened at its samples."""
+    """A measured track with its true states."""
 
     track: Track
     """Stamps, positions and labels with all their noise."""
 
     true_times: Array
-    """(n,) s, when the frames were taken."""
+    """(n,) s, true times of the frames."""
 
     true_states: Array
     """(n, 9) the ball's state at those times."""
@@ -36,12 +38,12 @@ class SimulatedTrack:
 
 @torch.no_grad()
 def measure(
-    config: SimulationConfig, model: BallModel, motion: Motion, settings: Settings, block: int, first: int
+    config: SimulationConfig, model: BallModel, motion: TrueMotion, settings: Settings, block: int, first: int
 ) -> list[SimulatedTrack]:
     """The tracks of a block of shots.
 
     Args:
-        model: the true ball without random kicks, and how it is measured.
+        model: the true ball without random kicks, with its measurement effects.
         motion: (n, k) true frames.
         settings: (n, 3) of the launcher.
         block: number of the block, which picks the random streams.
@@ -72,7 +74,7 @@ def measure(
 
 
 def _kept_frames(noise: MeasurementNoise, seed: int, block: int, exists: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(n, k) bool: the frame was not dropped. The luckiest frames of a track stay, however many are dropped."""
+    """(n, k) bool: the frame was not dropped. At least two frames of a track stay, whatever the dropout."""
     luck = generator(seed, Purpose.DROPOUT, block).random(exists.shape)
     kept = luck >= noise.dropout
     order = np.argsort(np.where(exists, -luck, 1.0), axis=1)
@@ -92,7 +94,7 @@ def _position_noise(noise: MeasurementNoise, seed: int, block: int, shape: tuple
 
 
 def _lasting_errors(noise: MeasurementNoise, rate: float, seed: int, block: int, shape: tuple[int, ...]) -> Array:
-    """(n, k, 3) m, errors whose correlation fades exponentially, on all frames, taken or dropped."""
+    """(n, k, 3) m, errors with exponentially decaying correlation, on all frames, kept or dropped."""
     if noise.memory == 0.0:
         return np.zeros((*shape, 3))
     errors = noise.memory * generator(seed, Purpose.MEMORY, block).standard_normal((*shape, 3))
@@ -103,7 +105,7 @@ def _lasting_errors(noise: MeasurementNoise, rate: float, seed: int, block: int,
 
 
 def _apparent_positions(config: SimulationConfig, model: BallModel, states: Array, exists: NDArray[np.bool_]) -> Array:
-    """(n, k, 3) m, where the ball seems to be before noise."""
+    """(n, k, 3) m, measured positions before noise."""
     apparent, flat = states[..., POSITION].copy(), torch.from_numpy(states[exists])
 
     def later(delay: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""The true motion of a block of shots: frame by frame, through contacts, with process noise."""
+"""Simulates the true motion of a block of shots frame by frame, through contacts, with process noise."""
 
 import math
 from dataclasses import dataclass
@@ -8,27 +8,28 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ballfg.dynamics import BallModel, Surfaces, advance, rollout
-from ballfg.dynamics.motion.rollout import is_resting
+from ballfg.dynamics import BallModel, Surfaces, rollout
+from ballfg.dynamics.compiled.flight import white_acceleration
+from ballfg.dynamics.motion.rollout import advance, is_resting
 from ballfg.simulation.config import MotionNoise
 from ballfg.simulation.launcher import SimulatedLauncher
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ, Z
 
 NOISE_STEP = 0.005
-"""s. Process noise enters at least this often. In free flight its discretisation is exact for any step; in a step with
-a contact the noise is added after the bounce, so that the step must be short."""
+"""s. Largest step of process noise. In free flight its discretisation is exact for any step; in a step with a contact
+the noise is added after the bounce, so that the step must be short."""
 TOGETHER = 32
-"""Frames that are computed at once; a ball that has left the view is followed for as many more at most."""
+"""Number of frames computed at once; a ball that has left the view is followed for as many more at most."""
 MIN_FRAMES = 5
-"""Every track has this many frames, even of a ball that leaves the view at once."""
+"""Least number of frames of a track, even if the ball leaves the view at once."""
 
 
 @dataclass(frozen=True)
-class Motion:
+class TrueMotion:
     """The true states of a block of shots at their frames, frame k at k / rate seconds."""
 
     states: NDArray[np.float64]
-    """(n, k, 9); behind the end of a track not defined."""
+    """(n, k, 9); undefined after the end of a track."""
 
     lengths: NDArray[np.int64]
     """(n,) frames of each track."""
@@ -43,13 +44,13 @@ def simulate_motion(
     launcher: SimulatedLauncher,
     noise: MotionNoise,
     rng: np.random.Generator,
-) -> Motion:
+) -> TrueMotion:
     """Follows shots until they leave the launcher's view or last too long.
 
     Args:
         start: (n, 9) first states.
         rate: Hz.
-        launcher: says where and when a track ends.
+        launcher: determines the end of a track.
         noise: process noise of the flight; that of contacts is in `model`.
         rng: draws the process noise.
     Returns: the frames; the first is `start`.
@@ -72,7 +73,7 @@ def simulate_motion(
         alive, state = alive[kept == count], ahead[kept == count, -1]
         if len(alive) == 0:
             break
-    return Motion(states.numpy(), lengths.numpy())
+    return TrueMotion(states.numpy(), lengths.numpy())
 
 
 def _next_frames(
@@ -84,44 +85,28 @@ def _next_frames(
     noise: MotionNoise,
     rng: np.random.Generator,
 ) -> Tensor:
-    """(n, count, 9) the frames after a state (n, 9), which are `dt` s apart."""
-    if count == 1:
-        return _next_frame(model, state, dt, surfaces, noise, rng)[:, None]
-    return rollout(model, state, dt * torch.arange(1, count + 1, dtype=torch.float64), surfaces)
-
-
-def _next_frame(
-    model: BallModel, state: Tensor, dt: float, surfaces: Surfaces, noise: MotionNoise, rng: np.random.Generator
-) -> Tensor:
-    """(n, 9) one frame later."""
+    """(n, count, 9) the frames after a state (n, 9), which are `dt` s apart; one frame where noise disturbs them."""
     if not noise.in_flight:
-        return advance(model, state, torch.full((len(state),), dt, dtype=torch.float64), surfaces)
+        return rollout(model, state, dt * torch.arange(1, count + 1, dtype=torch.float64), surfaces)
     steps = math.ceil(dt / NOISE_STEP - 1e-9)
     h = torch.full((len(state),), dt / steps, dtype=torch.float64)
     for _ in range(steps):
         state = advance(model, state, h, surfaces)
         disturbance = process_noise(len(state), dt / steps, noise, rng)
         resting = is_resting(model, state, surfaces.height_below(state))
-        disturbance[resting, Z] = 0.0  # the surface takes it up
+        disturbance[resting, Z] = 0.0  # the surface absorbs it
         disturbance[resting, VZ] = 0.0
         state = state + disturbance
-    return state
+    return state[:, None]
 
 
 def process_noise(count: int, dt: float, noise: MotionNoise, rng: np.random.Generator) -> Tensor:
-    """What white acceleration of density q adds to states over dt, drawn exactly.
-
-    Position and velocity are correlated, with covariance q^2 [dt^3/3, dt^2/2; dt^2/2, dt] per axis: with independent
-    standard normals a, b the velocity gains q sqrt(dt) a and the position q dt^1.5 (a / 2 + b / sqrt(12)).
-
-    Args: count: states.  dt: s.  noise: the densities.  rng: draws.
-    Returns: (count, 9).
-    Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001,
-        section 6.2.2 (continuous white noise acceleration model).
-    """
+    """(count, 9) what white acceleration adds to states over dt (s), drawn exactly; the spin is a random walk."""
     a, b, c = rng.standard_normal((3, count, 3))
+    position, between, velocity = white_acceleration(dt, 1.0)
+    root = np.linalg.cholesky([[velocity, between], [between, position]])
     added = np.zeros((count, STATE_DIM))
-    added[:, VELOCITY] = noise.acceleration * math.sqrt(dt) * a
-    added[:, POSITION] = noise.acceleration * dt**1.5 * (a / 2 + b / math.sqrt(12))
+    added[:, VELOCITY] = noise.acceleration * root[0, 0] * a
+    added[:, POSITION] = noise.acceleration * (root[1, 0] * a + root[1, 1] * b)
     added[:, SPIN] = noise.spin * math.sqrt(dt) * c
     return torch.from_numpy(added)

@@ -1,4 +1,4 @@
-"""The launcher's integer settings: which combinations there are, and in which order they are shot."""
+"""Lists the combinations of the launcher's integer settings, and their order."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -11,7 +11,7 @@ from ballfg.checks import check_instance, check_iterable, is_number, shown
 from ballfg.simulation.streams import Purpose, generator
 
 SETTING_LEVELS: Final[Mapping[str, range]] = {"topspin": range(-3, 6), "sidespin": range(-5, 6), "speed": range(8, 15)}
-"""Levels that the paper's launcher offers: 9 x 11 x 7 = 693 combinations. The keys are the names of the labels."""
+"""Levels of the paper's launcher: 9 x 11 x 7 = 693 combinations. The keys are the names of the labels."""
 
 Settings = NDArray[np.int64]
 """(n, 3) topspin, sidespin and velocity level."""
@@ -20,7 +20,7 @@ Settings = NDArray[np.int64]
 def all_settings(chosen: Mapping[str, Sequence[int]] | None = None) -> Settings:
     """Every combination of levels, (m, 3) numbers of topspin, sidespin and velocity levels.
 
-    Args: chosen: levels by setting, for those settings that are not to run through all of theirs.
+    Args: chosen: levels by setting, for restricted settings.
     Raises: ValueError: an unknown setting, a level that the launcher does not have, or no level at all.
     """
     levels: dict[str, Sequence[int]] = dict(SETTING_LEVELS)

@@ -1,7 +1,7 @@
-"""Streams of random numbers: one for each purpose and each block of tracks, all from one seed.
+"""Gives streams of random numbers, one for each purpose and block of tracks, all from one seed.
 
-Separate streams keep what is not changed the same: with the same seed, a simulation with wind has the launches and the
-measurement noise of the one without.
+Separate streams keep unchanged parts equal: with the same seed, a simulation with wind has the same launches and
+measurement noise as one without.
 """
 
 from enum import IntEnum
@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 JITTER_LIMIT = 3.0
-"""Sigmas at which jitter is cut off: at the largest sigma allowed, 0.15 frames, stamps stay 0.1 frames apart."""
+"""Sigmas at which jitter is cut off: at the largest sigma, 0.15 frames, stamps stay 0.1 frames apart."""
 
 
 class Purpose(IntEnum):
-    """What a stream is for. The numbers are part of what a seed means: never renumber."""
+    """Purposes of streams. The numbers are part of a seed's meaning: never renumber."""
 
     SETTINGS = 0
     LAUNCH = 1
@@ -40,5 +40,5 @@ def generator(seed: int, purpose: Purpose, number: int = 0) -> np.random.Generat
 
 
 def cut_normal(rng: np.random.Generator, shape: int | tuple[int, ...]) -> NDArray[np.float64]:
-    """Standard normals of some shape; those beyond `JITTER_LIMIT` are set to it."""
+    """Standard normals of some shape, limited to `JITTER_LIMIT`."""
     return np.clip(rng.standard_normal(shape), -JITTER_LIMIT, JITTER_LIMIT)

@@ -1,4 +1,4 @@
-"""Synthetic tracks, one after the other: launch, fly, measure, in blocks of bounded size."""
+"""Simulates tracks one after the other, in blocks of bounded size."""
 
 import itertools
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ from ballfg.simulation.measure import SimulatedTrack, measure
 from ballfg.simulation.motion import simulate_motion
 from ballfg.simulation.settings import settings_of_shots
 from ballfg.simulation.streams import Purpose, generator
-from ballfg.tracks import DatasetInfo
+from ballfg.tracks.info import DatasetInfo
 
 
 def simulate(config: SimulationConfig) -> Iterator[SimulatedTrack]:
@@ -20,7 +20,7 @@ def simulate(config: SimulationConfig) -> Iterator[SimulatedTrack]:
     Memory is that of one block, whatever the number of tracks.
 
     Returns: an iterator over the tracks in the order of their names, "000", "001" ...
-    Raises: ValueError: at once, if an undeclared effect does not go with the model.
+    Raises: ValueError: at once, if an undeclared effect does not fit the model.
     """
     check_instance("config", config, SimulationConfig, "Make one with SimulationConfig(tracks=10).")
     model = true_model(config.ball.model, config.undeclared)
@@ -49,7 +49,7 @@ def _block(config: SimulationConfig, model: AnalyticModel, block: int, first: in
 
 
 def dataset_info(config: SimulationConfig) -> DatasetInfo:
-    """The content of `dataset.yaml`: the declared noise, and nothing of undeclared effects."""
+    """The content of `dataset.yaml`: the declared noise, without undeclared effects."""
     noise = config.noise
     return DatasetInfo(
         name=f"simulated {config.ball.name}",

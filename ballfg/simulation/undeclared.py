@@ -1,6 +1,6 @@
-"""Undeclared effects of a simulation: every effect that a model file can name, and three that none can name.
+"""Collects the undeclared effects of a simulation: those of model files, and three that none can name.
 
-Those three test whether a diagnosis reports an unexplained part where the catalogue lacks the explanation.
+Those three test whether a diagnosis reports an unexplained part if the catalogue lacks the explanation.
 """
 
 import difflib
@@ -16,7 +16,7 @@ from ballfg.dynamics.effect import Coefficient, Effect, Flight, FlightEffect, ve
 from ballfg.dynamics.effects.registry import EFFECTS
 
 SOFT_START: Final = 0.1
-"""m. Over this distance the growth of thick air sets in, so that the force has no kink."""
+"""m. Distance over which the growth of thick air sets in, so that the force has no kink."""
 SOFT_SPEED: Final = 0.1
 """m/s. Below it the direction of flight fades, so that a ball at rest has none."""
 
@@ -57,7 +57,7 @@ class ThickAir(FlightEffect):
     needs = ("drag",)
 
     def adjust(self, flight: Flight) -> Flight:
-        """The flight with more drag the farther it has come."""
+        """The flight with a drag that grows with the distance."""
         beyond = flight.position[..., :1] - self.start_x
         return flight.more_drag(self.growth * 0.5 * (beyond + (beyond.square() + SOFT_START**2).sqrt()))
 
@@ -82,13 +82,12 @@ NOWHERE: Final[dict[str, type[Effect]]] = {effect.name: effect for effect in (Pu
 
 
 UNDECLARED: Final[Mapping[str, type[Effect]]] = ChainMap(NOWHERE, cast(dict[str, type[Effect]], EFFECTS))
-"""Every effect by name: the registered ones, those registered later too, and behind them those of `NOWHERE`. What a
-model file may declare can be left undeclared: an effect that the model lacks (wind), or another value of one that it
-has (restitution.e)."""
+"""Every effect by name: the registered ones, including later registrations, and then those of `NOWHERE`. Any declarable
+effect can be undeclared: an effect that the model lacks (wind), or another value of one that it has (restitution.e)."""
 
 
 def parse_effects(texts: Iterable[str]) -> tuple[Effect, ...]:
-    """Effects from texts such as `wind.x=0.3`; coefficients that are not named keep their defaults.
+    """Effects from texts such as `wind.x=0.3`; unnamed coefficients keep their defaults.
 
     Raises: ValueError: a text of another form, an unknown effect or coefficient (the message names the nearest one),
         a coefficient given twice, or a value out of bounds.

@@ -1,4 +1,4 @@
-"""A simulation as files: the dataset, the declared model, and the truth beside them."""
+"""Writes a simulation as files: the dataset, the declared model, and the true states."""
 
 import os
 from collections.abc import Iterable, Iterator
@@ -9,7 +9,9 @@ from typing import Any, Final, Literal, cast
 import yaml
 
 from ballfg.checks import shown
-from ballfg.dynamics import Effect, model_to_dict, save_model
+from ballfg.dynamics import save_model
+from ballfg.dynamics.effect import Effect
+from ballfg.dynamics.model_file import model_to_dict
 from ballfg.files.whole_folder import check_replaceable, whole_folder
 from ballfg.progress import Watch, unwatched
 from ballfg.simulation.config import SimulationConfig
@@ -33,17 +35,17 @@ def write_simulation(
 ) -> None:
     """Simulates tracks and writes them as a dataset, with their truth.
 
-    The dataset's own files (`dataset.yaml`, `tracks`, `labels.csv`) and `model.yaml` hold what is declared. `truth.csv`
-    or `truth.parquet` has the true state at each written stamp (`t`; `t_true` is the time at which it holds, where
-    stamps are off), `truth.yaml` the whole configuration with the undeclared effects.
+    The dataset's own files (`dataset.yaml`, `tracks`, `labels.csv`) and `model.yaml` hold the declared content.
+    `truth.csv` or `truth.parquet` has the true state at each recorded stamp (`t`; `t_true` is its true time, if stamps
+    are off), `truth.yaml` the whole configuration with the undeclared effects.
 
     Args:
         folder: new or empty; its parent must exist.
         file_format: "csv" or "parquet", for tracks and truth.
-        force: replace a simulated dataset that is there already.
-        watch: sees the tracks that are simulated.
+        force: replace an existing simulated dataset.
+        watch: called with the simulated tracks.
     Raises:
-        ValueError: the folder holds something else, an unknown format, or effects that do not go with the model.
+        ValueError: other content in the folder, an unknown format, or effects that do not fit the model.
         FileNotFoundError: the folder's parent does not exist.
     """
     path = Path(folder)
@@ -59,12 +61,12 @@ def write_simulation(
 
 
 def simulation_files() -> tuple[str, ...]:
-    """Names, or patterns of names, that the files of a simulated dataset can have."""
+    """Names, or patterns of names, of a simulated dataset's files."""
     return (*DATASET_FILES, *TRUTH_FILES)
 
 
 def check_format(name: str) -> FileFormat:
-    """The name of a file format, checked.
+    """Checks the name of a file format and returns it.
 
     Raises: ValueError: if there is no such format.
     """
@@ -74,7 +76,7 @@ def check_format(name: str) -> FileFormat:
 
 
 def truth_content(config: SimulationConfig) -> dict[str, Any]:
-    """The content of `truth.yaml`: everything that determines the tracks; undeclared effects have values and units."""
+    """The content of `truth.yaml`: all settings of the tracks; undeclared effects have values and units."""
     kind, surfaces = config.ball, config.ball.surfaces
     return {
         "seed": config.seed,
@@ -103,7 +105,7 @@ def _effect_content(effect: Effect) -> dict[str, Any]:
 
 
 def _with_truth(tracks: Iterable[SimulatedTrack], table: TableWriter, config: SimulationConfig) -> Iterator[Track]:
-    """The measured tracks; each one's truth goes to the table as it passes."""
+    """The measured tracks; each one's truth is written to the table on its way."""
     with_true_times = config.noise.jitter > 0
     for simulated in tracks:
         columns: dict[str, Any] = {"trajectory": simulated.track.name, "t": simulated.track.times}

@@ -1,4 +1,4 @@
-"""Tracks and datasets: reading, checking and writing them; docs/tracks.md describes the files."""
+"""Tracks and datasets are read, checked and written here; docs/tracks.md describes the files."""
 
 import lazy_loader
 

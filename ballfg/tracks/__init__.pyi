@@ -1,16 +1,8 @@
 from .dataset import Dataset as Dataset
 from .dataset import read_dataset as read_dataset
-from .detections_file import read_sightings as read_sightings
-from .detections_file import write_sightings as write_sightings
 from .info import TABLE_TENNIS as TABLE_TENNIS
-from .info import TENNIS as TENNIS
 from .info import Ball as Ball
-from .info import DatasetInfo as DatasetInfo
-from .memory import dataset_in_memory as dataset_in_memory
-from .noise import TrackNoise as TrackNoise
-from .sightings import Sightings as Sightings
 from .table import TableWriter as TableWriter
-from .track import SPIN_LABELS as SPIN_LABELS
 from .track import Label as Label
 from .track import Track as Track
 from .writing import write_dataset as write_dataset

@@ -1,7 +1,7 @@
-"""The rules that a whole trajectory must keep, the two repairs that are made openly, and doubts about its frame.
+"""Checks the rules of a whole trajectory, makes two repairs with a note, and reports doubts about its frame.
 
-Repairs: rows out of time order are sorted, exact repeats are dropped. Two different rows at one stamp that lie
-close together are one measurement with a stamp that is off (rounded or late): their mean takes their place.
+Repairs: rows out of time order are sorted, exact repeats are dropped. Two different rows at one stamp that lie close
+together count as one measurement with an inaccurate stamp: their mean replaces them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ballfg.tracks.grouping import RowGroup
 
 MERGE_DISTANCE = 0.1
-"""m: two rows at one stamp farther apart than this are refused; one frame of a ball at 15 m/s and 150 Hz."""
+"""m: two rows at one stamp farther apart are refused; one frame of a ball at 15 m/s and 150 Hz."""
 
 MAX_COORDINATE = 1000.0
 """m: positions farther from the origin are refused."""
@@ -33,7 +33,7 @@ MAX_SPEED = 343.0
 """m/s: a track whose median speed is above that of sound is refused."""
 
 MAX_MEDIAN_SIGMA = 1.0
-"""m: a track whose samples are less certain than this is refused."""
+"""m: a track with a larger median sigma is refused."""
 
 MAX_STEP = 1.0
 """s: a track whose median time step is longer is refused; no bounce could be seen in it."""
@@ -42,30 +42,30 @@ MIN_STEP = 1e-6
 """s: a track whose median time step is shorter is refused; no camera is that fast."""
 
 MAX_RATE_RATIO = 100.0
-"""A median time step that misses the declared rate by more than this factor is refused."""
+"""A median time step that differs from the declared rate by more than this factor is refused."""
 
 BASELINE: Final = 0.05
-"""s to each side over which an acceleration is read off: 3 mm of noise make 3 m/s^2 of one, 0.5 of a track's median."""
+"""s to each side for an acceleration: with 3 mm of noise its error is 3 m/s^2, that of a track's median 0.5."""
 LEAST_FALLING: Final = 0.2
-"""Share of a track that falls along -z as a ball does, from which on its axes are not doubted."""
+"""Least share of a track that falls along -z as a ball does, for undoubted axes."""
 MOSTLY: Final = 0.5
-"""Share of a track that falls along +z, from which on z seems to point down."""
+"""Share of a track that falls along +z, above which z seems to point down."""
 FALLS: Final = (0.4, 1.9)
 """Multiples of gravity between which a flying ball's vertical acceleration lies; strong topspin doubles it."""
 LEAST_REVERSAL: Final = 0.8
-"""m/s. A ball that falls and rises at least so fast, from one sample to a few later, has bounced."""
+"""m/s. A ball that falls and then rises at least so fast within a few samples has bounced."""
 NEAR_SURFACE: Final = 0.08
-"""m. Bounces farther from every declared surface are doubtful; a fast ball falls so far between two samples."""
+"""m. Distance from every declared surface beyond which a bounce is doubtful; a fast ball falls so far in one step."""
 AXES: Final = ("x", "y", "z")
 
-_NAMED = 3  # trajectories that a note names before it only counts
+_NAMED = 3  # number of trajectories that a note names
 
 Where = Callable[..., str]
 
 
 @dataclass
 class Findings:
-    """What was repaired while a dataset was checked."""
+    """The repairs made during the check of a dataset."""
 
     repeats: int = 0
     sorted_tracks: list[str] = field(default_factory=list)
@@ -73,7 +73,7 @@ class Findings:
     merged_distance: float = 0.0
 
     def notes(self) -> list[str]:
-        """One sentence for each kind of repair that was made."""
+        """One sentence for each kind of repair."""
         notes = []
         if self.repeats:
             notes.append(f"{_count(self.repeats, 'exact repeat')} dropped")
@@ -92,7 +92,7 @@ class Findings:
 def check_step(label: str, stamps: Array) -> None:
     """Refuses stamps that cannot be seconds of a camera.
 
-    Args: label: names the stamps in an error.  stamps: (n,) s, increasing; fewer than three tell nothing.
+    Args: label: name of the stamps in an error.  stamps: (n,) s, increasing; fewer than three are not checked.
     Raises: ValueError: a median step out of `MIN_STEP` to `MAX_STEP`.
     """
     step = float(np.median(np.diff(stamps))) if len(stamps) > 2 else MIN_STEP
@@ -106,7 +106,7 @@ def check_step(label: str, stamps: Array) -> None:
 def tidy(group: RowGroup, where: Where, findings: Findings | None = None) -> Array:
     """The samples of one trajectory, one for each stamp, in time order.
 
-    Returns: (n, 4) or (n, 7), columns as in Block; what is repaired is added to the findings.
+    Returns: (n, 4) or (n, 7), columns as in Block; repairs are added to the findings.
     Raises: ValueError: fewer than two stamps, or two rows at one stamp more than MERGE_DISTANCE apart.
     """
     findings = Findings() if findings is None else findings
@@ -130,8 +130,8 @@ def tidy(group: RowGroup, where: Where, findings: Findings | None = None) -> Arr
 def fuse(values: Array) -> Array:
     """The mean of different measurements of one position at one stamp.
 
-    With sigmas it is weighted by 1 / sigma^2, and sigma becomes that of the weighted mean times a factor >= 1,
-    where the measurements disagree by more than their sigmas allow.
+    With sigmas it is weighted by 1 / sigma^2, and its sigma is that of the weighted mean, times a factor >= 1 if the
+    measurements disagree by more than their sigmas allow.
 
     Args:
         values: (k, 4) or (k, 7), k >= 2, one stamp.
@@ -152,7 +152,7 @@ def check_scale(label: str, times: Array, positions: Array, sigmas: Array | None
     """Refuses a track whose numbers cannot be metres and seconds.
 
     Args: times: (n,) s, n >= 2, increasing.  positions: (n, 3) m.  sigmas: (n, 3) m.  rate: as declared, Hz.
-    Raises: ValueError: naming the likely unit.
+    Raises: ValueError: with the likely unit.
     """
     steps = np.diff(times)
     step = float(np.median(steps))
@@ -176,7 +176,7 @@ def check_scale(label: str, times: Array, positions: Array, sigmas: Array | None
             f"{label}: t must be in s, its stamps {expected}; got a median step of {step:.4g}. "
             f"{_time_remedy(step, rate)}"
         )
-    with np.errstate(over="ignore"):  # a single step may be next to nothing
+    with np.errstate(over="ignore"):  # a single step may be almost zero
         speed = float(np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1) / steps))
     if speed > MAX_SPEED:
         raise ValueError(
@@ -191,7 +191,7 @@ def check_scale(label: str, times: Array, positions: Array, sigmas: Array | None
 
 
 def doubts_about(times: Array, positions: Array, surfaces: Sequence[float], radius: float) -> tuple[str, ...]:
-    """What does not look like a ball that falls along -z and bounces on the declared surfaces.
+    """Doubts that a ball falls along -z and bounces on the declared surfaces.
 
     Args: times: (n,) s.  positions: (n, 3) m.  surfaces: heights, m.  radius: m, of the ball.
     Returns: one sentence for each doubt.
@@ -254,7 +254,7 @@ def _other_axis(times: Array, positions: Array, reach: int) -> tuple[str, ...]:
     low, high = FALLS[0] * STANDARD_GRAVITY, FALLS[1] * STANDARD_GRAVITY
     falls = (-high <= accelerations[:, Z]) & (accelerations[:, Z] <= -low)
     rises = (low <= accelerations[:, Z]) & (accelerations[:, Z] <= high)
-    if falls.mean() >= LEAST_FALLING:  # a bounce in a short track outweighs its flights in the median
+    if falls.mean() >= LEAST_FALLING:  # in a short track a bounce outweighs its flights in the median
         return ()
     if rises.mean() >= MOSTLY:
         return ("the ball rises faster and faster along z: z seems to point down. Turn the sign of z.",)

@@ -1,7 +1,7 @@
-"""CSV files: their header, their columns, and where and why one cannot be read.
+"""Reads headers and columns of CSV files, and explains errors with their line.
 
-The fast reader says that a block is bad, not which line of the file. A slow second look runs only when there is an
-error to report, so that it can afford to read the file cell by cell.
+The fast reader reports a bad block, not the line of the file. A slow second pass runs only after an error, so that it
+can afford to read the file cell by cell.
 """
 
 import csv
@@ -20,11 +20,11 @@ from ballfg.files.spreadsheet import bare
 _NUMBER = re.compile(r"\s*[+-]?(\d++\.?\d*+|\.\d++)([eE][+-]?\d+)?\s*", re.ASCII)
 _NOT_FINITE = re.compile(r"\s*[+-]?(nan|inf|infinity)\s*", re.IGNORECASE)
 MAX_HEADER = 1 << 16
-"""Bytes of the line of column names."""
+"""Largest number of bytes in the line of column names."""
 
 
 def is_number(cell: str) -> bool:
-    """Whether a cell holds a decimal number with a point, such as 0.02 or 2e-2, that can be meant (`LARGEST`)."""
+    """True for a decimal number with a point, such as 0.02 or 2e-2, of a plausible size (`LARGEST`)."""
     return _NUMBER.fullmatch(cell) is not None and abs(float(cell)) <= LARGEST
 
 
@@ -49,9 +49,9 @@ def read_header(path: Path) -> list[str]:
 
 
 def check_header(path: Path, header: Sequence[str], required: Sequence[str], known: Collection[str]) -> None:
-    """Refuses a header without a needed column or with a known one twice.
+    """Refuses a header without a required column or with a repeated known one.
 
-    Args: path: of the table.  header: its columns.  required: those needed.  known: those that mean something.
+    Args: path: of the table.  header: its columns.  required: columns.  known: columns with a meaning.
     Raises: ValueError: naming the column.
     """
     text = ",".join(header)
@@ -71,7 +71,7 @@ def check_header(path: Path, header: Sequence[str], required: Sequence[str], kno
 
 
 def convert_options(texts: Sequence[str], numbers: Sequence[str]) -> pa_csv.ConvertOptions:
-    """Makes the fast reader read these columns, in this order, and take no cell for a missing value."""
+    """Makes the fast reader read these columns, in this order, without missing values."""
     text = pa.dictionary(pa.int32(), pa.string())
     return pa_csv.ConvertOptions(
         column_types={**dict.fromkeys(texts, text), **dict.fromkeys(numbers, pa.float64())},
@@ -81,7 +81,7 @@ def convert_options(texts: Sequence[str], numbers: Sequence[str]) -> pa_csv.Conv
 
 
 def records(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """The rows of data with the number of the line on which each begins; empty lines are skipped.
+    """The rows of data with the line number of each; empty lines are skipped.
 
     Raises: ValueError: text that is not UTF-8, a line of more than `MAX_LINE` characters, or a quote that is never
         closed.
@@ -132,10 +132,10 @@ def lines_of_rows(path: Path, rows: Sequence[int]) -> list[int]:
 
 
 def explain(path: Path, numeric: Sequence[str], reason: str) -> ValueError:
-    """The error that names the first bad row of a file that the fast reader refused.
+    """The error for the first bad row of a file that the fast reader refused.
 
     Args: path: the file.  numeric: the columns that must hold numbers.
-        reason: the fast reader's own words, used if the second look finds nothing.
+        reason: the fast reader's own message, used if the second pass finds nothing.
     """
     header = read_header(path)
     line = 1
@@ -152,12 +152,12 @@ def explain(path: Path, numeric: Sequence[str], reason: str) -> ValueError:
 
 
 def no_rows(path: Path) -> ValueError:
-    """The error for a table that has only a header."""
+    """The error for a table with only a header."""
     return ValueError(f"{path}: must hold tracks; got a header without rows. Add the measurements.")
 
 
 def row_problem(header: list[str], numeric: Sequence[str], cells: list[str]) -> str | None:
-    """The end of a message about a row with too few or too many cells, or without a number where one must be."""
+    """The end of a message about a row with too few or too many cells, or without a required number."""
     if len(cells) != len(header):
         return (
             f": must have {len(header)} cells, one for each column of the header; got {len(cells)}. "

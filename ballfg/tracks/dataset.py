@@ -1,4 +1,4 @@
-"""A dataset: a folder of tracks, checked once, then streamed as often as one likes."""
+"""A dataset is a folder of tracks that is checked once and then streamed as often as needed."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ class Dataset(TrackFolder):
         self.path = path
         """The folder."""
         self.info = info
-        """What `dataset.yaml` states."""
+        """The content of `dataset.yaml`."""
         self.notes = notes
-        """What was ignored or repaired, one sentence each."""
+        """Ignored and repaired entries, one sentence each."""
         self._source = source
         self._index = index
         self._labels = labels
@@ -72,7 +72,7 @@ class Dataset(TrackFolder):
 
     @property
     def has_sigmas(self) -> bool:
-        """Whether every sample has its own standard deviations."""
+        """True if every sample has its own standard deviations."""
         return len(self._source.columns) > 4
 
     def __getitem__(self, name: str) -> Track:
@@ -80,9 +80,9 @@ class Dataset(TrackFolder):
         return self.track(name)
 
     def with_readings(self, attached: Callable[[Track], Track], notes: Sequence[str] = ()) -> Dataset:
-        """The dataset whose tracks come with further observations.
+        """The dataset with further observations in its tracks.
 
-        Args: attached: adds them to a track.  notes: on what was ignored in their files, one sentence each.
+        Args: attached: adds them to a track.  notes: on ignored entries of their files, one sentence each.
         """
         other = copy.copy(self)
         other._attached, other.notes = attached, [*self.notes, *notes]
@@ -105,21 +105,21 @@ class Dataset(TrackFolder):
 
 
 def has_positions(folder: str | PathLike[str]) -> bool:
-    """Whether a folder holds a table of tracks, or no detections either."""
+    """True if a folder holds a table of tracks, or has no detections."""
     path = Path(folder)
     return any((path / name).is_file() for name in TRACK_FILES) or not (path / DETECTIONS_FILE).is_file()
 
 
 @of_one_state
 def read_dataset(folder: str | PathLike[str]) -> Dataset:
-    """Opens a dataset and checks all of it, so that no error waits in the middle of the file.
+    """Opens a dataset and checks all of it, so that no error comes in the middle of a stream.
 
     The table is read twice in blocks (cells first, then whole trajectories); memory does not grow with the number
     of tracks, apart from their names and labels.
 
     Args:
         folder: holds `dataset.yaml`, `tracks.csv` or `tracks.parquet`, and optionally `labels.csv`; docs/tracks.md.
-    Returns: the dataset; its `notes` tell what was ignored or repaired.
+    Returns: the dataset; its `notes` list ignored and repaired entries.
     Raises:
         FileNotFoundError: the folder or one of its files is missing.
         ValueError: the content breaks a rule; the message names file, line, column and remedy.

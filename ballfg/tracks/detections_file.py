@@ -1,4 +1,4 @@
-"""`detections.csv`: its columns, their rules and noise, and the sightings of each ball in a dataset."""
+"""Reads and writes `detections.csv`: its columns, their rules and noise, and the sightings of each ball."""
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -23,7 +23,7 @@ from ballfg.tracks.table import TableWriter
 
 Texts = NDArray[np.str_]
 Rule = tuple[str, Callable[[Array], NDArray[np.bool_]]]
-"""What the numbers of a column must be, in words and as a test."""
+"""The rule for the numbers of a column, in words and as a test."""
 
 CAMERA: Final = "camera"
 PLACE: Final = ("t", "u", "v")
@@ -31,11 +31,11 @@ NOISE: Final = ("sigma_u", "sigma_v", "rho_uv")
 SCORE: Final = "score"
 OPTIONAL: Final = (*NOISE, SCORE)
 UNSTATED: Final = {"sigma_u": 0.5, "sigma_v": 0.5, "rho_uv": 0.0}
-"""px. Half a pixel: what a detector reaches that looks for the middle of a patch."""
+"""px. Half a pixel, as reached by a detector of patch centres."""
 LEAST_SIGMA: Final = 1e-4
-"""px. No camera tells a ball's centre better; a graph with far surer pixels cannot be solved in double precision."""
+"""px. Best resolution of a camera; a graph with far surer pixels cannot be solved in double precision."""
 MOST_PIXELS: Final = 1e6
-"""px. No image is wider; larger numbers leave double precision when they are squared."""
+"""px. Largest width of an image; larger numbers overflow when squared."""
 _SIGMA: Final[Rule] = (
     f"{LEAST_SIGMA:g} to {MOST_PIXELS:.0f} px",
     lambda x: (x >= LEAST_SIGMA) & (x <= MOST_PIXELS),
@@ -54,7 +54,7 @@ REQUIRED: Final = (KEY, "t", CAMERA, "u", "v")
 
 @dataclass(frozen=True)
 class _Table:
-    """The rows of the file that name a ball."""
+    """The rows of the file with a ball's name."""
 
     path: Path
     lines: NDArray[np.int64]  # (n,) row numbers in the file, from 0
@@ -66,21 +66,21 @@ class _Table:
 def read_sightings(
     path: str | os.PathLike[str], time_offsets: Mapping[str, float]
 ) -> tuple[dict[str, Sightings], list[str]]:
-    """The sightings of each ball that the file names.
+    """The sightings of each ball in the file.
 
-    Rows without a trajectory are candidates of which nobody knows the ball; they are left out. Of several rows of one
-    ball, camera and stamp the one with the highest score counts. The order of rows is free.
+    Rows without a trajectory are unassigned candidates; they are left out. Of several rows of one ball, camera and
+    stamp the one with the highest score counts. The order of rows is free.
 
     Args:
-        path: a table `trajectory,t,camera,u,v` (t in s, as the camera writes it, u and v in px), optionally with
+        path: a table `trajectory,t,camera,u,v` (t in s, as recorded by the camera, u and v in px), optionally with
             `sigma_u`, `sigma_v` (px), `rho_uv` and `score`.
-        time_offsets: s, by camera of the rig: rows are put in the order of t less the offset.
-    Returns: sightings by trajectory, in the order in which the trajectories first appear; what was ignored, one
-        sentence each.
+        time_offsets: s, by camera of the rig: rows are sorted by t less the offset.
+    Returns: sightings by trajectory, in the order in which the trajectories first appear; ignored entries, one sentence
+        each.
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: a missing or repeated column, a cell out of its range, an unknown camera, or several candidates of
-            one ball that no score tells apart; the message names file, line and column.
+            one ball with equal scores; the message names file, line and column.
     """
     path = Path(path)
     header, table, nameless = _read(path, list(time_offsets))
@@ -116,7 +116,7 @@ def write_sightings(path: str | os.PathLike[str], balls: Iterable[tuple[str, Sig
 
 
 def _read(path: Path, cameras: list[str]) -> tuple[list[str], _Table, int]:
-    """The header, the rows that name a ball, checked, and how many name none."""
+    """The header, the checked rows with a ball's name, and the number of other rows."""
     header, texts, numbers = read_columns(path, REQUIRED)
     (lines,) = np.nonzero(np.char.strip(texts[KEY]) != "")
     names, seen_by = texts[KEY][lines], texts[CAMERA][lines]
@@ -130,7 +130,7 @@ def _read(path: Path, cameras: list[str]) -> tuple[list[str], _Table, int]:
 
 
 def _chosen(table: _Table) -> tuple[NDArray[np.int64], int]:
-    """One row for each ball, camera and stamp, the best scored, ascending; and how many others there are.
+    """One row for each ball, camera and stamp, the best scored, ascending; and the number of the others.
 
     Raises: ValueError: two rows of the same score.
     """
@@ -153,7 +153,7 @@ def _chosen(table: _Table) -> tuple[NDArray[np.int64], int]:
 def read_columns(path: Path, required: Sequence[str]) -> tuple[list[str], dict[str, Texts], dict[str, Array]]:
     """The columns of a table, cells not yet checked.
 
-    Returns: the header; (n,) texts and (n,) numbers by column, of the required and the optional ones that are there.
+    Returns: the header; (n,) texts and (n,) numbers by column, of the required and the present optional ones.
     Raises: FileNotFoundError: no such file. ValueError: a missing or repeated column, a line or a cell that cannot be
         read; the message names it.
     """

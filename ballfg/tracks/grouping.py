@@ -1,9 +1,9 @@
-"""From rows to trajectories, one at a time, whatever the order of the rows.
+"""Groups rows to trajectories, one at a time, in any order of the rows.
 
-Where the rows of each trajectory stand together, the file is streamed: one block and one trajectory are in memory.
-Where the trajectories interleave, each pass first puts the rows in order in a temporary file (8 bytes a value,
-40 to 64 bytes a row, in the system's temporary folder): a counting sort, because the scan has counted the rows of
-each trajectory. Either way, memory grows with the longest trajectory, not with their number.
+If the rows of each trajectory are contiguous, the file is streamed: one block and one trajectory are in memory. If the
+trajectories interleave, each pass first sorts the rows in a temporary file (8 bytes a value, 40 to 64 bytes a row, in
+the system's temporary folder): a counting sort, because the scan has counted the rows of each trajectory. Either way,
+memory grows with the longest trajectory, not with their number.
 """
 
 import tempfile
@@ -21,7 +21,7 @@ from ballfg.tracks.csv_files import no_rows
 from ballfg.tracks.rows import Block, RowSource
 
 MIN_SIGMA, MAX_SIGMA = 1e-9, 1e6
-"""m: the standard deviations that a sample may have; a large one marks a sample that should hardly count."""
+"""m: allowed standard deviations of a sample; a large one marks a sample with little weight."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class RowGroup:
 
 @dataclass(frozen=True)
 class Index:
-    """What one scan of the file finds."""
+    """The result of one scan of the file."""
 
     names: list[str]
     """The trajectories in the order in which they first appear."""
@@ -48,16 +48,16 @@ class Index:
     """(number of trajectories,) rows of each."""
 
     contiguous: bool
-    """Whether the rows of each trajectory stand together."""
+    """True if the rows of each trajectory are contiguous."""
 
     stamp: tuple[int, int]
-    """Size (bytes) and time of change (ns) of the file that was scanned."""
+    """Size (bytes) and modification time (ns) of the scanned file."""
 
 
 def scan(source: RowSource) -> Index:
     """Reads the file once, checks every cell and counts the rows of each trajectory.
 
-    Raises: ValueError: no rows, a nameless trajectory, a value that is not finite, a sigma that is none.
+    Raises: ValueError: no rows, a nameless trajectory, a value that is not finite, an invalid sigma.
     """
     stamp = source.stamp()
     codes_of: dict[str, int] = {}
@@ -83,7 +83,7 @@ def scan(source: RowSource) -> Index:
 def groups(source: RowSource, index: Index) -> Iterator[RowGroup]:
     """Yields the trajectories in the order of their first rows.
 
-    Raises: ValueError: if the file is no longer the one that was scanned.
+    Raises: ValueError: if the file has changed since the scan.
     """
     if source.stamp() != index.stamp:
         raise ValueError(f"{source.path}: must not change while it is in use; it did. Call read_dataset again.")
@@ -91,7 +91,7 @@ def groups(source: RowSource, index: Index) -> Iterator[RowGroup]:
 
 
 def check_cells(source: RowSource, block: Block) -> None:
-    """Refuses a block with a nameless row, a value that is not finite, or a sigma that is none."""
+    """Refuses a block with a nameless row, a value that is not finite, or an invalid sigma."""
     for code, name in enumerate(block.names):
         if not name or not is_name(name):
             row = block.start + int(np.argmax(block.codes == code))
@@ -115,7 +115,7 @@ def check_cells(source: RowSource, block: Block) -> None:
 
 
 def _global_codes(block: Block, codes_of: dict[str, int]) -> NDArray[np.int32]:
-    """(n,) the trajectory's number for each row; new trajectories are numbered on."""
+    """(n,) the trajectory's number for each row; new trajectories get the next numbers."""
     numbers = [codes_of.setdefault(str(name), len(codes_of)) for name in block.names]
     return np.array(numbers, dtype=np.int32)[block.codes]
 

@@ -1,4 +1,4 @@
-"""What a dataset says about itself: `dataset.yaml`, checked."""
+"""Reads, checks and writes `dataset.yaml`, the description of a dataset."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -26,7 +26,7 @@ _REQUIRED = ("name", "frame", "ball")
 _OPTIONAL = ("rate", "position_noise", "spin_noise", "source", "licence")
 _KNOWN = (*_REQUIRED, *_OPTIONAL, "noise", "labels", "import")
 
-# The largest values that can be meant in SI units; above them the unit is almost surely another one.
+# The largest plausible values in SI units; larger ones are almost surely in another unit.
 _RADII = (1e-4, 0.5)  # m
 _MASSES = (1e-6, 2.0)  # kg
 MAX_HEIGHT = 50.0  # m
@@ -82,7 +82,7 @@ class DatasetInfo:
     """Radius (m) and mass (kg)."""
 
     rate: float | None = None
-    """Nominal sampling rate, Hz. The stamps of the tracks are what counts."""
+    """Nominal sampling rate, Hz. Computations use the stamps of the tracks."""
 
     position_noise: float | None = None
     """Standard deviation of one measured coordinate, m."""
@@ -91,19 +91,19 @@ class DatasetInfo:
     """Standard deviation of one component of the spin labels, rad/s."""
 
     source: str | None = None
-    """Where the data come from."""
+    """Origin of the data."""
 
     licence: str | None = None
-    """What one may do with them."""
+    """Terms of use."""
 
     table_extent: tuple[float, float, float, float] | None = None
-    """(x_low, x_high, y_low, y_high) m, the table's ends; None where they are not stated."""
+    """(x_low, x_high, y_low, y_high) m, the table's ends; None if unknown."""
 
     noise: TrackNoise | None = None
-    """All noise that is known of the tracks, as `ballfg noise` finds it; it comes before the two numbers above."""
+    """All known noise of the tracks, as from `ballfg noise`; it takes precedence over the two numbers above."""
 
     imported: Mapping[str, Any] | None = None
-    """How the tracks were read from their source, as `ballfg import` states it in the section `import`; for people."""
+    """Origin and conversion of the tracks, as `ballfg import` records them in the section `import`; for people."""
 
     def __post_init__(self) -> None:
         check_name("name", self.name)
@@ -131,11 +131,11 @@ class DatasetInfo:
 
     @classmethod
     def from_mapping(cls, content: Mapping[str, Any]) -> "DatasetInfo":
-        """The info that a parsed `dataset.yaml` states.
+        """The info in a parsed `dataset.yaml`.
 
         Args:
-            content: the file's content: `name`, `frame: {up, table_height}` with an optional `table: {x, y}`,
-                `ball: {radius, mass}` and the optional fields; keys that are not known are left aside.
+            content: the file's content: `name`, `frame: {up, table_height}` with an optional `table: {x, y}`, `ball:
+                {radius, mass}` and the optional fields; unknown keys are ignored.
         Raises: ValueError: a missing field, a wrong type or range, an up axis other than z.
         """
         frame = _section(content, "frame", {"up": "...", "table_height": "..."})
@@ -157,7 +157,7 @@ class DatasetInfo:
         )
 
     def to_mapping(self) -> dict[str, Any]:
-        """The content of the `dataset.yaml` that states this; fields that are None are left out."""
+        """The content of the corresponding `dataset.yaml`, without fields that are None."""
         frame: dict[str, Any] = {"up": "z", "table_height": self.table_height}
         if self.table_extent is not None:
             frame["table"] = {"x": list(self.table_extent[:2]), "y": list(self.table_extent[2:])}
@@ -174,13 +174,13 @@ class DatasetInfo:
 
 
 class TrackFolder:
-    """What every dataset tells of its ball and table."""
+    """Ball and table of a dataset."""
 
     info: DatasetInfo
 
     @property
     def ball(self) -> Ball:
-        """The ball that `dataset.yaml` states."""
+        """The ball in `dataset.yaml`."""
         return self.info.ball
 
     @property
@@ -192,7 +192,7 @@ class TrackFolder:
 def read_info(path: Path) -> tuple[DatasetInfo, list[str]]:
     """Reads a `dataset.yaml`.
 
-    Returns: the info, and a note for each key that is not known.
+    Returns: the info, and a note for each unknown key.
     Raises: ValueError: not readable as YAML, or a bad field; the message names file and field.
     """
     try:
@@ -226,7 +226,7 @@ def write_info(path: Path, info: DatasetInfo) -> None:
 
 
 def _section(content: Mapping[str, Any], key: str, fields: Mapping[str, str], prefix: str = "") -> dict[str, Any]:
-    """A section with all its fields; `fields` shows how each is written."""
+    """A section with all its fields; `fields` gives the format of each."""
     _need(content, key, prefix)
     section = content[key]
     if not isinstance(section, dict):
@@ -240,7 +240,7 @@ def _section(content: Mapping[str, Any], key: str, fields: Mapping[str, str], pr
 
 
 def _stated_extent(frame: Mapping[str, Any]) -> tuple[Any, ...] | None:
-    """The table's ends as `frame` states them, not yet checked but for their number."""
+    """The table's ends in `frame`, checked only for their number."""
     if frame.get("table") is None:
         return None
     table = _section(frame, "table", {"x": "[0.0, 2.74]", "y": "[-0.76, 0.76]"}, "frame.")

@@ -1,4 +1,4 @@
-"""`labels.csv`: what is known about each shot, one row per trajectory."""
+"""Reads `labels.csv`: the labels of each shot, one row per trajectory."""
 
 from collections.abc import Collection
 from pathlib import Path
@@ -16,8 +16,8 @@ TEXT_LABELS = ("group", "split")
 class LabelTable:
     """The labels of all trajectories.
 
-    A column is numeric if each of its non-empty cells is a number; `group` and `split` are always text, the spin
-    and the launcher settings always numbers. An empty cell is a label that this trajectory does not have.
+    A column is numeric if each of its non-empty cells is a number; `group` and `split` are always text, the spin and
+    the launcher settings always numbers. An empty cell means that the trajectory lacks the label.
     """
 
     def __init__(self, columns: dict[str, list[Label | None]], rows: dict[str, int]) -> None:
@@ -44,8 +44,8 @@ class LabelTable:
 def read_labels(path: Path, trajectories: Collection[str]) -> LabelTable:
     """Reads a `labels.csv`.
 
-    Raises: ValueError: a missing or repeated column, a ragged line, a row without a track, a second row for a
-        track, or a cell that must be a number and is not; the message names line and column.
+    Raises: ValueError: a missing or repeated column, a ragged line, a row without a track, a second row for a track, or
+        text in place of a number; the message names line and column.
     """
     header = csv_files.read_header(path)
     csv_files.check_header(path, header, (KEY,), (KEY,))

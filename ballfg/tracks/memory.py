@@ -1,4 +1,4 @@
-"""A dataset whose tracks are in memory."""
+"""Makes a dataset of tracks in memory."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -37,19 +37,19 @@ class MemoryRows(RowSource):
         return int(self._starts[-1]), 0
 
     def where(self, *rows: int) -> str:
-        """The tracks that hold these rows."""
+        """The tracks of these rows."""
         places = np.searchsorted(self._starts, rows, side="right") - 1
         return " and ".join(dict.fromkeys(f"track {shown(self._tracks[int(place)].name)}" for place in places))
 
 
 def dataset_in_memory(info: DatasetInfo, tracks: Sequence[Track], notes: Sequence[str] = ()) -> Dataset:
-    """A dataset of tracks that no file holds; it is used like one that was read.
+    """A dataset of tracks without files; it is used like one that was read.
 
     Args:
-        info: what `dataset.yaml` would state.
-        tracks: at least one, of two samples or more, with names of their own; sigmas for all or for none.
-        notes: on where they come from, one sentence each.
-    Raises: ValueError: no tracks, a name twice, or a track whose numbers cannot be metres and seconds.
+        info: the content of `dataset.yaml`.
+        tracks: at least one, of two samples or more, with unique names; sigmas for all or for none.
+        notes: on their origin, one sentence each.
+    Raises: ValueError: no tracks, a repeated name, or a track whose numbers cannot be metres and seconds.
     """
     check_instance("info", info, DatasetInfo, "Make one with DatasetInfo(name, table_height, ball).")
     tracks = tuple(check_each("tracks", tracks, Track, "Make one with Track(times, positions)."))

@@ -1,4 +1,4 @@
-"""The noise of a set of tracks: that of its tracker, its labels, its bounces and its flights, as files state it."""
+"""Holds the noise of a set of tracks as files state it: of the tracker, labels, bounces and flights."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ LARGEST: Final[Mapping[str, float]] = {
     "contact_tangential": 50.0,
     "contact_spin": 5000.0,
 }
-"""What a number may be at most; more is in another unit."""
+"""Largest value of each number; a larger one is in another unit."""
 SMALLEST: Final = 1e-9
-"""What a number that may not be zero is at least; weights of less leave no digits for the motion."""
+"""Least nonzero value of each number; smaller noise leaves no digits for the motion."""
 UNITS: Final[Mapping[str, str]] = {
     "position": "m",
     "memory": "m",
@@ -42,13 +42,13 @@ MAY_BE_ZERO: Final = ("memory", "stamp_jitter", "contact_tangential")
 
 @dataclass(frozen=True)
 class TrackNoise:
-    """Standard deviations; None where they are not known.
+    """Standard deviations; None if unknown.
 
     Raises: ValueError: a number that is negative, not finite, or cannot be in SI units; the message names it.
     """
 
     position: tuple[float, float, float] | None = None
-    """m, of the error of a measured x, y, z that is new in each sample."""
+    """m, of the white error of a measured x, y, z."""
 
     memory: tuple[float, float, float] | None = None
     """m, of the tracker's error along x, y, z that lasts from sample to sample."""
@@ -66,7 +66,7 @@ class TrackNoise:
     """rad/s, of one component of the spin of a ball without a label, about zero."""
 
     acceleration: float | None = None
-    """m/s^2/sqrt(Hz), density of the acceleration that the model lacks."""
+    """m/s^2/sqrt(Hz), density of the unmodelled acceleration."""
 
     contact_velocity: float | None = None
     """m/s, of each component of the velocity after a bounce."""
@@ -78,7 +78,7 @@ class TrackNoise:
     """rad/s, of each component of the spin after a bounce."""
 
     coefficients: Mapping[str, float] = field(default_factory=dict)
-    """By how much coefficients differ from track to track, by the name of the parameter, in its own unit."""
+    """Spread of coefficients between tracks, by the name of the parameter, in its own unit."""
 
     def __post_init__(self) -> None:
         for name in LARGEST:
@@ -91,10 +91,10 @@ class TrackNoise:
 
     @classmethod
     def from_mapping(cls, content: Any) -> TrackNoise:
-        """The noise that a file states.
+        """The noise in a file.
 
         Args: content: the parsed section; its keys are the fields of this class.
-        Raises: ValueError: a key that is not known, or a number out of its range.
+        Raises: ValueError: an unknown key, or a number out of its range.
         """
         if not isinstance(content, Mapping):
             raise ValueError(f"noise must be a mapping such as {{memory_time: 0.02}}; got {type_name(content)}.")
@@ -110,7 +110,7 @@ class TrackNoise:
         return cls(**values, coefficients={str(name): value for name, value in coefficients.items()})
 
     def to_mapping(self) -> dict[str, Any]:
-        """What a file says of this noise; what is not known is left out."""
+        """The section of a file with this noise, without unknown numbers."""
         content: dict[str, Any] = {}
         for name in LARGEST:
             value = getattr(self, name)

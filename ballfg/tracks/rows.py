@@ -1,4 +1,4 @@
-"""The rows of a track table, block by block: from CSV or from Parquet, with a bounded amount of memory."""
+"""Reads the rows of a track table block by block, from CSV or Parquet, with bounded memory."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
@@ -45,7 +45,7 @@ class Block:
 
 
 class RowSource(ABC):
-    """A track table that can be read again and again, in blocks.
+    """A track table that can be read repeatedly, in blocks.
 
     Raises: ValueError: a missing or repeated column.
     """
@@ -71,13 +71,13 @@ class RowSource(ABC):
         """
 
     def stamp(self) -> tuple[int, int]:
-        """Size (bytes) and time of the last change (ns) of the file."""
+        """Size (bytes) and modification time (ns) of the file."""
         status = self.path.stat()
         return status.st_size, status.st_mtime_ns
 
     @abstractmethod
     def where(self, *rows: int) -> str:
-        """The file and the place of these rows (counted from 0) as a reader of the file counts them."""
+        """The file and the place of these rows (counted from 0), numbered for a reader of the file."""
 
 
 class CsvRows(RowSource):
@@ -110,7 +110,7 @@ class ParquetRows(RowSource):
 
     def __init__(self, path: Path) -> None:
         with open_parquet(path) as file:
-            schema = file.schema.to_arrow_schema()  # without the dictionaries that texts are read as
+            schema = file.schema.to_arrow_schema()  # without the dictionaries of texts
         super().__init__(path, schema.names)
         for name in self.columns:
             kind = schema.field(name).type
@@ -149,8 +149,8 @@ def _block(batch: pa.RecordBatch, start: int) -> Block:
 def distinct(column: pa.Array) -> tuple[list[str | None], NDArray[np.int32]]:
     """The distinct texts of a column, in the order in which they first appear.
 
-    Args: column: (n,) of any type that can be text.
-    Returns: the texts, None for missing ones, and (n,) the number of each row's.
+    Args: column: (n,) of any type that converts to text.
+    Returns: the texts, None for missing ones, and (n,) the number of each row's text.
     """
     if not pa.types.is_dictionary(column.type):
         column = column.cast(pa.string()).dictionary_encode()

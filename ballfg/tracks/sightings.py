@@ -1,4 +1,4 @@
-"""One ball as several cameras saw it: pixels, each at its own camera's stamp."""
+"""Sightings are the pixels of one ball in several cameras, each with its own camera's stamp."""
 
 from __future__ import annotations
 
@@ -11,31 +11,31 @@ from ballfg.arrays import Array
 from ballfg.checks import check_array, check_iterable, check_name, shown
 
 ROUNDING = 1e-6
-"""Relative to the trace: a covariance that was computed in single precision is symmetric up to this."""
+"""Relative to the trace: tolerance for the symmetry of a covariance from single precision."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """One ball as cameras saw it, rows in order of true time. Arrays are copied; every field is checked.
+    """The sightings of one ball, rows in order of true time. Arrays are copied; every field is checked.
 
-    A camera sees a ball once in a frame, so the stamps of each camera increase. Stamps of different cameras are on
-    clocks of their own and are not compared.
+    A camera sees a ball once in a frame, so the stamps of each camera increase. Stamps of different cameras have clocks
+    of their own and are not compared.
 
     Raises: ValueError: a wrong shape, a number that is not finite, a camera's number out of range, stamps of one camera
         that do not increase, a covariance that is not symmetric and positive definite; the message names the row.
     """
 
     cameras: tuple[str, ...]
-    """Names of the rig's cameras, those too that never saw the ball."""
+    """Names of the rig's cameras, including those without a sighting."""
 
     camera: NDArray[np.int64]
-    """(m,) number of the camera that saw the ball: an index into `cameras`."""
+    """(m,) number of each sighting's camera: an index into `cameras`."""
 
     times: Array
-    """(m,) s, stamps as the camera wrote them."""
+    """(m,) s, stamps as recorded by the camera."""
 
     pixels: Array
-    """(m, 2) px, where the ball's centre was in the middle of the exposure."""
+    """(m, 2) px, place of the ball's centre in the middle of the exposure."""
 
     covariances: Array
     """(m, 2, 2) px^2."""
@@ -84,11 +84,11 @@ class Sightings:
     def __len__(self) -> int:
         return len(self.times)
 
-    def taken(self, rows: ArrayLike) -> Sightings:
-        """Some of the rows.
+    def select(self, rows: ArrayLike) -> Sightings:
+        """A part of the rows.
 
         Args: rows: (k,) their numbers, ascending, or (m,) bool.
-        Raises: ValueError: if none is left.
+        Raises: ValueError: if none remains.
         """
         kept = np.asarray(rows)
         return Sightings(self.cameras, self.camera[kept], self.times[kept], self.pixels[kept], self.covariances[kept])
@@ -103,7 +103,7 @@ def _floats(field: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 
 def are_covariances(matrices: Array) -> NDArray[np.bool_]:
-    """(n,) whether matrices (n, 2, 2) are symmetric, up to `ROUNDING`, and positive definite."""
+    """(n,) True for matrices (n, 2, 2) that are symmetric, up to `ROUNDING`, and positive definite."""
     a, b, c = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1]
     symmetric = np.abs(matrices[:, 1, 0] - b) <= ROUNDING * (a + c)
     return np.asarray(symmetric & (a > 0.0) & (c > 0.0) & (a * c > b * b))

@@ -1,4 +1,4 @@
-"""Stamps as time since a first one, so that nothing depends on where a clock began to count."""
+"""Converts stamps to the time since a first one, so that results do not depend on a clock's origin."""
 
 import math
 
@@ -8,22 +8,22 @@ from numpy.typing import ArrayLike
 from ballfg.arrays import Array
 
 TICKS = 1e6
-"""1/s. Files state stamps in whole microseconds as a rule."""
+"""1/s. Files usually state stamps in whole microseconds."""
 SUMMED = 1e-12
-"""s. By so little sums of whole microseconds miss them."""
+"""s. Tolerance for sums of whole microseconds."""
 STAMP_TOLERANCE = 1.5e-6
-"""s. A stamp this little after the end of a time belongs to it: stamps are rounded to a microsecond, if not to doubles
+"""s. A stamp this little after the end of an interval belongs to it: stamps are rounded to a microsecond, or to doubles
 0.24 us apart, and their differences by up to one."""
 
 
 def elapsed(times: ArrayLike, origin: float) -> Array:
     """Time since an origin on the same clock.
 
-    Seconds since 1970 are doubles 0.24 us apart, so that differences of whole microseconds come out broken. Where all
-    stamps are the doubles of whole microseconds, those are subtracted.
+    Seconds since 1970 are doubles 0.24 us apart, so that differences of whole microseconds are inexact. If all stamps
+    are the doubles of whole microseconds, those are subtracted.
 
     Args: times: (...) s.  origin: s.
-    Returns: (...) s; for stamps of whole microseconds the same bits wherever the clock began.
+    Returns: (...) s; for stamps of whole microseconds the same bits for any origin of the clock.
     """
     stamps = np.asarray(times, dtype=np.float64)
     ticks, first = np.rint(stamps * TICKS), np.rint(origin * TICKS)
@@ -33,10 +33,10 @@ def elapsed(times: ArrayLike, origin: float) -> Array:
 
 
 def written(seconds: ArrayLike, origin: float) -> Array:
-    """The stamps on the data's clock that `elapsed` has counted from an origin.
+    """The stamps on the data's clock for times that `elapsed` has computed.
 
     Args: seconds: (...) s since the origin.  origin: s.
-    Returns: (...) s; the doubles of whole microseconds where those were counted.
+    Returns: (...) s; the doubles of whole microseconds if `elapsed` used those.
     """
     since = np.asarray(seconds, dtype=np.float64)
     ticks, first = np.rint(since * TICKS), np.rint(origin * TICKS)

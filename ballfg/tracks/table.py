@@ -1,4 +1,4 @@
-"""Writing a result table as a stream: CSV or Parquet, and never half a file under the final name."""
+"""Writes a result table as a stream, CSV or Parquet, and never leaves half a file under the final name."""
 
 import csv
 import io
@@ -19,15 +19,15 @@ from ballfg.files.spreadsheet import NUMBER, QUOTED, guarded
 from ballfg.files.whole_file import check_file, whole_file
 
 ENDINGS = (".csv", ".parquet")
-_BLOCK_ROWS = 1 << 16  # rows held back before they are written; also the row group of a Parquet file
+_BLOCK_ROWS = 1 << 16  # rows in memory before they are written; also the row group of a Parquet file
 
 
 class TableWriter:
     """Writes a table block by block; the file takes its name only when the `with` block ends without an exception.
 
-    Floats are written with as many digits as bring back the same float64. Memory is bounded by a block. In CSV, a text
-    that a spreadsheet would take for a formula (=, +, - or @ at its beginning, and no number) stands behind an
-    apostrophe; the readers of ballfg take it away.
+    Floats are written with enough digits to restore the same float64. Memory is bounded by a block. In CSV, a text that
+    a spreadsheet would take for a formula (=, +, - or @ at its beginning, and no number) gets an apostrophe in front,
+    which ballfg's readers remove.
 
     Example:
         with TableWriter("states.csv") as table:
@@ -61,7 +61,7 @@ class TableWriter:
 
     @contextmanager
     def _opened(self) -> Iterator["TableWriter"]:
-        """The file takes its name when the rest is written; after an exception it is removed."""
+        """Gives the file its name when the rest is written; after an exception it is removed."""
         with whole_file(self.path, "path") as temporary, temporary.open("xb") as self._file:
             try:
                 yield self
@@ -80,7 +80,7 @@ class TableWriter:
 
         Args:
             columns: name -> (n,) numbers, in any unit, or text, the same n for all; a single number or text is
-                repeated. The first block fixes the names, their order and their types.
+                repeated. The first block determines the names, their order and their types.
         Raises: ValueError: columns of different lengths, other names than in the first block, or values of another
             type. RuntimeError: outside a `with` block.
         """
@@ -99,7 +99,7 @@ class TableWriter:
         assert self._file is not None
         table = pa.Table.from_batches(self._pending, self._schema).combine_chunks()
         if self.path.suffix.lower() == ".csv":
-            # The library quotes the header and, where a text needs quotes, all texts; simple readers expect neither.
+            # The library quotes the header and, if one text needs quotes, all texts; simple readers expect neither.
             if not self._has_header:
                 header = io.StringIO()
                 csv.writer(header, lineterminator="\n").writerow(map(guarded, table.column_names))
@@ -120,7 +120,7 @@ class TableWriter:
 
 
 def _batch(columns: Mapping[str, ArrayLike]) -> pa.RecordBatch:
-    """One block; names, lengths and shapes are checked."""
+    """One block after checks of names, lengths and shapes."""
     if not columns:
         raise ValueError("columns must name at least one column; got none. Pass name -> values.")
     arrays = {name: np.asarray(values) for name, values in columns.items()}
@@ -157,13 +157,13 @@ def _arrow(name: str, array: np.ndarray, count: int) -> pa.Array:
 
 
 def _guarded(column: pa.ChunkedArray) -> pa.ChunkedArray:
-    """The texts of a column, none of which a spreadsheet takes for a formula; see `ballfg.files.spreadsheet`."""
+    """The texts of a column, with formulas quoted; see `ballfg.files.spreadsheet`."""
     risky = pc.and_(pc.match_substring_regex(column, QUOTED), pc.invert(pc.match_substring_regex(column, NUMBER)))
     return pc.if_else(risky, pc.binary_join_element_wise("'", column, ""), column)
 
 
 def _conformed(batch: pa.RecordBatch, schema: pa.Schema) -> pa.RecordBatch:
-    """The block with the first block's types; whole numbers may stand in a column of floats."""
+    """The block with the first block's types; whole numbers may be in a column of floats."""
     if batch.schema.names != schema.names:
         raise ValueError(
             f"columns must be those of the first block, {schema.names}; got {batch.schema.names}. "

@@ -1,4 +1,4 @@
-"""One measured track: stamps, positions, other observations, and what is known about the shot."""
+"""A track holds stamps, positions, other observations and labels of one shot."""
 
 from __future__ import annotations
 
@@ -27,29 +27,29 @@ from ballfg.tracks.stamps import STAMP_TOLERANCE, elapsed
 SPIN_LABELS = ("spin_x", "spin_y", "spin_z")
 
 FASTEST_BALL = 200.0
-"""m/s. No ball is faster; a shuttlecock of 157 m/s is the record of all sports."""
+"""m/s. Largest speed of a ball; the record of all sports is a shuttlecock's, 157 m/s."""
 FASTEST_SPIN = 2000.0
-"""rad/s. No ball spins faster; a golf ball off a wedge reaches 1,200."""
+"""rad/s. Largest spin of a ball; a golf ball off a wedge reaches 1,200."""
 
 Label = float | str
 
 
 class Measurements(Protocol):
-    """What a track needs to know of an observation (`ballfg.estimation.Observation`)."""
+    """The interface of an observation for a track (`ballfg.estimation.Observation`)."""
 
     @property
     def name(self) -> str:
-        """Of the sort of measurement."""
+        """Name of the kind of measurement."""
         ...
 
-    def taken(self, samples: NDArray[np.bool_]) -> Self:
-        """The measurements of the samples (n,) bool of the track that stay."""
+    def select(self, samples: NDArray[np.bool_]) -> Self:
+        """The measurements of the selected samples (n,) bool of the track."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A ball's measured positions over time, with whatever else was measured of it.
+    """A ball's measured positions over time, with all further measurements.
 
     The arrays are copied and converted to float64; every field is checked when the track is made.
     Two tracks are equal only if they are the same object.
@@ -66,25 +66,25 @@ class Track:
     """(n, 3) m, world frame, z up."""
 
     sigmas: Array | None = None
-    """(n, 3) m, standard deviation of each coordinate, positive; None where the data states none."""
+    """(n, 3) m, standard deviation of each coordinate, positive; None if the data do not state it."""
 
     labels: Mapping[str, Label] = field(default_factory=dict)
-    """What is known about the shot: spin_x, spin_y, spin_z (rad/s, at the first sample), group, launcher settings."""
+    """Labels of the shot: spin_x, spin_y, spin_z (rad/s, at the first sample), group, launcher settings."""
 
     name: str = "track"
     """The trajectory's name, as in the column `trajectory`: "000" stays "000"."""
 
     observations: tuple[Any, ...] = ()
-    """What was measured beside the positions: `ballfg.estimation.Observation`s, one of a name."""
+    """Measurements other than positions: `ballfg.estimation.Observation`s, one of a name."""
 
     rough: bool = False
-    """Whether the positions were made from the observations. Events are found in them; they measure nothing anew."""
+    """True if the positions were computed from the observations: they then serve to find events only."""
 
     part: bool = False
-    """Whether it is a part of a longer track. Its scale was checked with the whole; a few samples do not tell it."""
+    """True for a part of a longer track. Its scale was checked with the whole; a few samples do not show it."""
 
     dataset: Any = None
-    """The dataset that the track was read from: tells its ball, table and noise. It does not travel to processes."""
+    """The dataset of the track, with its ball, table and noise. Processes do not get it."""
 
     def __post_init__(self) -> None:
         check_name("track name", self.name, "Rename the trajectory.")
@@ -139,7 +139,7 @@ class Track:
 
     @property
     def seconds(self) -> Array:
-        """(n,) s since the first sample: what is computed with, so that nothing depends on the clock's origin."""
+        """(n,) s since the first sample, for computations that must not depend on the clock's origin."""
         return elapsed(self.times, float(self.times[0]))
 
     @property
@@ -148,11 +148,11 @@ class Track:
         return float(self.seconds[-1])
 
     def since_first(self) -> Track:
-        """The same track with stamps counted from its first: what estimators compute with."""
+        """The same track with stamps counted from its first, for estimators."""
         return self if self.times[0] == 0.0 else replace(self, times=self.seconds)
 
     def opening(self, seconds: float) -> Track:
-        """The samples of the first seconds, a stamp at their end among them, as a new track.
+        """The samples of the first seconds, including a stamp at their end, as a new track.
 
         Args: seconds: since the first sample; not negative.
         """
@@ -170,7 +170,7 @@ class Track:
     def between(self, start: float, end: float) -> Track:
         """The samples with start <= time <= end, as a new track.
 
-        The spin labels hold at the first sample only, so they are left out when that sample is.
+        The spin labels belong to the first sample, so a part without that sample does not have them.
 
         Args:
             start: s, in the track's own time.
@@ -194,7 +194,7 @@ class Track:
             positions=self.positions[inside],
             sigmas=sigmas,
             labels=labels,
-            observations=tuple(observation.taken(inside) for observation in self.observations),
+            observations=tuple(observation.select(inside) for observation in self.observations),
             part=self.part or not inside.all(),
         )
 

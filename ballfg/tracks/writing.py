@@ -1,4 +1,4 @@
-"""Writing a dataset as a stream: either all of it appears, or none."""
+"""Writes a dataset as a stream, all of it or nothing."""
 
 import csv
 import json
@@ -21,11 +21,11 @@ from ballfg.tracks.table import TableWriter
 from ballfg.tracks.track import Track
 
 DATASET_FILES = (INFO_FILE, *TRACK_FILES, LABELS_FILE)
-"""All names that the files of a dataset can have."""
+"""All possible names of a dataset's files."""
 TRUTH_FILE: Final = "truth.yaml"
-"""What a simulation was made of; where it lies, the files below tell of the simulated tracks alone."""
+"""Settings of a simulation; in its folder, the files below belong to the simulated tracks alone."""
 TRUTH_FILES: Final = (TRUTH_FILE, "truth.csv", "truth.parquet", "model.yaml", "model.learned-*")
-"""All names, or patterns of names, that a simulation can have beside its dataset."""
+"""All names, or patterns of names, of a simulation's further files."""
 
 _SPOOL = "labels.jsonl"
 
@@ -39,13 +39,13 @@ def write_dataset(
     """Writes `dataset.yaml`, the table of tracks and, if any track carries labels, `labels.csv`.
 
     The files are written in a hidden folder and moved to their names when all are complete; after an exception or
-    Ctrl-C, what was there before is untouched. A dataset that is there already is replaced, other files stay. Tracks
-    are consumed one by one. What is written can be read: the rules of `read_dataset` hold here.
+    Ctrl-C, the previous files are untouched. An existing dataset is replaced, other files stay. Tracks are consumed one
+    by one. The written dataset can be read: the rules of `read_dataset` hold here.
 
     Args:
-        folder: made if it does not exist; its parent must.
+        folder: created if it does not exist; its parent must.
         info: the content of `dataset.yaml`.
-        tracks: at least one; each with at least two samples and a name of its own; sigmas for all or for none.
+        tracks: at least one; each with at least two samples and a unique name; sigmas for all or for none.
         file_format: "csv" (floats keep all their digits) or "parquet".
     Raises:
         ValueError: another format, no tracks, or a track that breaks a rule; the message names it.

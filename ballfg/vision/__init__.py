@@ -1,4 +1,4 @@
-"""From cameras to tracks: camera models, calibration, detection, association, triangulation."""
+"""Turns camera recordings into tracks: camera models, calibration, detection, association, triangulation."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Types of arrays that cameras' code shares; shapes and units stand where they are used."""
+"""Defines the array types of camera code; shapes and units stand where they are used."""
 
 import numpy as np
 from numpy.typing import NDArray

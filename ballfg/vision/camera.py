@@ -1,4 +1,4 @@
-"""A calibrated camera: OpenCV's pinhole model with distortion, where it stands, how its clock runs."""
+"""A calibrated camera follows OpenCV's pinhole model with distortion, and has a pose and a clock."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,14 +12,14 @@ from ballfg.arrays import Array, Mask
 from ballfg.checks import check_array, check_name, check_number, shown
 
 MOST_PIXELS: Final = 1_000_000
-"""px, of one side of an image."""
+"""Largest number of px of one side of an image."""
 DISTORTIONS: Final = (0, 4, 5, 8, 12, 14)
 """Lengths of distortion vectors in OpenCV: none; k1 k2 p1 p2; k3; k4 k5 k6; thin prism s1-s4; tilt tau_x tau_y."""
 _PRECISELY: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-12)
-"""OpenCV undoes distortion by five steps of a fixed point unless it is told to go on: 0.1 pixel off in a wide lens."""
+"""OpenCV undoes distortion by five steps of a fixed point by default: 0.1 pixel off in a wide lens."""
 
 WIDEST_ASKED: Final = 6.0
-"""Tangent of the widest angle from the axis at which it is asked whether a lens turns back: 80 degrees."""
+"""Tangent of the widest angle from the axis at which a lens is tested for turning back: 80 degrees."""
 WIDEST_STEPS: Final = 6001
 
 
@@ -55,7 +55,7 @@ class Camera:
     """(3,) m, the world's origin in the camera's frame."""
 
     time_offset: float = 0.0
-    """s by which the camera's stamps are late: what it stamps t happened at t - time_offset."""
+    """s, delay of the camera's stamps: an event stamped t happened at t - time_offset."""
 
     def __post_init__(self) -> None:
         check_name("a camera's name", self.name)
@@ -99,15 +99,15 @@ class Camera:
 
     @cached_property
     def centre(self) -> Array:
-        """(3,) m, where the camera stands."""
+        """(3,) m, position of the camera."""
         return np.asarray(-self.rotation.T @ self.tvec)
 
     @cached_property
     def widest(self) -> float:
-        """Distance from the axis, in the plane at z = 1, up to which the lens shows further out what is further out.
+        """Largest distance from the axis, in the plane at z = 1, up to which the projection grows monotonically.
 
-        The polynomial of a distortion that was fitted within the image turns back somewhere outside of it; what lies
-        beyond would land in the picture once more. Infinite for a lens that never turns back.
+        The polynomial of a distortion that was fitted within the image turns back somewhere outside of it; points
+        beyond would reappear in the picture. Infinite for a lens that never turns back.
         """
         k1, k2, _, _, k3, k4, k5, k6 = np.pad(self.distortion, (0, 14 - len(self.distortion)))[:8]
         r = np.linspace(0.0, WIDEST_ASKED, WIDEST_STEPS)
@@ -117,7 +117,7 @@ class Camera:
         return float(r[back[0]]) if len(back) else np.inf
 
     def project(self, points: ArrayLike) -> Array:
-        """Where points are seen.
+        """Projects points to pixels.
 
         Args: points: (..., 3) m, world.
         Returns: (..., 2) px; NaN for points behind the camera or beyond its lens.
@@ -144,7 +144,7 @@ class Camera:
         """Directions in the camera's frame, with the distortion undone.
 
         Args: pixels: (..., 2) px.
-        Returns: (..., 2) x/z and y/z, dimensionless, of what is seen there.
+        Returns: (..., 2) x/z and y/z, dimensionless, of the points seen there.
         """
         pixels = np.asarray(pixels, dtype=np.float64)
         flat = np.ascontiguousarray(pixels.reshape(-1, 1, 2))
@@ -154,7 +154,7 @@ class Camera:
         return np.asarray(plane, dtype=np.float64).reshape(pixels.shape)
 
     def rays(self, pixels: ArrayLike) -> Array:
-        """Rays from the camera's centre towards what is seen.
+        """Rays from the camera's centre through pixels.
 
         Args: pixels: (..., 2) px.
         Returns: (..., 3) unit vectors, dimensionless, in the world.
@@ -164,7 +164,7 @@ class Camera:
         return np.asarray(directions / np.linalg.norm(directions, axis=-1, keepdims=True))
 
     def in_view(self, points: ArrayLike) -> Mask:
-        """Whether points lie in front of the camera and within its image.
+        """True for points in front of the camera and within its image.
 
         Args: points: (..., 3) m, world.
         Returns: (...) bool.

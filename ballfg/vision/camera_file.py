@@ -1,4 +1,4 @@
-"""Cameras in files: `cameras.yaml`, and the files that OpenCV's FileStorage writes."""
+"""Reads and writes cameras: `cameras.yaml`, and the files of OpenCV's FileStorage."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,7 +22,7 @@ CAMERAS_FILE: Final = "cameras.yaml"
 LENS: Final = ("size", "matrix", "distortion")
 POSE: Final = ("rvec", "tvec")
 FIELDS: Final = (*LENS, *POSE, "time_offset")
-"""Fields of a camera in the file, in the order in which they are written; docs/calibrate.md says what they mean."""
+"""Fields of a camera in the file, in order; docs/calibrate.md explains them."""
 
 _MATRIX: Final = "camera_matrix"
 _NODES: Final = {
@@ -31,7 +31,7 @@ _NODES: Final = {
     "rvec": ("rvec",),
     "tvec": ("tvec",),
 }
-"""Our name of an array -> OpenCV's names of its node, the one that is written first; others are read."""
+"""This package's name of an array -> OpenCV's names of its node; the first is written, the others are read."""
 
 
 def read_cameras(path: str | PathLike[str], *, posed: bool = True) -> list[Camera]:
@@ -113,7 +113,7 @@ def write_opencv(path: str | PathLike[str], cameras: Iterable[Camera], *, posed:
 
 
 def _is_storage(path: Path) -> bool:
-    """Whether a file is one of FileStorage's: .xml, .json, or YAML that begins with a %YAML line."""
+    """True for a file of FileStorage: .xml, .json, or YAML that begins with a %YAML line."""
     if path.suffix.lower() in (".xml", ".json"):
         return True
     with path.open("rb") as file:
@@ -121,7 +121,7 @@ def _is_storage(path: Path) -> bool:
 
 
 def _from_storage(path: Path) -> dict[str, dict[str, Any]]:
-    """Name of each camera -> its fields as in `cameras.yaml`; nodes that say nothing about a camera are left aside.
+    """Name of each camera -> its fields as in `cameras.yaml`; unrelated nodes are ignored.
 
     A file with `camera_matrix` at its top holds one camera, named as the file; otherwise every map with that node is
     a camera.

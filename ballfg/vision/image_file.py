@@ -1,4 +1,4 @@
-"""Images of files: their size is read from the header, and bounded, before anything is decoded."""
+"""Reads images from files, after a check of the size in their header."""
 
 import warnings
 from pathlib import Path
@@ -13,7 +13,7 @@ from ballfg.files.damaged import check_pixels, whole_content
 from ballfg.vision.arrays import Image
 
 ENDINGS: Final = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
-"""Endings of what counts as an image in a folder; other files are left alone."""
+"""Endings of images in a folder; other files are ignored."""
 FORMATS: Final = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "PPM", "MPO")
 """Of Pillow's, which reads the headers alone. MPO: a JPEG with further pictures behind it, as telephones write."""
 _TILES: Final = (322, 323)

@@ -1,4 +1,4 @@
-"""Projection in torch: points through many cameras in one call, differentiable, distortion included."""
+"""Projects points through many cameras in one torch call, differentiable, with distortion."""
 
 from collections.abc import Sequence
 

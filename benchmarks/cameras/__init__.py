@@ -1,1 +1,1 @@
-"""`ballfg-bench cameras`."""
+"""Implements `ballfg-bench cameras`."""

@@ -1,4 +1,4 @@
-"""Cameras whose shutters do not open together: velocities from camera factors and from points, and clock offsets."""
+"""Evaluates unsynchronised cameras: velocities from camera factors and from points, and clock offsets."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,31 +10,24 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array
 from ballfg.benchmarks.cameras.scenes import Filmed, truth_at
 from ballfg.dynamics import nominal_model
-from ballfg.estimation import (
-    Estimate,
-    Online,
-    Settings,
-    Smoother,
-    TimeOffsets,
-    estimate_time_offsets,
-    sighted_track,
-)
+from ballfg.estimation import Estimate, Online, Settings, Smoother, estimate_time_offsets, sighted_track
 from ballfg.estimation.measurement.position_noise import estimate_position_noise
+from ballfg.estimation.smoother.time_offsets import TimeOffsets
 from ballfg.progress import progress
-from ballfg.simulation.scene import Flight
+from ballfg.simulation.scene.flights import Flight
 from ballfg.state import POSITION, VELOCITY, VZ
 from ballfg.tracks import Track
-from ballfg.vision import Camera, SeenBall, triangulate
-from ballfg.vision.association.gathering import nearest
+from ballfg.vision import Camera, triangulate
+from ballfg.vision.association.gathering import SeenBall, nearest
 
 NAIVE, FACTORS = "smoother, as if synchronised", "smoother, camera factors"
-"""Two of the ways to estimate, which are compared with each other."""
+"""Two of the ways to estimate, for comparison."""
 NEAR_BOUNCE: Final = 1.0
 """Frame intervals about a bounce that do not count: a stamp's velocity is before it or after it by chance."""
 BLIND: Final = 20.0
-"""px, what a ball of 10 m/s moves in half a frame at 120 Hz, 3 m away."""
+"""px, motion of a ball of 10 m/s in half a frame at 120 Hz, 3 m away."""
 OTHER_BALL: Final = 0.5
-"""m. A state that far from a flight is of another one."""
+"""m. Distance of a state from a flight beyond which it belongs to another one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +45,7 @@ class Velocities:
 
 
 def sighted(filmed: Filmed) -> list[Track]:
-    """The balls of a recording with the sightings that they were made from."""
+    """The balls of a recording with their sightings."""
     tracking = filmed.tracking
     pairs = zip(tracking.names, tracking.balls, strict=True)
     return [sighted_track(name, ball.sightings, tracking.cameras) for name, ball in pairs]
@@ -91,7 +84,7 @@ def _as_if_synchronised(ball: SeenBall, cameras: Sequence[Camera], rate: float) 
     """Times (n,) s and points (n, 3) m of the nearest frames, as one would who believes in one shutter.
 
     The frames are those of the camera that saw most; of the others the nearest sighting within half a frame counts. The
-    pixels' noise is taken to be as large as what the ball moves meanwhile: no view is refused for that.
+    pixels' noise includes the ball's motion meanwhile, so that no view is refused for that.
     """
     seen = ball.sightings
     offsets = np.array([camera.time_offset for camera in cameras])

@@ -1,4 +1,4 @@
-"""Pictures of the cameras' benchmark."""
+"""Draws the pictures of the cameras' benchmark."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

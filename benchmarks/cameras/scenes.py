@@ -1,4 +1,4 @@
-"""Filmed recordings with known truth: rendered, tracked from their videos, and judged point by point."""
+"""Films recordings with known truth, tracks them from their videos, and judges each point."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -12,23 +12,27 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array
 from ballfg.benchmarks.metrics import nees, root_mean_square
 from ballfg.simulation.cameras import table_rig
-from ballfg.simulation.scene import Flight, Recording, SceneConfig, free_running, record, write_scene
+from ballfg.simulation.scene.config import SceneConfig
+from ballfg.simulation.scene.flights import Flight
+from ballfg.simulation.scene.recording import Recording, record
+from ballfg.simulation.scene.shutter import free_running
+from ballfg.simulation.scene.writing import write_scene
 from ballfg.vision.association.gathering import SeenBall, nearest
 from ballfg.vision.detection.detect import detect_all
 from ballfg.vision.detection.detections import Detections
 from ballfg.vision.tracking.pipeline import Tracking, track_detections
 
 FALSE: Final = 0.05
-"""m. A point further from every ball than that is not of a ball."""
+"""m. Distance from every ball beyond which a point is false."""
 MIXED: Final = 3
 """Points of a second ball that make a track one of two balls; where two nearly touch, a point or two may seem to be."""
 SAME_FRAME: Final = 0.5
-"""Of a frame interval: a point that near in time to a frame is that frame's."""
+"""Share of a frame interval within which a point belongs to a frame."""
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """One way to film: the name of its rows, the scene, and whether all cameras expose at once."""
+    """One recording setup: the name of its rows, the scene, and whether all cameras expose at once."""
 
     name: str
     config: SceneConfig
@@ -60,7 +64,7 @@ def scenarios(shots: int, seed: int) -> list[Scenario]:
 
 @dataclass(frozen=True, eq=False)
 class Filmed:
-    """A recording and what was found in its videos."""
+    """A recording and the tracking of its videos."""
 
     scenario: Scenario
     recording: Recording
@@ -88,9 +92,9 @@ class Judged:
     """The points of balls against the truth.
 
     Attributes:
-        errors: (n, 3) m, of the points that are of a ball.
+        errors: (n, 3) m, of points that belong to a ball.
         squares: (n,) NEES of these.
-        false: points that are of no ball.
+        false: number of points that belong to no ball.
         seen: frames in which two cameras or more see a ball.  found: those that have a point.
         tracks: found.  mixed: those with points of more than one ball.  balls: launched.
     """

@@ -1,4 +1,4 @@
-"""Times of tracking: three video streams through detection and association, and live updates from sightings."""
+"""Times the tracking of three video streams, and live updates from sightings."""
 
 import time
 from functools import partial
@@ -9,10 +9,11 @@ from ballfg.benchmarks.cameras.clocks import sighted
 from ballfg.benchmarks.cameras.scenes import Filmed, Scenario
 from ballfg.benchmarks.speed.stopwatch import milliseconds
 from ballfg.dynamics import nominal_model
-from ballfg.estimation import Online, Settings, sightings_of
+from ballfg.estimation import Online, Settings
+from ballfg.estimation.observations.sightings import sightings_of
 from ballfg.parallel.processes import Processes
 from ballfg.progress import progress
-from ballfg.simulation.scene import write_scene
+from ballfg.simulation.scene.writing import write_scene
 from ballfg.vision import Detections, detect_all, track_detections
 
 

@@ -1,4 +1,4 @@
-"""The suite of `ballfg-bench cameras`: from rendered videos to states, against the truth."""
+"""Runs `ballfg-bench cameras`, from rendered videos to states, against the truth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,15 +16,15 @@ from ballfg.benchmarks.metrics import bootstrap, median_and_quartiles, median_an
 from ballfg.benchmarks.results import Results
 from ballfg.benchmarks.resumable import in_processes
 from ballfg.progress import progress
-from ballfg.simulation.scene import Clock
+from ballfg.simulation.scene.config import Clock
 
 LATE: Final = {"right": 0.004}
-"""s, by which cameras' stamps are late in the recordings whose clocks are to be found."""
+"""s, delay of the stamps in recordings with a late clock."""
 
 
 @dataclass(frozen=True)
 class Size:
-    """How much is computed.
+    """The amount of computation.
 
     Attributes:
         shots: balls in each recording.  late: recordings with a late clock.
@@ -98,7 +98,7 @@ def add_velocities(results: Results, found: dict[str, Velocities], seed: int) ->
 
 
 def add_clocks(results: Results, filmed: Sequence[Filmed]) -> None:
-    """How far each camera's clock is from what it was found to be; the first camera's is the reference."""
+    """Error of each camera's estimated clock; the first camera's is the reference."""
     errors, scores = [], []
     for one in progress(filmed, len(filmed), "recordings searched for late clocks"):
         found = clocks(one)
@@ -115,7 +115,7 @@ def add_clocks(results: Results, filmed: Sequence[Filmed]) -> None:
 
 
 def add_turns(results: Results, found: Sequence[Turn], filmed: Filmed) -> None:
-    """How often the turned camera is the one that is named; as a control, whether one is where none was turned."""
+    """Share of turned cameras that are named, and as a control, of recordings without one that name any."""
     agreement = filmed.tracking.agreement
     false_alarm = agreement is not None and agreement.culprit is not None
     results.add("no camera turned", "agreement", "named", "1", float(false_alarm), 1)

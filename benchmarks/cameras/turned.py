@@ -1,4 +1,4 @@
-"""A camera that was turned after its calibration: does the check of the cameras' agreement name it?"""
+"""Tests whether the check of the cameras' agreement names a camera that was turned after its calibration."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ class Turn:
     """One camera turned about one axis.
 
     Attributes:
-        camera, axis: which.
+        camera, axis: the turned camera and its axis.
         named: the camera that the check names, None for none.
         found: degrees by which the check finds the camera turned; NaN where it finds nothing.
     """

@@ -1,1 +1,1 @@
-"""`ballfg-bench loop`."""
+"""Implements `ballfg-bench loop`."""

@@ -1,4 +1,4 @@
-"""The cases of the loop's benchmark: datasets to be made, and the effects that a diagnosis of each should find."""
+"""Defines the cases of the loop's benchmark: datasets, and the effects that a diagnosis of each should find."""
 
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,24 +10,24 @@ from typing import Final
 import numpy as np
 
 from ballfg.benchmarks.diagnosis.effects import PAIRS, PLANTS, UNKNOWN
-from ballfg.simulation import SETTING_LEVELS
+from ballfg.simulation.settings import SETTING_LEVELS
 
 STATED_NOISE: Final = 0.003
-"""m, what every dataset says about its positions, and of most it is true."""
+"""m, noise of positions that every dataset states; in most it is true."""
 LABEL_NOISE: Final = 4.0
-"""rad/s per component, what every dataset says about its spin labels."""
+"""rad/s per component, noise of spin labels that every dataset states."""
 BARE: Final = ("magnus", "tangential_restitution", "table_height")
-"""What the nominal model loses to leave gravity, drag, restitution and friction."""
+"""Effects removed from the nominal model to leave gravity, drag, restitution and friction."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """How tracks are recorded.
+    """The recording settings of tracks.
 
     Attributes:
         tracks: number.  rate: Hz.  position: m and spin: rad/s, true noise of positions and labels.
         dropout, outliers: probability for each frame.  jitter: s, of the stamps.
-        labels: whether spins are labelled.
+        labels: True if spins are labelled.
         levels: launcher levels by setting, for those that do not run through all of theirs.
     """
 
@@ -48,11 +48,11 @@ class Case:
 
     Attributes:
         part: of the benchmark.
-        subject: what is planted, in a word.  size: of it; 1 is typical.  seed: number of the repetition.
+        subject: the planted effect, in a word.  size: of it; 1 is typical.  seed: number of the repetition.
         planted: names of the effects that the declared model lacks.
-        left_out: effects that the nominal model has and the declared one has not.
+        left_out: effects of the nominal model that the declared one lacks.
         sessions: undeclared effects, as texts, of each session that the dataset consists of.
-        recording: how its tracks are taken.
+        recording: settings of its tracks.
         data: folder of measured tracks, which take the place of simulated ones.
         repair: fit the true model too.  jobs: processes of the diagnosis.
     """
@@ -71,7 +71,7 @@ class Case:
 
     @property
     def name(self) -> str:
-        """Of its record."""
+        """Name of its record."""
         return f"{self.part}-{self.subject}-{self.size:.4g}-{self.seed}"
 
     @property
@@ -82,11 +82,11 @@ class Case:
 
 @dataclass(frozen=True)
 class Plan:
-    """How much is computed; by default everything.
+    """The amount of computation; by default everything.
 
     Attributes:
         effects, sizes: planted one by one, each in every size.
-        unlabelled: names of those planted where no spin is labelled.
+        unlabelled: names of effects planted in data without spin labels.
         pairs: names of two planted together.
         seeds: of each at its typical size; the true model is fitted to the first of them.
         side_seeds: of each at other sizes, and of pairs.  unlabelled_seeds: where no spin is labelled.
@@ -156,7 +156,7 @@ def detection_cases(plan: Plan, seed: int, ideal: Mapping[str, float]) -> Iterat
 
 
 def null_cases(plan: Plan, seed: int) -> Iterator[Case]:
-    """Datasets that lack nothing and differ in everything else."""
+    """Datasets without missing effects that differ in everything else."""
     for number in range(plan.nulls):
         yield Case("silence", "nothing", 1.0, seed + number, recording=null_recording(seed + number))
 
@@ -180,7 +180,7 @@ def null_recording(seed: int) -> Recording:
 
 
 def unknown_cases(plan: Plan, seed: int) -> Iterator[Case]:
-    """Physics that no catalogue holds."""
+    """Cases with physics outside of every catalogue."""
     for number, name in product(range(seed, seed + plan.unknown_seeds), plan.unknown):
         yield Case("unknown", name, 1.0, number, sessions=UNKNOWN[name])
 

@@ -1,4 +1,4 @@
-"""From a case to its data: simulated tracks in a folder, the declared model, and the true one."""
+"""Makes the data of a case: simulated tracks in a folder, the declared model, and the true one."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -6,8 +6,9 @@ from pathlib import Path
 from ballfg.benchmarks.diagnosis.cases import LABEL_NOISE, STATED_NOISE, Case
 from ballfg.diagnosis.search.hypothesis import has_effect, with_effects, without_effect
 from ballfg.dynamics import AnalyticModel, nominal_model
-from ballfg.simulation import MeasurementNoise, SimulationConfig, dataset_info, parse_effects, simulate, table_tennis
+from ballfg.simulation import MeasurementNoise, SimulationConfig, parse_effects, simulate, table_tennis
 from ballfg.simulation.composition import true_model
+from ballfg.simulation.synthetic import dataset_info
 from ballfg.tracks import Dataset, read_dataset, write_dataset
 
 
@@ -24,7 +25,7 @@ def make_dataset(case: Case, folder: Path) -> Dataset:
 
 
 def declared_model(case: Case, radius: float) -> AnalyticModel:
-    """The model that the diagnosis is given: the nominal one for a radius (m), without the effects left out."""
+    """The declared model of a diagnosis: the nominal one for a radius (m), without the effects left out."""
     model = with_effects(nominal_model(radius))
     for name in case.left_out:
         if has_effect(model, name):  # effects that need one go with it

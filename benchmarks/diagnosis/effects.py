@@ -1,6 +1,6 @@
-"""The planted effects: every catalogue effect at its typical size, pairs of them, and physics of no catalogue.
+"""Lists the planted effects: every catalogue effect at its usual size, pairs, and physics of no catalogue.
 
-Typical sizes are those that the effects themselves call usual.
+Typical sizes are the effects' own usual ones.
 """
 
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ class Plant:
 
     Attributes:
         name: of the effect.
-        amounts: by coefficient, what is added at size 1.
+        amounts: by coefficient, the addition at size 1.
         base: value of those coefficients at size 0: the effect is absent, or as declared.
         left_out: the nominal model has it; the declared model is the nominal one without it.
         hidden: other effects or free coefficients do the same; an honest answer names one of those effects or says that
@@ -40,7 +40,7 @@ class Plant:
         return tuple(f"{self.name}.{c}={self.base + size * amount!r}" for c, amount in self.amounts)
 
     def hypothesis(self) -> Hypothesis:
-        """The right one: this effect in its true shape."""
+        """The true hypothesis, with this effect in its true shape."""
         coefficients = EFFECTS[self.name].coefficients
         if not self.sized:
             whole = {c.name: c.default for c in coefficients} | {c: self.base + a for c, a in self.amounts}

@@ -1,4 +1,4 @@
-"""The ideal test: the size at which the best test of an effect alone finds it, with everything else known.
+"""The ideal test finds an effect alone, with everything else known; its size is the reference for the loop.
 
 It looks at all tracks, knows the noise, and asks for one effect in its true shape. Its statistic is the score test's:
 chi-square where the effect is absent, non-central where it acts, with size^2 d' F d as non-centrality. F is the
@@ -86,7 +86,7 @@ def ideal_case(name: str, seed: int) -> Case:
 
 
 def fit_declared(case: Case) -> Fit:
-    """The declared model fitted to the tracks of a case whose noise is none; the noise is taken to be as stated."""
+    """The declared model fitted to the tracks of a case without noise, under the stated noise."""
     with TemporaryDirectory() as folder:
         dataset = make_dataset(case, Path(folder) / "tracks")
         model = declared_model(case, dataset.info.ball.radius)

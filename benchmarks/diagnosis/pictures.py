@@ -1,4 +1,4 @@
-"""Pictures of the loop's benchmark: power against size, effects named against effects planted, and repaired errors."""
+"""Draws the loop's benchmark: power against size, named against planted effects, and repaired errors."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,7 +24,7 @@ NOTHING: Final = "nothing"
 FEW_DECADES: Final = 100.0
 """Ratio of the largest to the smallest size up to which more than the decades are numbered."""
 POINTS: Final = 200
-"""Of a drawn curve."""
+"""Number of points of a drawn curve."""
 
 
 def power_picture(
@@ -70,7 +70,7 @@ def _draw_power(axes: Axes, sizes: Sequence[float], outcomes: Sequence[bool], cu
 
 
 def confusion_picture(cases: Sequence[Case], records: Mapping[str, Record], path: Path) -> Path:
-    """What was named first (columns) for what was planted (rows), at typical size, with and without spin labels."""
+    """First named effects (columns) for planted ones (rows), at typical size, with and without spin labels."""
     parts = [("naming", "spin labels"), ("no_labels", "no spin labels")]
     figure, panels = plt.subplots(1, 2, figsize=(15, 7.5), layout="constrained")
     for axes, (part, title) in zip(panels, parts, strict=True):

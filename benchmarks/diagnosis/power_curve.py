@@ -1,4 +1,4 @@
-"""The probability that an effect is named against its size, and the size from which on it is named nearly always."""
+"""Fits the probability that an effect is named against its size, and its detection limit."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The record of a diagnosis: names, evidence, errors and seconds, as a JSON file that a later run reads."""
+"""Keeps the record of a diagnosis, names, evidence, errors and seconds, as a JSON file for later runs."""
 
 import hashlib
 import math
@@ -20,7 +20,7 @@ RANKED = 8
 
 @dataclass(frozen=True)
 class Found:
-    """A finding: its name, effects that it could not be told from, its evidence, and coefficients with their sigmas."""
+    """A finding: its name, indistinguishable effects, its evidence, and coefficients with their sigmas."""
 
     name: str
     alike: tuple[str, ...]
@@ -31,7 +31,7 @@ class Found:
 
 @dataclass(frozen=True)
 class Ranked:
-    """A candidate of a round: what it would explain, its evidence, and what became of it."""
+    """A candidate of a round: its explained residual, its evidence, and its outcome."""
 
     name: str
     explained: float
@@ -51,7 +51,7 @@ class Record:
         rounds: leading candidates of each round, best first, and those planted.
         errors: mm, prediction error on the judging half: `before`, `after`, of the true model `true`, and where there
             is a fallback, with it (`fallback`, the one after) and with named effects only (`named`).
-        patterns: p-values of the tests for what is left, by the place that they name.
+        patterns: p-values of the tests for remaining patterns, by their place.
         tracks, judged: numbers of tracks in the dataset and on the judging half.
         seconds: of the diagnosis, wall clock.
     """
@@ -80,7 +80,7 @@ def read_record(path: Path, digest: str) -> Record | None:
 
 
 def record_of(case: Case, digest: str, diagnosis: Diagnosis, true: Errors | None, seconds: float) -> Record:
-    """The part of a diagnosis that is kept."""
+    """The kept part of a diagnosis."""
     errors = {"before": diagnosis.before, "after": diagnosis.after}
     left = diagnosis.unexplained
     if left.fallback is not None:
@@ -117,7 +117,7 @@ def _leading(listed: tuple[Candidate, ...], planted: tuple[str, ...]) -> tuple[R
 
 
 def case_digest(case: Case) -> str:
-    """Of everything that decides a case: what is planted and how it is taken, or the measured files."""
+    """Digest of a case's settings: the planted effects and the recording, or the measured files."""
     digest = hashlib.sha256(repr((metadata.version("ballfg"), replace(case, data=None))).encode())
     if case.data is not None:
         for path in sorted(case.data.iterdir()):

@@ -1,4 +1,4 @@
-"""Rows of results from the records of the loop's cases; docs/benchmarks.md says what each metric is."""
+"""Makes rows of results from the records of the loop's cases; docs/benchmarks.md explains the metrics."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -17,7 +17,7 @@ ALL = "all"
 HIDDEN = "all that hide"
 """Rows over the effects that have equals; `ALL` is over the others."""
 FAILED = "failed"
-"""How many cases of a part ended in an error; they count as wrong."""
+"""Metric of the number of cases of a part that ended in an error; they count as wrong."""
 TITLES = {
     "naming": "naming, spin labels",
     "no_labels": "naming, no spin labels",
@@ -30,7 +30,7 @@ TITLES = {
 }
 """The name in `results.json` of each part's rows."""
 LARGEST_IDEAL = 2.0
-"""Times its typical size. An effect for which the ideal test needs more is not looked for at its limit."""
+"""Largest multiple of its typical size that the ideal test may need for a search at an effect's limit."""
 FEW_TRACKS = 25
 """Null datasets of so many tracks are also counted apart."""
 
@@ -102,7 +102,7 @@ def _add_pairs(results: Results, cases: Sequence[Case], records: Records) -> Non
 
 
 def detectable(ideals: Mapping[str, Ideal]) -> dict[str, float]:
-    """The ideal test's size of the effects that are looked for at their limit."""
+    """The ideal test's sizes of the effects with a detection limit."""
     return {name: ideal.size for name, ideal in ideals.items() if ideal.size <= LARGEST_IDEAL}
 
 

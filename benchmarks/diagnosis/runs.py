@@ -1,4 +1,4 @@
-"""Running cases and ideal tests, each in a process of its own; finished ones are kept."""
+"""Runs cases and ideal tests, each in a process of its own, and keeps finished ones."""
 
 import sys
 import time
@@ -35,8 +35,7 @@ def collect_records(
 ) -> dict[str, Record]:
     """The records of cases by their names: read from an existing folder where they are there, else made and kept.
 
-    A case whose diagnosis raises has no record: it is told on stderr, counts as failed, and is tried again by the next
-    run.
+    A case whose diagnosis raises has no record: stderr reports it, it counts as failed, and the next run repeats it.
     """
 
     def path(case: Case) -> Path:

@@ -1,4 +1,4 @@
-"""The suite of `ballfg-bench loop`: does the diagnosis find what was planted, and stay silent where nothing was?"""
+"""Runs `ballfg-bench loop`, which asks whether the diagnosis finds planted effects and no others."""
 
 import sys
 from collections.abc import Callable, Sequence

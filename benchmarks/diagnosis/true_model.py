@@ -1,4 +1,4 @@
-"""The error that a diagnosis could reach: that of the true model, on the same halves of the tracks."""
+"""Computes the best possible error of a diagnosis: the true model's, on the same halves of the tracks."""
 
 from dataclasses import replace
 

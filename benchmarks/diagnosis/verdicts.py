@@ -1,4 +1,4 @@
-"""Whether a diagnosis was right: which names are accepted for the planted effects."""
+"""Decides whether a diagnosis was right, by the names accepted for the planted effects."""
 
 from collections.abc import Iterable
 
@@ -13,18 +13,18 @@ LARGEST_GROUP = 3
 
 
 def named(record: Record, planted: Iterable[str]) -> bool:
-    """Whether the first finding is a planted effect, or one that is said to look like it in a group that is small."""
+    """True if the first finding is a planted effect, or one of a small group of indistinguishable ones with it."""
     return bool(record.found) and is_one_of(record.found[0], planted)
 
 
 def is_one_of(found: Found, planted: Iterable[str]) -> bool:
-    """Whether a finding is a planted effect, or in a small group with one."""
+    """True if a finding is a planted effect, or in a small group with one."""
     group = (found.name, *found.alike)
     return found.name in planted or (len(group) <= LARGEST_GROUP and not set(group).isdisjoint(planted))
 
 
 def honest(record: Record, name: str) -> bool:
-    """The same for an effect that hides: its group is named, however large, or it is said to be invisible."""
+    """True for an effect with equals if its group is named, however large, or it is reported as invisible."""
     if record.found:
         return name in (record.found[0].name, *record.found[0].alike)
     entries = {name, *(listed for listed, twins in TWINS.items() if name in twins)}  # exact twins are one entry
@@ -33,23 +33,23 @@ def honest(record: Record, name: str) -> bool:
 
 
 def right(record: Record, planted: tuple[str, ...]) -> bool:
-    """`honest` for an effect that hides, else `named`."""
+    """True by `honest` for an effect with equals, else by `named`."""
     if len(planted) == 1 and PLANTS[planted[0]].hidden:
         return honest(record, planted[0])
     return named(record, planted)
 
 
 def complete(record: Record, planted: tuple[str, ...]) -> bool:
-    """Whether every planted effect is the whole or a part of some finding, and no finding is anything else."""
+    """True if every planted effect is the whole or a part of some finding, and no finding is anything else."""
     every = all(any(is_one_of(found, (name,)) for found in record.found) for name in planted)
     return every and all(is_one_of(found, planted) for found in record.found)
 
 
 def false_names(record: Record, recording: Recording) -> list[str]:
-    """Names found in a dataset whose model lacks nothing; jitter of the stamps is one only where there is none."""
+    """False names in a dataset whose model is complete; jitter of the stamps is false only where there is none."""
     return [found.name for found in record.found if found.name != "stamp_jitter" or not recording.jitter]
 
 
 def alarmed(record: Record, recording: Recording) -> bool:
-    """Whether a dataset whose model lacks nothing was said to lack something, by name or without one."""
+    """True if a complete model was reported to lack something, by name or without one."""
     return bool(false_names(record, recording)) or record.verdict == Verdict.UNEXPLAINED.value

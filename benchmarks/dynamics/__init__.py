@@ -1,1 +1,1 @@
-"""`ballfg-bench dynamics`."""
+"""Implements `ballfg-bench dynamics`."""

@@ -1,4 +1,4 @@
-"""The contenders of the dynamics comparison: the contract, models in the factor graph, and those without training."""
+"""Defines the contenders of the dynamics comparison: their interface, graph models, untrained ones."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -46,7 +46,7 @@ class Job:
 
     @property
     def measured(self) -> bool:
-        """Whether the tracks are measured ones."""
+        """True if the tracks are measured ones."""
         return self.tasks[0].truth is None
 
 
@@ -74,7 +74,7 @@ class Contender(Protocol):
 
 
 def as_it_is(track: Track) -> Track:
-    """The track without a change."""
+    """The track itself."""
     return track
 
 
@@ -142,7 +142,7 @@ def _padded(times: Sequence[Array]) -> Array:
 
 
 def nominal_contender(job: Job, task: Task) -> GraphContender:
-    """The nominal analytic model: what one has before any data. It is told what launcher settings mean for the spin."""
+    """The nominal analytic model, as before any data, with the known spins of launcher settings."""
     label = as_it_is if task.launcher is None else task.launcher.labelled
     model = nominal_model(task.info.ball)
     return GraphContender(job.method, model, task.surfaces, task.settings, label, job.measured)
@@ -157,7 +157,7 @@ def adapting_contender(job: Job, task: Task) -> GraphContender:
 def truth_contender(job: Job, task: Task) -> GraphContender:
     """The true dynamics, with next to no process noise: what noise and spread of the launches leave unknown.
 
-    Raises: ValueError: if the task is of measured tracks, whose truth nobody knows.
+    Raises: ValueError: if the task is of measured tracks, whose truth is unknown.
     """
     if task.truth is None:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""One launch with many spins: the paths that a dynamics model predicts for each launcher setting."""
+"""Predicts one launch with many spins, one path for each launcher setting."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -7,8 +7,8 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.benchmarks.dynamics.contenders import GraphContender
-from ballfg.simulation import SETTING_LEVELS, table_tennis
-from ballfg.simulation.settings import Settings
+from ballfg.simulation import table_tennis
+from ballfg.simulation.settings import SETTING_LEVELS, Settings
 from ballfg.state import POSITION, SPIN, VELOCITY
 from ballfg.tracks import Track
 
@@ -21,7 +21,7 @@ RATE: Final = 120.0
 STRAIGHT: Final = 12
 """Samples of that track."""
 DIGITS: Final = 5
-"""Of a kept coordinate in m, 0.01 mm."""
+"""Resolution of a kept coordinate in m, 0.01 mm."""
 
 
 Point = tuple[float, float, float]

@@ -1,4 +1,4 @@
-"""Making and judging the methods of the dynamics comparison, each in a process of its own; finished ones are kept."""
+"""Trains and judges the methods of the dynamics comparison, each in a process, and keeps finished ones."""
 
 import sys
 from collections.abc import Sequence
@@ -51,7 +51,7 @@ def judged(job: Job) -> list[int]:
 
 
 def record_path(job: Job, number: int) -> Path:
-    """Where the record of a job on one of its tasks is kept."""
+    """Path of the record of a job on one of its tasks."""
     ending = "" if len(job.tasks) == 1 else f"-on-{number}"
     return job.folder.with_name(f"{job.folder.name}{ending}.json")
 

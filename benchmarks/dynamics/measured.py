@@ -1,4 +1,4 @@
-"""Measured tracks as tasks: learn from every second shot, observe a quarter of a second, predict what follows."""
+"""Makes tasks of measured tracks: learn from every second shot, observe a quarter of a second, predict the rest."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,10 +7,11 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.benchmarks.dynamics.task import Shot, Task
+from ballfg.benchmarks.dynamics.task import Task, TaskShot
 from ballfg.benchmarks.estimators.measured import HORIZON, OBSERVE
 from ballfg.dynamics import nominal_model
-from ballfg.estimation import Estimate, Smoother, dataset_settings, dataset_surfaces, estimate_tracks
+from ballfg.estimation import Estimate, Smoother, dataset_settings, dataset_surfaces
+from ballfg.estimation.batch import estimate_tracks
 from ballfg.prediction.apexes import measured_apexes
 from ballfg.progress import progress
 from ballfg.tracks import Dataset, Track
@@ -97,7 +98,7 @@ def measured_task(dataset: Dataset, jobs: int, tracks: int | None = None, *, lea
     )
 
 
-def measured_shot(track: Track, estimate: Estimate) -> Shot | None:
+def measured_shot(track: Track, estimate: Estimate) -> TaskShot | None:
     """A measured track up to the first hit that its estimate has; None if nothing is left to predict."""
     last = int(estimate.hits[0]) if len(estimate.hits) else len(track) - 1
     track = track.until(float(track.times[last]))
@@ -108,7 +109,7 @@ def measured_shot(track: Track, estimate: Estimate) -> Shot | None:
     end = since[observed - 1] + HORIZON + STAMP_TOLERANCE
     bounces = np.array([c.time for c in estimate.contacts if track.times[0] < c.time < track.times[-1]])
     apexes, apex_times = measured_apexes(track.times, track.positions, bounces)
-    return Shot(
+    return TaskShot(
         track=track,
         reference=track.positions,
         observed=observed,

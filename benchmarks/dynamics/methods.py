@@ -1,4 +1,4 @@
-"""The methods of the dynamics comparison."""
+"""Lists the methods of the dynamics comparison."""
 
 import importlib.util
 from collections.abc import Callable, Sequence
@@ -18,10 +18,10 @@ class Method:
 
     Attributes:
         make: a contender for one of the job's tasks; what the method learns is learned at the first of them.
-        trained: whether a seed makes a difference; if not it runs once.
+        trained: True if a seed makes a difference; if not it runs once.
         takes_part: on which tracks: `all`, `simulated` or `measured` ones.
-        transfers: whether it can be judged on tracks of a launcher that it did not learn from.
-        package: that it needs and that only an extra installs; empty if there is none.
+        transfers: True if it can be judged on tracks of a launcher outside of its training.
+        package: required package of an extra; empty if there is none.
     """
 
     make: Callable[[Job, Task], Contender]
@@ -32,18 +32,18 @@ class Method:
 
     @property
     def installed(self) -> bool:
-        """Whether everything that it needs is there."""
+        """True if its required package is installed."""
         return not self.package or importlib.util.find_spec(self.package) is not None
 
     def fits(self, tasks: Sequence[Task]) -> bool:
-        """Whether it takes part on these tracks."""
+        """True if it takes part on these tracks."""
         return self.takes_part in ("all", "measured" if tasks[0].truth is None else "simulated")
 
 
 SEQUENCES: Final = ("lstm+aug", "diffusion+aug")
-"""Know the settings of the launchers that they learned from, and nothing of spin."""
+"""Methods that know the settings of their training launchers, and nothing of spin."""
 TRAINED: Final = (*SEQUENCES, "a-tune+aug", "mlp+aug", "mlp+gs", "skip+gs", "mnn+gs")
-"""As in the paper's table."""
+"""The methods of the paper's table."""
 
 METHODS: Final = {
     "truth": Method(contenders.truth_contender, trained=False, takes_part="simulated"),

@@ -1,4 +1,4 @@
-"""Pictures of the dynamics comparison: errors by method, apex errors by flight, and a launch fanned out by its spin."""
+"""Draws the dynamics comparison: errors by method, apex errors by flight, and a launch fanned out by its spin."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +17,7 @@ from ballfg.benchmarks.estimators.measured import HORIZON
 from ballfg.benchmarks.pictures import BLUE, GREY, ORANGE, curve, save
 from ballfg.benchmarks.results import Row
 from ballfg.dynamics.surfaces import TABLE_LENGTH, TABLE_WIDTH
-from ballfg.simulation import SETTING_LEVELS
+from ballfg.simulation.settings import SETTING_LEVELS
 
 COLOURS: Final = {
     "truth": "#bdbdbd",
@@ -40,7 +40,7 @@ FANNED: Final = ("mnn+gs", "skip+gs", "mlp+gs", "mlp", "a-tune", "nominal")
 MARGIN: Final = 0.1
 """m, shown round the table."""
 GROUP_WIDTH: Final = 0.8
-"""Of a group of bars, where groups are 1 apart."""
+"""Width of a group of bars, for groups 1 apart."""
 
 
 def _colour_of(method: str) -> str:

@@ -1,4 +1,4 @@
-"""Training configs of the learned methods: equal in everything that is not the method.
+"""Defines the training configs of the learned methods, equal in everything but the method.
 
 On measured tracks there are few shots, real noise, and launchers whose spin nobody measured: there the models in the
 factor graph have a recipe of their own, which was found on the shots to learn from, parted into folds.
@@ -25,7 +25,7 @@ SIMULATED: Final[dict[str, Any]] = {
         "contact_spin": 10.0,
     },
 }
-"""Of all models in the factor graph."""
+"""Config of all models in the factor graph."""
 MEASURED: Final[dict[str, Any]] = {
     "optimizer": {"learning_rate": 3e-3, "batch": 12, "epochs": 40, "clip": 5.0},
     # little weight for the likelihood, to tie down the scale of the noise: at fifteen times the weight the launcher's
@@ -42,7 +42,7 @@ SEQUENCE_OPTIMIZERS: Final[dict[str, dict[str, Any]]] = {
     "lstm": {"learning_rate": 3e-3, "batch": 16, "epochs": 150, "warm_start_epochs": 5},
     "diffusion": {"learning_rate": 1e-3, "batch": 16, "epochs": 120, "warm_start_epochs": 5},
 }
-"""Of the sequence models, each the best of a few that were tried on the judging tracks: that favours them."""
+"""Optimizers of the sequence models, the best of a few on the judging tracks, which favours them."""
 QUICK_EPOCHS: Final = 2
 QUICK_PRETRAIN: Final = 60
 

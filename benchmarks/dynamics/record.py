@@ -1,4 +1,4 @@
-"""The record of a finished contender: its errors on every validation track, as a JSON file that a later run reads."""
+"""Keeps the record of a finished contender, its errors on every validation track, as a JSON file."""
 
 import hashlib
 from collections.abc import Sequence
@@ -53,7 +53,7 @@ def read_record(path: Path, digest: str) -> Record | None:
 
 
 def task_digest(task: Task, recipe: str) -> str:
-    """Of everything that decides a contender's errors but its method and seed: the task, and how it is trained."""
+    """Digest of the task and the training, which together with method and seed determine a contender's errors."""
     digest = hashlib.sha256(repr((metadata.version("ballfg"), task.case, recipe, task.settings)).encode())
     for part in (task.train, task.validation):
         for shot in part:
@@ -66,7 +66,7 @@ def task_digest(task: Task, recipe: str) -> str:
 
 
 def job_digest(task: Task, tasks: Sequence[Task], recipe: str) -> str:
-    """Of what decides the errors on one of several tasks that are learned from together.
+    """Digest of the settings that determine the errors on one of several tasks of a common training.
 
     Args: task: that is judged by.  tasks: that are learned from, where they hold shots for it.
     """

@@ -1,4 +1,4 @@
-"""From the errors of finished contenders to rows: pooled over tracks, averaged over seeds."""
+"""Makes rows from the errors of finished contenders, pooled over tracks and averaged over seeds."""
 
 from collections.abc import Iterator, Sequence
 

@@ -1,4 +1,4 @@
-"""Errors of predicted paths: over the track, over its unobserved part, and of the apex of each flight."""
+"""Scores predicted paths over the track, over its unobserved part, and at the apex of each flight."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
-from ballfg.benchmarks.dynamics.task import Shot
+from ballfg.benchmarks.dynamics.task import TaskShot
 from ballfg.benchmarks.metrics import square_norms
 from ballfg.prediction.apexes import FLIGHTS, flight_bounds, path_apex
 
@@ -22,7 +22,7 @@ class PathScore:
         track: m^2, of the squared distances over all judged samples (None if some were not predicted); their number.
         rest: the same over the judged samples after the observed ones.
         apex: m, distance between predicted and reference apex by flight (`APEXES`); None where either is missing.
-        apex_ahead: whether the reference apex lies after the observed part.
+        apex_ahead: True if the reference apex lies after the observed part.
     """
 
     track: tuple[float | None, int]
@@ -41,7 +41,7 @@ class PathScore:
         return pooled_rmse([self.rest])
 
 
-def score_path(shot: Shot, predicted: Array) -> PathScore:
+def score_path(shot: TaskShot, predicted: Array) -> PathScore:
     """The errors of a path predicted for a shot.
 
     Args:

@@ -1,4 +1,4 @@
-"""The suite of `ballfg-bench dynamics`: every method learns from the same shots and predicts the same others."""
+"""Runs `ballfg-bench dynamics`: every method learns from the same shots and predicts the same others."""
 
 import re
 import sys
@@ -22,7 +22,7 @@ from ballfg.benchmarks.resumable import RUNS_FOLDER
 
 @dataclass(frozen=True)
 class Plan:
-    """How much is computed.
+    """The amount of computation.
 
     Attributes:
         tracks: synthetic ones.

@@ -1,4 +1,4 @@
-"""The tracks of the dynamics comparison: shots to train on, shots to judge by, and the settings that all models get."""
+"""Holds the tracks of the dynamics comparison: shots for training and for judging, and common settings."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -7,8 +7,10 @@ from typing import Final
 
 from ballfg.arrays import Array
 from ballfg.dynamics import BallModel, Surfaces
-from ballfg.estimation import Launcher, Settings
-from ballfg.tracks import DatasetInfo, Track, write_dataset
+from ballfg.estimation import Settings
+from ballfg.estimation.launcher import Launcher
+from ballfg.tracks import Track, write_dataset
+from ballfg.tracks.info import DatasetInfo
 
 APEXES: Final = ("before_1", "1_2", "2_3")
 """The flights whose highest point is judged: before the first bounce, between the first two, between the next two."""
@@ -18,14 +20,14 @@ SPLIT_LABEL: Final = "split"
 
 
 @dataclass(frozen=True)
-class Shot:
-    """One track and what it is judged by.
+class TaskShot:
+    """One track with its reference.
 
     Attributes:
         track: stamps, measured positions and labels: all that a model may see.
         reference: (n, 3) m, the positions that count: the true ones where there is truth, else the measured ones.
         observed: number of first samples that a model is given.
-        judged: number of first samples over which errors are taken; the rest of the track is for apexes only.
+        judged: number of first samples for the errors; the rest of the track serves for apexes only.
         bounces: (b,) s, on the track's clock, in order.
         apexes: (3, 3) m, the highest points of the flights in `APEXES`; NaN where a flight has none inside the track.
         apex_times: (3,) s; NaN likewise.
@@ -53,12 +55,12 @@ class Task:
 
     Attributes:
         case: its name in `results.json`.
-        info: what is declared about the tracks: table, ball, rate, position noise.
-        surfaces: what every model is told to bounce on.
+        info: the declared table, ball, rate and position noise.
+        surfaces: table and floor, for every model.
         settings: of the estimator, the same for every model but for noise that a model has learned.
         launcher: spin per level for models that do not learn it; None where the tracks have no levels.
         launcher_labels: labels from which trained models learn the spin.
-        observe: what is observed of a shot, as a training config says it.
+        observe: the observed part of a shot, as in a training config.
         truth: the true dynamics; None for measured tracks.
         train: shots to learn from.  validation: shots to judge by.
     """
@@ -71,8 +73,8 @@ class Task:
     launcher_labels: tuple[str, ...]
     observe: Mapping[str, float]
     truth: BallModel | None
-    train: tuple[Shot, ...]
-    validation: tuple[Shot, ...]
+    train: tuple[TaskShot, ...]
+    validation: tuple[TaskShot, ...]
 
     def write(self, folder: Path, *, validate: bool = True) -> None:
         """Write the tracks of both parts into a new folder, as a dataset with a label `split`.

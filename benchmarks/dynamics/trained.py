@@ -1,4 +1,4 @@
-"""The trained contenders: models in the factor graph, and sequence models."""
+"""Trains the learned contenders: models in the factor graph, and sequence models."""
 
 from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout
@@ -56,14 +56,14 @@ def trained_contender(job: Job, task: Task) -> Contender:
 
 
 def _finished(folder: Path, config: TrainConfig) -> bool:
-    """Whether a training was run to its end: one that was stopped leaves its best model so far, too."""
+    """True if a training was run to its end: one that was stopped leaves its best model so far, too."""
     if not ((folder / MODEL).exists() or (folder / FOLDER).exists()) or not (folder / METRICS).is_file():
         return False
     return read_metrics(folder / METRICS)[-1].epoch >= config.optimizer.epochs
 
 
 def recipe(job: Job) -> str:
-    """How a job's method is trained, in words that change whenever that does."""
+    """A text on a job's training that changes whenever the training does."""
     words = repr(content_of(job.method, job.quick, job.measured))
     return words.replace("'jobs'", "'workers'")  # its earlier name: folders of finished trainings are marked with it
 

@@ -1,4 +1,4 @@
-"""The synthetic launcher tracks of the dynamics comparison, whose truth is richer than any model that is compared.
+"""Simulates the launcher tracks of the dynamics comparison, with a truth richer than any compared model.
 
 Seven things act at once that the analytic model has not, or has with another value. Their sizes come from what is
 known of spheres and from measured tracks; `EFFECTS` has them:
@@ -24,30 +24,25 @@ import numpy as np
 import torch
 
 from ballfg.arrays import Array
-from ballfg.benchmarks.dynamics.task import Shot, Task
+from ballfg.benchmarks.dynamics.task import Task, TaskShot
 from ballfg.benchmarks.estimators.protocols import gaussian_settings
-from ballfg.dynamics import BallModel, Surfaces, contact_time
-from ballfg.estimation import Launcher
+from ballfg.dynamics import BallModel, Surfaces
+from ballfg.dynamics.motion.contact import contact_time
+from ballfg.estimation.launcher import Launcher
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction.apexes import true_apexes
 from ballfg.progress import progress
-from ballfg.simulation import (
-    MeasurementNoise,
-    SimulatedTrack,
-    SimulationConfig,
-    dataset_info,
-    parse_effects,
-    simulate,
-    table_tennis,
-)
+from ballfg.simulation import MeasurementNoise, SimulationConfig, parse_effects, simulate, table_tennis
 from ballfg.simulation.composition import true_model
+from ballfg.simulation.measure import SimulatedTrack
+from ballfg.simulation.synthetic import dataset_info
 from ballfg.state import POSITION, VZ
 
 CASE: Final = "synthetic"
 TRACKS: Final = 717
 """As in the paper."""
 TRAIN_SHARE: Final = 0.8
-"""Of 717 tracks 573 are trained on, 144 judge."""
+"""Share of tracks for training: 573 of 717; 144 judge."""
 RATE: Final = 120.0
 """Hz."""
 NOISE: Final = 0.003
@@ -70,7 +65,7 @@ EFFECTS: Final = (
     "restitution_speed.slope=0.02",
     "tangential_restitution.e_t=0.25",
 )
-"""What acts although no compared model declares it, or declares another value."""
+"""Effects that act although no compared model declares them, or declares another value."""
 _SPLIT_STREAM: Final = 6
 """Keeps the draw of the split apart from other draws of the same seed."""
 
@@ -98,7 +93,7 @@ def synthetic_task(seed: int, tracks: int = TRACKS) -> Task:
     return Task(
         case=CASE,
         info=replace(dataset_info(config), name=CASE),
-        # the tracks end where a ball goes beside the table, so that its edges need not be told
+        # the tracks end where a ball falls beside the table, so that no model needs its edges
         surfaces=Surfaces.table_tennis(kind.surfaces.table_height),
         settings=gaussian_settings(NOISE, ProcessNoise(), LABEL_NOISE),
         launcher=Launcher.of_levels(kind.launcher.topspin_scale, kind.launcher.sidespin_scale, LABEL_NOISE),
@@ -117,7 +112,7 @@ def split(count: int, seed: int) -> tuple[list[int], list[int]]:
     return sorted(order[:fitted].tolist()), sorted(order[fitted:].tolist())
 
 
-def true_shot(made: SimulatedTrack, model: BallModel, surfaces: Surfaces) -> Shot:
+def true_shot(made: SimulatedTrack, model: BallModel, surfaces: Surfaces) -> TaskShot:
     """A simulated track up to its fourth bounce, with bounces and apexes of the true motion."""
     bounces = true_bounces(made.true_times, made.true_states, model, surfaces)
     keep = np.ones(len(made.track), dtype=bool)
@@ -126,7 +121,7 @@ def true_shot(made: SimulatedTrack, model: BallModel, surfaces: Surfaces) -> Sho
     times, states = made.true_times[keep], made.true_states[keep]
     track = replace(made.track, times=made.track.times[keep], positions=made.track.positions[keep])
     apexes, apex_times = true_apexes(times, states, bounces)
-    return Shot(
+    return TaskShot(
         track=track,
         reference=states[:, POSITION],
         observed=min(OBSERVED, len(track)),

@@ -1,1 +1,1 @@
-"""`ballfg-bench estimators`."""
+"""Implements `ballfg-bench estimators`."""

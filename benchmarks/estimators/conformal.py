@@ -1,4 +1,4 @@
-"""Coverage of conformal intervals on measured tracks: random halves calibrate, the other halves are predicted."""
+"""Computes the coverage of conformal intervals on measured tracks, by calibration on random halves."""
 
 from collections.abc import Sequence
 
@@ -6,8 +6,9 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.benchmarks.metrics import Figure, inside
-from ballfg.estimation import ConformalScales, TrackPrediction
+from ballfg.estimation import ConformalScales
 from ballfg.estimation.conformal import FEWEST, LEVEL
+from ballfg.estimation.track_prediction import TrackPrediction
 
 SPLITS = 200
 """Random splits. The mean of their coverages is then good to 0.3 %; that of a single split has a spread of 3 %."""

@@ -1,4 +1,4 @@
-"""The comparison on measured tracks, where no truth exists: predict what was measured later."""
+"""Compares estimators on measured tracks without known truth, by predictions of later samples."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,27 +13,20 @@ from ballfg.benchmarks.estimators.scoring import LEVELS, sums_and_counts
 from ballfg.benchmarks.metrics import Statistic, bootstrap, inside, pooled_mean, quantile, root_mean_square
 from ballfg.benchmarks.results import CURVE_MARK, Results
 from ballfg.dynamics import BallModel, nominal_model
-from ballfg.estimation import (
-    ESTIMATORS,
-    Estimate,
-    Status,
-    TrackPrediction,
-    dataset_settings,
-    dataset_surfaces,
-    estimate_tracks,
-    make_estimator,
-    predict_tracks,
-)
-from ballfg.estimation.segmentation import Quality
+from ballfg.estimation import Estimate, Status, dataset_settings, dataset_surfaces, predict_tracks
+from ballfg.estimation.batch import estimate_tracks
+from ballfg.estimation.registry import ESTIMATORS, make_estimator
+from ballfg.estimation.segmentation.result import Quality
+from ballfg.estimation.track_prediction import TrackPrediction
 from ballfg.progress import progress
 from ballfg.tracks import Dataset
 
 OBSERVE = 0.25
-"""s of each track that the estimators see."""
+"""s, observed part of each track."""
 HORIZON = 0.3
-"""s that are predicted after it."""
+"""s, predicted part after it."""
 END = 0.05
-"""s at the end of the horizon over which `prediction_end_error` is taken."""
+"""s, end of the horizon to which `prediction_end_error` applies."""
 CALIBRATION = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 """Nominal levels of the calibration curve."""
 QUARTILES = {"median": 0.5, "lower_quartile": 0.25, "upper_quartile": 0.75}
@@ -158,7 +151,7 @@ def _add_growth(add: Callable[..., None], predictions: Sequence[TrackPrediction]
 
 
 def _add_smoothing(results: Results, measured: Measured) -> None:
-    """How well the smoother explains whole tracks: whitened innovations, marked samples, hits, contacts.
+    """Measures of the smoother on whole tracks: whitened innovations, marked samples, hits, contacts.
 
     Samples next to a marked hit do not count.
     """

@@ -1,4 +1,4 @@
-"""Pictures of the comparison of estimators."""
+"""Draws the pictures of the comparison of estimators."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -10,7 +10,7 @@ import numpy as np
 from ballfg.benchmarks.estimators.measured import HORIZON, OBSERVE, Measured, prediction_rmse
 from ballfg.benchmarks.pictures import BLUE, GREY, ORANGE, curve, plain_ticks, save
 from ballfg.benchmarks.results import Row
-from ballfg.estimation import TrackPrediction
+from ballfg.estimation.track_prediction import TrackPrediction
 
 STYLES: dict[str, tuple[str, float, Any]] = {
     "sliding-window": (GREY, 2.0, "solid"),

@@ -1,4 +1,4 @@
-"""Tracks with known truth by the paper's protocol and by the fair one, and the estimators that are compared on them."""
+"""Makes tracks with known truth by the paper's and by the fair protocol, with the compared estimators."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,21 +10,16 @@ from numpy.typing import NDArray
 
 from ballfg.arrays import Array
 from ballfg.benchmarks.gaussian_settings import StepNoise, gaussian_settings
-from ballfg.dynamics import BallModel, Surfaces, contact_time, nominal_model, rollout
-from ballfg.estimation import (
-    ESTIMATORS,
-    Estimator,
-    ExtendedKalmanFilter,
-    Online,
-    Settings,
-    SlidingWindow,
-    Smoother,
-)
+from ballfg.dynamics import BallModel, Surfaces, nominal_model, rollout
+from ballfg.dynamics.motion.contact import contact_time
+from ballfg.estimation import Estimator, ExtendedKalmanFilter, Online, Settings, SlidingWindow, Smoother
+from ballfg.estimation.registry import ESTIMATORS
 from ballfg.factors.noise import ProcessNoise
 from ballfg.progress import progress
 from ballfg.simulation import MeasurementNoise, MotionNoise, SimulationConfig, simulate, table_tennis
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ
-from ballfg.tracks import SPIN_LABELS, Track
+from ballfg.tracks import Track
+from ballfg.tracks.track import SPIN_LABELS
 
 PAPER_SAMPLES = 80
 PAPER_RATE = 100.0
@@ -146,7 +141,7 @@ def _free_flights(model: BallModel, surfaces: Surfaces, count: int, rng: np.rand
 
 
 def fair_protocol(count: int, seed: int, name: str = "fair") -> Protocol:
-    """The launcher's tracks with their bounces; noise is what is declared, for everyone.
+    """The launcher's tracks with their bounces; all estimators know the true noise.
 
     The truth is disturbed with exactly the process noise of the settings; spin labels carry noise; nothing is an
     outlier and nothing hits the ball, so the loss is squared and no such event is looked for. At the newest sample the

@@ -1,4 +1,4 @@
-"""Errors of estimates against the truth, track by track, on all cores."""
+"""Computes errors of estimates against the truth, track by track, on all cores."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from ballfg.estimation.filters.sliding_window import WINDOW
 from ballfg.state import POSITION, SPIN, VELOCITY
 
 LEVELS = (0.5, 0.9)
-"""Of the intervals whose coverage is reported."""
+"""Levels of the intervals with a reported coverage."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class TrackScore:
         covered: (levels, n, 9) whether each component lies in the central interval of each of `LEVELS`.
         away: (n,) the sample is not at a bounce (`away_from_bounces`).
         newest: (k,) m/s, velocity error at the newest sample for each number of observations; NaN beyond the track.
-        ok: the estimation ended well.
+        ok: True if the estimate succeeded.
     """
 
     velocity: Array
@@ -95,11 +95,11 @@ def _newest(candidate: Candidate, case: Case, whole: Array, counts: Sequence[int
 
 
 Selection = Callable[[TrackScore], NDArray[np.bool_]]
-"""(n,) which samples count."""
+"""(n,) True for samples that count."""
 
 
 def judged(score: TrackScore) -> NDArray[np.bool_]:
-    """(n,) the samples that are judged: the sliding window is full, and no bounce is at them."""
+    """(n,) the judged samples: the sliding window is full, and no bounce is at them."""
     mask = score.away.copy()
     mask[: WINDOW - 1] = False
     return mask

@@ -1,4 +1,4 @@
-"""The suite of `ballfg-bench estimators`: synthetic tracks by two protocols, or a dataset of measured ones."""
+"""Runs `ballfg-bench estimators`: synthetic tracks by two protocols, or a dataset of measured ones."""
 
 import re
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from ballfg.tracks import Dataset
 
 @dataclass(frozen=True)
 class Size:
-    """How much is computed.
+    """The amount of computation.
 
     Attributes:
         compared: synthetic tracks in each protocol.

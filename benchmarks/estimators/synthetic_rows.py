@@ -1,4 +1,4 @@
-"""Rows of the comparison on synthetic tracks, and of the smoother's consistency."""
+"""Makes the rows of the comparison on synthetic tracks, and of the smoother's consistency."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,7 @@ SETTLED = 20
 BLOCKS = {"state": slice(0, STATE_DIM), "velocity": VELOCITY}
 """Components whose coverage is reported."""
 PLACES = {"first": 0.0, "quarter": 0.25, "middle": 0.5, "three_quarters": 0.75, "last": 1.0}
-"""Where on a track the consistency is tested, as a share of its samples."""
+"""Places of the consistency test on a track, as shares of its samples."""
 
 
 def run_protocol(results: Results, protocol: Protocol, jobs: int, counts: Sequence[int]) -> None:
@@ -27,7 +27,7 @@ def run_protocol(results: Results, protocol: Protocol, jobs: int, counts: Sequen
 
 
 def run_consistency(results: Results, protocol: Protocol, jobs: int) -> None:
-    """Smooth all tracks and add the rows that say whether the smoother's covariances are honest."""
+    """Smooths all tracks and adds the rows on the consistency of the smoother's covariances."""
     smoother = {"smoother": protocol.candidates["smoother"]}
     what = f"synthetic tracks estimated ({protocol.name})"
     add_consistency(results, protocol.name, score_tracks(smoother, protocol.tracks, (), jobs, what)["smoother"])

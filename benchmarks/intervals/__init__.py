@@ -1,1 +1,1 @@
-"""Do prediction intervals hold what they promise?"""
+"""Measures the coverage of prediction intervals."""

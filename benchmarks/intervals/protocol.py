@@ -1,8 +1,8 @@
-"""The protocol: 0.25 s of every judged track are seen, the next 0.3 s predicted; the noise comes from elsewhere.
+"""Predicts 0.3 s after the first 0.25 s of every judged track, with noise from elsewhere.
 
 Every second track is judged, then the others, so that a figure is of all tracks of a set. The noise "as usual" is the
-package's constants with the scatter of the samples. "From observed parts" it comes from what is seen of the judged
-tracks, "from other tracks" from whole tracks of the half that is not judged.
+package's constants with the scatter of the samples. "From observed parts" it comes from the observed parts of the
+judged tracks, "from other tracks" from whole tracks of the other half.
 """
 
 from collections.abc import Sequence
@@ -14,13 +14,14 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.dynamics import BallModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation import Settings, Smoother, Status, estimate_noise, predict_tracks, spread_over
+from ballfg.estimation import Settings, Smoother, Status, estimate_noise, predict_tracks
+from ballfg.estimation.noise.estimate import spread_over
 from ballfg.tracks import Track
 
 OBSERVED: Final = 0.25
-"""s of a judged track that are seen."""
+"""s, observed part of a judged track."""
 HORIZON: Final = 0.3
-"""s that are predicted."""
+"""s, predicted part."""
 USUAL: Final = "usual noise"
 OBSERVED_PARTS: Final = "noise from observed parts"
 OTHER_TRACKS: Final = "noise from other tracks"

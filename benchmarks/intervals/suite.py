@@ -1,4 +1,4 @@
-"""Coverage of 90 % intervals on measured datasets, and on simulated ones whose trackers have a memory and jitter."""
+"""Measures the coverage of 90 % intervals on measured datasets, and on simulated ones with memory and jitter."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -34,7 +34,7 @@ DIAGNOSED: Final = "model from diagnose"
 
 @dataclass(frozen=True)
 class Plan:
-    """How much is run: number of simulated settings, tracks in each, how often each planted tracker is diagnosed."""
+    """Amount of computation: simulated settings, tracks in each, diagnoses of each planted tracker."""
 
     settings: int
     tracks: int
@@ -67,7 +67,7 @@ def run_intervals(
 
     Args:
         first: how many tracks of a measured dataset are used, the first ones; None for all.
-        diagnosed: whether simulated tracks are predicted with the model that a diagnosis of others made.
+        diagnosed: True to predict simulated tracks with the model of a diagnosis of others.
     """
     if datasets:
         work = [(dataset, method) for dataset in datasets for method in METHODS]

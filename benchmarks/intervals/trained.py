@@ -1,4 +1,4 @@
-"""Networks elsewhere: each pair of measured datasets trains a residual MNN, which predicts all others.
+"""Tests networks in other rooms: each pair of measured datasets trains a residual MNN, which predicts all others.
 
 The noise is that of the observed parts of the judged tracks, as in `ballfg predict`; for comparison the nominal model,
 judged in the same way. Nothing of the judged datasets is used but these parts.
@@ -18,7 +18,7 @@ from ballfg.benchmarks.intervals.suite import LEVEL, known_surfaces
 from ballfg.benchmarks.metrics import inside
 from ballfg.benchmarks.results import Results
 from ballfg.dynamics import BallModel, load_model, nominal_model
-from ballfg.estimation import fitted_settings
+from ballfg.estimation.configure import fitted_settings
 from ballfg.learning import TrainConfig, run_training
 from ballfg.progress import progress
 from ballfg.tracks import Dataset, read_dataset
@@ -29,7 +29,7 @@ TRAINED: Final = "residual mnn+gs"
 
 @dataclass(frozen=True)
 class TrainedPlan:
-    """How much is trained: epochs, and pairs of datasets (None for all)."""
+    """Amount of training: epochs, and pairs of datasets (None for all)."""
 
     epochs: int
     pairs: int | None

@@ -1,1 +1,1 @@
-"""`ballfg-bench speed`."""
+"""Implements `ballfg-bench speed`."""

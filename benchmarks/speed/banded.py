@@ -1,4 +1,4 @@
-"""A control that is bound by Python's own speed: banded Gauss-Newton on the problem of one flight, in numpy and scipy.
+"""The control is a banded Gauss-Newton of one flight in numpy and scipy, bound by Python's own speed.
 
 The same 80 observations as everywhere in the speed benchmark, discretised more simply: each step is one explicit step
 of the acceleration, x_{k+1} = x_k + dt v_k + dt^2/2 a_k, v_{k+1} = v_k + dt a_k, up to 1 mm and 1 cm/s, and the spin is

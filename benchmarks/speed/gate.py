@@ -1,4 +1,4 @@
-"""Comparison of times with those of an earlier run, each as a multiple of the control that was timed beside it."""
+"""Compares times with those of an earlier run, each as a multiple of the control timed beside it."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,7 +23,7 @@ _ROWS: Final = TypeAdapter(list[Row])
 
 
 class SlowerError(Exception):
-    """Something takes longer than it did."""
+    """An action takes longer than it did."""
 
 
 def check_ratios(rows: Sequence[Row], baseline: Path) -> list[str]:

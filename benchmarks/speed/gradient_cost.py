@@ -1,4 +1,4 @@
-"""Cost of the gradient through an estimate next to the estimate: 80 observations, a network for the dynamics."""
+"""Measures the cost of the gradient through an estimate of 80 observations with a network for the dynamics."""
 
 from collections.abc import Mapping
 from functools import partial

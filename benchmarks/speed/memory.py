@@ -1,4 +1,4 @@
-"""Peak memory of `ballfg estimate` on some and on ten times as many tracks: `python -m ballfg.benchmarks.speed.memory`.
+"""Measures the peak memory of `ballfg estimate`, with `python -m ballfg.benchmarks.speed.memory`.
 
 Linux only: it reads each process's high-water mark (VmHWM) from /proc while the command runs.
 """

@@ -1,4 +1,4 @@
-"""A small network in place of the aerodynamics, fitted to the analytic model; it stands for learned models."""
+"""Fits a small network to the analytic model's aerodynamics, as a stand-in for learned models."""
 
 import math
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ SCALES = torch.tensor([SPEED_SCALE] * 3 + [SPIN_SCALE] * 3 + [SPEED_SCALE * SPIN
 GRAVITY = torch.tensor([0.0, 0.0, -STANDARD_GRAVITY], dtype=torch.float64)
 FIT_SAMPLES = 2000
 FIT_ITERATIONS = 600
-"""Of L-BFGS; the fit then is off by about a twentieth of the aerodynamic acceleration."""
+"""Iterations of L-BFGS; the fit then errs by about a twentieth of the aerodynamic acceleration."""
 
 
 class NetworkFlight(BallModel):
@@ -31,7 +31,7 @@ class NetworkFlight(BallModel):
     Bounces are another model's. Scales of inputs and output, and gravity, are folded into the first and the last layer.
 
     Args:
-        bounces: what a bounce does; its radius and inertia are taken too.
+        bounces: the model of bounces, with its radius and inertia.
         layers: linear layers from 9 scaled inputs to 3 scaled accelerations, tanh between them.
     """
 

@@ -1,4 +1,4 @@
-"""What a robot asks for while a ball flies: an estimate through bounces, a long stream, events ahead, many rollouts."""
+"""Times a robot's requests during a flight: an estimate through bounces, a stream, events ahead, many rollouts."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,9 +15,10 @@ from ballfg.dynamics import Architecture, BallModel, Surfaces, build, nominal_mo
 from ballfg.estimation import Online, Settings, Smoother
 from ballfg.estimation.settings import Solver
 from ballfg.prediction import next_contact, plane_crossing
-from ballfg.prediction.ahead import carried_by
+from ballfg.prediction.forecast import carried_by
 from ballfg.simulation import SimulationConfig, simulate
-from ballfg.tracks import SPIN_LABELS, Track
+from ballfg.tracks import Track
+from ballfg.tracks.track import SPIN_LABELS
 
 RADIUS: Final = 0.02
 """m."""
@@ -27,7 +28,7 @@ BOUNCING: Final = (0.0, 0.0, 0.3, 5.0, 0.5, -0.5, 0.0, 80.0, 20.0)
 LONG: Final = (20, 80, 320, 1280)
 """Observations of one flight."""
 DENSE: Final = 400.0
-"""Hz, at which they are taken, so that the longest flight stays below a sensible speed."""
+"""Hz, rate of these observations, so that the longest flight stays below a plausible speed."""
 STREAM_RATE: Final = 200.0
 """Hz."""
 STREAM_NOISE: Final = 0.003
@@ -35,7 +36,7 @@ STREAM_NOISE: Final = 0.003
 PAUSE: Final = 1.5
 """s between two flights of a stream."""
 STEPS: Final = 300
-"""Of 10 ms, in a rollout."""
+"""Number of steps of 10 ms in a rollout."""
 SLOWEST: Final = 3
 """Runs of what takes seconds."""
 

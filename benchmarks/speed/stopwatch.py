@@ -1,4 +1,4 @@
-"""Wall-clock times of warm, repeated runs, next to a control that shows the momentary speed of the machine."""
+"""Measures wall-clock times of warm, repeated runs, next to a control for the machine's present speed."""
 
 import gc
 import time
@@ -12,7 +12,7 @@ from ballfg.benchmarks.results import Results
 from ballfg.benchmarks.speed.banded import BandedProblem
 
 CONTROL_SIZE = 512
-"""Of the square float64 matrices whose product is the control."""
+"""Size of the square float64 matrices whose product is the control."""
 
 
 def milliseconds(action: Callable[[], object]) -> float:

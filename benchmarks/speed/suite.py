@@ -1,4 +1,4 @@
-"""The suite of `ballfg-bench speed`: times of an estimate, an update, a prediction and a Jacobian on one thread."""
+"""Runs `ballfg-bench speed`: times of an estimate, an update, a prediction and a Jacobian on one thread."""
 
 import copy
 from collections.abc import Mapping
@@ -18,18 +18,10 @@ from ballfg.benchmarks.speed.gradient_cost import time_gradients
 from ballfg.benchmarks.speed.network import FIT_ITERATIONS, fitted_network, parameter_count
 from ballfg.benchmarks.speed.robot import time_bounces, time_events, time_growth, time_rollouts, time_stream
 from ballfg.benchmarks.speed.stopwatch import Stopwatch, milliseconds
-from ballfg.dynamics import (
-    AnalyticModel,
-    Architecture,
-    BallModel,
-    Surfaces,
-    build,
-    fly_jacobian,
-    model_from_dict,
-    nominal_model,
-    rollout,
-)
+from ballfg.dynamics import AnalyticModel, Architecture, BallModel, Surfaces, build, nominal_model, rollout
 from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.dynamics.model_file import model_from_dict
+from ballfg.dynamics.motion.integrate import fly_jacobian
 from ballfg.estimation import Online, Settings, Smoother, dataset_settings, dataset_surfaces
 from ballfg.estimation.settings import Solver
 from ballfg.estimation.smoother.problem import Events
@@ -42,7 +34,8 @@ from ballfg.learning.end_to_end.pretrain import pretrain
 from ballfg.prediction import Belief, Propagator
 from ballfg.progress import progress
 from ballfg.state import POSITION
-from ballfg.tracks import SPIN_LABELS, Dataset, Track
+from ballfg.tracks import Dataset, Track
+from ballfg.tracks.track import SPIN_LABELS
 
 CASE = "speed"
 SAMPLES = 80
@@ -60,12 +53,12 @@ HORIZON = 0.3
 """s that are predicted, at `RATE`."""
 NO_SURFACE = Surfaces(-1e3)
 ONLINE: Final[Mapping[Solver, str]] = {"gtsam": "online_update", "ballfg": "online_chain_update"}
-"""What holds the window of the online estimator, and how its rows are called."""
+"""Solvers of the online estimator's window, and the names of their rows."""
 
 
 @dataclass(frozen=True)
 class Size:
-    """How much is computed.
+    """The amount of computation.
 
     Attributes:
         runs: timed runs of each action.  warm_up: runs before them.

@@ -70,16 +70,16 @@ def _lines(table: dict[str, Any]) -> list[list[str]]:
         of_method = [
             [(line.get("case", table.get("case")), name, metric) for metric in metrics] for name in table["columns"]
         ]
-        cells = (
-            " / ".join(_cell(rows[key], line.get("times", 1)) for key in keys if key in rows) for keys in of_method
-        )
+        cells = (" / ".join(_cell(rows[key], line) for key in keys if key in rows) for keys in of_method)
         lines.append([line["measure"], line.get("required", ""), *cells])
     return lines
 
 
-def _cell(row: dict[str, Any], times: float) -> str:
+def _cell(row: dict[str, Any], line: dict[str, Any]) -> str:
+    """A value, with its interval where the line has a requirement."""
+    times = line.get("times", 1)
     value, low, high = (None if row[name] is None else f"{times * row[name]:.3g}" for name in ("value", "low", "high"))
-    return f"{value} ({low} - {high})" if low is not None and high is not None else str(value)
+    return f"{value} ({low} - {high})" if low and high and line.get("required") else str(value)
 
 
 def _key(row: dict[str, Any]) -> tuple[str, ...]:

@@ -1,1 +1,1 @@
-"""The linear subproblem of a minimisation: a step, and the covariances at its end."""
+"""Solves the linear subproblem of a minimisation: the step, and the covariances at its end."""

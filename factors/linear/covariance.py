@@ -1,4 +1,4 @@
-"""Covariances of states and coefficients from the triangles that eliminations leave behind."""
+"""Computes covariances of states and coefficients from the triangles of eliminations."""
 
 from dataclasses import dataclass, replace
 
@@ -26,7 +26,7 @@ class Covariances:
     cross: Array
 
     def definite(self) -> "Covariances | None":
-        """These, safe from rounding; None where a track leaves something undetermined, to double precision."""
+        """The same, safe from rounding; None if a track leaves an unknown undetermined in double precision."""
         if not variances_positive(self.states).all() or not np.isfinite(self.cross).all():
             return None
         return replace(self, states=definite(self.states))
@@ -63,7 +63,7 @@ class NeighbourCovariances:
         return found
 
     def joint(self, left: Index, right: Index) -> Array:
-        """(m, d, e) covariances of some variables, each pair the same, neighbours, or with the coefficients.
+        """(m, d, e) covariances of pairs of variables: equal, neighbours, or with the coefficients.
 
         Args: left: (m,) variable numbers.  right: (m,).
         """

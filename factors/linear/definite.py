@@ -1,9 +1,9 @@
-"""Covariances that stay positive definite under rounding, whatever decades their numbers span.
+"""Keeps covariances positive definite under rounding, however many decades their numbers span.
 
-Everything here looks at correlations: positions of a micrometre beside velocities of 20 m/s and gaps of 100 s leave
+All functions use correlations: positions of a micrometre beside velocities of 20 m/s and gaps of 100 s leave
 eigenvalues that double precision cannot tell from zero, or from a little less. The remedy is shrinkage: correlations
-times 1 - a, standard deviations as they are, with the smallest a that makes the matrix positive definite. A covariance
-that is so already stays as it is.
+times 1 - a, standard deviations as they are, with the smallest a that makes the matrix positive definite. A positive
+definite covariance stays as it is.
 """
 
 import numpy as np
@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array
 
 MARGIN = 1e-13
-"""Smallest eigenvalue of a correlation matrix that is left as it is: further on, rounding decides on its sign."""
+"""Smallest eigenvalue of an unchanged correlation matrix: of smaller ones rounding decides the sign."""
 FIRST_SHRINKAGE = 1e-12
-"""By which correlations are shrunk first; then ten times as much, until it is enough."""
+"""First shrinkage of correlations; it grows tenfold until the matrix is positive definite."""
 
 
 def definite(covariance: Array) -> Array:
-    """Covariances (..., d, d), symmetric and positive definite; those that were are changed by rounding at most.
+    """Covariances (..., d, d), symmetric and positive definite; those that were already change by rounding at most.
 
     Args: covariance: (..., d, d) in the products of any units, with finite numbers and positive variances.
     """
@@ -30,7 +30,7 @@ def definite(covariance: Array) -> Array:
 
 
 def variances_positive(covariance: Array) -> NDArray[np.bool_]:
-    """(...) bool: whether a covariance (..., d, d) has finite numbers and positive variances."""
+    """(...) bool: True if a covariance (..., d, d) has finite numbers and positive variances."""
     finite = np.isfinite(covariance).all(axis=(-1, -2))
     with np.errstate(invalid="ignore"):
         return np.asarray(finite & (np.diagonal(covariance, axis1=-2, axis2=-1) > 0.0).all(axis=-1))
@@ -39,7 +39,7 @@ def variances_positive(covariance: Array) -> NDArray[np.bool_]:
 def raised(covariance: Array, least: Array) -> Array:
     """A covariance (d, d) that is positive definite, its standard deviations at least `least` (d,).
 
-    A difference of large numbers may leave a variance of zero or less; the least one is then all that can be said.
+    A difference of large numbers may leave a variance of zero or less; the least one replaces it.
     """
     variance = np.diagonal(covariance)
     low = ~(variance >= least**2)
@@ -59,7 +59,7 @@ def whitened(vectors: Array, covariance: Array) -> Array:
 
 
 def compatible(cross: Array, own: Array, shared: Array) -> Array:
-    """Covariances (n, d, p) between own variables and shared ones, shrunk until they contradict neither.
+    """Covariances (n, d, p) between own and shared variables, shrunk until compatible with the covariances of both.
 
     Args: cross: (n, d, p).  own: (n, d, d), positive definite.  shared: (p, p), positive definite.
     """

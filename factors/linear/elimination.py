@@ -19,10 +19,10 @@ from numba import types
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.flight import put_all
-from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, INDEX, NOTHING, ONE, REAL, THREE, TWO
+from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, NOTHING, ONE, REAL, THREE, TWO
 
 FOUR_AT_ONCE = 4
-"""Numbers that one instruction multiplies."""
+"""Number of values that one instruction multiplies."""
 BLOCK = 64
 """States that are reduced with one room for what they leave to each other, which so stays near the processor."""
 FADED = 1e-13
@@ -70,99 +70,11 @@ def padded(columns: int) -> int:
     return -(-columns // FOUR_AT_ONCE) * FOUR_AT_ONCE
 
 
-@machine_code(COUNT(COUNTS, INDEX, COUNT))
-def count_rows(counts: Index, variables: Index, dim: int) -> int:
-    """Add the rows of some factors to those of their first states.
-
-    Args: counts: (n + 1,) of each state; last those that look at coefficients alone.  variables: (m, a).  dim: rows of
-    each.
-    Returns: the number of a factor whose states are not neighbours, or -1.
-    """
-    n = len(counts) - 1
-    for factor in range(len(variables)):
-        first, last = n, -1
-        for k in range(variables.shape[1]):
-            state = variables[factor, k]
-            if state >= 0:
-                first, last = min(first, state), max(last, state)
-        if last > first + 1:
-            return factor
-        counts[first] += dim
-    return -1
-
-
-@machine_code(NOTHING(TWO, COUNTS, INDEX, TWO, COUNTS, COUNTS))
-def place_residuals(system: Array, free: Index, variables: Index, residual: Array, rows: Index, firsts: Index) -> None:
-    """Give the rows of some factors their places, and write the right side.
-
-    Args:
-        system: (r, k) rows of all factors, zeros to begin with; whitened, each column per unit of its number.
-        free: (n + 1,) the next free row of each state, moved on.
-        variables: (m, a).  residual: (m, d) whitened.
-        rows, firsts: (m,) written: the first row of each factor, and its first state.
-    """
-    n, end = len(free) - 1, system.shape[1] - 1
-    for factor in range(len(variables)):
-        first = n
-        for k in range(variables.shape[1]):
-            if 0 <= variables[factor, k] < first:
-                first = variables[factor, k]
-        rows[factor], firsts[factor] = free[first], first
-        free[first] += residual.shape[1]
-        for i in range(residual.shape[1]):
-            system[rows[factor] + i, end] = -residual[factor, i]
-
-
-@machine_code(NOTHING(TWO, COUNT, COUNT, COUNTS, COUNTS, INDEX, COUNT, THREE))
-def place_block(
-    system: Array, width: int, own: int, rows: Index, firsts: Index, variables: Index, which: int, block: Array
-) -> None:
-    """Write the Jacobians of some factors by one of their variables.
-
-    Args:
-        system, rows, firsts, variables: as for `place_residuals`; -1 are the coefficients, -2 is what waits behind the
-            first `own` of them.
-        width: w, numbers of a state.
-        which: number of the variable.  block: (m, d, w) or (m, d, p) whitened, per unit of the variable.
-    """
-    for factor in range(len(rows)):
-        state, row = variables[factor, which], rows[factor]
-        column = (state - firsts[factor]) * width if state >= 0 else 2 * width + (own if state < -1 else 0)
-        for i in range(block.shape[1]):
-            for j in range(block.shape[2]):
-                system[row + i, column + j] += block[factor, i, j]
-
-
-@machine_code(NOTHING(TWO, COUNTS, COUNTS, COUNT, REAL, TWO))
-def damp(system: Array, start: Index, free: Index, width: int, damping: float, diagonal: Array) -> None:
-    """Add a row for every unknown, which holds it back.
-
-    Args:
-        system, width, free: as above.  start: (n + 2,) the first row of each state, and the end.
-        damping: Marquardt's lambda, relative to the diagonal of J^T J.
-        diagonal: (n + 1, w + p) zeros; becomes that diagonal, the coefficients in the last row.
-    """
-    n, end = len(start) - 2, system.shape[1] - 1
-    for i in range(n + 1):
-        for row in range(start[i], free[i]):
-            for j in range(end):
-                if j < width and i < n:
-                    diagonal[i, j] += system[row, j] ** 2
-                elif width <= j < 2 * width and i + 1 < n:
-                    diagonal[i + 1, j - width] += system[row, j] ** 2
-                elif j >= 2 * width:
-                    diagonal[n, j - 2 * width] += system[row, j] ** 2
-    for i in range(n + 1):
-        for j in range(width if i < n else diagonal.shape[1] - width):
-            system[free[i], j if i < n else 2 * width + j] = math.sqrt(damping * diagonal[i, j])
-            free[i] += 1
-
-
 @machine_code(NOTHING(TWO, TWO, COUNT, COUNT, COUNT, COUNT, ONE))
 def absorb(upper: Array, system: Array, begin: int, end: int, first: int, count: int, column: Array) -> None:
-    """Reflect rows begin:end of the system into a triangle, until their columns first:first+count are zero.
+    """Reflects rows begin:end of the system into a triangle, until their columns first:first+count are zero.
 
-    Columns up to those are used up, nobody reads them again. Four columns at a time fill one register of a processor.
+    Columns before those are not read again. Four columns at a time fill one register of a processor.
 
     Args:
         upper: (count, all columns), triangular from column `first` on.
@@ -209,7 +121,7 @@ def absorb(upper: Array, system: Array, begin: int, end: int, first: int, count:
 
 @machine_code(NOTHING(TWO, TWO, COUNT))
 def copy_kept(target: Array, source: Array, kept: int) -> None:
-    """Copy the first columns of some rows, and the right side, which is last in both."""
+    """Copies the first columns of some rows, and the right side, which is last in both."""
     for i in range(target.shape[0]):
         for j in range(kept):
             target[i, j] = source[i, j]
@@ -218,13 +130,13 @@ def copy_kept(target: Array, source: Array, kept: int) -> None:
 
 @machine_code(NOTHING(TWO, COUNTS, COUNT, THREE, THREE, THREE))
 def eliminate_on(system: Array, start: Index, width: int, carries: Array, shared: Array, root: Array) -> None:
-    """Reduce the rows of a part of the chain, from a state on to the last, after what the states before have left.
+    """Reduces the rows of a part of the chain, from a state to the last, with the triangles of the earlier states.
 
     Args:
-        system: (r, k) as above; it is used up.  width: w.
+        system: (r, k) as above; overwritten.  width: w.
         start: (m + 1,) the first row of each of m states, and the end.
-        carries: (m + 1, w, k) triangle that the states before leave on the first one; those on the others are written.
-        shared: (m + 1, p, k) triangle of the coefficients before the first state; that after each state is written.
+        carries: (m + 1, w, k) triangle of the earlier states on the first one; those on the others are written.
+        shared: (m + 1, p, k) triangle of the coefficients before the first state; those after each state are written.
         root: (m, w, 2 w + p + 1), written: the rows of R of each state: by itself, by the next one, by the
             coefficients, the right side.
     """

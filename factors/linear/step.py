@@ -1,4 +1,4 @@
-"""The linear subproblem: the step that minimises the linearised objective, by QR, state by state along the track."""
+"""Solves the linear subproblem by QR, state by state along the track, for the step of a minimisation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ballfg.arrays import Array, Index
 from ballfg.factors.batch import Rows, Values
-from ballfg.factors.linear import elimination
+from ballfg.factors.linear import elimination, placement
 from ballfg.factors.linear.elimination import Root
 from ballfg.factors.linear.substitution import solution_of
 
@@ -30,8 +30,8 @@ class Step:
     Attributes:
         states: (n, 9 + b) m, m/s, rad/s, and m of biases: part of the step d that minimises |r + J d|^2 (+ damping).
         coefficients: (p,) in their own units, the other part of it.
-        root: the triangle that the elimination leaves.
-        decrease: half of |r|^2 - |r + J d|^2, by which the linear model promises to reduce the objective.
+        root: the triangle of the elimination.
+        decrease: half of |r|^2 - |r + J d|^2, the decrease of the objective predicted by the linear model.
     """
 
     states: Array
@@ -41,7 +41,7 @@ class Step:
 
     @classmethod
     def of(cls, root: Root, states: Array, coefficients: Array, damping: float, diagonal: Array) -> Step | None:
-        """The step R d = y with what it promises; None where it is not finite.
+        """The step R d = y with its predicted decrease; None if it is not finite.
 
         Args:
             root: R and y.
@@ -53,7 +53,7 @@ class Step:
         if not (np.isfinite(states).all() and np.isfinite(coefficients).all()):
             return None
         n, w, p = len(states), root.width, len(coefficients)
-        # |J d|^2 and what the damping rows add to it
+        # |J d|^2 and the share of the damping rows in it
         promised = float((root.states[..., -1] ** 2).sum() + (root.coefficients[:, -1] ** 2).sum())
         if damping:
             held = (diagonal[:n, :w] * states**2).sum() + (diagonal[n, :p] * coefficients**2).sum()
@@ -78,13 +78,13 @@ def weighted(rows: Rows) -> tuple[Array, tuple[Array, ...]]:
 
 
 def solve(linearized: Sequence[Rows], values: Values, damping: float = 0.0) -> Step | None:
-    """Minimise the linearised, reweighted objective.
+    """Minimises the linearised, reweighted objective.
 
     Args:
         linearized: all batches of a graph at `values`.
         values: the point; its shapes give the variables.
         damping: Marquardt's lambda, relative to the diagonal of J^T J.
-    Returns: None where the system is singular or its solution is not finite.
+    Returns: None if the system is singular or its solution is not finite.
     Raises: ValueError: if a factor links states that are not neighbours.
     """
     system, start, diagonal = damped_rows(linearized, values, damping)
@@ -110,7 +110,7 @@ def damped_rows(
     system, start, free = _system(pieces, n, p - held, p, w, further=damping > 0.0)
     diagonal = np.zeros((n + 1, w + p))
     if damping:
-        elimination.damp(system, start, free, w, damping, diagonal)
+        placement.damp(system, start, free, w, damping, diagonal)
     return system, start, diagonal
 
 
@@ -123,7 +123,7 @@ def _system(
     """
     counts = np.zeros(n + 1, dtype=np.int64)
     for variables, residual, _ in pieces:
-        wrong = elimination.count_rows(counts, _plain(variables), residual.shape[1])
+        wrong = placement.count_rows(counts, _plain(variables), residual.shape[1])
         if wrong >= 0:
             linked = sorted({int(v) for v in variables[wrong] if v >= 0})
             raise ValueError(
@@ -136,12 +136,12 @@ def _system(
     free, system = start[:-1].copy(), np.zeros((start[-1], elimination.padded(2 * width + p + 1)))
     for variables, residual, jacobians in pieces:
         rows, firsts = np.empty(len(variables), dtype=np.int64), np.empty(len(variables), dtype=np.int64)
-        elimination.place_residuals(system, free, _plain(variables), _plain(residual), rows, firsts)
+        placement.place_residuals(system, free, _plain(variables), _plain(residual), rows, firsts)
         for which, block in enumerate(jacobians):
-            elimination.place_block(system, width, own, rows, firsts, _plain(variables), which, _plain(block))
+            placement.place_block(system, width, own, rows, firsts, _plain(variables), which, _plain(block))
     return system, start, free
 
 
 def _plain(array: NDArray[N]) -> NDArray[N]:
-    """An array as machine code takes it: its rows one behind another, and open for writing."""
+    """An array for machine code: contiguous and writable."""
     return array if array.flags.c_contiguous and array.flags.writeable else np.array(array, order="C")

@@ -1,4 +1,4 @@
-"""What the triangle R of a chain of states tells: steps, by substitution, and covariances, in machine code."""
+"""Computes steps and covariances from the triangle R of a chain of states, in machine code."""
 
 import numpy as np
 
@@ -84,7 +84,7 @@ def invert(upper: Array, inverse: Array) -> None:
 
 @machine_code(NOTHING(TWO, COUNT, REAL, TWO))
 def _part(rows: Array, first: int, scale: float, part: Array) -> None:
-    """Copy columns from the first on, scaled, into an array of their own."""
+    """Copies columns from the first on, scaled, into an array of their own."""
     for a in range(part.shape[0]):
         for b in range(part.shape[1]):
             part[a, b] = scale * rows[a, first + b]

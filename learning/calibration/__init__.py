@@ -1,1 +1,1 @@
-"""Calibration of a model's coefficients on a population of tracks."""
+"""Calibrates a model's coefficients on a population of tracks."""

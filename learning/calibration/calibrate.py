@@ -1,4 +1,4 @@
-"""Calibration: the coefficients of a population of tracks, judged by the prediction of other tracks.
+"""Calibrates coefficients on a population of tracks, judged by the prediction of other tracks.
 
 Each step estimates the fitted tracks with the smoother, removes the priors from their posteriors of the coefficients,
 finds the population's mean and spread, and puts the mean into the model. It ends when the mean no longer moves.
@@ -15,19 +15,9 @@ from pydantic import BaseModel, ConfigDict
 from ballfg.arrays import Array
 from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation import (
-    Estimate,
-    NoiseEstimate,
-    Settings,
-    Smoother,
-    Status,
-    dataset_settings,
-    dataset_surfaces,
-    estimate_noise,
-    estimate_tracks,
-    spread_over,
-)
-from ballfg.estimation.batch import map_tracks
+from ballfg.estimation import Estimate, Settings, Smoother, Status, dataset_settings, dataset_surfaces, estimate_noise
+from ballfg.estimation.batch import estimate_tracks, map_tracks
+from ballfg.estimation.noise.estimate import NoiseEstimate, spread_over
 from ballfg.learning.calibration.coefficients import Chosen, choose, with_values
 from ballfg.learning.calibration.population import Evidence, evidence, fit_population
 from ballfg.learning.config.calibration import CalibrationConfig
@@ -121,12 +111,12 @@ def calibrate(problem: Problem, done: Iterable[Step] = (), *, watch: Watch = unw
 
 
 def has_converged(config: CalibrationConfig, step: Step) -> bool:
-    """Whether the mean has stopped moving."""
+    """True if the mean has stopped moving."""
     return step.moved is not None and step.moved <= config.tolerance
 
 
 def has_ended(config: CalibrationConfig, step: Step) -> bool:
-    """Whether a step is the last one."""
+    """True if a step is the last one."""
     return has_converged(config, step) or step.number >= config.max_iterations
 
 
@@ -152,7 +142,7 @@ def population_settings(problem: Problem, step: Step) -> Settings:
 def fitted_noise(
     problem: Problem, model: AnalyticModel, settings: Settings, watch: Watch = unwatched
 ) -> NoiseEstimate | None:
-    """The noise that the fitted tracks show about the calibrated model; None where it cannot be told.
+    """The noise of the fitted tracks about the calibrated model; None if undetermined.
 
     Args: model: with the calibrated coefficients.  settings: with the population as the prior of each coefficient.
     """

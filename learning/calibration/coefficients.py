@@ -1,4 +1,4 @@
-"""The coefficients that are calibrated: looked up in the model, checked against the data, put back into a model."""
+"""Looks up the calibrated coefficients in the model, checks them against the data, and puts them back."""
 
 import copy
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ class Chosen:
 
     @property
     def needs_spin(self) -> bool:
-        """Whether only tracks with a spin label are informative."""
+        """True if only tracks with a spin label are informative."""
         return any(name in NEED_SPIN_LABELS for name in self.names)
 
 

@@ -1,4 +1,4 @@
-"""The picture of a calibration: each track's coefficients, the population, and the errors before and after."""
+"""Draws a calibration: each track's coefficients, the population, and the errors before and after."""
 
 from pathlib import Path
 

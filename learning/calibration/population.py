@@ -1,4 +1,4 @@
-"""Empirical Bayes over tracks: the mean of a population of coefficients and its spread from track to track.
+"""Estimates the mean and spread of coefficients over a population of tracks by empirical Bayes.
 
 Track i has a Gaussian likelihood of its own coefficients b_i, with the information L_i and the vector h_i = L_i y_i;
 the information is zero in directions that the track does not observe. The tracks are draws b_i ~ N(theta, D) with a
@@ -18,7 +18,7 @@ from scipy.optimize import lsq_linear
 from ballfg.arrays import Array
 
 MAX_STEPS = 20_000
-"""Of the iteration: some tens are usual, thousands where the spread is close to zero. A step takes 50 us."""
+"""Largest number of iterations: some tens are usual, thousands for a spread close to zero. A step takes 50 us."""
 STEP_TOLERANCE = 1e-11
 """Relative change of every variance at which the iteration ends."""
 NO_SPREAD = 1e-10

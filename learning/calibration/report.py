@@ -1,4 +1,4 @@
-"""The result of a calibration as `report.json` and as text: coefficients and errors before and after."""
+"""Reports a calibration as `report.json` and as text: coefficients and errors before and after."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ballfg.estimation import NoiseEstimate
+from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.learning.calibration.calibrate import Problem, Step, has_converged
 from ballfg.learning.evaluation import Summary, TrackScore, summary
 
@@ -16,7 +16,7 @@ NEW_INFORMATION = 0.05
 
 @dataclass(frozen=True)
 class Comparison:
-    """Scores of the judging tracks before and after, of those that could be judged each time.
+    """Scores of those judging tracks that could be judged both before and after.
 
     Attributes:
         with_spread: with the calibrated model, each track's prior as wide as the population.

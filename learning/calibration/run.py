@@ -1,4 +1,4 @@
-"""A calibration from config to results: `ballfg-train` with the kind `calibrate`, and its checkpoint."""
+"""Runs a calibration from config to results, for `ballfg-train` with the kind `calibrate`."""
 
 import sys
 import time
@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from ballfg.dynamics import model_to_dict, save_model
+from ballfg.dynamics import save_model
+from ballfg.dynamics.model_file import model_to_dict
 from ballfg.files.damaged import whole_content
 from ballfg.learning.calibration.calibrate import (
     Problem,
@@ -145,7 +146,7 @@ def read_checkpoint(folder: Path, problem: Problem) -> list[Step]:
 
 
 def _follow(steps: Sequence[Step], problem: Problem) -> bool:
-    """Whether steps could be those of a problem: numbered from 0, with its coefficients and its tracks."""
+    """True if steps fit a problem: numbered from 0, with its coefficients and its tracks."""
     size, tracks, judged = len(problem.chosen.names), set(problem.split.fit), len(problem.split.judge)
     for number, step in enumerate(steps):
         rows = [step.mean]

@@ -1,1 +1,1 @@
-"""The configs of a training and of a calibration, and their file."""
+"""Defines the configs of a training and of a calibration, and reads their file."""

@@ -1,4 +1,4 @@
-"""The config of a calibration; each field with its meaning."""
+"""Defines the config of a calibration; each field has its meaning below it."""
 
 from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal

@@ -1,4 +1,4 @@
-"""The config file of `ballfg-train`: YAML with `key=value` overrides, checked before anything starts."""
+"""Reads the config file of `ballfg-train`, YAML with `key=value` overrides, and checks it."""
 
 import json
 from collections.abc import Iterable, Mapping

@@ -1,4 +1,4 @@
-"""The config of a training; each field with its meaning."""
+"""Defines the config of a training; each field has its meaning below it."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -290,7 +290,7 @@ class TrainConfig(Section):
 
     @property
     def augmented(self) -> bool:
-        """Whether training tracks are rotated and shifted."""
+        """True if training tracks are rotated and shifted."""
         return TRAINEES[self.kind].augmented if self.augment is None else self.augment
 
     @model_validator(mode="after")

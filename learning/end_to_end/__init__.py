@@ -1,1 +1,1 @@
-"""Learning through the estimator."""
+"""Trains models through the estimator."""

@@ -1,7 +1,8 @@
-"""From a config to a model of the dynamics that is trained through the estimator."""
+"""Builds a model of the dynamics from a config, for training through the estimator."""
 
 import copy
 from collections.abc import Mapping
+from typing import ClassVar
 
 from ballfg.dynamics import AnalyticModel, BallModel
 from ballfg.dynamics.networks.architecture import Architecture
@@ -12,7 +13,7 @@ from ballfg.learning.end_to_end.first_spins import begin_with_tracks
 from ballfg.learning.end_to_end.learnables import Learnables, NoiseScales
 from ballfg.learning.end_to_end.pretrain import Anchor, pretrain
 from ballfg.learning.gradient.implicit import GaussNewtonGradient, GradientMethod, ImplicitGradient, UnrolledGradient
-from ballfg.learning.registry import NETWORKS
+from ballfg.learning.registry import NETWORKS, TraineeKind
 from ballfg.learning.trainee import Prepared
 from ballfg.learning.training_data import read_training_data
 from ballfg.progress import doing
@@ -68,3 +69,47 @@ def _model(config: TrainConfig, analytic: AnalyticModel) -> BallModel:
             left = pretrain(model, analytic, config.seed, config.architecture.pretrain)
         print(f"networks fitted to the analytic model: {left:.2g} m/s^2, 0.1 m/s, 10 rad/s left", flush=True)
     return model
+
+
+class Network(TraineeKind):
+    """A network for the dynamics, trained through the estimator."""
+
+    unused: ClassVar[tuple[str, ...]] = ("options",)
+
+    @classmethod
+    def build(cls, config: TrainConfig) -> Prepared:
+        """The model with its data, ready to train."""
+        return build_end_to_end(config)
+
+
+class ATune(Network):
+    """The coefficients of the analytic model."""
+
+    name = "a-tune"
+    unused = ("architecture", "options")
+    augmented = True
+
+
+class Mlp(Network):
+    """A network on raw states, which learns the symmetry of the room from rotated and shifted tracks."""
+
+    name = "mlp"
+    augmented = True
+
+
+class MlpGramSchmidt(Network):
+    """A network on Gram-Schmidt features, which do not change with a rotation or a shift."""
+
+    name = "mlp+gs"
+
+
+class SkipGramSchmidt(Network):
+    """The same with skip connections."""
+
+    name = "skip+gs"
+
+
+class MnnGramSchmidt(Network):
+    """The same with multiplications of hidden states."""
+
+    name = "mnn+gs"

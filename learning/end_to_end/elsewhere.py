@@ -1,4 +1,4 @@
-"""What a residual network has to know to be used in other rooms: where it was trained, and the noise there."""
+"""Prepares a residual network for other rooms: the extent of its training data, and the noise there."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -18,9 +18,9 @@ from ballfg.dynamics.networks.learned import BASE, LearnedModel
 from ballfg.estimation import Smoother, estimate_noise, predict_tracks
 from ballfg.estimation.noise.parameters import with_noise
 from ballfg.learning.end_to_end.solving import Solved
-from ballfg.learning.shots import Shot
+from ballfg.learning.shots import TrainingShot
 from ballfg.state import STATE_DIM
-from ballfg.tracks import TrackNoise
+from ballfg.tracks.noise import TrackNoise
 
 ROOM_TRACKS: Final = 12
 """Tracks of each room that tell its noise, in a few seconds."""
@@ -29,7 +29,7 @@ HORIZON: Final = 0.3
 AVERAGED: Final = ("contact_velocity", "contact_tangential", "contact_spin")
 
 
-def training_states(model: BallModel, shots: Sequence[Shot], solved: Sequence[Solved]) -> list[Tensor]:
+def training_states(model: BallModel, shots: Sequence[TrainingShot], solved: Sequence[Solved]) -> list[Tensor]:
     """(n, 9) states at the stamps of each shot, from the estimate of its observed part."""
     found = []
     with torch.no_grad():
@@ -43,7 +43,7 @@ def training_states(model: BallModel, shots: Sequence[Shot], solved: Sequence[So
 
 
 def fading_of(model: LearnedModel, tracks: Sequence[Tensor]) -> Fading:
-    """How the correction of a trained model fades, from the states (n, 9) of each training track."""
+    """The fading of a trained model's correction, from the states (n, 9) of each training track."""
     contacts = [states_before_contacts(states) for states in tracks]
     fading = Fading.of(tracks, contacts, model.radius)
     flying, bouncing = torch.cat(list(tracks)), torch.cat(contacts)
@@ -54,10 +54,10 @@ def fading_of(model: LearnedModel, tracks: Sequence[Tensor]) -> Fading:
     return fading
 
 
-def noise_elsewhere(base: BallModel, shots: Sequence[Shot]) -> TrackNoise | None:
+def noise_elsewhere(base: BallModel, shots: Sequence[TrainingShot]) -> TrackNoise | None:
     """The noise of motion, bounces and spins that whole tracks of the training rooms show about the analytic model.
 
-    Acceleration is the least of the rooms: tracks with hits that nobody found show more. Others are means.
+    Acceleration is the least of the rooms: undetected hits raise it. Others are means.
 
     Returns: its coefficients as the learned model names them; None where no track is long enough.
     """
@@ -81,7 +81,7 @@ def noise_elsewhere(base: BallModel, shots: Sequence[Shot]) -> TrackNoise | None
     )
 
 
-def strength_abroad(model: LearnedModel, noise: TrackNoise, shots: Sequence[Shot]) -> float:
+def strength_abroad(model: LearnedModel, noise: TrackNoise, shots: Sequence[TrainingShot]) -> float:
     """Share of the correction to use in other rooms: `ABROAD` if it helps in every room that trained, else 0.
 
     Abroad the coefficients of the base are estimated with each track, which already takes in much of what a correction
@@ -101,7 +101,7 @@ def strength_abroad(model: LearnedModel, noise: TrackNoise, shots: Sequence[Shot
     return ABROAD
 
 
-def by_room(shots: Sequence[Shot]) -> list[list[Shot]]:
+def by_room(shots: Sequence[TrainingShot]) -> list[list[TrainingShot]]:
     """At most `ROOM_TRACKS` shots of each room, spread over it."""
     rooms = defaultdict(list)
     for shot in shots:
@@ -112,7 +112,7 @@ def by_room(shots: Sequence[Shot]) -> list[list[Shot]]:
     ]
 
 
-def _log_errors(smoother: Smoother, shots: Sequence[Shot]) -> Array:
+def _log_errors(smoother: Smoother, shots: Sequence[TrainingShot]) -> Array:
     """(n,) logarithms of the root mean square errors over the next 0.3 s; NaN where there is nothing to predict."""
     seconds = {shot.name: float(shot.track.times[shot.observed - 1] - shot.track.times[0]) for shot in shots}
     results = predict_tracks(

@@ -1,4 +1,4 @@
-"""Learning through the estimator: observations, states, rollout, error, and the gradient all the way back.
+"""Trains through the estimator: observations, states, rollout, error, and the gradient all the way back.
 
 The estimate is a function of the model, the launcher's embedding and the noise. Its derivative follows from the
 implicit function theorem (`ballfg.learning.gradient.implicit`). Source: Q. Xiao, Z. Wu, M. Gombolay 2024, section III.
@@ -35,10 +35,10 @@ from ballfg.learning.gradient.implicit import GradientMethod, ImplicitGradient, 
 from ballfg.learning.gradient.likelihood import negative_log_likelihood
 from ballfg.learning.gradient.objective import BatchObjective
 from ballfg.learning.run.run_folder import MODEL
-from ballfg.learning.shots import Shot
+from ballfg.learning.shots import TrainingShot
 from ballfg.learning.trainee import BatchLoss, Learned, PredictedShot, Trainee
 from ballfg.state import POSITION, STATE_DIM
-from ballfg.tracks import TrackNoise
+from ballfg.tracks.noise import TrackNoise
 
 LOSS_UNIT: Final = 0.01
 """m. Squared errors are divided by its square, so that losses are of order one."""
@@ -64,7 +64,7 @@ EMBEDDING_STEP: Final = 3.0
 
 
 @dataclass(frozen=True)
-class Prediction:
+class ShotPrediction:
     """Predicted less measured positions of some tracks (t, k, 3) m, and the points that count (t, k); else zero."""
 
     error: Tensor
@@ -81,7 +81,7 @@ class EndToEnd(Trainee):
     Args:
         shots: all of them; batches are numbers of shots.
         method: of the gradient through the estimate; by default `ImplicitGradient`.
-        augment: whether shots are rotated and shifted in training.
+        augment: True to rotate and shift shots in training.
         optimizer: solves the estimates, with its tolerance.
         linear_solver: for the Hessians of a batch.
         anchor: distance of the model from the analytic one; None if it is not part of the loss.
@@ -92,7 +92,7 @@ class EndToEnd(Trainee):
 
     def __init__(
         self,
-        shots: Sequence[Shot],
+        shots: Sequence[TrainingShot],
         learnables: Learnables,
         loss: LossConfig,
         *,
@@ -198,7 +198,7 @@ class EndToEnd(Trainee):
             good = prediction.finite()
             names = [self.shots[s.number].name for s, ok in zip(solved, good.tolist(), strict=True) if not ok]
             failed += [(name, "the predicted track is not finite") for name in names]
-            prediction = Prediction(prediction.error[good], prediction.counts[good])
+            prediction = ShotPrediction(prediction.error[good], prediction.counts[good])
             return _batch_loss(self._outer(prediction).sum(), prediction, failed)
 
     def shown(self, track: int) -> PredictedShot | None:
@@ -243,7 +243,7 @@ class EndToEnd(Trainee):
         found["spin noise"] = (spin * noise.spin_scale(), "rad/s", words)
         return found
 
-    def predict(self, solved: Sequence[Solved], first: Tensor, epoch: int | None) -> Prediction:
+    def predict(self, solved: Sequence[Solved], first: Tensor, epoch: int | None) -> ShotPrediction:
         """Rollouts over the whole tracks from their first states.
 
         Args: solved: t estimates.  first: (t, 9) SI units.  epoch: of the horizon; None: the full horizon.
@@ -259,9 +259,9 @@ class EndToEnd(Trainee):
             rows = torch.tensor(members)
             difference = self._roll([solved[k] for k in members], first[rows], counts[rows], surfaces)
             error = error.index_put((rows[:, None], torch.arange(difference.shape[1])), difference)
-        return Prediction(error, counts)
+        return ShotPrediction(error, counts)
 
-    def _counted(self, shot: Shot, epoch: int | None) -> Tensor:
+    def _counted(self, shot: TrainingShot, epoch: int | None) -> Tensor:
         """(n,) bool: the usable samples up to the horizon."""
         times = shot.track.times
         left = float(times[-1] - times[shot.observed - 1])
@@ -281,7 +281,7 @@ class EndToEnd(Trainee):
         states = paths(self.learnables.model, first, torch.minimum(times, end), surfaces)
         return torch.where(counts[:, :needed, None], states[..., POSITION] - measured, 0.0)
 
-    def _outer(self, prediction: Prediction) -> Tensor:
+    def _outer(self, prediction: ShotPrediction) -> Tensor:
         """(t,) mean loss over the points of each track."""
         square = (prediction.error / LOSS_UNIT).square().sum(-1)
         return self.point_loss.of_square(square).sum(-1) / prediction.counts.sum(-1)
@@ -336,6 +336,6 @@ class EndToEnd(Trainee):
         return folder / MODEL
 
 
-def _batch_loss(total: Tensor, prediction: Prediction, failed: Sequence[tuple[str, str]]) -> BatchLoss:
+def _batch_loss(total: Tensor, prediction: ShotPrediction, failed: Sequence[tuple[str, str]]) -> BatchLoss:
     squared = float(prediction.error.detach().square().sum())
     return BatchLoss(total, len(prediction.error), squared, int(prediction.counts.sum()), tuple(failed))

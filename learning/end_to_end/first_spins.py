@@ -1,4 +1,4 @@
-"""First values of the spins that launcher settings mean, from the analytic model's estimates of the training tracks.
+"""Initialises the spins of launcher settings from the analytic model's estimates of the training tracks.
 
 Without spin labels only the flight shows the spin. From no spin, learning needs many epochs to reach 150 rad/s, and a
 group of shots may end with the wrong sign. The spin with which an analytic model explains a whole track is right
@@ -16,7 +16,7 @@ from ballfg.arrays import Array
 from ballfg.dynamics.analytic import AnalyticModel, coefficient_sigmas
 from ballfg.dynamics.networks.spin_embedding import SPIN_UNIT, SpinEmbedding
 from ballfg.estimation import Smoother, Status
-from ballfg.learning.shots import Shot
+from ballfg.learning.shots import TrainingShot
 from ballfg.state import SPIN, VELOCITY
 
 SPIN_PRIOR: Final = 150.0
@@ -25,7 +25,7 @@ LEAST_SPEED: Final = 0.5
 """m/s of horizontal motion below which a launch has no forward direction."""
 
 
-def begin_with_tracks(embedding: SpinEmbedding, shots: Iterable[Shot], model: AnalyticModel) -> None:
+def begin_with_tracks(embedding: SpinEmbedding, shots: Iterable[TrainingShot], model: AnalyticModel) -> None:
     """Set an embedding to the spins that a model finds in whole tracks, by least squares over their settings.
 
     Shots with a spin label, or without all settings, are skipped; where none is left the embedding stays as it is.
@@ -44,7 +44,7 @@ def begin_with_tracks(embedding: SpinEmbedding, shots: Iterable[Shot], model: An
             embedding.weight.copy_(torch.from_numpy(weight))
 
 
-def _spin(shot: Shot, model: AnalyticModel) -> Array | None:
+def _spin(shot: TrainingShot, model: AnalyticModel) -> Array | None:
     """(3,) rad/s about forward, across and up at the first sample; None for a failed estimate or a slow launch."""
     wide = replace(shot.settings, launcher=None, coefficients=coefficient_sigmas(model), spin_prior=SPIN_PRIOR)
     estimate = Smoother(model, shot.surfaces, wide).estimate(shot.track)

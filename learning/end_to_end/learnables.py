@@ -1,4 +1,4 @@
-"""The learnable parameters of an estimator: the ball's model, the meaning of launcher settings, the noise."""
+"""Holds the learnable parameters of an estimator: the ball's model, the launcher's embedding, the noise."""
 
 from collections.abc import Sequence
 from dataclasses import replace

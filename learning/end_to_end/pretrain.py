@@ -1,4 +1,4 @@
-"""The distance of a model from the analytic one, on random flights and bounces: to start from, and to stay close to.
+"""Measures the distance of a model from the analytic one on random states, for pretraining and as a loss.
 
 An untrained network makes the estimate ill-posed, and spin without an effect on the flight cannot be learned from
 positions. Training therefore starts from physics that is roughly right, and tracks correct it. A few dozen shots say

@@ -1,4 +1,4 @@
-"""Estimates of many shots together, each starting from where it ended the last time."""
+"""Estimates many shots together, each starting from its last estimate."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -10,16 +10,17 @@ from torch import Tensor
 from ballfg.arrays import Array
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import Smoother
-from ballfg.estimation.segmentation import Contact
+from ballfg.estimation.segmentation.result import Contact
 from ballfg.estimation.smoother.problem import effective_sigmas
 from ballfg.estimation.smoother.settle import Earlier, Solution
 from ballfg.factors.batch import Values
 from ballfg.factors.graph import Convergence, LevenbergMarquardt
 from ballfg.learning.augment import apply, rotate, undo
 from ballfg.learning.end_to_end.learnables import Learnables
-from ballfg.learning.shots import Shot
+from ballfg.learning.shots import TrainingShot
 from ballfg.state import POSITION, SPIN, VELOCITY
-from ballfg.tracks import SPIN_LABELS, Track
+from ballfg.tracks import Track
+from ballfg.tracks.track import SPIN_LABELS
 
 TRAINING = LevenbergMarquardt(tolerance=1e-4)
 """Posterior standard deviations to the minimum: the gradient is off by as little, far less than batches scatter."""
@@ -28,17 +29,17 @@ ACCEPTED = (Convergence.CONVERGED, Convergence.AT_KINK)
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a shot is seen from: turned about z by `angle` rad (), then shifted by `shift` m (2,)."""
+    """The frame of a shot: turned about z by `angle` rad (), then shifted by `shift` m (2,)."""
 
     angle: Tensor
     shift: Tensor
 
     def positions(self, positions: Array) -> Array:
-        """(n, 3) m as seen from there."""
+        """(n, 3) m in that frame."""
         return apply(torch.from_numpy(positions), self.angle, self.shift).numpy()
 
     def track(self, track: Track) -> Track:
-        """A track as seen from there, its spin label too."""
+        """A track in that frame, including its spin label."""
         labels = track.labels
         if track.spin_label is not None:
             spin = rotate(torch.from_numpy(track.spin_label), self.angle)
@@ -49,7 +50,7 @@ class Pose:
         return replace(track, positions=self.positions(track.positions), labels=labels, observations=turned)
 
     def states(self, states: Array, *, back: bool = False) -> Array:
-        """(n, 9) as seen from there; or, from there, as they were."""
+        """(n, 9) in that frame; with `back`, from that frame to the original one."""
         given, angle = torch.from_numpy(states), -self.angle if back else self.angle
         moved = (undo if back else apply)(given[:, POSITION], self.angle, self.shift)
         return torch.cat((moved, rotate(given[:, VELOCITY], angle), rotate(given[:, SPIN], angle)), dim=-1).numpy()
@@ -87,7 +88,7 @@ class WarmStarts:
         self._last[number] = (states, values.coefficients, solution.events.contacts)
 
     def forget(self, number: int) -> None:
-        """Start anew the next time."""
+        """Forgets the last estimate of a shot."""
         self._last.pop(number, None)
 
     def tensors(self) -> dict[str, Tensor]:
@@ -101,7 +102,7 @@ class WarmStarts:
         return found
 
     def take(self, tensors: Mapping[str, Tensor]) -> None:
-        """What `tensors` gave."""
+        """Restores the values of `tensors`."""
         for name in tensors:
             number, _, part = name.partition(".")
             if part == "states":
@@ -113,15 +114,15 @@ class WarmStarts:
 
 @dataclass
 class BatchSolver:
-    """Solves shots, given by number, with the parameters as they are."""
+    """Solves shots, given by number, with the present parameters."""
 
-    shots: Sequence[Shot]
+    shots: Sequence[TrainingShot]
     learnables: Learnables
     optimizer: LevenbergMarquardt = TRAINING
     warm: WarmStarts = field(default_factory=WarmStarts)
 
     def __call__(self, numbers: Sequence[int], poses: Mapping[int, Pose]) -> tuple[list[Solved], list[tuple[str, str]]]:
-        """Estimates of some shots; name and reason of those that did not converge.
+        """Estimates of some shots; name and reason of each failure to converge.
 
         Args: numbers: of the shots.  poses: for those that are not seen as measured.
         """
@@ -145,7 +146,7 @@ class BatchSolver:
         shot = self.shots[number]
         key = id(shot.settings), shot.surfaces, pose is not None
         if key not in smoothers:
-            # hits were looked for once, in the shots: what a model in training cannot explain yet is no hit
+            # hits were searched once, in the shots: an unexplained motion of a model in training is no hit
             settings = replace(self.learnables.noise.settings(shot.settings), find_events=False)
             if pose is not None:
                 x, y, z = settings.memory

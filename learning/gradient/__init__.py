@@ -1,1 +1,1 @@
-"""The gradient through a converged estimate."""
+"""Computes the gradient through a converged estimate."""

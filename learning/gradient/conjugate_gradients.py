@@ -1,4 +1,4 @@
-"""Solving with the exact Hessian: conjugate gradients, preconditioned with the Gauss-Newton triangle.
+"""Solves with the exact Hessian by conjugate gradients, preconditioned with the Gauss-Newton triangle.
 
 The Hessian of a batch of tracks is block diagonal, one block per track. All blocks are solved in lockstep: one product
 with the whole Hessian serves all of them, while each track has its own step lengths. The Gauss-Newton matrix R^T R,

@@ -1,4 +1,4 @@
-"""The gradient through a solver, by the implicit function theorem.
+"""Computes the gradient through a solver by the implicit function theorem.
 
 A point x* with g(x*, theta) = 0, g the derivative of an objective by x, moves with the parameters theta as
 dx*/dtheta = -H^-1 dg/dtheta, H = dg/dx. The gradient of an outer loss L(x*) by theta is -lambda^T dg/dtheta with

@@ -1,4 +1,4 @@
-"""The likelihood of the observations as a function of the noise, which determines the scale of learned noise.
+"""Computes the likelihood of the observations as a function of the noise, for learning its scale.
 
 Scaling all standard deviations does not move the most probable states, so that an error of states cannot determine the
 scale. The likelihood of the observations with all states integrated out does. In Laplace's approximation, exact for a
@@ -41,7 +41,7 @@ def negative_log_likelihood(
         value = root.log_determinant + sum(r.error() for r in rows) + sum(kind.log_spread() for kind in kinds)
         expected = torch.zeros((), dtype=torch.float64)
         for kind, linearized in zip(kinds, rows, strict=True):
-            change = kind.rewhitening(noise)
+            change = kind.noise_scale(noise)
             if change is not None:
                 expected = expected + _expected(kind, linearized, posterior, change)
         totals.append(float(value) + expected - expected.detach())

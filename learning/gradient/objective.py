@@ -1,4 +1,4 @@
-"""The objective of many tracks' graphs as one torch function of states, model, noise and priors.
+"""Evaluates the objective of many tracks' graphs as one torch function of states, model, noise and priors.
 
 The estimator minimises it in numpy, track by track. A gradient through the estimate needs it again in torch, for a
 batch of tracks at once. Factors of the same sort are merged, so that a batch costs few torch calls.
@@ -104,7 +104,7 @@ class BatchObjective:
         for block in self._blocks:
             seen = whole if block.kind.sees_biases else states
             inputs = tuple((coefficients if shared else seen)[index] for shared, index in block.places)
-            residual = rewhitened(block.kind.residual(inputs), block.kind.rewhitening(noise))
+            residual = rewhitened(block.kind.residual(inputs), block.kind.noise_scale(noise))
             total = total.index_add(0, block.tracks, block.kind.loss.of_square(residual.square().sum(-1)))
         return total
 
@@ -116,7 +116,7 @@ class BatchObjective:
 
 
 def rewhitened(residual: Tensor, change: Tensor | None) -> Tensor:
-    """Whitened residuals (m, r) for changed noise; `change` as `FactorBatch.rewhitening` gives it."""
+    """Whitened residuals (m, r) for changed noise; `change` as `FactorBatch.noise_scale` gives it."""
     if change is None:
         return residual
     return (change @ residual.unsqueeze(-1)).squeeze(-1) if change.dim() else change * residual

@@ -1,1 +1,1 @@
-"""A training run: the loop, its checkpoints, its folder, its processes."""
+"""Runs a training: the loop, its checkpoints, its folder, its processes."""

@@ -1,4 +1,4 @@
-"""The checkpoint of a training, from which it continues to the same numbers: a folder of tensors and YAML."""
+"""Writes and reads the checkpoint of a training, a folder of tensors and YAML, for an exact continuation."""
 
 import hashlib
 from collections.abc import Container, Mapping

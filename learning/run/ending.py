@@ -1,4 +1,4 @@
-"""The end of a training, in its first process: the model, the page, and in words whether it helped."""
+"""Ends a training in its first process: it writes the model and the page, and says whether it helped."""
 
 import math
 import shlex
@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Final
 
-from ballfg.estimation import spread_over
+from ballfg.estimation.noise.estimate import spread_over
 from ballfg.files.whole_file import write_text
 from ballfg.learning.run import run_folder as files
 from ballfg.learning.run.loop import Task, Training
@@ -45,7 +45,7 @@ def finish(training: Training, record: Record, command: str) -> int:
 
 
 def stop(training: Training, record: Record, command: str) -> None:
-    """Write the best model so far after Ctrl-C, and say what is kept."""
+    """Writes the best model so far after Ctrl-C, and lists the kept files."""
     print(f"{record.kept}; continue with --resume {record.folder}", file=sys.stderr, flush=True)
     if training.progress is None:
         print("no model is written: not even the first one had been judged", file=sys.stderr)

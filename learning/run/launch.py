@@ -1,4 +1,4 @@
-"""Several training processes on this machine, started as torchrun would start them."""
+"""Starts several training processes on this machine, as torchrun would."""
 
 import multiprocessing
 import os

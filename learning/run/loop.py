@@ -1,4 +1,4 @@
-"""The training loop: for each batch of tracks the sum of their gradients and a step; then the validation tracks.
+"""The training loop sums the gradients of each batch of tracks, takes a step, and judges validation tracks.
 
 `Training.epochs` is the loop. Random numbers derive from seed and epoch, so that a loop which continues from a
 checkpoint takes the same steps, bit for bit.

@@ -1,4 +1,4 @@
-"""The numbers of an epoch: one row of `metrics.csv`."""
+"""Holds the numbers of an epoch, one row of `metrics.csv`."""
 
 import csv
 import io

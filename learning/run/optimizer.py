@@ -1,4 +1,4 @@
-"""AdamW over a trainee's parameters: groups, learning rate by step, state by parameter name."""
+"""Makes AdamW over a trainee's parameters: groups, learning rate by step, state by parameter name."""
 
 import math
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""Processes that train one model: they add up sums, exchange values, and end together.
+"""Lets processes that train one model add up sums, exchange values, and end together.
 
 A process is a rank. Each rank owns tracks by their number, independent of the batch, so that its memory of a track
 stays with it. A single process is the case of one rank: nothing is sent, and the numbers are the same up to rounding.
@@ -45,7 +45,7 @@ class Ranks:
 
     @property
     def first(self) -> bool:
-        """Whether this is the process that writes and prints."""
+        """True for the process that writes and prints."""
         return self.rank == 0
 
     def own(self, tracks: Sequence[int]) -> list[int]:
@@ -164,5 +164,5 @@ def join_ranks() -> Iterator[Ranks]:
 
 
 def started_by_launcher() -> bool:
-    """Whether this process is one of several that a launcher has started."""
+    """True if this process is one of several that a launcher has started."""
     return "RANK" in os.environ and "WORLD_SIZE" in os.environ

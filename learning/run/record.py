@@ -1,4 +1,4 @@
-"""The record of a training, written after each epoch: metrics, curves, TensorBoard, checkpoints, a line of text."""
+"""Records a training after each epoch: metrics, curves, TensorBoard, checkpoints, a line of text."""
 
 from collections.abc import Sequence
 from operator import itemgetter

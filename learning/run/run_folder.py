@@ -1,4 +1,4 @@
-"""The folder of a run: names of its files, checks before a run starts, config and versions."""
+"""Checks and prepares the folder of a run: names of its files, config and versions."""
 
 import json
 from collections.abc import Iterator, Mapping

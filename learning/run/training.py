@@ -1,4 +1,4 @@
-"""A training from config to model: the work of `ballfg-train` in each of its processes."""
+"""Runs a training from config to model, in each process of `ballfg-train`."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def _built(ranks: Ranks, config: TrainConfig) -> Prepared:
 
 
 def _opened(task: Task, folder: Path, checkpoint: Checkpoint | None) -> tuple[Record | None, Any]:
-    """What writes the run, and what ends it; none but in the first process.
+    """The writer and the ending of the run; None outside of the first process.
 
     Pictures and TensorBoard take half a second to import; the other processes do without.
     """

@@ -1,4 +1,4 @@
-"""`training.html`: a training as a page for people. Whether it helped comes first, then the grounds."""
+"""Writes `training.html`, a page that first says whether the training helped."""
 
 from collections.abc import Mapping, Sequence
 
@@ -23,9 +23,9 @@ TERMS = {
 
 
 def improved(epochs: Sequence[Epoch], best_epoch: int) -> bool | None:
-    """Whether the best model predicts validation tracks better than the one before the first step.
+    """True if the best model predicts validation tracks better than the one before the first step.
 
-    Returns: None where that cannot be said: no step was taken, or no validation track was judged.
+    Returns: None if that is unknown: no step was taken, or no validation track was judged.
     """
     judged = [e for e in epochs if e.validation_rmse is not None]
     if not judged or judged[0].epoch != 0 or len(epochs) < 2:
@@ -34,7 +34,7 @@ def improved(epochs: Sequence[Epoch], best_epoch: int) -> bool | None:
 
 
 def beside_untrained(epochs: Sequence[Epoch], best_epoch: int, untrained: float | None) -> str:
-    """How the analytic model does on the same tracks, in one sentence; empty where nobody knows.
+    """A sentence on the analytic model's error on the same tracks; empty if unknown.
 
     Args: untrained: RMSE of the analytic model on the validation tracks, m.
     """
@@ -46,7 +46,7 @@ def beside_untrained(epochs: Sequence[Epoch], best_epoch: int, untrained: float 
 
 
 def verdict(epochs: Sequence[Epoch], best_epoch: int) -> str:
-    """Whether the training helped, in one sentence."""
+    """A sentence on whether the training helped."""
     better = improved(epochs, best_epoch)
     if better is None:
         return "Whether the training helped is not known: no validation track was judged before and after it."
@@ -83,7 +83,7 @@ def page(
         curves: loss and errors over the epochs.
         learned: coefficients and noise before and after.
         shot: a validation track predicted by the written model; None where there is none.
-        next_command: what to type next; empty where no command takes the model.
+        next_command: the command to type next, or empty.
         origin: date, versions, command: what the page comes from, by its name.
         untrained: RMSE of the analytic model on the validation tracks, m; None where it is not known.
     """
@@ -146,7 +146,7 @@ def _numbers(epochs: Sequence[Epoch], best_epoch: int) -> Html:
 
 
 def _origin(origin: Mapping[str, str]) -> Html:
-    """What the page was made from; commands stay as they were typed."""
+    """The inputs of the page; commands stay as they were typed."""
     rows = [(name, typed(said) if name == "command" else said) for name, said in origin.items()]
     return table(("", ""), [*rows, ("config", "config.yaml beside this page, with every default")])
 

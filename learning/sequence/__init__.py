@@ -1,4 +1,4 @@
-"""Baselines that map observations straight to the rest of a track: an LSTM and a conditional diffusion model."""
+"""Sequence models map observations straight to the rest of a track: an LSTM and a conditional diffusion model."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Kind and size of a sequence model, and the model itself."""
+"""Defines kind and size of a sequence model, and builds the model."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

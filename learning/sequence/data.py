@@ -1,4 +1,4 @@
-"""Tracks as padded tensors: observations, launcher settings, and the times to predict."""
+"""Holds tracks as padded tensors: observations, launcher settings, and the times to predict."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

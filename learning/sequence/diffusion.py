@@ -1,4 +1,4 @@
-"""Conditional diffusion baseline: from noise to the rest of a track, given the observations.
+"""The conditional diffusion baseline generates the rest of a track from noise, given the observations.
 
 The network predicts the clean path at every noise level. The last level is pure noise, so that training sees nothing of
 the answer there. Source: J. Ho, A. Jain, P. Abbeel 2020 (training); J. Song, C. Meng, S. Ermon 2021 (sampling without
@@ -36,7 +36,7 @@ START_SEED = 0
 NOISE_STREAM = 1
 """Makes the noise differ from the augmentation of the same seed, epoch and track."""
 HEADS = 4
-"""Of the attention between tokens and of the final pooling."""
+"""Number of heads of the attention between tokens and of the final pooling."""
 WAVES = 8
 """Periods of the features of a place in time."""
 SHORTEST_PERIOD, PERIOD_RANGE = 4.0, 256.0
@@ -44,7 +44,7 @@ SHORTEST_PERIOD, PERIOD_RANGE = 4.0, 256.0
 LONG = 100.0
 """Grid steps by which a place in time is divided, to be of order one."""
 DILATIONS = (1, 2, 4, 8, 16, 32, 1, 2)
-"""Of the blocks; together they look back 132 grid steps."""
+"""Dilations of the blocks; together they look back 132 grid steps."""
 
 
 def place_features(steps: Tensor) -> Tensor:

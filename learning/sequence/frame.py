@@ -1,4 +1,4 @@
-"""The frame in which sequence models see tracks: places relative to the last observed one, all of order one.
+"""Transforms tracks to the frame of sequence models, relative to the last observed place, all of order one.
 
 Only shifts and scales: no direction is singled out and nothing is extrapolated. Height keeps its origin, since the
 table lies at one height for all tracks.

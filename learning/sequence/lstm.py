@@ -1,4 +1,4 @@
-"""LSTM baseline: one recurrent network reads the observations, another predicts step by step."""
+"""The LSTM baseline reads the observations by one recurrent network and predicts step by step by another."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""The contract of a sequence model: from the observed part of tracks to the rest, no estimator, no dynamics."""
+"""Defines the interface of a sequence model, which predicts the rest of tracks from their observed part."""
 
 import math
 from abc import ABC, abstractmethod
@@ -38,10 +38,10 @@ class SequenceModel(nn.Module, ABC):
 
     @abstractmethod
     def predict(self, batch: Batch) -> Tensor:
-        """(b, m, 3) m, world positions at the times asked. The same batch gives the same bytes."""
+        """(b, m, 3) m, world positions at the batch's times. The same batch gives the same bytes."""
 
     def points_asked(self, batch: Batch) -> int:
-        """Grid points that reach to the last time asked, `points` at most."""
+        """Number of grid points up to the last requested time, `points` at most."""
         return max(1, min(self.points, math.ceil(float(batch.times.max() / self.frame.step) - ROUND)))
 
     def path(self, grid: Tensor, batch: Batch) -> Tensor:

@@ -1,4 +1,4 @@
-"""A trained sequence model for use: predictions from tracks, and its folder with a config and weights."""
+"""Predicts tracks by a trained sequence model, and saves and loads it as a folder."""
 
 import hashlib
 from collections.abc import Sequence
@@ -29,20 +29,20 @@ CONFIG, WEIGHTS = "config.yaml", "weights.safetensors"
 
 
 class FolderConfig(BaseModel):
-    """What `config.yaml` says."""
+    """The content of `config.yaml`."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
     kind: Literal["lstm", "diffusion"]
-    """Of the model."""
+    """Kind of the model."""
     width: Annotated[int, Field(ge=1, le=2048)]
-    """Of its hidden states."""
+    """Width of its hidden states."""
     points: Annotated[int, Field(ge=1, le=100_000)]
-    """Of the grid on which it predicts."""
+    """Number of points of its grid."""
     labels: Annotated[tuple[str, ...], Field(strict=False)]
     """Labels that are launcher settings."""
     categories: dict[str, Annotated[tuple[str, ...], Field(strict=False)]]
-    """Values of those that are text."""
+    """Values of the textual labels."""
     digest: str | None = None
     """SHA-256 of the weights; null in folders of earlier versions."""
 

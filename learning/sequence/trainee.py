@@ -1,26 +1,27 @@
-"""A sequence model with its tracks, for the training loop."""
+"""Adapts a sequence model with its tracks to the training loop."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import ClassVar, cast
 
 import torch
 from torch import Tensor
 
 from ballfg.learning.augment import augmentation
 from ballfg.learning.config.training import TrainConfig
+from ballfg.learning.registry import TraineeKind
 from ballfg.learning.sequence.architecture import SequenceArchitecture, SequenceKind
 from ballfg.learning.sequence.data import Batch, Example, LauncherSettings, collate, example
 from ballfg.learning.sequence.model import SequenceModel
 from ballfg.learning.sequence.predictor import SequencePredictor
-from ballfg.learning.shots import Shot
+from ballfg.learning.shots import TrainingShot
 from ballfg.learning.trainee import BatchLoss, PredictedShot, Prepared, Trainee
 from ballfg.learning.training_data import read_training_data
 from ballfg.tracks import Track
 
 FOLDER = "model"
-"""Of the predictor, in that of a training."""
+"""Folder of the predictor, in that of a training."""
 
 
 class SequenceTrainee(Trainee):
@@ -34,7 +35,7 @@ class SequenceTrainee(Trainee):
         architecture: kind and size.
         launcher: its labels.
         seed: of initial weights, augmentation and diffusion noise, >= 0.
-        augment: whether training tracks are rotated and shifted.
+        augment: True to rotate and shift training tracks.
     Raises: ValueError: if no track of the training part can be used.
     """
 
@@ -144,9 +145,33 @@ def build_sequence(config: TrainConfig) -> Prepared:
     return Prepared(trainee, data.train, data.validation)
 
 
-def _usable(shot: Shot) -> tuple[Track, int]:
-    """The usable samples of a shot, and the number of those that are observed."""
+def _usable(shot: TrainingShot) -> tuple[Track, int]:
+    """The usable samples of a shot, and the number of observed ones."""
     keep, track = shot.usable, shot.track
     sigmas = None if track.sigmas is None else track.sigmas[keep]
     kept = replace(track, times=track.times[keep], positions=track.positions[keep], sigmas=sigmas)
     return kept, int(keep[: shot.observed].sum())
+
+
+class SequenceModelKind(TraineeKind):
+    """A network from observations to the rest of a track."""
+
+    unused: ClassVar[tuple[str, ...]] = ("architecture", "model", "noise", "gradient", "options")
+    augmented = True
+
+    @classmethod
+    def build(cls, config: TrainConfig) -> Prepared:
+        """The model with its data, ready to train."""
+        return build_sequence(config)
+
+
+class Lstm(SequenceModelKind):
+    """A recurrent network."""
+
+    name = "lstm"
+
+
+class Diffusion(SequenceModelKind):
+    """A conditional diffusion model."""
+
+    name = "diffusion"

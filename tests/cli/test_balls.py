@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from ballfg.cli.commands.live import _scene
-from ballfg.dynamics import KNOWN_BALLS
-from ballfg.simulation import SimulationConfig, ball_kind, write_simulation
+from ballfg.dynamics.known_balls import KNOWN_BALLS
+from ballfg.simulation import SimulationConfig, write_simulation
+from ballfg.simulation.balls import ball_kind
 from tests.commands import status
 
 

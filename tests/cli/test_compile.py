@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from ballfg.dynamics.compiled.kept import cache_folder
+from ballfg.dynamics.known_balls import KNOWN_BALLS
 from ballfg.simulation import SimulationConfig, write_simulation
 from tests.commands import status
 from tests.interpreter import Interpreter
@@ -13,6 +15,7 @@ from tests.interpreter import Interpreter
 MODEL = "flight: {gravity: {}, drag: {k: 0.1}, wind: {x: 1.0}}\nbounce: {restitution: {e: 0.9}}\n"
 
 
+@pytest.mark.thorough
 def test_nothing_is_generated_after_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a model that nobody has used yet. What depends on no model is kept beside the package, for all tests."""
     write_simulation(tmp_path / "shots", SimulationConfig(tracks=2, rate=60.0, seed=2))
@@ -33,6 +36,14 @@ def test_nothing_is_generated_after_it(tmp_path: Path, monkeypatch: pytest.Monke
         assert ran(ballfg, "estimate", "shots", "--model", "model.yaml", "--out", "states.csv") == made
         assert ran(ballfg, "predict", "shots", "--model", "model.yaml", "--observe", "0.2", "--out", "a.csv") == made
         assert ran(ballfg, "live", "--replay", "shots", "--model", "model.yaml", "--speed", "100") == made
+
+
+def test_the_balls_that_ship(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Two of them: each takes as long as any other."""
+    two = ("table_tennis", "tennis")
+    monkeypatch.setattr("ballfg.dynamics.known_balls.KNOWN_BALLS", {name: KNOWN_BALLS[name] for name in two})
+    assert status("compile") == 0
+    assert capsys.readouterr().out == f"{', '.join(two)}: compiled, and kept in {cache_folder()}\n"
 
 
 def test_a_model_that_is_not_there(capsys: pytest.CaptureFixture[str]) -> None:

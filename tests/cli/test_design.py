@@ -46,6 +46,7 @@ def test_pairs_of_a_diagnosis(launched: Path, tmp_path: Path, capsys: pytest.Cap
     assert "frame_tilt.x frame_tilt.y from table_tilt.x table_tilt.y" in capsys.readouterr().out
 
 
+@pytest.mark.thorough
 def test_without_a_pair_the_dataset_is_diagnosed_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Shots that fall too slowly: a clock that is wrong, or another g. The plan is that of the pair named by hand."""
     settings, fall = {"sidespin": [0], "speed": [11]}, tuple(parse_effects(["gravity.g=9.6"]))

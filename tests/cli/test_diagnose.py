@@ -150,7 +150,6 @@ def test_help_has_an_example(capsys: pytest.CaptureFixture[str]) -> None:
     assert "ballfg diagnose data/aimy --model model.yaml --out diagnosis" in " ".join(capsys.readouterr().out.split())
 
 
-@pytest.mark.slow
 def test_a_whole_run(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """On tracks of the declared model: a report whose error is about the noise, and a model that can be read."""
     out = tmp_path / "diagnosis"

@@ -12,7 +12,7 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 import pytest
 
-from ballfg.estimation import ESTIMATORS
+from ballfg.estimation.registry import ESTIMATORS
 from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.tracks import read_dataset
 from tests.commands import status

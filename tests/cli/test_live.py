@@ -96,7 +96,7 @@ def test_a_replay_gives_the_states_of_the_online_estimator(
     assert "28 positions, 2 balls; 0 late, 0 too old, 0 repeated, 0 malformed, 0 dropped" in text
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.thorough)])
 def test_a_service_manager_or_a_closed_terminal_end_a_stream_like_ctrl_c(dataset: Path, number: int) -> None:
     with started("--listen", "tcp://127.0.0.1:0", "--like", dataset) as process:
         assert process.stderr is not None

@@ -7,7 +7,8 @@ import pytest
 
 from ballfg.cli.main import app
 from ballfg.cli.start import _command
-from ballfg.tracks import TABLE_TENNIS, DatasetInfo, Track, write_dataset
+from ballfg.tracks import TABLE_TENNIS, Track, write_dataset
+from ballfg.tracks.info import DatasetInfo
 from tests.commands import status
 
 WORDS = {

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ballfg.estimation import OBSERVATIONS, load_observations, read
+from ballfg.estimation import read
+from ballfg.estimation.observations.registry import OBSERVATIONS, load_observations
 from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate, write_simulation
 from ballfg.tracks import TableWriter
 from tests.commands import status

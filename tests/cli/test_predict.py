@@ -10,7 +10,8 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 
-from ballfg.estimation import ConformalScales, load_conformal
+from ballfg.estimation import ConformalScales
+from ballfg.estimation.conformal import load_conformal
 from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.tracks import Dataset, read_dataset
 from tests.commands import status

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from ballfg.tracks import TENNIS, read_dataset
+from ballfg.tracks import read_dataset
+from ballfg.tracks.info import TENNIS
 from tests.commands import status
 
 

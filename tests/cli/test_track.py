@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 from ballfg.simulation.cameras import table_rig
-from ballfg.simulation.scene import SceneConfig, record, write_scene
+from ballfg.simulation.scene.config import SceneConfig
+from ballfg.simulation.scene.recording import record
+from ballfg.simulation.scene.writing import write_scene
 from ballfg.tracks import read_dataset
 from ballfg.vision import Camera
 from ballfg.vision.camera_file import read_cameras, write_cameras
@@ -236,6 +238,7 @@ def numbers(path: Path, *columns: str) -> dict[str, np.ndarray]:
     return {name: np.array(rows) for name, rows in found.items()}
 
 
+@pytest.mark.thorough
 def test_videos_become_the_tracks_that_were_flown(scene: Path, tracked: Path) -> None:
     truth = numbers(scene / "truth.csv", "t", "x", "y", "z")
     visible = numbers(scene / "visible.csv", "t_true")

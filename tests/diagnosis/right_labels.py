@@ -22,20 +22,22 @@ from torch import Tensor
 from ballfg.diagnosis import check_labels, diagnose, fit_model, hold_out
 from ballfg.diagnosis.label_verdicts import LabelCheck
 from ballfg.diagnosis.search.process_noise import calibrated_model
-from ballfg.dynamics import advance, nominal_model
+from ballfg.dynamics import nominal_model
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.motion.rollout import advance
 from ballfg.estimation.settings import MEASURED
 from ballfg.simulation import SimulationConfig
 from ballfg.simulation.composition import KickedModel
 from ballfg.simulation.config import MeasurementNoise, MotionNoise
 from ballfg.simulation.measure import measure
-from ballfg.simulation.motion import MIN_FRAMES, NOISE_STEP, Motion, process_noise
+from ballfg.simulation.motion import MIN_FRAMES, NOISE_STEP, TrueMotion, process_noise
 from ballfg.simulation.settings import settings_of_shots
 from ballfg.simulation.synthetic import dataset_info
 from ballfg.state import STATE_DIM
-from ballfg.tracks import SPIN_LABELS, Dataset, Track
+from ballfg.tracks import Dataset, Track
 from ballfg.tracks.memory import dataset_in_memory
+from ballfg.tracks.track import SPIN_LABELS
 
 TRACKS, RATE, NOISE, LABEL_NOISE = 25, 100.0, 0.002, 4.0
 SIZES = (0.25, 0.5, 1.0)
@@ -82,7 +84,7 @@ def scattering_set(seed: int, size: float, wrong: float = 0.0, tracks: int = TRA
     return dataset_in_memory(dataset_info(config), made), {made[i].name for i in chosen}
 
 
-def _flown(moving: ScatteringBounces, state: Tensor, config: SimulationConfig, rng: np.random.Generator) -> Motion:
+def _flown(moving: ScatteringBounces, state: Tensor, config: SimulationConfig, rng: np.random.Generator) -> TrueMotion:
     """The motion of balls (n, 9 + p), with process noise, until they leave the launcher's view."""
     launcher, surfaces = config.ball.launcher, config.ball.surfaces
     steps = math.ceil(1.0 / RATE / NOISE_STEP)
@@ -94,7 +96,7 @@ def _flown(moving: ScatteringBounces, state: Tensor, config: SimulationConfig, r
         frames.append(state)
     states = torch.stack(frames, dim=1)
     seen = launcher.in_view(states, surfaces, moving) | (torch.arange(len(frames)) < MIN_FRAMES)
-    return Motion(states[..., :STATE_DIM].numpy(), seen.cumprod(dim=1).sum(dim=1).numpy())
+    return TrueMotion(states[..., :STATE_DIM].numpy(), seen.cumprod(dim=1).sum(dim=1).numpy())
 
 
 def _with_wrong_label(track: Track, rng: np.random.Generator) -> Track:

@@ -59,7 +59,7 @@ def test_the_whole_from_python(here: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert json.loads((here / "diagnosis" / "report.json").read_text(encoding="utf-8"))["effects"]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_pieces_from_python(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     names: dict = {}
     exec(compile(blocks("diagnose.md", "python")[1], "diagnose.md", "exec"), names)

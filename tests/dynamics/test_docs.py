@@ -9,8 +9,10 @@ import pytest
 import torch
 import yaml
 
-from ballfg.dynamics import EFFECTS, AnalyticModel, advance, model_from_dict, model_to_dict, nominal_model
+from ballfg.dynamics import EFFECTS, AnalyticModel, nominal_model
+from ballfg.dynamics.model_file import model_from_dict, model_to_dict
 from ballfg.dynamics.motion.integrate import fly
+from ballfg.dynamics.motion.rollout import advance
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.simulation import parse_effects
 from tests.places import DOCS

@@ -9,10 +9,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from ballfg.dynamics import KNOWN_BALLS, Surfaces, advance, fly, known_ball, known_balls, known_name, nominal_model
+from ballfg.dynamics import Surfaces, known_balls, nominal_model
 from ballfg.dynamics.analytic import coefficient_sigmas
-from ballfg.dynamics.known_balls import _read_ball
-from ballfg.tracks import TABLE_TENNIS, TENNIS, Ball
+from ballfg.dynamics.known_balls import KNOWN_BALLS, _read_ball, known_ball
+from ballfg.dynamics.motion.integrate import fly
+from ballfg.dynamics.motion.rollout import advance
+from ballfg.dynamics.nominal import known_name
+from ballfg.tracks import TABLE_TENNIS, Ball
+from ballfg.tracks.info import TENNIS
 
 AIR = 1.2
 """kg/m^3."""

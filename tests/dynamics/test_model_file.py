@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import yaml
 
-from ballfg.dynamics import EFFECTS, load_model, model_from_dict, model_to_dict, nominal_model, save_model
+from ballfg.dynamics import EFFECTS, load_model, nominal_model, save_model
+from ballfg.dynamics.model_file import model_from_dict, model_to_dict
 
 GOOD = """
 flight: {gravity: {g: 9.80}, drag: {k: 0.13}, magnus: {}}

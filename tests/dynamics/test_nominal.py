@@ -6,10 +6,12 @@ import math
 
 import pytest
 
-from ballfg.dynamics import AnalyticModel, model_to_dict, nominal_model, nominal_note
+from ballfg.dynamics import AnalyticModel, nominal_model
 from ballfg.dynamics.analytic import coefficient_sigmas
-from ballfg.dynamics.nominal import air_coefficients
-from ballfg.tracks import TABLE_TENNIS, TENNIS, Ball
+from ballfg.dynamics.model_file import model_to_dict
+from ballfg.dynamics.nominal import air_coefficients, nominal_note
+from ballfg.tracks import TABLE_TENNIS, Ball
+from ballfg.tracks.info import TENNIS
 
 SQUASH = Ball(radius=0.02, mass=0.024)
 TENNIS_DRAG = 0.6

@@ -5,10 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 
-from ballfg.dynamics import Surfaces, advance, fly, fly_jacobian, fly_through, fly_through_jacobian, substitute
+from ballfg.dynamics import Surfaces
 from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.dynamics.model import take_rows
-from ballfg.dynamics.motion.integrate import batch_jacobian
+from ballfg.dynamics.model import substitute, take_rows
+from ballfg.dynamics.motion.contact import fly_through, fly_through_jacobian
+from ballfg.dynamics.motion.integrate import batch_jacobian, fly, fly_jacobian
+from ballfg.dynamics.motion.rollout import advance
 
 NAMES = (
     "flight.drag.k",

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.dynamics import Variation, load_model, model_from_dict, nominal_model, save_model
-from ballfg.dynamics.variation import place_of
+from ballfg.dynamics import load_model, nominal_model, save_model
+from ballfg.dynamics.model_file import model_from_dict
+from ballfg.dynamics.variation import Variation, place_of
 from ballfg.tracks import Track
 
 

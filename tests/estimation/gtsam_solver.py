@@ -19,7 +19,8 @@ from pathlib import Path
 import numpy as np
 
 import ballfg as bf
-from ballfg.estimation import dataset_surfaces, fitted_settings
+from ballfg.estimation import dataset_surfaces
+from ballfg.estimation.configure import fitted_settings
 from ballfg.factors import LevenbergMarquardt
 from ballfg.simulation import SimulationConfig
 from ballfg.tracks import Track

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import yaml
 
-from ballfg.estimation import ConformalScales, Estimate, Status, TrackPrediction, load_conformal
-from ballfg.estimation.conformal import BIN, HALF_WIDTH
+from ballfg.estimation import ConformalScales, Estimate, Status
+from ballfg.estimation.conformal import BIN, HALF_WIDTH, load_conformal
+from ballfg.estimation.track_prediction import TrackPrediction
 
 ESTIMATE = Estimate("0", np.array([1.7e9]), np.zeros((1, 9)), np.eye(9)[None], Status.OK)
 """Ends at a stamp that is rounded to 2e-7 s."""

@@ -5,7 +5,7 @@ import re
 import numpy as np
 
 import ballfg as bf
-from ballfg.estimation import ESTIMATORS
+from ballfg.estimation.registry import ESTIMATORS
 from tests.places import DOCS
 
 

@@ -7,9 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ballfg.dynamics import Surfaces, Variation, nominal_model
-from ballfg.estimation import Settings, estimate_tracks, make_estimator, predict_tracks
+from ballfg.dynamics import Surfaces, nominal_model
+from ballfg.dynamics.variation import Variation
+from ballfg.estimation import Settings, predict_tracks
+from ballfg.estimation.batch import estimate_tracks
 from ballfg.estimation.noise.linear_tracks import linearise
+from ballfg.estimation.registry import make_estimator
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.simulation import SimulationConfig, parse_effects, simulate
 

@@ -19,7 +19,8 @@ from ballfg.estimation.settings import MEASURED
 from ballfg.factors.launcher import LauncherSpinFactors
 from ballfg.factors.loss import Loss
 from ballfg.factors.prior import PriorFactors, SpinLabelFactors
-from ballfg.tracks import SPIN_LABELS, Track, read_dataset
+from ballfg.tracks import Track, read_dataset
+from ballfg.tracks.track import SPIN_LABELS
 
 TABLE = Surfaces(0.0, -0.76)
 LEVELS = {"topspin": 2.0, "sidespin": -1.0, "group": "left"}

@@ -7,8 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ballfg.dynamics import AnalyticModel, BallModel, Effect
-from ballfg.estimation import Settings, TrackPrediction, make_estimator, predict_tracks
+from ballfg.dynamics import AnalyticModel, BallModel
+from ballfg.dynamics.effect import Effect
+from ballfg.estimation import Settings, predict_tracks
+from ballfg.estimation.registry import make_estimator
+from ballfg.estimation.track_prediction import TrackPrediction
 from ballfg.factors.noise import ProcessNoise
 from ballfg.simulation import MeasurementNoise, SimulationConfig, parse_effects, simulate
 

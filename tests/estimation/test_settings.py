@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 
 from ballfg.dynamics import EFFECTS, AnalyticModel, nominal_model
-from ballfg.estimation import configure, make_estimator
+from ballfg.estimation import configure
 from ballfg.estimation.configure import dataset_settings, dataset_surfaces
-from ballfg.estimation.segmentation import Quality, Segmentation
+from ballfg.estimation.registry import make_estimator
+from ballfg.estimation.segmentation.result import Quality, Segmentation
 from ballfg.estimation.settings import MEASURED, Settings, sample_sigmas
 from ballfg.estimation.smoother.problem import QUALITY_SIGMA, effective_sigmas
 from ballfg.simulation import SimulationConfig, simulate
-from ballfg.tracks import Ball, DatasetInfo, Track, dataset_in_memory, read_dataset
+from ballfg.tracks import Ball, Track, read_dataset
+from ballfg.tracks.info import DatasetInfo
+from ballfg.tracks.memory import dataset_in_memory
 
 NONE = np.zeros(0, dtype=np.int64)
 

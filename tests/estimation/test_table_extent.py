@@ -10,9 +10,11 @@ from numpy.testing import assert_allclose
 import ballfg as bf
 from ballfg.dynamics import Surfaces, nominal_model, rollout
 from ballfg.dynamics.surfaces import TABLE_LENGTH, TABLE_WIDTH
-from ballfg.estimation import dataset_surfaces, table_note
+from ballfg.estimation import dataset_surfaces
+from ballfg.estimation.configure import table_note
 from ballfg.estimation.table_extent import _falls, find_table_extent
-from ballfg.tracks import TABLE_TENNIS, TENNIS, DatasetInfo, Track, read_dataset, write_dataset
+from ballfg.tracks import TABLE_TENNIS, Track, read_dataset, write_dataset
+from ballfg.tracks.info import TENNIS, DatasetInfo
 from tests.places import DATA
 
 HEIGHT, RADIUS, SIGMA = 0.76, TABLE_TENNIS.radius, 0.003

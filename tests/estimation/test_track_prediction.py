@@ -10,7 +10,8 @@ import torch
 
 from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.dynamics.motion.rollout import advance
-from ballfg.estimation import Settings, Status, dataset_settings, dataset_surfaces, make_estimator, predict_tracks
+from ballfg.estimation import Settings, Status, dataset_settings, dataset_surfaces, predict_tracks
+from ballfg.estimation.registry import make_estimator
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction import Belief
 from ballfg.state import SPIN, VZ

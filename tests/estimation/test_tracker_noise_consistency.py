@@ -73,8 +73,14 @@ ESTIMATORS = {
 }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "smoother",
+        "ekf",
+        *(pytest.param(n, marks=pytest.mark.thorough) for n in ("ekf+rts", "ekf from a window", "online")),
+    ],
+)
 def test_nees_is_inside_its_band(tracks, name) -> None:
     build, options = ESTIMATORS[name]
     model, surfaces = CONFIG.ball.model, CONFIG.ball.surfaces

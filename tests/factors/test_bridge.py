@@ -12,7 +12,7 @@ import torch
 from ballfg.dynamics import nominal_model, rollout
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation import OBSERVATIONS
+from ballfg.estimation.observations.registry import OBSERVATIONS
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Values
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY, Bridge, from_gtsam, key_of, nonlinear_graph, to_gtsam
 from ballfg.factors.check import check_factor, jacobian_errors

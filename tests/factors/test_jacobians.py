@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.dynamics import fly_through
+from ballfg.dynamics.motion.contact import fly_through
 from ballfg.factors.batch import COEFFICIENTS, Values
 from ballfg.factors.dynamics import ContactFactors, FlightFactors, RestFactors
 from ballfg.factors.loss import Loss

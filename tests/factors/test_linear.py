@@ -246,8 +246,8 @@ def test_minimum_has_no_gradient_left(problem, tolerance) -> None:
     size = values.states.size
     for _ in range(5):
         d = 1e-3 * scale * rng.standard_normal(len(scale))
-        ahead = graph.error(minimum.values.moved(d[:size].reshape(-1, 9), d[size:]))
-        behind = graph.error(minimum.values.moved(-d[:size].reshape(-1, 9), -d[size:]))
+        ahead = graph.error(minimum.values.retract(d[:size].reshape(-1, 9), d[size:]))
+        behind = graph.error(minimum.values.retract(-d[:size].reshape(-1, 9), -d[size:]))
         curvature = ahead + behind - 2 * minimum.error
         assert curvature > 0
         assert abs(ahead - behind) < 1e-2 * curvature

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from ballfg.dynamics.compiled.beliefs.carry import add_flight
 from ballfg.factors.noise import ProcessNoise, whitening
 from ballfg.state import POSITION, SPIN, VELOCITY
 
@@ -32,6 +33,12 @@ def van_loan(dt: float) -> np.ndarray:
 @pytest.mark.parametrize("dt", [1e-3, 0.01, 0.2, 3.0])
 def test_flight_is_the_integral_of_white_noise(dt) -> None:
     np.testing.assert_allclose(NOISE.flight(np.array([dt]))[0], van_loan(dt), rtol=1e-10, atol=1e-18)
+
+
+def test_machine_code_adds_the_same_noise() -> None:
+    found = np.zeros((9, 9))
+    add_flight(found, 0.013, np.array([NOISE.acceleration, NOISE.spin, 0.0, 0.0, 0.0]))
+    np.testing.assert_array_equal(found, NOISE.flight(np.array([0.013]))[0])
 
 
 def test_a_dropped_frame_is_not_another_model() -> None:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ballfg.dynamics import fly_through
+from ballfg.dynamics.motion.contact import fly_through
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.factors.batch import FactorBatch, Noise, Values
 from ballfg.factors.dynamics import ContactFactors, DynamicsFactors, FlightFactors, RestFactors
@@ -153,7 +153,7 @@ def test_a_kind_without_a_torch_residual_says_so() -> None:
     kind = Silent(np.zeros((1, 1), dtype=np.int64), 1)
     with pytest.raises(NotImplementedError, match="Silent has no residual in torch"):
         kind.residual(())
-    assert kind.rewhitening(Noise(spin=torch.ones(()))) is None
+    assert kind.noise_scale(Noise(spin=torch.ones(()))) is None
     assert kind.log_spread() == 0.0
 
 
@@ -170,15 +170,15 @@ def test_process_noise_that_is_learned(kind, model) -> None:
     values = near(kind, model, np.zeros(0))
     old, new = dynamics(kind, model, None, NOISE), dynamics(kind, model, None, OTHER)
     residual = old.residual(inputs_of(old, values)).detach()
-    change = old.rewhitening(Noise(process=numbers(OTHER)))
+    change = old.noise_scale(Noise(process=numbers(OTHER)))
     expected = new.residual(inputs_of(new, values)).detach()
     torch.testing.assert_close((change @ residual[..., None])[..., 0], expected, rtol=1e-9, atol=1e-9)
     assert bool((change.triu(1).abs() <= 1e-12 * change.abs().amax()).all())
     grown = -float(change.diagonal(dim1=-2, dim2=-1).log().sum())
     assert new.log_spread() - old.log_spread() == pytest.approx(grown, rel=1e-12)
-    same = old.rewhitening(Noise(process=numbers(NOISE)))
+    same = old.noise_scale(Noise(process=numbers(NOISE)))
     torch.testing.assert_close(same, torch.eye(9, dtype=torch.float64).expand(3, 9, 9), rtol=0, atol=1e-10)
-    assert old.rewhitening(Noise(position=torch.ones(()))) is None
+    assert old.noise_scale(Noise(position=torch.ones(()))) is None
 
 
 def test_other_noise_that_is_learned(augmented) -> None:
@@ -188,10 +188,10 @@ def test_other_noise_that_is_learned(augmented) -> None:
     for kind, _ in others(augmented):
         learned = noise.get(type(kind).__name__)
         for name in ("position", "spin"):
-            change = kind.rewhitening(Noise(**{name: scale}))
+            change = kind.noise_scale(Noise(**{name: scale}))
             assert (change is not None) == (learned == name)
             assert change is None or float(change) == pytest.approx(0.4, rel=1e-15)
-        assert kind.rewhitening(Noise(process=numbers(NOISE))) is None
+        assert kind.noise_scale(Noise(process=numbers(NOISE))) is None
     for build, arguments in (
         (PositionFactors, (np.array([0, 2]), LAUNCHES)),
         (spin_label, (np.array([0, 2]), LAUNCHES)),

@@ -9,10 +9,10 @@ import torch
 
 from ballfg.factors.batch import FactorBatch, Noise, Values, merge
 from ballfg.factors.bridge import Bridge, from_gtsam, nonlinear_graph, to_gtsam
+from ballfg.factors.correlated_noise import BiasedPositionFactors, BiasFactors, BiasStartFactors, bias_step
 from ballfg.factors.graph import BallGraph, LevenbergMarquardt
 from ballfg.factors.loss import Loss
 from ballfg.factors.prior import state_prior
-from ballfg.factors.tracker import BiasedPositionFactors, BiasFactors, BiasStartFactors, bias_step
 
 SIGMA = np.array([0.004, 0.003, 0.006])
 MEMORY_TIME = 0.02
@@ -71,12 +71,12 @@ def test_torch_sees_the_same_residuals(kind) -> None:
 def test_rows_of_a_batch_are_rows_by_themselves(kind) -> None:
     whole = kind.linearize(values())
     rows = np.array([1, 0])
-    part = kind.taken(rows).linearize(values())
+    part = kind.select(rows).linearize(values())
     np.testing.assert_array_equal(part.residual, whole.residual[rows])
     for block, expected in zip(part.jacobians, whole.jacobians, strict=True):
         np.testing.assert_array_equal(block, expected[rows])
         assert block.shape[-1] == 12
-    both = merge([kind.taken(np.array([0])), kind.taken(np.array([1]))])
+    both = merge([kind.select(np.array([0])), kind.select(np.array([1]))])
     np.testing.assert_array_equal(both.linearize(values()).residual, whole.residual[:2])
 
 
@@ -118,13 +118,13 @@ def test_learned_position_noise_scales_the_white_part() -> None:
     where, measured = np.arange(3), np.random.default_rng(2).standard_normal((3, 3))
     old = BiasedPositionFactors(where, measured, sigma, stamps)
     new = BiasedPositionFactors(where, measured, 2.5 * sigma, stamps)
-    change, inputs = old.rewhitening(scale), tuple(torch.from_numpy(np.array(x)) for x in old.inputs(values()))
+    change, inputs = old.noise_scale(scale), tuple(torch.from_numpy(np.array(x)) for x in old.inputs(values()))
     found = (change @ old.residual(inputs)[..., None])[..., 0]
     torch.testing.assert_close(found, new.residual(inputs), rtol=1e-9, atol=1e-9)
     grown = -float(change.diagonal(dim1=-2, dim2=-1).log().sum())
     assert new.log_spread() - old.log_spread() == pytest.approx(grown, rel=1e-9)
-    assert [kind.rewhitening(scale) for kind in batches()[2:]] == [None, None]
-    assert old.rewhitening(Noise()) is None
+    assert [kind.noise_scale(scale) for kind in batches()[2:]] == [None, None]
+    assert old.noise_scale(Noise()) is None
 
 
 def test_gtsam_finds_the_same_minimum_with_biases_behind_its_states() -> None:

@@ -13,7 +13,18 @@ from typing import Any
 import numpy as np
 
 import ballfg as bf
-from ballfg import dynamics, estimation, factors, prediction, simulation, tracks, vision
+from ballfg import dynamics, estimation, factors, simulation, tracks, vision
+from ballfg.dynamics.known_balls import known_ball
+from ballfg.estimation.launcher import Launcher
+from ballfg.estimation.registry import make_estimator
+from ballfg.factors.loss import Loss
+from ballfg.prediction.state import World
+from ballfg.simulation.launcher import SimulatedLauncher
+from ballfg.tracks.info import DatasetInfo
+from ballfg.tracks.memory import dataset_in_memory
+from ballfg.tracks.noise import TrackNoise
+from ballfg.tracks.sightings import Sightings
+from ballfg.vision.projection import CameraBank
 from tests.places import ROOT
 
 LONGEST_MESSAGE = 1000
@@ -85,9 +96,9 @@ def _tracks(count: int, samples: int = 12) -> list[bf.Track]:
 
 def calls_of_tracks(folder: Path) -> dict[str, Call]:
     one, two = _tracks(2)
-    radar, info = bf.RadarSpeed(0, 5.0, 0.1), tracks.DatasetInfo("a", 0.76, bf.Ball(0.02, 0.0027))
-    sighted = tracks.Sightings(("a",), np.array([0]), np.array([0.0]), np.array([[1.0, 2.0]]), np.eye(2)[None])
-    dataset = tracks.dataset_in_memory(info, [one, two])
+    radar, info = bf.RadarSpeed(0, 5.0, 0.1), DatasetInfo("a", 0.76, bf.Ball(0.02, 0.0027))
+    sighted = Sightings(("a",), np.array([0]), np.array([0.0]), np.array([[1.0, 2.0]]), np.eye(2)[None])
+    dataset = dataset_in_memory(info, [one, two])
     (longer,) = _tracks(1, 60)
     table = np.column_stack([longer.times, longer.positions])
     imported: dict[str, Any] = dict.fromkeys(
@@ -100,11 +111,11 @@ def calls_of_tracks(folder: Path) -> dict[str, Call]:
         "RadarSpeed": Call(bf.RadarSpeed, {"state": [0], "values": [5.0], "sigma": 0.1, "delay": [0.0]}),
         "SpinReading": Call(bf.SpinReading, {"state": [0], "values": [[5.0, 1.0, 2.0]], "sigma": 0.1, "delay": [0.0]}),
         "RadarSpeed.at": Call(bf.RadarSpeed.at, {"track": one, "times": [0.1], "values": [5.0], "sigma": 0.1}),
-        "Sightings": Call(tracks.Sightings, _example(sighted)),
-        "DatasetInfo": Call(tracks.DatasetInfo, _example(info)),
-        "TrackNoise": Call(tracks.TrackNoise, _example(tracks.TrackNoise())),
+        "Sightings": Call(Sightings, _example(sighted)),
+        "DatasetInfo": Call(DatasetInfo, _example(info)),
+        "TrackNoise": Call(TrackNoise, _example(TrackNoise())),
         "Dataset.track": Call(dataset.track, {"name": one.name}),
-        "dataset_in_memory": Call(tracks.dataset_in_memory, {"info": info, "tracks": [one, two], "notes": ()}),
+        "dataset_in_memory": Call(dataset_in_memory, {"info": info, "tracks": [one, two], "notes": ()}),
         "write_dataset": Call(tracks.write_dataset, {"folder": folder / "set", "info": info, "tracks": [one, two]}),
         "read": Call(bf.read, {"folder": folder / "set"}),
         "import_tracks": Call(
@@ -116,8 +127,8 @@ def calls_of_tracks(folder: Path) -> dict[str, Call]:
 def calls_of_estimates(_folder: Path) -> dict[str, Call]:
     (track,), model = _tracks(1), bf.nominal_model()
     settings, table = bf.Settings.for_measured(model), bf.Surfaces.table_tennis(0.76)
-    info = tracks.DatasetInfo("a", 0.76, bf.Ball(0.02, 0.0027))
-    dataset = tracks.dataset_in_memory(info, [track])
+    info = DatasetInfo("a", 0.76, bf.Ball(0.02, 0.0027))
+    dataset = dataset_in_memory(info, [track])
     options = {"method": "sliding-window", "model": None, "surfaces": 0.76, "settings": settings, "jobs": 1}
     ahead = {"horizon": 0.05, "observe": 0.05, "conformal": None}
     found = bf.estimate(track, method="ekf", surfaces=0.76)
@@ -141,7 +152,7 @@ def calls_of_estimates(_folder: Path) -> dict[str, Call]:
         "predict of a dataset": Call(bf.predict, {"known": dataset, **options, **ahead}),
         "diagnose": Call(bf.diagnose, {"measured": "/nonexistent", "model": None, "jobs": 1}),
         "Estimate.predict": Call(found.predict, {"horizon": 0.05, "step": 0.01}),
-        "Ahead.crossing": Call(found.predict(0.3).crossing, {"x": 1.0}),
+        "Forecast.crossing": Call(found.predict(0.3).crossing, {"x": 1.0}),
         "Settings": Call(bf.Settings, _example(settings)),
         "Smoother": Call(bf.Smoother, {**parts, "optimizer": None}),
         "ExtendedKalmanFilter": Call(bf.ExtendedKalmanFilter, {**parts, "smooth": False, "initialise": "prior"}),
@@ -151,17 +162,17 @@ def calls_of_estimates(_folder: Path) -> dict[str, Call]:
             push, {"time": 0.03, "position": track.positions[3], "sigma": [0.003] * 3, "observations": ()}
         ),
         "Smoother.estimate": Call(bf.Smoother(**parts).estimate, {"track": track, "factors": ()}),
-        "make_estimator": Call(estimation.make_estimator, {"name": "ekf", **parts}),
+        "make_estimator": Call(make_estimator, {"name": "ekf", **parts}),
         "estimate_noise": Call(
             estimation.estimate_noise, {**parts, "surfaces": table, "tracks": [track], "errors": False, "jobs": 1}
         ),
-        "Launcher": Call(estimation.Launcher, {"embedding": None, "sigma": 1.0, "defaults": {}}),
+        "Launcher": Call(Launcher, {"embedding": None, "sigma": 1.0, "defaults": {}}),
         "Tracker": Call(bf.Tracker, {**parts, "lag": 0.1, "gap": 0.5, "confirm": 3, "most": 16}),
         "Tracker.push": Call(
             lambda **given: bf.Tracker(model, 0.76).push(**given),
             {"time": 0.0, "positions": track.positions[:1], "sigmas": None},
         ),
-        "Loss": Call(factors.Loss, {"name": "huber", "scale": 3.0}),
+        "Loss": Call(Loss, {"name": "huber", "scale": 3.0}),
         "ProcessNoise": Call(factors.ProcessNoise, _example(factors.ProcessNoise())),
         "LevenbergMarquardt": Call(factors.LevenbergMarquardt, _example(factors.LevenbergMarquardt())),
         "register_estimator": Call(bf.register_estimator, {"cls": int}),
@@ -177,12 +188,12 @@ def calls_of_models(folder: Path) -> dict[str, Call]:
         "Surfaces": Call(bf.Surfaces, surfaces),
         "Ball": Call(bf.Ball, {"radius": 0.02, "mass": 0.0027}),
         "nominal_model": Call(bf.nominal_model, {"ball": 0.02}),
-        "known_ball": Call(dynamics.known_ball, {"name": "tennis"}),
+        "known_ball": Call(known_ball, {"name": "tennis"}),
         "AnalyticModel": Call(bf.AnalyticModel, {"effects": (), **size}),
         "drag": Call(dynamics.EFFECTS["drag"], {"k": 0.1}),
         "load_model": Call(bf.load_model, {"path": "/nonexistent", **size, "room": None}),
         "save_model": Call(bf.save_model, {"model": model, "path": folder / "model.yaml"}),
-        "World": Call(prediction.World, {"model": model, "surfaces": bf.Surfaces(), "process": factors.ProcessNoise()}),
+        "World": Call(World, {"model": model, "surfaces": bf.Surfaces(), "process": factors.ProcessNoise()}),
         "register": Call(bf.register, {"cls": int}),
     }
 
@@ -194,7 +205,7 @@ def calls_of_simulation(_folder: Path) -> dict[str, Call]:
         simulation.MotionNoise(),
         simulation.SceneConfig(),
         simulation.Clock(),
-        simulation.SimulatedLauncher(),
+        SimulatedLauncher(),
         simulation.table_tennis(),
     )
     called = {type(example).__name__: Call(type(example), _example(example)) for example in examples}
@@ -210,7 +221,7 @@ def calls_of_cameras(_folder: Path) -> dict[str, Call]:
     sighting = {"time": 0.0, "camera": "a", "pixel": [320.0, 240.0], "covariance": np.eye(2)}
     return {
         "Camera": Call(vision.Camera, _example(one)),
-        "CameraBank": Call(vision.CameraBank, {"cameras": [one]}),
+        "CameraBank": Call(CameraBank, {"cameras": [one]}),
         "DetectorSettings": Call(vision.DetectorSettings, _example(vision.DetectorSettings())),
         "AssociationSettings": Call(vision.AssociationSettings, _example(vision.AssociationSettings())),
         "triangulate": Call(vision.triangulate, {"cameras": [one, two], "pixels": pixels, "covariances": covariances}),

@@ -19,7 +19,8 @@ import numpy as np
 import torch
 
 from ballfg.dynamics import Surfaces, nominal_model, rollout
-from ballfg.tracks import Ball, DatasetInfo, Track, write_dataset
+from ballfg.tracks import Ball, Track, write_dataset
+from ballfg.tracks.info import DatasetInfo
 
 RATE, NOISE, HEIGHT = 100.0, 0.0015, 0.76
 SHORT = 5

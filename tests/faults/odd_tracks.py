@@ -17,13 +17,17 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.dynamics import Surfaces, nominal_model
-from ballfg.estimation import Estimate, Estimator, Settings, Status, make_estimator
+from ballfg.estimation import Estimate, Estimator, Settings, Status
 from ballfg.estimation.filters.window_velocity import WINDOW
+from ballfg.estimation.registry import make_estimator
 from ballfg.estimation.track_prediction import predict_tracks
 from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate
 from ballfg.state import POSITION, STANDARD_GRAVITY
-from ballfg.tracks import SPIN_LABELS, TABLE_TENNIS, DatasetInfo, Track, dataset_in_memory
+from ballfg.tracks import TABLE_TENNIS, Track
 from ballfg.tracks.checks import check_scale
+from ballfg.tracks.info import DatasetInfo
+from ballfg.tracks.memory import dataset_in_memory
+from ballfg.tracks.track import SPIN_LABELS
 
 METHODS = ("smoother", "online", "ekf", "sliding-window")
 TABLE_HEIGHT = 0.76

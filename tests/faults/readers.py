@@ -12,9 +12,11 @@ from ballfg.benchmarks.dynamics.record import read_record as read_contender
 from ballfg.benchmarks.speed.gate import SlowerError, check_ratios
 from ballfg.diagnosis.design.reported import reported_pairs
 from ballfg.dynamics import load_model
-from ballfg.estimation import load_conformal, with_readings
+from ballfg.estimation.conformal import load_conformal
 from ballfg.estimation.observations.sighted_dataset import read_sighted
-from ballfg.importing import Choices, propose
+from ballfg.estimation.reading import with_readings
+from ballfg.importing import Choices
+from ballfg.importing.proposal import propose
 from ballfg.learning.calibration.report import compare
 from ballfg.learning.calibration.run import read_checkpoint as read_steps
 from ballfg.learning.config.config_file import read_config
@@ -22,7 +24,9 @@ from ballfg.learning.run.checkpoint import read_checkpoint
 from ballfg.learning.run.metrics import read_metrics
 from ballfg.learning.sequence.predictor import SequencePredictor
 from ballfg.live.sources.sender import Sender
-from ballfg.pages import collect, recognise, show_page
+from ballfg.pages.given import recognise
+from ballfg.pages.show_page import show_page
+from ballfg.pages.shown import collect
 from ballfg.simulation.balls import ball_kind
 from ballfg.simulation.scene.writing import earlier_files
 from ballfg.tracks import read_dataset

@@ -14,9 +14,9 @@ import yaml
 
 import tests.learning.run.falling_ball  # noqa: F401 - registers its kind
 from ballfg.cli.main import run
-from ballfg.dynamics import LearnedModel, load_model, nominal_model, save_model
+from ballfg.dynamics import load_model, nominal_model, save_model
 from ballfg.dynamics.networks.architecture import Architecture
-from ballfg.dynamics.networks.learned import build
+from ballfg.dynamics.networks.learned import LearnedModel, build
 from ballfg.learning.config.training import OptimizerConfig, TrainConfig
 from ballfg.learning.run.checkpoint import Checkpoint, RunProgress, read_checkpoint, write_checkpoint
 from ballfg.learning.run.training import run_training
@@ -172,7 +172,7 @@ def report(found: bool) -> Callable[[Path], None]:
 
 def read_report(folder: Path) -> object:
     """What `ballfg show` reads of a diagnosis, and its model."""
-    from ballfg.pages import recognise
+    from ballfg.pages.given import recognise
 
     return recognise([folder / "diagnosis"]), load_model(folder / "diagnosis" / "model.yaml")
 

@@ -124,6 +124,7 @@ def test_an_output_in_proc_is_refused_at_once(home: Path) -> None:
     assert said.startswith("ballfg: error: /proc/x.csv: ")
 
 
+@pytest.mark.thorough
 def test_random_folders() -> None:
     """A few of those of `python -m tests.faults.elsewhere`."""
     seen, wrong = try_folders(2, seed=3)

@@ -19,12 +19,11 @@ from tests.faults import worker
 from tests.faults.worker import Worker, verdict
 from tests.places import ROOT
 
-SECONDS = 3
 
-
-def test_every_reader_refuses_damaged_files_in_one_line() -> None:
-    """The corpus, every file replaced as a whole, and then some seconds of random damage."""
-    command = [sys.executable, "-m", "tests.faults.fuzz", "--replay", "--seconds", str(SECONDS), "--seed", "1"]
+@pytest.mark.parametrize("seconds", [0, pytest.param(6, marks=pytest.mark.thorough)])
+def test_every_reader_refuses_damaged_files_in_one_line(seconds: int) -> None:
+    """The corpus, every file replaced as a whole, then some seconds of random damage."""
+    command = [sys.executable, "-m", "tests.faults.fuzz", "--replay", "--seconds", str(seconds), "--seed", "1"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"

@@ -85,6 +85,7 @@ def test_a_folder_that_is_read_only_is_refused_in_one_line(tmp_path: Path, capsy
     assert "Permission denied" in one_line(capsys)
 
 
+@pytest.mark.thorough
 def test_a_home_in_which_nothing_can_be_written(tmp_path: Path) -> None:
     """Compiled functions then go to a temporary folder, where the next start finds them; /proc refuses root too."""
     temporary = tmp_path / "temporary"

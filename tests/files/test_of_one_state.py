@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from ballfg.files.whole_folder import of_one_state, whole_folder
-from ballfg.tracks import Ball, DatasetInfo, Track, read_dataset, write_dataset
+from ballfg.tracks import Ball, Track, read_dataset, write_dataset
+from ballfg.tracks.info import DatasetInfo
 
 
 def write(folder: Path, text: str) -> None:

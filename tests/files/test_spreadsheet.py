@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from ballfg.files.spreadsheet import bare, guarded
 from ballfg.pages.tables import Kind, read_table
-from ballfg.tracks import TABLE_TENNIS, DatasetInfo, TableWriter, Track, read_dataset, write_dataset
+from ballfg.tracks import TABLE_TENNIS, TableWriter, Track, read_dataset, write_dataset
+from ballfg.tracks.info import DatasetInfo
 
 NAMES = (
     "=1+1",

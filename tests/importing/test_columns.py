@@ -10,7 +10,9 @@ import pyarrow.parquet as pq
 import pytest
 
 import ballfg as bf
-from ballfg.importing import Choices, UndecidedError, propose
+from ballfg.importing import Choices
+from ballfg.importing.choices import UndecidedError
+from ballfg.importing.proposal import propose
 from ballfg.importing.writing import _drawing
 from ballfg.tracks import Track
 from tests.importing.throws import thrown, write_rows

@@ -16,7 +16,8 @@ import pytest
 import scipy.io
 
 import ballfg as bf
-from ballfg.importing import Choices, propose
+from ballfg.importing import Choices
+from ballfg.importing.proposal import propose
 from ballfg.simulation import SimulationConfig, simulate
 from ballfg.tracks import Track, read_dataset
 from tests.commands import status

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import ballfg as bf
-from ballfg.importing import UndecidedError
 from ballfg.importing.bounces import bounce_heights, surface
+from ballfg.importing.choices import UndecidedError
 from ballfg.importing.fall import AXES, scales
 from ballfg.importing.frame import TURNS
 from ballfg.importing.names import meanings

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ballfg.importing import FORMATS, Format, import_tracks, register_format
+from ballfg.importing import Format, import_tracks, register_format
+from ballfg.importing.formats.registry import FORMATS
 from tests.importing.throws import thrown
 
 

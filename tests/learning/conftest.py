@@ -4,8 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from ballfg.dynamics import model_from_dict
-from ballfg.simulation import MeasurementNoise, SimulationConfig, table_tennis, with_model, write_simulation
+from ballfg.dynamics.model_file import model_from_dict
+from ballfg.simulation import MeasurementNoise, SimulationConfig, table_tennis, write_simulation
+from ballfg.simulation.balls import with_model
 
 PLANTED = {"flight.drag.k": 0.155, "bounce.restitution.e": 0.88, "bounce.table_height.offset": 0.006}
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Surfaces, rollout
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.estimation.launcher import Launcher
-from ballfg.estimation.segmentation import Segmentation
+from ballfg.estimation.segmentation.result import Segmentation
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.problem import effective_sigmas
 from ballfg.estimation.smoother.settle import Earlier, Solution
@@ -27,7 +27,7 @@ from ballfg.learning.end_to_end.learnables import Learnables, NoiseScales
 from ballfg.learning.gradient.conjugate_gradients import ConjugateGradients, GaussNewtonFactors
 from ballfg.learning.gradient.implicit import GradientMethod
 from ballfg.learning.gradient.objective import BatchObjective
-from ballfg.learning.shots import Shot, shots_of
+from ballfg.learning.shots import TrainingShot, shots_of
 from ballfg.tracks import Track
 
 TABLE = Surfaces(0.0)
@@ -156,10 +156,10 @@ def launcher() -> Launcher:
 
 def shots(
     tracks: Sequence[Track], model: BallModel, settings: Settings = SETTINGS, surfaces: Surfaces = TABLE
-) -> list[Shot]:
+) -> list[TrainingShot]:
     """Their first samples are observed, the rest predicted."""
     found = [shot for _, shot in shots_of(tracks, model, surfaces, settings, samples=OBSERVED, seconds=None)]
-    assert all(isinstance(shot, Shot) for shot in found)
+    assert all(isinstance(shot, TrainingShot) for shot in found)
     return found
 
 

@@ -9,7 +9,8 @@ import torch
 import yaml
 from safetensors.torch import load_file
 
-from ballfg.learning import TRAINEES, read_config
+from ballfg.learning import read_config
+from ballfg.learning.registry import TRAINEES
 from ballfg.learning.run.metrics import read_metrics
 from ballfg.simulation import SimulationConfig, write_simulation
 from tests.learning.estimates import directional
@@ -26,6 +27,7 @@ def examples() -> list[str]:
     return re.findall(r"```python\n(.*?)```", GUIDE.read_text(encoding="utf-8"), re.DOTALL)
 
 
+@pytest.mark.thorough
 def test_training_from_python(examples: list[str], tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}

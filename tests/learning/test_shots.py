@@ -10,9 +10,9 @@ import torch
 
 from ballfg.dynamics import Surfaces, nominal_model, rollout
 from ballfg.estimation import Settings, Smoother
-from ballfg.estimation.segmentation import Quality
+from ballfg.estimation.segmentation.result import Quality
 from ballfg.estimation.smoother.problem import QUALITY_SIGMA, effective_sigmas
-from ballfg.learning.shots import Shot, part, shots_of
+from ballfg.learning.shots import TrainingShot, part, shots_of
 from ballfg.tracks import Track
 
 TABLE = Surfaces(0.0, -0.76)
@@ -37,7 +37,7 @@ def hit_track() -> Track:
     return Track(times, np.concatenate((there.positions, back.positions[1:])), name="hit")
 
 
-def shot_of(track: Track, settings: Settings = SETTINGS, **observe) -> Shot | str:
+def shot_of(track: Track, settings: Settings = SETTINGS, **observe) -> TrainingShot | str:
     observe = {"samples": None, "seconds": None} | observe
     ((given, shot),) = shots_of([track], nominal_model(), TABLE, settings, **observe)
     assert given is track
@@ -111,11 +111,11 @@ def test_why_a_track_gives_no_shot() -> None:
     assert shot_of(flown(), samples=58).startswith(short)
     assert shot_of(flown(), samples=100).startswith(short)
     assert shot_of(hit_track(), samples=39).startswith(short)
-    assert isinstance(shot_of(flown(), samples=57), Shot)
+    assert isinstance(shot_of(flown(), samples=57), TrainingShot)
 
 
 def test_every_track_is_answered_for_in_order() -> None:
     tracks = [flown(), flown(10, name="short"), flown(name="third")]
     answers = list(shots_of(iter(tracks), nominal_model(), TABLE, SETTINGS, samples=20, seconds=None))
     assert [track.name for track, _ in answers] == ["shot", "short", "third"]
-    assert [isinstance(shot, Shot) for _, shot in answers] == [True, False, True]
+    assert [isinstance(shot, TrainingShot) for _, shot in answers] == [True, False, True]

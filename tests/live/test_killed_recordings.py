@@ -9,7 +9,11 @@ import pytest
 from tests.live.killed_recordings import Case, run
 
 
-@pytest.mark.parametrize("case", [Case("jsonl", "tcp", 1.7), Case("mcap", "pipe", 2.2)], ids=lambda case: case.ending)
+@pytest.mark.parametrize(
+    "case",
+    [Case("jsonl", "tcp", 1.7), pytest.param(Case("mcap", "pipe", 2.2), marks=pytest.mark.thorough)],
+    ids=["jsonl", "mcap"],
+)
 def test_a_kill_loses_nothing_and_the_same_command_continues(case: Case, tmp_path: Path) -> None:
     if case.ending == "mcap":
         pytest.importorskip("rosbags", reason="the extra 'ros' is not installed")

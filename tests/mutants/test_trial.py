@@ -25,6 +25,7 @@ def change() -> Mutation:
     )
 
 
+@pytest.mark.thorough
 def test_a_run_tells_which_test_reaches_a_line(tmp_path: Path, change: Mutation) -> None:
     record(tmp_path, ["tests/files/test_whole_folder.py"], 1)
     assert recorded_tests(tmp_path) == ["tests/files/test_whole_folder.py"]
@@ -56,6 +57,7 @@ def test_a_change_is_noticed_in_a_copy_and_taken_back(tmp_path: Path, change: Mu
     assert (ROOT / FILE).read_bytes() == source
 
 
+@pytest.mark.thorough
 def test_tests_that_are_not_there_notice_nothing(tmp_path: Path, change: Mutation) -> None:
     """As after a test was renamed: pytest ends with an error, with the change and without it."""
     with (

@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from ballfg.pages import collect, recognise, show_page
+from ballfg.pages.given import recognise
+from ballfg.pages.show_page import show_page
+from ballfg.pages.shown import collect
 from tests.browser import needs_browser, opened
 from tests.pages.made import Fall, Made, make
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from ballfg.pages.coverage import BIN, coverage
-from ballfg.pages.shot import Shot
+from ballfg.pages.shot import ShownShot
 
 
-def shots(count: int, stated: float, seed: int = 3) -> list[Shot]:
+def shots(count: int, stated: float, seed: int = 3) -> list[ShownShot]:
     """Shots of 60 samples whose predictions err by 0.02 m and state another number."""
     generator, made = np.random.default_rng(seed), []
     times = np.arange(60) / 100.0
@@ -16,7 +16,9 @@ def shots(count: int, stated: float, seed: int = 3) -> list[Shot]:
         later = times > 0.2
         guess = places[later] + 0.02 * generator.normal(size=(later.sum(), 3))
         sigmas = np.full(guess.shape, stated)
-        made.append(Shot(str(i), times, places, predicted_times=times[later], predicted=guess, predicted_sigmas=sigmas))
+        made.append(
+            ShownShot(str(i), times, places, predicted_times=times[later], predicted=guess, predicted_sigmas=sigmas)
+        )
     return made
 
 
@@ -41,4 +43,4 @@ def test_bins_are_counted_from_the_last_observed_sample() -> None:
 
 def test_infinite_intervals_hold_everything_and_no_prediction_gives_no_bins() -> None:
     assert (coverage(shots(3, np.inf)).shares == 1.0).all()
-    assert coverage([Shot("a", np.zeros(1), np.zeros((1, 3)))]).shares.shape == (0, 3)
+    assert coverage([ShownShot("a", np.zeros(1), np.zeros((1, 3)))]).shares.shape == (0, 3)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ballfg.pages import recognise
+from ballfg.pages.given import recognise
 from ballfg.tracks import TableWriter
 from tests.pages.made import Made, write
 

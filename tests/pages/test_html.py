@@ -2,7 +2,8 @@
 
 import pytest
 
-from ballfg.pages import Html, explained, table, tag, text, typed, whole_page
+from ballfg.pages.html import Html, explained, table, tag, text, typed
+from ballfg.pages.page import whole_page
 
 
 def test_content_and_attributes_are_escaped() -> None:

@@ -9,8 +9,9 @@ import pytest
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
-from ballfg.pages import Shown, collect, recognise
+from ballfg.pages.given import recognise
 from ballfg.pages.pictures import by_axis, views
+from ballfg.pages.shown import Shown, collect
 from tests.pages.made import SPREAD, Made
 
 LEVEL_90 = 1.6448536

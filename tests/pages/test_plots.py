@@ -44,7 +44,7 @@ def test_a_path_ahead(estimate: bf.Estimate) -> None:
 
 def test_one_of_several_balls(estimate: bf.Estimate) -> None:
     from ballfg.prediction import Belief, Propagator
-    from ballfg.prediction.ahead import carried_by
+    from ballfg.prediction.forecast import carried_by
 
     propagator, belief = carried_by(estimate.last)
     assert isinstance(propagator, Propagator)

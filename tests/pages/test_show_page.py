@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ballfg.pages import collect, recognise, show_page
+from ballfg.pages.given import recognise
+from ballfg.pages.show_page import show_page
+from ballfg.pages.shown import collect
 from tests.pages.made import Fall, Made, make, write
 
 

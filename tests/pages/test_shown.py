@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ballfg.pages import collect, recognise
 from ballfg.pages import shown as room
+from ballfg.pages.given import recognise
+from ballfg.pages.shown import collect
 from tests.pages.made import NOISE, Fall, Made, make
 
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from ballfg.simulation import SimulationConfig, write_simulation
-from ballfg.tracks import TrackNoise, read_dataset, write_dataset
+from ballfg.tracks import read_dataset, write_dataset
+from ballfg.tracks.noise import TrackNoise
 
 TRACKS = 24
 

@@ -12,8 +12,9 @@ from typing import Any
 import pytest
 
 from ballfg.dynamics import nominal_model
-from ballfg.estimation import Estimate, Estimator, dataset_settings, dataset_surfaces, make_estimator, predict_tracks
+from ballfg.estimation import Estimate, Estimator, dataset_settings, dataset_surfaces, predict_tracks
 from ballfg.estimation.batch import do_all, estimate_tracks
+from ballfg.estimation.registry import make_estimator
 from ballfg.parallel import on_cluster
 from ballfg.parallel.same_versions import HERE, differences, own_versions
 from ballfg.tracks import Dataset, read_dataset
@@ -155,6 +156,7 @@ def test_versions_are_compared() -> None:
     assert "must be able to import ballfg" in (differences({}) or "")
 
 
+@pytest.mark.thorough
 @needs_ray
 def test_a_killed_ray_worker_loses_and_doubles_nothing(
     dataset: Dataset, estimator: Estimator, alone: list[bytes]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ballfg.benchmarks.dynamics.scoring import apex_errors, pooled_rmse, score_path
-from ballfg.benchmarks.dynamics.task import Shot
+from ballfg.benchmarks.dynamics.task import TaskShot
 from ballfg.prediction.apexes import flight_bounds, measured_apexes, path_apex, true_apexes
 from ballfg.tracks import Track
 
@@ -117,10 +117,10 @@ def test_flights_end_with_the_track() -> None:
     assert flight_bounds(times, np.array([0.2, 0.4, 0.6, 0.8])) == [(0.0, 0.2), (0.2, 0.4), (0.4, 0.6)]
 
 
-def shot(times: np.ndarray, states: np.ndarray, bounces: np.ndarray, observed: int = 60) -> Shot:
+def shot(times: np.ndarray, states: np.ndarray, bounces: np.ndarray, observed: int = 60) -> TaskShot:
     apexes, when = true_apexes(times, states, bounces)
     track = Track(times, states[:, :3], name="hops")
-    return Shot(track, states[:, :3], observed, len(times), bounces, apexes, when, states)
+    return TaskShot(track, states[:, :3], observed, len(times), bounces, apexes, when, states)
 
 
 def test_errors_of_a_shifted_path_are_the_shift(hops) -> None:  # type: ignore[no-untyped-def]

@@ -20,5 +20,5 @@ def test_the_guide_runs(capsys):
     assert 0.2 < slow < 2.2
     assert lines[3].endswith(") m")
     assert "(2.00, " in lines[3]
-    assert lines[4].startswith("Ahead(30 times to t = 0.500 s")
+    assert lines[4].startswith("Forecast(30 times to t = 0.500 s")
     assert re.fullmatch(r"track: 5 positions predicted, the last \d+ mm off", lines[6])

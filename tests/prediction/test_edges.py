@@ -7,9 +7,10 @@ import pytest
 import torch
 from scipy.stats import norm
 
-from ballfg.dynamics import Surfaces, fly, rollout
+from ballfg.dynamics import Surfaces, rollout
 from ballfg.dynamics.compiled.beliefs.course import Course
 from ballfg.dynamics.compiled.beliefs.edges import come_down, falls_past
+from ballfg.dynamics.motion.integrate import fly
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction import Propagator, apex
 from tests.prediction.conftest import NEARLY_EXACT

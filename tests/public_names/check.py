@@ -27,7 +27,6 @@ ROOMS = (
     "ballfg.tracks",
     "ballfg.vision",
     "ballfg.dynamics",
-    "ballfg.pages",
     "ballfg.simulation",
     "ballfg.factors",
     "ballfg.estimation",

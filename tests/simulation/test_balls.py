@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from ballfg.dynamics import nominal_model
-from ballfg.simulation import SimulationConfig, ball_kind, simulate, tennis, with_model
-from ballfg.tracks import TENNIS
+from ballfg.simulation import SimulationConfig, simulate, tennis
+from ballfg.simulation.balls import ball_kind, with_model
+from ballfg.tracks.info import TENNIS
 
 SQUASH = """
 name: squash

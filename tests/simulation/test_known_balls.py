@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from ballfg.dynamics import KNOWN_BALLS
+from ballfg.dynamics.known_balls import KNOWN_BALLS
 from ballfg.estimation import Settings, Smoother, Status
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
-from ballfg.simulation import MeasurementNoise, MotionNoise, SimulationConfig, ball_kind, simulate
+from ballfg.simulation import MeasurementNoise, MotionNoise, SimulationConfig, simulate
+from ballfg.simulation.balls import ball_kind
 from ballfg.tracks import TABLE_TENNIS
 
 TRACKS = 3

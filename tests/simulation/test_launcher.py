@@ -5,15 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ballfg.simulation import (
-    SETTING_LEVELS,
-    SimulatedLauncher,
-    SimulationConfig,
-    all_settings,
-    parse_settings,
-    simulate,
-)
-from ballfg.simulation.settings import settings_of_shots
+from ballfg.simulation import SimulationConfig, simulate
+from ballfg.simulation.launcher import SimulatedLauncher
+from ballfg.simulation.settings import SETTING_LEVELS, all_settings, parse_settings, settings_of_shots
 
 
 class Shots:

@@ -7,20 +7,15 @@ import pytest
 import torch
 from scipy import stats
 
-from ballfg.dynamics import model_from_dict, nominal_model
+from ballfg.dynamics import nominal_model
+from ballfg.dynamics.model_file import model_from_dict
 from ballfg.factors.noise import ProcessNoise
-from ballfg.simulation import (
-    MeasurementNoise,
-    MotionNoise,
-    SimulatedTrack,
-    SimulationConfig,
-    simulate,
-    table_tennis,
-    with_model,
-)
+from ballfg.simulation import MeasurementNoise, MotionNoise, SimulationConfig, simulate, table_tennis
+from ballfg.simulation.balls import with_model
 from ballfg.simulation.composition import KickedModel
+from ballfg.simulation.measure import SimulatedTrack
 from ballfg.simulation.motion import process_noise
-from ballfg.tracks import SPIN_LABELS
+from ballfg.tracks.track import SPIN_LABELS
 
 QUIET = MeasurementNoise(position=0.0, spin=0.0)
 

@@ -7,20 +7,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from ballfg.dynamics import EFFECTS, AnalyticModel, Effect, Flight, FlightEffect, model_from_dict, nominal_model
+from ballfg.dynamics import EFFECTS, AnalyticModel, Flight, FlightEffect, nominal_model
+from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.model import substitute
-from ballfg.simulation import (
-    UNDECLARED,
-    MeasurementNoise,
-    SimulatedTrack,
-    SimulationConfig,
-    parse_effects,
-    simulate,
-    table_tennis,
-    with_model,
-)
+from ballfg.dynamics.model_file import model_from_dict
+from ballfg.simulation import MeasurementNoise, SimulationConfig, parse_effects, simulate, table_tennis
+from ballfg.simulation.balls import with_model
 from ballfg.simulation.composition import true_model
-from ballfg.tracks import SPIN_LABELS
+from ballfg.simulation.measure import SimulatedTrack
+from ballfg.simulation.undeclared import UNDECLARED
+from ballfg.tracks.track import SPIN_LABELS
 
 STATE = torch.tensor([[1.2, 0.3, 1.1, 5.0, -1.0, 2.0, 40.0, -150.0, 60.0]], dtype=torch.float64)
 MOTION = {

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ballfg.tracks import TABLE_TENNIS, DatasetInfo, Track
+from ballfg.tracks import TABLE_TENNIS, Track
+from ballfg.tracks.info import DatasetInfo
 
 YAML = "name: small\nframe: {up: z, table_height: 0.76}\nball: {radius: 0.02, mass: 0.0027}\nrate: 100\n"
 TRACKS = """trajectory,t,x,y,z

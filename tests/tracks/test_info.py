@@ -1,8 +1,8 @@
 import pytest
 
 from ballfg.checks import MAX_LISTED
-from ballfg.tracks import TABLE_TENNIS, TENNIS, Ball, DatasetInfo, read_dataset
-from ballfg.tracks.info import read_info, write_info
+from ballfg.tracks import TABLE_TENNIS, Ball, read_dataset
+from ballfg.tracks.info import TENNIS, DatasetInfo, read_info, write_info
 
 GOOD = {
     "name": "name: small",

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ballfg.tracks import TABLE_TENNIS, DatasetInfo, Track, write_dataset
+from ballfg.tracks import TABLE_TENNIS, Track, write_dataset
+from ballfg.tracks.info import DatasetInfo
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="peak memory is read from /proc")
 
@@ -53,7 +54,7 @@ def _interleave(path) -> None:
     path.write_text(header + "".join(rows))
 
 
-@pytest.mark.parametrize("kind", ["csv", "parquet", "interleaved csv"])
+@pytest.mark.parametrize("kind", [pytest.param("csv", marks=pytest.mark.thorough), "parquet", "interleaved csv"])
 def test_memory_does_not_grow_with_the_number_of_tracks(tmp_path, kind):
     info = DatasetInfo("many", 0.76, TABLE_TENNIS, rate=150.0)
     peaks = []

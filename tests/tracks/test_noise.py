@@ -3,8 +3,9 @@
 import pytest
 
 from ballfg.dynamics import load_model, nominal_model, save_model
-from ballfg.tracks import TABLE_TENNIS, DatasetInfo, TrackNoise
-from ballfg.tracks.info import read_info, write_info
+from ballfg.tracks import TABLE_TENNIS
+from ballfg.tracks.info import DatasetInfo, read_info, write_info
+from ballfg.tracks.noise import TrackNoise
 
 NOISE = TrackNoise(
     position=(0.001, 0.002, 0.0015),

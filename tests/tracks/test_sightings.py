@@ -28,12 +28,12 @@ def sightings(m: int = 6, **changes: object) -> Sightings:
 
 def test_rows_can_be_taken() -> None:
     whole = sightings()
-    for part in (whole.taken(np.array([1, 4])), whole.taken(np.arange(6) % 3 == 1)):
+    for part in (whole.select(np.array([1, 4])), whole.select(np.arange(6) % 3 == 1)):
         assert len(part) == 2
         np.testing.assert_array_equal(part.times, whole.times[[1, 4]])
         np.testing.assert_array_equal(part.camera, [1, 0])
     with pytest.raises(ValueError, match="m >= 1"):
-        whole.taken(np.zeros(6, dtype=bool))
+        whole.select(np.zeros(6, dtype=bool))
 
 
 def test_arrays_are_copies() -> None:

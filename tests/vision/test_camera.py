@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.vision import Camera, CameraBank
+from ballfg.vision import Camera
+from ballfg.vision.projection import CameraBank
 
 DISTORTIONS = {
     0: [],

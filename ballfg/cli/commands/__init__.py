@@ -1,1 +1,1 @@
-"""The commands of `ballfg`, one file each: they parse, call and print."""
+"""Each command of `ballfg` has a file, which parses, calls and prints."""

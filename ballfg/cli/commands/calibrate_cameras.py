@@ -1,4 +1,4 @@
-"""`ballfg calibrate-cameras`: from images of a board and points of the table to `cameras.yaml`."""
+"""Implements `ballfg calibrate-cameras`: images of a board and points of the table give `cameras.yaml`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 OURS: Final = (".yaml", ".yml")
 THEIRS: Final = (".xml", ".json")
-"""Endings of files of cameras: ours, and those of OpenCV's FileStorage."""
+"""Endings of camera files: this package's, and those of OpenCV's FileStorage."""
 
 _lens_option, _place_option = (
     partial(typer.Option, rich_help_panel=panel) for panel in ("Lens, from images of a board", "Place, from the table")
@@ -95,7 +95,7 @@ def calibrate_cameras(
 
 
 def _grouped(option: str, words: Iterable[str]) -> dict[str, list[str]]:
-    """Places by camera. Raises: ValueError: a word that is not NAME=PLACE."""
+    """Paths by camera. Raises: ValueError: an argument other than NAME=PLACE."""
     grouped: dict[str, list[str]] = {}
     for word in words:
         name, equals, place = word.partition("=")
@@ -108,7 +108,7 @@ def _grouped(option: str, words: Iterable[str]) -> dict[str, list[str]]:
 def _check_same(
     cameras: Iterable[str], where: str, marked: TableFile | None, table: Path | None, shown: Iterable[str]
 ) -> None:
-    """Refuses a camera that is named in one place only."""
+    """Refuses a camera that is named in only one of the two."""
     cameras = set(cameras)
     listed = ", ".join(sorted(cameras))
     for name in sorted(set(shown) - cameras):

@@ -1,4 +1,4 @@
-"""`ballfg compile`: machine code ahead of its first use."""
+"""Implements `ballfg compile`, which compiles machine code ahead of its first use."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _done(parts: list[Callable[[], object]]) -> Iterator[object]:
 
 
 def _parts(model: BallModel) -> list[Callable[[], object]]:
-    """Whatever an estimate, a stream and their predictions call, with the settings that commands use."""
+    """The functions of an estimate, a stream and their predictions, with the settings of commands."""
     from ballfg.dynamics import Surfaces
     from ballfg.estimation import Online, Settings, Smoother, estimate_noise
     from ballfg.estimation.online.warm_up import falling_ball

@@ -1,4 +1,4 @@
-"""`ballfg design`: which shots to make next."""
+"""Implements `ballfg design`, which chooses the next shots."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ballfg.cli import inputs
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from ballfg.diagnosis import ShotPlan
+    from ballfg.diagnosis.design.plan import ShotPlan
     from ballfg.dynamics import AnalyticModel
     from ballfg.tracks import Dataset
 
@@ -86,7 +86,7 @@ def _say(line: str) -> None:
 def _pairs(
     between: str | None, shrink: str | None, folder: Path | None, data: Dataset, model: AnalyticModel, jobs: int
 ) -> Sequence[tuple[str, str]]:
-    """What to tell apart: as the options say, else what a diagnosis could not; nothing with --shrink."""
+    """The pairs of effects to separate: from the options, else those that a diagnosis left open; none with --shrink."""
     from ballfg.diagnosis import diagnose
     from ballfg.diagnosis.design.reported import pairs_of, reported_pairs
 

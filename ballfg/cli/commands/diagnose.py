@@ -1,4 +1,4 @@
-"""`ballfg diagnose`: effects that a model lacks, by the tracks of a dataset."""
+"""Implements `ballfg diagnose`, which finds effects that a model lacks from the tracks of a dataset."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def diagnose(
         raise ValueError(f"out must not be the dataset itself; got {out}. Choose another folder.")
     if model is not None and model.resolve() == out.resolve() / MODEL:
         raise ValueError(f"out must not hold the model itself; {model} would be replaced. Choose another folder.")
-    with reserved(out):  # until the report is there: a diagnosis takes minutes
+    with reserved(out):  # until the report is written: a diagnosis takes minutes
         check_report_folder(out, force=force)
         know_observations(observations_file)
         inputs, *others = [open_inputs(dataset, model, effects_file) for dataset in datasets]

@@ -1,4 +1,4 @@
-"""`ballfg estimate`: the states of every track of a dataset."""
+"""Implements `ballfg estimate`, which estimates the states of every track of a dataset."""
 
 from __future__ import annotations
 
@@ -60,8 +60,8 @@ def estimate(
 
     Example: ballfg estimate data/aimy --method smoother --out states.csv
     """
-    from ballfg.estimation import has_positions
     from ballfg.estimation.batch import map_tracks
+    from ballfg.estimation.reading import has_positions
     from ballfg.tracks import TableWriter
 
     outcome = inputs.Outcome()
@@ -88,7 +88,7 @@ def estimate(
 
 @dataclass(frozen=True)
 class _Estimated:
-    """What the table and the last lines need of an estimate: a tenth of it, to be sent between machines."""
+    """The parts of an estimate that the table and the last lines need: a tenth of it, for other processes."""
 
     name: str
     columns: list[dict[str, str | np.ndarray]]
@@ -100,12 +100,12 @@ class _Estimated:
 
 
 def _estimated(model: BallModel, estimator: Estimator, track: Track) -> _Estimated:
-    from ballfg.estimation.outside import outside_of
+    from ballfg.estimation.out_of_distribution import out_of_distribution
 
     columns, shares, notes, rows, hits = [], list[float](), list[str](), 0, 0
     status = None
     for part in estimator.in_sections(track):
-        share = outside_of(model, part.states)
+        share = out_of_distribution(model, part.states)
         columns.append(_columns(part) | ({} if share is None else {"outside": share}))
         shares += [] if share is None else [float(share.sum())]
         notes += part.notes

@@ -1,4 +1,4 @@
-"""`ballfg example`: shots to try everything with."""
+"""Implements `ballfg example`, which writes shots for trying everything."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MEASURED = (
     ("robot_rallies", "50 rallies of a robot", "intelligent-soft-robots/pam_configuration", "BSD-3-Clause"),
     ("spindoe", "shots with measured spin", "cogsys-tuebingen/spindoe", "none stated: for evaluation only"),
 )
-"""Name, what it is, the repository on GitHub that publishes it, its licence."""
+"""Name, description, publishing repository on GitHub, licence."""
 PAUSE = 1.5
 """s between two shots of the recording."""
 
@@ -69,7 +69,7 @@ def example(
 
 
 def _capture(config: SimulationConfig) -> str:
-    """Shots one after another in one table, in the units and axes of somebody else."""
+    """Shots one after another in one table, in a foreign program's units and axes."""
     from ballfg.simulation import simulate
 
     lines, begin = ["Zeit [ms];X [mm];Y [mm];Z [mm]"], 0.0

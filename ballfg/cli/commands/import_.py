@@ -1,4 +1,4 @@
-"""`ballfg import`: a user's own files to a dataset."""
+"""Implements `ballfg import`, which turns a user's own files into a dataset."""
 
 from __future__ import annotations
 
@@ -13,13 +13,15 @@ import typer
 from ballfg.progress import idle
 
 if TYPE_CHECKING:
-    from ballfg.importing import Choices, Proposal, UndecidedError
+    from ballfg.importing import Choices
+    from ballfg.importing.choices import UndecidedError
+    from ballfg.importing.proposal import Proposal
 
 _guess, _file = (partial(typer.Option, rich_help_panel=panel) for panel in ("Instead of a guess", "Files"))
 MOST_QUESTIONS = 8
-"""Questions on a terminal, after which something else is wrong."""
+"""Largest number of questions on a terminal; after more something else is wrong."""
 WIDTH = 160
-"""Characters of a line of the proposal, where no terminal tells."""
+"""Number of characters in a line of the proposal without a terminal."""
 
 
 def import_(
@@ -51,7 +53,9 @@ def import_(
     Example: ballfg import shots.csv --out my_shots
     """
     from ballfg.files.whole_folder import check_replaceable
-    from ballfg.importing import Choices, parse_columns, write_import
+    from ballfg.importing import Choices
+    from ballfg.importing.choices import parse_columns
+    from ballfg.importing.writing import write_import
 
     if format not in ("csv", "parquet"):
         raise ValueError(f"--format must be csv or parquet; got {format!r}. Choose one of them.")
@@ -68,8 +72,9 @@ def import_(
 
 
 def _proposed(sources: list[Path], choices: Choices) -> Proposal:
-    """The proposal; on a terminal the user answers what is not safe to guess."""
-    from ballfg.importing import UndecidedError, propose
+    """The proposal; on a terminal the user answers the unsafe guesses."""
+    from ballfg.importing.choices import UndecidedError
+    from ballfg.importing.proposal import propose
 
     for _ in range(MOST_QUESTIONS):
         try:
@@ -82,10 +87,10 @@ def _proposed(sources: list[Path], choices: Choices) -> Proposal:
 
 
 def _answered(question: UndecidedError, choices: Choices) -> Choices:
-    from ballfg.importing import parse_columns
+    from ballfg.importing.choices import parse_columns
 
     default = question.choices[0] if question.choices else None
-    with idle():  # who is asked may take time to answer
+    with idle():  # the user may take time to answer
         answer = typer.prompt(f"{question}\n--{question.option}", default=default, err=True)
     field = question.option.replace("-", "_")
     if field == "columns":

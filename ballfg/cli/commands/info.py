@@ -1,4 +1,4 @@
-"""`ballfg info`, `balls` and `effects`: what is installed and registered, and what is known of balls and effects."""
+"""Implements `ballfg info`, `balls` and `effects`, which list what is installed, registered and known."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ballfg.machine import usable_cores
 from ballfg.registry import PACKAGE, Registry, source_of
 
 if TYPE_CHECKING:
-    from ballfg.dynamics import Effect
+    from ballfg.dynamics.effect import Effect
 
 REGISTRIES = (
     ("effects", "ballfg.dynamics", "EFFECTS"),
@@ -28,9 +28,9 @@ REGISTRIES = (
     ("trainees", "ballfg.learning", "TRAINEES"),
     ("formats", "ballfg.importing", "FORMATS"),
 )
-"""Title, module and attribute of each registry, in the order in which they are shown."""
+"""Title, module and attribute of each registry, in the order of the output."""
 WIDTH = 110
-"""Longest line, in characters."""
+"""Largest number of characters in a line."""
 
 
 def info() -> None:
@@ -53,7 +53,7 @@ def _show(title: str, lines: Iterator[str]) -> None:
 
 
 def required(requirements: Iterable[str]) -> dict[str | None, list[str]]:
-    """Names of the packages that are required always (None), and for each extra, from the metadata of a package."""
+    """Names of a package's required packages (None), and of those of each extra, from its metadata."""
     names: dict[str | None, list[str]] = {None: []}
     for text in requirements:
         extra = re.search(r'extra == "([\w-]+)"', text)
@@ -63,13 +63,13 @@ def required(requirements: Iterable[str]) -> dict[str | None, list[str]]:
 
 
 def packages(needed: Mapping[str | None, list[str]]) -> Iterator[str]:
-    """The packages that are always needed, with their versions."""
+    """The required packages, with their versions."""
     for name in needed[None]:
         yield _installed(name) or f"{name} is not installed; pip install {name}"
 
 
 def extras(needed: Mapping[str | None, list[str]]) -> Iterator[str]:
-    """The optional parts of the package: installed, or how to install them."""
+    """The optional parts of the package: installed, or the command that installs them."""
     for extra, names in needed.items():
         if extra is not None:
             missing = [name for name in names if _installed(name) is None]
@@ -99,7 +99,7 @@ def _machine() -> Iterator[str]:
 
 
 def _registered(classes: Mapping[str, type[Any]]) -> Iterator[str]:
-    """The names in a registry, one line for each package that they come from."""
+    """The names in a registry, one line for each package of origin."""
     by_source: dict[str, list[str]] = {}
     for name, cls in classes.items():
         source = classes.source(name) if isinstance(classes, Registry) else source_of(cls)
@@ -121,7 +121,9 @@ def balls() -> None:
 
 
 def _ball_lines() -> Iterator[str]:
-    from ballfg.dynamics import KNOWN_BALLS, model_to_dict, nominal_model
+    from ballfg.dynamics import nominal_model
+    from ballfg.dynamics.known_balls import KNOWN_BALLS
+    from ballfg.dynamics.model_file import model_to_dict
 
     titles = ("name", "radius mm", "mass g", "drag k 1/m", "terminal m/s", "restitution", "court m")
     yield f"{titles[0]:<13}" + "".join(f"{title:>14}" for title in titles[1:]) + "  radius and mass by"
@@ -132,7 +134,7 @@ def _ball_lines() -> Iterator[str]:
             f"{1e3 * known.ball.radius:.2f}",
             f"{1e3 * known.ball.mass:.1f}",
             f"{drag:.4g}",
-            f"{math.sqrt(gravity / drag):.1f}",  # where the drag k v^2 is g
+            f"{math.sqrt(gravity / drag):.1f}",  # the drag k v^2 equals g
             f"{model['bounce']['restitution']['e']:.3g}",
             "-" if known.court is None else "{:g} x {:g}".format(*known.court),
         )
@@ -158,7 +160,7 @@ def effects(
 
 
 def _described(effect: type[Effect]) -> Iterator[str]:
-    """All that is known of an effect, in lines."""
+    """A description of an effect, in lines."""
     yield f"{effect.name}: {effect.plain or effect.name.replace('_', ' ')}, an effect of {effect.kind}"
     told = {
         "what": effect.sentence,

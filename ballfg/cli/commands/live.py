@@ -1,4 +1,4 @@
-"""`ballfg live`: positions in as they are measured, states and predictions out."""
+"""Implements `ballfg live`, which answers measured positions with states and predictions in real time."""
 
 from __future__ import annotations
 
@@ -104,14 +104,14 @@ def live(
         print(f"ballfg live: reading {source.name}{trust}", file=sys.stderr, flush=True)
         inbox = Inbox(source)
         session = Session(tracker, inbox, write, wanted, watchers)
-        with progress.idle():  # it waits for lines, and answers them
+        with progress.idle():  # it waits for lines
             _run(session, inbox)
     for line in session.summary():
         print(f"ballfg live: {line}", file=sys.stderr)
 
 
 def _check_out(out: Path) -> None:
-    """Refuse what cannot become a recording, before any work. Raises: ValueError; FileNotFoundError: no such folder."""
+    """Refuses an unusable recording before any work. Raises: ValueError; FileNotFoundError: no such folder."""
     from ballfg.files.whole_file import check_file
 
     check_file(out)
@@ -124,7 +124,7 @@ def _is_bag(path: Path) -> bool:
 
 
 def _dataset(folder: Path | None) -> Dataset | None:
-    """The dataset of a replay, or the one that the stream is like."""
+    """The dataset of a replay, or the one named as similar to the stream."""
     if folder is None:
         return None
     from ballfg.estimation.observations.files import tables_of_readings
@@ -139,11 +139,12 @@ def _dataset(folder: Path | None) -> Dataset | None:
 def _scene(
     data: Dataset | None, model: Path | None, named: str | None, table: float | None, noise: float | None
 ) -> tuple[BallModel, Surfaces, Settings]:
-    """Ball, surfaces and noise: the dataset's, or as the options say."""
+    """Ball, surfaces and noise: the dataset's, or the options'."""
     from dataclasses import replace
 
     from ballfg.checks import check_number
-    from ballfg.dynamics import KNOWN_BALLS, Surfaces, known_ball, load_model, nominal_model
+    from ballfg.dynamics import Surfaces, load_model, nominal_model
+    from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball
     from ballfg.estimation import dataset_settings, dataset_surfaces
 
     if data is not None:
@@ -167,7 +168,7 @@ def _scene(
 
 
 def _settings(ball: BallModel) -> Settings:
-    """The noise of a stream of which no dataset tells: the usual, or what the model brings along."""
+    """The noise of a stream without a dataset: the usual one, or the model's."""
     from ballfg.estimation import Settings
     from ballfg.estimation.configure import learned_process
     from ballfg.estimation.noise.parameters import with_noise
@@ -205,7 +206,7 @@ def _source(
 
 @contextlib.contextmanager
 def _output(out: Path | None, source: Source) -> Iterator[Callable[[bytes], None]]:
-    """Where lines are written: standard output, a recording, or nowhere beside a bag."""
+    """The output of lines: standard output, a recording, or none beside a bag."""
     if out is None:
         stream = sys.stdout.buffer
 
@@ -239,7 +240,7 @@ def _watchers(out: Path | None, source: Source, viewer: bool, horizon: float) ->
 
 
 def _run(session: Session, inbox: Inbox) -> None:
-    """Until the input ends, the output closes, or a signal: the first lets the sample at hand be finished."""
+    """Runs until the input ends, the output closes, or a signal comes: the first finishes the present sample."""
 
     def stop(number: int, frame: object) -> None:
         inbox.interrupt()
@@ -247,11 +248,11 @@ def _run(session: Session, inbox: Inbox) -> None:
 
     before = {number: signal.signal(number, stop) for number in heeded()}
     interval = sys.getswitchinterval()
-    sys.setswitchinterval(5e-4)  # the reading thread gets its turn soon, and with it the true moment of reading
+    sys.setswitchinterval(5e-4)  # the reading thread runs soon, and so notes the true moment of reading
     try:
         session.run()
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered goes nowhere
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the rest of the buffer goes nowhere
     finally:
         inbox.close()
         sys.setswitchinterval(interval)

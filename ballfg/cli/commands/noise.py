@@ -1,4 +1,4 @@
-"""`ballfg noise`: the noise that the tracks of a dataset show, with error bars."""
+"""Implements `ballfg noise`, which estimates the noise of a dataset's tracks, with error bars."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ballfg.progress import progress
 
 if TYPE_CHECKING:
     from ballfg.dynamics import BallModel
-    from ballfg.estimation import NoiseEstimate
+    from ballfg.estimation.noise.estimate import NoiseEstimate
     from ballfg.tracks import Dataset
 
 MEANINGS = {
@@ -29,9 +29,9 @@ MEANINGS = {
     "contact_spin": ("scatter of the spin after a bounce", 1.0, "rad/s"),
     "coefficients": ("spread of coefficients from track to track / usual", 1.0, ""),
 }
-"""For each number its meaning, the factor to the unit that is printed, and that unit."""
+"""Meaning of each number, factor to its printed unit, and that unit."""
 UNKNOWN = 0.7
-"""Standard deviation of a logarithm from which on the tracks hardly tell more than the order of magnitude."""
+"""Standard deviation of a logarithm beyond which the tracks give hardly more than the order of magnitude."""
 
 
 def noise(
@@ -53,7 +53,9 @@ def noise(
 
     Example: ballfg noise data/ballgun --out noisy.yaml
     """
-    from ballfg.estimation import dataset_settings, dataset_surfaces, estimate_noise, spread_over, with_readings
+    from ballfg.estimation import dataset_settings, dataset_surfaces, estimate_noise
+    from ballfg.estimation.noise.estimate import spread_over
+    from ballfg.estimation.reading import with_readings
     from ballfg.tracks import read_dataset
 
     inputs.know_effects(effects_file)
@@ -97,14 +99,14 @@ def _table(found: NoiseEstimate) -> list[str]:
 
 
 def _limits(low: float, high: float) -> str:
-    """The interval of a number, or the one limit that the tracks show."""
+    """The interval of a number, or its only limit."""
     if math.isinf(high):
         return f"  (above {low:.2g})" if low > 0.0 else ""
     return f"  ({low:.2g} to {high:.2g})" if low > 0.0 else f"  (below {high:.2g})"
 
 
 def _ratio(error: float) -> str:
-    """The factor by which a number may be larger or smaller, one standard deviation."""
+    """The factor of one standard deviation of a number's logarithm."""
     return f"{2.718281828**error:4.2f}"
 
 

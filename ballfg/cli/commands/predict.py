@@ -1,4 +1,4 @@
-"""`ballfg predict`: from the first part of every track, where the ball is at all later stamps."""
+"""Implements `ballfg predict`, which predicts the later positions of every track from its first part."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from ballfg.progress import progress
 if TYPE_CHECKING:
     import numpy as np
 
-    from ballfg.estimation import ConformalScales, Estimator, TrackPrediction
+    from ballfg.estimation import ConformalScales, Estimator
+    from ballfg.estimation.track_prediction import TrackPrediction
     from ballfg.tracks import Dataset
 
 
@@ -52,7 +53,8 @@ def predict(
 
     Example: ballfg predict data/ballgun --observe 0.25 --out predictions.csv
     """
-    from ballfg.estimation import check_observe, predict_tracks
+    from ballfg.estimation import predict_tracks
+    from ballfg.estimation.track_prediction import check_observe
     from ballfg.files.whole_file import check_file
     from ballfg.tracks import TableWriter
 
@@ -95,14 +97,10 @@ def _conformal_scales(
     observe: float,
     jobs: int,
 ) -> ConformalScales:
-    """Scales from the calibration tracks of a folder, or from a file that keeps them."""
-    from ballfg.estimation import (
-        ConformalScales,
-        check_calibration_tracks,
-        load_conformal,
-        predict_tracks,
-        with_readings,
-    )
+    """Scales from the calibration tracks of a folder, or from a file of scales."""
+    from ballfg.estimation import ConformalScales, predict_tracks
+    from ballfg.estimation.conformal import check_calibration_tracks, load_conformal
+    from ballfg.estimation.reading import with_readings
     from ballfg.tracks import read_dataset
 
     if source.is_file():
@@ -119,7 +117,7 @@ def _conformal_scales(
 
 
 def _print_conformal(scales: ConformalScales, outcome: _Outcome) -> None:
-    """Prints what the intervals hold, of the calibration tracks and of those predicted, and where they are infinite."""
+    """Prints the coverage of the intervals, on calibration and predicted tracks, and where they are infinite."""
     from ballfg.estimation import Status
     from ballfg.estimation.conformal import BIN, FEWEST
 
@@ -156,7 +154,7 @@ class _Outcome:
     tracks: inputs.Outcome = field(default_factory=inputs.Outcome)
 
     def add(self, result: TrackPrediction, own_sigmas: np.ndarray) -> None:
-        """Counts a track; coordinates in 90 % intervals are counted where the interval is finite."""
+        """Counts a track, with the coordinates inside their finite 90 % intervals."""
         import numpy as np
 
         from ballfg.estimation.conformal import HALF_WIDTH
@@ -173,7 +171,7 @@ class _Outcome:
         self.tracks.add(result.name, result.status, result.estimate.notes, outside)
 
     def print(self, observe: float) -> None:
-        """Prints how the tracks ended and how far off their predictions are."""
+        """Prints the counts of tracks by status and the errors of their predictions."""
         self.tracks.print()
         if self.rows:
             rmse = 1e3 * (self.squares / self.rows) ** 0.5

@@ -1,4 +1,4 @@
-"""`ballfg render`: synthetic videos of balls over a table, with the truth beside them."""
+"""Implements `ballfg render`, which films simulated balls over a table, with their true states."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ballfg.cli.inputs import EffectsFiles, Seed, know_effects
 from ballfg.progress import progress
 
 if TYPE_CHECKING:
-    from ballfg.simulation.scene import Clock
+    from ballfg.simulation.scene.config import Clock
 
 _cameras, _picture, _balls, _files = (
     partial(typer.Option, rich_help_panel=panel) for panel in ("Cameras", "Picture", "Balls", "Files")
@@ -56,8 +56,9 @@ def render(
     cameras.yaml holds the cameras, NAME_stamps.csv the stamps of the frames, truth.csv the true states over time,
     visible.csv the true place of each ball in each frame, scene.yaml all settings.
     """
-    from ballfg.simulation import SceneConfig, parse_effects, parse_settings, record, table_rig, write_scene
+    from ballfg.simulation import SceneConfig, parse_effects, record, table_rig, write_scene
     from ballfg.simulation.scene.writing import check_scene_folder
+    from ballfg.simulation.settings import parse_settings
 
     know_effects(effects_file)
     check_scene_folder(out, force=force)
@@ -88,10 +89,11 @@ def render(
 def _clocks(
     names: list[str], rate: float, seed: int, offsets: tuple[str, ...] | list[str], *, unsynchronised: bool
 ) -> dict[str, Clock]:
-    """Clocks by camera, from the command line's words."""
+    """Clocks by camera, from the options."""
     from dataclasses import replace
 
-    from ballfg.simulation.scene import Clock, free_running
+    from ballfg.simulation.scene.config import Clock
+    from ballfg.simulation.scene.shutter import free_running
 
     clocks = {name: Clock() for name in names}
     if unsynchronised:

@@ -1,4 +1,4 @@
-"""`ballfg show`: measured shots, estimates, predictions and a diagnosis as a page to look at."""
+"""Implements `ballfg show`, which writes a page of shots, estimates, predictions and a diagnosis."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ballfg.files.whole_file import check_file, whole_file, write_text
 
 if TYPE_CHECKING:
     from ballfg.estimation.observations.sighted_dataset import SightedDataset
-    from ballfg.pages import Shown
+    from ballfg.pages.shown import Shown
     from ballfg.tracks import Dataset
 
 
@@ -40,7 +40,9 @@ def show(
 
     The page is one file without links: it opens without a network, on a computer or a phone.
     """
-    from ballfg.pages import collect, recognise, show_page
+    from ballfg.pages.given import recognise
+    from ballfg.pages.show_page import show_page
+    from ballfg.pages.shown import collect
 
     _check_outputs(out, png, rerun)
     what, names = recognise(given, _dataset), track or []
@@ -61,7 +63,7 @@ def show(
 
 
 def _dataset(folder: Path) -> Dataset | SightedDataset:
-    """The tracks of a folder; roughly triangulated ones where there are only detections."""
+    """The tracks of a folder; roughly triangulated ones if there are only detections."""
     from ballfg.tracks.dataset import has_positions, read_dataset
 
     if has_positions(folder):
@@ -91,7 +93,7 @@ def _check_outputs(out: Path | None, png: Path | None, rerun: Path | None) -> No
 
 
 def _write_picture(shown: Shown, png: Path) -> None:
-    """The first shot that is shown, for papers."""
+    """The first shot of the page, for papers."""
     from ballfg.pages.pictures import views
 
     if not shown.shots:
@@ -102,7 +104,7 @@ def _write_picture(shown: Shown, png: Path) -> None:
 
 
 def _write_recording(shown: Shown, rerun: Path) -> None:
-    from ballfg.pages import record
+    from ballfg.pages.recording import record
 
     with whole_file(rerun, "rerun") as temporary:
         record(shown, temporary)

@@ -1,4 +1,4 @@
-"""`ballfg simulate`: synthetic tracks, with or without undeclared effects."""
+"""Implements `ballfg simulate`, which writes synthetic tracks, with or without undeclared effects."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ballfg.cli.inputs import EffectsFiles, Seed, know_effects
 from ballfg.progress import progress
 
 if TYPE_CHECKING:
-    from ballfg.simulation import BallKind
+    from ballfg.simulation.balls import BallKind
 
 _noise, _ball_option, _files = (
     partial(typer.Option, rich_help_panel=panel) for panel in ("Noise", "Ball and launcher", "Files")
@@ -58,6 +58,7 @@ def simulate(
     truth.yaml holds the undeclared effects and all settings, truth.csv the true state at every stamp.
     """
     from ballfg import simulation
+    from ballfg.simulation.settings import parse_settings
     from ballfg.simulation.writing import check_format
 
     file_format = check_format(format)
@@ -67,7 +68,7 @@ def simulate(
         rate=rate,
         seed=seed,
         ball=_ball(ball, model),
-        settings=simulation.parse_settings(settings) if settings else {},
+        settings=parse_settings(settings) if settings else {},
         noise=simulation.MeasurementNoise(
             noise, dropout, jitter, outliers, outlier_size, spin_noise, memory, memory_time
         ),
@@ -82,9 +83,9 @@ def simulate(
 
 
 def _ball(name: str, model: Path | None) -> BallKind:
-    """The ball, with the model of a file in place of its own if there is one."""
+    """The ball, with the model of a file, if any, in place of its own."""
     from ballfg.dynamics import AnalyticModel, load_model
-    from ballfg.simulation import ball_kind, with_model
+    from ballfg.simulation.balls import ball_kind, with_model
 
     kind = ball_kind(name)
     if model is None:

@@ -1,4 +1,4 @@
-"""`ballfg track`: cameras to tracks."""
+"""Implements `ballfg track`, which turns videos of calibrated cameras into tracks."""
 
 from __future__ import annotations
 
@@ -66,12 +66,12 @@ def track(
     The dataset holds tracks.csv, detections.csv (all candidates) and cameras.yaml.
     overlay.mp4 shows the views with what was found, contact_sheet.png each track.
     """
-    # FFmpeg and OpenCV print what they think of a file, unless they are told not to before OpenCV is loaded.
+    # FFmpeg and OpenCV print messages on a file, unless switched off before the import of OpenCV.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     from ballfg.files.whole_folder import reserved
     from ballfg.simulation.balls import ball_kind
-    from ballfg.tracks import DatasetInfo
+    from ballfg.tracks.info import DatasetInfo
     from ballfg.vision.camera_file import read_cameras
     from ballfg.vision.tracking.dataset import check_result_folder, write_tracking
     from ballfg.vision.tracking.recordings import without as others
@@ -79,7 +79,7 @@ def track(
 
     kind = ball_kind(ball)
     height = kind.surfaces.table_height if table_height is None else table_height
-    with reserved(out):  # what cannot be written to is better known before the search
+    with reserved(out):  # refuses an unusable folder before the search
         check_result_folder(out, [cameras, *(Path(text) for text in recordings)], force=force)
         files = " ".join(Path(text).name for text in recordings)
         info = DatasetInfo(name or out.resolve().name, height, kind.ball, source=f"ballfg track {files}")
@@ -109,7 +109,7 @@ def track(
 
 
 def _refuse(**options: object) -> None:
-    """Raises ValueError for an option that only videos have a use for."""
+    """Raises ValueError for an option that only videos use."""
     for name, value in options.items():
         if value is not None:
             raise ValueError(
@@ -126,7 +126,7 @@ def _from_videos(
     jobs: int | None,
     without: Sequence[str],
 ) -> tuple[Tracking, Streams]:
-    """What was found, and what gives each video's frames once more."""
+    """The detections, and a function that gives each video's frames again."""
     from ballfg.vision.detection.detect import learn_detector, load_detector
     from ballfg.vision.detection.detector import DetectorSettings
     from ballfg.vision.detection.video import open_video
@@ -143,7 +143,7 @@ def _from_videos(
 
 
 def _on_one_clock(tracking: Tracking, model: AnalyticModel, surfaces: Surfaces) -> Tracking:
-    """The same candidates once more, each camera with the time offset that the balls tell."""
+    """The same candidates with time offsets of the cameras estimated from the balls."""
     from ballfg.estimation import Settings, estimate_time_offsets, sighted_track
     from ballfg.vision.tracking.pipeline import track_detections
     from ballfg.vision.tracking.report import disagreement

@@ -1,1 +1,1 @@
-"""The shots that tell most: predicted flights, their information, and a choice among them."""
+"""Designs the most informative shots: predicts flights, computes their information, and chooses among them."""

@@ -1,9 +1,9 @@
-"""The choice of shots: those that together tell most of what is asked.
+"""Chooses the shots that together determine the wanted coefficients best.
 
 The measure of a side of r strengths is log det C / 2 r, with C their covariance when all else is unknown: the log of
 its error bar, averaged over its directions. That is D_s-optimality, and c-optimality for a single coefficient. The
 measures of all sides are averaged. Shots are chosen greedily, then exchanged one by one while that lowers the measure,
-then put in the order in which they help most.
+then sorted by their gain.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,9 +17,9 @@ from ballfg.diagnosis.design.information import Information
 Measure = Callable[[Array], Array]
 """(m,) measures of information matrices (m, q, q)."""
 LEAST_GAIN = 1e-9
-"""An exchange that lowers the measure by less is none; it could go round in circles."""
+"""Least decrease of the measure by an exchange, against cycles."""
 DRAWS = 100
-"""Random choices whose median error bars stand beside those of the chosen shots."""
+"""Number of random choices whose median error bars are the comparison."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Choice:
         error: (k + 1,) mean error bar of all sides, in prior standard deviations of the unknowns; first without shots.
         random: (k + 1,) the same after as many random shots, the median of `DRAWS` choices.
         sigmas: (k + 1, p) standard deviation of each coefficient asked about, in its own unit.
-        as_random: number of random shots that would bring as much as all that were chosen.
+        as_random: number of random shots with the same gain as all chosen ones.
     """
 
     shots: list[int]
@@ -48,10 +48,10 @@ def choose(
 
     Args:
         information: of dataset and candidates.
-        sides: coefficients that are to be known well, by parameter name.
-        names: of coefficients whose error bars are told.
-        count: of shots.
-        seed: of the random choices to compare with.
+        sides: coefficients that should be known well, by parameter name.
+        names: of coefficients whose error bars are reported.
+        count: number of shots.
+        seed: of the random choices for comparison.
     """
     measure = _measure([information.columns(side) for side in sides])
     known, shots = information.known, information.shots
@@ -91,7 +91,7 @@ def _greedy(known: Array, shots: Array, count: int, measure: Measure) -> list[in
 
 
 def _exchanged(known: Array, shots: Array, chosen: list[int], measure: Measure) -> list[int]:
-    """Each shot in turn replaced by the best one beside the others, until no exchange helps."""
+    """Replaces each shot in turn by the best one beside the others, until no exchange helps."""
     chosen, total = list(chosen), known + shots[chosen].sum(axis=0)
     now, helped = float(measure(total[None])[0]), True
     while helped:
@@ -115,7 +115,7 @@ def _ordered(known: Array, shots: Array, chosen: Sequence[int], measure: Measure
 
 
 def _as_random(known: Array, mean: Array, measure: Measure, reached: float) -> float:
-    """How many shots of mean information reach a measure: by bisection, since more information never raises it."""
+    """Number of mean shots that reach a measure: by bisection, since more information never raises it."""
     low, high = 0.0, 1.0
     while float(measure((known + high * mean)[None])[0]) > reached and high < 1e6:
         low, high = high, 2.0 * high

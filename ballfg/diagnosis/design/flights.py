@@ -1,4 +1,4 @@
-"""Flights that a launcher would shoot, as stretches without noise: what the diagnosis would see of them."""
+"""Predicts the flights of a launcher as stretches without noise, for the diagnosis."""
 
 from dataclasses import dataclass
 
@@ -11,22 +11,22 @@ from ballfg.dynamics import BallModel, Surfaces, rollout
 from ballfg.state import SPIN, VZ
 
 MARGIN = 0.25
-"""Share of the measured extent, along x and y, by which a flight may leave it on each side. Few tracks do not show all
-that the cameras see."""
+"""Share of the measured extent, along x and y, by which a flight may leave it on each side. A few tracks do not show
+the whole view of the cameras."""
 LEAST_KICK = 0.3
-"""m/s. A contact turns the vertical speed by more; a ball that rises slower than half of it comes to rest soon."""
+"""m/s. Least change of the vertical speed in a contact; a ball that rises slower than half of it comes to rest soon."""
 
 
 @dataclass(frozen=True)
 class View:
-    """What the cameras see of a flight.
+    """The view of the cameras on a flight.
 
     Attributes:
-        low, high: (3,) m, corners of the box in which the ball is seen. It has no lid: lobs are seen too.
+        low, high: (3,) m, corners of the box in which the ball is visible. It is open above: lobs are visible too.
         duration: s, longest flight.
         interval: s between samples.
         sigmas: (3,) m, stated noise of a coordinate.
-        labelled: whether the spin at the first sample is measured.
+        labelled: True if the spin at the first sample is measured.
     """
 
     low: Array
@@ -38,7 +38,7 @@ class View:
 
     @classmethod
     def of(cls, stretches: Stretches) -> "View":
-        """The view that measured stretches show."""
+        """The view of measured stretches."""
         used = stretches.used.numpy()
         positions, sigmas = stretches.positions.numpy()[used], stretches.sigmas.numpy()[used]
         low, high = positions.min(axis=0), positions.max(axis=0)
@@ -59,15 +59,15 @@ class View:
 def planned_flights(
     model: BallModel, starts: Array, settings: Array, surfaces: Surfaces, view: View
 ) -> tuple[Stretches, Mask]:
-    """Flights from first states as stretches, up to where they leave the view.
+    """Flights from first states as stretches, until they leave the view.
 
     Args:
         model: the ball.
         starts: (m, 9) first states.
-        settings: (m, s) launcher settings as the stretches of the dataset have them.
-        surfaces: where the ball bounces.
-        view: what is seen.
-    Returns: the flights that are long enough, and which (m,) of all they are.
+        settings: (m, s) launcher settings, as in the stretches of the dataset.
+        surfaces: table and floor.
+        view: of the cameras.
+    Returns: the flights that are long enough, and (m,) a mask of them.
     """
     times = torch.arange(0.0, view.duration + 0.5 * view.interval, view.interval, dtype=torch.float64)
     with torch.no_grad():
@@ -101,7 +101,7 @@ def planned_flights(
 
 
 def _seen(path: Array, gaps: Array, view: View) -> tuple[int, Index]:
-    """How many samples of a path (k, 9) are seen, and the samples (c,) after which contacts follow."""
+    """Number of visible samples of a path (k, 9), and the samples (c,) before contacts."""
     inside = ((path[:, :3] >= view.low) & (path[:, :3] <= view.high)).all(axis=1)
     end = len(path) if inside.all() else int(np.argmin(inside))
     before, after = path[: end - 1, VZ], path[1:end, VZ]

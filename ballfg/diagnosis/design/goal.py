@@ -1,4 +1,4 @@
-"""What shots are chosen for: to tell two effects apart, or to shrink the error bar of a coefficient."""
+"""A goal of a design is to separate two effects, or to shrink the error bar of a coefficient."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,11 +12,11 @@ from ballfg.dynamics import EFFECTS
 
 @dataclass(frozen=True)
 class Goal:
-    """Sides of coefficients that are to be known well, each with everything else unknown.
+    """Sides of coefficients that should be known well, each with all else unknown.
 
     Attributes:
-        hypotheses: effects whose strengths are unknown, beside what the model declares.
-        sides: parameter names; two sides for effects to tell apart, one for a coefficient.
+        hypotheses: effects with unknown strengths, in addition to the model's.
+        sides: parameter names; two sides for effects to separate, one for a coefficient.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -29,10 +29,10 @@ class Goal:
 
 
 def separating(fit: Fit, pairs: Sequence[tuple[str, str]]) -> Goal:
-    """The goal to tell the effects of some pairs apart.
+    """The goal to separate the effects of some pairs.
 
     Args: fit: of the declared model.  pairs: effects (`frame_tilt`) or single strengths of them (`wind.x`).
-    Raises: ValueError: an effect or coefficient that is not known or cannot act in these data, or one named twice.
+    Raises: ValueError: an unknown effect or coefficient, one that cannot act in these data, or one named twice.
     """
     found = {text: hypothesis_of(fit, text) for pair in pairs for text in pair}
     for one, other in pairs:
@@ -53,7 +53,7 @@ def shrinking(fit: Fit, text: str) -> Goal:
 
 
 def hypothesis_of(fit: Fit, text: str) -> Hypothesis:
-    """The effect that a text names (`wind`, or one strength of it, `wind.x`), in the shape that explains most."""
+    """The effect in a text (`wind`, or one strength of it, `wind.x`), in the shape that explains most."""
     name, _, strength = text.strip().partition(".")
     if name not in EFFECTS:
         raise ValueError(f"effect '{name}' is not known.{did_you_mean(name, EFFECTS)} See ballfg info.")

@@ -1,4 +1,4 @@
-"""Information on coefficients: what the tracks of a dataset hold, and what each flight of a launcher would add."""
+"""Computes the information on coefficients in a dataset's tracks and in each flight of a launcher."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -15,9 +15,9 @@ from ballfg.diagnosis.search.candidates import with_hypothesis
 from ballfg.dynamics import AnalyticModel, Surfaces
 
 AT_ONCE = 500
-"""Flights whose derivatives are held at once; a flight takes up to half a megabyte."""
+"""Number of flights whose derivatives are held at once; a flight takes up to half a megabyte."""
 MISSED = 1e-3
-"""m. A planned flight whose samples differ by more from those between its given contacts has other contacts."""
+"""m. Difference between a planned flight's samples with given and with found contacts that means other contacts."""
 
 
 @dataclass(frozen=True)
@@ -26,10 +26,10 @@ class Information:
 
     Attributes:
         names: of the coefficients, which are the first unknowns; launcher settings follow.
-        units: (q,) prior standard deviations, which the matrices are in units of.
-        known: (q, q) what priors and dataset hold.
-        shots: (m, q, q) what each candidate would add.
-        kept: (m,) numbers of the candidates whose flights can be used.
+        units: (q,) prior standard deviations, the units of the matrices.
+        known: (q, q) of priors and dataset.
+        shots: (m, q, q) of each candidate.
+        kept: (m,) numbers of the candidates with usable flights.
     """
 
     names: tuple[str, ...]
@@ -44,15 +44,15 @@ class Information:
 
 
 def information_of(fit: Fit, goal: Goal, starts: Array, settings: Array, surfaces: Surfaces) -> Information:
-    """What the tracks of a fit and flights from first states tell of the unknowns.
+    """Information on the unknowns from the tracks of a fit and from flights with given first states.
 
     Args:
         fit: of the declared model to all tracks.
-        goal: adds the unknowns that are asked about.
+        goal: with further unknowns.
         starts: (m, 9) first states.
-        settings: (m, s) launcher settings as the fit's stretches have them.
-        surfaces: where the ball bounces.
-    Raises: ValueError: if no candidate's flight is long enough to tell anything.
+        settings: (m, s) launcher settings, as in the fit's stretches.
+        surfaces: table and floor.
+    Raises: ValueError: if no candidate's flight is long enough.
     """
     problem = fit.problem
     for hypothesis in goal.hypotheses:
@@ -99,7 +99,7 @@ def _as_fitted(model: AnalyticModel, values: Mapping[str, float]) -> AnalyticMod
 
 
 def _as_planned(at: Fit) -> Mask:
-    """(m,) flights that meet the contacts which a rollout meets, and those alone."""
+    """(m,) True for flights with exactly the contacts of a rollout."""
     used = at.problem.stretches.used.numpy()[..., None]
     off = np.abs(np.where(used, at.predicted.positions - at.problem.stretches.positions.numpy(), 0.0))
     return np.asarray(np.nan_to_num(off, nan=np.inf).max(axis=(1, 2)) < MISSED)

@@ -1,7 +1,7 @@
-"""From settings of a launcher to the first state of its shots, learned from the shots of a dataset.
+"""Learns the map from a launcher's settings to the first states of its shots.
 
-Place, speed, azimuth, elevation and spin of a first state are taken to be linear in the settings. The spin is that
-about forward, across and up, so that a launcher that aims elsewhere turns it along.
+Place, speed, azimuth, elevation and spin of a first state are linear in the settings. The spin is that about forward,
+across and up, so that it turns along with the launcher.
 """
 
 from collections.abc import Sequence
@@ -14,21 +14,21 @@ from ballfg.diagnosis.fit.problem import launch_axes
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 
 SPARE = 2
-"""Shots beyond one for each number of the line; fewer tell nothing of the scatter about it."""
+"""Number of shots beyond one for each parameter of the line; fewer do not show the scatter about it."""
 LEAST_SHARE = 1e-8
 """Smallest over largest eigenvalue of the settings' correlations: below, settings changed together only."""
 
 
 @dataclass(frozen=True)
 class LauncherMap:
-    """First states as a line in the settings.
+    """First states as a linear function of the settings.
 
     Attributes:
-        names: of s settings, as labels have them.
+        names: of s settings, as in labels.
         weights: (s + 1, 9) of a constant and the settings, for place (m), speed (m/s), azimuth and elevation (rad), and
             spin about forward, across and up (rad/s).
         scatter: (9,) standard deviations of the shots about the line, in the same units.
-        low, high: (s,) settings that were shot.
+        low, high: (s,) limits of the measured settings.
     """
 
     names: tuple[str, ...]
@@ -48,7 +48,7 @@ class LauncherMap:
         return np.asarray(states)
 
     def outside(self, settings: Array) -> list[str]:
-        """A sentence for each setting whose candidates (m, s) lie beyond what was shot."""
+        """A sentence for each setting whose candidates (m, s) exceed the measured ones."""
         least, most = settings.min(axis=0), settings.max(axis=0)
         return [
             f"{name} was shot from {self.low[i]:g} to {self.high[i]:g}; candidates from {least[i]:g} to {most[i]:g} "
@@ -59,7 +59,7 @@ class LauncherMap:
 
 
 def learn_launcher(names: Sequence[str], settings: Array, states: Array) -> LauncherMap:
-    """The line through the first states of shots.
+    """Fits the line through the first states of shots.
 
     Args: names: of s settings.  settings: (n, s) of n shots.  states: (n, 9) their first states.
     Raises: ValueError: too few shots, or settings that did not change independently of each other.

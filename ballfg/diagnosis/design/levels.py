@@ -1,4 +1,4 @@
-"""Candidate settings of a launcher: from a text such as `topspin=-3..5,speed=8..14` to all their combinations."""
+"""Parses candidate settings of a launcher, such as `topspin=-3..5,speed=8..14`, to all combinations."""
 
 import itertools
 import math
@@ -9,7 +9,7 @@ import numpy as np
 from ballfg.arrays import Array
 
 MOST = 5000
-"""Combinations of levels. More take minutes to fly, and neighbours hardly differ."""
+"""Largest number of combinations. More take minutes, and neighbours hardly differ."""
 
 
 def parse_levels(text: str) -> dict[str, list[float]]:
@@ -17,7 +17,7 @@ def parse_levels(text: str) -> dict[str, list[float]]:
 
     Args: text: `NAME=FROM..TO` in steps of one, `NAME=FROM..TO:STEP`, or `NAME=LEVEL`, separated by commas.
     Returns: the levels, rising, in the unit of the label of that name.
-    Raises: ValueError: a text of another form, a setting named twice, a step that is not positive, or too many
+    Raises: ValueError: a text of another form, a repeated setting, a step that is not positive, or too many
         combinations.
     """
     found: dict[str, list[float]] = {}

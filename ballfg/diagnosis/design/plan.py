@@ -1,4 +1,4 @@
-"""The plan: which shots to make next with a launcher, so that they tell most."""
+"""Plans the next, most informative shots of a launcher."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,25 +20,25 @@ from ballfg.dynamics import AnalyticModel
 from ballfg.tracks import Dataset, Track
 
 MOST_SHOTS = 1000
-"""More shots at once are better planned in parts, each with the tracks of the parts before."""
+"""Largest number of shots; more are better planned in parts, each with the tracks of the earlier parts."""
 
 
 @dataclass(frozen=True)
 class ShotPlan:
-    """Shots to make next, in order, and what they would bring.
+    """The next shots, in order, and their gain.
 
     Attributes:
         settings: (k, s) of the launcher, in the units of the labels.
         setting_names: of the s settings.
-        sides: what is to be told apart or shrunk, by effect and coefficient, for instance (("wind.x",), ("drag.k",)).
+        sides: coefficients to separate or shrink, by effect and coefficient, for instance (("wind.x",), ("drag.k",)).
         names: of the p coefficients of all sides, by effect and coefficient.
         units: of the coefficients.
         sigmas: (k + 1, p) in `units`, standard deviation of each, all else unknown, before the shots and after each.
         error: (k + 1,) dimensionless, mean error bar of the sides over the priors of the fit.
         random: (k + 1,) dimensionless, the same after as many random shots.
-        as_random: number of random shots that would bring as much as all k.
-        candidates: number of candidates that could be judged.
-        remarks: sentences on candidates that were left out and on how well the launcher is known.
+        as_random: number of random shots with the same gain as all k.
+        candidates: number of usable candidates.
+        remarks: sentences on unusable candidates and on the accuracy of the launcher's map.
     """
 
     settings: Array
@@ -66,21 +66,21 @@ def design_shots(
     jobs: int = 1,
     watch: Callable[[str], None] | None = None,
 ) -> ShotPlan:
-    """Choose the shots that best tell effects apart, or that shrink the error bar of a coefficient most.
+    """Chooses the shots that best separate effects, or that shrink the error bar of a coefficient most.
 
     Args:
         dataset: tracks of the launcher, with its settings as labels.
         model: as declared; it is fitted to the tracks first.
         levels: candidates, the levels of each setting by the name of its label; all combinations count.
-        between: pairs of effects or coefficients to tell apart, `("wind.x", "drag.k")`.
+        between: pairs of effects or coefficients to separate, `("wind.x", "drag.k")`.
         shrink: a coefficient, `drag.k`; either this or `between`.
-        shots: number to choose; a setting may be chosen again.
-        seed: of the random shots that stand beside those chosen.
+        shots: number of shots; a setting may be repeated.
+        seed: of the random shots for comparison.
         jobs: processes.
-        watch: is told of progress, in lines.
-    Returns: the shots with the standard deviations to expect.
-    Raises: ValueError: neither or both of `between` and `shrink`, labels that the tracks do not have as numbers, too
-        few or too uniform tracks to learn the launcher from, effects that are not known, or no candidate that flies.
+        watch: called with lines of progress.
+    Returns: the shots with the expected standard deviations.
+    Raises: ValueError: neither or both of `between` and `shrink`, missing or textual labels, too few or too uniform
+        tracks for the launcher's map, unknown effects, or no candidate that flies.
     """
     if bool(between) == bool(shrink):
         raise ValueError("either between or shrink must say what the shots are for. Give one of them.")
@@ -114,9 +114,9 @@ def design_shots(
 
 
 def check_labels(dataset: Dataset, names: Sequence[str]) -> None:
-    """Refuse settings that the tracks do not have as labels.
+    """Refuses settings without a column of labels.
 
-    Raises: ValueError: a name that no column of labels has.
+    Raises: ValueError: a name without a column of labels.
     """
     for name in names:
         if name not in dataset.label_names:
@@ -142,7 +142,7 @@ def _fit_of_all(model: AnalyticModel, holdout: Holdout) -> Fit:
 
 
 def _launcher(fit: Fit, tracks: Sequence[Track], names: tuple[str, ...]) -> LauncherMap:
-    """What the settings do, by the first states of the tracks that have all of them as labels."""
+    """The launcher's map, from the first states of tracks with all its settings as labels."""
     labels = {track.name: track.labels for track in tracks}
     stretches = fit.problem.stretches
     firsts = np.unique(stretches.track, return_index=True)[1]
@@ -152,7 +152,7 @@ def _launcher(fit: Fit, tracks: Sequence[Track], names: tuple[str, ...]) -> Laun
 
 
 def _known_settings(holdout: Holdout, fit: Fit, names: tuple[str, ...], candidates: Array) -> Array:
-    """(m, s) settings as the fit's launcher has them; those that are not candidates stay at their mean."""
+    """(m, s) settings of the fit's launcher; settings other than candidates stay at their mean."""
     launcher, used = holdout.launcher.embedding.names, fit.problem.stretches.settings
     settings = np.repeat(
         used[used.any(axis=1)].mean(axis=0, keepdims=True) if used.any() else used[:1], len(candidates), 0

@@ -1,4 +1,4 @@
-"""The pairs of effects that a diagnosis could not tell apart."""
+"""Reads the pairs of effects that a diagnosis could not separate."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,7 +12,7 @@ from ballfg.files.json_file import read_json
 
 
 def pairs_of(diagnosis: Diagnosis) -> list[tuple[str, str]]:
-    """Pairs of a diagnosis: an effect that was added and one that would have explained as much.
+    """Pairs of a diagnosis: an added effect and one that would have explained as much.
 
     Raises: ValueError: if there is no such pair.
     """
@@ -20,7 +20,7 @@ def pairs_of(diagnosis: Diagnosis) -> list[tuple[str, str]]:
 
 
 def reported_pairs(folder: Path) -> list[tuple[str, str]]:
-    """Pairs of a diagnosis that was written to a folder.
+    """Pairs of a diagnosis in a folder.
 
     Raises: FileNotFoundError: no report there. ValueError: a file that is no report, or no pair in it.
     """
@@ -37,7 +37,7 @@ def reported_pairs(folder: Path) -> list[tuple[str, str]]:
 
 
 def _pairs(alike: Mapping[str, Sequence[str]], where: str) -> list[tuple[str, str]]:
-    """Pairs of registered effects; twins are left out, because no shot tells them apart."""
+    """Pairs of registered effects, without twins, which no shot separates."""
     pairs = [
         (name, other)
         for name, others in alike.items()

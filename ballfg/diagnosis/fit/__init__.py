@@ -1,1 +1,1 @@
-"""The joint fit of a model to all stretches of a dataset."""
+"""Fits a model jointly to all stretches of a dataset."""

@@ -1,4 +1,4 @@
-"""Dual numbers of torch's forward mode, faster by ten where they meet plain numbers.
+"""Computes torch's dual numbers ten times faster for operations between dual and plain operands.
 
 Where only one operand of torch 2.13's arithmetic has a tangent, torch replaces the missing one by a tensor of symbolic
 zeros and finds the shape of the result in Python. That takes 80 to 200 microseconds an operation; with two tangents it
@@ -42,7 +42,7 @@ RULES: Final = {
 
 @contextmanager
 def dual_level() -> Iterator[None]:
-    """A level of torch's forward mode, as `torch.autograd.forward_ad.dual_level`, in which plain operands are fast."""
+    """A level of torch's forward mode, as `torch.autograd.forward_ad.dual_level`, with fast plain operands."""
     with forward.dual_level(), _WrittenZeros():
         yield
 
@@ -50,8 +50,8 @@ def dual_level() -> Iterator[None]:
 def make_dual(primal: Tensor, tangent: Tensor) -> Tensor:
     """A tensor with a tangent, within `dual_level()`.
 
-    The first call makes torch 2.13 compile its own rules with `torch.jit.script`, which warns that it is deprecated. No
-    caller can avoid that warning, and it would be an error where warnings are errors.
+    The first call makes torch 2.13 compile its own rules with `torch.jit.script`, whose deprecation warning callers
+    cannot avoid; it would be an error in a process that turns warnings into errors.
     """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "`torch.jit.script` is deprecated", DeprecationWarning)
@@ -59,7 +59,7 @@ def make_dual(primal: Tensor, tangent: Tensor) -> Tensor:
 
 
 class _WrittenZeros(TorchFunctionMode):
-    """Computes with a moving and a plain operand by rules of its own, or gives plain ones a tangent of zeros."""
+    """Computes with a dual and a plain operand by rules of its own, or gives plain ones a tangent of zeros."""
 
     def __torch_function__(
         self,
@@ -78,7 +78,7 @@ class _WrittenZeros(TorchFunctionMode):
 
 
 def _one_moves(kind: str, swapped: bool, args: Sequence[Any], which: int) -> Tensor:
-    """A sum, difference, product or quotient of two operands of which one moves: half the work, and no zeros."""
+    """A sum, difference, product or quotient with a single dual operand: half the work, and no zeros."""
     moving = forward.unpack_dual(args[which])
     left, right = (moving.primal if k == which else a for k, a in enumerate(args))
     first = which == 0
@@ -100,7 +100,7 @@ def _one_moves(kind: str, swapped: bool, args: Sequence[Any], which: int) -> Ten
 
 
 def _still(operand: Tensor | float) -> Tensor:
-    """An operand that does not move."""
+    """The primal of an operand, without a tangent."""
     plain = operand if isinstance(operand, Tensor) else torch.tensor(operand, dtype=torch.float64)
     if not plain.is_floating_point():
         return plain

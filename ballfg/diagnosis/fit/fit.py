@@ -1,8 +1,8 @@
-"""The joint fit of a declared model: first states stretch by stretch, coefficients and launcher over all of them.
+"""Fits a declared model jointly: first states stretch by stretch, coefficients and launcher over all of them.
 
-The method is Gauss-Newton with Levenberg's damping. The scale of the noise is estimated along each axis from the
-residuals, and so is the scatter of unlabelled spins about the launcher's mean. Coefficients have the priors that their
-effects declare, so that those which the data cannot determine keep their declared values.
+The method is Gauss-Newton with Levenberg's damping. The residuals give the scale of the noise along each axis, and the
+scatter of unlabelled spins about the launcher's mean. Coefficients have the priors of their effects, so that
+coefficients which the data cannot determine keep their declared values.
 """
 
 import copy
@@ -25,20 +25,20 @@ from ballfg.state import SPIN, STATE_DIM
 from ballfg.tracks import Track
 
 MOST_STEPS = 15
-"""Gauss-Newton steps of one minimisation."""
+"""Largest number of Gauss-Newton steps in one minimisation."""
 SCALE_ROUNDS = 3
-"""Noise and weights are settled after so many minimisations."""
+"""Number of minimisations, each with new noise and weights."""
 SETTLED = 0.01
-"""Share by which the noise may still change when it is taken as settled."""
+"""Relative change of the noise below which it has converged."""
 TOLERANCE = 1e-5
-"""A minimisation ends when the objective falls by less than this share."""
+"""Relative decrease of the objective below which a minimisation ends."""
 FIRST_DAMPING, LARGEST_DAMPING = 1e-4, 1e6
 NORMAL_MEDIAN = 0.6745
 """Median of the absolute value of a standard normal number."""
 LEAST_SPREAD = 1e-3
-"""Share of the stated noise below which an axis shows none at all."""
+"""Share of the stated noise below which an axis counts as free of noise."""
 LEAST_SPIN_SCATTER = 1.0
-"""rad/s. Unlabelled spins are taken to scatter at least so much."""
+"""rad/s. Least scatter of unlabelled spins."""
 
 
 def fit_model(
@@ -49,14 +49,14 @@ def fit_model(
     settle_noise: bool = True,
     tracks: Sequence[Track] = (),
 ) -> Fit:
-    """Fit a model's coefficients to stretches, with all first states.
+    """Fits a model's coefficients to stretches, with all first states.
 
     Args:
         model: as declared; it is copied. Coefficients with a prior are estimated.
-        stretches: the data. Those whose contacts the model does not reach from the first guess are left out.
+        stretches: the data. Stretches whose contacts the model does not reach from the first guess are left out.
         settings: of the dataset; the noise of spin labels and the prior of spins.
-        settle_noise: whether the scale of the noise is estimated too.
-        tracks: those of the stretches; needed where the model's coefficients differ between tracks.
+        settle_noise: True to estimate the scale of the noise too.
+        tracks: of the stretches; needed if the model's coefficients differ between tracks.
     Returns: the minimum.
     """
     model = copy.deepcopy(model).requires_grad_(False)
@@ -72,9 +72,9 @@ def fit_model(
 def reachable(
     model: AnalyticModel, stretches: Stretches, values: Mapping[str, float | Array] | None = None
 ) -> Stretches:
-    """Those stretches whose contacts a model reaches from the first guess of their states.
+    """The stretches whose contacts a model reaches from the first guess of their states.
 
-    Args: values: coefficients by parameter name that differ from the model's own, as fitted.
+    Args: values: fitted coefficients by parameter name, in place of the model's own.
     """
     predicted = predict(model, stretches, stretches.starts.numpy(), values or {})
     reached: Mask = np.asarray(np.isfinite(predicted.positions).all(axis=(1, 2)))
@@ -89,14 +89,14 @@ def first_guess(problem: Problem, label_noise: float, spin_prior: float) -> tupl
 
 
 def fit_problem(problem: Problem, unknowns: Unknowns, noise: Noise, *, settle_noise: bool = True) -> Fit:
-    """Minimise over all unknowns, and settle the scale of the noise.
+    """Minimises over all unknowns, and estimates the scale of the noise in turns.
 
     Args:
         problem: the data, the model and the priors.
-        unknowns: first guess. Every stretch must reach its contacts from there, as those of `reachable` do; else the
-            result is the first guess itself, its cost infinite.
-        noise: scales to start from; kept as they are unless `settle_noise`.
-        settle_noise: whether the scale of the noise is estimated.
+        unknowns: first guess. Every stretch must reach its contacts from there, as `reachable` ensures; else the result
+            is the first guess itself, with infinite cost.
+        noise: scales to start from; constant unless `settle_noise`.
+        settle_noise: True to estimate the scale of the noise.
     """
     result = _minimise(Fit.at(problem, unknowns, noise))
     for _ in range(SCALE_ROUNDS if settle_noise else 0):
@@ -108,7 +108,7 @@ def fit_problem(problem: Problem, unknowns: Unknowns, noise: Noise, *, settle_no
 
 
 def _near(before: Noise, after: Noise) -> bool:
-    """Whether the noise has settled."""
+    """True if the noise has converged."""
     ratios = np.append(after.position / before.position, after.spin / before.spin)
     return bool(np.abs(np.log(ratios)).max() < SETTLED)
 
@@ -116,7 +116,7 @@ def _near(before: Noise, after: Noise) -> bool:
 def values_of(fit: Fit, names: Iterable[str], declared: Mapping[str, float]) -> dict[str, Value]:
     """Fitted coefficients with their standard deviations, by parameter name.
 
-    Args: names: those wanted.  declared: values that the model stated before the fit, for those that it did.
+    Args: names: of coefficients.  declared: values that the model stated before the fit, for a part of them.
     """
     names = list(names)
     sigmas = dict(zip(names, np.sqrt(np.diagonal(covariance_of(fit, names))).tolist(), strict=True))
@@ -125,7 +125,7 @@ def values_of(fit: Fit, names: Iterable[str], declared: Mapping[str, float]) -> 
 
 
 def covariance_of(fit: Fit, names: Sequence[str]) -> Array:
-    """(p, p) covariance of fitted coefficients by the noise, everything else being free; names: p parameters."""
+    """(p, p) covariance of fitted coefficients from the noise, with all else free; names: p parameters."""
     total = fit.gram.sum(axis=0)[:-1, :-1] + np.diag(fit.problem.common_precision)
     listed = list(fit.problem.free)
     chosen = [listed.index(name) for name in names]
@@ -149,7 +149,7 @@ def _minimise(now: Fit) -> Fit:
 
 
 def _step(now: Fit, damping: float) -> tuple[Fit | None, float]:
-    """The fit after one step, None where no damping lowers the objective; and the damping of the next step."""
+    """The fit after one step, None if no damping lowers the objective; and the damping of the next step."""
     system, first = now.linearised(), damping
     while damping < LARGEST_DAMPING:
         moved = _followed_up(_moved(now, system, damping), system, now.robust)
@@ -178,11 +178,11 @@ def _moved(now: Fit, system: System, damping: float) -> Fit:
 
 
 def _followed_up(moved: Fit, system: System, weights: Robust) -> Fit:
-    """The fit with first states corrected once more after a step of all unknowns.
+    """The fit after a further correction of the first states, following a step of all unknowns.
 
     The linearised problem leaves out the product of a step of coefficients and a step of states. With many samples that
-    product is large, and first states can take most of it up. The derivatives stay as they are; a stretch that does
-    not gain keeps its state. Further corrections would gain nothing that the next step does not.
+    product is large, and first states can absorb most of it. The derivatives stay; a stretch without a gain keeps its
+    state. Further corrections would gain no more than the next step does.
     """
     correction = system.start_correction(moved.weighted_residual(weights))
     unknowns = replace(moved.unknowns, starts=moved.unknowns.starts + correction)
@@ -199,9 +199,9 @@ def _followed_up(moved: Fit, system: System, weights: Robust) -> Fit:
 
 
 def _settled(result: Fit) -> Noise:
-    """Noise from the residuals: their median absolute deviation, with the degrees of freedom that states took.
+    """Noise from the residuals: their median absolute deviation, corrected for the degrees of freedom of the states.
 
-    One scale for all axes: what a model lacks often acts along one of them. With a scale for each, that axis would
+    One scale serves all axes: missing physics often acts along one of them. With a scale for each, that axis would
     count as noisy and hide it. Axes without any noise were not measured (a ball that is dropped along x = y = 0): they
     do not count.
     """
@@ -212,14 +212,14 @@ def _settled(result: Fit) -> Noise:
 
 
 def noise_by_axis(result: Fit) -> Array:
-    """(3,) m: how far measured positions lie from fitted ones along each axis; the median over all samples."""
+    """(3,) m: median distance between measured and fitted positions along each axis, over all samples."""
     used = result.problem.stretches.used.numpy()
     residual = result.whitened[used] * result.sigmas[used]
     return np.array([_spread(result, residual[:, axis]) for axis in range(3)])
 
 
 def _spread(result: Fit, residuals: Array) -> float:
-    """Median absolute deviation as a standard deviation, with the degrees of freedom that states took."""
+    """Median absolute deviation as a standard deviation, corrected for the degrees of freedom of the states."""
     used = result.problem.stretches.used.numpy()
     taken = (STATE_DIM - 3) * len(used) / (3.0 * used.sum())
     return float(np.median(np.abs(residuals)) / NORMAL_MEDIAN / np.sqrt(1.0 - taken))

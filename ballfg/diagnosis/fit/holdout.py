@@ -1,4 +1,4 @@
-"""A dataset split for diagnosis: every second track to search for effects, the others held out."""
+"""Splits a dataset for diagnosis: every second track to search for effects, the others held out."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -9,27 +9,29 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.stamps import Stamps, look_at_stamps
 from ballfg.diagnosis.fit.stretches import LEAST_SAMPLES, Stretches, stretches_of
-from ballfg.dynamics import AnalyticModel, SpinEmbedding, Surfaces
-from ballfg.estimation import Launcher, Settings, Smoother, dataset_settings, dataset_surfaces
+from ballfg.dynamics import AnalyticModel, Surfaces
+from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.estimation import Settings, Smoother, dataset_settings, dataset_surfaces
 from ballfg.estimation.batch import map_tracks
+from ballfg.estimation.launcher import Launcher
 from ballfg.estimation.measurement.as_measured import plainly_measured
 from ballfg.estimation.measurement.position_noise import estimate_position_noise
 from ballfg.state import STANDARD_GRAVITY
 from ballfg.tracks import Dataset, Track
 
 MOST_TRACKS = 200
-"""Tracks that are used, evenly over the dataset. Computing time grows with their number; verdicts do not change."""
+"""Largest number of tracks, evenly over the dataset. Computing time grows with it; verdicts do not change."""
 LEAST_TRACKS = 6
-"""Fewer tracks leave fewer than three to search, whose scatter cannot measure the noise."""
+"""Least number of tracks: with fewer, the search half has fewer than three, too few to measure the noise."""
 USUAL = {"flight.gravity.g": STANDARD_GRAVITY, "flight.drag.k": 0.12}
-"""Gravity and drag by parameter name, for a model that has none."""
+"""Gravity and drag by parameter name, for a model without them."""
 LAUNCHER_LABELS = ("topspin", "sidespin", "speed")
-"""Launcher settings that a dataset's labels may hold as numbers."""
+"""Launcher settings that labels may hold as numbers."""
 
 
 @dataclass(frozen=True)
 class EvaluationTrack:
-    """The part of a track that a model is to explain: up to the first hit or rest, without outliers; bounces (b,) s."""
+    """The part of a track for evaluating a model: up to the first hit or rest, without outliers; bounces (b,) s."""
 
     track: Track
     bounces: Array
@@ -43,12 +45,12 @@ class Holdout:
         dataset: the whole.
         settings: its noise, as stated or estimated.
         surfaces: where its balls bounce.
-        launcher: which labels of a shot tell its spin; its weights mean nothing.
+        launcher: names the labels of a shot that give its spin; its weights are not used.
         search, held_out: stretches of the two halves.
         search_tracks, held_out_tracks: tracks of the two halves up to their first hit.
-        tracks: those of both halves, whole and in the order of the recording.
-        stamps: what is wrong with the stamps of all tracks; the stretches have frames in their places.
-        excluded: sentences on tracks that are not used.
+        tracks: of both halves, whole and in the order of the recording.
+        stamps: errors of the stamps of all tracks; the stretches have corrected frames.
+        excluded: sentences on unused tracks.
     """
 
     dataset: Dataset
@@ -72,14 +74,14 @@ def hold_out(
     *,
     most_tracks: int = MOST_TRACKS,
 ) -> Holdout:
-    """Split a dataset in two and find the stretches of both halves.
+    """Splits a dataset in two and finds the stretches of both halves.
 
     Args:
         dataset: of at least `LEAST_TRACKS` tracks.
         model: as declared.
         jobs: processes.
-        watch: is told of progress, in lines.
-        most_tracks: of a larger dataset so many tracks are used, evenly spread.
+        watch: called with lines of progress.
+        most_tracks: largest number of tracks, evenly spread over a larger dataset.
     Returns: both halves, as stretches to fit and as tracks to predict.
     Raises: ValueError: if there are too few tracks, or a half without a stretch that is long enough.
     """
@@ -122,7 +124,7 @@ def hold_out(
 
 
 def stamps_of(tracks: Sequence[Track], model: AnalyticModel) -> Stamps:
-    """What is wrong with the stamps of tracks; nothing where the model says how they are written."""
+    """Errors of the stamps of tracks; none if the model describes the stamps."""
     if {"time_scale", "counted_frames"} & set(model.measurement):
         return Stamps()
     values = {name: value.detach() for name, value in model.named_parameters()}
@@ -131,7 +133,7 @@ def stamps_of(tracks: Sequence[Track], model: AnalyticModel) -> Stamps:
 
 
 def _as_written(part: EvaluationTrack, repaired: Track, written: Track) -> EvaluationTrack:
-    """A part of a track whose stamps were repaired, with its stamps as they were written."""
+    """A part of a track with repaired stamps, with its original stamps."""
     if repaired is written:
         return part
     times = written.times[np.searchsorted(repaired.times, part.track.times)]
@@ -152,18 +154,18 @@ def _chosen(dataset: Dataset, most: int) -> tuple[list[Track], list[str]]:
 
 
 def _excess_noise(tracks: Sequence[Track], settings: Settings) -> float:
-    """Noise that the tracks show over the stated noise, at least 1.
+    """Noise of the tracks over the stated noise, at least 1.
 
-    Outliers are recognised by their distance from the expected place of the ball. With the stated noise, if it is too
-    small, ordinary samples that differ from their neighbours would count as outliers. The errors of the remaining
-    samples would then be alike, as if a force were missing.
+    Outliers are recognised by their distance from the expected place of the ball. If the stated noise is too small,
+    ordinary samples that differ from their neighbours would count as outliers. The errors of the remaining samples
+    would then be alike, as if a force were missing.
     """
     shown = estimate_position_noise(tracks)
     return max(1.0, float(np.max(shown / (settings.position_scale * np.asarray(settings.position_noise)))))
 
 
 def launcher_labels(dataset: Dataset, tracks: list[Track], settings: Settings) -> Launcher:
-    """The labels that tell how unlabelled spins were launched: settings, else groups, else one group for all."""
+    """The labels that give the launch of unlabelled spins: settings, else groups, else one group for all."""
     names = tuple(n for n in LAUNCHER_LABELS if all(isinstance(t.labels.get(n), float) for t in tracks))
     if names:
         return Launcher(SpinEmbedding(names, {}), settings.spin_prior)
@@ -173,7 +175,7 @@ def launcher_labels(dataset: Dataset, tracks: list[Track], settings: Settings) -
 
 
 def _evaluation_track(smoother: Smoother, track: Track) -> EvaluationTrack | None:
-    """The part of a track that a model is to explain; None where it has too few samples."""
+    """The part of a track for evaluating a model; None if it has too few samples."""
     segmentation = smoother.segment(track)
     first, last = segmentation.segments[0]
     last = min([last, *(rest.first for rest in segmentation.rests if rest.first >= first)])

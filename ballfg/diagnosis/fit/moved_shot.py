@@ -1,4 +1,4 @@
-"""`shoot` in machine code: the motion of many balls through known contacts, with its derivatives in many directions."""
+"""Computes `shoot` in machine code: many balls through known contacts, with many directional derivatives."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,13 +18,13 @@ from ballfg.dynamics.motion.limits import LONGEST_FALL
 
 @dataclass(frozen=True)
 class Coefficients:
-    """Coefficients of n balls by parameter name, (n,) each, and their tangents (n, d); zero where there are none."""
+    """Coefficients of n balls by parameter name, (n,) each, and their tangents (n, d); zero for the others."""
 
     values: Mapping[str, Array]
     tangents: Mapping[str, Array]
 
     def of(self, function: Function, rows: Index, directions: int) -> tuple[Array, Array]:
-        """Those of some rows for a compiled function: (m, p) and (m, p, d)."""
+        """Coefficients of some rows for a compiled function, with tangents: (m, p) and (m, p, d)."""
         m, p = len(rows), len(function.names)
         values, tangents = np.empty((m, p)), np.zeros((m, p, directions))
         for place, name in enumerate(function.names):
@@ -36,7 +36,7 @@ class Coefficients:
 
 @dataclass(frozen=True)
 class MovedShot:
-    """Arcs of a motion with their derivatives, and the times (n, c) s of contacts; NaN where there is none."""
+    """Arcs of a motion with their derivatives, and the times (n, c) s of contacts; NaN without one."""
 
     arcs: list[MovedArc]
     contacts: Tensor
@@ -54,13 +54,13 @@ def shoot_compiled(
     """The motion of n balls, as `shooting.shoot`, with its derivatives in d directions.
 
     Args:
-        model: its functions, of an analytic model.
+        model: the functions of an analytic model.
         coefficients: of each ball.
         start: (n, 9) at time 0.
         moved: (n, 9, d) its derivatives.
-        heights: (n, c) m, declared heights of the surfaces met, in order; NaN where there is no further one.
-        guesses: (n, c) s, about when.
-        ends: (n,) s, how long to fly.
+        heights: (n, c) m, declared heights of the surfaces in order of contact; NaN after the last.
+        guesses: (n, c) s, approximate times of contact.
+        ends: (n,) s, durations.
     """
     n, _, d = moved.shape
     rows, begun, began = np.arange(n, dtype=np.int64), np.zeros(n), np.zeros((n, d))

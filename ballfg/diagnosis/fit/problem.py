@@ -1,4 +1,4 @@
-"""A fit problem with its unknowns, priors and losses, and the linearised rows at some unknowns."""
+"""Defines a fit problem with its unknowns, priors and losses, and linearises its rows."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -12,24 +12,25 @@ from ballfg.diagnosis.fit.free import Deviation
 from ballfg.diagnosis.fit.sensitivity import Predicted, Sensitivity, predict, sensitivity
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.fit.system import System, by_track
-from ballfg.dynamics import AnalyticModel, Coefficient, Variation
+from ballfg.dynamics import AnalyticModel, Coefficient
 from ballfg.dynamics.networks.spin_embedding import SOFT_SPEED
+from ballfg.dynamics.variation import Variation
 from ballfg.factors.loss import Loss
 from ballfg.state import SPIN, STATE_DIM, VELOCITY
 
 POSITION_LOSS = Loss("huber", 3.0)
 """Loss of a whitened position residual (three coordinates)."""
 LABEL_LOSS = Loss("cauchy", 3.0)
-"""Loss of a whitened spin label: labels were seen to contradict the flight."""
+"""Loss of a whitened spin label: some labels contradict the flight."""
 LAUNCHER_SPIN_SIGMA = 150.0
-"""rad/s, prior of the spin that a launcher setting of typical size means, per axis, about zero."""
+"""rad/s, prior per axis, about zero, of the spin for a launcher setting of typical size."""
 
 
 @dataclass(frozen=True)
 class Unknowns:
-    """Everything that a fit estimates: first states (n, 9), coefficients by parameter name, and the launcher.
+    """All unknowns of a fit: first states (n, 9), coefficients by parameter name, and the launcher.
 
-    That is (s, 3) rad/s per unit of each launcher setting: spin about forward, across and up.
+    The launcher is (s, 3) rad/s per unit of each setting: spin about forward, across and up.
     """
 
     starts: Array
@@ -39,14 +40,14 @@ class Unknowns:
 
 @dataclass(frozen=True)
 class Noise:
-    """Scale of the noise: of the stated position noise per axis (3,), of spin labels, of unlabelled spins in rad/s."""
+    """Scale of the noise: factor on the stated position noise (3,) and on spin labels, unlabelled spins in rad/s."""
 
     position: Array = field(default_factory=lambda: np.ones(3))
     label: float = 20.0
     spin: float = 60.0
 
     def same_as(self, other: Self) -> bool:
-        """Whether all scales are the same numbers."""
+        """True if all scales are equal."""
         return np.array_equal(self.position, other.position) and (self.label, self.spin) == (other.label, other.spin)
 
 
@@ -57,10 +58,10 @@ class Problem:
     Attributes:
         model: with every effect that has a coefficient among `free`.
         stretches: the data.
-        free: coefficients to estimate, by parameter name, with their priors; deviations too, by their names.
-        shared: whether coefficients and launcher are estimated. Otherwise only first states are, as in an evaluation
-            on other tracks.
-        deviations: those among `free`, by name.
+        free: coefficients to estimate, by parameter name, with their priors; deviations by their names.
+        shared: True if coefficients and launcher are estimated. Otherwise only first states are, as in an evaluation on
+            other tracks.
+        deviations: the deviations among `free`, by name.
     """
 
     model: AnalyticModel
@@ -71,7 +72,7 @@ class Problem:
 
     @property
     def declared(self) -> dict[str, float]:
-        """Prior means of the coefficients to estimate: the model's own values, and no deviations."""
+        """Prior means of the coefficients to estimate: the model's own values, and zero deviations."""
         parameters = dict(self.model.named_parameters())
         return {name: float(parameters[name].detach()) if name in parameters else 0.0 for name in self.free}
 
@@ -97,9 +98,9 @@ class Problem:
         return np.concatenate((self.precisions, np.repeat(self.launcher_precision, 3)))
 
     def by_stretch(self, values: Mapping[str, float], stretches: Stretches | None = None) -> dict[str, float | Array]:
-        """Coefficients by parameter name: one number, or (n,) where deviations make them differ between n stretches.
+        """Coefficients by parameter name: one number, or (n,) if deviations make them differ between n stretches.
 
-        Args: values: of all unknowns, by name.  stretches: the problem's own where None.
+        Args: values: of all unknowns, by name.  stretches: None: the problem's own.
         """
         found: dict[str, float | Array] = {n: value for n, value in values.items() if n not in self.deviations}
         parameters, declared = dict(self.model.named_parameters()), self.model.declared_coefficients()
@@ -124,9 +125,9 @@ class Robust:
 
 @dataclass(frozen=True)
 class Fit:
-    """Unknowns of a problem and the samples that they predict, after some Gauss-Newton steps.
+    """Unknowns of a problem and their predicted samples, after some Gauss-Newton steps.
 
-    The result of a fit is the one at the minimum.
+    The result of a fit is this at the minimum.
     """
 
     problem: Problem
@@ -161,17 +162,17 @@ class Fit:
 
     @cached_property
     def sigmas(self) -> Array:
-        """(n, k, 3) m, stated noise times its estimated scale; infinite where there is no sample."""
+        """(n, k, 3) m, stated noise times its estimated scale; infinite for padding."""
         return np.asarray(self.problem.stretches.sigmas.numpy() * self.noise.position)
 
     @cached_property
     def whitened(self) -> Array:
-        """(n, k, 3) position residuals over their noise; zero where there is no sample."""
+        """(n, k, 3) position residuals over their noise; zero for padding."""
         return np.asarray((self.problem.stretches.positions.numpy() - self.predicted.positions) / self.sigmas)
 
     @cached_property
     def whitened_spins(self) -> Array:
-        """(n, 3) whitened residual of each spin against its label, or against its launcher where it has no label."""
+        """(n, 3) whitened residual of each spin against its label or, without a label, against its launcher."""
         stretches, unknowns = self.problem.stretches, self.unknowns
         local = stretches.settings @ unknowns.launcher
         mean = (launch_axes(unknowns.starts) @ local[..., None])[..., 0]
@@ -182,7 +183,7 @@ class Fit:
 
     @cached_property
     def robust(self) -> Robust:
-        """Huber's weights and losses of positions, Cauchy's of labels."""
+        """Weights and losses: Huber's of positions, Cauchy's of labels."""
         length = np.linalg.norm(self.whitened, axis=-1)
         spin, labelled = np.linalg.norm(self.whitened_spins, axis=-1), self.problem.stretches.labelled
         spin_weight = np.where(labelled, LABEL_LOSS.weight(spin), 1.0)
@@ -192,7 +193,7 @@ class Fit:
 
     @cached_property
     def cost(self) -> float:
-        """Half the robust sum of squares, priors included; infinite where a stretch misses a contact."""
+        """Half the robust sum of squares, including priors; infinite if a stretch misses a contact."""
         problem, cost = self.problem, float(self.robust.losses.sum())
         values = np.array([self.unknowns.values[name] for name in problem.free])
         cost += 0.5 * float((problem.precisions * (values - problem.centres) ** 2).sum())
@@ -213,7 +214,7 @@ class Fit:
     def sensitivity(self) -> Sensitivity:
         """Derivatives of the samples by first states and by all of `Problem.free`.
 
-        That by a deviation is that by its coefficient, times the weight of each stretch.
+        The derivative by a deviation is that by its coefficient, times the weight of each stretch.
         """
         problem, deviations = self.problem, self.problem.deviations
         if not problem.shared:  # first states only: columns of coefficients stay zero
@@ -235,7 +236,7 @@ class Fit:
         )
 
     def _known(self, names: Iterable[str]) -> dict[str, float | Array]:
-        """All fitted coefficients, and the model's own values of others that are named."""
+        """All fitted coefficients, and the model's own values of further names."""
         parameters = dict(self.problem.model.named_parameters())
         return {name: float(parameters[name].detach()) for name in names} | self.values
 

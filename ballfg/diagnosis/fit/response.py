@@ -1,4 +1,4 @@
-"""Response of the samples to accelerations in flight and to kicks right after contacts.
+"""Computes the response of the samples to accelerations in flight and to kicks right after contacts.
 
 To first order, an acceleration a(s) along the fitted motion moves the position measured at time t by P(t) times the
 integral over s < t of F(s)^-1 (0, a(s), 0), by variation of constants. F and P are the derivatives of the state and of
@@ -25,12 +25,12 @@ from ballfg.state import STATE_DIM, VELOCITY
 NODE = 0.01
 """s. Spacing of the points at which forces act; a pattern of 1 m/s^2 is then right to 13 micrometres."""
 MOST_STRETCHES = 100
-"""Stretches of one pass; memory is about a megabyte each."""
+"""Largest number of stretches in one pass; each takes about a megabyte."""
 
 
 @dataclass(frozen=True)
 class FittedPath:
-    """The fitted motion of n stretches; times (k, n) s and states (n, k, 9) at their samples, from the first one on."""
+    """The fitted motion of n stretches; times (k, n) s and states (n, k, 9) at their samples, from the first on."""
 
     motion: Trajectories
     times: Tensor
@@ -46,7 +46,7 @@ class ArcResponse:
         number: of the arc: 0 is before the first contact, j follows contact j - 1.
         begun: (m,) s since the first sample.
         step: (m,) s between nodes.
-        incoming: (m, 9) state before the contact with which the arc begins; the first state itself for arc 0.
+        incoming: (m, 9) state before the arc's first contact; the first state itself for arc 0.
         nodes: (m, q, 9) states.
         times: (m, q) s of the nodes since the first sample.
         inverse: (m, q, 9, 3) of the derivative of a node's state by the arc's first state, columns of the velocity.
@@ -97,7 +97,7 @@ def responses(fit: Fit, path: FittedPath) -> Iterator[ArcResponse]:
 
 
 def weighted(fit: Fit, positions: Array, rows: Index) -> Array:
-    """(m, 3 k + 3, p) rows as in the fit's system, of derivatives (m, k, 3, p) of positions; labels do not respond."""
+    """(m, 3 k + 3, p) rows as in the fit's system, from derivatives (m, k, 3, p) of positions; zero for labels."""
     moved = fit.position_rows(positions, rows)
     return np.concatenate((moved, np.zeros((len(rows), 3, positions.shape[-1]))), axis=1)
 

@@ -1,4 +1,4 @@
-"""Predicted samples, and their derivatives by first states and coefficients.
+"""Predicts samples, and differentiates them by first states and coefficients.
 
 Derivatives are torch's forward mode: the batch is repeated once per direction, with a dual number in that direction.
 """
@@ -18,19 +18,20 @@ from ballfg.diagnosis.fit.moved_shot import Coefficients, shoot_compiled
 from ballfg.diagnosis.fit.shooting import shoot
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.fit.tangents import MovedArc, RepeatedMotion
-from ballfg.dynamics import BallModel, substitute
+from ballfg.dynamics import BallModel
 from ballfg.dynamics.compiled.functions import CompiledModel, compiled
+from ballfg.dynamics.model import substitute
 from ballfg.state import SPIN, STATE_DIM
 
 MOST_ROWS = 3000
-"""Rows of one forward pass. More rows take several passes; a row needs some 50 kB of memory."""
+"""Largest number of rows in one forward pass. A row needs some 50 kB of memory."""
 
 
 @dataclass(frozen=True)
 class Predicted:
-    """Samples as a model predicts them: positions (n, k, 3) m, labels (n, 3) rad/s, and the times of contacts (n, c) s.
+    """Predicted samples: positions (n, k, 3) m, labels (n, 3) rad/s, and the times of contacts (n, c) s.
 
-    A time is NaN where there is no contact.
+    A time is NaN without a contact.
     """
 
     positions: Array
@@ -47,9 +48,9 @@ class Sensitivity:
 
 
 def predict(model: BallModel, stretches: Stretches, starts: Array, values: Mapping[str, float | Array]) -> Predicted:
-    """The samples that a model predicts from states (n, 9) at the first samples.
+    """The samples of a model, from states (n, 9) at the first samples.
 
-    Args: values: those of some coefficients, the same for all stretches or (n,) one for each.
+    Args: values: of some coefficients, the same for all stretches or (n,) one for each.
     """
     functions, n = compiled(model), len(stretches)
     with torch.no_grad():
@@ -80,7 +81,7 @@ def _column(value: float | Array, count: int) -> Tensor:
 
 @dataclass(frozen=True)
 class _Direction:
-    """A component of the first state or a coefficient, and values that other coefficients have meanwhile."""
+    """A component of the first state or a coefficient, with values of other coefficients for its derivative."""
 
     component: int | None = None
     name: str | None = None
@@ -102,12 +103,12 @@ def sensitivity(
 
     Args:
         model, stretches, starts, values: as for `predict`.
-        names: coefficients among `values`; one that is named again has one derivative for each of its shapes.
-        shapes: for each name, values of other coefficients with which that derivative is taken; empty: none.
+        names: coefficients among `values`; a repeated one has one derivative for each of its shapes.
+        shapes: for each name, values of other coefficients for that derivative; empty: none.
     """
     wanted = [_Direction(component=number) for number in range(STATE_DIM if by_start else 0)]
     wanted += [_Direction(None, name, shape) for name, shape in zip(names, shapes or [{}] * len(names), strict=True)]
-    # a fit takes many steps with one model, a score test one look at each of many
+    # a fit takes many steps with one model, a score test one step each with many
     functions = compiled(model) if by_start and not shapes else None
     if functions is not None:
         return _compiled_derivatives(functions, model, stretches, starts, values, wanted)
@@ -192,7 +193,7 @@ def _repeated(
 def _coefficients(
     model: BallModel, stretches: Stretches, values: Mapping[str, float | Array], wanted: Sequence[_Direction]
 ) -> Coefficients:
-    """All coefficients of a model for each stretch, and which of them moves in which direction."""
+    """All coefficients of a model for each stretch, and the direction of the nonzero tangent of each."""
     n, own = len(stretches), {name: p for name, p in model.named_parameters() if p.dim() == 0}
     known = {name: np.full(n, float(p.detach())) for name, p in own.items()}
     known |= {name: np.array(np.broadcast_to(value, n), dtype=np.float64) for name, value in values.items()}
@@ -225,7 +226,7 @@ def _tangent(dual: Tensor) -> Tensor:
 
 def _true_times(model: BallModel, stretches: Stretches) -> Tensor:
     """(k, r) s of true time, of the samples."""
-    # stamps run along the first axis: a coefficient of shape (r, 1) then goes with (k, r, 1)
+    # stamps run along the first axis: a coefficient of shape (r, 1) then fits (k, r, 1)
     return model.true_stamps(stretches.times.T.unsqueeze(-1)).squeeze(-1)
 
 

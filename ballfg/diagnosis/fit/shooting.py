@@ -1,4 +1,4 @@
-"""Motion from a first state, through contacts whose number and order are known: smooth in everything.
+"""Integrates motion from a first state through a known sequence of contacts, smoothly in all arguments.
 
 A rollout finds the bounces itself, so that a small change can add or lose one. Here the contacts are given, each with a
 guess of its time, and only their times are solved for. Each row flies in equal steps of its own from contact to
@@ -11,9 +11,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ballfg.dynamics import BallModel, contact_time, fly
+from ballfg.dynamics import BallModel
 from ballfg.dynamics.model import take_rows
-from ballfg.dynamics.motion.integrate import MAX_STEP, derivative, rk4_step
+from ballfg.dynamics.motion.contact import contact_time
+from ballfg.dynamics.motion.flight_step import derivative, rk4_step
+from ballfg.dynamics.motion.integrate import fly
+from ballfg.dynamics.motion.limits import MAX_STEP
 from ballfg.dynamics.motion.paths import hermite
 from ballfg.state import VELOCITY
 
@@ -22,7 +25,7 @@ LONGEST_STEP, LONGEST_WAY = 0.04, 0.4
 then ends within a micrometre of the rollout's, far below the resolution of any camera. Steps become no shorter than a
 rollout's, however fast a state that a fit tries."""
 LEAST_ARC = 1e-3
-"""s. An arc between two contacts is taken to last at least so long when its steps are laid out."""
+"""s. Least duration of an arc between two contacts for the choice of its steps."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,7 @@ class Arc:
     slopes: Tensor
 
     def states(self, times: Tensor) -> Tensor:
-        """(k, m, 9) states at times (k, m) s; beyond the last node the last polynomial goes on."""
+        """(k, m, 9) states at times (k, m) s; beyond the last node by the last polynomial."""
         place = (times - self.begun) / self.step[:, 0]
         index = place.detach().floor().clamp(0, len(self.nodes) - 2).long()
         theta = (place - index).unsqueeze(-1)
@@ -55,7 +58,7 @@ class Arc:
 
 @dataclass(frozen=True)
 class Trajectories:
-    """The motion of r rows: arcs in order of time; (r, c) s of contacts, NaN where there is none or none is reached."""
+    """The motion of r rows: arcs in order of time; (r, c) s of contacts, NaN if there is none or it is not reached."""
 
     arcs: tuple[Arc, ...]
     contacts: Tensor
@@ -75,11 +78,11 @@ def shoot(model: BallModel, start: Tensor, heights: Tensor, guesses: Tensor, end
     """The motion of rows of balls.
 
     Args:
-        model: coefficients may have one value a row, shape (r, 1).
+        model: coefficients may have one value per row, shape (r, 1).
         start: (r, 9) at time 0.
-        heights: (r, c) m, declared heights of the surfaces met, in order; NaN where there is no further one.
-        guesses: (r, c) s, about when.
-        ends: (r,) s, how long to fly.
+        heights: (r, c) m, declared heights of the surfaces in order of contact; NaN after the last.
+        guesses: (r, c) s, approximate times of contact.
+        ends: (r,) s, durations.
     Returns:
         The motion, differentiable backward and forward in start and coefficients. A row that misses a contact is NaN
         from there on.
@@ -107,7 +110,7 @@ def shoot(model: BallModel, start: Tensor, heights: Tensor, guesses: Tensor, end
 
 
 def steps_of_arc(state: Tensor, duration: Tensor) -> tuple[int, Tensor]:
-    """Number of equal steps for arcs of some durations (m,) s from states (m, 9), and their lengths (m,) s."""
+    """Number of equal steps for arcs of durations (m,) s from states (m, 9), and their lengths (m,) s."""
     duration = duration.clamp_min(LEAST_ARC)
     fastest = float(state[:, VELOCITY].detach().square().sum(-1).nan_to_num(nan=0.0).max().sqrt())
     longest = min(LONGEST_STEP, max(MAX_STEP, LONGEST_WAY / max(fastest, 1.0)))

@@ -1,4 +1,4 @@
-"""What stamps are wrong by, seen in the tracks alone: frames that were counted though some were dropped; a far clock.
+"""Finds errors of stamps from the tracks alone: counted frames of which some were dropped, and a wrong clock.
 
 Both must be known before a track is cut into flights. With a clock that is wrong by tens of percent, or with a step of
 the ball that is twice as long as the one before, free flight looks like a chain of hits.
@@ -17,36 +17,36 @@ from ballfg.estimation.measurement.position_noise import FLOOR
 from ballfg.tracks import Track
 
 REGULAR: Final = 0.02
-"""Relative. Stamps that count frames have intervals that differ by no more."""
+"""Relative. Largest difference between the intervals of stamps that count frames."""
 NEAR: Final = 9
-"""Steps about one that tell the length of a step of one frame."""
+"""Number of neighbouring steps that give the length of a step of one frame."""
 SHORT: Final = 25.0
-"""Percentile of these lengths that is one frame's to begin with."""
+"""Percentile of these lengths that is first taken as one frame's."""
 MOST_MISSING: Final = 6
-"""Frames between two samples, at most."""
+"""Largest number of frames between two samples."""
 WINDOW: Final = 16
-"""Samples of a piece of flight whose polynomial is looked at."""
+"""Number of samples in a piece of flight for its polynomial."""
 ROUNDS: Final = 100
-"""Times that frames are counted again beside a motion that became smoother."""
+"""Number of times that frames are counted again on a smoother motion."""
 CLEAR: Final = 0.7
-"""A further missing frame must lower the variance of a piece to this share."""
+"""Largest ratio of a piece's variance with and without a further missing frame."""
 LEAST_SHARE: Final = 0.02
-"""Share of missing frames that is thought possible to begin with."""
+"""Smallest share of missing frames at first."""
 TINY: Final = 1e-9
-"""m. Shorter steps are divided by it."""
+"""m. Least step in a division."""
 QUIET: Final = 3.0
-"""Pieces whose scatter is larger than so many times the lower quartile's hold a bounce or a hit."""
+"""Pieces whose scatter exceeds this multiple of the lower quartile hold a bounce or a hit."""
 SMOOTHER: Final = 0.5
-"""Fall of the log variance about polynomials from which counted frames are believed."""
+"""Least decrease of the log variance about polynomials for counted frames."""
 FAR: Final = 0.2
-"""A clock that is wrong by less is found by the fit itself; a lift may look like a clock that is."""
+"""Least error of a clock: the fit itself finds smaller ones, and a lift may look like one."""
 CHANCE: Final = 1e-3
-"""Probability by chance, in each half of the tracks, below which wrong stamps are believed."""
+"""Significance level of wrong stamps in each half of the tracks."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """A number for each track of a half that is zero on average by chance: its mean, and the probability of that."""
+    """The mean over a half's tracks of a number that is zero on average by chance, and its probability."""
 
     mean: float
     p_value: float
@@ -54,7 +54,7 @@ class Evidence:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> "Evidence":
-        """From one number a track; gain: of a normal log likelihood, per track."""
+        """Computes the evidence from one number per track; gain: of a normal log likelihood, per track."""
         spread = float(np.std(values, ddof=1)) if len(values) > 2 else np.inf
         mean = float(np.mean(values)) if len(values) else 0.0
         if not np.isfinite(spread) or spread == 0.0:
@@ -64,12 +64,12 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Stamps:
-    """What is known of a dataset's stamps before anything is fitted.
+    """Errors of a dataset's stamps, found before any fit.
 
     Attributes:
-        missing: frames that are missing for each sample, on average; zero where stamps are times.
-        counted: (n,) s stamps of each track with the missing frames in their places, the mean rate as written.
-        scale: written durations over true ones less one; zero where the clock is not far off.
+        missing: average number of missing frames per sample; zero if stamps are times.
+        counted: (n,) s stamps of each track with the missing frames inserted, at the recorded mean rate.
+        scale: recorded durations over true ones less one; zero if the clock is not far off.
         found: by effect, the evidence on the search half and on the held-out half.
     """
 
@@ -80,11 +80,11 @@ class Stamps:
 
     @property
     def stretch(self) -> float:
-        """True durations over those of stamps with the missing frames in their places."""
+        """True durations over those of stamps with the missing frames inserted."""
         return (1.0 + self.missing) / (1.0 + self.scale)
 
     def repaired(self, track: Track) -> Track:
-        """The track with stamps as they should be: frames in their places, and true durations."""
+        """The track with corrected stamps: missing frames inserted, and true durations."""
         if not self.found:
             return track
         times = self.counted.get(track.name, track.times)
@@ -92,7 +92,7 @@ class Stamps:
 
 
 def look_at_stamps(tracks: Sequence[Track], gravity: float, drag: float) -> Stamps:
-    """Look for counted frames and for a clock that is far off.
+    """Finds counted frames and a clock that is far off.
 
     Args: tracks: every second one belongs to the search half.  gravity: m/s^2.  drag: 1/m, of the declared model.
     """
@@ -107,7 +107,7 @@ def look_at_stamps(tracks: Sequence[Track], gravity: float, drag: float) -> Stam
 
 
 def _with_counts(tracks: Sequence[Track]) -> Stamps:
-    """The frames that are missing between samples, if stamps count frames and some are missing."""
+    """The missing frames between samples, if stamps count frames and some are missing."""
     counts = [frame_counts(track) for track in tracks]
     falls = []
     for track, count in zip(tracks, counts, strict=True):
@@ -125,7 +125,7 @@ def _with_counts(tracks: Sequence[Track]) -> Stamps:
 
 
 def frame_counts(track: Track) -> Index:
-    """(n,) number of the frame of each sample, from the lengths of the ball's steps; 0, 1, 2 ... where none is missing.
+    """(n,) number of the frame of each sample, from the lengths of the ball's steps; 0, 1, 2 ... without missing ones.
 
     A step of the ball over a missing frame is twice as long as its neighbours.
     """
@@ -147,9 +147,9 @@ def frame_counts(track: Track) -> Index:
 
 
 def _changes(numbers: Index, positions: Array, quiet: float) -> Index:
-    """(n - 1,) by how many frames each step is longer if the motion about it shall be as smooth as possible.
+    """(n - 1,) number of frames to add to each step so that the motion around it becomes smoothest.
 
-    Of steps that are near each other only the one changes with which most is gained.
+    Of neighbouring steps only the one with the largest gain changes.
 
     Args: numbers: (n,) frames so far.  positions: (n, 3) m.  quiet: m^2, variance of a coordinate's noise.
     """
@@ -187,7 +187,7 @@ def _quadratics(times: Array, positions: Array) -> tuple[Array, Array]:
 
 
 def _pieces(times: Array, positions: Array) -> tuple[Array, Array]:
-    """Quadratics through windows of samples, as `_quadratics` gives them; none for a track that is too short."""
+    """Quadratics through windows of samples, by `_quadratics`; none for a track that is too short."""
     if len(times) < WINDOW:
         return np.zeros((0, 3, 3)), np.zeros(0)
     windows = sliding_window_view(times, WINDOW)[:: WINDOW // 4]
@@ -195,7 +195,7 @@ def _pieces(times: Array, positions: Array) -> tuple[Array, Array]:
 
 
 def _across(track: Track) -> float:
-    """m^2, variance of a coordinate across the motion, which wrong stamps do not change: about planar parabolas.
+    """m^2, variance of a coordinate across the motion, about planar parabolas; wrong stamps do not change it.
 
     A ball that falls straight down with x = y = 0, as one axis of a computed track does, has none: at least `FLOOR`.
     """
@@ -206,7 +206,7 @@ def _across(track: Track) -> float:
 
 
 def _log_gravity(track: Track, gravity: float, drag: float) -> float:
-    """Log of the downward acceleration over g once drag is taken off; drag along a path has no clock."""
+    """Log of the downward acceleration over g after drag is subtracted; drag along a path is free of the clock."""
     found, variances = _pieces(track.times, track.positions)
     if not len(variances):
         return float("nan")

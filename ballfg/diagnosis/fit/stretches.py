@@ -1,4 +1,4 @@
-"""Stretches: parts of tracks without a hit, as one padded batch.
+"""Cuts tracks into stretches, their parts without a hit, and holds them as one padded batch.
 
 A stretch starts at its first usable sample with a state of its own. The ball flies and bounces at contacts whose order
 is known. The stretch ends before the next hit or when the ball comes to rest. The motion is deterministic, so what the
@@ -16,17 +16,18 @@ import torch
 from torch import Tensor
 
 from ballfg.arrays import Array, Index, Mask
-from ballfg.estimation import Launcher, Smoother
+from ballfg.estimation import Smoother
 from ballfg.estimation.batch import map_tracks
+from ballfg.estimation.launcher import Launcher
 from ballfg.tracks import Track
 
 LEAST_SAMPLES = 10
-"""A stretch of fewer samples tells next to nothing once its nine start values are found."""
+"""Least number of samples: a shorter stretch leaves little information beyond its nine initial values."""
 MOST_CONTACTS = 3
 """A stretch ends before the next contact: every further one costs as much as the first and makes the motion more
-sensitive to its start, and the last small hops of a ball tell next to nothing."""
+sensitive to its start, while the last small hops of a ball carry little information."""
 LEAST_DURATION = 0.08
-"""s. A shorter stretch tells next to nothing either."""
+"""s. A shorter stretch also carries little information."""
 TENSORS = ("times", "positions", "sigmas", "starts", "heights", "contacts", "labels")
 """Names of the tensors of `Stretches`."""
 PADDING = {"sigmas": math.inf, "heights": math.nan, "contacts": math.nan}
@@ -40,13 +41,13 @@ class Stretches:
     Attributes:
         names: of the tracks they come from.
         track: (n,) number of the track: stretches of one track count as one observation.
-        settings: (n, s) launcher settings, zero where a stretch does not start at the launcher or tells none.
+        settings: (n, s) launcher settings, zero if a stretch does not start at the launcher or has none.
         times: (n, k) s since the stretch's first sample; the last one repeated.
         positions: (n, k, 3) m as measured.
-        sigmas: (n, k, 3) m, stated noise; infinite where there is no sample.
+        sigmas: (n, k, 3) m, stated noise; infinite for padding.
         starts: (n, 9) first guess of the state at the first sample.
-        heights: (n, c) m, declared height of each contact's surface in order of time; NaN where there is none.
-        contacts: (n, c) s, guesses of when they happen.
+        heights: (n, c) m, declared height of each contact's surface in order of time; NaN for padding.
+        contacts: (n, c) s, guesses of their times.
         labels: (n, 3) rad/s, spin label at the first sample; NaN without one.
     """
 
@@ -66,21 +67,21 @@ class Stretches:
 
     @property
     def ends(self) -> Tensor:
-        """(n,) s, last sample of each."""
+        """(n,) s, time of the last sample of each."""
         return self.times[:, -1]
 
     @property
     def used(self) -> Tensor:
-        """(n, k) bool, there is a sample."""
+        """(n, k) bool, True for samples, False for padding."""
         return self.sigmas[..., 0].isfinite()
 
     @property
     def labelled(self) -> Mask:
-        """(n,) whether each has a spin label."""
+        """(n,) bool, True for stretches with a spin label."""
         return np.asarray(~np.isnan(self.labels[:, 0].numpy()))
 
     def take(self, rows: Sequence[int] | Index | Mask) -> Self:
-        """Some of the stretches."""
+        """A part of the stretches."""
         index = np.arange(len(self))[np.asarray(rows)]
         where = torch.from_numpy(index)
         tensors = {name: getattr(self, name)[where] for name in TENSORS}
@@ -91,8 +92,8 @@ class Stretches:
 def stretches_of(smoother: Smoother, tracks: Iterable[Track], launcher: Launcher, jobs: int = 1) -> Stretches:
     """The stretches of tracks.
 
-    The smoother finds contacts, hits and outliers, and the states from which the fit starts. The launcher reads the
-    settings of a shot; its weights do not matter.
+    The smoother finds contacts, hits and outliers, and initial states for the fit. The launcher reads the settings of a
+    shot; its weights are not used.
 
     Raises: ValueError: if no track has a stretch that is long enough.
     """
@@ -108,7 +109,7 @@ def stretches_of(smoother: Smoother, tracks: Iterable[Track], launcher: Launcher
 
 
 def _cut(smoother: Smoother, launcher: Launcher, track: Track) -> list[Stretches]:
-    """Each stretch of a track by itself."""
+    """The stretches of one track, each as a batch of its own."""
     known = launcher.settings(track)
     settings = np.zeros(len(launcher.embedding.names)) if known is None else known
     problem = smoother.problem(track)
@@ -157,7 +158,7 @@ def joined(parts: Sequence[Stretches]) -> Stretches:
 
 
 def _padded(rows: Tensor, length: int, fill: float | None) -> Tensor:
-    """Rows (n, m, ...) continued to a length, with a number or else with the last of each."""
+    """Rows (n, m, ...) extended to a length, by a number or by the last of each."""
     missing = (len(rows), length - rows.shape[1], *rows.shape[2:])
     rest = rows[:, -1:].expand(missing) if fill is None else rows.new_full(missing, fill)
     return torch.cat((rows, rest), dim=1)

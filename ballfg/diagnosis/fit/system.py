@@ -1,8 +1,8 @@
-"""The linearised problem of all stretches, with the first states eliminated stretch by stretch.
+"""Eliminates the first states from the linearised problem, stretch by stretch.
 
-Common columns are those of everything that acts on all stretches: declared coefficients, launcher settings and
-candidate effects. The best first state absorbs a part of each column; the rest is its projected signature. Tests and
-fits need only the inner products of projected signatures, summed over each track.
+Common columns belong to unknowns that act on all stretches: declared coefficients, launcher settings and candidate
+effects. The best first state absorbs a part of each column; the rest is its projected signature. Tests and fits need
+only the inner products of projected signatures, summed over each track.
 """
 
 from dataclasses import dataclass
@@ -29,8 +29,8 @@ class Eliminated:
     def common_step(self, precision: Array, pull: Array, low: Array, high: Array, damping: float = 0.0) -> Array:
         """(q,) best step of the common unknowns within limits.
 
-        An unknown whose step would pass its limit ends there, and the others are solved for beside it: a full step of
-        theirs would count on a move that does not happen.
+        An unknown whose step would pass its limit ends there, and the others are solved again with it fixed: their full
+        step would count on a change that does not happen.
 
         Args:
             precision: (q,) of the priors.
@@ -53,18 +53,18 @@ class Eliminated:
         return step
 
     def start_step(self, common: Array) -> Array:
-        """(n, 9) step of the first states that goes with a step (q,) of the common unknowns."""
+        """(n, 9) step of the first states that follows a step (q,) of the common unknowns."""
         return np.asarray(self.solved[..., -1] - self.solved[..., :-1] @ common)
 
 
 @dataclass(frozen=True)
 class System:
-    """Whitened rows of n stretches: m samples' coordinates and three of the spin each.
+    """Whitened rows of n stretches: m is the number of samples' coordinates plus three for the spin.
 
     Attributes:
         residual: (n, m) measured minus predicted.
         by_start: (n, m, 9) derivative of the prediction by the first state.
-        by_common: (n, m, q) derivative of the prediction by everything that all stretches share.
+        by_common: (n, m, q) derivative of the prediction by the unknowns that all stretches share.
     """
 
     residual: Array
@@ -78,7 +78,7 @@ class System:
 
     @property
     def start_information(self) -> Array:
-        """(n, 9, 9) information of the first states; one for a number that no row tells of, which so stays."""
+        """(n, 9, 9) information of the first states; one for an undetermined number, which so stays."""
         found, diagonal = self.by_start.swapaxes(-1, -2) @ self.by_start, np.arange(STATE_DIM)
         found[:, diagonal, diagonal] += found[:, diagonal, diagonal] == 0.0
         return np.asarray(found)

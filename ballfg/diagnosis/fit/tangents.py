@@ -1,4 +1,4 @@
-"""States and their derivatives between the nodes of trajectories.
+"""Interpolates states and their derivatives between the nodes of trajectories.
 
 Between two nodes a state is a sum of the nodes' states and slopes, with weights that depend on the time alone; so are
 its derivatives, which need no dual arithmetic at the samples.
@@ -29,7 +29,7 @@ class RepeatedMotion:
         arcs: of the motion.
         balls: n.
         directions: d.
-        parts: 3; or 1 where nobody asks for velocities and spins, and states are (n, k, 3).
+        parts: 3; or 1 for positions alone, with states (n, k, 3).
     """
 
     def __init__(self, arcs: Sequence[MovedArc], balls: int, directions: int, parts: int) -> None:
@@ -54,7 +54,7 @@ class RepeatedMotion:
         return self.states(times)[0].transpose(0, 1)
 
     def dual_states(self, times: Tensor) -> Tensor:
-        """(k, d n, 9) the same as dual numbers, direction by direction."""
+        """(k, d n, 9) states as dual numbers, direction by direction."""
         value, tangent = self.states(times)
         repeated = value.transpose(0, 1).repeat(1, self.directions, 1)
         return make_dual(repeated, tangent.permute(1, 3, 0, 2).reshape(repeated.shape).contiguous())
@@ -97,7 +97,7 @@ class MovedArc:
 
     @property
     def arrays(self) -> tuple[Array, ...]:
-        """All of it, in order."""
+        """All arrays, in order."""
         return tuple(getattr(self, field.name) for field in fields(self))
 
 

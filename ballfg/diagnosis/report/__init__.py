@@ -1,1 +1,1 @@
-"""A diagnosis as files and pictures."""
+"""Writes a diagnosis as files and pictures."""

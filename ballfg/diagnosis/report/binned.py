@@ -1,4 +1,4 @@
-"""Residuals in the axes of the motion, and their means over bins, for the pictures."""
+"""Turns residuals into the axes of the motion and averages them over bins, for the pictures."""
 
 from dataclasses import dataclass
 
@@ -13,11 +13,11 @@ from ballfg.state import SPIN, VELOCITY
 MOST_BINS, LEAST_BINS = 12, 3
 """Limits of the number of bins, which hold equal counts."""
 STRETCHES_A_BIN = 6
-"""Few stretches make few bins, so that each mean is over several stretches."""
+"""Number of stretches per bin, so that each mean is over several stretches."""
 LEAST_STRETCHES = 3
-"""A bin of fewer stretches has no standard error worth showing."""
+"""Least number of stretches for the standard error of a bin."""
 STEEP = 1e-6
-"""Horizontal share of a velocity below which it is vertical: its direction along the ground is then that of x."""
+"""Horizontal share of a velocity below which it counts as vertical: its direction along the ground is then x."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,8 @@ def binned(against: Array, values: Array, sigmas: Array, stretch: Index) -> Bins
     """Weighted means of values over bins of equal counts.
 
     Args:
-        against: (m,) quantity that is cut into bins.
-        values, sigmas: (m,) and their standard deviations, which give the weights.
+        against: (m,) quantity on the axis of the bins.
+        values, sigmas: (m,) and their standard deviations, for the weights.
         stretch: (m,) number of the stretch: values of one stretch are correlated and count as one.
     Returns: the bins with enough stretches. The standard errors come from the scatter between stretches alone.
     """

@@ -1,4 +1,4 @@
-"""The candidates of a diagnosis: a ranking of each round, and those about which the data say nothing."""
+"""Lists the candidates of a diagnosis: a ranking of each round, and those that the data cannot show."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -13,9 +13,9 @@ from ballfg.dynamics import EFFECTS
 from ballfg.pages.html import Html, bar, picture, section, table, tag
 
 COLOURS = {Outcome.ADDED: "added", Outcome.ALIKE: "alike"}
-"""Classes of the style for the outcome of a candidate."""
+"""CSS classes for the outcome of a candidate."""
 SHOWN = 8
-"""Rows of a ranking that are seen at once; the others unfold."""
+"""Number of visible rows of a ranking; the others unfold."""
 RANKING = (
     "candidate",
     term("squared residual", "squared residual it would explain"),
@@ -64,7 +64,7 @@ def _lines(row: Sequence[Candidate], most: float) -> Iterator[tuple[str, ...]]:
 
 
 def noticed_from(diagnosis: Diagnosis) -> Html:
-    """From which size on these tracks would have shown each of the effects that they do not show."""
+    """Detectable sizes of the effects that these tracks do not show."""
     quiet = not_shown(diagnosis)
     words = (
         "These effects were looked for and not found. Here is how strong each would have had to be for the test to "
@@ -82,7 +82,7 @@ def noticed_from(diagnosis: Diagnosis) -> Html:
 
 
 def invisible(diagnosis: Diagnosis) -> Html:
-    """Candidates about which these data say nothing: they may be there all the same."""
+    """Candidates on which these data carry no information: they may exist all the same."""
     last = {c.name: c for row in diagnosis.rounds for c in row}
     names = [name for name, c in last.items() if c.outcome is Outcome.INVISIBLE]
     words = (

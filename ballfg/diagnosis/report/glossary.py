@@ -1,4 +1,4 @@
-"""What the words of a report mean: on hover where they stand, and in a list at the end of the page."""
+"""Explains the words of a report, on hover and in a list at the end of the page."""
 
 from typing import Final
 
@@ -51,7 +51,7 @@ OUTCOMES: Final = {
     "that were added explain, or chance.",
     Outcome.INVISIBLE: "Nothing in these tracks depends on it, so they neither show it nor rule it out.",
 }
-"""What each outcome of a candidate means."""
+"""Meaning of each outcome of a candidate."""
 
 
 def term(name: str, shown: str = "") -> Html:

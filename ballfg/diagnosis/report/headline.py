@@ -1,4 +1,4 @@
-"""The first lines of a report: what was found, how sure that is, and what to do next, for any reader."""
+"""Writes the first lines of a report for any reader: the finding, its certainty, and the next step."""
 
 import math
 import re
@@ -10,14 +10,14 @@ from typing import Final
 import numpy as np
 
 from ballfg.diagnosis.generic_test import ALARM
-from ballfg.diagnosis.remains.label_check import LABEL
-from ballfg.diagnosis.remains.patterns import EVERYWHERE
 from ballfg.diagnosis.report.origin import Origin
 from ballfg.diagnosis.report.plain_effects import BY_GROUP, DRIFT, in_plain_words, plain_name
 from ballfg.diagnosis.report.wording import NONE, fixed, joined, number, probability, sized
+from ballfg.diagnosis.residual_tests.label_check import LABEL
+from ballfg.diagnosis.residual_tests.patterns import EVERYWHERE
 from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Finding, Outcome, Verdict
 from ballfg.dynamics import EFFECTS
-from ballfg.estimation.noise.tracker import NUMBERS
+from ballfg.estimation.noise.tracker_errors import NUMBERS
 
 PLACES: Final = {
     "flight": "in flight",
@@ -27,13 +27,13 @@ PLACES: Final = {
     "label": "in the spin labels",
     "time": "from sample to sample",
 }
-"""Begin of a test's words, and the same in a sentence."""
+"""Beginning of a test's words, and the same within a sentence."""
 SURE: Final = ((1e-6, "practically certain"), (1e-3, "very likely"), (0.05, "likely"))
-"""Words for the probability that a finding is none; the larger one of both halves of the tracks counts."""
+"""Words for the probability that a finding is false; the larger one of both halves of the tracks counts."""
 SKEWED: Final = 1.5
-"""Ratio of the root mean square to the median track's error beyond which the median is told."""
+"""Ratio of the root mean square to the median track's error beyond which the median is reported."""
 MAIN: Final = ("wind", "drag_speed", "time_scale", "scale", "frame_tilt")
-"""Effects whose least size is told in the first lines of a report that finds nothing."""
+"""Effects whose detectable size is in the first lines of a report without findings."""
 COUNTS: Final = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine")
 
 
@@ -44,10 +44,10 @@ def answer(diagnosis: Diagnosis) -> str:
 
 
 def not_shown(diagnosis: Diagnosis) -> list[Candidate]:
-    """Effects that the last round tested and nothing asks for, with the least size that would have been noticed.
+    """Effects that the last round tested without evidence, with their detectable sizes.
 
-    None where a pattern is left: it may hide them. Those that differ between tracks are left out: there is a size for
-    each group of tracks and for each place of a change.
+    None if a pattern remains: it may hide them. Effects that differ between tracks are left out: their size depends on
+    the group of tracks and the place of a change.
     """
     if diagnosis.verdict is Verdict.UNEXPLAINED or not diagnosis.rounds:
         return []
@@ -58,7 +58,7 @@ def not_shown(diagnosis: Diagnosis) -> list[Candidate]:
 
 
 def headline(diagnosis: Diagnosis) -> str:
-    """The answer for a reader who knows neither the model nor the statistics, and what predictions gain."""
+    """The answer for a reader without knowledge of the model and statistics, and the gain of predictions."""
     effects = [f for f in diagnosis.findings if f.name not in NUMBERS]
     if not effects and diagnosis.verdict is not Verdict.UNEXPLAINED:
         nothing = f"Nothing that the model lacks was found: its predictions are off by {_error(diagnosis)}"
@@ -78,7 +78,7 @@ def headline(diagnosis: Diagnosis) -> str:
 
 
 def further(diagnosis: Diagnosis) -> Iterator[str]:
-    """Sentences on what else was found: several effects one by one, the tracker, and what no effect explains."""
+    """Sentences on further findings: several effects one by one, the tracker, and unexplained patterns."""
     effects = [f for f in diagnosis.findings if f.name not in NUMBERS]
     if len(effects) > 1:
         yield from (in_plain_words(f) for f in effects)
@@ -90,11 +90,11 @@ def further(diagnosis: Diagnosis) -> Iterator[str]:
 
 
 def gain(diagnosis: Diagnosis, what: str) -> str:
-    """By how much predictions gain, in one sentence; what: the change, as in `With it`."""
+    """The gain of predictions, in one sentence; what: the change, as in `With it`."""
     before, after = diagnosis.before.prediction_rmse_mm, diagnosis.after.prediction_rmse_mm
     if not what or not math.isfinite(before + after):
         return f"Predictions are off by {_error(diagnosis)}." if math.isfinite(after) else ""
-    if medians := skewed_medians(diagnosis.before, diagnosis.after):  # one ball that misses the table may weigh most
+    if medians := skewed_medians(diagnosis.before, diagnosis.after):  # one ball that misses the table may dominate
         least, most = (f"{median:.1f}" for median in reversed(medians))
         return f"{what}, half of the tracks are predicted to {least} mm or better; before, to {most} mm."
     if f"{before:.1f}" == f"{after:.1f}":
@@ -103,7 +103,7 @@ def gain(diagnosis: Diagnosis, what: str) -> str:
 
 
 def skewed_medians(before: Errors, after: Errors) -> tuple[float, float] | None:
-    """mm, errors of the median track before and after, where a few tracks make most of the root mean square."""
+    """mm, errors of the median track before and after, if a few tracks dominate the root mean square."""
     medians = tuple(
         float(np.nanmedian(e.by_track)) if np.isfinite(e.by_track).any() else math.nan for e in (before, after)
     )
@@ -114,7 +114,7 @@ def skewed_medians(before: Errors, after: Errors) -> tuple[float, float] | None:
 
 
 def certainty(diagnosis: Diagnosis) -> Iterator[str]:
-    """How sure the answer is: a line for each finding, or what the silence rests on."""
+    """The certainty of the answer: a line for each finding, or the basis for finding none."""
     for finding in diagnosis.findings:
         yield f"{_upper(plain_name(finding.name))}: {_sure(finding)}"
     last = diagnosis.rounds[-1] if diagnosis.rounds else ()
@@ -142,7 +142,7 @@ def certainty(diagnosis: Diagnosis) -> Iterator[str]:
 
 
 def advice(diagnosis: Diagnosis, origin: Origin) -> Iterator[tuple[str, str]]:
-    """What to do next: a sentence, and the command to type (empty where there is none)."""
+    """The next step: a sentence, and the command to type (or empty)."""
     rooms = list(zip(origin.datasets, origin.models, strict=True))
     datasets = " ".join(map(shlex.quote, origin.datasets))
     given = f" --model {shlex.quote(origin.model)}" if origin.model else ""
@@ -181,7 +181,7 @@ def advice(diagnosis: Diagnosis, origin: Origin) -> Iterator[tuple[str, str]]:
 
 
 def _to_look_at(pattern: str) -> str:
-    """What tells the cause of a pattern, by the kind of the test that found it."""
+    """An experiment for the cause of a pattern, by the kind of its test."""
     if pattern.startswith("label: "):
         return "measure the spin of these tracks once more, and check the axes and the unit of the labels"
     if pattern.startswith("time: "):
@@ -199,7 +199,7 @@ def _command(name: str, makes: str, dataset: str, model: str, origin: Origin, mo
 
 
 def _least(candidate: Candidate) -> str:
-    """The size from which on an effect would have been noticed, of a vector whatever its direction along the axes."""
+    """The detectable size of an effect; for a vector in any direction along the axes."""
     worst = max(candidate.seen_from, key=candidate.seen_from.__getitem__)
     size, unit = candidate.seen_from[worst], candidate.estimate[worst].unit
     said = f"{number(100 * size, 2)} %" if unit == "1" else sized(size, unit)
@@ -207,7 +207,7 @@ def _least(candidate: Candidate) -> str:
 
 
 def where(words: str) -> str:
-    """The place of a pattern, as the inside of a sentence: `in flight, acceleration along the flight is off ...`."""
+    """The place of a pattern, within a sentence: `in flight, acceleration along the flight is off ...`."""
     kind, sign, rest = words.partition(": ")
     known = PLACES.get(kind)
     return f"{known}, {rest.rstrip('.')}" if sign and known else re.sub(r"^In ", "in ", words.rstrip("."))

@@ -1,4 +1,4 @@
-"""Where a report comes from: the command that made it, its inputs, and the versions of the packages."""
+"""Records the origin of a report: its command, its inputs, and the versions of the packages."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -10,7 +10,7 @@ PACKAGES: Final = ("ballfg", "torch", "numpy", "scipy")
 
 @dataclass(frozen=True)
 class Origin:
-    """What a report was made from, as the user typed it.
+    """The inputs of a report, as the user typed them.
 
     Attributes:
         command: the command line.

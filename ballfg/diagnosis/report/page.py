@@ -1,4 +1,4 @@
-"""`report.html`: a diagnosis as one self-contained page. The answer comes first, then its grounds."""
+"""Writes `report.html`, a diagnosis as one self-contained page: first the answer, then its grounds."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -22,11 +22,11 @@ from ballfg.pages.html import Html, items, picture, section, table, tag, typed
 from ballfg.pages.page import whole_page
 
 BADGES = {Verdict.FOUND: "found", Verdict.NOTHING: "nothing", Verdict.UNEXPLAINED: "unexplained"}
-"""Class of the style for the verdict."""
+"""CSS class of the verdict."""
 
 
 def page(diagnosis: Diagnosis, origin: Origin | None = None) -> str:
-    """The whole page; origin: the command and the files that it comes from, where they are known."""
+    """The whole page; origin: its command and files, if known."""
     badge = tag("span", answer(diagnosis), kind=f"badge {BADGES[diagnosis.verdict]}")
     question = tag("p", f"{diagnosis.dataset} · what does the model lack? ", badge)
     values = (term("coefficient"), "declared", "fitted" + (" with the added effects" if diagnosis.findings else ""))
@@ -54,7 +54,7 @@ def page(diagnosis: Diagnosis, origin: Origin | None = None) -> str:
 
 
 def _in_short(diagnosis: Diagnosis) -> Html:
-    """What was found beside the first sentence, and how sure it is."""
+    """Further findings after the first sentence, and their certainty."""
     more = items(further(diagnosis))
     parts = [tag("h3", "In detail"), more] if more else []
     sure = items(certainty(diagnosis))
@@ -62,7 +62,7 @@ def _in_short(diagnosis: Diagnosis) -> Html:
 
 
 def _next(diagnosis: Diagnosis, origin: Origin | None) -> Iterator[Html]:
-    """Commands and experiments that follow."""
+    """The next commands and experiments."""
     known = origin or Origin("", ("DATASET",), "", "OUT")
     for words, command in advice(diagnosis, known):
         yield tag("p", words)
@@ -84,7 +84,7 @@ def _made(diagnosis: Diagnosis, origin: Origin | None) -> Html:
 
 
 def _finding(finding: Finding) -> Html:
-    """An effect that was added, its coefficients and its evidence."""
+    """An added effect, its coefficients and its evidence."""
     head = tag("h3", capital(plain_name(finding.name)), " ", tag("code", finding.name, kind="quiet"))
     values = table(
         (term("coefficient"), "value ± standard deviation"),
@@ -121,7 +121,7 @@ def _finding(finding: Finding) -> Html:
 
 
 def _alike(diagnosis: Diagnosis) -> Html:
-    """Effects that the data cannot tell apart, and measurements that can."""
+    """Indistinguishable effects, and measurements that would separate them."""
     cards = []
     for finding in diagnosis.findings:
         others = finding.indistinguishable_from
@@ -135,7 +135,7 @@ def _alike(diagnosis: Diagnosis) -> Html:
 
 
 def _left_over(diagnosis: Diagnosis) -> Html:
-    """The pattern that is left in the end, its tests, and a description without a name."""
+    """The remaining pattern, its tests, and a description without a name."""
     left, share = diagnosis.unexplained, ""
     words = capital(f"{where(left.where)}.") if left.where else ""
     words = words or "No pattern is left that the tests can see: what remains is noise."
@@ -178,7 +178,7 @@ def _labels(diagnosis: Diagnosis) -> Html:
 
 
 def _share(test: GenericTest) -> str:
-    """The share of a pattern that is left."""
+    """The remaining share of a pattern."""
     return f"{100 * test.share:.0f} %" if math.isfinite(test.share) else NONE
 
 
@@ -213,13 +213,13 @@ def _values(values: Mapping[str, Value]) -> Iterator[tuple[str, ...]]:
 
 
 def _in_mm(values: Mapping[str, Value]) -> dict[str, Value]:
-    """Lengths in mm, as prediction errors are."""
+    """Lengths in mm, like prediction errors."""
     declared = {name: v.declared if v.declared is None else 1e3 * v.declared for name, v in values.items()}
     return {name: Value(1e3 * v.value, 1e3 * v.sigma, "mm", declared[name]) for name, v in values.items()}
 
 
 def _evaluation(diagnosis: Diagnosis) -> Html:
-    """The halves, their use, and tracks that were left out."""
+    """The halves, their use, and unused tracks."""
     words = (
         "Traces of effects were looked for in all tracks: half of them would show only larger ones. The strength of an "
         f"effect was then fitted to {diagnosis.tracks_found_on} tracks, and with that strength it had to help on the "

@@ -1,7 +1,7 @@
-"""Pictures of a diagnosis: residuals in flight, at contacts and in the measurements; errors; the rounds.
+"""Draws a diagnosis: residuals in flight, at contacts and in the measurements; errors; the rounds.
 
-Each function draws one figure without pyplot. Where a model was changed, `before` and `after` stand side by side or in
-one panel, always with the same axes.
+Each function draws one figure without pyplot. If a model was changed, `before` and `after` stand side by side or in one
+panel, always with the same axes.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -18,35 +18,35 @@ from ballfg.diagnosis.result import Candidate, Errors, Outcome, Residuals
 from ballfg.state import SPIN, VELOCITY, VZ
 
 Series = Mapping[str, Residuals]
-"""Residuals by their name in the legend: `before` and `after`, or one alone."""
+"""Residuals by their name in the legend: `before` and `after`, or a single one."""
 Parts = tuple[Mapping[str, Array], Array, Array, Index]
 """Conditions by name, components of a residual, their standard deviations, and numbers of stretches."""
 
 BEFORE, AFTER, GREY = "#d55e00", "#0072b2", "#8c8c8c"
-"""Okabe and Ito's vermilion and blue: they differ for every kind of colour vision."""
+"""Okabe and Ito's vermilion and blue, distinct for every kind of colour vision."""
 AXIS_COLOURS = ("#0072b2", "#e69f00", "#009e73")
 IN_FLIGHT = ("along the flight", "across, to the left", "across, upwards")
 AT_CONTACT = ("along the ground", "to the left", "up")
 LARGEST_WHITENED = 4.0
-"""Whitened residuals are limited to it in means, so that one outlier hides no pattern of all the others."""
+"""Limit of whitened residuals in means, so that one outlier hides no pattern of the others."""
 HISTOGRAM_END = 6.0
 """Whitened residuals at which the axis of their histogram ends."""
 SHOWN_SHARE = 0.98
-"""Share of the single points that lie within the axes."""
+"""Share of the single points inside the axes."""
 LEAST_EXPLAINED = 0.3
-"""Least squared residual that is drawn: chance alone explains about 1."""
+"""Least squared residual in the drawing: chance alone explains about 1."""
 MARGINS = (0.8, 0.12, 0.52, 0.32)
 """Inches left and right of a grid of panels and below it, for names and numbers; above it, for a line of a title."""
 NAMED = 6
-"""Candidates of the first round that the picture of the rounds names, beside those added later."""
+"""Number of named candidates of the first round in the picture of the rounds, beside those added later."""
 LINES_OF_TEXT = 18
-"""Lines that fit above each other beside the picture of the rounds."""
+"""Number of lines of text beside the picture of the rounds."""
 MARKED = {Outcome.ADDED: ("added", AFTER), Outcome.ALIKE: ("alike", BEFORE)}
-"""Word and colour of the candidates that stand out there."""
+"""Word and colour of the prominent candidates there."""
 
 
 def flight_in_time(series: Series) -> Figure:
-    """Acceleration that the model lacks against the time since launch, one column for each of the series."""
+    """Unmodelled acceleration against the time since launch, one column for each of the series."""
     figure, panels = _grid(3, len(series), (max(7.4, 5.0 * len(series)), 6.0), titles=2)
     for column, (label, residuals) in zip(panels.T, series.items(), strict=True):
         flight = residuals.flight
@@ -59,7 +59,7 @@ def flight_in_time(series: Series) -> Figure:
 
 
 def flight_against(series: Series) -> Figure:
-    """The same against speed, height and spin."""
+    """Unmodelled acceleration against speed, height and spin."""
 
     def parts(residuals: Residuals) -> Parts:
         flight, states = residuals.flight, residuals.flight.states
@@ -143,7 +143,7 @@ def histogram(series: Series) -> Figure:
 
 
 def beyond_histogram(series: Series) -> str:
-    """How many residuals the histogram does not show, in a sentence: `Of 1200 before, 3 lie beyond ...`."""
+    """Number of residuals outside of the histogram, in a sentence: `Of 1200 before, 3 lie beyond ...`."""
     parts = []
     for label, residuals in series.items():
         whitened = residuals.measurement.position / residuals.measurement.sigma
@@ -177,7 +177,7 @@ def errors_by_track(before: Errors, after: Errors) -> Figure:
 
 
 def ranking(rounds: Sequence[Sequence[Candidate]]) -> Figure:
-    """The squared residual that each candidate explains, round after round."""
+    """The squared residual explained by each candidate, round after round."""
     figure, panels = _grid(1, 1, (7.6, 4.2))
     axes = panels[0, 0]
     outcome = {c.name: c.outcome for row in reversed(rounds) for c in row}
@@ -217,14 +217,14 @@ def _apart(places: Mapping[str, float]) -> dict[str, float]:
 
 
 def _grid(rows: int, columns: int, size: tuple[float, float], titles: int = 1) -> tuple[Figure, NDArray[np.object_]]:
-    """A figure of panels: those in a column have the same horizontal axis, all of them the same vertical one.
+    """A figure of panels: those in a column share the horizontal axis, all share the vertical one.
 
     Args: size: inches.  titles: lines above the panels.
     """
     (left, right, bottom, line), (width, height) = MARGINS, size
     top = titles * line
     places = {"left": left / width, "right": 1 - right / width, "bottom": bottom / height, "top": 1 - top / height}
-    figure = Figure(figsize=size)  # matplotlib's own search for a layout takes longer than all the drawing
+    figure = Figure(figsize=size)  # matplotlib's own layout takes longer than all the drawing
     panels = figure.subplots(
         rows, columns, squeeze=False, sharex="col", sharey=True, gridspec_kw=places | {"wspace": 0.05, "hspace": 0.1}
     )

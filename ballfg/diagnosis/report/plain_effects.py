@@ -1,4 +1,4 @@
-"""Effects in everyday words: a short name of each, and a sentence with its numbers for readers who are no specialists.
+"""Describes effects in everyday words: a short name, and a sentence with numbers for any reader.
 
 The words are those of the effect's class. An effect without words, such as a user's own, gets its name with spaces and
 its own `sentence`.
@@ -12,7 +12,7 @@ from ballfg.dynamics import EFFECTS
 from ballfg.dynamics.wording import said
 
 BY_GROUP, DRIFT = "_by_group", "_drift"
-"""Ends of the names of effects that differ between groups of tracks, or change along the recording."""
+"""Suffixes of the names of effects that differ between groups of tracks, or change along the recording."""
 OF_A_TRACKER: Final = {
     "tracker_memory": (
         "a tracker whose errors last",
@@ -23,11 +23,11 @@ OF_A_TRACKER: Final = {
         "The time stamps jitter by {sigma:milli} ms from sample to sample.",
     ),
 }
-"""What a diagnosis finds that is no effect: as a noun and in a sentence."""
+"""Findings of a diagnosis other than effects: as a noun and in a sentence."""
 
 
 def plain_name(effect: str) -> str:
-    """An effect as a noun: `a wind`; of an unknown effect its name with spaces."""
+    """An effect as a noun: `a wind`; for an unknown effect its name with spaces."""
     for ending, words in ((BY_GROUP, "different from group to group"), (DRIFT, "changing along the recording")):
         if effect.endswith(ending):
             return f"{plain_name(effect.removesuffix(ending))}, {words}"
@@ -35,7 +35,7 @@ def plain_name(effect: str) -> str:
 
 
 def in_plain_words(finding: Finding) -> str:
-    """A sentence on an effect and its size. Of an unknown effect: its own first sentence and its coefficients."""
+    """A sentence on an effect and its size. For an unknown effect: its own first sentence and its coefficients."""
     if says := _words(finding.name)[1]:
         return said(says, finding.parameters)
     for ending, words in ((BY_GROUP, "differs between groups of tracks"), (DRIFT, "changes along the recording")):
@@ -48,7 +48,7 @@ def in_plain_words(finding: Finding) -> str:
 
 
 def _words(effect: str) -> tuple[str, str]:
-    """Noun and sentence of an effect; empty where it has none."""
+    """Noun and sentence of an effect; empty without any."""
     if effect in OF_A_TRACKER:
         return OF_A_TRACKER[effect]
     known = EFFECTS.get(effect)
@@ -56,6 +56,6 @@ def _words(effect: str) -> tuple[str, str]:
 
 
 def _level(name: str) -> str:
-    """`topspin` of `k[topspin]`; with the axis of a coefficient that has several: `topspin x`."""
+    """`topspin` for `k[topspin]`; with the axis of a vector's coefficient: `topspin x`."""
     coefficient, _, level = name.partition("[")
     return f"{level.removesuffix(']')} {coefficient}" if coefficient in ("x", "y", "z") else level.removesuffix("]")

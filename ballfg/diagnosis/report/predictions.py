@@ -1,4 +1,4 @@
-"""How well the model predicts, before and after: errors on held-out tracks, one shot, and where the errors are."""
+"""Reports the predictions before and after: errors on held-out tracks, one shot, and a map of the errors."""
 
 import math
 from typing import Final
@@ -13,11 +13,11 @@ from ballfg.pages.html import Html, items, picture, section, table, tag, text
 BY_CHANCE: Final = 2.0
 """Standard errors within which a NIS counts as 1."""
 NEAR_FLOOR: Final = 1.2
-"""Ratio to the floor up to which a model can hardly be better."""
+"""Ratio to the floor below which a model can hardly be improved."""
 
 
 def errors(diagnosis: Diagnosis) -> Html:
-    """Errors of predictions on the held-out half, before and after, and what they should be."""
+    """Errors of predictions on the held-out half, before and after, with their ideal values."""
     before, after, changed = diagnosis.before, diagnosis.after, diagnosis.after is not diagnosis.before
     changed = changed and (bool(diagnosis.findings) or diagnosis.unexplained.fallback is not None)
     numbers = (
@@ -60,7 +60,7 @@ def errors(diagnosis: Diagnosis) -> Html:
 
 
 def meaning(diagnosis: Diagnosis) -> list[Html]:
-    """What the numbers of the table say: how near the floor the errors are, and whether they are as large as stated."""
+    """The meaning of the table: the distance of the errors from the floor, and whether their stated size is right."""
     after, floor = diagnosis.after, diagnosis.floor_mm
     error, said = after.prediction_rmse_mm, list[Html]()
     if math.isfinite(floor + error):
@@ -82,7 +82,7 @@ def meaning(diagnosis: Diagnosis) -> list[Html]:
 
 
 def _few_tracks(before: Errors, after: Errors) -> str:
-    """The error of the median track, where a few tracks make most of the root mean square; else nothing."""
+    """The error of the median track, if a few tracks dominate the root mean square; else empty."""
     medians = skewed_medians(before, after)
     if medians is None:
         return ""
@@ -91,7 +91,7 @@ def _few_tracks(before: Errors, after: Errors) -> str:
 
 
 def _about_nis(errors: Errors) -> str:
-    """What a NIS says of the stated uncertainty, and by how much that is off."""
+    """The meaning of a NIS for the stated uncertainty, and its deviation."""
     error = f" ± {fixed(errors.nis_error, 2)}" if math.isfinite(errors.nis_error) else ""
     begin, held = f"A NIS of {fixed(errors.nis, 2)}{error}", ""
     if math.isfinite(errors.intervals_held):
@@ -112,7 +112,7 @@ def _about_nis(errors: Errors) -> str:
 
 
 def _goal(floor: float) -> str:
-    """What the prediction error should be."""
+    """The ideal prediction error."""
     return f"near {floor:.1f} mm" if math.isfinite(floor) else "small"
 
 
@@ -125,14 +125,14 @@ def _fixed(value: float, unit: str) -> str:
 
 
 def _changed(was: float, now: float, unit: str) -> str:
-    """The change in percent of a length; nothing for numbers whose ratio means nothing."""
+    """The change of a length in percent; empty for numbers without a meaningful ratio."""
     if not math.isfinite(was + now):
         return "nothing to compare"
     return change(was, now) if unit == " mm" else ""
 
 
 def one_shot(diagnosis: Diagnosis) -> Html:
-    """One shot, and where the errors are."""
+    """One shot, and a map of the errors."""
     before, after = diagnosis.before, diagnosis.after
     changed = after is not before and bool(diagnosis.findings or diagnosis.unexplained.fallback)
     shot = shots.median_shot(before, after, changed)

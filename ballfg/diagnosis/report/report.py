@@ -1,4 +1,4 @@
-"""A diagnosis as files: `report.json` for programs, `report.html` for people, `model.yaml` for other commands."""
+"""Writes a diagnosis as `report.json` for programs, `report.html` for people, `model.yaml` for other commands."""
 
 import glob
 import json
@@ -23,13 +23,13 @@ from ballfg.files.whole_folder import check_replaceable, whole_folder
 
 REPORT: Final = "report.json"
 PROGRAM: Final = "ballfg diagnose"
-"""Stands in `report.json` under `program`: other commands write files of that name too."""
+"""Value of `program` in `report.json`: other commands write files of that name too."""
 PAGE: Final = "report.html"
 MODEL: Final = "model.yaml"
 
 
 def room_file(name: str) -> str:
-    """The model file of one of several rooms, by its name."""
+    """Name of the model file of one of several rooms."""
     return f"{Path(MODEL).stem}.{re.sub(r'[^A-Za-z0-9_-]', '_', name)}.yaml"
 
 
@@ -39,19 +39,18 @@ def write_report(
     rooms: Mapping[str, BallModel] | None = None,
     origin: Origin | None = None,
 ) -> None:
-    """Write `report.json`, `report.html` and `model.yaml` into a folder.
+    """Writes `report.json`, `report.html` and `model.yaml` into a folder.
 
-    They appear together. An earlier report is replaced: its files are those that its `report.json` lists. Other files
-    of the folder stay, and so do folders of weights, which copies of its models may name.
+    They appear together. An earlier report is replaced: its files are listed in its `report.json`. Other files of the
+    folder stay, and so do folders of weights, which copies of its models may name.
 
     Args:
-        diagnosis: to report.
+        diagnosis: for the report.
         out: folder, new, empty or with an earlier report; its parent must exist.
         rooms: models of single rooms, by name, written beside it.
-        origin: the command and the files that the diagnosis comes from, for the page.
+        origin: its command and files, for the page.
     Raises:
-        ValueError: if `out` is a file, holds other things than a report, or a file that another program wrote and that
-            would be replaced.
+        ValueError: if `out` is a file, holds other content than a report, or a foreign file that would be replaced.
         FileNotFoundError: if its parent does not exist.
     """
     folder = Path(out).resolve()
@@ -70,9 +69,9 @@ def write_report(
 
 
 def check_report_folder(folder: Path, *, force: bool = True) -> None:
-    """Refuse a folder whose content must not be lost.
+    """Refuses a folder whose content must not be lost.
 
-    Args: folder: for a report.  force: an earlier report may be replaced.
+    Args: folder: for a report.  force: True to replace an earlier report.
     Raises:
         ValueError: if it is a file or a folder with other content than an earlier report, or with one and no force.
         FileNotFoundError: if its parent does not exist.
@@ -88,7 +87,7 @@ def check_report_folder(folder: Path, *, force: bool = True) -> None:
 
 
 def earlier_files(path: Path) -> list[str] | None:
-    """Names of the files that an earlier diagnosis wrote; None where `report.json` is missing or of no diagnosis."""
+    """Names of the files of an earlier diagnosis; None without its `report.json`."""
     try:
         found = read_json(path)
     except (FileNotFoundError, NotADirectoryError, ValueError):
@@ -99,7 +98,7 @@ def earlier_files(path: Path) -> list[str] | None:
 
 
 def _check_own(folder: Path, names: Iterable[str]) -> None:
-    """Refuses to replace a file that no diagnosis wrote. Raises: ValueError."""
+    """Refuses to replace a file from outside of any diagnosis. Raises: ValueError."""
     own = earlier_files(folder / REPORT) or ()
     for name in names:
         if name not in own and (folder / name).exists():
@@ -174,7 +173,7 @@ def _errors(errors: Errors) -> dict[str, Any]:
 
 
 def _values(values: Mapping[str, Value]) -> dict[str, Any]:
-    """Each with value, sigma and unit, and with the declared value where there is one."""
+    """Each with value, sigma and unit, and with the declared value, if any."""
     return {name: {k: v for k, v in vars(value).items() if v is not None} for name, value in values.items()}
 
 

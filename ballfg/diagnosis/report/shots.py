@@ -1,4 +1,4 @@
-"""Pictures of predictions: one shot before and after, and where on the table and in flight the errors are."""
+"""Draws predictions: one shot before and after, and a map of the errors on the table and in flight."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,16 +16,16 @@ from ballfg.diagnosis.result import Errors, PredictedPath
 ACROSS, DEEP = 6, 4
 """Cells of the map along the longer and the shorter side of the table."""
 LEAST_SAMPLES: Final = 5
-"""Samples in a cell or bin from which on its error is shown."""
+"""Least number of samples in a cell or bin for its error."""
 SHEET: Final = 5.2
-"""Inches, width of a picture that stands beside another one: wider ones shrink until nobody can read them."""
+"""Inches, width of a picture beside another one: wider ones shrink until they are unreadable."""
 BINS: Final = 8
-"""Bins of time."""
+"""Number of bins of time."""
 
 
 @dataclass(frozen=True)
-class Shot:
-    """One held-out track, predicted by the declared and by the corrected model; the same twice if nothing changed."""
+class ShotErrors:
+    """One held-out track, predicted by the declared and by the corrected model, or twice by an unchanged one."""
 
     before: PredictedPath
     after: PredictedPath
@@ -42,17 +42,17 @@ def distances(path: PredictedPath) -> Array:
     return np.asarray(np.linalg.norm(path.predicted - path.measured, axis=-1))
 
 
-def median_shot(before: Errors, after: Errors, changed: bool) -> Shot | None:
-    """The shot whose gain is the median of all, or whose error is where nothing changed; None without predictions."""
+def median_shot(before: Errors, after: Errors, changed: bool) -> ShotErrors | None:
+    """The shot with the median gain, or the median error of an unchanged model; None without predictions."""
     later = {path.name: path for path in after.paths}
-    shots = [Shot(path, later[path.name]) for path in before.paths if path.name in later]
+    shots = [ShotErrors(path, later[path.name]) for path in before.paths if path.name in later]
     if not shots:
         return None
     key = (lambda s: s.errors[0] - s.errors[1]) if changed else (lambda s: s.errors[1])
     return sorted(shots, key=key)[(len(shots) - 1) // 2]
 
 
-def shot_picture(shot: Shot, changed: bool) -> Figure:
+def shot_picture(shot: ShotErrors, changed: bool) -> Figure:
     """Side view, top view and error over time of one shot."""
     figure = Figure(figsize=(SHEET, 7.2), layout="constrained")
     side, top, error = figure.subplots(3, 1)
@@ -86,7 +86,7 @@ def shot_picture(shot: Shot, changed: bool) -> Figure:
 
 
 def error_map(before: Errors, after: Errors, changed: bool) -> Figure:
-    """Prediction errors by place, seen from above, and by time since the last sample seen."""
+    """Prediction errors by place, seen from above, and by time since the last observed sample."""
     series = [("before", before, BEFORE), ("after", after, AFTER)] if changed else [("", after, AFTER)]
     figure = Figure(figsize=(SHEET, 2.6 + 2.6 * len(series)), layout="constrained")
     panels: Sequence[Axes] = figure.subplots(len(series) + 1, 1)
@@ -125,7 +125,7 @@ def _sides(places: Array) -> list[tuple[float, float, int]]:
 
 
 def _cells(paths: Sequence[PredictedPath], edges: Sequence[Array]) -> Array:
-    """(a, b) mm, root mean square error of the samples in each cell; NaN with few of them."""
+    """(a, b) mm, root mean square error of the samples in each cell; NaN for few samples."""
     where = np.concatenate([path.measured[:, :2] for path in paths])
     squares = np.concatenate([distances(path) ** 2 for path in paths])
     places = [np.searchsorted(own, where[:, i], side="right") - 1 for i, own in enumerate(edges)]

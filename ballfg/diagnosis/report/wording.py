@@ -1,17 +1,17 @@
-"""Numbers for people, with as many digits as are known and their unit, and the answer in one sentence."""
+"""Writes numbers for people, with known digits and units, and the answer in one sentence."""
 
 import math
 from collections.abc import Mapping, Sequence
 
 from ballfg.diagnosis.result import Finding, Outcome, Refusal, Unexplained, Value, Verdict
-from ballfg.estimation.noise.tracker import NUMBERS
+from ballfg.estimation.noise.tracker_errors import NUMBERS
 
 NONE = "–"
-"""Stands for a missing number."""
+"""Text for a missing number."""
 MOST_DECIMALS = 6
-"""A number that needs more decimals is written with a power of ten."""
+"""Largest number of decimals; others are written with a power of ten."""
 LEAST_PROBABILITY = 1e-99
-"""Smaller probabilities depend on tails of distributions that nobody knows."""
+"""Smaller probabilities depend on unknown tails of distributions."""
 
 REFUSED = {
     Outcome.IMPLAUSIBLE: "it would have to be stronger than is plausible",
@@ -20,7 +20,7 @@ REFUSED = {
     Outcome.SAME_PATTERN: "it explains the same pattern as another effect, which explains more",
     Outcome.MISLEADING: "predictions get worse with it",
 }
-"""Reasons for which an effect that fits better is no name."""
+"""Reasons against naming an effect that fits better."""
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -46,7 +46,7 @@ def plus_minus(value: Value) -> str:
 
 
 def sized(size: float, unit: str) -> str:
-    """A size to two digits with its unit, which `1` leaves out; a dash where it is not finite."""
+    """A size to two digits with its unit, without the unit `1`; a dash if it is not finite."""
     if not math.isfinite(size):
         return NONE
     return number(size, 2) if unit == "1" else f"{number(size, 2)} {unit}"
@@ -67,7 +67,7 @@ def probability(p: float) -> str:
 
 
 def change(before: float, after: float) -> str:
-    """For instance `-34 %`; empty where there is nothing to compare with."""
+    """For instance `-34 %`; empty without a comparison."""
     if not (math.isfinite(before) and math.isfinite(after)) or before == 0.0:
         return ""
     return f"{100 * (after / before - 1):+.0f} %"
@@ -79,7 +79,7 @@ def joined(names: tuple[str, ...]) -> str:
 
 
 def refusal(refused: Refusal) -> str:
-    """Why an effect that fits better is no name, and the measurement that would decide."""
+    """The reason against naming an effect that fits better, and the measurement that would decide."""
     reason = f" ({refused.reason})" if refused.reason else ""
     return (
         f"{refused.name} ({listed(refused.parameters)}) would fit these tracks better but is not named: "
@@ -88,7 +88,7 @@ def refusal(refused: Refusal) -> str:
 
 
 def sentence(verdict: Verdict, findings: Sequence[Finding], left: Unexplained) -> str:
-    """The answer of a diagnosis in one sentence; in a second one what was found of the tracker's noise."""
+    """The answer of a diagnosis in one sentence, with a second one on the tracker's noise."""
     if verdict is Verdict.NOTHING:
         return "Nothing is lacking that these tracks could show: what the model leaves is noise."
     effects = [f for f in findings if f.name not in NUMBERS]

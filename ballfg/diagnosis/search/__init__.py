@@ -1,1 +1,1 @@
-"""The search: candidate effects are scored, refitted and evaluated, one after the other."""
+"""The search scores, refits and evaluates candidate effects, one after the other."""

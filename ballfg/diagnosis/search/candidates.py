@@ -1,4 +1,4 @@
-"""One round of the search: score every hypothesis, refit the leading ones, compare them by their refits."""
+"""Scores every hypothesis of a search round, refits the leading ones and compares the refits."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,26 +17,26 @@ from ballfg.diagnosis.search.signatures import hypothesis_signatures
 from ballfg.state import SPIN
 
 ALARM = 0.0025
-"""Probability that a hypothesis passes the score tests of one round by chance. They look at all tracks, since half of
-them would find only effects 1.4 times as large."""
+"""Probability that a hypothesis passes the score tests of one round by chance. They use all tracks, since half of them
+would find only effects 1.4 times as large."""
 HALF_ALARM = 0.05
-"""As `ALARM`, for tests that need a refit and so look at the search half. The effect must then also help on the
-held-out half (`loop.CONFIRMED`), so that both together happen by chance in one round of 400."""
+"""As `ALARM`, for tests that need a refit and so use the search half. The effect must then also help on the held-out
+half (`loop.CONFIRMED`), so that both happen by chance in one round of 400."""
 MOST_REFITS = 6
-"""Hypotheses that are refitted in a round."""
+"""Largest number of refitted hypotheses in a round."""
 FRAME_CHOICE = 2.0 * float(np.log(FRAMES - 1))
-"""Cost of a label frame in BIC: it was chosen among so many others."""
+"""Cost of a label frame in BIC, for the choice among all frames."""
 LEADING = 0.5
-"""A hypothesis that explains less than this share of the best one's is not refitted."""
+"""Share of the best hypothesis' explained residual below which another one is not refitted."""
 ALIKE = 6.0
-"""BIC difference below which two effects cannot be told apart: odds of 20 to 1."""
+"""BIC difference below which two effects are indistinguishable: odds of 20 to 1."""
 
 
 @dataclass(frozen=True)
 class Scored:
     """A hypothesis and the outcome of its score test, corrected for the number of hypotheses; None: not visible.
 
-    `opposite` is the best shape in which its effect would have the opposite sign: there may be the better minimum.
+    `opposite` is the best shape with the opposite sign of its effect, a possibly better minimum.
     `tested` is the number of hypotheses.
     """
 
@@ -48,13 +48,13 @@ class Scored:
 
     @property
     def explained(self) -> float:
-        """Squared whitened residual that the hypothesis would explain; below zero where it cannot be seen."""
+        """Squared whitened residual that the hypothesis would explain; negative if it is not visible."""
         return -1.0 if self.score is None else self.score.explained
 
 
 @dataclass(frozen=True)
 class Refit:
-    """A hypothesis in the model, everything fitted again at the noise of the fit before, and BIC minus that before.
+    """The refit of a model with a hypothesis at the noise of the previous fit, and the difference of BIC to that.
 
     A negative difference is better.
     """
@@ -75,7 +75,7 @@ def score_all(fitted: Fit, candidates: Sequence[Hypothesis]) -> list[Scored]:
     Args:
         fitted: the fit without any of them.
         candidates: the hypotheses; those without strengths are left out.
-    Returns: the tests, the hypothesis that explains most first and those that the data cannot show last.
+    Returns: the tests, sorted by explained residual, invisible hypotheses last.
     """
     testable = [h for h in candidates if h.strengths]
     if not testable:
@@ -99,7 +99,7 @@ def shortlist(scored: Sequence[Scored], alarm: float = ALARM) -> list[Scored]:
 
 
 def _opposite(best: Scored, scored: Sequence[Scored]) -> Hypothesis | None:
-    """Of an effect with one strength, the shape with the other sign of it that explains most."""
+    """For an effect with one strength, the shape of the other sign that explains most."""
     if best.score is None or len(best.score.estimate) != 1:
         return None
     estimate = best.score.estimate
@@ -108,10 +108,10 @@ def _opposite(best: Scored, scored: Sequence[Scored]) -> Hypothesis | None:
 
 
 def refit(before: Fit, scored: Scored) -> Refit:
-    """The joint fit with a hypothesis in the model, started where it is absent, in the shapes that are to be tried.
+    """The joint fit with a hypothesis in the model, started from its absence, in the shapes to be tried.
 
-    An effect that balls usually have (friction, say) is also started at its usual strength, for its absence may be a
-    minimum of its own: without friction, spins are fitted that friction contradicts.
+    A usual effect (friction, say) is also started at its usual strength, for its absence may be a minimum of its own:
+    without friction, the fitted spins contradict friction.
 
     Args:
         before: the fit without the hypothesis.
@@ -138,7 +138,7 @@ def _refit(before: Fit, scored: Scored) -> Refit:
 
 
 def _started_at(before: Fit, hypothesis: Hypothesis, problem: Problem, values: Mapping[str, float]) -> Fit:
-    """The fit of a problem with a hypothesis in it, started from the fit before and some values of the hypothesis."""
+    """The fit of a problem with a hypothesis, started from the previous fit and some values of the hypothesis."""
     unknowns = replace(before.unknowns, values={**before.unknowns.values, **values})
     if hypothesis.shape and not hypothesis.strengths:
         unknowns = replace(unknowns, starts=_starts_with_labels(problem, unknowns.starts))
@@ -146,7 +146,7 @@ def _started_at(before: Fit, hypothesis: Hypothesis, problem: Problem, values: M
 
 
 def says_the_same(candidate: Refit, better: Refit) -> bool:
-    """Whether a hypothesis has nothing left to explain beside another one that explains clearly more."""
+    """True if a hypothesis explains nothing beside another one that explains clearly more."""
     hypothesis = candidate.scored.hypothesis
     if not hypothesis.strengths or hypothesis.effect.multiplies_spin or better.delta_bic > candidate.delta_bic - ALIKE:
         return False
@@ -165,7 +165,7 @@ def with_hypothesis(problem: Problem, hypothesis: Hypothesis) -> Problem:
 
 
 def _starts_with_labels(problem: Problem, starts: Array) -> Array:
-    """First states whose spins are the labels as a model reads them that takes them in another frame."""
+    """First states whose spins are the labels in a model's label frame."""
     with torch.no_grad():
         offset = problem.model.labelled(torch.zeros(3, dtype=torch.float64)).numpy()
         read = problem.model.labelled(torch.eye(3, dtype=torch.float64)).numpy() - offset  # rows M e_i
@@ -177,9 +177,9 @@ def _starts_with_labels(problem: Problem, starts: Array) -> Array:
 def refit_driven(before: Fit, hypothesis: Hypothesis) -> Refit:
     """The fit with an effect that multiplies unlabelled spins, tested by the ratio of marginal likelihoods.
 
-    A coefficient times a spin of mean zero has no slope at zero. With the coefficient at its usual value there is one,
-    and launcher settings and single shots find their spins. They do so first, with the coefficient held: bounces alone
-    may have given spins the wrong sign, and a free coefficient would take that sign over.
+    A coefficient times a spin of mean zero has zero slope at zero. At its usual value the slope is nonzero, and
+    launcher settings and single shots get their spins. They do so first, with a fixed coefficient: bounces alone may
+    have given spins the wrong sign, which a free coefficient would adopt.
     """
     listed = {hypothesis.parameter(n): c for n, c in hypothesis.coefficients.items()}
     free = {**before.problem.free, **{name: listed[name] for name in hypothesis.columns}}
@@ -195,10 +195,10 @@ def refit_driven(before: Fit, hypothesis: Hypothesis) -> Refit:
 
 
 def refit_usual(before: Fit, hypothesis: Hypothesis) -> Refit:
-    """The fit with an effect that balls usually have, whatever its score test says.
+    """The fit with a usual effect, whatever the result of its score test.
 
-    The usual strength is far from absence, where a slope may say nothing. Without friction, for instance, a ball keeps
-    its spin through a bounce, and nothing tells how friction would change the spin that was fitted to it.
+    The usual strength is far from absence, where the slope may carry no information. Without friction, for instance, a
+    ball keeps its spin through a bounce, and nothing shows how friction would change the fitted spin.
     """
     after = refit(before, Scored(hypothesis, None, 1.0)).fit
     return _by_likelihood(before, after, hypothesis, 0.0, len(hypothesis.columns))
@@ -217,14 +217,14 @@ def _by_likelihood(before: Fit, after: Fit, hypothesis: Hypothesis, taken: float
 def _narrowness(fitted: Fit) -> float:
     """Half the log determinant of the information on first states. With the cost it gives the marginal likelihood.
 
-    With a lift every spin is a degree of freedom of its flight, which fits noise too. This term is its price, by
+    With a lift every spin is a degree of freedom of its flight, which also fits noise. This term is its cost, by
     Laplace's approximation.
     """
     return 0.5 * float(np.linalg.slogdet(fitted.linearised().start_information)[1].sum())
 
 
 def delta_bic(before: Fit, after: Fit) -> float:
-    """BIC of one fit minus that of another at the same noise, counted in tracks: they are the independent units."""
+    """BIC of one fit minus that of another at the same noise, counted in tracks, the independent units."""
     more = len(after.problem.free) - len(before.problem.free)
     tracks = len(np.unique(before.problem.stretches.track))
     return 2.0 * (after.cost - before.cost) + more * float(np.log(tracks))

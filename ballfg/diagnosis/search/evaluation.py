@@ -1,4 +1,4 @@
-"""Evaluation of a model on tracks that it was not fitted to: predictions of unseen parts, and held-out likelihood."""
+"""Evaluates a model on other tracks than those of its fit, by predictions of unseen parts and by likelihood."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,44 +17,46 @@ from ballfg.diagnosis.search.plausible import SIGMAS
 from ballfg.diagnosis.search.score import score_tests
 from ballfg.diagnosis.search.signatures import Signatures
 from ballfg.dynamics import BallModel, Surfaces
-from ballfg.estimation import Settings, Status, TrackPrediction, make_estimator, predict_tracks
+from ballfg.estimation import Settings, Status, predict_tracks
 from ballfg.estimation.noise.forecasts import NINETY
+from ballfg.estimation.registry import make_estimator
+from ballfg.estimation.track_prediction import TrackPrediction
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction.apexes import measured_apexes, path_apex
 from ballfg.tracks import Track
 
 OBSERVED = 0.4
-"""Share of each track that is observed; the rest is predicted."""
+"""Observed share of each track; the rest is predicted."""
 LEAST_PREDICTED = 3
-"""Samples that must be left to predict."""
+"""Least number of predicted samples."""
 SURELY = 1.645
-"""Standard errors, from the scatter of tracks, by which squared prediction errors grow where predictions are worse."""
+"""Standard errors, from the scatter of tracks, by which squared errors of worse predictions must grow."""
 HARDLY = 1.01
-"""Ratio of prediction errors that counts as worse even if the tracks cannot tell. An effect near the detection limit
-moves predictions by less than that, up or down by chance."""
+"""Ratio of prediction errors that counts as worse even without significance. An effect near the detection limit changes
+predictions by less than that, up or down by chance."""
 QUIET: Final = ProcessNoise(acceleration=1e-3, spin=0.05, contact_velocity=1e-3, contact_spin=0.1)
-"""Process noise of a model that is as good as exact: it moves predictions by less than a millimetre."""
+"""Process noise of an almost exact model: it changes predictions by less than a millimetre."""
 MOST_FORETOLD = 3.0
-"""Ratio to the median of the error foretold for a track beyond which a false hit was found in it."""
+"""Ratio of a track's expected error to the median beyond which a false hit is assumed."""
 FEW_WORSE = 1.05
 MOST_BETTER = 0.9
-"""Where half of the tracks are predicted so much better, the root mean square over all may grow by so much: a few balls
-that miss another surface than before weigh more in it than all others."""
+"""Factor by which the root mean square over all tracks may grow if half of the tracks are predicted this much better: a
+few balls that now miss another surface outweigh all others in it."""
 
 
 def prediction_errors(
     model: BallModel, tracks: Sequence[EvaluationTrack], surfaces: Surfaces, settings: Settings, jobs: int = 1
 ) -> Errors:
-    """Errors of the predictions that `ballfg predict` would make with a model.
+    """Errors of `ballfg predict` with a model.
 
     Args:
         model: with the fitted noise and launcher in `trained`.
-        tracks: that it was not fitted to.
+        tracks: outside of its fit.
         surfaces: of the dataset with this model.
         settings: of the dataset with this model.
         jobs: processes.
     Returns: errors over all tracks, in mm and without unit, with the predictions.
-    Raises: ValueError: if no track leaves enough to predict.
+    Raises: ValueError: if no track has enough samples to predict.
     """
     estimator = make_estimator("smoother", model, surfaces, settings)
     observed = [t.track for t in tracks]
@@ -85,14 +87,14 @@ def prediction_errors(
 def prediction_floor(
     model: BallModel, tracks: Sequence[EvaluationTrack], surfaces: Surfaces, settings: Settings, jobs: int = 1
 ) -> float:
-    """mm, the prediction error that is left where the model is exact: foretold, not measured.
+    """mm, expected prediction error of an exact model.
 
-    It is what the covariance states once the process noise is as good as none: the noise of the measurements, and what
-    the observed part leaves open of the release. A model that may not err explains the bends of a few tracks by hits
-    that nobody made, after which nothing is known of the flight; tracks with far more than the median are left out.
+    It is the covariance for almost zero process noise: the noise of the measurements, and the uncertainty of the
+    release after the observed part. Such a model explains the bends of a few tracks by false hits, after which the
+    flight is unknown; tracks with far more than the median are left out.
 
     Args: as `prediction_errors`.
-    Returns: NaN if fewer than half of the tracks could be estimated so: the model is not near enough to them.
+    Returns: NaN if fewer than half of the tracks could be estimated so: the model does not fit them.
     """
     quiet = replace(settings, process=QUIET, coefficients={})
     estimator, observed = make_estimator("smoother", model, surfaces, quiet), [t.track for t in tracks]
@@ -106,7 +108,7 @@ def prediction_floor(
 
 
 def error_of_mean(by_track: Sequence[Array]) -> float:
-    """Standard error of the mean over all numbers, those of one track going together; NaN for a single track."""
+    """Standard error of the mean over all numbers, grouped by track; NaN for a single track."""
     if len(by_track) < 2:
         return float("nan")
     sums, counts = np.array([s.sum() for s in by_track]), np.array([s.size for s in by_track])
@@ -121,7 +123,7 @@ def _path(track: Track, prediction: TrackPrediction) -> PredictedPath:
 
 
 def _apex_distances(evaluated: EvaluationTrack, prediction: TrackPrediction) -> Array:
-    """(a,) m between measured and predicted apexes of flights whose apex was not observed."""
+    """(a,) m between measured and predicted apexes of flights with an unobserved apex."""
     track, end = evaluated.track, float(prediction.times[0])
     points, when = measured_apexes(track.times, track.positions, evaluated.bounces)
     edges = [float(track.times[0]), *evaluated.bounces.tolist(), float(track.times[-1])]
@@ -144,17 +146,17 @@ class HeldOutGain:
 
 
 def held_out_gain(before: Fit, after: Fit, held_out: Stretches, on_before: Fit | None = None) -> HeldOutGain:
-    """The gain of a larger model on tracks that neither fit has seen; only first states adapt to them.
+    """The gain of a larger model on tracks outside of both fits; only first states adapt to them.
 
-    The gain shows whether the larger model helps. Its significance comes from the residual along the change that the
-    larger model makes: without an effect, the product of the two scatters about zero, track by track. The sum of losses
-    would be a test with a quarter of that information, because half the length of the change is taken off it.
+    The gain shows whether the larger model helps. Its significance comes from the product of the residual with the
+    larger model's change of the predictions: without an effect it scatters about zero, track by track. The sum of
+    losses would be a test with a quarter of that information, because it subtracts half the length of the change.
 
     Args:
         before: fit on other tracks.
         after: fit of the larger model on the same other tracks.
         held_out: stretches to compare on.
-        on_before: `on_others(before, held_out)` where that was computed already.
+        on_before: `on_others(before, held_out)`, if computed already.
     Returns: the gain in natural units per track, and its probability by chance.
     """
     for fitted in (before, after):
@@ -177,7 +179,7 @@ def held_out_gain(before: Fit, after: Fit, held_out: Stretches, on_before: Fit |
 
 
 def on_others(fitted: Fit, others: Stretches) -> Fit:
-    """The fit of first states to stretches of other tracks, everything else as it was fitted."""
+    """The fit of first states to stretches of other tracks, with all else as fitted."""
     return _on(fitted, _reached(fitted, others), fitted.noise)
 
 
@@ -196,14 +198,14 @@ def _reached(fitted: Fit, stretches: Stretches) -> Stretches:
 
 
 def _on(fitted: Fit, stretches: Stretches, noise: Noise) -> Fit:
-    """A fit's shared unknowns on other stretches, whose first states are fitted."""
+    """A fit's shared unknowns on other stretches, with new first states."""
     problem = replace(fitted.problem, stretches=stretches, shared=False)
     unknowns = replace(fitted.unknowns, starts=stretches.starts.numpy().copy())
     return fit_problem(problem, unknowns, noise, settle_noise=False)
 
 
 def got_worse(after: Errors, before: Errors) -> bool:
-    """Whether predictions got worse, by more than chance makes of an effect that hardly moves them.
+    """True if predictions got worse, by more than chance would cause.
 
     Args: after, before: errors of the predictions (mm) of the same tracks by two models.
     """
@@ -213,12 +215,12 @@ def got_worse(after: Errors, before: Errors) -> bool:
         return False
     growth = np.square(after.by_track) - np.square(before.by_track)
     others = np.sign(np.delete(before.by_track - after.by_track, growth.argmax()))
-    # one ball misses the table's end, the others are better; by how much a few of them are would weigh too much
+    # one ball misses the table's end, the others are better; a mean would weigh a few balls too much
     if growth.sum() < growth.max() and others.sum() > SIGMAS * np.sqrt(len(others)):
         return False
     return ratio > HARDLY or _sure(growth) > SURELY
 
 
 def _sure(values: Array) -> float:
-    """By how many of its standard errors the mean of some numbers lies above zero; 0 for a single one."""
+    """The mean of some numbers in units of its standard error; 0 for a single one."""
     return float(values.mean() / values.std(ddof=1) * np.sqrt(len(values))) if len(values) > 1 else 0.0

@@ -1,4 +1,4 @@
-"""A hypothesis: one effect, in one shape, that the model may lack; and the models that hold it."""
+"""A hypothesis is one effect, in one shape, that the model may lack."""
 
 import copy
 from collections.abc import Iterable, Mapping
@@ -11,25 +11,25 @@ import numpy as np
 from ballfg.diagnosis.fit.free import LOOSE, Deviation, spread
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.result import Value
-from ballfg.dynamics import AnalyticModel, Coefficient, Effect
-from ballfg.dynamics.effect import Scene, Vector
+from ballfg.dynamics import AnalyticModel, Coefficient
+from ballfg.dynamics.effect import Effect, Scene, Vector
 
 TWINS: Mapping[str, tuple[str, ...]] = {"gravity": ("buoyancy",)}
-"""Effects that are exactly the same as another one of a model: the other one is listed for both."""
+"""Effects that are equivalent to another one in a model: the other one is listed for both."""
 LEAST_GAP = 1e-4
-"""s. Stamps nearer together tell no speed."""
+"""s. Least distance of stamps for a speed."""
 AROUND = 0.1
-"""s to each side of a contact in which the speed before it is looked for: offsets of time shift it."""
+"""s to each side of a contact for the speed before it: offsets of time shift it."""
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """An effect that may be lacking.
+    """An effect that the model may lack.
 
     Attributes:
         effect: its class.
-        shape: coefficients that only give it a form (a centre, a reference), and values that are tried as a whole.
-        strengths: coefficients that a score test can look at: at their absent values nothing changes.
+        shape: coefficients of its form (a centre, a reference), and values that are tried as a whole.
+        strengths: coefficients of its size, for score tests: at their absent values nothing changes.
     """
 
     effect: type[Effect]
@@ -52,15 +52,15 @@ class Hypothesis:
         return self.effect.decide
 
     def known_as(self, coefficient: str) -> str:
-        """The coefficient as the table of plausible ranges names it."""
+        """The coefficient's name in the table of plausible ranges."""
         return f"{self.name}.{coefficient}"
 
     def deviations(self) -> dict[str, Deviation]:
-        """Those unknowns that act on some tracks more than on others; none where the effect is the same for all."""
+        """Its unknowns that act on some tracks more than on others; none if the effect is the same for all."""
         return {}
 
-    def told(self, fit: Fit, values: Mapping[str, Value]) -> dict[str, Value]:
-        """Coefficients for a report; values: those fitted, by coefficient."""
+    def reported(self, fit: Fit, values: Mapping[str, Value]) -> dict[str, Value]:
+        """Coefficients for a report; values: fitted ones, by coefficient."""
         shape = {c: Value(v, 0.0, self.coefficients[c].unit) for c, v in self.shape.items() if c not in values}
         return {**values, **shape}
 
@@ -70,7 +70,7 @@ class Hypothesis:
         return {c.name: c for c in self.effect.coefficients}
 
     def parameter(self, coefficient: str) -> str:
-        """Its name among the model's parameters."""
+        """Name of a coefficient among the model's parameters."""
         return f"{self.effect.kind}.{self.effect.name}.{coefficient}"
 
     @property
@@ -80,24 +80,24 @@ class Hypothesis:
 
     @property
     def usual(self) -> bool:
-        """Whether balls usually have the effect: its nominal strength is not zero, and its absence far from it."""
+        """True for a usual effect: its nominal strength is not zero, and its absence is far from it."""
         return any(self.coefficients[n].default != self.coefficients[n].absent for n in self.strengths)
 
     def strain(self, values: Mapping[str, float]) -> float:
-        """Prior standard deviations between the furthest strength and its usual value; values: by parameter name."""
+        """Largest distance of a strength from its usual value in prior sigmas; values: by parameter name."""
         listed = self.coefficients
         far = (abs(values[self.parameter(n)] - listed[n].default) / spread(listed[n]) for n in self.strengths)
         return max(far, default=0.0)
 
     def free(self) -> dict[str, Coefficient]:
-        """Coefficients that a refit estimates in addition: strengths, and shapes that are uncertain."""
+        """Coefficients that a refit estimates in addition: strengths, and uncertain shapes."""
         listed = self.coefficients
         loose = {self.parameter(n): replace(listed[n], sigma=LOOSE * spread(listed[n])) for n in self.strengths}
         formed = {self.parameter(n): listed[n] for n in self.shape if listed[n].absent is None and listed[n].sigma > 0}
         return loose | formed
 
     def added_to(self, model: AnalyticModel) -> AnalyticModel:
-        """The model with the effect in it, its strengths absent; the model itself where it has the effect already."""
+        """The model with the effect at zero strength; the model itself if it has the effect already."""
         if has_effect(model, self.name):
             return model
         absent = {n: cast(float, self.coefficients[n].absent) for n in self.strengths}
@@ -111,12 +111,12 @@ def effects_of(model: AnalyticModel) -> list[Effect]:
 
 
 def has_effect(model: AnalyticModel, name: str) -> bool:
-    """Whether the model declares an effect."""
+    """True if the model declares an effect."""
     return any(effect.name == name for effect in effects_of(model))
 
 
 def with_effects(model: AnalyticModel, *effects: Effect) -> AnalyticModel:
-    """A copy of a model with further effects; its parameters do not learn (`requires_grad` is off)."""
+    """A copy of a model with further effects; its parameters are fixed (`requires_grad` is off)."""
     every = [*(copy.deepcopy(effect) for effect in effects_of(model)), *effects]
     return AnalyticModel(every, radius=model.radius, inertia_factor=model.inertia_factor).requires_grad_(False)
 
@@ -128,10 +128,10 @@ def without_effect(model: AnalyticModel, name: str) -> AnalyticModel:
 
 
 def hypotheses(model: AnalyticModel, scene: Scene, catalogue: Iterable[type[Effect]]) -> list[Hypothesis]:
-    """All effects that the model may lack and that could act in these data.
+    """All effects that the model may lack and that can act in these data.
 
-    An effect of the catalogue that the model lacks, and whose needs it meets, is listed in each shape that the scene
-    suggests. An effect that the model has is listed with the coefficients that are declared as exact.
+    A missing effect of the catalogue whose needs are met is listed in each shape for the scene. An effect of the model
+    is listed with the coefficients that are declared as exact.
 
     Args:
         model: as declared so far.
@@ -159,7 +159,7 @@ def hypotheses(model: AnalyticModel, scene: Scene, catalogue: Iterable[type[Effe
 
 
 def scene_of(fit: Fit) -> Scene:
-    """The extent of the stretches of a fit: places, speeds, impacts and spin labels.
+    """The extent of a fit's stretches: places, speeds, impacts and spin labels.
 
     Args: fit: of a model to the stretches.
     Returns: the scene, in m and m/s.
@@ -170,7 +170,7 @@ def scene_of(fit: Fit) -> Scene:
     times = fit.problem.model.true_stamps(stretches.times).detach().numpy()
     gaps = np.maximum(np.gradient(times, axis=1), LEAST_GAP)[..., None]
     velocities = np.gradient(fit.predicted.positions, axis=1) / gaps
-    falls = []  # the steepest near each contact: no difference that spans it is, nor one after it
+    falls = []  # the steepest near each contact: differences across or after it are smaller
     for i, row in enumerate(fit.predicted.contacts):
         for time in row[np.isfinite(row)]:
             first, last = np.searchsorted(times[i], (time - AROUND, time + AROUND))

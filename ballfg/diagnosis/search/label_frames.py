@@ -1,4 +1,4 @@
-"""Spin labels in other axes or with other signs: one of 48 frames, too large a change for a score test.
+"""Tests the 48 frames of spin labels, with other axes or signs, a change too large for a score test.
 
 Spins are estimated from the flights alone, without labels and with the declared coefficients, because coefficients
 fitted to wrong labels would be wrong too. The frames in which the labels agree best with these spins are then fitted in
@@ -18,17 +18,17 @@ from ballfg.dynamics.effects.measurement import signed_permutations
 from ballfg.state import SPIN
 
 UNLABELLED_SPIN = 200.0
-"""rad/s, prior of a spin about zero while labels are set aside."""
+"""rad/s, prior of a spin about zero without labels."""
 FRAMES = 48
-"""Ways in which axes can be exchanged and reversed, the identity among them."""
+"""Number of exchanges and reversals of axes, including the identity."""
 FRAMES_FITTED = 2
-"""Frames that are fitted in full."""
+"""Number of frames that are fitted in full."""
 
 
 def frame_hypotheses(before: Fit, general: Hypothesis) -> list[Hypothesis]:
-    """The frames that suit the flights best.
+    """The frames that agree best with the flights.
 
-    Args: before: the fit so far.  general: the hypothesis of another frame, whichever.
+    Args: before: the fit so far.  general: the hypothesis of any other frame.
     """
     spins, covariances, labels = _spins_without_labels(before)
     frames = signed_permutations().numpy()[1:]
@@ -51,7 +51,7 @@ def _spins_without_labels(before: Fit) -> tuple[Array, Array, Array]:
 
 
 def _disagreement(labels: Array, spins: Array, covariances: Array, frame: Array, noise: float) -> float:
-    """Robust squared distance between labels and spins in a frame (3, 3)."""
+    """Robust squared distance between spins and labels in a frame (3, 3)."""
     covariance = frame @ covariances @ frame.T + noise**2 * np.eye(3)
     apart = labels - spins @ frame.T
     square = (apart * np.linalg.solve(covariance, apart[..., None])[..., 0]).sum(axis=-1)

@@ -1,4 +1,4 @@
-"""The search loop: fit, test, add the effect that is lacking, and repeat until nothing more helps."""
+"""The search loop fits, tests, adds the missing effect, and repeats until no effect helps."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -19,35 +19,36 @@ from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_
 from ballfg.diagnosis.search.state import Confirmed, Search, left_out, without_named
 from ballfg.diagnosis.search.trial import try_further, try_hypotheses, try_varying
 from ballfg.diagnosis.search.varying import Grouping, groupings
-from ballfg.dynamics import AnalyticModel, BallModel, Effect
+from ballfg.dynamics import AnalyticModel, BallModel
+from ballfg.dynamics.effect import Effect
 from ballfg.estimation.batch import do_all
 
 MOST_EFFECTS = 4
-"""Effects that are added before the search ends; further ones would be found in what earlier wrong ones left."""
+"""Largest number of added effects; further ones would fit the errors of earlier wrong ones."""
 CONFIRMED = 0.05
-"""An effect stays only if its gain on the held-out half would arise by chance less often than this."""
+"""Significance level of an effect's gain on the held-out half."""
 WORSE = 1.1
-"""Ratio of prediction errors beyond which an effect is not added, however much better whole tracks are fitted with it:
-a wrong name for a lacking effect bends the motion to the samples, and predictions get worse."""
+"""Ratio of prediction errors above which an effect is not added, even if whole tracks are fitted better: a wrong name
+for a missing effect bends the motion to the samples, and predictions get worse."""
 PLAUSIBLE = 10.0
-"""Prior standard deviations from its usual value within which a coefficient is plausible. An effect that must be
-stronger than that (air that moves at 20 m/s through a part of the room) stands for something else."""
+"""Prior standard deviations from its usual value within which a coefficient is plausible. A stronger effect (air that
+moves at 20 m/s through a part of the room) stands for something else."""
 POORER = 0.3
-"""Share of an effect's gain that is there without the effect too, from which the fit before was in a poor minimum."""
+"""Share of an effect's gain that remains without the effect, above which the previous fit was in a poor minimum."""
 
 
 Examined = Confirmed | tuple[Outcome, Fit]
-"""A refit with all that confirms it, or why it is no name and its fit then."""
+"""A refit with its confirmation, or the reason for its refusal and its fit."""
 
 
 @dataclass(frozen=True)
 class SearchLoop:
     """The inputs of a search, the same in every round.
 
-    `predictive` gives a fitted model the process noise that predicts the tracks which it was fitted to; `judge` gives
-    the errors of its predictions on the judging half; `watch` is told of progress, in lines; refits share `jobs`
-    processes. Effects `of_some` (all of the catalogue where None) may differ between tracks in `ways`, which are asked
-    for with the names of the tracks of the search half; None: by their labels and along the recording.
+    `predictive` gives a fitted model the process noise that predicts the tracks of its fit; `judge` gives the errors of
+    its predictions on the judging half; `watch` is called with lines of progress; refits share `jobs` processes.
+    Effects `of_some` (None: all of the catalogue) may differ between tracks in `ways`, a function of the names of the
+    search half's tracks; None: by their labels and along the recording.
     """
 
     holdout: Holdout
@@ -61,9 +62,9 @@ class SearchLoop:
     ways: Callable[[Sequence[str]], list[Grouping]] | None = None
 
     def run(self, model: AnalyticModel, first: Fit | None = None) -> Search:
-        """Add effects to the declared model until none helps, then take out those without which it predicts better.
+        """Adds effects to the declared model until none helps, then removes those without which predictions are better.
 
-        Args: model: as declared.  first: its fit, where that was made already.
+        Args: model: as declared.  first: its fit, if made already.
         """
         self.watch(f"fitting the declared model to {len(self.holdout.search)} flights")
         stamps = self.holdout.stamps
@@ -81,7 +82,7 @@ class SearchLoop:
         return replace(search, findings=findings, refused=refused)
 
     def _round(self, search: Search) -> tuple[Search, bool]:
-        """The search after one more round, and whether the round added an effect."""
+        """The search after one more round, and True if the round added an effect."""
         number = len(search.rounds) + 1
         on_before = on_others(search.fit, self.holdout.held_out)
         scored, refits = self._tried(search, on_before, number)
@@ -128,16 +129,16 @@ class SearchLoop:
         return try_hypotheses(search.fit, whole, self.catalogue, partial(self._tell, number), self.jobs)
 
     def _on_all(self, fit: Fit) -> Fit:
-        """The fit to the tracks of both halves, from one to the search half: significance is theirs."""
+        """The fit to the tracks of both halves, from one to the search half, for significance tests."""
         return on_all(fit, on_others(fit, self.holdout.held_out))
 
     def _tell(self, number: int, line: str) -> None:
         self.watch(f"round {number}: {line}")
 
     def _better_minimum(self, search: Search, best: Refit) -> Search | None:
-        """The search from a better minimum of the same model, to which a refit has led; None if there is none.
+        """The search from a better minimum of the same model, found by a refit; None without one.
 
-        Spins without labels leave several minima. An effect that leads out of a poor one has not explained anything:
+        Spins without labels cause several minima. An effect that leads out of a poor one has not explained anything:
         without it the fit stays as good.
         """
         if best.delta_bic >= 0.0:
@@ -166,8 +167,8 @@ class SearchLoop:
     ) -> tuple[Confirmed | None, dict[str, Refusal]]:
         """The best refit that deserves a name, and better ones that do not; fills in their outcomes.
 
-        What one effect explains gets no lesser name only because the better one predicted a few balls worse; such
-        better ones are added to `misleading`.
+        If a better effect was refused only because it predicted a few balls worse, its pattern gets no lesser name;
+        such effects are added to `misleading`.
         """
         refused: dict[str, Refusal] = {}
         waiting, examined = [r for r in refits if r.delta_bic < 0.0], dict[int, Examined]()
@@ -188,14 +189,14 @@ class SearchLoop:
     def _examined_together(
         self, search: Search, waiting: Sequence[Refit], on_before: Fit, misleading: Sequence[Refit]
     ) -> dict[int, Examined]:
-        """The next refits examined, by their id, one a process: where the first is refused, the second is wanted."""
+        """The next refits examined in parallel, by their id: if the first is refused, the second is needed."""
         others = [r for r in waiting if not any(says_the_same(r, better) for better in misleading)][: self.jobs]
-        silent = replace(self, watch=_untold) if len(others) > 1 else self  # what is told of progress stays here
+        silent = replace(self, watch=_untold) if len(others) > 1 else self  # progress is reported in this process
         tasks = [partial(silent._examined, search, candidate, on_before) for candidate in others]
         return dict(zip(map(id, others), do_all(tasks, self.jobs), strict=True))
 
     def _examined(self, search: Search, candidate: Refit, on_before: Fit) -> Examined:
-        """A refit with all that confirms it, or why it is no name and its fit then; cheap questions come first."""
+        """A refit with its confirmation, or the reason for its refusal and its fit; cheap tests come first."""
         hypothesis = candidate.scored.hypothesis
         evidence = held_out_gain(search.fit, candidate.fit, self.holdout.held_out, on_before)
         if evidence.p_value >= CONFIRMED:
@@ -228,7 +229,7 @@ class SearchLoop:
         return Confirmed(candidate, evidence, kept, settled, whole, predictive, judged)
 
     def _implausible(self, hypothesis: Hypothesis, fit: Fit) -> str:
-        """Why the fitted strengths of an effect are not plausible; empty if they are."""
+        """The reason why the fitted strengths of an effect are implausible; empty if they are plausible."""
         values = fitted_values(fit, hypothesis)
         radius = fit.problem.model.radius
         known = [implausible(hypothesis.known_as(n), values[n], radius) for n in hypothesis.strengths]
@@ -240,19 +241,19 @@ class SearchLoop:
         return ""
 
     def _pushed(self, hypothesis: Hypothesis, before: Fit, after: Fit) -> bool:
-        """Whether the strengths of an effect are plausible, and would not be beside a further effect."""
+        """True if an effect's strengths are plausible, but would not be beside a further effect."""
         return bool(self._implausible(hypothesis, after)) and not self._implausible(hypothesis, before)
 
     def _refusal(self, hypothesis: Hypothesis, fit: Fit, outcome: Outcome) -> Refusal:
-        """An effect that fits better and is no name; fit: with it."""
+        """The refusal of an effect that fits better; fit: with it."""
         reason = self._implausible(hypothesis, fit) if outcome is Outcome.IMPLAUSIBLE else ""
         return Refusal(hypothesis.name, fitted_values(fit, hypothesis), outcome, reason, hypothesis.decide)
 
     def _pruned(self, search: Search, *, examined: int = 1) -> Search:
-        """The search without effects that are no names beside those that came after them; the last added goes first.
+        """The search without effects that later ones made superfluous; the last added is tested first.
 
-        Effects are asked again whether they are plausible, differ from zero, and make predictions of the judging half
-        better; not so the last ones that were `examined` beside all others when they were added.
+        Each effect must still be plausible, differ from zero, and improve predictions of the judging half; the last
+        ones that were `examined` beside all others are not tested again.
         """
         whole = self._on_all(search.fit)
         idle = insignificant(whole, search.named, search.first)
@@ -281,14 +282,14 @@ class SearchLoop:
 
 
 def _untold(_line: str) -> None:
-    """Nobody is told of progress."""
+    """Reports no progress."""
 
 
 def _same_change(search: Search, hypothesis: Hypothesis) -> bool:
-    """Whether an effect changes at the track at which another one was found to change.
+    """True if an effect changes at the same track as an earlier found one.
 
-    A new table changes several coefficients at once. Until all of them are in the model each bends to make up for the
-    others, in either half differently.
+    A new table changes several coefficients at once. Until the model has all of them, each compensates for the others,
+    differently in either half.
     """
     found = {deviation.level for deviation in search.fit.problem.deviations.values() if deviation.first}
     return any(deviation.level in found for deviation in hypothesis.deviations().values())

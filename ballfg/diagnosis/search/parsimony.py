@@ -1,8 +1,8 @@
-"""Whether an effect that fits better deserves a name.
+"""Tests whether an effect that fits better deserves a name.
 
-A flexible effect fits almost any pattern a little. It is a name only if its coefficients differ from zero by
-themselves, if both halves of the tracks want the same ones, and if the effects that were named before are still needed
-beside it. Standard deviations here come from the scatter of tracks, not from the stated noise.
+A flexible effect fits almost any pattern a little. It is a name only if its own coefficients differ from zero, if both
+halves of the tracks agree on them, and if the earlier effects are still needed beside it. Standard deviations here come
+from the scatter of tracks, not from the stated noise.
 """
 
 from collections.abc import Sequence
@@ -23,17 +23,17 @@ from ballfg.diagnosis.search.signatures import Signatures
 from ballfg.diagnosis.search.state import without_named
 
 LEAST_FREEDOM: Final = 2
-"""Degrees of freedom that a half with hardly more tracks than unknowns is taken to have."""
+"""Least degrees of freedom of a half, even with hardly more tracks than unknowns."""
 CHANCE: Final = 2.0 * float(stats.norm.sf(SIGMAS))
-"""The probability that goes with `SIGMAS`: a group of several coefficients is held to the same one."""
+"""The probability of `SIGMAS`, for groups of several coefficients."""
 
 
 def own_scores(fit: Fit, named: Sequence[Hypothesis]) -> list[Score | None]:
-    """Tests of effects that are in the model: would the fit be as good without each of them, all else being free?
+    """Tests of a model's effects: the loss of fit without each of them, with all else free.
 
     Args: fit: with all of them in its model.  named: effects with strengths.
     Returns: for each its coefficients less their absent values, their standard deviations from the scatter of tracks,
-        and the probability of so much by chance; None for an effect that the tracks do not show.
+        and the probability by chance; None for an effect that the tracks do not show.
     """
     return [_own_score(fit, hypothesis) for hypothesis in named]
 
@@ -56,18 +56,18 @@ def _own_score(fit: Fit, hypothesis: Hypothesis) -> Score | None:
 
 @dataclass(frozen=True)
 class Significance:
-    """Whether an effect differs from absent by itself, and the standard deviation (p,) of each of its strengths."""
+    """True if an effect by itself differs from absent, and the standard deviation (p,) of each of its strengths."""
 
     differs: bool
     sigmas: Array
 
 
 def significance(fit: Fit, hypothesis: Hypothesis, first: Fit) -> Significance:
-    """Whether an effect of a model differs from absent: its strengths together, and one of them alone.
+    """The significance of an effect's difference from absence: of its strengths together, and of a single one.
 
-    Standard deviations are those of the noise or of the scatter of tracks, the larger of the two. A strength that acts
-    far from linearly (a saturation) may be badly known and yet far from zero. For a single strength the likelihood
-    ratio against the fit without it therefore counts too, divided by the excess of the scatter over the noise.
+    Standard deviations are those of the noise or of the scatter of tracks, the larger of the two. A strongly nonlinear
+    strength (a saturation) may be uncertain and yet far from zero. For a single strength the likelihood ratio against
+    the fit without it therefore counts too, divided by the excess of the scatter over the noise.
 
     Args: fit: with the effect, which has strengths.  first: of the declared model, without the named effects.
     """
@@ -79,10 +79,10 @@ def significance(fit: Fit, hypothesis: Hypothesis, first: Fit) -> Significance:
     absent = np.array([hypothesis.coefficients[n].absent for n in hypothesis.strengths], dtype=np.float64)
     strengths = np.array([fit.unknowns.values[name] for name in hypothesis.columns]) - absent
     sigmas = np.maximum(noise, score.sigma)
-    # the score leaves out directions that change nothing, such as the same time offset of all axes
+    # the score leaves out directions without an effect, such as the same time offset of all axes
     differs = score.p_value <= CHANCE and bool((np.abs(score.estimate) > SIGMAS * score.sigma).any())
     if len(noise) > 1:
-        # so it leaves out the strength of an effect whose shape makes up for any strength; the covariance does not
+        # it thus leaves out the strength of an effect whose shape compensates any strength; the covariance does not
         seen = np.isfinite(score.sigma)
         excess = max(1.0, float((score.sigma[seen] / noise[seen]).max()))
         wald = float(strengths @ np.linalg.solve(covariance, strengths)) / excess**2
@@ -96,14 +96,14 @@ def significance(fit: Fit, hypothesis: Hypothesis, first: Fit) -> Significance:
 
 
 def insignificant(fit: Fit, named: Sequence[Hypothesis], first: Fit) -> list[Hypothesis]:
-    """Those effects of a model that do not differ from absent by themselves; not those that differ between tracks."""
+    """The effects of a model that do not differ from absent by themselves, except those that differ between tracks."""
     varying = {h.effect.name for h in named if h.deviations()}
     asked = [h for h in named if h.strengths and (h.deviations() or h.effect.name not in varying)]
     return [h for h in asked if not significance(fit, h, first).differs]
 
 
 def halves_differ(fit: Fit, hypothesis: Hypothesis, held_out: Stretches) -> bool:
-    """Whether the held-out half wants other strengths of an effect than the search half, on which the model was fitted.
+    """True if the held-out half gives other strengths of an effect than the search half of the fit.
 
     Args: fit: to the search half, with the effect.  held_out: stretches of the other half.
     """
@@ -118,10 +118,10 @@ def halves_differ(fit: Fit, hypothesis: Hypothesis, held_out: Stretches) -> bool
     one, two = (own_scores(half, [hypothesis])[0] for half in (fit, other))
     if one is None or two is None:
         return False
-    # in the directions that tracks show: nothing tells the same time offset of all axes, which differs by chance
+    # in visible directions only: a common time offset of all axes is invisible and differs by chance
     difference = two.estimate - one.estimate
     tracks = np.array([len(np.unique(half.problem.stretches.track)) for half in (fit, other)])
-    # the scatter of tracks about common unknowns that were fitted to the same tracks is too small by these unknowns
+    # the scatter of tracks is too small by the number of common unknowns fitted to the same tracks
     left = np.maximum(tracks - len(values), LEAST_FREEDOM)
     sigma = np.hypot(*(half.sigma * np.sqrt(n / m) for half, n, m in zip((one, two), tracks, left, strict=True)))
     freedom = int(left.sum())

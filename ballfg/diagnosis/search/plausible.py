@@ -1,4 +1,4 @@
-"""Fitted coefficients against the ranges in which those of a table-tennis ball, its table and its room are plausible.
+"""Compares fitted coefficients with the plausible ranges of a table-tennis ball, its table and its room.
 
 A coefficient that must lie outside of its range to explain the tracks stands for something else: it is never a name.
 """
@@ -11,16 +11,16 @@ from ballfg.dynamics.effect import Range
 from ballfg.tracks import TABLE_TENNIS
 
 NEAR: Final = 0.15
-"""Relative. A ball whose radius is further from a table-tennis ball's has none of these ranges."""
+"""Relative. Largest difference from the radius of a table-tennis ball, for these ranges to apply."""
 MARGIN: Final = 0.1
 """Share of a range by which a fitted value may lie outside of it."""
 SIGMAS: Final = 3.0
-"""Standard deviations: coefficients must differ from absent by so many and the halves by no more, and a value may lie
-so many outside of its range."""
+"""Standard deviations: least distance of coefficients from absent, largest difference between halves, and largest
+distance of a value from its range."""
 
 
 def range_of(name: str, radius: float) -> Range | None:
-    """The plausible range of a coefficient, for a ball of some radius in m; None where nothing is known."""
+    """The plausible range of a coefficient, for a ball of some radius in m; None if unknown."""
     effect, _, coefficient = name.partition(".")
     known = EFFECTS.get(effect)
     if known is None or abs(radius / TABLE_TENNIS.radius - 1.0) > NEAR:
@@ -29,7 +29,7 @@ def range_of(name: str, radius: float) -> Range | None:
 
 
 def implausible(name: str, value: Value, radius: float) -> str:
-    """Why a fitted value is not plausible, in words; empty if it is, or if nothing is known of it.
+    """The reason why a fitted value is implausible; empty if it is plausible, or without a known range.
 
     Args: name: of effect and coefficient, `wind.x`.  radius: of the ball, m.
     """

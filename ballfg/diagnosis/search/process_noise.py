@@ -1,8 +1,8 @@
-"""From a fit to a model that others can use: fitted coefficients, launcher and the noise that the tracks show.
+"""Turns a fit into a model for predictions: fitted coefficients, launcher, and the noise of the tracks.
 
-The fit is deterministic, so that all motion beside the model goes to the residual. Predictions need that motion as
-noise: too little of it makes them overconfident, too much makes them ignore the observed part. `estimate_noise` finds
-it from forecasts within the tracks of the search half.
+The fit is deterministic, so that all unmodelled motion is in the residual. Predictions need that motion as noise: too
+little of it makes them overconfident, too much makes them ignore the observed part. `estimate_noise` determines it by
+forecasts within the tracks of the search half.
 """
 
 from collections.abc import Sequence
@@ -16,31 +16,35 @@ from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.result import Errors
 from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.diagnosis.search.hypothesis import with_effects
-from ballfg.dynamics import AnalyticModel, BallModel, SpinEmbedding, Trained
+from ballfg.dynamics import AnalyticModel, BallModel
 from ballfg.dynamics.analytic import coefficient_sigmas
-from ballfg.estimation import dataset_settings, dataset_surfaces, estimate_noise, spread_over
-from ballfg.tracks import Dataset, TrackNoise
+from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.dynamics.trained import Trained
+from ballfg.estimation import dataset_settings, dataset_surfaces, estimate_noise
+from ballfg.estimation.noise.estimate import spread_over
+from ballfg.tracks import Dataset
+from ballfg.tracks.noise import TrackNoise
 
 MOST_PREDICTED = 15
-"""Tracks of the search half that are predicted to see whether an effect misleads, evenly spread."""
+"""Number of the search half's tracks whose predictions reveal a misleading effect, evenly spread."""
 MOST_FOR_NOISE = 25
-"""Tracks that the noise is estimated from, evenly spread; more move no number by more than its error bar."""
+"""Number of tracks for the noise, evenly spread; more move no number by more than its error bar."""
 LEAST_SPIN_SIGMA = 1.0
-"""rad/s. A launcher is not taken to repeat its spin better than that."""
+"""rad/s. Least scatter of a launcher's spin."""
 SPREAD = 0.3
-"""Prior median of the spread of coefficients between tracks, over the prior of a coefficient that nobody fitted."""
+"""Prior median of the spread of coefficients between tracks, over the prior of an unfitted coefficient."""
 
 
 @dataclass(frozen=True)
 class PredictiveModel:
-    """A model with the noise to predict with, and its errors on tracks that it was fitted to."""
+    """A model with its noise for predictions, and its errors on tracks of its fit."""
 
     model: AnalyticModel
     errors: Errors
 
 
 def fitted_model(fit: Fit) -> AnalyticModel:
-    """A copy of a fit's model with the fitted coefficients; deviations, noise and launcher are not in it."""
+    """A copy of a fit's model with the fitted coefficients, without deviations, noise and launcher."""
     model = with_effects(fit.problem.model)
     parameters = dict(model.named_parameters())
     with torch.no_grad():
@@ -51,7 +55,7 @@ def fitted_model(fit: Fit) -> AnalyticModel:
 
 
 def calibrated_model(fit: Fit, embedding: SpinEmbedding) -> AnalyticModel:
-    """The fitted model, for estimates and predictions; embedding: names the launcher settings of the fit."""
+    """The fitted model, for estimates and predictions; embedding: with the names of the fit's launcher settings."""
     model = fitted_model(fit)
     model.variations = fit.variations()
     unlabelled = not fit.problem.stretches.labelled.all()
@@ -72,13 +76,13 @@ def noise_about(
     *,
     jobs: int = 1,
 ) -> TrackNoise | None:
-    """The noise that tracks show about a calibrated model; None where they are too short to tell.
+    """The noise of tracks about a calibrated model; None if they are too short.
 
     Args:
         model: with `trained`.
-        tracks: those that it was fitted to.
+        tracks: of its fit.
         dataset: their origin.
-        tracker: memory of the tracker and jitter of the stamps, which stay; None: those that the dataset states.
+        tracker: fixed memory of the tracker and jitter of the stamps; None: the dataset's.
         jobs: processes.
     """
     tracker = tracker or TrackNoise()
@@ -99,10 +103,10 @@ def noise_about(
 
 
 class Predicting:
-    """Makes models that predict from fits of one holdout, each with the noise that the search half shows about it.
+    """Makes predicting models from fits of one holdout, each with its noise on the search half.
 
-    A model that lacks an effect has too much noise for the corrected one; with its noise predictions hardly follow the
-    observed part, and what an effect gains would be judged by how wrong the others are.
+    A model that lacks an effect has too much noise for the corrected one; with that noise predictions hardly follow the
+    observed part, and an effect's gain would depend on the errors of the others.
 
     Args: holdout: the halves.  jobs: processes.
     """

@@ -1,4 +1,4 @@
-"""One round of the search in words and numbers: the effect that was added, and the ranking of all candidates."""
+"""Reports a search round in words and numbers: the added effect, and the ranking of all candidates."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -21,11 +21,11 @@ NO_NAME: Final = (
     Outcome.SAME_PATTERN,
     Outcome.MISLEADING,
 )
-"""Outcomes of candidates that fit better on both halves and are no names all the same: the report says why."""
+"""Outcomes of refused candidates that fit better on both halves: the report gives the reason."""
 
 
 def finding_of(refit: Refit, settled: Fit, evidence: HeldOutGain, alike: tuple[str, ...]) -> Finding:
-    """An effect that is added, with its evidence. settled: the fit with it, its noise estimated anew."""
+    """An added effect, with its evidence. settled: the fit with it and a new noise estimate."""
     hypothesis = refit.scored.hypothesis
     return Finding(
         name=hypothesis.name,
@@ -42,17 +42,17 @@ def finding_of(refit: Refit, settled: Fit, evidence: HeldOutGain, alike: tuple[s
 
 
 def fitted_values(fit: Fit, hypothesis: Hypothesis) -> dict[str, Value]:
-    """Coefficients of an effect as fitted, and those of its shape that were not."""
+    """The fitted coefficients of an effect, and the fixed ones of its shape."""
     names = {hypothesis.parameter(name): name for name in hypothesis.coefficients}
     values = values_of(fit, [name for name in names if name in fit.problem.free], {})
-    return hypothesis.told(fit, {names[name]: value for name, value in values.items()})
+    return hypothesis.reported(fit, {names[name]: value for name, value in values.items()})
 
 
 def as_left(findings: Sequence[Finding], named: Sequence[Hypothesis], fit: Fit, first: Fit) -> tuple[Finding, ...]:
-    """Findings with the coefficients of the last fit, beside all the others.
+    """Findings with the coefficients of the last fit, with all the others in the model.
 
     The standard deviation of a strength is that of its significance; first: the fit without any of the findings. An
-    effect that turned out to differ between tracks is listed once, as that.
+    effect that turned out to differ between tracks is listed only in that form.
     """
     refreshed = []
     varying = {h.effect.name for h in named if h.deviations()}
@@ -61,7 +61,7 @@ def as_left(findings: Sequence[Finding], named: Sequence[Hypothesis], fit: Fit, 
             continue
         values = fitted_values(fit, hypothesis)
         sigmas = significance(fit, hypothesis, first).sigmas if hypothesis.strengths else np.zeros(0)
-        if hypothesis.deviations():  # what is told is the sum with the coefficient itself
+        if hypothesis.deviations():  # the report gives the sum with the coefficient itself
             noise = np.sqrt(np.diagonal(covariance_of(fit, hypothesis.columns)))
             sigmas = sigmas / noise * [values[name].sigma for name in hypothesis.strengths]
         for name, sigma in zip(hypothesis.strengths, sigmas.tolist(), strict=True):
@@ -74,7 +74,7 @@ def as_left(findings: Sequence[Finding], named: Sequence[Hypothesis], fit: Fit, 
 def ranking(
     scored: Sequence[Scored], refits: Sequence[Refit], outcomes: Mapping[str, Outcome]
 ) -> tuple[Candidate, ...]:
-    """One row an effect, its best shape, the one that explains most first."""
+    """One row per effect in its best shape, sorted by explained residual."""
     refitted = {r.name: r.delta_bic for r in refits}
     best: dict[str, Scored] = {}
     for candidate in scored:

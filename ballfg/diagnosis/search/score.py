@@ -1,15 +1,15 @@
-"""Score tests: would an effect that is absent make the samples more probable, everything else being free to adapt?
+"""Tests by the score whether an absent effect would make the samples more probable, with all else free.
 
 At the minimum of the declared model the derivative of the objective by the coefficients of an absent effect is their
 score. First states are eliminated stretch by stretch, declared coefficients over all tracks. The remaining information
-tells how large the score may be by chance. Tracks are the independent units: the scatter of their scores tells how far
-the stated noise can be trusted. False alarms therefore stay as rare as stated when the noise is misjudged or
-correlated. docs/derivations/diagnosis.md has the derivation.
+gives the size of the score by chance. Tracks are the independent units: the scatter of their scores shows how far the
+stated noise can be trusted. False alarms therefore stay as rare as stated when the noise is misjudged or correlated.
+docs/derivations/diagnosis.md has the derivation.
 
-A track with much information on a pattern pulls the estimate towards itself, so that the score which the estimate
-leaves scatters too little. Uncorrected, false alarms are two to four times as frequent as stated for 12 tracks. Source
-of the correction: R. Bell and D. McCaffrey 2002, "Bias reduction in standard errors for linear regression with
-multi-stage samples", Survey Methodology 28, the estimator known as CR2.
+A track with much information on a pattern pulls the estimate towards itself, so that its remaining score scatters too
+little. Uncorrected, false alarms are two to four times as frequent as stated for 12 tracks. Source of the correction:
+R. Bell and D. McCaffrey 2002, "Bias reduction in standard errors for linear regression with multi-stage samples",
+Survey Methodology 28, the estimator known as CR2.
 """
 
 from collections.abc import Sequence
@@ -24,18 +24,18 @@ from ballfg.arrays import Array, Index
 from ballfg.diagnosis.search.signatures import Efficient, Signatures, visible_directions
 
 PRIOR_TRACKS = 10.0
-"""Weight, in tracks, of the scatter pooled over all patterns beside a pattern's own, which few tracks tell badly."""
+"""Weight, in tracks, of the scatter pooled over all patterns, beside a pattern's own, uncertain one."""
 LEAST_OWN = 1e-6
-"""Least share of all information that a track has in every direction: a track without information on it counts, and
-rounding in columns that were nearly projected out does not."""
+"""Least share of all information that a track has in every direction: it counts tracks without information, but not
+rounding in columns that were nearly projected out."""
 LEAST_KEPT = 0.05
-"""Least share that is left of a track's score: a track that rules a direction alone cannot tell its scatter."""
+"""Least remaining share of a track's score: a track that determines a direction alone cannot show its scatter."""
 
 
 NOTICED: Final = 0.9
-"""Probability with which an effect of the size `seen_from` passes the test."""
+"""Probability that an effect of the size `seen_from` passes the test."""
 LARGEST: Final = 1e4
-"""Squared size, in units of its covariance, that any test notices."""
+"""Squared size, in units of its covariance, that any test detects."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Pattern:
         estimate: (r,) in those directions, one step from absent.
         information: (r, r).
         scatter: (r, r) covariance of the score, from the tracks.
-        p_value: probability of so much by chance.
+        p_value: probability by chance.
     """
 
     rank: int
@@ -70,9 +70,9 @@ class Score:
         estimate: (p,) coefficients after one step from absent.
         sigma: (p,) their standard deviations.
         explained: squared whitened residual that the effect would explain: chi-square of `rank` degrees by chance.
-        p_value: probability of so much by chance.
+        p_value: probability by chance.
         rank: number of directions in which the data show the coefficients.
-        tracks: number of tracks that the scatter comes from.
+        tracks: number of tracks behind the scatter.
     """
 
     estimate: Array
@@ -83,19 +83,19 @@ class Score:
     tracks: int
 
     def seen_from(self, alarm: float) -> Array:
-        """(p,) sizes from which on the test would notice each coefficient in 9 of 10 cases, whatever the others are.
+        """(p,) detectable sizes of each coefficient, in 9 of 10 cases, whatever the others are.
 
-        Where the other coefficients are zero, less is enough. Infinite where the data do not show the coefficient.
+        If the other coefficients are zero, smaller sizes suffice. Infinite if the data do not show the coefficient.
 
-        Args: alarm: probability of an outcome by chance below which the test notices something.
+        Args: alarm: significance level of the test.
         """
         return self.sigma * least_noticed(self.rank, self.tracks, alarm)
 
 
 def score_tests(signatures: Signatures, candidates: Sequence[Sequence[int]]) -> list[Score | None]:
-    """One test for each candidate; None where the data do not show it at all.
+    """One test for each candidate; None if the data do not show it at all.
 
-    Args: candidates: for each the columns that are its coefficients, counted after the common ones.
+    Args: candidates: for each the columns of its coefficients, counted after the common ones.
     """
     efficient = signatures.efficient()
     turns = [_visible(efficient, np.array(chosen)) for chosen in candidates]
@@ -107,7 +107,7 @@ def score_tests(signatures: Signatures, candidates: Sequence[Sequence[int]]) -> 
 
 
 def _visible(efficient: Efficient, chosen: Index) -> Array | None:
-    """(p, r) the directions of some of all p columns that projection leaves; None: it leaves none."""
+    """(p, r) the remaining directions of some of all p columns after projection; None: there is none."""
     directions = visible_directions(efficient.total[np.ix_(chosen, chosen)], efficient.raw[chosen])
     if not directions.shape[1]:
         return None
@@ -117,7 +117,7 @@ def _visible(efficient: Efficient, chosen: Index) -> Array | None:
 
 
 def _score(pattern: Pattern, turn: Array, tracks: int) -> Score:
-    """Args: turn: (p, r) the coefficients of a candidate in the directions that were tested."""
+    """Args: turn: (p, r) the coefficients of a candidate in the tested directions."""
     inverse = np.linalg.inv(pattern.information)
     spread = turn @ inverse @ pattern.scatter @ inverse @ turn.T
     # a coefficient without a visible direction has no finite uncertainty
@@ -127,7 +127,7 @@ def _score(pattern: Pattern, turn: Array, tracks: int) -> Score:
 
 
 def pattern_tests(signatures: Signatures, directions: Sequence[Array]) -> list[Pattern]:
-    """One test for each pattern, the scatter of all helping where tracks are few.
+    """One test for each pattern, with pooled scatter if tracks are few.
 
     Args: directions: for each pattern (p, r), combinations of the p columns of all patterns.
     """
@@ -138,7 +138,7 @@ def pattern_tests(signatures: Signatures, directions: Sequence[Array]) -> list[P
 
 
 def _corrected(signatures: Signatures, turn: Array) -> Pattern:
-    """The estimate of a pattern and its scatter, corrected for each track's part in the estimate; not tested yet."""
+    """The estimate of a pattern and its scatter, corrected for each track's part in the estimate; without a test."""
     q, rank = signatures.common, turn.shape[1]
     chosen = np.zeros((signatures.gram.shape[-1], q + rank + 1))
     chosen[:q, :q], chosen[q:-1, q:-1], chosen[-1, -1] = np.eye(q), turn, 1.0
@@ -162,7 +162,7 @@ def _corrected(signatures: Signatures, turn: Array) -> Pattern:
 
 
 def _as_if_apart(left: Array, full: Array, kept: Array) -> Array:
-    """(r,) a track's score as it would scatter had the track no part in the estimate.
+    """(r,) a track's score with the scatter that it would have without its part in the estimate.
 
     Args: full, kept: (r, r) its covariance without and with the track's part, for noise as stated.
     """
@@ -183,16 +183,16 @@ def _p_value(pattern: Pattern, tracks: int, dispersion: float) -> float:
 
 
 def _freedom(rank: int, tracks: int) -> tuple[float, float]:
-    """Degrees of freedom of the scatter, and those left: Hotelling's, for the covariance is estimated too."""
+    """Degrees of freedom of the scatter, before and after Hotelling's correction for the estimated covariance."""
     freedom = tracks + PRIOR_TRACKS - 1.0
     return freedom, freedom - rank + 1.0
 
 
 @lru_cache(maxsize=1024)
 def least_noticed(rank: int, tracks: int, alarm: float) -> float:
-    """The size of an effect, in standard deviations, that the test notices in 9 of 10 cases.
+    """The size of an effect, in standard deviations, that the test detects in 9 of 10 cases.
 
-    Args: rank: directions tested.  tracks: their number.  alarm: probability by chance below which it is noticed.
+    Args: rank: number of tested directions.  tracks: their number.  alarm: significance level.
     """
     _, left = _freedom(rank, tracks)
     limit = float(stats.f.isf(alarm, rank, left))

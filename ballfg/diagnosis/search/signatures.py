@@ -1,4 +1,4 @@
-"""Signatures of hypotheses: the change of the samples by each absent coefficient, with states projected out.
+"""Computes signatures: the change of the samples by each absent coefficient, with states projected out.
 
 Tests of candidate effects need only the inner products of these columns, track by track.
 """
@@ -18,7 +18,7 @@ from ballfg.diagnosis.fit.system import System, by_track
 from ballfg.diagnosis.search.hypothesis import Hypothesis
 
 LEAST_SHARE = 1e-8
-"""Share of a column's length that must survive projection: less is rounding, and the effect cannot be seen at all."""
+"""Least share of a column's length that survives projection: less is rounding, and the effect is invisible."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Signatures:
         return len(self.gram)
 
     def efficient(self) -> Efficient:
-        """Scores and information of the candidates with the common columns projected out too."""
+        """Scores and information of the candidates, with the common columns projected out too."""
         q, g = self.common, self.gram
         total = g.sum(axis=0)
         share = np.linalg.solve(total[:q, :q] + np.diag(self.precision), total[:q, q:-1])
@@ -56,7 +56,7 @@ class Efficient:
     Attributes:
         score: (t, p).
         information: (t, p, p).
-        prior: (p, p) information that the priors of common columns leave.
+        prior: (p, p) remaining information of the common columns' priors.
         raw: (p,) squared length of each column before common columns were projected out.
     """
 
@@ -72,9 +72,9 @@ class Efficient:
 
 
 def visible_directions(information: Array, raw: Array) -> Array:
-    """(p, r) the directions of p coefficients that projection leaves; r is zero where it leaves none.
+    """(p, r) the remaining directions of p coefficients after projection; r is zero without any.
 
-    Args: information: (p, p), everything else projected out.  raw: (p,) of each if all else were known.
+    Args: information: (p, p), all else projected out.  raw: (p,) of each if all else were known.
     """
     if not (raw > 0.0).any():
         return np.zeros((len(raw), 0))
@@ -100,8 +100,8 @@ def hypothesis_signatures(fit: Fit, candidates: Sequence[Hypothesis]) -> tuple[S
 def _columns(fit: Fit, candidates: Sequence[Hypothesis]) -> Array:
     """Columns of all candidates, in their order.
 
-    Those that act on the ball are computed together, and so are those that act on its measurement. The latter need
-    states at further moments, which is expensive where rows are many.
+    Effects on the ball are computed together, and so are effects on its measurement. The latter need states at further
+    times, which is expensive for many rows.
     """
     parts: dict[int, Array] = {}
     for late in (False, True):
@@ -116,8 +116,8 @@ def _columns(fit: Fit, candidates: Sequence[Hypothesis]) -> Array:
 def hypothesis_columns(fit: Fit, group: Sequence[Hypothesis]) -> Array:
     """(n, m, p) whitened, weighted derivatives of the samples by the strengths of hypotheses.
 
-    One model holds all of them. Each is absent, so that none sees another. A deviation needs no derivative of its own:
-    it is that of its coefficient, times a weight.
+    One model holds all of them at zero strength, so that none affects another. A deviation needs no derivative of its
+    own: it is that of its coefficient, times a weight.
     """
     model = fit.problem.model
     for hypothesis in group:
@@ -142,11 +142,11 @@ def hypothesis_columns(fit: Fit, group: Sequence[Hypothesis]) -> Array:
 
 
 _Key = tuple[str, tuple[tuple[str, float], ...]]
-"""A coefficient by parameter name, and the values of others with which its derivative is taken."""
+"""A coefficient by parameter name, with the values of others for its derivative."""
 
 
 def _asked(hypothesis: Hypothesis) -> list[tuple[_Key, Deviation | None]]:
-    """The derivative behind each strength of a hypothesis, and the deviation that it is multiplied for."""
+    """The derivative behind each strength of a hypothesis, and the deviation that weights it."""
     shape = tuple((hypothesis.parameter(name), value) for name, value in hypothesis.shape.items())
     deviations = hypothesis.deviations()
     found = [(deviations.get(name), name) for name in hypothesis.columns]

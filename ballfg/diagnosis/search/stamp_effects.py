@@ -1,4 +1,4 @@
-"""Effects on stamps that the tracks show before anything is fitted: the fit begins with them in its model."""
+"""Adds effects on stamps, visible in the tracks before any fit, to the model of the first fit."""
 
 import numpy as np
 
@@ -14,10 +14,10 @@ from ballfg.dynamics.effects.measurement import CountedFrames, TimeScale
 
 
 def stamp_hypotheses(stamps: Stamps) -> tuple[Hypothesis, ...]:
-    """What is wrong with stamps, as effects.
+    """The errors of stamps as effects.
 
-    Missing frames and a clock act alike on average. Where both were found, the number of frames is taken as counted
-    and the clock is fitted.
+    Missing frames and a clock act alike on average. If both were found, the number of frames is fixed as counted and
+    the clock is fitted.
     """
     if "time_scale" not in stamps.found:
         return (Hypothesis(CountedFrames, {}, ("missing",)),) if stamps.found else ()
@@ -26,7 +26,7 @@ def stamp_hypotheses(stamps: Stamps) -> tuple[Hypothesis, ...]:
 
 
 def first_fit(model: AnalyticModel, holdout: Holdout) -> Fit:
-    """The fit of a declared model to the search half, with the stamps as they were found to be."""
+    """The fit of a declared model to the search half, with the corrected stamps."""
     stamps, search, settings = holdout.stamps, holdout.search, holdout.settings
     named = stamp_hypotheses(stamps)
     if not named:
@@ -41,7 +41,7 @@ def first_fit(model: AnalyticModel, holdout: Holdout) -> Fit:
 
 
 def as_declared(model: AnalyticModel, stamps: Stamps) -> AnalyticModel:
-    """A calibrated model without the effects on stamps, its noise and launcher kept."""
+    """A calibrated model without the effects on stamps, with its noise and launcher."""
     if not stamps.found:
         return model
     bare = model
@@ -52,7 +52,7 @@ def as_declared(model: AnalyticModel, stamps: Stamps) -> AnalyticModel:
 
 
 def stamp_findings(fit: Fit, stamps: Stamps) -> tuple[Finding, ...]:
-    """Effects on stamps with the evidence for them; their coefficients come from the last fit of a search."""
+    """Effects on stamps with their evidence; their coefficients come from the last fit of a search."""
     tracks = len(np.unique(fit.problem.stretches.track))
     findings = []
     for hypothesis in stamp_hypotheses(stamps):

@@ -1,4 +1,4 @@
-"""The state of a search: the model so far, its fit and its errors, and the effects that were named or refused."""
+"""Holds the state of a search: its model, fit and errors, and the named and refused effects."""
 
 from dataclasses import dataclass, field, replace
 
@@ -16,13 +16,13 @@ class Search:
     """State of the search after some rounds.
 
     Attributes:
-        first, declared: fit of the declared model, and that model as it predicts.
+        first, declared: fit of the declared model, and that model for predictions.
         fit, predictive: the same of the model with the effects added so far.
         before, judged: prediction errors of both on the judging half.
-        whole: the last model fitted to the tracks of both halves, once the search is over; its values are reported.
+        whole: the last model fitted to the tracks of both halves, at the end of the search, for the report.
         named: the effects added so far, in order.
         findings, rounds: as in `Diagnosis`.
-        refused: by name, effects that fit better and are no names.
+        refused: refused effects that fit better, by name.
     """
 
     first: Fit
@@ -45,8 +45,8 @@ class Confirmed:
     Attributes:
         refit: with the effect.
         evidence: its gain on the held-out half.
-        kept: effects named before that stay.
-        settled, predictive: the fit with its noise settled, and as it predicts.
+        kept: earlier effects that stay.
+        settled, predictive: the fit with converged noise, and its model for predictions.
         whole: the same model fitted to the tracks of both halves.
         judged: errors of its predictions on the judging half.
     """
@@ -63,7 +63,7 @@ class Confirmed:
 def left_out(
     search: Search, hypothesis: Hypothesis, fit: Fit, predictive: PredictiveModel, judged: Errors, refusal: Refusal
 ) -> Search:
-    """The search after one of its effects was taken out; the fit and errors are those without it."""
+    """The search without one of its effects, with the corresponding fit and errors."""
     kept = [h for h in search.named if h is not hypothesis and has_effect(fit.problem.model, h.effect.name)]
     return replace(
         search,
@@ -77,7 +77,7 @@ def left_out(
 
 
 def without_named(fit: Fit, hypothesis: Hypothesis, first: Fit) -> Fit:
-    """The fit without one of the effects that were added to the first one's model, at the same noise."""
+    """The fit without one of the effects added to the first one's model, at the same noise."""
     problem, name = fit.problem, hypothesis.effect.name
     gone = set(hypothesis.columns)
     needed = has_effect(first.problem.model, name)

@@ -1,4 +1,4 @@
-"""One round's trial of every hypothesis: score tests of all of them, and refits of those that deserve one."""
+"""Tries every hypothesis of a round: score tests of all of them, and refits of the best."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -21,18 +21,18 @@ from ballfg.diagnosis.search.evaluation import on_others
 from ballfg.diagnosis.search.hypothesis import has_effect, hypotheses, scene_of
 from ballfg.diagnosis.search.label_frames import frame_hypotheses
 from ballfg.diagnosis.search.varying import Grouping, Varying, between, near, varying_hypotheses
-from ballfg.dynamics import Effect
+from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.effects.measurement import SpinLabelFrame
 from ballfg.dynamics.variation import place_of
 from ballfg.estimation.batch import do_all
 
 VARYING_ALARM = 0.001
-"""As `ALARM`, for effects that differ between tracks: they are flexible, and the best of further places near a change
-is taken, which the correction for the number of hypotheses does not count."""
+"""As `ALARM`, for effects that differ between tracks: they are flexible, and the choice of the best place of a change
+is not part of the correction for the number of hypotheses."""
 AS_GOOD = 0.97
 """Share of the best place's explained residual from which another place of a change is as good."""
 LABELLED = 0.5
-"""Share of flights whose spin must be labelled for an effect that multiplies spins to show in a score test."""
+"""Share of flights with a spin label needed for a score test of an effect that multiplies spins."""
 
 
 def try_varying(
@@ -43,14 +43,14 @@ def try_varying(
     tell: Callable[[str], None],
     jobs: int = 1,
 ) -> tuple[list[Scored], list[Refit]]:
-    """Every hypothesis that an effect differs between tracks, and refits of the leading ones, the best first.
+    """Tries every hypothesis of an effect that differs between tracks; refits of the leading ones, the best first.
 
     Args:
         before: the fit without any of them.
         catalogue: effects that may differ.
         held_out: stretches of the other half.
-        ways: in which tracks may differ, of the names of those of the search half.
-        tell: is told of progress.
+        ways: groupings of the tracks, by the names of the search half's tracks.
+        tell: called with progress.
         jobs: processes.
     """
     problem = before.problem
@@ -68,7 +68,7 @@ def try_varying(
         same = between(cast(Varying, best.hypothesis), searched, names)
         placed = [replace(best, hypothesis=h, p_value=candidate.p_value) for h in same]
         fitted = do_all([partial(refit, before, one) for one in placed], jobs)
-        # the search half has no track between these places, so that the other half tells them apart
+        # the search half has no track between these places, so that only the other half separates them
         refits.append(min(fitted, key=lambda r: on_others(r.fit, held_out).cost) if len(same) > 1 else fitted[0])
     return scored, sorted(refits, key=lambda r: r.delta_bic)
 
@@ -76,10 +76,10 @@ def try_varying(
 def try_further(
     before: Fit, scored: Sequence[Scored], tried: Sequence[Refit], tell: Callable[[str], None], jobs: int = 1
 ) -> list[Refit]:
-    """Refits of the next hypotheses in the ranking, the best first; none if no further one is significant.
+    """Refits of the next hypotheses in the ranking, the best first; empty without a further significant one.
 
-    They are for a round in which none of those tried before deserves a name: flexible effects of implausible size
-    explain most of any pattern, and stand before its cause.
+    They serve a round in which no earlier hypothesis deserves a name: flexible effects of implausible size explain most
+    of any pattern, and rank before its cause.
     """
     names = {refitted.name for refitted in tried}
     tasks = _refits(before, shortlist([s for s in scored if s.hypothesis.name not in names]), tell)
@@ -87,7 +87,7 @@ def try_further(
 
 
 def _refits(before: Fit, leading: Sequence[Scored], tell: Callable[[str], None]) -> list[Callable[[], Refit]]:
-    """The refits to do, of every shape of the leading hypotheses."""
+    """The refits of every shape of the leading hypotheses."""
     shaped: list[Scored] = []
     for candidate in leading:
         tell(f"fitting with {candidate.hypothesis.name}")
@@ -100,10 +100,10 @@ def _refits(before: Fit, leading: Sequence[Scored], tell: Callable[[str], None])
 
 
 def _placed(before: Fit, closer: Sequence[Varying]) -> Scored:
-    """The change along the recording where it explains most.
+    """The change along the recording at its best place.
 
-    Several places explain about the same where tracks between them do not show the coefficient. Then it is the place
-    of a change that was named before, since one new table changes several coefficients; else the middle of them.
+    Several places explain about the same if tracks between them do not show the coefficient. Then an earlier change's
+    place is chosen, since one new table changes several coefficients; else the middle of them.
     """
     known = {deviation.level for deviation in before.problem.deviations.values()}
     scored = {id(s.hypothesis): s for s in score_all(before, closer)}
@@ -116,13 +116,13 @@ def _placed(before: Fit, closer: Sequence[Varying]) -> Scored:
 def try_hypotheses(
     before: Fit, whole: Fit, catalogue: Sequence[type[Effect]], tell: Callable[[str], None], jobs: int = 1
 ) -> tuple[list[Scored], list[Refit]]:
-    """Every hypothesis, the one that explains most first; and the refits to the search half, the best first.
+    """Scores all hypotheses, sorted by explained residual, and refits the best to the search half.
 
     Args:
         before: the fit to the search half without any of them.
-        whole: the same model's fit to the tracks of both halves, in which effects are looked for.
-        catalogue: effects to look for.
-        tell: is told of progress.
+        whole: the same model's fit to the tracks of both halves, for the score tests.
+        catalogue: candidate effects.
+        tell: called with progress.
         jobs: processes.
     """
     model = before.problem.model

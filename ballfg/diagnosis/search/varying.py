@@ -1,7 +1,7 @@
-"""The hypothesis that an effect is not the same for all tracks: it differs by group or along the recording.
+"""A varying hypothesis lets an effect differ between tracks, by group or along the recording.
 
-Such a hypothesis is flexible: groups that differ in their spins, say, would have it take in any effect that depends on
-spin. It is tried only where no effect that is the same for all tracks helps.
+Such a hypothesis is flexible: groups that differ in their spins, say, would absorb any effect that depends on spin. It
+is tried only if no effect that is equal for all tracks helps.
 """
 
 import itertools
@@ -18,27 +18,28 @@ from ballfg.diagnosis.fit.free import LOOSE, Deviation, spread
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.result import Value
 from ballfg.diagnosis.search.hypothesis import Hypothesis, has_effect, with_effects
-from ballfg.dynamics import AnalyticModel, Coefficient, Effect, Scene
+from ballfg.dynamics import AnalyticModel, Coefficient, Scene
+from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.variation import TRACK, number_of, place_of
 from ballfg.tracks import Track
 
 MOST_GROUPS: Final = 8
-"""Labels with more values than this (a wheel speed, a player) are not groups."""
+"""Largest number of values of a label that defines groups; a wheel speed or a player has more."""
 LEAST_TRACKS: Final = 3
-"""Tracks on either side of a change, and in each group of either half: fewer cannot tell their scatter."""
+"""Least number of tracks on either side of a change, and in each group of either half, for their scatter."""
 PARTS: Final = 8
-"""A recording is first asked for a change after each of so many parts of it; then the change is looked for between."""
+"""Number of parts of a recording after which a change is first tested; its place is then refined."""
 
 
 @dataclass(frozen=True)
 class Grouping:
-    """One way in which tracks differ.
+    """One grouping of tracks.
 
     Attributes:
         by: the label, or "track" for the place in the recording.
         weights: by name of a level, the weight (by name of the track) of the level's own deviation.
         first: name of the first track, of a place in the recording.
-        line: whether the change along the recording is steady.
+        line: True for a steady change along the recording.
     """
 
     by: str
@@ -48,7 +49,7 @@ class Grouping:
 
     @property
     def suffix(self) -> str:
-        """End of the name of a finding."""
+        """Suffix of the name of a finding."""
         return "_drift" if self.by == TRACK else "_by_group"
 
     def named(self, level: str) -> str:
@@ -57,15 +58,15 @@ class Grouping:
 
 
 def groupings(tracks: Sequence[Track], searched: Sequence[str]) -> list[Grouping]:
-    """All ways in which the tracks of a dataset may differ.
+    """All groupings of the tracks of a dataset.
 
-    Args: tracks: all, in the order of the recording.  searched: names of those of the search half.
+    Args: tracks: all, in the order of the recording.  searched: names of the search half's tracks.
     """
     return [*_by_labels(tracks, set(searched)), *_by_place([track.name for track in tracks], searched)]
 
 
 def steps_near(grouping: Grouping, searched: Sequence[str], names: Sequence[str]) -> list[Grouping]:
-    """A step moved to every track of the search half that no other part begins nearer to; itself if it is no step."""
+    """A step moved to every track of the search half that is nearest to it; other groupings stay."""
     if grouping.by != TRACK or grouping.line:
         return [grouping]
     reach, at = max(1, len(searched) // PARTS), searched.index(next(iter(grouping.weights)))
@@ -74,7 +75,7 @@ def steps_near(grouping: Grouping, searched: Sequence[str], names: Sequence[str]
 
 
 def steps_between(grouping: Grouping, searched: Sequence[str], names: Sequence[str]) -> list[Grouping]:
-    """A step moved to every track since the last one of the search half before it; itself if it is no step."""
+    """A step moved to every track since the previous one of the search half; other groupings stay."""
     if grouping.by != TRACK or grouping.line:
         return [grouping]
     begin = next(iter(grouping.weights))
@@ -96,7 +97,7 @@ def _by_labels(tracks: Sequence[Track], searched: set[str]) -> list[Grouping]:
 
 
 def _by_place(names: Sequence[str], searched: Sequence[str]) -> list[Grouping]:
-    """Steps and a line; none where names do not tell the order of the recording."""
+    """Steps and a line; none if names do not give the order of the recording."""
     places = [place_of(name) for name in names]
     if any(later <= earlier for earlier, later in itertools.pairwise(places)):
         return []
@@ -124,7 +125,7 @@ class Varying(Hypothesis):
 
     Attributes:
         effect, shape: as of `Hypothesis`.
-        strengths: the deviations, `e[backspin]`: of each coefficient that varies, for each level.
+        strengths: the deviations, `e[backspin]`: of each varying coefficient, for each level.
         grouping: how tracks differ.
     """
 
@@ -138,7 +139,7 @@ class Varying(Hypothesis):
 
     @property
     def name(self) -> str:
-        """Name of the effect, and how it varies: `restitution_drift`, `table_tilt_by_group`."""
+        """Name of the effect with its variation: `restitution_drift`, `table_tilt_by_group`."""
         return self.effect.name + self.grouping.suffix
 
     @property
@@ -162,16 +163,16 @@ class Varying(Hypothesis):
         return {s: replace(listed[_varied(s)], name=s, default=0.0, absent=0.0) for s in self.strengths}
 
     def known_as(self, coefficient: str) -> str:
-        """The coefficient whose plausible range holds for a level."""
+        """The coefficient whose plausible range applies to a level."""
         return f"{self.effect.name}.{_varied(coefficient)}"
 
     @property
     def usual(self) -> bool:
-        """No ball usually differs from track to track."""
+        """False: no ball usually differs from track to track."""
         return False
 
     def free(self) -> dict[str, Coefficient]:
-        """The deviations; only the sum of a coefficient and its deviations has bounds."""
+        """The deviations; bounds apply only to the sum of a coefficient and its deviations."""
         listed = {c.name: LOOSE * spread(c) for c in self.effect.coefficients}
         return {
             self.parameter(n): replace(c, sigma=listed[_varied(n)], low=c.low - c.high, high=c.high - c.low)
@@ -197,14 +198,14 @@ class Varying(Hypothesis):
         return self.parameter(_varied(strength))
 
     def added_to(self, model: AnalyticModel) -> AnalyticModel:
-        """The model with the effect in it, absent for all tracks alike; the model itself where it has the effect."""
+        """The model with the effect at zero strength for all tracks; the model itself if it has the effect."""
         if has_effect(model, self.effect.name):
             return model
         absent = {c.name: c.absent for c in self.effect.coefficients if c.absent is not None}
         return with_effects(model, self.effect(**absent))
 
-    def told(self, fit: Fit, values: Mapping[str, Value]) -> dict[str, Value]:
-        """The coefficients at each level, for a report; values: deviations as fitted, by strength."""
+    def reported(self, fit: Fit, values: Mapping[str, Value]) -> dict[str, Value]:
+        """The coefficients at each level, for a report; values: fitted deviations, by strength."""
         variations, told = fit.variations(), dict[str, Value]()
         for strength, deviation in values.items():
             name = self._coefficient(strength)
@@ -223,10 +224,10 @@ class Varying(Hypothesis):
 def varying_hypotheses(
     model: AnalyticModel, scene: Scene, catalogue: Iterable[type[Effect]], free: Iterable[str], ways: Sequence[Grouping]
 ) -> list[Varying]:
-    """Effects of which each may differ between tracks in each way.
+    """Hypotheses that each effect differs between tracks in each way.
 
-    Of an effect in the model those coefficients may that a fit estimates (`free`, parameter names), and that do not
-    vary yet; of an absent one all, if it has one shape only and does not act on spins.
+    For an effect of the model, its estimated coefficients (`free`, parameter names) without a variation; for an absent
+    one all, if it has one shape only and does not act on spins.
     """
     free, listed = set(free), []
     for effect in catalogue:
@@ -247,14 +248,14 @@ def varying_hypotheses(
 
 
 def near(hypothesis: Varying, searched: Sequence[str], names: Sequence[str]) -> list[Varying]:
-    """The hypothesis with its step at every place near by; itself where it has no step."""
+    """The hypothesis with its step at every nearby place; itself without a step."""
     coefficients = tuple(dict.fromkeys(_varied(s) for s in hypothesis.strengths))
     ways = steps_near(hypothesis.grouping, searched, names)
     return [Varying.of(hypothesis.effect, coefficients, way) for way in ways]
 
 
 def between(hypothesis: Varying, searched: Sequence[str], names: Sequence[str]) -> list[Varying]:
-    """The hypothesis with its step before each track that lies between two of the search half."""
+    """The hypothesis with its step before each track between two of the search half."""
     coefficients = tuple(dict.fromkeys(_varied(s) for s in hypothesis.strengths))
     ways = steps_between(hypothesis.grouping, searched, names)
     return [Varying.of(hypothesis.effect, coefficients, way) for way in ways]

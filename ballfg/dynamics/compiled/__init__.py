@@ -1,1 +1,1 @@
-"""Machine code from torch models: traced, differentiated, written as source, compiled by numba, kept on disk."""
+"""Turns torch models into machine code: traces, differentiates, writes source, compiles it by numba and caches it."""

@@ -1,4 +1,4 @@
-"""From a scalar program to a compiled function, kept on disk under the hash of its source."""
+"""Compiles generated source to machine code and keeps it on disk under the hash of that source."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ ONE, TWO, THREE = (types.Array(types.float64, dimensions, "C") for dimensions in
 
 @machine_code(types.void(TWO, TWO, ONE, THREE, THREE, TWO, THREE))
 '''
-"""What comes before `compute` in a file."""
+"""Beginning of each generated file, before `compute`."""
 HELPERS: Final = ("add_product", "tanh_all")
 """Functions of `layers.py` that generated ones may call."""
 
@@ -63,7 +63,7 @@ def machine_code(signature: Any) -> Callable[[Callable[..., Any]], Any]:
                 return next(iter(dispatcher.overloads.values())).entry_point
 
         def for_caller(args: Any, kwargs: Any) -> Any:
-            """What numba asks for when it compiles a function that calls this one."""
+            """The machine code, which numba asks for when it compiles a caller of this function."""
             for_call()
             return dispatcher.get_call_template(args, kwargs)
 
@@ -118,7 +118,7 @@ def _built(text: str) -> Code:
 
 
 def _holds(path: Path, text: str) -> bool:
-    """Whether a file has this content, whole."""
+    """True if a file has exactly this content."""
     try:
         return path.read_bytes() == text.encode()
     except OSError:

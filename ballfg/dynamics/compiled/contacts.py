@@ -1,4 +1,4 @@
-"""Machine code that finds contacts with surfaces and moves balls through them, by the rules of `motion.contact`."""
+"""Finds contacts with surfaces and moves balls through them in machine code, by the rules of `motion.contact`."""
 
 import math
 
@@ -15,6 +15,7 @@ from ballfg.dynamics.motion.limits import (
     SEARCH_STEPS,
     TIME_TOLERANCE,
     TYPICAL_JERK,
+    steps_over,
 )
 
 LEAST = 1e-300
@@ -34,12 +35,12 @@ def _approach(rates, surface, x, c, s, w, ws, height, radius):
 
 @machine_code(COUNT(ONE))
 def _common_steps(durations):
-    """The number of steps that the longest of some durations needs; those that are no numbers need none."""
+    """The number of steps for the longest of some durations; NaN needs none."""
     longest = 0.0
     for duration in durations:
         if abs(duration) > longest:
             longest = abs(duration)
-    return max(1, math.ceil(longest / MAX_STEP - 1e-9))
+    return steps_over(longest)
 
 
 @machine_code(NOTHING(FUNCTION, FUNCTION, TWO, TWO, TWO, ONE, ONE, ONE, REAL, ONE, ONE))
@@ -83,7 +84,7 @@ def _search(rates, surface, state, c, s, w, ws, heights, radius, longest, tau):
 
 @machine_code(REAL(FUNCTION, FUNCTION, ONE, ONE, ONE, ONE, ONE, REAL, REAL, REAL))
 def _scan(rates, surface, state, c, s, w, ws, height, radius, longest):
-    """Time (s) within one step of the contact, by small steps; NaN where the ball turns before it gets there."""
+    """Time (s) of the contact within one step, by small steps; NaN if the ball turns before it touches."""
     none, nonec, at, still = np.empty((9, 0)), np.empty((len(c), 0)), state.copy(), np.empty(0)
     gap, rate, _ = _approach(rates, surface, at, c, s, w, ws, height, radius)
     forward = not (gap < 0.0 and rate < 0.0)

@@ -1,4 +1,4 @@
-"""Machine code that moves balls in free flight, round a model's compiled rates.
+"""Moves balls in free flight in machine code, by a model's compiled rates.
 
 Each row of a batch is a ball with coefficients of its own; weights w are the same for all. Tangents travel with the
 values: derivatives in d directions at once, of which there may be none. The rules are those of
@@ -6,12 +6,26 @@ values: derivatives in d directions at once, of which there may be none. The rul
 """
 
 import numpy as np
+from numba.extending import register_jitable
 
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.signatures import COUNT, FOUR, FUNCTION, NOTHING, ONE, REAL, THREE, TWO
+from ballfg.dynamics.compiled.signatures import COUNT, FOUR, FUNCTION, LAW, NOTHING, ONE, REAL, THREE, TWO, Law
+from ballfg.dynamics.motion.limits import STAGES
 
 TOGETHER = 96
-"""Balls whose layers of a network stay in a processor's own memory."""
+"""Number of balls whose network layers fit into a processor's cache."""
+
+
+@register_jitable
+def white_acceleration(dt, density):
+    """What white acceleration noise gathers over dt s along an axis: the only place that says so.
+
+    Args: dt: s, a number or an array.  density: m^2/s^3, the square of one in m/s^2/sqrt(Hz).
+    Returns: variance of the position (m^2), covariance with the velocity (m^2/s), variance of the velocity (m^2/s^2).
+    Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001,
+        section 6.2.2 (continuous white noise acceleration model).
+    """
+    return density * dt**3 / 3.0, density * dt**2 / 2.0, density * dt
 
 
 @machine_code(NOTHING(ONE, ONE))
@@ -37,46 +51,42 @@ def evaluate(function, x, c, w, xt, ct, y, yt):
     function(one[0], one[1], w, moved[0], moved[1], y.reshape(1, m), yt.reshape(1, m, d))
 
 
-@machine_code(NOTHING(FUNCTION, ONE, ONE, ONE, TWO, TWO, ONE, TWO, ONE, TWO))
-def slope_at(rates, x, c, w, xt, ct, k, kt, a, at):
-    """The derivative k (9,) of a state by time, with tangents; a (6,) and at (6, d) are working memory."""
-    evaluate(rates, x, c, w, xt, ct, a, at)
-    for i in range(3):
-        k[i] = x[3 + i]
-        for q in range(xt.shape[1]):
-            kt[i, q] = xt[3 + i, q]
-    for i in range(6):
-        k[3 + i] = a[i]
-        for q in range(xt.shape[1]):
-            kt[3 + i, q] = at[i, q]
+@machine_code(NOTHING(LAW, TWO, THREE, TWO, THREE, TWO, THREE))
+def slopes_at(rates, x, xt, k, kt, a, at):
+    """The derivatives k (n, 9) of states by time, with tangents; a (n, 6) and at (n, 6, d) are working memory."""
+    rates.compute(x, rates.c, rates.w, xt, rates.ct, a, at)
+    for r in range(len(x)):
+        for i in range(3):
+            k[r, i], k[r, 3 + i], k[r, 6 + i] = x[r, 3 + i], a[r, i], a[r, 3 + i]
+            for q in range(xt.shape[2]):
+                kt[r, i, q], kt[r, 3 + i, q], kt[r, 6 + i, q] = xt[r, 3 + i, q], at[r, i, q], at[r, 3 + i, q]
 
 
-@machine_code(NOTHING(FUNCTION, ONE, ONE, ONE, TWO, TWO, REAL, ONE, ONE, TWO, ONE, TWO))
-def step_on(rates, x, c, w, xt, ct, h, ht, k1, k1t, y, yt):
-    """One Runge-Kutta step of h s from x with the slope k1 there, to y; all with tangents (ht (d,)). y may be x."""
-    d = xt.shape[1]
-    x2, x2t, total, totalt = np.empty(9), np.empty((9, d)), np.empty(9), np.empty((9, d))
-    k, kt, a, at = np.empty(9), np.empty((9, d)), np.empty(6), np.empty((6, d))
-    for i in range(9):
-        total[i] = k[i] = k1[i]
-        for q in range(d):
-            totalt[i, q] = kt[i, q] = k1t[i, q]
-    for stage in range(3):
-        share = 1.0 if stage == 2 else 0.5
+@machine_code(NOTHING(LAW, TWO, THREE, ONE, TWO, TWO, THREE))
+def step_on(rates, x, xt, h, ht, k, kt):
+    """`flight_step.runge_kutta` of n states, in place: h (n,) s, ht (n, d); k, kt: the slopes at x, then used up."""
+    n, d = len(x), xt.shape[2]
+    a, at = np.empty((n, 6)), np.empty((n, 6, d))
+    stage, staget, total, totalt = np.empty((n, 9)), np.empty((n, 9, d)), np.empty((n, 9)), np.empty((n, 9, d))
+    put_all(total, k)
+    put_all(totalt.reshape(n * 9, d), kt.reshape(n * 9, d))
+    for reach, weight in STAGES:
+        for r in range(n):
+            for i in range(9):
+                stage[r, i] = x[r, i] + reach * h[r] * k[r, i]
+                for q in range(d):
+                    staget[r, i, q] = xt[r, i, q] + reach * (h[r] * kt[r, i, q] + ht[r, q] * k[r, i])
+        slopes_at(rates, stage, staget, k, kt, a, at)
+        for r in range(n):
+            for i in range(9):
+                total[r, i] += weight * k[r, i]
+                for q in range(d):
+                    totalt[r, i, q] += weight * kt[r, i, q]
+    for r in range(n):
         for i in range(9):
-            x2[i] = x[i] + share * h * k[i]
+            x[r, i] += h[r] / 6.0 * total[r, i]
             for q in range(d):
-                x2t[i, q] = xt[i, q] + share * (h * kt[i, q] + ht[q] * k[i])
-        slope_at(rates, x2, c, w, x2t, ct, k, kt, a, at)
-        weight = 1.0 if stage == 2 else 2.0
-        for i in range(9):
-            total[i] += weight * k[i]
-            for q in range(d):
-                totalt[i, q] += weight * kt[i, q]
-    for i in range(9):
-        y[i] = x[i] + h / 6.0 * total[i]
-        for q in range(d):
-            yt[i, q] = xt[i, q] + (h * totalt[i, q] + ht[q] * total[i]) / 6.0
+                xt[r, i, q] += (h[r] * totalt[r, i, q] + ht[r, q] * total[r, i]) / 6.0
 
 
 @machine_code(NOTHING(FUNCTION, TWO, THREE, TWO, THREE, ONE, ONE, COUNT, THREE, FOUR, THREE, FOUR))
@@ -86,74 +96,50 @@ def fly_arcs(rates, start, startt, c, ct, w, step, count, nodes, nodest, slopes,
     Args: start (m, 9), startt (m, 9, d), c (m, p), ct (m, p, d), step (m,) s.
     Writes: states nodes (m, count + 1, 9) and their derivatives by time, slopes, with tangents (m, count + 1, 9, d).
     """
-    a, at, still = np.empty(6), np.empty((6, startt.shape[2])), np.zeros(startt.shape[2])
+    d = startt.shape[2]
+    x, xt, k, kt = np.empty((1, 9)), np.empty((1, 9, d)), np.empty((1, 9)), np.empty((1, 9, d))
+    a, at, still = np.empty((1, 6)), np.empty((1, 6, d)), np.zeros((1, d))
     for r in range(len(start)):
-        put(nodes[r, 0], start[r])
-        put_all(nodest[r, 0], startt[r])
-        slope_at(rates, nodes[r, 0], c[r], w, nodest[r, 0], ct[r], slopes[r, 0], slopest[r, 0], a, at)
-        for s in range(count):
-            x, xt, y, yt = nodes[r, s], nodest[r, s], nodes[r, s + 1], nodest[r, s + 1]
-            step_on(rates, x, c[r], w, xt, ct[r], step[r], still, slopes[r, s], slopest[r, s], y, yt)
-            slope_at(rates, y, c[r], w, yt, ct[r], slopes[r, s + 1], slopest[r, s + 1], a, at)
-
-
-@machine_code(NOTHING(FUNCTION, ONE, ONE, ONE, TWO, TWO, REAL, ONE, COUNT))
-def fly_one(rates, x, c, w, xt, ct, duration, durationt, steps):
-    """Move a state on by a duration (s, may be negative; tangents (d,)), in so many equal steps; with tangents."""
-    d = xt.shape[1]
-    k, kt, a, at = np.empty(9), np.empty((9, d)), np.empty(6), np.empty((6, d))
-    for _ in range(steps):
-        slope_at(rates, x, c, w, xt, ct, k, kt, a, at)
-        step_on(rates, x, c, w, xt, ct, duration / steps, durationt / steps, k, kt, x, xt)
-
-
-@machine_code(NOTHING(FUNCTION, TWO, TWO, ONE, THREE, THREE, TWO, THREE, TWO, THREE))
-def slopes_at(rates, x, c, w, xt, ct, k, kt, a, at):
-    """As `slope_at`, of the rows of x (m, 9)."""
-    rates(x, c, w, xt, ct, a, at)
-    for r in range(len(x)):
-        for i in range(3):
-            k[r, i], k[r, 3 + i], k[r, 6 + i] = x[r, 3 + i], a[r, i], a[r, 3 + i]
-            for q in range(xt.shape[2]):
-                kt[r, i, q], kt[r, 3 + i, q], kt[r, 6 + i, q] = xt[r, 3 + i, q], at[r, i, q], at[r, 3 + i, q]
-
-
-@machine_code(NOTHING(FUNCTION, TWO, TWO, ONE, THREE, THREE, ONE, TWO, COUNT))
-def fly_side_by_side(rates, x, c, w, xt, ct, duration, durationt, steps):
-    """As `fly_one`, of the rows of x (m, 9), whose rates are computed together."""
-    n, d = len(x), xt.shape[2]
-    k, kt, a, at = np.empty((n, 9)), np.empty((n, 9, d)), np.empty((n, 6)), np.empty((n, 6, d))
-    x2, x2t, total, totalt = np.empty((n, 9)), np.empty((n, 9, d)), np.empty((n, 9)), np.empty((n, 9, d))
-    for _ in range(steps):
-        slopes_at(rates, x, c, w, xt, ct, k, kt, a, at)
-        put_all(total, k)
-        put_all(totalt.reshape(n * 9, d), kt.reshape(n * 9, d))
-        for stage in range(3):
-            share, weight = (1.0 if stage == 2 else 0.5), (1.0 if stage == 2 else 2.0)
-            for r in range(n):
-                h = duration[r] / steps
-                for i in range(9):
-                    x2[r, i] = x[r, i] + share * h * k[r, i]
-                    for q in range(d):
-                        x2t[r, i, q] = xt[r, i, q] + share * (h * kt[r, i, q] + durationt[r, q] / steps * k[r, i])
-            slopes_at(rates, x2, c, w, x2t, ct, k, kt, a, at)
-            for r in range(n):
-                for i in range(9):
-                    total[r, i] += weight * k[r, i]
-                    for q in range(d):
-                        totalt[r, i, q] += weight * kt[r, i, q]
-        for r in range(n):
-            h = duration[r] / steps
-            for i in range(9):
-                x[r, i] += h / 6.0 * total[r, i]
-                for q in range(d):
-                    xt[r, i, q] += (h * totalt[r, i, q] + durationt[r, q] / steps * total[r, i]) / 6.0
+        own = Law(rates, c[r : r + 1], ct[r : r + 1], w)
+        put(x[0], start[r])
+        put_all(xt[0], startt[r])
+        for s in range(count + 1):
+            if s:
+                step_on(own, x, xt, step[r : r + 1], still, k, kt)
+            slopes_at(own, x, xt, k, kt, a, at)
+            put(nodes[r, s], x[0])
+            put_all(nodest[r, s], xt[0])
+            put(slopes[r, s], k[0])
+            put_all(slopest[r, s], kt[0])
 
 
 @machine_code(NOTHING(FUNCTION, TWO, THREE, TWO, THREE, ONE, ONE, TWO, COUNT))
 def fly_together(rates, state, statet, c, ct, w, dt, dtt, steps):
-    """Move m balls on by durations dt (m,) s with tangents dtt (m, d), in so many equal steps each, in place."""
+    """Move m balls on by durations dt (m,) s with tangents dtt (m, d), in so many equal steps each, in place.
+
+    Durations may be negative. The rates of some balls are computed together.
+    """
     for first in range(0, len(state), TOGETHER):
         past = min(first + TOGETHER, len(state))
-        x, xt, own, ownt = state[first:past], statet[first:past], c[first:past], ct[first:past]
-        fly_side_by_side(rates, x, own, w, xt, ownt, dt[first:past], dtt[first:past], steps)
+        x, xt, own = state[first:past], statet[first:past], Law(rates, c[first:past], ct[first:past], w)
+        n, d = len(x), xt.shape[2]
+        h, ht = dt[first:past] / steps, dtt[first:past] / steps
+        k, kt, a, at = np.empty((n, 9)), np.empty((n, 9, d)), np.empty((n, 6)), np.empty((n, 6, d))
+        for _ in range(steps):
+            slopes_at(own, x, xt, k, kt, a, at)
+            step_on(own, x, xt, h, ht, k, kt)
+
+
+@machine_code(NOTHING(FUNCTION, ONE, ONE, ONE, TWO, TWO, REAL, ONE, COUNT))
+def fly_one(rates, x, c, w, xt, ct, duration, durationt, steps):
+    """`fly_together` of one ball: x (9,), c (p,), tangents (9, d), (p, d) and (d,)."""
+    p, d = len(c), xt.shape[1]
+    one, moved, own = x.reshape(1, 9), xt.reshape(1, 9, d), Law(rates, c.reshape(1, p), ct.reshape(1, p, d), w)
+    k, kt, a, at = np.empty((1, 9)), np.empty((1, 9, d)), np.empty((1, 6)), np.empty((1, 6, d))
+    h, ht = np.empty(1), np.empty((1, d))
+    h[0] = duration / steps
+    for q in range(d):
+        ht[0, q] = durationt[q] / steps
+    for _ in range(steps):
+        slopes_at(own, one, moved, k, kt, a, at)
+        step_on(own, one, moved, h, ht, k, kt)

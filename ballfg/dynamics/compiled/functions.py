@@ -1,4 +1,4 @@
-"""The functions of a ball model as machine code: rates, impact and surface, each with its tangents."""
+"""Compiles the functions of a ball model, rates, impact and surface, each with its tangents."""
 
 from __future__ import annotations
 
@@ -18,19 +18,22 @@ from torch import Tensor, nn
 
 from ballfg.arrays import Array
 from ballfg.dynamics.compiled.build import Code, built, digest, read_note, write_note
+from ballfg.dynamics.compiled.flight import fly_together
 from ballfg.dynamics.compiled.places import Numbers, numbers_of
 from ballfg.dynamics.compiled.translation.recipe import Recipe
 from ballfg.dynamics.model import BallModel, is_substituted, substitute
+from ballfg.dynamics.motion.flight_step import step_jacobian
+from ballfg.dynamics.motion.limits import MAX_STEP
 from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.progress import doing
 from ballfg.state import STATE_DIM
 
 VALUES_AGREE: Final = 1e-12
-"""Relative difference up to which a compiled value is that of torch."""
+"""Largest relative difference between a compiled value and torch's."""
 SLOPES_AGREE: Final = 1e-10
-"""As `VALUES_AGREE`, of derivatives."""
+"""Largest relative difference between a compiled derivative and torch's."""
 COMPARED: Final = 4
-"""Random states at which both are computed."""
+"""Number of random states at which both are computed."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +43,9 @@ class Function:
     Attributes:
         compute: `compute(x, c, w, xt, ct, y, yt)`: n states x (n, 9), their coefficients c (n, p), weights w (k,),
             tangents xt (n, 9, d) and ct (n, p, d); writes the results y (n, m) and their tangents yt (n, m, d).
-        names: of the p coefficients that matter, as in `model.named_parameters()`.
+        names: of the p coefficients that the function uses, as in `model.named_parameters()`.
         size: m.
-        weigh: gives the weights from a model's tables; None where there are none.
+        weigh: computes the weights from a model's tables; None if there are none.
     """
 
     compute: Code
@@ -68,7 +71,7 @@ class CompiledModel:
     radius: float
 
     def weights(self, model: BallModel) -> tuple[Array, Array, Array]:
-        """Those that rates, impact and surface take, from a model's tables as they are now."""
+        """Weights of rates, impact and surface from a model's present tables."""
         if all(part.weigh is None for part in (self.rates, self.impact, self.surface)):
             return NONE, NONE, NONE
         numbers = numbers_of(model)
@@ -84,11 +87,11 @@ class CompiledModel:
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights that were made from a model's tables.
+    """Weights that were computed from a model's tables.
 
     Attributes:
-        stamp: of the tables, which changes when they do.
-        tables: kept, so that no others can have their place in memory, and with it their stamp.
+        stamp: identifies the state of the tables; it changes when they do.
+        tables: kept alive, so that no others get their place in memory, and with it their stamp.
         of_parts: of rates, impact and surface, (k,) each.
     """
 
@@ -101,17 +104,17 @@ NONE: Final = np.zeros(0)
 """The weights of a function without tables."""
 _weights: weakref.WeakKeyDictionary[BallModel, Weights] = weakref.WeakKeyDictionary()
 _OF_TORCH: Final = frozenset(vars(nn.Module()))
-"""What every module has; its parameters, buffers and parts are looked at by themselves."""
+"""Attributes of every module; its parameters, buffers and parts are compared by themselves."""
 _BESIDE: Final = frozenset({"trained", "noise", "variations", "measurement"})
-"""What a ball model carries beside its motion."""
+"""Attributes of a ball model that do not belong to its motion."""
 
 
 class NotTheSameError(Exception):
-    """Compiled code that does not give what torch gives."""
+    """Compiled code gives other values than torch."""
 
 
 class NotComparableError(Exception):
-    """A module of which nobody can say whether another one computes the same."""
+    """A module that cannot be compared with another one."""
 
 
 _by_model: weakref.WeakKeyDictionary[BallModel, tuple[Numbers, CompiledModel | None]] = weakref.WeakKeyDictionary()
@@ -120,9 +123,9 @@ _LOOKING: Final = threading.RLock()  # threads that want the same functions wait
 
 
 def compiled(model: BallModel) -> CompiledModel | None:
-    """The functions of a model, whose parameters they take as arguments; None where one cannot be compiled.
+    """The functions of a model, with its parameters as arguments; None if one cannot be compiled.
 
-    Args: model: without substituted parameters. Where another module is put into it, it gets other functions.
+    Args: model: without substituted parameters. After an exchange of a module it gets other functions.
     """
     known = _by_model.get(model)
     if known is not None and known[0] is numbers_of(model):
@@ -141,7 +144,7 @@ def compiled(model: BallModel) -> CompiledModel | None:
 
 
 def _structure(module: nn.Module) -> Hashable:
-    """What decides which functions a module computes, but for its parameters; copies of a model share it.
+    """The structure that decides which functions a module computes, apart from its parameters; copies share it.
 
     Raises: NotComparableError: if the module has attributes that cannot be compared.
     """
@@ -172,7 +175,9 @@ def _compiled(model: BallModel, key: Hashable | None) -> CompiledModel | None:
     try:
         with doing("machine code for this model"):
             rates, impact, surface = (_function(model, part, key) for part in PARTS)
-        return CompiledModel(rates, impact, surface, model.radius)
+            made = CompiledModel(rates, impact, surface, model.radius)
+            _compare_steps(model, made)
+        return made
     except ImportError:
         raise
     except Exception as error:  # a user's own effect may do anything, and torch runs it all the same
@@ -198,11 +203,11 @@ def _surface(model: BallModel, state: Tensor) -> Tensor:
 
 
 PARTS: Final = (_rates, _impact, _surface)
-"""What is compiled of a model: functions of it and of a state (9,)."""
+"""The functions that are compiled: of a model and of a state (9,)."""
 
 
 def _function(model: BallModel, function: Callable[[BallModel, Tensor], Tensor], key: Hashable | None) -> Function:
-    """A function, from disk where a model of this structure was traced before and torch still gives the same."""
+    """A function, from disk if a model of this structure was traced before and torch gives the same values."""
     files = None if key is None else _files_of(model)
     known = None if files is None else f"{function.__name__}, {key}, {files}, {_generator()}, torch {torch.__version__}"
     kept = None if known is None else read_note(known)
@@ -225,13 +230,13 @@ def _function(model: BallModel, function: Callable[[BallModel, Tensor], Tensor],
 
 @cache
 def _generator() -> str:
-    """Hashes of the files that decide what a function's source is, so that no older source is taken for it."""
+    """Hashes of the files that generate source, so that source of another version is never loaded."""
     folder = Path(__file__).parent
     return ",".join(digest(file) for file in (folder / "build.py", *sorted((folder / "translation").glob("*.py"))))
 
 
 def _files_of(model: BallModel) -> str | None:
-    """Hashes of the files that define the parts of a model; None where one has no file."""
+    """Hashes of the files that define the parts of a model; None if one has no file."""
     found = set()
     for part in model.modules():
         file = getattr(sys.modules.get(type(part).__module__), "__file__", None)
@@ -242,7 +247,7 @@ def _files_of(model: BallModel) -> str | None:
 
 
 def _traced(model: BallModel, function: Callable[[BallModel, Tensor], Tensor]) -> tuple[str, Function]:
-    """A function that was traced anew, and its source."""
+    """A newly traced function, and its source."""
     from ballfg.dynamics.compiled.translation.source import function_source
     from ballfg.dynamics.compiled.translation.trace import trace  # torch's tracer takes a second to import
     from ballfg.dynamics.networks.layers import MNN
@@ -268,7 +273,7 @@ def _traced(model: BallModel, function: Callable[[BallModel, Tensor], Tensor]) -
 
 
 def _compare(model: BallModel, function: Callable[[BallModel, Tensor], Tensor], made: Function) -> None:
-    """Hold a compiled function against torch at a few states.
+    """Compares a compiled function with torch at a few states.
 
     Raises: NotTheSameError: if they differ.
     """
@@ -291,9 +296,29 @@ def _compare(model: BallModel, function: Callable[[BallModel, Tensor], Tensor], 
     made.compute(*given, y, yt)
     for k in range(COMPARED):
         x, c = torch.from_numpy(states[k]), torch.from_numpy(coefficients[k])
-        right = of_both(x, c).detach().numpy()
+        right = of_both(x, c).detach()
         rows = torch.cat([j.reshape(made.size, -1) for j in torch.autograd.functional.jacobian(of_both, (x, c))], dim=1)
-        for got, wanted, limit in ((y[k], right, VALUES_AGREE), (yt[k], rows.numpy(), SLOPES_AGREE)):
-            scale = np.maximum(1.0, np.abs(wanted))
-            if not (np.abs(got - wanted) <= limit * scale).all():
-                raise NotTheSameError(f"compiled {function.__name__} of {type(model).__name__} differs from torch")
+        _agree(f"{function.__name__} of {type(model).__name__}", (y[k], yt[k]), (right, rows))
+
+
+def _compare_steps(model: BallModel, made: CompiledModel) -> None:
+    """Hold a step of compiled flight, and its Jacobian, against the definition in torch, at a few states.
+
+    Raises: NotTheSameError: if they differ.
+    """
+    states = np.random.default_rng(0).normal(size=(COMPARED, STATE_DIM)) * np.repeat((1.0, 5.0, 100.0), 3)
+    start = torch.tensor(states)
+    right = step_jacobian(model, start, start.new_full((COMPARED, 1), MAX_STEP))
+    moved, names = np.tile(np.eye(STATE_DIM), (COMPARED, 1, 1)), made.rates.names
+    c = np.tile([numbers_of(model).value(name) for name in names], (COMPARED, 1)).reshape(COMPARED, len(names))
+    given = (c, np.zeros((*c.shape, STATE_DIM)), made.weights(model)[0], np.full(COMPARED, MAX_STEP))
+    fly_together(made.rates.compute, states, moved, *given, np.zeros((COMPARED, STATE_DIM)), 1)
+    _agree(f"flight of {type(model).__name__}", (states, moved), right)
+
+
+def _agree(name: str, got: tuple[Array, Array], right: tuple[Tensor, Tensor]) -> None:
+    """Refuse values and derivatives that are not those of torch. Raises: NotTheSameError."""
+    for own, tensor, limit in zip(got, right, (VALUES_AGREE, SLOPES_AGREE), strict=True):
+        wanted = tensor.numpy()
+        if not (np.abs(own - wanted) <= limit * np.maximum(1.0, np.abs(wanted))).all():
+            raise NotTheSameError(f"compiled {name} differs from torch")

@@ -1,6 +1,6 @@
-"""Functions of a model that torch computes, in the shape in which machine code calls them.
+"""Calls a model's torch functions from machine code, for models that cannot be compiled.
 
-They serve models that cannot be compiled: prediction then runs the same code for every model, only more slowly.
+Prediction then runs the same code for every model, only more slowly.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from ballfg.dynamics.compiled.signatures import ONE, THREE, TWO
 from ballfg.dynamics.model import BallModel, substitute
 
 SIZES: Final = (6, 9, 3)
-"""Numbers that rates, impact and surface give."""
+"""Number of outputs of rates, impact and surface."""
 
 _asked: dict[int, Callable[[Tensor, Tensor], Tensor]] = {}
 
@@ -42,7 +42,7 @@ _failed = _Failed()
 
 
 def _answer(number, x, c, xt, ct, y, yt):  # type: ignore[no-untyped-def]
-    """Compute one function; an error waits for `raise_errors`, since machine code cannot pass it on."""
+    """Computes one function; an error waits for `raise_errors`, since machine code cannot pass it on."""
     try:
         given = (torch.from_numpy(np.array(x)), torch.from_numpy(np.array(c)))
         if not xt.shape[1]:
@@ -77,7 +77,7 @@ def _code() -> Code:
 
 @dataclass(frozen=True)
 class InTorch(CompiledModel):
-    """The functions of a model that torch computes; `numbers` are the weights by which they are known."""
+    """The functions of a model in torch; their weights are the `numbers` that identify them."""
 
     numbers: tuple[int, int, int]
 
@@ -92,7 +92,7 @@ _next = count()
 
 
 def in_torch(model: BallModel) -> InTorch:
-    """The functions of any model, each of whose calls costs about half a millisecond."""
+    """The functions of any model; each call costs about half a millisecond."""
     if model not in _made:
         names, known = tuple(numbers_of(model).scalars), weakref.ref(model)
         numbers = (next(_next), next(_next), next(_next))
@@ -118,7 +118,7 @@ def _value(
 
 
 def raise_errors() -> None:
-    """Raise what torch raised while machine code was running."""
+    """Raises the error that torch raised while machine code was running."""
     if _failed.errors:
         first = _failed.errors[0]
         _failed.errors.clear()

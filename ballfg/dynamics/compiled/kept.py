@@ -1,7 +1,7 @@
-"""Where machine code is kept from one process to the next, whatever may be read and written there.
+"""Keeps machine code on disk from one process to the next, in folders that nobody else can change.
 
-Machine code is run as it is found. So it is read from folders that nobody but this user and root can change, wherever
-their names come from, and each file says of which function, sources, versions and processor it is.
+Machine code is run as it is found. So it is read only from folders that this user and root alone can change, and each
+file states its function, its sources, their versions and the processor.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def cache_folder() -> Path:
 
 @cache
 def _is_trusted(folder: Path) -> bool:
-    """Whether machine code in a folder may be run; where not, the first such folder is named on stderr."""
+    """True if machine code in a folder may be run; else the first such folder is named on stderr."""
     trusted = is_own(folder)
     if not trusted and NOTED not in os.environ and sys.stderr is not None:
         os.environ[NOTED] = "1"
@@ -72,7 +72,7 @@ def _is_trusted(folder: Path) -> bool:
 
 
 def readable(name: str) -> list[Path]:
-    """Where a kept file may be found: a folder that an administrator has filled is read though nothing is written."""
+    """Path of a kept file; a folder that an administrator has filled is read though nothing is written to it."""
     folders = [cache_folder()]
     with suppress(RuntimeError):
         if _is_trusted(configured_folder()):
@@ -81,7 +81,7 @@ def readable(name: str) -> list[Path]:
 
 
 def keep(name: str, text: str) -> Path:
-    """Write a file to the cache at once: another process never reads half of it. Returns: its path."""
+    """Writes a file to the cache atomically: another process never reads half of it. Returns: its path."""
     path = cache_folder() / name
     with _replaced(path) as file:
         file.write(text.encode())
@@ -90,7 +90,7 @@ def keep(name: str, text: str) -> Path:
 
 @contextmanager
 def _replaced(path: Path) -> Iterator[IO[bytes]]:
-    """A new file that takes the place of another one; this user alone may change it."""
+    """A new file that replaces another one; only this user may change it."""
     part = path.with_name(f"{path.name}.{uuid.uuid4().hex}.part")
     try:
         with open(part, "wb", opener=lambda name, flags: os.open(name, flags, FOR_OTHERS_TO_READ)) as file:
@@ -116,7 +116,7 @@ class _Beside(_InTree):
 
 
 class _Trusted:
-    """A locator of numba's, which finds nothing where somebody else could change what it finds."""
+    """A locator of numba's that ignores folders in which somebody else could change the code."""
 
     def __init__(self, locator: Any) -> None:
         self._locator = locator
@@ -140,9 +140,9 @@ class _Read(CompileResultCacheImpl):
 
 
 class _Checked(IndexDataCacheFile):
-    """Files of machine code, each with what it is of, and with the digest of the rest.
+    """Files of machine code, each with its key and with a digest of the rest.
 
-    Damaged code, or that of another function, ends the process, or computes nonsense.
+    Damaged code, or another function's, would end the process or compute nonsense.
     """
 
     def __init__(self, folder: str, base: str, stamp: str) -> None:
@@ -151,11 +151,11 @@ class _Checked(IndexDataCacheFile):
         self._about = f"{base}, {stamp}, {self._version}"
 
     def save(self, key: Any, data: Any) -> None:
-        """Keep code. Args: key: signature, processor and its features, bytecode."""
+        """Keeps code. Args: key: signature, processor and its features, bytecode."""
         super().save(key, (f"{self._about}, {key}", data))
 
     def load(self, key: Any) -> Any:
-        """The code of a key; None where there is none. Raises: ValueError: other code was put in its place."""
+        """The code of a key; None if there is none. Raises: ValueError: the file holds other code."""
         about, data = super().load(key) or ("", None)
         if data is not None and about != f"{self._about}, {key}":
             raise ValueError(f"{self._index_name} must lead to its own code. It is compiled again.")
@@ -193,7 +193,7 @@ def _digest(content: bytes) -> bytes:
 
 @cache
 def _stamp(file: str) -> str:
-    """Digest of a source file and of those of ballfg that it imports, directly or not: what it calls is built in."""
+    """Digest of a source file and of all ballfg files that it imports, since their functions are compiled in."""
     found, waiting = dict[str, bytes](), [file]
     while waiting:
         path = waiting.pop()
@@ -226,10 +226,9 @@ class _KeptBeside(_Cache):
 class Kept(_Cache):
     """Machine code of a function on disk.
 
-    It is written to the first folder that numba can write to and nobody else can change, and read from beside the
-    source too, where whoever installed the package may have compiled it; `NUMBA_CACHE_DIR` is the only folder where it
-    is set. What cannot be read, is damaged, as after a power failure, or belongs to somebody else is made again; a full
-    disk costs time.
+    It is written to the first folder that numba can write to and nobody else can change. It is also read from beside
+    the source, where an administrator may have compiled it; if `NUMBA_CACHE_DIR` is set, only from there. Unreadable,
+    damaged or foreign code is compiled again; a full disk only costs time.
     """
 
     _impl_class: Any = _Written
@@ -243,7 +242,7 @@ class Kept(_Cache):
             self._beside = _KeptBeside(function)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The code that was kept; None where there is none."""
+        """The kept code; None if there is none."""
         found = self._loaded(super(), sig, target_context)
         if found is None and self._beside is not None:
             found = self._loaded(self._beside, sig, target_context)
@@ -258,6 +257,6 @@ class Kept(_Cache):
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep code for other processes."""
+        """Keeps code for other processes."""
         with suppress(OSError):
             super().save_overload(sig, data)

@@ -1,4 +1,4 @@
-"""What layers of networks need inside of generated functions: matrix products and tanh, each compiled once for all."""
+"""Computes matrix products and tanh for the network layers in generated functions, each compiled only once."""
 
 from typing import Final
 
@@ -18,7 +18,7 @@ LN2: Final = 6.93147180369123816490e-01
 LN2_REST: Final = 1.90821492927058770002e-10
 """ln 2 in two parts, the first of which times a whole number is exact."""
 BITS, BIAS = np.int64(52), np.int64(1023 << 52)
-"""Where a float64 has its exponent."""
+"""Place of the exponent in a float64."""
 STEEP: Final = 0.625
 """Below, 1 - 2 / (exp(2x) + 1) would lose digits."""
 

@@ -1,4 +1,4 @@
-"""Flight and contacts of a batch with their Jacobians, in machine code."""
+"""Moves batches of balls through flight and contacts in machine code, with Jacobians."""
 
 from __future__ import annotations
 
@@ -16,24 +16,23 @@ from ballfg.dynamics.compiled.functions import CompiledModel, Function, compiled
 from ballfg.dynamics.compiled.places import numbers_of
 from ballfg.dynamics.compiled.roll_out import roll_out as roll_out_rows
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.integrate import step_count
-from ballfg.dynamics.motion.limits import BEYOND
+from ballfg.dynamics.motion.limits import BEYOND, step_count
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import STATE_DIM
 
 
 class Moving:
-    """Balls with the derivatives of their states by where they began, as machine code moves them.
+    """Balls that machine code moves, with the derivatives of their states by the initial ones.
 
     Args:
-        model: the ball; coefficients that travel with the states are columns of theirs.
+        model: the ball; coefficients that travel with the states are columns of the states.
         functions: of the model.
         states: (n, 9 + p).
         width: d, 9 + p, or 0 for no derivatives.
 
     Attributes:
         states: (n, 9) where the balls are.
-        moved: (n, 9, d) derivatives by the states they began with.
+        moved: (n, 9, d) derivatives by the initial states.
         elapsed, slower: (n,) s so far, and (n, d) its derivatives: contacts come sooner or later.
     """
 
@@ -53,7 +52,7 @@ class Moving:
         self._known: dict[tuple[str, ...], tuple[Array, Array]] = {}
 
     def fly(self, dt: Array) -> None:
-        """Move on by dt (n,) s, less what has elapsed."""
+        """Moves on by dt (n,) s, less the elapsed time."""
         left, earlier = np.ascontiguousarray(dt - self.elapsed), -self.slower
         steps = step_count(left)
         rates = self.functions.rates
@@ -61,7 +60,7 @@ class Moving:
         fly_together(rates.compute, *given)
 
     def bounce(self, height: Array, longest: Array) -> None:
-        """Move on through the next contact with surfaces at some heights (n,) m; NaN where there is none."""
+        """Moves on through the next contact with surfaces at some heights (n,) m; NaN if there is none."""
         n, _, width = self.moved.shape
         functions = (self.functions.rates, self.functions.impact, self.functions.surface)
         given = [array for function in functions for array in self.coefficients(function)]
@@ -87,7 +86,7 @@ class Moving:
         self.elapsed, self.slower = self.elapsed + tau, self.slower + slower
 
     def meets(self, height: Array, longest: Array) -> Array:
-        """(n,) s until the next contact with surfaces at some heights (n,) m; NaN where there is none."""
+        """(n,) s until the next contact with surfaces at some heights (n,) m; NaN if there is none."""
         rates, surface, tau = self.functions.rates, self.functions.surface, np.empty(len(self.states))
         c, s = (self.coefficients(function)[0] for function in (rates, surface))
         w, _, ws = self.weights
@@ -96,7 +95,7 @@ class Moving:
         return tau
 
     def whole(self) -> Tensor:
-        """(n, 9 + p) states with the coefficients that travel with them."""
+        """(n, 9 + p) states with their coefficients."""
         return torch.from_numpy(np.concatenate((self.states, self.travelling), axis=1))
 
     def results(self) -> tuple[Tensor, Tensor]:
@@ -109,7 +108,7 @@ class Moving:
         return self.whole(), torch.from_numpy(jacobian)
 
     def coefficients(self, function: Function) -> tuple[Array, Array]:
-        """(n, p) of a function for each ball, and (n, p, d) how they move."""
+        """(n, p) coefficients of a function for each ball, and their tangents (n, p, d)."""
         if function.names not in self._known:
             n, _, width = self.moved.shape
             values, moved = np.empty((n, len(function.names))), np.zeros((n, len(function.names), width))
@@ -125,9 +124,9 @@ class Moving:
 
 
 def functions_of(model: BallModel) -> CompiledModel | None:
-    """The functions of a model, with or without coefficients that travel with the state.
+    """The functions of a model, also for coefficients that travel with the state.
 
-    A subclass of `AugmentedModel` may compute anything, or draw random numbers: torch asks it itself.
+    A subclass of `AugmentedModel` may compute anything, or draw random numbers: torch evaluates it.
     """
     if isinstance(model, AugmentedModel):
         return compiled(model.model) if type(model) is AugmentedModel else None
@@ -155,9 +154,9 @@ def contact_time(
 def roll_out(
     model: BallModel, functions: CompiledModel, state: Tensor, steps: Tensor, surfaces: Surfaces
 ) -> tuple[Tensor, Tensor]:
-    """As `rollout.rollout`, of durations (n, k) s one after another: states (n, k, 9), and how many are right, (n,).
+    """Durations (n, k) s one after another, as in `rollout.rollout`: states (n, k, 9) and how many are valid (n,).
 
-    A ball that rests, or may come to rest, is left where that duration began.
+    A ball that rests, or may come to rest, stays where that duration began.
     """
     n, width = state.shape
     moving = Moving(model, functions, state.detach(), 0)
@@ -178,7 +177,7 @@ def world_of(surfaces: Surfaces, radius: float) -> Array:
 
 
 def _numbers(given: Tensor | float, shape: torch.Size) -> Array:
-    """(n,) of one number or one a ball."""
+    """(n,) from a scalar or from one number per ball."""
     if isinstance(given, Tensor):
         return np.ascontiguousarray(given.detach().expand(shape).reshape(-1).numpy(), dtype=np.float64)
     return np.full(shape.numel(), given, dtype=np.float64)
@@ -213,7 +212,7 @@ def fly_through_jacobian(
 
 
 def _through(moving: Moving, dt: Tensor, heights: Sequence[Tensor | float]) -> Tensor:
-    """Move balls on by dt (n,) s with a contact at each height on the way; the times of these (n, k) s."""
+    """Moves balls by dt (n,) s with a contact at each height on the way; returns the contact times (n, k) s."""
     whole, times = np.ascontiguousarray(dt.detach().numpy()), []
     for height in heights:
         moving.bounce(np.full(whole.shape, height, dtype=np.float64), np.abs(whole) + BEYOND)

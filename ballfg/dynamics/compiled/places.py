@@ -1,4 +1,4 @@
-"""Where a model keeps its numbers, the coefficients and the tables of weights that machine code takes."""
+"""Finds the coefficients and weights that a model passes to machine code, without a search at each call."""
 
 import weakref
 from collections.abc import Hashable, Mapping, Sequence
@@ -12,7 +12,7 @@ from ballfg.dynamics.model import BallModel
 
 @dataclass(frozen=True)
 class Numbers:
-    """Where a model keeps its numbers: looking for them takes longer than a flight.
+    """References to a model's numbers: searching for them takes longer than a flight.
 
     Attributes:
         scalars: by name, the dictionary and the key at which a coefficient lies.
@@ -27,23 +27,23 @@ class Numbers:
     ball: tuple[float, float]
 
     def are_of(self, model: BallModel) -> bool:
-        """Whether a model still consists of the same modules: someone may have put another effect in."""
+        """True if a model still consists of the same modules, none of them exchanged."""
         for held, parts in self.parts:
             if tuple(held.values()) != parts:
                 return False
         return self.ball == (model.radius, model.inertia_factor)
 
     def value(self, name: str) -> float:
-        """A coefficient as it is now."""
+        """Present value of a coefficient."""
         owner, key = self.scalars[name]
         return float(owner[key].item())
 
     def tables(self) -> list[Tensor]:
-        """The arrays as they are now."""
+        """Present arrays."""
         return [owner[key] for owner, key in self.arrays.values()]
 
     def stamp(self) -> Hashable:
-        """Changes when a number does, as long as the `tables` of an earlier stamp are kept alive."""
+        """A number that changes with any value, as long as the `tables` of an earlier stamp are kept alive."""
         values = tuple(self.value(name) for name in self.scalars)
         tables = tuple((id(table), table._version, table.data_ptr()) for table in self.tables())
         return self.ball, tuple(self.scalars), values, tables
@@ -53,7 +53,7 @@ _numbers: weakref.WeakKeyDictionary[BallModel, Numbers] = weakref.WeakKeyDiction
 
 
 def numbers_of(model: BallModel) -> Numbers:
-    """Where a model keeps its numbers.
+    """References to the numbers of a model.
 
     Args: model: without substituted parameters.
     """

@@ -1,4 +1,4 @@
-"""Machine code that moves balls from time to time, through contacts, by the rules of `motion.rollout`."""
+"""Moves balls from time to time through contacts in machine code, by the rules of `motion.rollout`."""
 
 import math
 
@@ -21,14 +21,14 @@ from ballfg.dynamics.compiled.signatures import (
     THREE_WEIGHTS,
     TWO,
 )
-from ballfg.dynamics.motion.limits import LONGEST_FALL, LONGEST_MOTION, MAX_CONTACTS, MAX_STEP, REST_SPEED
+from ballfg.dynamics.motion.limits import LONGEST_FALL, LONGEST_MOTION, MAX_CONTACTS, REST_SPEED, steps_over
 
 
 @machine_code(FLAG(THREE_FUNCTIONS, THREE_VALUES, THREE_WEIGHTS, ONE, REAL, REAL, ONE, ONE))
 def _through(functions, values, weights, x, level, h, world, after):
-    """Move a ball x (9,) on by h s, one step at most, to `after` (9,); whether it rests or may come to rest on the way.
+    """Moves a ball x (9,) by h s, at most one step, to `after` (9,); True if it rests or may come to rest.
 
-    It starts in flight, and `after` is where it would be without the surface at `level` m.
+    It starts in flight; `after` holds the state that the ball would have without the surface at `level` m.
     """
     rates, impact, surface = functions
     c, b, s = values
@@ -45,7 +45,7 @@ def _through(functions, values, weights, x, level, h, world, after):
         if level == world[0] and not math.isnan(tau[0]):
             touch = at[0].copy()
             fly_one(rates, touch, c[0], w, empty, ct[0], tau[0], np.empty(0), 1)
-            if not over_table(touch, world):  # beside the table: the floor is what it falls on
+            if not over_table(touch, world):  # beside the table: the ball falls on the floor
                 level = world[1]
                 if gap_of(surface, after, s[0], ws, level, world[2]) >= 0.0:
                     return False
@@ -68,7 +68,7 @@ def roll_out(rates, impact, surface, values, weights, start, durations, world, s
     """Balls start (m, 9) after each of k durations (m, k) s, one after another.
 
     Args: world: table's and floor's height and radius in m, the table's ends, as in `Course`.
-    Writes: states (m, k, 9); reached (m,), how many of them: a ball that rests is left where the duration began.
+    Writes: states (m, k, 9); reached (m,), the number of valid ones: a ball that rests stays where it was.
     """
     functions, (c, b, s), (w, _, ws) = (rates, impact, surface), values, weights
     m, k = durations.shape
@@ -80,7 +80,7 @@ def roll_out(rates, impact, surface, values, weights, start, durations, world, s
         longest = 0.0
         for r in range(m):
             longest = max(longest, min(durations[r, j], LONGEST_MOTION))
-        steps = max(1, math.ceil(longest / MAX_STEP - 1e-9))
+        steps = steps_over(longest)
         for r in range(m):
             step[r] = min(durations[r, j], LONGEST_MOTION) / steps
         for _ in range(steps):

@@ -1,6 +1,6 @@
-"""Types of what machine code takes."""
+"""Declares the argument types of compiled functions."""
 
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from numba import types
 
@@ -19,16 +19,29 @@ FUNCTION: Final[Any] = types.FunctionType(types.void(TWO, TWO, ONE, THREE, THREE
 """A compiled function of a model, `compute(x, c, w, xt, ct, y, yt)`, of many states."""
 
 
+class Law(NamedTuple):
+    """A compiled function of a model, of n balls with coefficients c (n, p) and their tangents ct (n, p, d)."""
+
+    compute: Any
+    c: Any
+    ct: Any
+    w: Any
+    """(k,) weights."""
+
+
+LAW: Final[Any] = types.NamedTuple((FUNCTION, TWO, THREE, ONE), Law)
+
+
 def several(kind: Any, count: int) -> Any:
-    """A tuple of so many results of one kind."""
+    """A tuple of `count` equal types."""
     return types.UniTuple(kind, count)
 
 
 THREE_FUNCTIONS: Final[Any] = several(FUNCTION, 3)
 """Rates, impact and surface of a model."""
 THREE_VALUES: Final[Any] = several(TWO, 3)
-"""Their coefficients, one row a ball."""
+"""The coefficients of these, one row per ball."""
 THREE_TANGENTS: Final[Any] = several(THREE, 3)
-"""How these move with the tangents."""
+"""The tangents of these coefficients."""
 THREE_WEIGHTS: Final[Any] = several(ONE, 3)
-"""Their weights."""
+"""The weights of the three functions."""

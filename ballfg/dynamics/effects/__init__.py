@@ -1,1 +1,1 @@
-"""Physical effects, the registry that names them, and effects of one's own."""
+"""Registers the physical effects by name, those of the package and those of users."""

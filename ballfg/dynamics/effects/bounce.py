@@ -1,4 +1,4 @@
-"""Effects on the impact and on the place of the surfaces: restitution, friction, the table's height and tilt."""
+"""Defines the effects on the impact and on the surfaces: restitution, friction, the table's height and tilt."""
 
 from collections.abc import Mapping, Sequence
 

@@ -1,4 +1,4 @@
-"""Which effect classes are accepted: what each must say, and what must not contradict itself."""
+"""Checks the declarations of an effect class for missing and contradicting entries."""
 
 from typing import NamedTuple
 
@@ -31,7 +31,7 @@ def check_effect(effect: type[Effect]) -> None:
 
 
 def _check_knowledge(effect: type[Effect]) -> None:
-    """What a class need not say, and must say rightly where it does."""
+    """Checks the optional declarations of a class."""
     owners = ("rig",) if effect.kind == "measurement" else ("ball", "room")
     if effect.belongs_to not in owners:
         raise ValueError(

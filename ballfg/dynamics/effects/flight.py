@@ -1,4 +1,4 @@
-"""Effects on the free ball: gravity, drag, Magnus force, spin decay, moving air."""
+"""Defines the effects on the free ball: gravity, drag, Magnus force, spin decay, moving air."""
 
 import itertools
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Generic effects: sums of terms in place, velocity and spin, for what nobody can name; one for each kind."""
+"""Generic effects describe patterns without a known cause as sums of terms in place, velocity and spin."""
 
 from collections.abc import Iterable, Mapping
 from typing import Final
@@ -64,7 +64,7 @@ def _coefficients(axes: Iterable[str], terms: Terms, bound: float = BOUND) -> tu
 
 
 def _center() -> tuple[Coefficient, ...]:
-    """The place from which terms in the place are counted."""
+    """The point from which terms in the place are counted."""
     middle = {"center_x": 1.4, "center_y": 0.0, "center_z": 1.0}
     return tuple(Coefficient(name, m, 0.0, "m", -100.0, 100.0, absent=None) for name, m in middle.items())
 
@@ -104,7 +104,7 @@ class GenericFlight(FlightEffect):
 class GenericContact(BounceEffect):
     """v + sum of c_{axis,term} term axis in place of the incoming velocity v, in the axes of the surface.
 
-    What comes out changes by the impulse's derivative: by -e c vertically, by c less what friction takes horizontally.
+    The outcome changes by the impulse's derivative: by -e c vertically, by c less the part of friction horizontally.
     """
 
     name = "generic_contact"

@@ -1,4 +1,4 @@
-"""Effects on what is written down: the clock, the frame of the positions, the spin labels."""
+"""Defines the effects on the recorded data: the clock, the frame of the positions, the spin labels."""
 
 import itertools
 from collections.abc import Mapping, Sequence

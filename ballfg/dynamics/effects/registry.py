@@ -1,4 +1,4 @@
-"""The effects that a model file may name: all that the modules of this folder define, and those of other packages."""
+"""Registers the effects that a model file may name: those of this folder and those of other packages."""
 
 from collections.abc import Iterator
 from importlib import import_module
@@ -16,7 +16,7 @@ from ballfg.registry import Registry
 GENERIC: Final[dict[str, type[Effect]]] = {
     effect.name: effect for effect in (generic.GenericFlight, generic.GenericContact, generic.GenericMeasurement)
 }
-"""Sums of terms that a model file may name too. They describe without explaining, so no search for causes has them."""
+"""Sums of terms that a model file may name. They describe without explaining, so searches for causes skip them."""
 
 
 def _check(effect: type[Effect]) -> None:
@@ -32,7 +32,7 @@ def _check(effect: type[Effect]) -> None:
 EFFECTS: Final = Registry[Effect](
     "effect", group="ballfg.effects", base=BASES, remedy=REMEDY, check=_check, reserved=GENERIC
 )
-"""Every effect that a search for causes may find, by the name that model files use."""
+"""Every effect that a search for causes may find, by its name in model files."""
 
 
 def _own() -> Iterator[type[Effect]]:

@@ -1,1 +1,1 @@
-"""How a ball gets from one state to a later one: integration, contacts, rollouts."""
+"""Moves a ball from one state to a later one: integration, contacts, rollouts."""

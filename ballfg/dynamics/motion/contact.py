@@ -1,4 +1,4 @@
-"""Contacts with a surface: when the ball touches it, and the flow through one or more contacts.
+"""Finds the times of contacts with a surface and computes the flow through one or more contacts.
 
 The contact time is a function of the state. A search finds it without a graph; two Newton steps then run with one. A
 Newton step from the solution has the solution's exact first derivative, two steps have its derivatives up
@@ -11,8 +11,10 @@ import math
 import torch
 from torch import Tensor
 
+from ballfg.dynamics.compiled import motion
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.integrate import batch_jacobian, fly, fly_jacobian, followed, is_plain, rk4_step
+from ballfg.dynamics.motion.flight_step import rk4_step
+from ballfg.dynamics.motion.integrate import batch_jacobian, fly, fly_jacobian, followed, is_plain
 from ballfg.dynamics.motion.limits import (
     BEYOND,
     GAP_TOLERANCE,
@@ -48,8 +50,6 @@ def contact_time(
 def _found(model: BallModel, state: Tensor, height: Tensor | float, longest: Tensor | float) -> Tensor:
     """`contact_time` without derivatives."""
     if not followed(state, height, longest):
-        from ballfg.dynamics.compiled import motion  # which needs the models, and these this file
-
         calm = model.in_flight
         functions = motion.functions_of(calm)
         if functions is not None:
@@ -139,8 +139,6 @@ def fly_through(
         never comes; they have no part in any gradient.
     """
     if not followed(state, dt, *heights):
-        from ballfg.dynamics.compiled import motion  # which needs the models, and these this file
-
         functions = motion.functions_of(model)
         if functions is not None:
             return motion.fly_through(model, functions, state, dt, heights)
@@ -169,8 +167,6 @@ def fly_through_jacobian(
     Returns: state after dt (n, 9), contact times (n, k) s, Jacobian (n, 9, 9); detached from any graph.
     """
     if is_plain(state):
-        from ballfg.dynamics.compiled import motion  # which needs the models, and these this file
-
         functions = motion.functions_of(model)
         if functions is not None:
             return motion.fly_through_jacobian(model, functions, state, dt, heights)

@@ -1,4 +1,4 @@
-"""The impulse of one impact on a plane: normal restitution, and Coulomb friction that slides or grips.
+"""Computes the impulse of an impact on a plane: normal restitution, and Coulomb friction that slides or grips.
 
 The plane is horizontal; vectors at a tilted one are turned into its axes first, by the shortest turn that takes the
 vertical into its normal.
@@ -59,7 +59,7 @@ def _smooth_minimum(slide: Tensor, grip: Tensor) -> Tensor:
 
 
 def to_plane(vector: Tensor, slope: Tensor) -> Tensor:
-    """A vector (..., 3) of the world in the axes of a plane that rises by `slope` (..., 2) along x and y.
+    """A world vector (..., 3) in the axes of a plane that rises by `slope` (..., 2) along x and y.
 
     With the normal n and q = n_x v_x + n_y v_y the turn of n into the vertical is (v_t - n_t (q / (1 + n_z) + v_z),
     q + n_z v_z), t for the two horizontal components; turning back has the opposite sign of n_t.
@@ -69,7 +69,7 @@ def to_plane(vector: Tensor, slope: Tensor) -> Tensor:
 
 
 def from_plane(vector: Tensor, slope: Tensor) -> Tensor:
-    """The vector (..., 3) of the world whose components in the plane's axes are given; undoes `to_plane`."""
+    """The world vector (..., 3) with given components in the plane's axes; undoes `to_plane`."""
     upright = (1.0 + slope.square().sum(-1, keepdim=True)).rsqrt()
     return _turn(vector, slope * upright, upright)
 

@@ -1,27 +1,37 @@
-"""Numbers that every integration and every search for a contact keeps to, in torch and in machine code."""
+"""Defines the limits of integrations and contact searches, for torch and machine code alike."""
 
+import math
 from typing import Final
 
+import numpy as np
+from numba.extending import register_jitable
+from torch import Tensor
+
+from ballfg.arrays import Array, Index
+
+STAGES: Final = ((0.5, 2.0), (0.5, 2.0), (1.0, 1.0))
+"""Of the classic Runge-Kutta scheme of order four, for the second stage to the last: how far along the step it lies, by
+the slope of the stage before, and how often its own slope counts; that of the first stage counts once, all six times.
+Source: E. Hairer, S. P. Norsett, G. Wanner, "Solving Ordinary Differential Equations I", 1993, table II.1.2."""
 MAX_STEP: Final = 0.02
 """s. Longer intervals are cut into equal steps. The error of a step of 0.02 s is 2e-9 m at 6 m/s, 2e-7 m at
 20 m/s."""
 SEARCH_STEPS: Final = 12
 """Upper bound on the search for a contact from a guess; one or two are enough for a contact within 20 ms."""
 TIME_TOLERANCE: Final = 1e-13
-"""s. The search stops when the bound on every contact time's error is below."""
+"""s. The search stops when the error bound of every contact time is below."""
 GAP_TOLERANCE: Final = 1e-10
 """m. A grazing ball whose search stalled this close to the surface has touched it."""
 TYPICAL_JERK: Final = 60.0
 """m/s^3, in the bound on the search's error."""
 DEEPEST: Final = 0.25
-"""m. A ball whose centre is further below the lowest surface is out of this world, and meets nothing. Floors are known
-to some centimetres."""
+"""m. A ball whose centre is further below the lowest surface meets nothing. Floors are known to some centimetres."""
 LEAST_FALL: Final = 1.0
 """m/s^2. The search takes a ball to fall at least as fast as this."""
 LONGEST_FALL: Final = 20.0
 """s. A contact further away counts as none."""
 BEYOND: Final = 0.3
-"""s. A contact that lies further away than its interval's length and this is no continuation of it any more: NaN."""
+"""s. A contact time further outside of its interval than this, and than the interval's length, is set to NaN."""
 MIN_SPEED: Final = 1e-6
 """m/s. Least normal speed that a Newton step divides by; a ball that grazes more gently is at its apex."""
 REST_SPEED: Final = 0.05
@@ -30,11 +40,38 @@ REST_GAP: Final = 1e-5
 """m. A ball this close to a surface and slower than half of `REST_SPEED` rests on it. A ball that left at `REST_SPEED`
 or faster is never both, so that a hop is the same motion however its time is cut."""
 NEGLIGIBLE: Final = 1e-4
-"""Share of balls that pass a table's edge on the other side than the mean, below which they do not count; they would
+"""Share of balls that pass a table's edge on the other side than the mean, below which they are neglected; they would
 add 0.05 m/s to a velocity."""
 LEAST_SIGMA: Final = 1e-12
-"""m. A place known better than this has a sigma of this."""
+"""m. Least standard deviation of a place."""
 LONGEST_MOTION: Final = 20.0
-"""s. A ball that nobody touches lies still by then; over a longer interval it is taken to stay where it is."""
+"""s. An untouched ball lies still by then; over a longer interval it stays in place."""
 MAX_CONTACTS: Final = 32
 """In one step of 20 ms a ball that leaves at `REST_SPEED` under its weight alone bounces at most twice."""
+
+
+@register_jitable
+def steps_over(duration: float) -> int:
+    """Number of equal steps, each at most `MAX_STEP` to rounding, that a duration (s) needs; at least one."""
+    return max(1, math.ceil(duration / MAX_STEP - 1e-9))
+
+
+def steps_over_each(durations: Array) -> Index:
+    """`steps_over` of each of some durations (n,) s."""
+    return np.maximum(1, np.ceil(durations / MAX_STEP - 1e-9)).astype(np.int64)
+
+
+def step_count(dt: Tensor | Array) -> int:
+    """Number of equal steps, each at most `MAX_STEP`, that the longest of some intervals (s) needs.
+
+    An interval that is NaN (a contact that never comes) needs none.
+
+    Raises: ValueError: if an interval is infinite.
+    """
+    durations = dt.detach().abs() if isinstance(dt, Tensor) else np.abs(dt)
+    longest = float(durations.max()) if 0 not in durations.shape else 0.0
+    if math.isnan(longest):
+        longest = max((float(d) for d in durations.reshape(-1) if not math.isnan(d)), default=0.0)
+    if math.isinf(longest):
+        raise ValueError("dt must be finite; got inf. Check the times.")
+    return steps_over(longest)

@@ -1,10 +1,10 @@
-"""Rollouts of many balls at many times, arc by arc: the same motion as `rollout`, in far fewer steps.
+"""Rolls many balls out to many times, arc by arc: the same motion as `rollout`, in far fewer steps.
 
 `rollout` steps from stamp to stamp. Here the balls fly in common steps of `MAX_STEP`, each from its own last contact
 on; the states at the stamps come from a Hermite polynomial through the ends of the step in which they lie, with the
 position's second derivatives, so that nothing of the integration's accuracy is lost (docs/derivations/integration.md).
-A contact is solved once an arc, for all balls together. What does not simply fly and bounce (rest, rolling, a ball lost
-below a surface) is handed to `rollout`.
+A contact is solved once an arc, for all balls together. `rollout` takes over all balls that do more than fly and bounce
+(rest, roll, lie below a surface).
 """
 
 from dataclasses import dataclass
@@ -16,14 +16,15 @@ from torch.autograd.function import once_differentiable
 
 from ballfg.dynamics.model import BallModel, take_rows
 from ballfg.dynamics.motion.contact import contact_time
-from ballfg.dynamics.motion.integrate import MAX_STEP, derivative, fly, fly_jacobian, rk4_step
-from ballfg.dynamics.motion.limits import LONGEST_MOTION, REST_SPEED
+from ballfg.dynamics.motion.flight_step import derivative, rk4_step
+from ballfg.dynamics.motion.integrate import fly, fly_jacobian
+from ballfg.dynamics.motion.limits import LONGEST_MOTION, MAX_STEP, REST_SPEED
 from ballfg.dynamics.motion.rollout import next_surface, rollout, stays
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import POSITION, VELOCITY, VZ
 
 MOST_ARCS = 40
-"""A ball that bounces more often is about to come to rest."""
+"""Number of arcs after which a ball is about to come to rest."""
 
 
 def paths(model: BallModel, state: Tensor, times: Tensor, surfaces: Surfaces) -> Tensor:
@@ -39,7 +40,7 @@ def paths(model: BallModel, state: Tensor, times: Tensor, surfaces: Surfaces) ->
     """
     times = times.expand(state.shape[0], -1) if times.dim() == 1 else times
     if times.shape[1] == 0 or not bool((torch.diff(times, dim=-1, prepend=torch.zeros_like(times[:, :1])) >= 0).all()):
-        return rollout(model, state, times, surfaces)  # it says what is wrong
+        return rollout(model, state, times, surfaces)  # `rollout` raises the error
     result = state.unsqueeze(1).expand(-1, times.shape[1], -1)
     strange = times[:, -1] > LONGEST_MOTION
     active, begun, at = torch.arange(len(state)), torch.zeros_like(times[:, 0]), state
@@ -69,7 +70,7 @@ class _Arc:
     """Free flight of m balls from a common moment on.
 
     Attributes:
-        nodes: (j + 1, m, 9) states, `MAX_STEP` apart; a ball that is done stays where it was.
+        nodes: (j + 1, m, 9) states, `MAX_STEP` apart; a ball that has landed stays where it was.
         slopes: (j + 1, m, 9) their derivatives by time.
         landed: (m,) bool, the ball came down on a surface.
         step: (m,) the step in which it did.
@@ -145,9 +146,9 @@ def _fly_arc(model: BallModel, state: Tensor, left: Tensor, surfaces: Surfaces) 
 
 
 def _followed(model: BallModel, start: Tensor, nodes: Tensor, stays_put: Tensor) -> Tensor:
-    """Nodes (j + 1, m, 9) that are known, differentiable once in the first of them, `start`, and in the parameters.
+    """Known nodes (j + 1, m, 9), differentiable once in the first of them, `start`, and in the parameters.
 
-    Args: stays_put: (j, m) bool, the ball is done and does not take the step.
+    Args: stays_put: (j, m) bool, the ball has landed and does not take the step.
     """
     before, dt = nodes[:-1], nodes.new_full(nodes[:-1].shape[:-1], MAX_STEP)
     after = torch.where(stays_put.unsqueeze(-1), before, rk4_step(model.rates, before, dt.unsqueeze(-1)))
@@ -158,7 +159,7 @@ def _followed(model: BallModel, start: Tensor, nodes: Tensor, stays_put: Tensor)
 
 
 class _Chain(torch.autograd.Function):
-    """States x_k = F_k(x_{k-1}), known with the Jacobians A_k of all steps.
+    """Known states x_k = F_k(x_{k-1}), with the Jacobians A_k of all steps.
 
     Autograd through a loop evaluates the model step by step, forward and back. Here what the parameters do in each step
     is one batch, `after`, and a gradient by the states goes back through the Jacobians: u_{k-1} += A_k^T u_k.

@@ -1,6 +1,6 @@
-"""Motion with events: free flight, contacts at their exact times, several in one step, rest and rolling.
+"""Moves balls through free flight, exact contacts, rest and rolling, with several contacts in one step.
 
-What is defined where nature is not asked:
+These rules complete the physics:
 - A bounce that would rise for less than `REST_SPEED` ends in rest: the ball stays on the surface and rolls. So does one
   that meets a surface more than `MAX_CONTACTS` times within one step. A resting ball whose lift exceeds its weight
   takes off again.
@@ -18,10 +18,12 @@ import math
 import torch
 from torch import Tensor
 
+from ballfg.dynamics.compiled import motion
 from ballfg.dynamics.model import BallModel, take_rows
 from ballfg.dynamics.motion.contact import contact_time
-from ballfg.dynamics.motion.integrate import RateFunction, fly, followed, rk4_step, step_count
-from ballfg.dynamics.motion.limits import LONGEST_MOTION, MAX_CONTACTS, REST_GAP, REST_SPEED
+from ballfg.dynamics.motion.flight_step import rk4_step
+from ballfg.dynamics.motion.integrate import fly, followed
+from ballfg.dynamics.motion.limits import LONGEST_MOTION, MAX_CONTACTS, REST_GAP, REST_SPEED, step_count
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import VZ, Z
 
@@ -40,18 +42,17 @@ def place_on(model: BallModel, state: Tensor, height: Tensor | float) -> Tensor:
 
 
 def roll(model: BallModel, state: Tensor, dt: Tensor, height: Tensor | float) -> Tensor:
-    """The state after `dt` (...) s of resting on the surface at `height` m: sliding until it rolls, then rolling."""
+    """The state after `dt` (...) s on the surface at `height` m: sliding until it rolls, then rolling."""
     state = place_on(model, state, height)
     steps = step_count(dt)
     h = (dt / steps).unsqueeze(-1)
-    rates: RateFunction = model.roll
     for _ in range(steps):
-        state = rk4_step(rates, state, h)
+        state = rk4_step(model.roll, state, h)
     return state
 
 
 def advance(model: BallModel, state: Tensor, dt: Tensor, surfaces: Surfaces) -> Tensor:
-    """The state after `dt`, through whatever contacts happen on the way.
+    """The state after `dt`, through all contacts on the way.
 
     Args:
         model: the ball.
@@ -117,7 +118,7 @@ def stays(model: BallModel, state: Tensor, height: Tensor, surfaces: Surfaces) -
 def next_surface(
     model: BallModel, state: Tensor, after: Tensor, height: Tensor, flying: Tensor, surfaces: Surfaces
 ) -> tuple[Tensor, Tensor]:
-    """Heights (n,) m of the surfaces that count in this step and whether (n,) the flying balls come down on them."""
+    """Heights (n,) m of the next surfaces and whether (n,) the flying balls come down on them within this step."""
     landing = flying & (model.gap(after, height) < 0) & (after[..., VZ] < 0)
     to_check = landing & (height == surfaces.table_height)
     if surfaces.extent is None or not bool(to_check.any()):
@@ -133,7 +134,7 @@ def next_surface(
 
 
 def _land(model: BallModel, state: Tensor, remaining: Tensor, height: Tensor, *, last: bool) -> tuple[Tensor, Tensor]:
-    """States just after the next contact and the time then left; a bounce too small to rise ends in rest."""
+    """States right after the next contact and the remaining time; a bounce too small to rise ends in rest."""
     tau = contact_time(model, state, height)
     lost = tau.isnan()  # below the surface and never up again
     tau = torch.where(lost, torch.zeros_like(tau), tau)
@@ -169,14 +170,12 @@ def rollout(model: BallModel, state: Tensor, times: Tensor, surfaces: Surfaces) 
 
 
 def _by_machine_code(model: BallModel, state: Tensor, steps: Tensor, surfaces: Surfaces) -> Tensor | None:
-    """The states (n, k, 9) after each of the steps (n, k) s, which are durations; None where only torch can tell.
+    """The states (n, k, 9) after each of the durations (n, k) s; None if torch must compute them.
 
-    Balls that come to rest go on in torch from there.
+    Torch continues the balls that come to rest.
     """
     if not steps.numel() or followed(state, steps):
         return None
-    from ballfg.dynamics.compiled import motion  # which needs the models, and these this file
-
     functions = motion.functions_of(model)
     if functions is None:
         return None

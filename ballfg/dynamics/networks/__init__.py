@@ -1,1 +1,1 @@
-"""Learned models: networks, Gram-Schmidt features, their files."""
+"""Learned models describe flight and bounce by networks of Gram-Schmidt features, kept in files of their own."""

@@ -1,4 +1,4 @@
-"""What a learned model is made of, as numbers that a file can hold."""
+"""Describes the networks of a learned model by numbers for a file."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Architecture(BaseModel):
     depth: Annotated[int, Field(ge=1, le=MOST_DEPTH)]
     """Hidden layers (mlp), blocks (skip), or repetitions of the one layer (mnn) of each network."""
     residual: bool = False
-    """The networks correct another model; false: they are all there is."""
+    """True: the networks correct another model; False: they are the whole model."""
     spin_rate: bool = False
     """The flight network also gives the angular acceleration; false: the spin is constant in flight (or the base's)."""
 
@@ -51,7 +51,7 @@ class Architecture(BaseModel):
         residual: bool = False,
         spin_rate: bool = False,
     ) -> Architecture:
-        """An architecture in which sizes that are not given are the kind's default ones."""
+        """An architecture with the kind's default for each size that is not given."""
         flight, contact, steps = DEFAULT_SIZES[kind]
         return cls(
             kind=kind,

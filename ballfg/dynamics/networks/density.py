@@ -1,4 +1,4 @@
-"""How densely training tracks cover the invariant features of a network: a kernel density, as a weight from 0 to 1."""
+"""Estimates how densely training tracks cover a network's features, as a weight from 0 to 1."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from torch import Tensor, nn
 from ballfg.arrays import Array
 
 MOST_CENTRES: Final = 200
-"""Kernels of a density: more cost time in every step of a flight and hardly change it."""
+"""Largest number of kernels: more cost time in every step of a flight and hardly change the density."""
 LEAST_GROUPS: Final = 8
-"""Tracks from which a density can be told; with fewer nothing counts as known."""
+"""Smallest number of tracks for a density; with fewer its weight is zero."""
 LEAST_SPREAD: Final = 0.03
-"""Of a feature, which lies within -1 to 1: a launcher that always does the same is not known more finely."""
+"""Smallest spread of a feature in [-1, 1], for a launcher that always does the same."""
 EDGE: Final = 0.05
-"""Share of the features of left-out training tracks that lie where the weight is below one half."""
+"""Share of held-out training features whose weight is below one half."""
 BANDWIDTHS: Final = np.geomspace(0.05, 2.0, 30)
-"""Widths of the kernels that are tried, in standard deviations of the features."""
+"""Kernel widths to choose from, in standard deviations of the features."""
 
 
 class FeatureDensity(nn.Module):
@@ -56,7 +56,7 @@ class FeatureDensity(nn.Module):
 
     @classmethod
     def of(cls, groups: Sequence[Array], features: int) -> FeatureDensity:
-        """The density of training features; its width is the most probable one for tracks that are left out.
+        """The density of training features, with the kernel width that is most probable for held-out tracks.
 
         Every track counts the same, however many samples it has.
 

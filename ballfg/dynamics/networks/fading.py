@@ -1,4 +1,4 @@
-"""A network's correction where it was not trained: it fades, and an unknown share of it stays as uncertainty."""
+"""Fades a network's correction away from its training data and keeps an unknown share of it as uncertainty."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from ballfg.dynamics.networks.gram_schmidt import CONTACT_FEATURES, FLIGHT_FEATU
 from ballfg.state import SPIN, VELOCITY, VZ
 
 DOUBT: Final = "fading."
-"""What the names of the doubts start with in a `LearnedModel`."""
+"""Prefix of the doubts' names in a `LearnedModel`."""
 ABROAD: Final = 0.5
-"""Largest share of a correction that is used in a room that had no part in the training: few rooms do not tell which
-part of a correction is the ball's and which is theirs. Whichever it is, at least half of it is right."""
+"""Largest share of a correction that is used in a room outside of the training: a few rooms cannot separate the ball's
+part of a correction from theirs. Whichever it is, at least half of it is right."""
 DOUBTS: Final = tuple(Coefficient(name, 0.0, 1.0, "1", -3.0, 3.0, varies=True) for name in ("flight", "contact"))
-"""Unknown shares, about zero, of the correction that stands outside of the training data."""
+"""Unknown shares, with mean zero, of the correction that remains outside of the training data."""
 
 
 class Fading(nn.Module):
     """Weights of a correction: one where the training tracks were, zero far from them.
 
-    What fades away may still be right in part. Its size, at most the usual one of the correction in training, times an
-    unknown share is the uncertainty that grows with the distance. The share is estimated with each track, like a
-    coefficient, so that estimates, predictions and their derivatives have it.
+    The part that fades away may still be right. Its size, at most the usual correction in training, times an unknown
+    share is the uncertainty that grows with the distance. The share is estimated with each track, like a coefficient,
+    so that it enters estimates, predictions and their derivatives.
 
     Attributes:
         flying, bouncing: densities of the features of flights and of contacts.
         flight, contact: () the unknown shares; zero.
         acceleration: () m/s^2, usual size of the correction of a flight.
         velocity: () m/s, of the correction of a contact; that of the spin counts as velocity of the ball's surface.
-        strength: share of the correction that is used where its weight is one; 1, in a foreign room `abroad`.
-        abroad: () that share: `ABROAD` where tracks that were held out in training predict better with it, else 0.
+        strength: share of the correction that is used at weight one; 1, in a foreign room `abroad`.
+        abroad: () that share: `ABROAD` if held-out training tracks are predicted better with it, else 0.
     """
 
     abroad: Tensor
@@ -54,12 +54,12 @@ class Fading(nn.Module):
 
     @classmethod
     def empty(cls, flying: int, bouncing: int, radius: float) -> Fading:
-        """With so many kernels of each density, to be filled from a file."""
+        """An object with this many kernels of each density, to be filled from a file."""
         return cls(FeatureDensity(flying, FLIGHT_FEATURES), FeatureDensity(bouncing, CONTACT_FEATURES), radius)
 
     @classmethod
     def of(cls, flights: Sequence[Tensor], contacts: Sequence[Tensor], radius: float) -> Fading:
-        """From training tracks.
+        """Fits the densities to training tracks.
 
         Args:
             flights: (n, 9) states of each track in flight.
@@ -71,7 +71,7 @@ class Fading(nn.Module):
         return cls(FeatureDensity.of(seen, FLIGHT_FEATURES), FeatureDensity.of(touched, CONTACT_FEATURES), radius)
 
     def measure(self, accelerations: Tensor, changes: Tensor) -> None:
-        """Take the usual sizes from the corrections in training: (n, 3) m/s^2 in flight, (n, 9) after contacts."""
+        """Sets the usual sizes from the corrections in training: (n, 3) m/s^2 in flight, (n, 9) after contacts."""
         self.acceleration = accelerations.square().sum(-1).mean().sqrt() if len(accelerations) else self.acceleration
         self.velocity = self._square(changes).mean().sqrt() if len(changes) else self.velocity
 
@@ -81,13 +81,13 @@ class Fading(nn.Module):
         return weight
 
     def in_flight(self, state: Tensor, correction: Tensor) -> Tensor:
-        """The correction (..., 3) m/s^2 of states (..., 9), faded, with the unknown share of the rest."""
+        """The faded correction (..., 3) m/s^2 of states (..., 9), with the unknown share of the rest."""
         weight = self.inside(state)
         limited = _limited(correction, correction.square().sum(-1, keepdim=True), self.acceleration)
         return self.strength * weight * correction + (1.0 - weight) * self.flight * limited
 
     def at_contact(self, state: Tensor, change: Tensor) -> Tensor:
-        """The change (..., 9) that corrects a bounce from states (..., 9), faded, with an unknown share of the rest."""
+        """The faded change (..., 9) of a bounce from states (..., 9), with the unknown share of the rest."""
         weight = self.bouncing(contact_frame(state, self.radius).features)
         limited = _limited(change, self._square(change), self.velocity)
         return self.strength * weight * change + (1.0 - weight) * self.contact * limited
@@ -99,7 +99,7 @@ class Fading(nn.Module):
 
 
 def _limited(correction: Tensor, square: Tensor, size: Tensor | nn.Module) -> Tensor:
-    """A correction whose length (the root of `square`) stays below `size`, smoothly."""
+    """A correction whose length (the root of `square`) is limited smoothly to `size`."""
     assert isinstance(size, Tensor)
     return correction * (size / (size.square() + square + 1e-12).sqrt())
 
@@ -107,7 +107,7 @@ def _limited(correction: Tensor, square: Tensor, size: Tensor | nn.Module) -> Te
 def states_before_contacts(states: Tensor, least: float = 0.3) -> Tensor:
     """(k, 9) of states (n, 9) along a flight: the last ones before the ball turns from falling to rising.
 
-    Args: states: at the stamps of a track.  least: m/s, slowest fall and rise; slower ones are a ball at rest.
+    Args: states: at the stamps of a track.  least: m/s, slowest fall and rise; a slower ball is at rest.
     """
     turns = (states[:-1, VZ] < -least) & (states[1:, VZ] > least)
     return states[:-1][turns]

@@ -1,4 +1,4 @@
-"""Gram-Schmidt representations: what a network sees of velocity and spin, and how its answer turns back into vectors.
+"""Computes the invariant features of velocity and spin for a network, and vectors from its coefficients.
 
 Features do not change under rotations and mirrors; vectors are made of vectors that turn and flip along, with
 coefficients that a network gives. Spin is a pseudovector, so a term of the wrong parity carries a pseudoscalar factor.
@@ -15,9 +15,9 @@ from torch import Tensor
 from ballfg.state import SPIN, VELOCITY
 
 SPEED_SCALE: Final = 6.0
-"""m/s, a usual speed of a table-tennis ball: the middle of what a feature resolves."""
+"""m/s, a usual speed of a table-tennis ball: the middle of a feature's range."""
 SPIN_SCALE: Final = 150.0
-"""rad/s, a usual spin of a table-tennis ball: the middle of what a feature resolves."""
+"""rad/s, a usual spin of a table-tennis ball: the middle of a feature's range."""
 CONTACT_SCALE: Final = 5.0
 """m/s, the same for a contact's velocities: of the ball, and of its surface (radius times spin)."""
 LIFT: Final = 0.3
@@ -128,7 +128,7 @@ def contact_frame(state: Tensor, radius: float) -> ContactFrame:
 
 
 def contact_change(frame: ContactFrame, coefficients: Tensor, radius: float) -> tuple[Tensor, Tensor]:
-    """What a contact changes, but for the normal velocity.
+    """Change of a state in a contact, apart from the normal velocity.
 
     v_xy changes by A direction + B v_xy + C side, radius z x w likewise, and radius w_z by A twist + B turn.
 

@@ -1,7 +1,7 @@
-"""Three small networks that differ in how a hidden state passes from one step to the next: plain, added, multiplied.
+"""Defines three small networks, whose hidden states pass from step to step plain, added or multiplied.
 
 All map features (..., f) to outputs (..., o) in float64. The last layer starts at zero, so that an untrained network
-says nothing; the others start at random from a generator.
+gives zero; the others start at random from a generator.
 """
 
 import math
@@ -16,8 +16,8 @@ from ballfg.dynamics.networks.polynomial import Weights, evaluate, evaluation_co
 NetworkKind = Literal["mlp", "skip", "mnn"]
 
 EXPANSION_ROWS = 256
-"""States from which on an MNN is written out as a polynomial: the coefficients cost as much as running it on 100 to 300
-states, with or without derivatives."""
+"""Number of states from which an MNN is evaluated as a polynomial: computing the coefficients costs as much as running
+it on 100 to 300 states, with or without derivatives."""
 
 
 class MLP(nn.Module):
@@ -69,7 +69,7 @@ class MNN(nn.Module):
         self._least_rows = EXPANSION_ROWS if evaluation_cost(inputs, outputs, depth) < depth * width**2 else math.inf
 
     def write_out(self) -> None:
-        """Have it written out for single states too, where that is cheaper once the coefficients are there."""
+        """Uses the polynomial for single states too, where that is cheaper with known coefficients."""
         if math.isfinite(self._least_rows):
             self._least_rows = 0
 

@@ -1,4 +1,4 @@
-"""The learned model: networks say how the ball flies and bounces, alone or as a correction of another model."""
+"""The learned model computes flight and bounce by networks, alone or as a correction of another model."""
 
 from typing import Final
 
@@ -7,7 +7,6 @@ from torch import Tensor, nn
 
 from ballfg.dynamics.effect import Coefficient, per_row
 from ballfg.dynamics.effects.bounce import TableHeight
-from ballfg.dynamics.measurement import Later
 from ballfg.dynamics.model import THIN_SHELL, BallModel, Rates
 from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.dynamics.networks.fading import DOUBT, DOUBTS, Fading
@@ -19,13 +18,13 @@ from ballfg.dynamics.networks.learned_parts import (
     RawContact,
     RawFlight,
 )
-from ballfg.state import POSITION, SPIN, VZ
+from ballfg.state import SPIN, VZ
 
 START_OFFSET: Final = -0.003
-"""m by which an untrained model takes surfaces to lie above their declared heights: as in the nominal model."""
+"""m by which an untrained model puts surfaces above their declared heights, as in the nominal model."""
 
 BASE: Final = "base."
-"""What the names of the base's coefficients start with."""
+"""Prefix of the names of the base's coefficients."""
 
 
 class LearnedModel(BallModel):
@@ -35,9 +34,9 @@ class LearnedModel(BallModel):
     tangential change in a bounce. With a base it starts as the base.
 
     Attributes:
-        architecture: what it is made of.
+        architecture: kind and sizes of the networks.
         flight: network of the rates.  contact: network of the bounce.
-        base: the model that is corrected, or None.
+        base: the model to correct, or None.
         offset: () m by which surfaces lie above their declared heights; the base's where there is one.
         fading: how the correction fades outside of the training data; None without a base, and before the training.
 
@@ -108,7 +107,7 @@ class LearnedModel(BallModel):
         return base_acceleration + acceleration, base_spin_rate if spin_rate is None else spin_rate
 
     def after_bounce(self, state: Tensor) -> Tensor:
-        """(..., 9) state just after an impact on a horizontal plane, from the state (..., 9) before it."""
+        """(..., 9) state right after an impact on a horizontal plane, from the state (..., 9) before it."""
         if self.base is None:
             up = -START_RESTITUTION * state[..., VZ : VZ + 1]
             guess = torch.cat((state[..., :VZ], up, state[..., SPIN]), dim=-1)
@@ -132,25 +131,9 @@ class LearnedModel(BallModel):
         return None if self.base is None else self.base.surface_slope(state)
 
     @property
-    def measures_plainly(self) -> bool:
-        """As the base; a model without one does."""
-        return self.base is None or self.base.measures_plainly
-
-    def measured(self, states: Tensor, later: Later) -> Tensor:
-        """(..., 3) m, the positions as the base measures them."""
-        return states[..., POSITION] if self.base is None else self.base.measured(states, later)
-
-    def true_stamps(self, stamps: Tensor) -> Tensor:
-        """(...) s, as the base."""
-        return stamps if self.base is None else self.base.true_stamps(stamps)
-
-    def stamps(self, times: Tensor) -> Tensor:
-        """(...) s as written, from true times (...) s: as the base."""
-        return times if self.base is None else self.base.stamps(times)
-
-    def labelled(self, spin: Tensor) -> Tensor:
-        """(..., 3) rad/s as labelled, from the true spin (..., 3) rad/s: as the base."""
-        return spin if self.base is None else self.base.labelled(spin)
+    def measuring(self) -> BallModel | None:
+        """The base."""
+        return self.base
 
     def extra_repr(self) -> str:
         """Kind, radius and inertia factor for `print(model)`."""

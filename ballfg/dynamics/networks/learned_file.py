@@ -1,7 +1,7 @@
-"""The learned part of a model file: a folder with `config.yaml` and `weights.safetensors`.
+"""Reads and writes the learned part of a model file: a folder with `config.yaml` and `weights.safetensors`.
 
-Safe loaders only. The folder's name ends with a digest of its content: a model file always names a whole folder, and
-saving again never changes one that a file names.
+It uses safe loaders only. The folder's name ends with a digest of its content: a model file always names a complete
+folder, and saving again never changes that folder.
 """
 
 import hashlib
@@ -26,17 +26,17 @@ from ballfg.dynamics.trained import Trained
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.files.weights import read_tensors
 from ballfg.files.whole_folder import whole_folder
-from ballfg.tracks import TrackNoise
+from ballfg.tracks.noise import TrackNoise
 
 CONFIG, WEIGHTS = "config.yaml", "weights.safetensors"
 LEARNED = ".learned-"
-"""In the name of a folder, between the stem of the first model file that named it and the digest of its content."""
+"""Part of a folder's name, between the stem of the model file that named it first and the digest of its content."""
 _MODEL, _LAUNCHER, BASE = "model.", "launcher.", "base."
-"""What the names of tensors start with: those of the networks and of the spin embedding; those of the base, which
-stand in the model file itself."""
+"""Prefixes of tensor names: of the networks and of the spin embedding; of the base, whose values stand in the model
+file itself."""
 
 LARGEST_DENSITY = 100_000
-"""Centres of a density of features; training chooses some hundred."""
+"""Largest number of centres of a feature density; training chooses a few hundred."""
 
 
 class _Section(BaseModel):
@@ -69,15 +69,15 @@ class _Config(_Section):
 
 
 def has_learned_part(model: BallModel) -> bool:
-    """Whether a model file needs a folder to hold this model."""
+    """True if this model needs a folder beside its model file."""
     return isinstance(model, LearnedModel) or model.trained is not None
 
 
 def write_learned(model: BallModel, parent: Path, stem: str) -> str:
-    """Write the folder of a model's learned part.
+    """Writes the folder of a model's learned part.
 
     Args: model: learned, or analytic with `trained`.  parent: folder to write into.  stem: start of the name.
-    Returns: the folder's name. It appears only once it is whole, and nothing removes it: model files are copied.
+    Returns: the folder's name. It appears only once it is complete, and nothing removes it: users copy model files.
     """
     config = yaml.safe_dump(_config(model).model_dump(mode="json"), sort_keys=False, allow_unicode=True).encode()
     weights = safetensors.torch.save({name: t.detach().contiguous() for name, t in _tensors(model).items()})
@@ -89,12 +89,12 @@ def write_learned(model: BallModel, parent: Path, stem: str) -> str:
 
 
 def read_learned(folder: Path, analytic: AnalyticModel) -> BallModel:
-    """The model of a folder and of the effects that the model file declares.
+    """The model of a folder and of the effects in the model file.
 
     Args: folder: written by `write_learned`.  analytic: model of the effects; the base of a residual architecture.
     Raises:
         FileNotFoundError: if the folder or one of its files is missing.
-        ValueError: if a file is damaged or is not the one that was saved, the config unknown, or weights have other
+        ValueError: if a file is damaged or was changed after saving, the config is unknown, or weights have other
             names, shapes or types.
     """
     for path in (folder / CONFIG, folder / WEIGHTS):
@@ -107,7 +107,7 @@ def read_learned(folder: Path, analytic: AnalyticModel) -> BallModel:
     with torch.no_grad():
         for name, tensor in expected.items():
             tensor.copy_(tensors[name])
-    _check_digest(folder)  # last: what is wrong with a file says more than that it was changed
+    _check_digest(folder)  # last: an error in a file says more than that it was changed
     return model
 
 
@@ -116,7 +116,7 @@ def _digest(config: bytes, weights: bytes) -> str:
 
 
 def _check_digest(folder: Path) -> None:
-    """Refuses files that are not those that were saved. A folder that somebody has named otherwise has no digest."""
+    """Refuses files that were changed after saving. A folder that a user has renamed has no digest."""
     named = re.search(rf"{re.escape(LEARNED)}([0-9a-f]{{12}})$", folder.name)
     found = _digest((folder / CONFIG).read_bytes(), (folder / WEIGHTS).read_bytes())
     if named is not None and named[1] != found:
@@ -176,7 +176,7 @@ def _read_config(path: Path) -> _Config:
 
 
 def _empty_model(config: _Config, analytic: AnalyticModel, folder: Path) -> BallModel:
-    """The model that the config describes, its weights not yet the learned ones."""
+    """The model that the config describes, with untrained weights."""
     model: BallModel = analytic
     architecture = config.architecture
     if architecture is not None:

@@ -1,4 +1,4 @@
-"""The flight and the contact of a learned ball, with Gram-Schmidt features or with raw velocity and spin."""
+"""Computes flight and contact of a learned ball, from Gram-Schmidt features or from raw velocity and spin."""
 
 from typing import Final
 
@@ -12,7 +12,7 @@ from ballfg.dynamics.networks.layers import NETWORKS, NetworkKind
 from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, VELOCITY, VZ
 
 HIGHEST_RESTITUTION: Final = 1.2
-"""Most that a network may give: above one, so that a fit can move through what no table does."""
+"""Largest restitution of a network: above one, so that a fit can pass through unphysical values."""
 START_RESTITUTION: Final = 0.85
 """Restitution of an untrained model."""
 
@@ -77,7 +77,7 @@ class RawFlight(nn.Module):
 
 
 class GramSchmidtContact(nn.Module):
-    """A bounce: a network's coefficients on Gram-Schmidt vectors in the plane change a first guess of it.
+    """A bounce: a network's coefficients of Gram-Schmidt vectors in the plane change a first guess of it.
 
     Args:
         kind, width, depth: of the network.
@@ -104,9 +104,9 @@ class GramSchmidtContact(nn.Module):
 
 
 class RawContact(nn.Module):
-    """A bounce: a network of velocity and spin as they are changes a first guess of it.
+    """A bounce: a network of raw velocity and spin changes a first guess of it.
 
-    Args: as for `GramSchmidtContact`. The radius is not used: raw velocity and spin are all that the network sees.
+    Args: as for `GramSchmidtContact`. The radius is unused: the network sees raw velocity and spin only.
     """
 
     def __init__(

@@ -1,8 +1,7 @@
-"""The MNN written out: with N steps it is a polynomial of degree N + 1, whose coefficients follow from the weights.
+"""Expands an MNN of N steps to a polynomial of degree N + 1, with coefficients computed from the weights.
 
-For many states with few features that costs a small part of running the network, derivatives included: the wide hidden
-states are gone through once, for the coefficients, instead of once for each state. Derivation in
-docs/derivations/mnn.md.
+For many states with few features that costs a small part of running the network, derivatives included: the coefficients
+need one pass through the wide hidden states, instead of one for each state. Derivation in docs/derivations/mnn.md.
 """
 
 import functools
@@ -37,7 +36,7 @@ def expand(first: Weights, step: Weights, last: Weights, depth: int) -> Tensor:
 def evaluate(coefficients: Tensor, features: Tensor, depth: int) -> Tensor:
     """Values (..., outputs) of polynomials at features (..., f).
 
-    Monomials of half the degree on either side of a matrix: fewer numbers than all monomials.
+    A matrix stands between monomials of half the degree: fewer numbers than all monomials.
     """
     tables = _tables(features.shape[-1] + 1, depth, features.device)
     one = torch.nn.functional.pad(features, (1, 0), value=1.0)
@@ -58,13 +57,13 @@ def evaluation_cost(features: int, outputs: int, depth: int) -> int:
 
 @dataclass(frozen=True)
 class _Tables:
-    """Where products of monomials are found.
+    """Places of products of monomials.
 
     Attributes:
         raised: for degree k = 1, 2, ...: (variables, m_k), number of each monomial times each variable in degree k + 1,
             and how many monomials there are in degree k + 1.
-        powers: for degree k = 2, 3, ...: monomial of degree k - 1 and variable that each of degree k is a product of.
-        left: which of the powers stands left of the matrix; the last one stands right.
+        powers: for degree k = 2, 3, ...: the monomial of degree k - 1 and the variable whose product gives each of
+            powers: for degree k = 2, 3, ...: the monomial of degree k - 1 and the variable whose product each is.
         pairs: (left, right), number of their product in the full degree.
         shares: (left, right), one over the number of pairs that give the same product.
     """

@@ -1,4 +1,4 @@
-"""Spin from launcher settings by a linear layer that is learned: what the settings mean, along the flight.
+"""Maps launcher settings to the spin of a shot by a learned linear layer, in axes along the flight.
 
 Axes: forward is the horizontal direction of flight, across is z x forward (topspin turns about it), up is z (sidespin
 turns about it). Turning the velocity about z turns the spin. A mirrored launch has other settings (sidespin changes
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from ballfg.checks import shown
 
 SPIN_UNIT: Final = 100.0
-"""rad/s that a weight of one stands for, so that weights are of order one."""
+"""rad/s for a weight of one, so that weights are of order one."""
 SOFT_SPEED: Final = 0.05
 """m/s. Well below it a launch has no horizontal direction and its forward and across axes fade out; at 5 m/s they are
 5e-5 short of one."""
@@ -63,7 +63,7 @@ class SpinEmbedding(nn.Module):
         return (label,) if values is None else tuple(f"{label}={value}" for value in values)
 
     def settings(self, labels: Mapping[str, object]) -> Tensor | None:
-        """(k,) the settings of a track with these labels, each in its own unit; None where one is missing or unknown.
+        """(k,) the settings of a track with these labels, each in its own unit; None if one is missing or unknown.
 
         Raises: ValueError: if a label that must be a number is not one.
         """

@@ -1,1 +1,1 @@
-"""The extended Kalman filter with its backward pass, and the sliding-window mean."""
+"""Filters estimate states sample by sample: the extended Kalman filter and the sliding-window mean."""

@@ -1,4 +1,4 @@
-"""filterpy's extended Kalman filter with the ball's own prediction."""
+"""Extends filterpy's extended Kalman filter by the ball's own prediction."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy.special import chdtri
 
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.advance_jacobian import Motion, advance_jacobian
+from ballfg.dynamics.motion.advance_jacobian import Advance, advance_jacobian
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.innovation import FilterInnovation
 from ballfg.factors.batch import FactorBatch
@@ -18,16 +18,16 @@ from ballfg.factors.linear.definite import whitened
 from ballfg.state import STANDARD_GRAVITY, STATE_DIM, VELOCITY, Z
 
 GATE_CHANCE = 1e-6
-"""Share of good measurements that are not used: of positions those whose squared whitened innovation exceeds 30.7."""
+"""Share of good measurements that are rejected: positions whose squared whitened innovation exceeds 30.7."""
 WIDE_VELOCITY = 1.0
-"""m/s. While the velocity is less well known, a step is linearised at the velocity that its sample suggests."""
+"""m/s. While the velocity is less certain, a step is linearised at the velocity that its sample suggests."""
 
 
 class BallFilter(FilterpyEKF):
     """filterpy's filter with the ball's own prediction: x, P, F, Q, R are its attributes, the update is its own.
 
-    The first `width` numbers of x move with the ball: its state and the model's coefficients. The tracker's bias, where
-    it has one, stands behind them.
+    The first `width` numbers of x move with the ball: its state and the model's coefficients. The tracker's bias, if
+    any, follows them.
 
     Its update uses the Joseph form (I - K H) P (I - K H)^T + K R K^T, positive definite under rounding.
     """
@@ -42,7 +42,7 @@ class BallFilter(FilterpyEKF):
         self.width = STATE_DIM + model_width(model)
         self.predicted = mean
 
-    def move(self, point: Array, dt: float, decay: float) -> Motion:
+    def move(self, point: Array, dt: float, decay: float) -> Advance:
         """Sets F at the linearisation point, and the mean that `predict_x` will put into x."""
         width = self.width
         motion = advance_jacobian(self.model, torch.from_numpy(point[:width])[None], dt, self.surfaces)
@@ -54,7 +54,7 @@ class BallFilter(FilterpyEKF):
 
     @property
     def velocity_is_wide(self) -> bool:
-        """Whether the velocity is hardly known."""
+        """True if the velocity is almost unknown."""
         return bool(np.trace(self.P[VELOCITY, VELOCITY]) >= WIDE_VELOCITY**2)
 
     def predict_x(self, u: float = 0) -> None:
@@ -64,7 +64,7 @@ class BallFilter(FilterpyEKF):
     def linearisation_point(self, measured: Array, dt: float, R: Array) -> Array:
         """(d,) the mean; while the velocity is wide, the mean given the interval's sample in drag-free flight.
 
-        It is no information, only the place of the tangent: the sample itself still updates the state once.
+        It only sets the linearisation point: the sample itself still updates the state once.
         """
         if not self.velocity_is_wide:
             return self.x
@@ -82,7 +82,7 @@ class BallFilter(FilterpyEKF):
 
     @staticmethod
     def passes(innovation: Array) -> bool:
-        """Whether a whitened innovation (dim,) is within the gate."""
+        """True if a whitened innovation (dim,) is within the gate."""
         return bool(innovation @ innovation <= chdtri(len(innovation), GATE_CHANCE))
 
     def correct(self, measured: Array) -> None:
@@ -92,7 +92,7 @@ class BallFilter(FilterpyEKF):
     def correct_by(self, factor: FactorBatch, gated: bool) -> Array:
         """(dim,) whitened innovation of a factor on the present state; the update of filterpy with its residual.
 
-        The factor's loss gives the noise its weight; with a gate, a measurement beyond it is not used.
+        The factor's loss weights the noise; with a gate, a measurement beyond it is not used.
         """
         found = FilterInnovation.of(factor, self.x, self.P, biases=len(self.x) - self.width)
         if not gated or self.passes(found.whitened):

@@ -1,6 +1,6 @@
-"""The extended Kalman filter on filterpy, with the same dynamics and noise as the smoother, and an RTS pass.
+"""The extended Kalman filter on filterpy shares dynamics and noise with the smoother and may add an RTS pass.
 
-docs/estimators_ekf.md has the equations, what the filter does at contacts, hits and outliers, and what it cannot do.
+docs/estimators_ekf.md has the equations, the rules at contacts, hits and outliers, and the limits.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from scipy.linalg import LinAlgWarning
 from ballfg.arrays import Array
 from ballfg.checks import check_choice, check_flag
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.advance_jacobian import Motion
+from ballfg.dynamics.motion.advance_jacobian import Advance
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.rts import FilterRecord, fly_back, rts_smooth
@@ -26,15 +26,15 @@ from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities
 from ballfg.estimation.observations.observation import Context, refuse_unknowns
 from ballfg.estimation.plausible import plausible
 from ballfg.estimation.result import Estimate, Status
-from ballfg.estimation.segmentation import Contact, Quality
+from ballfg.estimation.segmentation.result import Contact, Quality
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, stamp_covariance, total_sigmas
 from ballfg.estimation.sides.hypotheses import HypothesisModel, SampleMeasurement
 from ballfg.estimation.sides.monitor import ContactMonitor, ContactState, with_contact_states
 from ballfg.estimation.sides.widening import widened_near_contacts
 from ballfg.estimation.smoother.problem import coefficient_means, trackwise_model
 from ballfg.factors.batch import FactorBatch
+from ballfg.factors.correlated_noise import bias_step
 from ballfg.factors.linear.definite import raised
-from ballfg.factors.tracker import bias_step
 from ballfg.state import POSITION, STATE_DIM, VELOCITY, Z
 from ballfg.tracks import Ball, Track
 
@@ -42,27 +42,27 @@ if TYPE_CHECKING:
     from ballfg.estimation.filters.ball_filter import BallFilter
 
 REJECTED_FOR_HIT = 4
-"""So many samples in a row beyond the gate are no outliers: something hit the ball before the first of them."""
+"""Number of consecutive samples beyond the gate that make a hit before the first of them."""
 HIT_POSITION = 1.0
-"""m, standard deviation of the position after a hit: it starts anew at the measurement."""
+"""m, standard deviation of the position after a hit, where it restarts at the measurement."""
 LEAST_USED = 0.5
-"""Share of samples that must have passed the gate for the filter to have followed the ball."""
+"""Least share of samples within the gate for a filter that has followed the ball."""
 LEAST_SHARE = 1e-3
-"""Of the noise of one sample over the root of their number, or of a prior: what is known better is rounding."""
+"""Least standard deviation, as a share of one sample's noise over the root of their number, or of a prior."""
 LEAST_MOTION = 1e-6
-"""m/s and rad/s, the same of velocity and spin."""
+"""m/s and rad/s, the same for velocity and spin."""
 NEAR_SURFACE = 0.05
-"""m. Samples this close to a surface need not lie on one parabola with others: there may be a bounce."""
+"""m. Samples this close to a surface need not lie on one parabola with others: a bounce may be between."""
 
 
 class ExtendedKalmanFilter(Estimator):
     """The extended Kalman filter; with `smooth`, followed by a Rauch-Tung-Striebel pass.
 
     The state is the 9-vector and, with `settings.coefficients`, the model's uncertain coefficients; with
-    `settings.memory` the tracker's bias follows, which no estimate shows. Contacts happen where the predicted flight
-    meets a surface. With `settings.find_events`, samples beyond the gate are outliers, and four of them in a row make
-    a hit: the filter goes back to before the first one, widens velocity and spin by `settings.process.hit_velocity`
-    and `hit_spin`, and starts anew at the measurements.
+    `settings.memory` the tracker's bias follows, which no estimate contains. Contacts happen where the predicted flight
+    meets a surface. With `settings.find_events`, samples beyond the gate are outliers, and four of them in a row make a
+    hit: the filter goes back to before the first one, widens velocity and spin by `settings.process.hit_velocity` and
+    `hit_spin`, and restarts at the measurements.
 
     Args:
         model: the ball.  surfaces: what it may bounce on.  settings: noise and priors.
@@ -111,7 +111,7 @@ class ExtendedKalmanFilter(Estimator):
         whitened = record.innovations(run.H, mean, covariance, track.positions) if self.smooth else record.whitened
         estimate = self._result(track, run, mean, covariance, whitened)
         found = run.states_near_contacts()
-        if self.smooth:  # later samples have shown the side, but for the last
+        if self.smooth:  # later samples show the side, except at the end
             estimate = widened_near_contacts(estimate, self.ball)
             found = {k: state for k, state in found.items() if k == len(track) - 1}
         return with_contact_states(estimate, found).dated(written.times)
@@ -155,14 +155,14 @@ class ExtendedKalmanFilter(Estimator):
 
 
 def _status(used: NDArray[np.bool_]) -> Status:
-    """A filter that set aside most of what it saw has lost the ball, or was told wrong things about it."""
+    """The status for the used samples: a filter that set most of them aside has lost the ball."""
     if used.sum() < 2:
         return Status.NO_VELOCITY
     return Status.OK if used.mean() >= LEAST_USED else Status.NOT_CONVERGED
 
 
 class _Run:
-    """One pass of the filter over one track; `record` is what comes out."""
+    """One pass of the filter over one track; `record` holds the result."""
 
     def __init__(self, owner: ExtendedKalmanFilter, track: Track) -> None:
         self.owner = owner
@@ -190,11 +190,11 @@ class _Run:
             self._filter()
 
     def finite(self) -> bool:
-        """Whether all of it is a number."""
+        """True if the whole record is finite."""
         return bool(np.isfinite(self.record.mean).all() and np.isfinite(self.record.covariance).all())
 
     def prior(self, i: int) -> tuple[Array, Array]:
-        """What is known at sample i from it alone: mean (d,) and covariance (d, d)."""
+        """The prior at sample i from that sample alone: mean (d,) and covariance (d, d)."""
         spin, spin_sigma = spin_start(self.settings.spin_label(self.track), self.settings)
         mean = np.concatenate((self.track.positions[i], np.zeros(3), spin, self.means, np.zeros(len(self.bias_sigmas))))
         sigma = (
@@ -213,7 +213,7 @@ class _Run:
         return mean, covariance
 
     def states_near_contacts(self) -> dict[int, ContactState]:
-        """The states to report at samples at which the ball may be on either side of a contact."""
+        """The states to report at samples where the ball may be on either side of a contact."""
         record, times = self.record, self.track.times
         model = HypothesisModel(self.owner.ball, self.owner.surfaces, self.settings, len(self.bias_sigmas))
         monitor, found = ContactMonitor(model), dict[int, ContactState]()
@@ -229,30 +229,30 @@ class _Run:
         return found
 
     def _bounced_before(self, k: int, count: int) -> bool:
-        """Whether the filter's ball has bounced in the last `count` intervals before sample k."""
+        """True if the filter's ball has bounced in the last `count` intervals before sample k."""
         return any(i in self.record.contacts for i in range(k - count, k))
 
     def _measured(self, k: int) -> SampleMeasurement:
-        """What the filter took in at a sample."""
+        """The measurements that the filter used at a sample."""
         if self.record.quality[k] == Quality.OUTLIER:
             return SampleMeasurement()
         rows = [(batch, row) for one, batch in self.beside for row in one.filter_rows(k)]
-        factors = [batch.taken(np.array([row])) for batch, row in rows]
+        factors = [batch.select(np.array([row])) for batch, row in rows]
         return SampleMeasurement(self.track.positions[k], self.sigma[k], factors)
 
     def _least(self) -> Array:
-        """(d,) standard deviations below which no number can be known, whatever rounding says of it."""
+        """(d,) least standard deviations, against rounding."""
         position = LEAST_SHARE * float(self.sigma.min()) / np.sqrt(len(self.track))
         coefficients = LEAST_SHARE * np.array(list(self.settings.coefficients.values()))
         own = np.concatenate((np.full(3, position), np.full(6, LEAST_MOTION), coefficients))
         return np.concatenate((own, LEAST_SHARE * self.bias_sigmas))
 
     def _measurement_noise(self, k: int, velocity: Array) -> Array:
-        """(3, 3) m^2, of a sample's white error and of the error of its stamp at a velocity (3,) m/s."""
+        """(3, 3) m^2, of a sample's white error and of its stamp's error at a velocity (3,) m/s."""
         return np.diag(self.sigma[k] ** 2) + stamp_covariance(self.settings, velocity)
 
     def _filter(self) -> None:
-        """All samples in turn; back to before the first of four that were rejected, with a hit there."""
+        """Filters all samples in turn; after four rejected ones it goes back to before the first, with a hit there."""
         n, record = len(self.track), self.record
         ball = self._begin()
         k = record.start + 1
@@ -304,7 +304,7 @@ class _Run:
         return ball
 
     def _hit(self, ball: BallFilter, since: int) -> None:
-        """Back to before sample `since`; the flight begins anew at the first good one from there on."""
+        """Goes back to before sample `since` with a hit; the flight restarts at the first good sample from there on."""
         first, second = self._first_pair(since)
         self.skipped.update(range(since, first))
         self.skipped.update(range(first + 1, second))
@@ -314,7 +314,7 @@ class _Run:
         ball.P = self.record.covariance[since - 1].copy()
 
     def _first_pair(self, first: int) -> tuple[int, int]:
-        """The first two good samples of a flight from sample `first` on; a filter believes them whatever they are."""
+        """The first two good samples of a flight from sample `first` on; the filter uses them without a gate."""
         if not self.settings.find_events:
             return first, first + 1
         z = self.track.positions[:, Z, None] - self.owner.model.radius
@@ -323,7 +323,7 @@ class _Run:
         return first_pair(self.track.times, self.track.positions, sigma, near, first)
 
     def _predict(self, ball: BallFilter, k: int) -> None:
-        """To the time of sample k."""
+        """Predicts to the time of sample k."""
         times, record = self.track.times, self.record
         used = next((i for i in range(k, len(times)) if i not in self.skipped), k)
         R = self._measurement_noise(used, self.velocities[used])
@@ -342,7 +342,7 @@ class _Run:
         record.prior_mean[k], record.prior_covariance[k] = ball.x, ball.P
         record.transition[k], record.noise[k] = ball.F, ball.Q
 
-    def _noise(self, k: int, motion: Motion) -> Array:
+    def _noise(self, k: int, motion: Advance) -> Array:
         """(d, d) process noise from sample k - 1 to k: flight, contacts, a hit at an unknown time."""
         process, dt = self.settings.process, np.diff(self.track.times[k - 1 : k + 1])
         covariance = self.flight_noise[k - 1].copy()
@@ -358,7 +358,7 @@ class _Run:
         return noise
 
     def _accept(self, ball: BallFilter, k: int) -> bool:
-        """Update with sample k unless it lies beyond the gate; the first sample after a hit always counts."""
+        """Updates with sample k unless it lies beyond the gate; the first sample after a hit always counts."""
         measured = self.track.positions[k]
         whitened = self.record.whitened[k] = ball.innovation(measured)
         used = not self.settings.find_events or k - 1 in self.record.hits or ball.passes(whitened)
@@ -369,15 +369,15 @@ class _Run:
         return used
 
     def _correct_beside(self, ball: BallFilter, k: int) -> None:
-        """Update with everything else that was measured at sample k.
+        """Updates with all other measurements at sample k.
 
-        At the first sample the velocity is still unknown: a speed, of which no tangent tells anything there, is left
-        out with an innovation of NaN.
+        At the first sample the velocity is still unknown: a speed, whose Jacobian is zero there, is skipped with an
+        innovation of NaN.
         """
         begins = k == self.record.start
         for observation, batch in self.beside:
             for row in observation.filter_rows(k):
-                one = batch.taken(np.array([row]))
+                one = batch.select(np.array([row]))
                 whitened = ball.correct_by(one, self.settings.find_events or begins)
                 if not begins or ball.passes(whitened):
                     self.innovations[observation.name][row] = whitened

@@ -1,4 +1,4 @@
-"""The record of a filter's run over a track, and the Rauch-Tung-Striebel pass that smooths it.
+"""Records a filter's run over a track and smooths it by the Rauch-Tung-Striebel pass.
 
 Source: H. E. Rauch, F. Tung, C. T. Striebel, "Maximum likelihood estimates of linear dynamic systems", AIAA Journal
 3(8), 1965, equations 3.30 and 3.31; the covariance in the form that stays positive definite under rounding.
@@ -16,7 +16,7 @@ from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.integrate import fly_jacobian
 from ballfg.estimation.observations.innovation import leave_position_out
-from ballfg.estimation.segmentation import Contact, Quality
+from ballfg.estimation.segmentation.result import Contact, Quality
 from ballfg.factors.batch import Rows
 from ballfg.factors.linear.definite import raised
 from ballfg.factors.loss import Loss
@@ -25,19 +25,19 @@ from ballfg.state import STATE_DIM
 
 @dataclass
 class FilterRecord:
-    """What a filter knew at each of n samples, in d numbers: the state, coefficients of the model, the tracker's bias.
+    """A filter's belief at each of n samples, in d numbers: state, coefficients of the model, tracker's bias.
 
     Attributes:
-        start: first sample that the filter knows something of.
+        start: first sample with a belief.
         prior_mean: (n, d) and prior_covariance: (n, d, d), before the sample.
         mean: (n, d) and covariance: (n, d, d), after it.
         transition: (n, d, d), Jacobian of the motion from the sample before.
         noise: (n, d, d), process noise gathered since the sample before.
         measurement_noise: (n, 3, 3) m^2, covariance of the sample's white error and of that of its stamp.
-        whitened: (n, 3), innovations divided by their standard deviations; NaN where there is none.
+        whitened: (n, 3), innovations divided by their standard deviations; NaN where a sample has none.
         quality: (n,) `Quality`.
-        least: (d,) standard deviations that rounding takes none of them below.
-        contacts: for each interval that has any.
+        least: (d,) least standard deviations, against rounding.
+        contacts: for each interval with any.
         hits: intervals.
     """
 
@@ -57,7 +57,7 @@ class FilterRecord:
 
     @classmethod
     def empty(cls, n: int, d: int) -> FilterRecord:
-        """A record of n samples with nothing in it yet."""
+        """A record of n samples without content."""
         square = (n, d, d)
         return cls(
             prior_mean=np.zeros((n, d)),
@@ -74,7 +74,7 @@ class FilterRecord:
 
     @property
     def used(self) -> NDArray[np.bool_]:
-        """(n,) samples that took part."""
+        """(n,) the samples that the filter used."""
         return self.quality != Quality.OUTLIER
 
     def innovations(self, H: Array, mean: Array, covariance: Array, measured: Array) -> Array:
@@ -95,14 +95,14 @@ class FilterRecord:
 
 
 def rts_smooth(record: FilterRecord) -> tuple[Array, Array]:
-    """Means (n, d) and covariances (n, d, d) given all samples; those before `record.start` are left as they are.
+    """Means (n, d) and covariances (n, d, d) given all samples; entries before `record.start` stay.
 
     Filterpy has this pass for linear filters only: it predicts with F x; here the prediction is the motion itself.
 
     With C = P_k F^T (P-_{k+1})^-1, from the last sample to the first:
     x^s_k = x_k + C (x^s_{k+1} - x-_{k+1}) and P^s_k = (I - C F) P_k (I - C F)^T + C (P^s_{k+1} + Q) C^T.
 
-    At a hit P- holds the hit's wide jump, so that C is small there and little is carried across.
+    At a hit P- holds the hit's wide jump, so that C is small there and little information passes it.
     """
     mean, covariance = record.mean.copy(), record.covariance.copy()
     identity = np.eye(mean.shape[1])
@@ -132,15 +132,15 @@ def fly_back(
     mean: Array,
     covariance: Array,
 ) -> None:
-    """Fills the states before sample `start`, in place: free flight back from it.
+    """Fills the states before sample `start`, in place, by free flight back from it.
 
     Args:
         model: the ball, with its coefficients in the state.
         start: the first sample with a state.
         times: (n,) s.
         noise: (n - 1, 9, 9), process noise of free flight over each interval.
-        fading: (n - 1,) decay of the bias over each interval and (n - 1, b) m its new part's standard deviation, the
-            same in both directions of time.
+        fading: (n - 1,) decay of the bias over each interval and (n - 1, b) m, the standard deviation of its new part,
+            the same in both directions of time.
         mean: (n, d).
         covariance: (n, d, d).
     """
@@ -155,6 +155,6 @@ def fly_back(
         mean[k, :width], mean[k, width:] = after[0].numpy(), fading[0][k] * mean[k + 1, width:]
         covariance[k] = F @ widened @ F.T
         covariance[k, width:, width:] += np.diag(fading[1][k] ** 2)
-        if not (np.isfinite(mean[k]).all() and np.isfinite(covariance[k]).all()):  # drag, back in time, is a push
+        if not (np.isfinite(mean[k]).all() and np.isfinite(covariance[k]).all()):  # drag accelerates back in time
             mean[: k + 1], covariance[: k + 1] = np.nan, np.nan
             return

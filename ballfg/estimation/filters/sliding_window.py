@@ -1,4 +1,4 @@
-"""The sliding-window mean: the plainest estimate of a velocity, and where the better ones start.
+"""The sliding-window mean is the simplest estimate of a velocity and a start for the better ones.
 
 Source: Q. Xiao, Z. Wu, M. Gombolay, "Learning Dynamics of a Ball with Differentiable Factor Graph and
 Roto-Translational Invariant Representations", section IV: the average velocity within a sliding window of size 5.
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.integrate import rate_jacobian
+from ballfg.dynamics.motion.flight_step import rate_jacobian
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities
@@ -25,17 +25,17 @@ from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, STATE_DIM, VELOCITY, 
 from ballfg.tracks import Track
 
 START_SEARCH = 12
-"""How many samples are looked at for the first good ones of a flight."""
+"""Number of samples among which the first good ones of a flight are searched."""
 START_GATE = 30.7
 """Squared whitened miss beyond which three samples are not one flight: chi-square, 3 degrees of freedom, 1e-6."""
 START_ACCELERATION = 20.0
-"""m/s^2, standard deviation of what bends three samples beside gravity: twice a fast ball's drag."""
+"""m/s^2, standard deviation of the acceleration of three samples beside gravity: twice a fast ball's drag."""
 FRICTION_SHARE = 0.5
 """Largest change of tangential speed in a bounce, as a share of the normal speed's change: Coulomb's mu."""
 
 
 class SlidingWindow(Estimator):
-    """The mean velocity over a causal window of five samples; a baseline, not corrected for what it neglects.
+    """The mean velocity over a causal window of five samples; a baseline without corrections.
 
     - Position: as measured, with the standard deviation of the whole error: white, lasting, and that of the stamp.
       Velocity: (p_k - p_j) / (t_k - t_j) with j = max(k - 4, 0); at the first sample, zero with the prior's covariance.
@@ -52,7 +52,7 @@ class SlidingWindow(Estimator):
     name = "sliding-window"
 
     def estimate(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Estimate:
-        """The states of a track, from its positions alone; a single sample has no velocity and the status says so."""
+        """The states of a track, from its positions alone; the status reports a single sample, without velocity."""
         written = self.prepared(track, factors)
         track = written.since_first()
         n, settings = len(track), self.settings.for_track(track)
@@ -86,7 +86,7 @@ class SlidingWindow(Estimator):
         return plausible(estimate, track, sigma, self.settings).dated(written.times)
 
     def _spin_covariance(self, track: Track, bounced: NDArray[np.bool_]) -> Array:
-        """(n, 3, 3): prior or label, the random walk since, and an unknown change once the ball may have bounced."""
+        """(n, 3, 3): prior or label, the random walk since, and an unknown change after a possible bounce."""
         _, start = spin_start(self.settings.spin_label(track), self.settings)
         variance = start**2 + self.settings.process.spin**2 * (track.times - track.times[0])
         variance = variance + self.settings.spin_prior**2 * np.logical_or.accumulate(bounced)
@@ -94,9 +94,9 @@ class SlidingWindow(Estimator):
 
 
 def may_touch(times: Array, positions: Array, surfaces: Surfaces, radius: float) -> NDArray[np.bool_]:
-    """(n,) bool: the ball may have touched a surface since the sample before.
+    """(n,) bool: True if the ball may have touched a surface since the sample before.
 
-    It is so where one of the two samples lies closer to a surface than the ball moves in one interval.
+    This holds if one of the two samples lies closer to a surface than the ball moves in one interval.
     """
     n = len(times)
     gap = np.abs(positions[:, Z, None] - radius - np.array(surfaces.heights())).min(axis=-1)
@@ -150,8 +150,8 @@ def first_pair(
 ) -> tuple[int, int]:
     """The first two good samples of a flight: with a third they lie on a parabola.
 
-    Of the triples that end earliest, the one with the best parabola is taken. Samples near a surface agree with all,
-    as there may be a bounce between them.
+    The triple with the best parabola among those that end earliest gives them. Samples near a surface agree with all,
+    as a bounce may lie between them.
 
     Args:
         times: (n,) s.
@@ -159,7 +159,7 @@ def first_pair(
         sigma: (n, 3) m.
         near: (n,) bool, samples near a surface.
         first: the first sample to look at.
-    Returns: indices of two samples; `first` and the next one where nothing fits.
+    Returns: indices of two samples; `first` and the next one if nothing fits.
     """
     for last in range(first + 2, min(first + START_SEARCH, len(times))):
         pairs = list(combinations(range(first, last), 2))

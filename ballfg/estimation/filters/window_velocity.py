@@ -1,4 +1,4 @@
-"""Velocities from line fits in windows of a few samples: where estimates start, and what a launch looks like."""
+"""Fits velocities to windows of a few samples, as a start for estimates and for the direction of a launch."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,8 +15,8 @@ def window_velocities(times: Array, positions: Array, breaks: ArrayLike = ()) ->
     """Velocities at all samples, by line fits over five samples that end at the breaks of the motion.
 
     Least squares over p(t) = p_0 + v t - g t^2/2 e_z, with t counted from the sample, so that v is the velocity there.
-    A window is centred on its sample, shifted where a break or an end of the track is near, shorter where there are
-    fewer than five samples between two breaks. A sample alone between breaks gets the mean slope to its neighbours.
+    A window is centred on its sample, shifted near a break or an end of the track, and shorter if two breaks hold fewer
+    than five samples. A sample alone between breaks gets the mean slope to its neighbours.
 
     Args:
         times: (n,) s, increasing.
@@ -59,7 +59,7 @@ def _segment_bounds(n: int, breaks: NDArray[np.int64]) -> tuple[NDArray[np.int64
 
 
 def _neighbour_slopes(times: Array, positions: Array) -> Array:
-    """(n, 3) mean of the slopes to the samples before and after; at the ends the one there is."""
+    """(n, 3) mean of the slopes to the samples before and after; at the ends the single slope."""
     slopes = np.diff(positions, axis=0) / np.diff(times)[:, None]
     padded = np.concatenate((slopes[:1], slopes, slopes[-1:]))
     return np.asarray((padded[1:] + padded[:-1]) / 2)

@@ -1,1 +1,1 @@
-"""Measurement effects undone, and the noise of positions."""
+"""Inverts measurement effects and estimates the noise of positions."""

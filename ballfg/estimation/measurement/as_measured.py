@@ -1,4 +1,4 @@
-"""Between what happened and what is written down: stamps, positions and spin labels, as a model measures them."""
+"""Converts between true and recorded stamps, positions and spin labels by a model's measurement effects."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from ballfg.state import POSITION, STATE_DIM
 _MEASUREMENT = "measurement"
 """Attribute of an `AnalyticModel` that holds its measurement effects."""
 LARGEST_CONDITION = 1e6
-"""Of the map from spins to labels: beyond it a label leaves a component of the spin open."""
+"""Largest condition of the map from spins to labels: beyond it a label leaves a component of the spin undetermined."""
 
 
 def plainly_measured(model: BallModel) -> BallModel:
-    """The ball of a model, its positions, stamps and labels written down as they are; all parameters are shared.
+    """The model without measurement effects; all parameters are shared.
 
     Raises: TypeError: if the model measures by other means than the effects of an analytic model or of its base.
     """
@@ -51,7 +51,7 @@ def _without_effects(model: BallModel) -> BallModel:
 
 
 def true_times(model: BallModel, times: Array) -> Array:
-    """(n,) s, when the samples of a track were taken; the first stamp is right. Those of a plain model, to the bit.
+    """(n,) s, true times of a track's samples; the first stamp is right. Without effects they stay to the bit.
 
     Args: times: (n,) s, all stamps of the track from its first on.
     """
@@ -62,19 +62,19 @@ def true_times(model: BallModel, times: Array) -> Array:
 
 
 def written_time(model: BallModel, first: float, time: float) -> float:
-    """What a track whose first stamp is `first` would write at a true time; both s."""
+    """The recorded stamp of a true time in a track whose first stamp is `first`; both s."""
     with torch.no_grad():
         return first + float(model.stamps(torch.tensor(time - first, dtype=torch.float64)))
 
 
 @torch.no_grad()
 def measured_positions(model: BallModel, states: Tensor, surfaces: Surfaces) -> Tensor:
-    """(n, 3) m, where balls will be measured, before noise.
+    """(n, 3) m, expected measured positions of balls, before noise.
 
     Args:
         model: may be augmented.
         states: (n, 9 + p), true.
-        surfaces: what a ball may bounce on between the moments that one sample is made of.
+        surfaces: those that a ball may bounce on between the moments of one sample.
     """
     if model.measures_plainly:
         return states[:, POSITION]
@@ -87,7 +87,7 @@ def measured_positions(model: BallModel, states: Tensor, surfaces: Surfaces) -> 
 
 @dataclass(frozen=True)
 class LabelMap:
-    """How labels come from spins: label = matrix spin + offset.
+    """The affine map from spins to labels: label = matrix spin + offset.
 
     Attributes:
         matrix: (3, 3).
@@ -116,5 +116,5 @@ class LabelMap:
 
     @property
     def gain(self) -> float:
-        """By which labels are larger than spins, in the mean over all directions."""
+        """Mean factor between the lengths of labels and spins over all directions."""
         return float(abs(np.linalg.det(self.matrix)) ** (1.0 / 3.0))

@@ -1,7 +1,7 @@
-"""Estimators for models whose measurements are not what happened: the measurement is undone before the estimation.
+"""Inverts measurement effects before the estimation, for models whose measurements differ from the true motion.
 
-Only the forward map is asked, so any effect will do. With h(x) the position that is measured of a ball in state x, the
-track is shifted by h(x) - p(x), x the states that the smoother finds in the shifted track, until the shift stays.
+Only the forward map is used, so any effect will do. With h(x) the measured position of a ball in state x, the track is
+shifted by h(x) - p(x) until the shift converges; x are the smoother's states of the shifted track.
 """
 
 from collections.abc import Sequence
@@ -31,26 +31,27 @@ from ballfg.estimation.smoother.pieces.long_tracks import PiecewiseSmoother
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.batch import FactorBatch
 from ballfg.state import POSITION, STATE_DIM
-from ballfg.tracks import SPIN_LABELS, Track
+from ballfg.tracks import Track
+from ballfg.tracks.track import SPIN_LABELS
 
 ROUNDS: Final = 20
-"""How often the track is estimated at most; a lag of 5 ms takes four or five rounds, an offset of 30 ms a dozen."""
+"""Largest number of estimates of a track; a lag of 5 ms takes four or five, an offset of 30 ms a dozen."""
 FIRST_ROUNDS: Final = 8
-"""Steps of the fixed point on positions alone: a map that stretches them by 10 % is then undone to 1e-8."""
+"""Steps of the fixed point on positions alone: they undo a stretch by 10 % to 1e-8."""
 SETTLED: Final = 1e-3
-"""Standard deviations of a sample: shifts that change by less are the same."""
+"""Standard deviations of a sample: shifts that change by less have converged."""
 LOST: Final = 1e4
-"""Standard deviations of a sample, tens of metres: shifts that change by more will not settle."""
+"""Standard deviations of a sample, tens of metres: shifts that change by more diverge."""
 
 
 @dataclass(frozen=True)
 class Undone:
-    """A track as it happened: stamps, positions and label.
+    """The true track: stamps, positions and label.
 
     Attributes:
         track: shifted, on the true clock.
         estimate: of the smoother.
-        settled: whether the shift stayed.
+        settled: True if the shift converged.
     """
 
     track: Track
@@ -59,19 +60,18 @@ class Undone:
 
 
 class InvertMeasurement(Estimator):
-    """An estimator of true states from what a model with measurement effects has written down.
+    """Estimates true states from the records of a model with measurement effects.
 
-    Stamps of the result are as written, its states are true. The shift of a sample is found by the smoother for all
-    estimators, from the whole track. What is neglected: that the shift of a sample is as uncertain as the state it is
-    made from (by a lag times the velocity's standard deviation: 0.2 mm for 5 ms and 0.04 m/s), and that noise is
-    stretched along with positions (by a per cent for a scale that is wrong by one). Hits within the time that a sample
-    is spread over are not seen.
+    Stamps of the result are the recorded ones, its states are true. The smoother finds the shift of a sample for all
+    estimators, from the whole track. Two errors are neglected: the shift of a sample is as uncertain as its state (a
+    lag times the velocity's standard deviation: 0.2 mm for 5 ms and 0.04 m/s), and noise is stretched along with
+    positions (by a per cent for a scale that is wrong by one). Hits within the time that a sample spans are not seen.
 
     Args:
         kind: the estimator.
-        model: the ball, with measurement effects.  surfaces: what it may bounce on.  settings: noise and priors.
+        model: the ball, with measurement effects.  surfaces: table and floor.  settings: noise and priors.
 
-    Raises: ValueError: if the model's spin labels do not tell the spin; from `estimate`, for a track whose
+    Raises: ValueError: if the model's spin labels do not determine the spin; from `estimate`, for a track whose
         positions are rough.
     """
 
@@ -88,7 +88,7 @@ class InvertMeasurement(Estimator):
         self.inner = self.smoother if kind in (Smoother, PiecewiseSmoother) else kind(plain, self.surfaces, own)
 
     def estimate(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Estimate:
-        """The true states at the written stamps; `NOT_CONVERGED` where the shifts did not settle."""
+        """The true states at the recorded stamps; `NOT_CONVERGED` if the shifts did not converge."""
         written = self.prepared(track, factors)
         track = written.since_first()
         undone = self.undo(track)
@@ -105,7 +105,7 @@ class InvertMeasurement(Estimator):
         return result.dated(written.times)
 
     def undo(self, track: Track) -> Undone:
-        """The track as it happened, and what the smoother makes of it; of shifts that do not settle, the steadiest."""
+        """The true track and the smoother's estimate of it; if shifts do not converge, the steadiest."""
         if track.rough:
             raise ValueError(
                 "model must have no measurement effects for a track that cameras saw: they act on positions, and there "
@@ -137,7 +137,7 @@ class InvertMeasurement(Estimator):
         return replace(track, times=true_times(self.model, track.times), labels=labels)
 
     def _first_shift(self, track: Track) -> Array:
-        """(n, 3) m, of balls at rest where they were measured: right where the map asks for positions alone."""
+        """(n, 3) m, of balls at rest at the measured positions: exact for a map of positions alone."""
         states = torch.zeros((len(track), STATE_DIM), dtype=torch.float64)
         written = torch.from_numpy(track.positions)
         shift = torch.zeros_like(written)
@@ -148,7 +148,7 @@ class InvertMeasurement(Estimator):
         return np.asarray(np.nan_to_num(shift.numpy(), posinf=0.0, neginf=0.0))
 
     def _shift(self, estimate: Estimate) -> Array:
-        """(n, 3) m, by how much the estimated states are measured away from their positions."""
+        """(n, 3) m, distance between the measured and the true positions of the estimated states."""
         states, model = torch.from_numpy(estimate.states), self.model
         if estimate.coefficient_names:
             augmented = AugmentedModel(model, estimate.coefficient_names)
@@ -158,10 +158,10 @@ class InvertMeasurement(Estimator):
         return (measured_positions(model, states, self.surfaces) - states[:, POSITION]).numpy()
 
     def _last(self, model: BallModel, before: Tensor, times: Array) -> Tensor:
-        """(1, 9 + p) the last state, as it follows from the one before.
+        """(1, 9 + p) the last state, as it follows from the previous one.
 
-        No later sample tells on which side of a bounce the last one is. Shifted as if before it, a sample after it
-        would go on looking like one before: the motion must decide.
+        No later sample tells on which side of a bounce the last one is. Shifted as if before the bounce, a sample after
+        it would still look like one before: the motion must decide.
         """
         with torch.no_grad():
             return advance(model, before, torch.from_numpy(np.diff(times[-2:])), self.surfaces)

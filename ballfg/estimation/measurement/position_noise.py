@@ -1,4 +1,4 @@
-"""Position noise of a tracker, read off its tracks: how far a sample lies from a smooth path through its neighbours."""
+"""Estimates a tracker's position noise from the distance of samples to smooth paths through their neighbours."""
 
 from collections.abc import Iterable
 
@@ -10,46 +10,46 @@ from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
 from ballfg.tracks import Track
 
 HALF_WINDOW = 5
-"""Samples on each side of the one that is judged."""
+"""Number of samples on each side of the tested one."""
 DEGREE = 3
-"""Of the polynomials. Over `LONGEST_WINDOW` what is left of a flight beyond a cubic is below 0.1 mm."""
+"""Of the polynomials. Over `LONGEST_WINDOW` a flight differs from a cubic by less than 0.1 mm."""
 LONGEST_WINDOW = 0.3
 """s. Windows with a gap, or of a slow tracker, are left out."""
 REJECT = 5.0
-"""Windows in which any residual exceeds this many sigma hold a bounce, a hit or an outlier, and are left out."""
+"""Windows with a residual above this many sigma hold a bounce, a hit or an outlier, and are left out."""
 ROUNDS = 4
 """Repetitions of estimate and rejection; the first one rejects nothing."""
 ENOUGH = 20_000
-"""Windows after which no further track is read: they give sigma to 1 %."""
+"""Number of windows that gives sigma to 1 %; no further track is read."""
 FLOOR = 2e-4
-"""m. No tracker of flying balls is better; identical or computed positions would give zero."""
+"""m. Least noise of a tracker of flying balls; identical or computed positions would give zero."""
 FALLBACK = 2e-3
-"""m. Assumed where no track has a window: the noise of a camera tracker in a room."""
+"""m. Noise of a camera tracker in a room, for data in which no track has a window."""
 LEAST_LEFT = 1e-6
-"""Share of a sample's variance that a fit leaves, at least: a sample far from all others determines the cubic alone."""
+"""Least share of a sample's variance that a fit leaves: a sample far from all others determines the cubic alone."""
 LOOKED_AT = 128
-"""Samples of a track whose scatter is compared with the stated noise: they tell it to some 10 %."""
+"""Number of samples of a track whose scatter is compared with the stated noise; they give it to some 10 %."""
 LEAST_WINDOWS = 20
-"""Windows without which a track does not tell its scatter."""
+"""Least number of windows for the scatter of a track."""
 MOST_SCATTER = 1.75
-"""Of the stated noise. Of 300 simulated tracks of each of nine sorts (seed 5; 60 to 200 Hz, with 5 % outliers or
-stamps that jitter) at most one in a hundred scatters so much."""
+"""Of the stated noise. Of 300 simulated tracks of each of nine kinds (seed 5; 60 to 200 Hz, with 5 % outliers or
+jittering stamps) at most one in a hundred scatters so much."""
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal variable divided by the median of its absolute value."""
 
 
 def estimate_position_noise(tracks: Iterable[Track]) -> Array:
-    """The standard deviation of each coordinate, for data that states none.
+    """The standard deviation of each coordinate, for data that does not state it.
 
-    A cubic is fitted to each window of 11 samples, the middle one left out, and predicts that one. The residuals,
-    divided by what such a prediction adds to the noise, have the standard deviation sought; their median absolute
-    value gives it without regard to a few bad ones. Windows with a bounce, a hit or an outlier are rejected.
+    A cubic is fitted to each window of 11 samples without the middle one, and predicts that one. The residuals, divided
+    by the growth of the noise in such a prediction, have the standard deviation sought; their median absolute value
+    gives it regardless of a few bad ones. Windows with a bounce, a hit or an outlier are rejected.
 
-    Noise with a memory longer than the window (calibration, a shifted tracker) is not seen; stamp jitter is, along
+    Noise with a memory longer than the window (calibration, a shifted tracker) does not show; stamp jitter does, along
     the flight.
 
-    Args: tracks: read until there is enough.
-    Returns: (3,) m, at least `FLOOR`; `FALLBACK` where every track is shorter than a window.
+    Args: tracks: read until there are enough windows.
+    Returns: (3,) m, at least `FLOOR`; `FALLBACK` if every track is shorter than a window.
     """
     blocks: list[Array] = []
     count = 0
@@ -65,10 +65,10 @@ def estimate_position_noise(tracks: Iterable[Track]) -> Array:
 
 
 def noise_doubts(track: Track, settings: Settings) -> tuple[str, ...]:
-    """Whether positions scatter far more than the settings say, one sentence; for `Estimate.notes`.
+    """One sentence if positions scatter far more than the settings say; for `Estimate.notes`.
 
-    With a noise that is stated too small, covariances are too small and good samples are taken for events. The first
-    `LOOKED_AT` samples tell it; rough positions, and tracks of fewer than `LEAST_WINDOWS` windows, do not.
+    If the stated noise is too small, covariances are too small and good samples are taken for events. The first
+    `LOOKED_AT` samples show it; rough positions, and tracks of fewer than `LEAST_WINDOWS` windows, do not.
     """
     first = slice(0, LOOKED_AT)
     times, positions = track.seconds[first], track.positions[first]
@@ -91,8 +91,8 @@ def noise_doubts(track: Track, settings: Settings) -> tuple[str, ...]:
 def _window_residuals(times: Array, positions: Array) -> Array:
     """(w, 11, 3) m, residuals of the cubic through each window, scaled to the standard deviation of one sample.
 
-    A residual of least squares has variance sigma^2 (1 - h) with h the leverage; predicted with its own sample left
-    out it is larger by 1 / (1 - h), so that r / sqrt(1 - h) is either of them, standardised.
+    A residual of least squares has variance sigma^2 (1 - h) with h the leverage; predicted without its own sample it is
+    larger by 1 / (1 - h), so that r / sqrt(1 - h) standardises either of them.
     """
     size = 2 * HALF_WINDOW + 1
     if len(times) < size:

@@ -1,1 +1,1 @@
-"""Noise that the tracks of a dataset show: of the tracker, of the motion, of bounces, labels and spins."""
+"""Estimates noise from the tracks of a dataset: of the tracker, the motion, bounces, labels and spins."""

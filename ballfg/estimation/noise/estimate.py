@@ -1,4 +1,4 @@
-"""The noise of a set of tracks, from how well forecasts within the tracks keep their promise."""
+"""Estimates the noise of a set of tracks by the calibration of forecasts within them."""
 
 from __future__ import annotations
 
@@ -33,39 +33,40 @@ from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.parallel.work import on_one_thread
 from ballfg.progress import Watch, unwatched
-from ballfg.tracks import Track, TrackNoise
+from ballfg.tracks import Track
+from ballfg.tracks.noise import TrackNoise
 
 T = TypeVar("T")
 
 LONGEST_PART: Final = 0.75
-"""s of a track that are used: a start at 0.2 s or later, and 0.3 s of forecast behind it."""
+"""s, used part of a track: a start at 0.2 s or later, and 0.3 s of forecast after it."""
 MOST_TRACKS: Final = 20
-"""Tracks that are used; twice as many move no number by more than its error bar, and take twice as long."""
+"""Number of used tracks; twice as many move no number by more than its error bar, and take twice as long."""
 MOST_ITERATIONS: Final = 25
 EARLIEST_SHARE: Final = 0.7
-"""Share of a short track that is seen before the first forecast."""
+"""Share of a short track before the first forecast."""
 EVERY_SHARE: Final = 0.12
 """Share of a short track between two starts."""
 OPEN: Final = 0.7
-"""Of the standard deviation of the prior. Beyond it the prior and not the tracks ends an interval, which is open."""
+"""In standard deviations of the prior: an interval beyond it is open, since the prior and not the tracks ends it."""
 
 
 @dataclass(frozen=True)
 class NoiseEstimate:
-    """What tracks tell of their noise.
+    """The noise estimated from tracks.
 
     Attributes:
         noise: standard deviations.
-        relative_errors: standard deviation of each number's logarithm, by name, with `.x`, `.y`, `.z` where there is
-            one per axis; the larger one of its two sides.
-        intervals: of the same numbers, one standard deviation to each side, in their own units; from 0 where tracks do
-            not tell how small a number is, to infinity where they do not tell how large.
+        relative_errors: standard deviation of each number's logarithm, by name, with `.x`, `.y`, `.z` if there is one
+            per axis; the larger one of its two sides.
+        intervals: of the same numbers, one standard deviation to each side, in their own units; from 0 or to infinity
+            if the tracks do not bound a number below or above.
         coefficient_factor: spread of coefficients from track to track, as a multiple of the settings'.
         settings: with that noise.
         held_before: share of forecast coordinates inside their 90 % intervals with the settings given.
         held: the same with this noise.
-        tracks: number of tracks that were used.
-        starts: number of moments that forecasts were made from.
+        tracks: number of used tracks.
+        starts: number of forecast origins.
     """
 
     noise: TrackNoise
@@ -93,20 +94,20 @@ def estimate_noise(
 ) -> NoiseEstimate | None:
     """The noise that makes forecasts 20 to 300 ms ahead within the tracks most probable.
 
-    Every track is estimated once and linearised about the estimate; trying a noise is then a Kalman filter. The model
-    is not changed: what it lacks counts as noise.
+    Every track is estimated once and linearised about the estimate; another noise then costs only a Kalman filter. The
+    model stays: its errors count as noise.
 
     Args:
         model: the ball, and how it is measured.
-        surfaces: what it may bounce on.
+        surfaces: table and floor.
         settings: prior medians of all numbers.
-        tracks: measured positions; each contributes its first part (`LONGEST_PART`).
-        position_known: whether the settings' white noise of positions stays as it is.
-        tracker_known: whether the settings' memory of the tracker and jitter of the stamps stay as they are.
-        errors: whether to compute error bars, which doubles the time.
-        watch: told of each track, and of each step of the search.
+        tracks: measured positions; the first part of each is used (`LONGEST_PART`).
+        position_known: True if the settings' white noise of positions is fixed.
+        tracker_known: True if the settings' memory of the tracker and jitter of the stamps are fixed.
+        errors: True to compute error bars, which doubles the time.
+        watch: called for each track and each step of the search.
         jobs: processes.
-    Returns: None where no track is long enough.
+    Returns: None if no track is long enough.
     """
     check_instance("model", model, BallModel, "Load one with load_model.")
     check_instance("settings", settings, Settings, "Make them with Settings.for_measured(model).")
@@ -119,7 +120,7 @@ def estimate_noise(
     if linear is None:
         return None
     known = (position_known or own_sigmas, tracker_known)
-    # the batches are small: threads cost more than they bring, and where others compute they wait for each other
+    # the batches are small: threads gain nothing, and slow each other down on a busy machine
     return on_one_thread(partial(_searched, parts, settings, known, errors, watch), linear)
 
 
@@ -159,7 +160,7 @@ def _searched(
 
 
 def _intervals(logs: Array, sides: Array, wide: Array) -> list[tuple[float, float]]:
-    """Limits at distances (k, 2) below and above logarithms (k,); none where a distance is beyond `wide` (k,)."""
+    """Limits at distances (k, 2) below and above logarithms (k,); open where a distance is beyond `wide` (k,)."""
     limits = []
     for log, (below, above), most in zip(logs, sides, wide, strict=False):
         limits.append(
@@ -180,14 +181,14 @@ def linearised(
     *,
     jobs: int = 1,
 ) -> LinearTracks | None:
-    """Tracks about their estimates with white noise alone; None where all are short.
+    """Tracks linearised about estimates with white noise alone; None if all are short.
 
     Args:
         model: the ball, and how it is measured.
         surfaces: what it may bounce on.
-        settings: of which memory and jitter play no part.
+        settings: their memory and jitter are ignored.
         tracks: measured.
-        watch: told of each track.
+        watch: called for each track.
         jobs: processes.
     """
     plain = replace(settings, memory=(0.0, 0.0, 0.0), stamp_jitter=0.0)
@@ -216,7 +217,7 @@ def _first_part(track: Track) -> Track:
 
 
 def _forecaster(linear: LinearTracks, parts: Sequence[Track], settings: Settings, biased: bool) -> Forecaster:
-    """Forecasts that start where a robot would use them, or earlier in tracks that are too short for that."""
+    """Forecasts from the origins that a robot would use, or earlier ones in tracks that are too short."""
     typical = float(np.median([part.duration for part in parts]))
     return Forecaster(
         linear,
@@ -250,7 +251,7 @@ class _Search:
     def minimised(self, tick: Callable[[], object]) -> Array:
         """(k,) logarithms at the minimum."""
 
-        def told(logs: Array) -> tuple[float, Array]:
+        def objective(logs: Array) -> tuple[float, Array]:
             tick()
             return self.value(logs)
 
@@ -258,16 +259,16 @@ class _Search:
         options = {"maxiter": MOST_ITERATIONS, "maxfun": 2 * MOST_ITERATIONS, "ftol": 1e-5}
         from scipy.optimize import minimize  # it takes half a second to import
 
-        found = minimize(told, self.start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+        found = minimize(objective, self.start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
         return np.asarray(found.x)
 
     def profile(self, logs: Array) -> Profile:
-        """What is known about the minimum near some logarithms (k,)."""
+        """The profile of the minimum near some logarithms (k,)."""
         return Profile(self.value, self._scatter, logs, self.spread, self.low, self.high)
 
     @property
     def names(self) -> list[str]:
-        """Of the numbers, with `.x`, `.y`, `.z` where there is one per axis."""
+        """Names of the numbers, with `.x`, `.y`, `.z` if there is one per axis."""
         return [p.name if p.axis is None else f"{p.name}.{'xyz'[p.axis]}" for p in self.parameters]
 
     def _scatter(self, logs: Array) -> Array:

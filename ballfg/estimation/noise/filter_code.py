@@ -1,4 +1,4 @@
-"""Machine code of a Kalman filter over linearised tracks."""
+"""Filters linearised tracks by a Kalman filter in machine code."""
 
 import math
 
@@ -10,25 +10,25 @@ from ballfg.estimation.noise.transition_code import invert_root, is_something, m
 from ballfg.state import STATE_DIM
 
 NEXT_FROM = 3
-"""Samples that determine a state; the marginal likelihood counts those after them."""
+"""Number of samples that determine a state; the marginal likelihood counts the later ones."""
 GATE = 30.0
 """Squared whitened innovation of three coordinates; beyond it, one in a million, a sample does not update."""
 NEXT_TAIL = 4.0
 """Standard deviations, of the norm of three coordinates, beyond which the score of a next sample grows linearly; a
-missed hit must not decide the noise."""
+missed hit must not dominate the noise."""
 
 
 @machine_code(NOTHING(TWO, ONE, REAL, THREE, ONE, ONE, ONE, TWO, THREE))
-def _predict(transition, departure, decay, kicks, process, memory, m, p, work):
-    """Move mean m (w,) and covariance p (w, w) on by one interval; work (2, w, w) is written to."""
+def _predict(transition, offset, decay, kicks, process, memory, m, p, work):
+    """Moves mean m (w,) and covariance p (w, w) on by one interval; overwrites work (2, w, w)."""
     d, w = len(transition), len(m)
     before = m.copy()
     for i in range(STATE_DIM):
-        m[i] = departure[i]
+        m[i] = offset[i]
         for j in range(d):
             m[i] += transition[i, j] * before[j]
     for i in range(STATE_DIM, d):
-        m[i] += departure[i]
+        m[i] += offset[i]
     move(transition, decay, p, work[0])
     transpose(work[0], work[1])
     move(transition, decay, work[1], p)
@@ -43,11 +43,11 @@ def _predict(transition, departure, decay, kicks, process, memory, m, p, work):
 
 
 @machine_code(REAL(COUNT, ONE, TWO, ONE, TWO, TWO, TWO, ONE, ONE))
-def _innovate(d, m, p, error, measured, seen, root, new, told):
-    """Compare a sample with its forecast: squared whitened innovation, not a number where S is not positive definite.
+def _innovate(d, m, p, error, measured, seen, root, new, weighted):
+    """Squared whitened innovation of a sample; NaN if the innovation's covariance S is not positive definite.
 
-    Writes: seen (w, 3) = P H', root (3, 3), the inverse of that of S, new (3,), the whitened innovation, and told (3,),
-    the innovation over S.
+    Writes: seen (w, 3) = P H', root (3, 3), the inverse of that of S, new (3,), the whitened innovation, and
+    weighted (3,), the innovation over S.
     """
     w, s = len(m), np.empty((3, 3))
     for i in range(w):
@@ -65,15 +65,15 @@ def _innovate(d, m, p, error, measured, seen, root, new, told):
             new[a] += root[a, b] * (error[b] - m[b] - (m[d + b] if d < w else 0.0))
         square += new[a] * new[a]
     for a in range(3):
-        told[a] = 0.0
+        weighted[a] = 0.0
         for c in range(a, 3):
-            told[a] += root[c, a] * new[c]
+            weighted[a] += root[c, a] * new[c]
     return square
 
 
 @machine_code(NOTHING(TWO, TWO, ONE, ONE, TWO, TWO))
 def _update(seen, root, new, m, p, gain):
-    """Take in a sample of which the whitened innovation is `new`; writes its gain (w, 3)."""
+    """Updates with a sample whose whitened innovation is `new`; writes its gain (w, 3)."""
     w = len(m)
     whitened = np.zeros((3, w))
     for i in range(w):
@@ -95,8 +95,8 @@ def _update(seen, root, new, m, p, gain):
 def _join(d, gain, prior, measured, p, work):
     """The covariance after the first sample, A P A' + K R K' with A = 1 - K H.
 
-    A difference would lose ten digits: the prior of the position is that much wider than what is left of it. `prior`
-    (w, w) and `work` (2, w, w) are written to.
+    A difference would lose ten digits: the prior of the position is that much wider than the posterior. Overwrites
+    `prior` (w, w) and `work` (2, w, w).
     """
     w = len(p)
     kept, half = work[0], work[1]
@@ -121,41 +121,41 @@ def _join(d, gain, prior, measured, p, work):
     FLAG(FOUR, THREE, FIVE, TWO, TWO, TWO, FOUR, THREE, INDEX, TWO, TWO, THREE, FOUR, FOUR, FOUR, THREE, TWO, ONE)
 )
 def filter_tracks(
-    transitions, departures, kicks, process, decays, memory, measured, errors, used, starts, priors,
-    means, covariances, gains, roots, told, squares, following,
+    transitions, offsets, kicks, process, decays, memory, measured, errors, used, starts, priors,
+    means, covariances, gains, roots, weighted, nis, nll,
 ):  # fmt: skip
-    """The filter over t tracks of n samples; False where a covariance is not positive definite.
+    """Filters t tracks of n samples; False if a covariance is not positive definite.
 
     Args:
-        transitions (t, n - 1, d, d), departures (t, n - 1, d), kicks (t, n - 1, 7, 9, 9): the linearised motion.
+        transitions (t, n - 1, d, d), offsets (t, n - 1, d), kicks (t, n - 1, 7, 9, 9): the linearised motion.
         process (t, 7): multiples of the kicks.  decays (t, n - 1), memory (t, 3): of the biases.
-        measured (t, n, 3, 3): covariance of what is new in a sample.  errors (t, n, 3), used (t, n): the samples.
+        measured (t, n, 3, 3): covariance of a sample's white error.  errors (t, n, 3), used (t, n): the samples.
         starts (t, w), priors (t, w): mean and variances before the first sample.
     Writes: means (t, n, w), covariances (t, n, w, w), gains (t, n, w, 3), zero where a sample does not update,
-        roots (t, n, 3, 3), inverse of the Cholesky root of the innovation's covariance S, told (t, n, 3), S^-1 e,
-        squares (t, n), e' S^-1 e, and following (t,), negative logarithm of the densities of next samples.
+        roots (t, n, 3, 3), inverse of the Cholesky root of the innovation's covariance S, weighted (t, n, 3), S^-1 e,
+        nis (t, n), e' S^-1 e, and nll (t,), negative logarithm of the densities of next samples.
     """
     count, samples, w = means.shape
     d = transitions.shape[2]
     seen, new, m, p, work = np.empty((w, 3)), np.empty(3), np.empty(w), np.empty((w, w)), np.empty((2, w, w))
     for t in range(count):
-        following[t] = 0.0
+        nll[t] = 0.0
         m[:], p[:] = starts[t], 0.0
         for i in range(w):
             p[i, i] = priors[t, i]
         for k in range(samples):
             if k:
-                departure, kick = departures[t, k - 1], kicks[t, k - 1]
-                _predict(transitions[t, k - 1], departure, decays[t, k - 1], kick, process[t], memory[t], m, p, work)
+                offset, kick = offsets[t, k - 1], kicks[t, k - 1]
+                _predict(transitions[t, k - 1], offset, decays[t, k - 1], kick, process[t], memory[t], m, p, work)
             root, gain = roots[t, k], gains[t, k]
-            square = _innovate(d, m, p, errors[t, k], measured[t, k], seen, root, new, told[t, k])
+            square = _innovate(d, m, p, errors[t, k], measured[t, k], seen, root, new, weighted[t, k])
             if math.isnan(square):
                 return False
-            squares[t, k], gain[:] = square, 0.0
+            nis[t, k], gain[:] = square, 0.0
             if k >= NEXT_FROM and used[t, k]:
                 tail = NEXT_TAIL * math.sqrt(square) - 0.5 * NEXT_TAIL * NEXT_TAIL
-                following[t] += 0.5 * square if square < NEXT_TAIL * NEXT_TAIL else tail
-                following[t] -= math.log(root[0, 0] * root[1, 1] * root[2, 2])
+                nll[t] += 0.5 * square if square < NEXT_TAIL * NEXT_TAIL else tail
+                nll[t] -= math.log(root[0, 0] * root[1, 1] * root[2, 2])
             if used[t, k] and square < GATE:
                 prior = covariances[t, k]
                 prior[:] = p

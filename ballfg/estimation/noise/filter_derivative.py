@@ -1,7 +1,7 @@
-"""Machine code for the derivative of a Kalman filter over linearised tracks, from the last sample to the first.
+"""Differentiates a Kalman filter over linearised tracks backward in machine code, from last sample to first.
 
-A gain K is that of the least covariance: what moves it does not, to first order, move the covariance after it. So with
-A = 1 - K H, S = H P H' + R and the innovation e = y - H m, an update moves
+A gain K minimises the covariance: to first order, a change of K does not change it. So with A = 1 - K H, S = H P H' + R
+and the innovation e = y - H m, an update moves
 
     the covariance by A dP A' + K dR K',    the mean by A dm + (A dP H' - K dR) S^-1 e,
     e' S^-1 e by -2 (S^-1 e)' H dm - (S^-1 e)' dS S^-1 e,    log det S by trace(S^-1 dS).
@@ -41,18 +41,18 @@ def _lift_both(d, rows, block, p):
 
 
 @machine_code(NOTHING(COUNT, TWO, TWO, ONE, REAL, FLAG, REAL, ONE, TWO, TWO))
-def _before_update(d, gain, root, told, square, updated, share, m, p, to_measured):
-    """From derivatives m (w,), p (w, w) by mean and covariance after an update to those before it, and (3, 3) by R.
+def _before_update(d, gain, root, weighted, square, updated, share, m, p, to_measured):
+    """Derivatives m (w,), p (w, w) by mean and covariance before an update, from those after it, and (3, 3) by R.
 
     Args:
-        gain, root, told, square, updated: of the update, as the filter wrote them.
+        gain, root, weighted, square, updated: of the update, as the filter wrote them.
         share: derivative by the negative logarithm of the sample's density.
     """
     w = len(m)
     slope = share * (0.5 if square < NEXT_TAIL * NEXT_TAIL else 0.5 * NEXT_TAIL / math.sqrt(square))  # by e' S^-1 e
     rows, along, half, block = np.zeros((3, w)), np.zeros(3), np.zeros(3), np.zeros((3, 3))
     if updated:
-        half[:] = 0.5 * told
+        half[:] = 0.5 * weighted
         for i in range(w):
             for a in range(3):
                 along[a] += gain[i, a] * m[i]
@@ -64,18 +64,18 @@ def _before_update(d, gain, root, told, square, updated, share, m, p, to_measure
                 block[a, b] -= gain[i, a] * rows[b, i]
             for c in range(max(a, b), 3):
                 block[a, b] += 0.5 * share * root[c, a] * root[c, b]
-            block[a, b] -= slope * told[a] * told[b]
+            block[a, b] -= slope * weighted[a] * weighted[b]
             to_measured[a, b] = block[a, b] - along[a] * half[b] - along[b] * half[a]
     _lift(d, -1.0, along, m)
     for a in range(3):
         rows[a] += half[a] * m
     _lift_both(d, rows, block, p)
-    _lift(d, -2.0 * slope, told, m)
+    _lift(d, -2.0 * slope, weighted, m)
 
 
 @machine_code(REAL(TWO, REAL, THREE, ONE, ONE, TWO, ONE, TWO, ONE, ONE, THREE))
 def _before_prediction(transition, decay, kicks, memory, before, spread, m, p, to_process, to_memory, work):
-    """From derivatives by mean and covariance after an interval to those before it; adds those by its noise.
+    """Derivatives by mean and covariance before an interval, from those after it; adds those by its noise.
 
     Args: before (w,), spread (w, w): mean and covariance at its begin.  work (2, w, w) is written to.
     Returns: the derivative by the decay.
@@ -94,7 +94,7 @@ def _before_prediction(transition, decay, kicks, memory, before, spread, m, p, t
         for s in range(w):
             to_decay += 2.0 * work[1, i, s] * spread[s, i]
     pull(transition, decay, work[1], p)
-    for i in range(w):  # rounding would make it lopsided, and more so from step to step
+    for i in range(w):  # rounding would make it asymmetric, more so from step to step
         for j in range(i):
             p[i, j] = p[j, i] = 0.5 * (p[i, j] + p[j, i])
     after = m.copy()
@@ -113,16 +113,16 @@ def _before_prediction(transition, decay, kicks, memory, before, spread, m, p, t
     )
 )  # fmt: skip
 def pull_back(
-    transitions, kicks, decays, memory, used, means, covariances, gains, roots, told, squares,
+    transitions, kicks, decays, memory, used, means, covariances, gains, roots, weighted, nis,
     by_mean, by_covariance, by_following, to_process, to_decays, to_memory, to_priors, to_measured,
 ):  # fmt: skip
-    """The derivatives by the noise of a function of what `filter_tracks` writes.
+    """The derivatives of a function of the results of `filter_tracks` by the noise.
 
     Args:
-        transitions, kicks, decays, memory, used: what the filter took.
-        means, covariances, gains, roots, told, squares: what it wrote.
+        transitions, kicks, decays, memory, used: arguments of the filter.
+        means, covariances, gains, roots, weighted, nis: its results.
         by_mean (t, n, w), by_covariance (t, n, w, w), by_following (t,): derivatives of the function by these; the
-            first two with n = 0 where it does not depend on them.
+            first two with n = 0 if it does not depend on them.
     Writes: to_process (t, 7), to_decays (t, n - 1), to_memory (t, 3), to_priors (t, w), to_measured (t, n, 3, 3).
     """
     count, samples, w = means.shape
@@ -136,10 +136,10 @@ def pull_back(
                     m[i] += by_mean[t, k, i]
                     for j in range(w):
                         p[i, j] += 0.5 * (by_covariance[t, k, i, j] + by_covariance[t, k, j, i])
-            seen, square = used[t, k] != 0, squares[t, k]
+            seen, square = used[t, k] != 0, nis[t, k]
             share = by_following[t] if seen and k >= NEXT_FROM else 0.0
             updated = seen and square < GATE
-            _before_update(d, gains[t, k], roots[t, k], told[t, k], square, updated, share, m, p, to_measured[t, k])
+            _before_update(d, gains[t, k], roots[t, k], weighted[t, k], square, updated, share, m, p, to_measured[t, k])
             if k:
                 to_decays[t, k - 1] = _before_prediction(
                     transitions[t, k - 1], decays[t, k - 1], kicks[t, k - 1], memory[t], means[t, k - 1],

@@ -1,10 +1,10 @@
-"""Forecasts of linearised tracks under some noise, and how well they keep their promise.
+"""Scores noise by forecasts of linearised tracks, at 20 to 300 ms ahead.
 
-An interval 0.3 s ahead is not decided by the scatter from sample to sample. So noise is scored by what it says about
-later samples: from many moments of every track a Kalman filter forecasts 20 to 300 ms ahead, and the score is the mean
-negative logarithm of the density of what was then measured (A. P. Dawid, "The prequential approach", 1984), with tails
-that grow linearly. The same score of the next sample alone, the marginal likelihood, is added with a small weight: it
-tells apart the parts of the noise that forecasts leave open.
+The scatter from sample to sample does not determine an interval 0.3 s ahead. So noise is scored by its forecasts: from
+many origins in every track a Kalman filter forecasts 20 to 300 ms ahead, and the score is the mean negative logarithm
+of the density at the later samples (A. P. Dawid, "The prequential approach", 1984), with tails that grow linearly. The
+same score of the next sample alone, the marginal likelihood, is added with a small weight: it separates parts of the
+noise that forecasts leave undetermined.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ from ballfg.tracks.stamps import STAMP_TOLERANCE
 HORIZONS: Final = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
 """s ahead of a start; the first good sample at or after each is scored."""
 START_EVERY: Final = 0.05
-"""s between two starts of forecasts in a track."""
+"""s between two forecast origins in a track."""
 EARLIEST_START: Final = 0.2
-"""s after the first sample. Before that the start of the track decides, and no robot acts on it yet."""
+"""s after the first sample. Before that the start of the track dominates, and no robot acts on it yet."""
 MARGINAL_WEIGHT: Final = 0.1
 TAIL: Final = 3.0
-"""Standard deviations of a coordinate beyond which its score grows linearly; a missed hit must not decide the noise."""
+"""Standard deviations of a coordinate beyond which its score grows linearly, so that a missed hit does not dominate."""
 NINETY: Final = 1.6448536269514722
 """Standard deviations to each side of a central 90 % interval."""
 
 
 @dataclass(frozen=True)
 class Score:
-    """How forecasts compare with what was measured.
+    """The comparison of forecasts with the measured samples.
 
     Attributes:
         by_track: (t,) each track's share of the mean negative logarithm of a density, of forecasts and next samples.
         held: share of forecast coordinates inside the central 90 % intervals.
-        starts: number of moments that forecasts were made from.
+        starts: number of forecast origins.
     """
 
     by_track: Tensor
@@ -60,12 +60,12 @@ class Forecaster:
     Args:
         tracks: linearised.
         velocity_prior: m/s, standard deviation per axis at the start of a track.
-        earliest: s after the first sample, of the first start of a forecast.
-        every: s between starts.
-        biased: whether the noise may have a memory.
+        earliest: s after the first sample, of the first forecast origin.
+        every: s between origins.
+        biased: True if the noise may have a memory.
 
     Attributes:
-        starts: (r, 2) track and sample from which forecasts are made.
+        starts: (r, 2) track and sample of each forecast origin.
     """
 
     def __init__(
@@ -95,11 +95,11 @@ class Forecaster:
         measured = self.filter.measured(noise)
         filtered = self.filter.run(noise, measured)
         total, inside, count = self._forecast(filtered, noise, measured)
-        by_track = total / max(count, 1) + MARGINAL_WEIGHT * filtered.following / max(filtered.count, 1)
+        by_track = total / max(count, 1) + MARGINAL_WEIGHT * filtered.nll / max(filtered.count, 1)
         return Score(by_track, inside / max(3 * count, 1), len(self.starts))
 
     def _forecast(self, filtered: Filtered, noise: Noise, measured: Tensor) -> tuple[Tensor, float, int]:
-        """(t,) summed scores of forecasts, coordinates inside their 90 % intervals, and the number of forecasts."""
+        """(t,) summed scores of forecasts, number of coordinates in their 90 % intervals, number of forecasts."""
         ahead = self._ahead
         mean, covariance = filtered.means[ahead.track, ahead.start], filtered.covariances[ahead.track, ahead.start]
         process = noise.process.square().expand(self.count, -1)[ahead.track]
@@ -111,7 +111,7 @@ class Forecaster:
             gathered = gathered + memory * (1.0 - decay.square())[:, None]
         new = torch.diagonal(measured[ahead.track, ahead.sample], dim1=-2, dim2=-1)
         variance = ((observe @ covariance) * observe).sum(dim=2) + gathered + new
-        predicted = (observe @ mean[..., None])[..., 0] + ahead.departures
+        predicted = (observe @ mean[..., None])[..., 0] + ahead.offsets
         square = (self.tracks.errors[ahead.track, ahead.sample] - predicted).square() / variance
         beyond = TAIL * square.clamp(min=1e-12).sqrt() - 0.5 * TAIL**2
         scores = (torch.where(square < TAIL**2, 0.5 * square, beyond) + 0.5 * variance.log()).sum(dim=1)
@@ -121,14 +121,14 @@ class Forecaster:
 
 @dataclass(frozen=True)
 class _Ahead:
-    """The forecasts that are scored, and what leads to them whatever the noise is: s forecasts.
+    """The s scored forecasts, with the parts that do not depend on the noise.
 
     Attributes:
-        track, start, sample: (s,) the track, the sample from which, and the one of which.
+        track, start, sample: (s,) the track, the sample of the origin, and the forecast sample.
         elapsed: (s,) s between the two.
-        by_state: (s, 3, d) how the position moves with state and coefficients at the start.
-        kicks: (s, 3, 7) m^2, its variance per axis that a unit of each number of `PROCESS_NOISE` gathers on the way.
-        departures: (s, 3) m, what the departures on the way make of it.
+        by_state: (s, 3, d) derivative of the position by state and coefficients at the origin.
+        kicks: (s, 3, 7) m^2, the position's variance per axis for a unit of each number of `PROCESS_NOISE`.
+        offsets: (s, 3) m, the sum of the estimate's offsets on the way.
     """
 
     track: Tensor
@@ -137,23 +137,23 @@ class _Ahead:
     elapsed: Tensor
     by_state: Tensor
     kicks: Tensor
-    departures: Tensor
+    offsets: Tensor
 
     @classmethod
     def of(cls, tracks: LinearTracks, starts: Tensor) -> _Ahead:
-        """All forecasts from some starts (r, 2), track and sample."""
+        """All forecasts from some origins (r, 2), track and sample."""
         (track, start), (samples, own) = starts.T, (tracks.times.shape[1], tracks.transitions.shape[-1])
         begin, reached = tracks.times[track, start], torch.zeros(len(track), dtype=torch.float64)
         horizons, found = torch.tensor(HORIZONS, dtype=torch.float64), []
         way = torch.eye(own, dtype=torch.float64).expand(len(track), own, own)
         kicks = torch.zeros((len(track), *tracks.kicks.shape[2:]), dtype=torch.float64)
-        departed = torch.zeros((len(track), own), dtype=torch.float64)
+        shifted = torch.zeros((len(track), own), dtype=torch.float64)
         for ahead in range(1, samples):
             interval = (start + ahead - 1).clamp(max=samples - 2)
             step = tracks.transitions[track, interval]
             moved = step[:, None, :STATE_DIM, :STATE_DIM]
             way, kicks = step @ way, moved @ kicks @ moved.mT + tracks.kicks[track, interval]
-            departed = (step @ departed[..., None])[..., 0] + tracks.departures[track, interval]
+            shifted = (step @ shifted[..., None])[..., 0] + tracks.offsets[track, interval]
             sample = (start + ahead).clamp(max=samples - 1)
             elapsed = tracks.times[track, sample] - begin
             fresh = (start + ahead < samples) & tracks.used[track, sample]
@@ -161,7 +161,7 @@ class _Ahead:
             rows = torch.nonzero(fresh & due)[:, 0]
             reached = torch.where(fresh, elapsed + STAMP_TOLERANCE, reached)
             gathered = torch.diagonal(kicks[rows][..., POSITION, POSITION], dim1=-2, dim2=-1).mT
-            found.append((rows, sample[rows], elapsed[rows], way[rows, POSITION], gathered, departed[rows, POSITION]))
+            found.append((rows, sample[rows], elapsed[rows], way[rows, POSITION], gathered, shifted[rows, POSITION]))
             if bool((reached >= HORIZONS[-1]).all()):
                 break
         rows, *rest = (torch.cat(parts) for parts in zip(*found, strict=True))

@@ -1,4 +1,4 @@
-"""A Kalman filter over linearised tracks, for any noise: state, coefficients and the tracker's biases together."""
+"""Filters linearised tracks with any noise: state, coefficients and the tracker's biases together."""
 
 from __future__ import annotations
 
@@ -43,18 +43,18 @@ class Noise:
 
 @dataclass(frozen=True)
 class Filtered:
-    """What the filter makes of t tracks of n samples.
+    """The filter's results for t tracks of n samples.
 
     Attributes:
         means: (t, n, w) after each sample.
         covariances: (t, n, w, w).
-        following: (t,) summed negative logarithms of the density of each next sample.
+        nll: (t,) summed negative logarithms of the density of each next sample.
         count: number of these samples.
     """
 
     means: Tensor
     covariances: Tensor
-    following: Tensor
+    nll: Tensor
     count: int
 
 
@@ -64,7 +64,7 @@ class LinearFilter:
     Args:
         tracks: linearised.
         velocity_prior: m/s, standard deviation per axis at the start of a track.
-        biased: whether the noise may have a memory; three numbers of the state, and time, are spared if not.
+        biased: True if the noise may have a memory; False saves three numbers of the state, and time.
     """
 
     def __init__(self, tracks: LinearTracks, velocity_prior: float, *, biased: bool = True) -> None:
@@ -78,22 +78,22 @@ class LinearFilter:
         self._scored = int(tracks.used[:, NEXT_FROM:].sum())
 
     def measured(self, noise: Noise) -> Tensor:
-        """(t, n, 3, 3) m^2, of the part of a measured position that is new in each sample."""
+        """(t, n, 3, 3) m^2, covariance of the white error of a measured position."""
         way = self.tracks.velocities
         along = noise.stamp_jitter[:, None, None, None] * way[..., :, None] * way[..., None, :]
-        white = (noise.position[:, None, :] * self.tracks.white).clamp_min(LEAST_NOISE)  # an axis may show none
+        white = (noise.position[:, None, :] * self.tracks.white).clamp_min(LEAST_NOISE)  # an axis may have no noise
         return along + torch.diag_embed(white.square())
 
     def losses(self, noise: Noise) -> Tensor:
         """(t,) negative logarithms of the marginal likelihood of each track."""
-        return self.run(noise, self.measured(noise)).following
+        return self.run(noise, self.measured(noise)).nll
 
     def run(self, noise: Noise, measured: Tensor) -> Filtered:
         """The filter over all samples, differentiable by the noise.
 
         Args:
             noise: all of it.
-            measured: (t, n, 3, 3) m^2, what `measured` makes of it.
+            measured: (t, n, 3, 3) m^2, the result of `measured`.
         Raises: torch.linalg.LinAlgError: the covariance of an innovation is not positive definite.
         """
         tracks, count = self.tracks, self.count
@@ -102,12 +102,12 @@ class LinearFilter:
         prior = tracks.prior_variances(noise.spin_prior, noise.spin_label, noise.coefficients, self.velocity_prior)
         prior = torch.cat((prior, memory[:, : self.biases]), dim=1)
         process = noise.process.square().expand(count, -1)
-        means, covariances, following = _Run.apply(self, process, decays, memory, prior, measured)
-        return Filtered(means, covariances, following, self._scored)
+        means, covariances, nll = _Run.apply(self, process, decays, memory, prior, measured)
+        return Filtered(means, covariances, nll, self._scored)
 
 
 class _Run(torch.autograd.Function):
-    """Machine code as a function that torch can differentiate once."""
+    """The compiled filter as a function that torch can differentiate once."""
 
     @staticmethod
     def forward(ctx: Any, tracks: LinearFilter, *noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -115,14 +115,14 @@ class _Run(torch.autograd.Function):
         process, decays, memory, prior, measured = (tensor.detach().contiguous().numpy() for tensor in noise)
         sizes = ((tracks.width,), (tracks.width, tracks.width), (tracks.width, 3), (3, 3), (3,), ())
         made = [np.empty(shape + size) for size in sizes]
-        following = np.empty(tracks.count)
-        moved = [x.numpy() for x in (linear.transitions, linear.departures, linear.kicks)]
+        nll = np.empty(tracks.count)
+        moved = [x.numpy() for x in (linear.transitions, linear.offsets, linear.kicks)]
         seen = linear.errors.numpy(), tracks._used, tracks._starts
-        if not filter_tracks(*moved, process, decays, memory, measured, *seen, prior, *made, following):
+        if not filter_tracks(*moved, process, decays, memory, measured, *seen, prior, *made, nll):
             raise torch.linalg.LinAlgError("the covariance of an innovation is not positive definite")
         ctx.tracks, ctx.decays, ctx.memory, ctx.made = tracks, decays, memory, made
         ctx.set_materialize_grads(False)
-        return torch.from_numpy(made[0]), torch.from_numpy(made[1]), torch.from_numpy(following)
+        return torch.from_numpy(made[0]), torch.from_numpy(made[1]), torch.from_numpy(nll)
 
     @staticmethod
     @once_differentiable
@@ -141,5 +141,5 @@ class _Run(torch.autograd.Function):
 
 
 def _dense(derivative: Tensor | None, like: Array) -> Array:
-    """A derivative as machine code takes it; zero where there is none."""
+    """A derivative as a dense array for machine code; zeros for None."""
     return np.zeros(like.shape) if derivative is None else np.asarray(derivative.contiguous().numpy())

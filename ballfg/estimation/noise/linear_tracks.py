@@ -1,7 +1,7 @@
-"""Tracks linearised about their estimates: what another noise would have made of them, without estimating again.
+"""Linearises tracks about their estimates, so that another noise needs no new estimate.
 
 Near an estimate the motion is linear: a deviation d_k of state and coefficients moves on as F_k d_k + o_k, where o_k is
-by how much the estimate itself departs from the model. F and o come from the dynamics factors of the solved graph,
+the offset of the estimate itself from the model. F and o come from the dynamics factors of the solved graph,
 contacts with their saltation included. A Kalman filter over deviations then gives forecasts for any noise.
 """
 
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ballfg.arrays import Array
 from ballfg.estimation.batch import map_tracks
-from ballfg.estimation.segmentation import Quality
+from ballfg.estimation.segmentation.result import Quality
 from ballfg.estimation.settings import sample_sigmas
 from ballfg.estimation.smoother.problem import START_POSITION_SIGMA, TrackProblem, coefficient_means
 from ballfg.estimation.smoother.settle import Solution
@@ -30,27 +30,27 @@ from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 from ballfg.tracks import Track
 
 LEAST_SAMPLES = 6
-"""A track of fewer samples says nothing about its noise that its own fit does not take away."""
+"""Least number of samples: the fit of a shorter track absorbs all of its noise."""
 
 
 @dataclass(frozen=True)
 class LinearTracks:
-    """Linearised tracks side by side; shorter ones end in samples that are not used.
+    """Linearised tracks side by side; shorter ones are padded with unused samples.
 
     With t tracks of up to n samples, and d = 9 + p numbers for state and coefficients:
 
     Attributes:
-        numbers: (t,) of the tracks given, those that are used.
-        times: (t, n) s since the first sample that is used.
+        numbers: (t,) indices of the used tracks.
+        times: (t, n) s since the first used sample.
         errors: (t, n, 3) m, measured minus estimated positions.
         white: (t, n, 3) m, standard deviations of the samples' white errors.
         velocities: (t, n, 3) m/s.
         used: (t, n) bool, good samples.
         transitions: (t, n - 1, d, d) F, in the units of state and coefficients.
-        departures: (t, n - 1, d) o, in the units of state and coefficients.
-        kicks: (t, n - 1, 7, 9, 9) covariance that a unit of each number of `PROCESS_NOISE` gathers.
+        offsets: (t, n - 1, d) o, in the units of state and coefficients.
+        kicks: (t, n - 1, 7, 9, 9) covariance for a unit of each number of `PROCESS_NOISE`.
         starts: (t, d) mean of the prior at the first sample, as a deviation from the estimate.
-        labelled: (t,) bool, whether a label tells the spin at the first sample.
+        labelled: (t,) bool, True if a label gives the spin at the first sample.
         coefficient_sigmas: (p,) prior standard deviations, in the coefficients' own units.
     """
 
@@ -61,7 +61,7 @@ class LinearTracks:
     velocities: Tensor
     used: Tensor
     transitions: Tensor
-    departures: Tensor
+    offsets: Tensor
     kicks: Tensor
     starts: Tensor
     labelled: Tensor
@@ -96,7 +96,7 @@ class _Piece:
     velocities: Array
     used: Array
     transitions: Array
-    departures: Array
+    offsets: Array
     kicks: Array
     start: Array
     labelled: bool
@@ -105,12 +105,12 @@ class _Piece:
 def linearise(
     smoother: Smoother, tracks: Sequence[Track], watch: Watch = unwatched, *, jobs: int = 1
 ) -> LinearTracks | None:
-    """The tracks about what a smoother makes of them, each in its longest time between hits; None where all are short.
+    """The tracks linearised about a smoother's estimates, each in its longest time between hits; None if all are short.
 
     Args:
         smoother: model, surfaces and the noise to linearise with.
         tracks: measured.
-        watch: told of each track.
+        watch: called for each track.
         jobs: processes.
     """
     pieces, numbers = [], []
@@ -136,7 +136,7 @@ def _linearised(problem: TrackProblem, solution: Solution) -> _Piece:
     track, values, width = problem.track, solution.minimum.values, problem.width
     intervals = len(track) - 1
     transitions = np.tile(np.eye(STATE_DIM + width), (intervals, 1, 1))
-    departures = np.zeros((intervals, STATE_DIM + width))
+    offsets = np.zeros((intervals, STATE_DIM + width))
     kicks = np.zeros((intervals, len(PROCESS_NOISE), STATE_DIM, STATE_DIM))
     linked = np.zeros(intervals, dtype=bool)
     for batch in solution.graph.batches:
@@ -146,7 +146,7 @@ def _linearised(problem: TrackProblem, solution: Solution) -> _Piece:
             transitions[where, :STATE_DIM, :STATE_DIM] = (spread @ rows.jacobians[0])[..., :STATE_DIM]
             if width:
                 transitions[where, :STATE_DIM, STATE_DIM:] = (spread @ rows.jacobians[2])[..., :width]
-            departures[where, :STATE_DIM] = (spread @ rows.residual[..., None])[..., 0]
+            offsets[where, :STATE_DIM] = (spread @ rows.residual[..., None])[..., 0]
             kicks[where] = Kicks(batch.kick_times, batch.hit).basis(batch.dt)
             linked[where] = True
     breaks = np.union1d(np.flatnonzero(~linked), solution.events.segmentation.hits).astype(np.int64)
@@ -165,7 +165,7 @@ def _linearised(problem: TrackProblem, solution: Solution) -> _Piece:
         values.states[samples, VELOCITY],
         solution.events.segmentation.quality[samples] == Quality.GOOD,
         transitions[intervals_within],
-        departures[intervals_within],
+        offsets[intervals_within],
         kicks[intervals_within],
         start,
         label is not None,
@@ -175,7 +175,7 @@ def _linearised(problem: TrackProblem, solution: Solution) -> _Piece:
 def _longest_stretch(times: Array, breaks: NDArray[np.int64]) -> tuple[int, int]:
     """First sample, and the one after the last, of the longest time without a break between two samples.
 
-    Args: times: (n,) s.  breaks: intervals, between samples i and i + 1, in which the motion is not known.
+    Args: times: (n,) s.  breaks: intervals, between samples i and i + 1, with unknown motion.
     """
     firsts = np.concatenate(([0], breaks + 1))
     ends = np.concatenate((breaks + 1, [len(times)]))
@@ -202,7 +202,7 @@ def _side_by_side(pieces: Sequence[_Piece], numbers: Array, coefficient_sigmas: 
         velocities=stacked((p.velocities for p in pieces), longest, "edge"),
         used=stacked((p.used for p in pieces), longest, "zero"),
         transitions=stacked((p.transitions for p in pieces), longest - 1, "edge"),
-        departures=stacked((p.departures for p in pieces), longest - 1, "zero"),
+        offsets=stacked((p.offsets for p in pieces), longest - 1, "zero"),
         kicks=stacked((p.kicks for p in pieces), longest - 1, "zero"),
         starts=torch.from_numpy(np.stack([p.start for p in pieces])),
         labelled=torch.tensor([p.labelled for p in pieces]),

@@ -1,4 +1,4 @@
-"""The marginal likelihood of linearised tracks: the density of each next sample, given those before it."""
+"""Maximises the marginal likelihood of linearised tracks: the density of each sample given those before it."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ DIFFERENCE: Final = 0.002
 
 
 class MarginalFit:
-    """The noise that makes the next samples of tracks most probable.
+    """The noise that maximises the density of the next samples of tracks.
 
     Args:
         tracks: the filter of the tracks.
-        settings: values of what is not among the parameters.
+        settings: values of all other numbers.
         parameters: the numbers to estimate.
-        begin: logarithms of numbers, by name and axis, at which the search begins; others at their prior medians.
+        begin: logarithms of numbers, by name and axis, as a start; others start at their prior medians.
         tolerance: largest derivative at the minimum, by numbers in their standard deviations.
-        most: evaluations after which the search ends; where the likelihood is flat it does not get far.
+        most: largest number of evaluations; a flat likelihood does not converge.
 
     Attributes:
-        logs: (k,) their logarithms.
-        losses: (t,) negative logarithm of the density of each track there.
+        logs: (k,) logarithms of the numbers.
+        losses: (t,) negative logarithm of the density of each track at `logs`.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class MarginalFit:
         return losses.detach().numpy(), gradients.numpy()
 
     def noise(self) -> Noise:
-        """The noise found, one row for each track."""
+        """The estimated noise, one row for each track."""
         return tensors_of(self.parameters, torch.from_numpy(np.tile(self.logs, (self.tracks.count, 1))), self.settings)
 
     def covariance(self) -> Array:
@@ -96,16 +96,16 @@ class MarginalFit:
         return value, gradients.sum(axis=0) + self.precision * away
 
     def _minimise(self, tolerance: float, most: int) -> None:
-        """Move to the minimum of the negative log posterior.
+        """Moves to the minimum of the negative log posterior.
 
-        The search is in units in which the scatter of the tracks' gradients, which stands for the second derivatives
-        (Berndt, Hall, Hall and Hausman 1974), is one.
+        The search variables are scaled to a unit scatter of the tracks' gradients, which approximates the second
+        derivatives (Berndt, Hall, Hall and Hausman 1974).
         """
         root = np.linalg.cholesky(self._scatter() + np.diag(self.precision))
         turn = np.linalg.inv(root).T
         begin = self.logs
 
-        def told(way: Array) -> tuple[float, Array]:
+        def objective(way: Array) -> tuple[float, Array]:
             logs = begin + turn @ way
             value, gradient = self._objective(*self.at(logs), logs)
             return value, turn.T @ gradient
@@ -113,6 +113,6 @@ class MarginalFit:
         options = {"gtol": tolerance, "ftol": 0.0, "maxfun": most, "maxcor": len(begin)}
         from scipy.optimize import minimize  # it takes half a second to import
 
-        found = minimize(told, np.zeros(len(begin)), jac=True, method="L-BFGS-B", options=options)
+        found = minimize(objective, np.zeros(len(begin)), jac=True, method="L-BFGS-B", options=options)
         self.logs = begin + turn @ found.x
         self.losses, self.gradients = self.at(self.logs)

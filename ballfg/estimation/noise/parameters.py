@@ -1,4 +1,4 @@
-"""The numbers of the noise that tracks tell, as a vector of logarithms with a prior, and back to settings."""
+"""Maps the estimated numbers of the noise to a vector of logarithms with a prior, and back to settings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ballfg.estimation.noise.linear_filter import Noise
 from ballfg.estimation.noise.linear_tracks import LinearTracks
 from ballfg.estimation.settings import Settings
 from ballfg.factors.noise import PROCESS_NOISE
-from ballfg.tracks import TrackNoise
+from ballfg.tracks.noise import TrackNoise
 
 
 @dataclass(frozen=True)
@@ -23,9 +23,9 @@ class Parameter:
 
     Attributes:
         name: a field of `TrackNoise`.
-        axis: 0, 1, 2 for x, y, z; None where there is one number for all.
+        axis: 0, 1, 2 for x, y, z; None for one number for all.
         start: its prior median, in its own unit.
-        spread: standard deviation of its logarithm beforehand.
+        spread: prior standard deviation of its logarithm.
         low, high: limits, in its own unit.
     """
 
@@ -38,11 +38,11 @@ class Parameter:
 
 
 FACTOR_FOUR: Final = 1.4
-"""Standard deviation of a logarithm of which nothing but the order of magnitude is known."""
+"""Standard deviation of a logarithm when only the order of magnitude is known."""
 FACTOR_TWO: Final = 0.7
-"""The same where it is known to a factor of two or so."""
+"""Standard deviation of a logarithm when a number is known to a factor of two."""
 MEMORY_SHARE: Final = 0.4
-"""Prior median of the part with a memory, as a share of the white part."""
+"""Prior median of the lasting part, as a share of the white part."""
 USUAL_JITTER: Final = 1e-4
 """s. Stamps of a driver are good to a tenth of a millisecond, arrival times to one."""
 COEFFICIENTS: Final = "coefficients"
@@ -51,13 +51,13 @@ COEFFICIENTS: Final = "coefficients"
 def parameters_of(
     settings: Settings, tracks: LinearTracks, position_known: bool, tracker_known: bool = False
 ) -> list[Parameter]:
-    """The numbers that some tracks can tell.
+    """The numbers that some tracks can determine.
 
     Args:
         settings: prior medians.
-        tracks: that are asked; without labels, balls without a label, or bounces they do not tell of these.
-        position_known: whether the white noise of positions is stated, and stays.
-        tracker_known: whether the memory of the tracker and the jitter of the stamps are, too.
+        tracks: without labels, balls without a label, or bounces, they do not determine those numbers.
+        position_known: True if the white noise of positions is stated and fixed.
+        tracker_known: True if the memory of the tracker and the jitter of the stamps are, too.
     """
     process, found = settings.process, []
     white = settings.position_scale * np.array(settings.position_noise)
@@ -87,9 +87,9 @@ def parameters_of(
 
 
 def tensors_of(parameters: list[Parameter], logs: Tensor, settings: Settings) -> Noise:
-    """The noise that logarithms (r, k) stand for, a row for each track or one for all.
+    """The noise for logarithms (r, k), with a row for each track or one for all.
 
-    What is not among the parameters is the settings'.
+    All other numbers are the settings'.
     """
     values = {(p.name, p.axis): torch.exp(log) for p, log in zip(parameters, logs.unbind(-1), strict=True)}
 
@@ -111,7 +111,7 @@ def tensors_of(parameters: list[Parameter], logs: Tensor, settings: Settings) ->
 
 
 def track_noise(parameters: list[Parameter], logs: Array, settings: Settings) -> TrackNoise:
-    """The noise of a vector of logarithms (k,), as a file states it."""
+    """The noise for a vector of logarithms (k,), in the form of a file."""
     values: dict[str, object] = {}
     for name in dict.fromkeys(p.name for p in parameters):
         numbers = [float(np.exp(log)) for p, log in zip(parameters, logs, strict=True) if p.name == name]
@@ -123,10 +123,10 @@ def track_noise(parameters: list[Parameter], logs: Array, settings: Settings) ->
 
 
 def with_noise(settings: Settings, noise: TrackNoise) -> Settings:
-    """Settings with all that is known of the noise.
+    """Settings with a noise.
 
-    Spreads of coefficients replace those of the settings for coefficients that are estimated with each track; where the
-    settings estimate none, all that the noise names are.
+    Spreads of coefficients replace those of the settings for coefficients that are estimated with each track; if the
+    settings estimate none, all coefficients of the noise are estimated.
     """
     own: dict[str, Any] = {
         "position_noise": noise.position,

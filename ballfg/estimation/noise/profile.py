@@ -1,9 +1,9 @@
-"""How well each number is known: how far it can go until the best that the others can do about it is too little.
+"""Computes the confidence limits of each number from its profile, with all other numbers refitted.
 
-The curvature at a minimum tells it where the objective is a parabola. Of a noise that is small beside another one it is
-not: upwards it is soon contradicted, downwards hardly ever, and the curvature knows of neither. So the profile is
-followed, the objective with all other numbers at their best, to where it has risen by what one standard deviation is
-worth (D. R. Cox, D. V. Hinkley, "Theoretical Statistics", 1974, section 9.3).
+The curvature at a minimum gives them only if the objective is a parabola. For a noise that is small beside another one
+it is not: the data bound it from above, hardly from below. So the profile, the objective with all other numbers at
+their best, is followed until it has risen by one standard deviation's worth (D. R. Cox, D. V. Hinkley, "Theoretical
+Statistics", 1974, section 9.3).
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from ballfg.arrays import Array
 DIFFERENCE: Final = 0.02
 """Step of a logarithm for second derivatives."""
 HONEST: Final = 1.25
-"""The profile is not followed further where it is at what is looked for within this factor, in standard deviations."""
+"""The search along the profile ends within this factor of its target, in standard deviations."""
 MOST_LOOKS: Final = 4
-"""Distances that are tried to each side."""
+"""Number of distances to try on each side."""
 LONGEST_LOOK: Final = 3.0
-"""By how much a look may be farther or nearer than the one before."""
+"""Largest ratio between two successive distances."""
 SETTLED: Final = 0.25
-"""Largest derivative where others are at their best, in their standard deviations: the objective is then right to some
-hundredths. Where it is a parabola, one evaluation shows it."""
+"""Largest derivative of the refitted numbers, in their standard deviations: the objective is then right to some
+hundredths. On a parabola, one evaluation shows it."""
 MOVED: Final = 0.3
 """Standard deviations by which the minimum may move without new second derivatives."""
 MOST_EVALUATIONS: Final = 15
-"""After these the others follow no further."""
+"""Largest number of evaluations in a refit."""
 
 Objective = Callable[[Array], tuple[float, Array]]
 """A negative log posterior of logarithms (k,), and its derivatives (k,)."""
 
 
 class Profile:
-    """What is known about the minimum of an objective that is a sum over independent tracks and a prior.
+    """The minimum of an objective that is a sum over independent tracks and a prior, with confidence limits.
 
     With H the second derivatives of the objective, G the sum over tracks of the squares of their derivatives and P the
     precision of the prior, the covariance of the minimum is H^-1 (G + P) H^-1: forecasts of one track need not be
@@ -50,8 +50,8 @@ class Profile:
         low, high: (k,) bounds.
 
     Attributes:
-        best: (k,) where the objective is least.
-        covariance: (k, k) of that.
+        best: (k,) the minimum.
+        covariance: (k, k) of the minimum.
     """
 
     def __init__(
@@ -68,13 +68,13 @@ class Profile:
     def sides(self) -> Array:
         """(k, 2) distances below and above the best, one standard deviation each.
 
-        Where tracks scatter more than the curvature says, a standard deviation is worth more by that. Where they
-        scatter less it is not worth less: what pulls all of them away from the truth, as the prior does, is no scatter.
+        If tracks scatter more than the curvature says, a standard deviation is worth more accordingly. If they scatter
+        less it is not worth less: a common pull away from the truth, such as the prior's, is no scatter.
         """
         return np.array([[self._side(k, sign) for sign in (-1.0, 1.0)] for k in range(len(self.best))])
 
     def _inverse(self, logs: Array) -> Array:
-        """(k, k) inverse of the second derivatives; where these bend downwards the prior alone is what is known."""
+        """(k, k) inverse of the second derivatives; that of the prior alone where these bend downwards."""
         hessian = np.empty((len(logs), len(logs)))
         for k, step in enumerate(DIFFERENCE * np.eye(len(logs))):
             hessian[k] = (self.value(logs + step)[1] - self.value(logs - step)[1]) / (2.0 * DIFFERENCE)
@@ -82,7 +82,7 @@ class Profile:
         return np.asarray((vectors / np.maximum(values, self.spread.max() ** -2)) @ vectors.T)
 
     def _side(self, k: int, sign: float) -> float:
-        """Distance of number k at which the profile has risen by half the square of what a deviation is worth."""
+        """Distance of number k at which the profile has risen by half the square of a deviation's worth."""
         deviation = float(np.sqrt(max(self.covariance[k, k], self.inverse[k, k])))
         worth, distance = deviation / float(np.sqrt(self.inverse[k, k])), deviation
         toward = self.inverse[:, k] / self.inverse[k, k]
@@ -97,19 +97,19 @@ class Profile:
         return distance
 
     def _settled(self, begin: Array, inverse: Array) -> tuple[float, Array]:
-        """The least objective near some logarithms, and where; what has no share in `inverse` stays as it is."""
+        """The least objective near some logarithms, and its place; numbers without a share in `inverse` stay."""
         values, vectors = np.linalg.eigh(inverse)
         turn = vectors * np.sqrt(values.clip(min=0.0))  # in these units the second derivatives are one
 
         def at(way: Array) -> Array:
             return np.asarray(np.clip(begin + turn @ way, self.low, self.high))
 
-        def told(way: Array) -> tuple[float, Array]:
+        def objective(way: Array) -> tuple[float, Array]:
             value, gradient = self.value(at(way))
             return value, turn.T @ gradient
 
         options = {"gtol": SETTLED, "ftol": 0.0, "maxfun": MOST_EVALUATIONS}
         from scipy.optimize import minimize  # it takes half a second to import
 
-        found = minimize(told, np.zeros(len(begin)), jac=True, method="L-BFGS-B", options=options)
+        found = minimize(objective, np.zeros(len(begin)), jac=True, method="L-BFGS-B", options=options)
         return float(found.fun), at(found.x)

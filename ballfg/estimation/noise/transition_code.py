@@ -1,6 +1,6 @@
-"""Machine code for what a Kalman filter over linearised tracks and its derivative share: transitions, small roots.
+"""Multiplies transitions and inverts small roots in machine code, for the filter of linearised tracks.
 
-Of w numbers the first nine are the state; the next, up to d, are coefficients, which stay; the last three, where d < w,
+Of w numbers the first nine are the state; the next, up to d, are coefficients, which stay; the last three, if d < w,
 are biases, which decay. So a transition is nine rows of numbers, then ones, then decays on the diagonal.
 """
 
@@ -15,7 +15,7 @@ from ballfg.state import STATE_DIM
 
 @machine_code(NOTHING(COUNT, REAL, TWO, TWO))
 def _keep(d, decay, x, result):
-    """The rows of x (w, w) that only ones and decays act on; zero for those of the state."""
+    """Writes the rows of x (w, w) that only ones and decays act on; zero for those of the state."""
     for i in range(len(x)):
         own = 0.0 if i < STATE_DIM else 1.0 if i < d else decay
         for j in range(len(x)):
@@ -72,7 +72,7 @@ def transpose(x, result):
 
 @machine_code(FLAG(TWO))
 def is_something(covariance):
-    """Whether a covariance is not zero; its diagonal says so."""
+    """True if a covariance is not zero, by its diagonal."""
     total = 0.0
     for i in range(len(covariance)):
         total += covariance[i, i]
@@ -81,7 +81,7 @@ def is_something(covariance):
 
 @machine_code(FLAG(TWO, TWO))
 def invert_root(x, inverse):
-    """The inverse (3, 3) of the Cholesky root of x (3, 3); whether x is positive definite."""
+    """Writes the inverse (3, 3) of the Cholesky root of x (3, 3); False if x is not positive definite."""
     root = np.zeros((3, 3))
     inverse[:] = 0.0
     for i in range(3):

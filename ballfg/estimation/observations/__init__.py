@@ -1,1 +1,1 @@
-"""Observations: what was measured, as objects that every estimator knows."""
+"""Observations hold measurements of any kind in a form that every estimator uses."""

@@ -1,4 +1,4 @@
-"""Readings in the folder of a dataset: one table a sort, `trajectory,t,<values>,sigma`."""
+"""Reads and writes readings in a dataset's folder: one table per kind, `trajectory,t,<values>,sigma`."""
 
 from collections import defaultdict
 from collections.abc import Collection, Iterable
@@ -17,7 +17,7 @@ from ballfg.tracks import TableWriter, Track, csv_files
 from ballfg.tracks.rows import KEY
 
 LONGEST_HEADER: Final = 4096
-"""Bytes of a table's first line that are looked at."""
+"""Largest number of bytes read from a table's first line."""
 
 
 @dataclass
@@ -26,14 +26,14 @@ class ReadingTables:
 
     Attributes:
         rows: of each sort of reading, by trajectory: (m, 2 + dim) t (s), the values and sigma, in their own units.
-        notes: what was ignored, one sentence each.
+        notes: ignored rows and files, one sentence each.
     """
 
     rows: dict[type[Observation], dict[str, Array]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
     def attached(self, track: Track) -> Track:
-        """The track with its readings; those before its first and after its last sample are left out."""
+        """The track with its readings; readings before its first and after its last sample are left out."""
         found = []
         for sort, tables in self.rows.items():
             table = tables.get(track.name)
@@ -46,11 +46,11 @@ class ReadingTables:
 
 
 def read_readings(folder: str | PathLike[str], trajectories: Collection[str]) -> ReadingTables:
-    """All tables of readings that lie in a folder, of every registered sort.
+    """All tables of readings in a folder, of every registered kind.
 
     Args: folder: of a dataset.  trajectories: names of its tracks.
     Raises: ValueError: a missing column, a row of an unknown trajectory, or a cell that is no number; the message names
-        file, line and column. A table of readings that belongs to no registered sort.
+        file, line and column. A table of readings of no registered kind.
     """
     tables, known = ReadingTables(), set(trajectories)
     for name, sort in tables_of_readings(folder).items():
@@ -59,11 +59,11 @@ def read_readings(folder: str | PathLike[str], trajectories: Collection[str]) ->
 
 
 def tables_of_readings(folder: str | PathLike[str]) -> dict[str, type[Observation]]:
-    """The tables of readings in the folder of a dataset, by name, with the sort that each belongs to.
+    """The tables of readings in a dataset's folder, by name, with the kind of each.
 
-    Results and other tables may lie there too: readings are told by their columns `trajectory`, `t` and `sigma`.
+    Results and other tables may lie there too: tables of readings have the columns `trajectory`, `t` and `sigma`.
 
-    Raises: ValueError: if a table of readings belongs to no registered sort.
+    Raises: ValueError: if a table of readings is of no registered kind.
     """
     sorts = {sort.file: sort for sort in OBSERVATIONS.values() if sort.file is not None}
     found = {name: sort for name, sort in sorts.items() if (Path(folder) / name).is_file()}
@@ -87,7 +87,7 @@ def write_readings(folder: str | PathLike[str], tracks: Iterable[Track]) -> list
     """Writes the readings of tracks as tables into the folder of their dataset.
 
     Args: folder: it exists.  tracks: with their observations.
-    Returns: the files; none where no track has readings.
+    Returns: the files; empty if no track has readings.
     """
     tables: defaultdict[str, list[tuple[str, dict[str, Array]]]] = defaultdict(list)
     for track in tracks:

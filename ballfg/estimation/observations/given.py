@@ -1,4 +1,4 @@
-"""Factors that a user hands to an estimator, as an observation that all estimators know."""
+"""Wraps a user's factors as an observation that all estimators use."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ballfg.factors.batch import FactorBatch
 class GivenFactors(Observation):
     """A batch of factors, each on one state of the track.
 
-    Args: factors: their first variable is the index of a sample.  number: among those that were given together.
+    Args: factors: their first variable is the index of a sample.  number: index among the user's batches.
     """
 
     def __init__(self, factors: FactorBatch, number: int) -> None:
@@ -28,9 +28,9 @@ class GivenFactors(Observation):
         """The factors."""
         return self.factors
 
-    def taken(self, samples: NDArray[np.bool_]) -> GivenFactors:
+    def select(self, samples: NDArray[np.bool_]) -> GivenFactors:
         """The factors of some samples."""
-        kept = self.factors.taken(np.flatnonzero(samples[self.state]))
+        kept = self.factors.select(np.flatnonzero(samples[self.state]))
         kept.variables = kept.variables.copy()
         kept.variables[:, 0] = (np.cumsum(samples) - 1)[kept.variables[:, 0]]
         return GivenFactors(kept, self.number)

@@ -1,4 +1,4 @@
-"""Whitened innovations: of a filter against its prediction, of a smoother against the prediction from all others."""
+"""Computes whitened innovations: a filter's against its prediction, a smoother's against all other measurements."""
 
 from dataclasses import dataclass
 
@@ -12,12 +12,12 @@ from ballfg.factors.linear.step import weighted
 from ballfg.state import POSITION, STATE_DIM
 
 LEAST_INFORMATION = 1e-6
-"""Share of the posterior's information that the other measurements are given at least."""
+"""Least share of the posterior's information that the other measurements get."""
 
 
 @dataclass(frozen=True)
 class FilterInnovation:
-    """One factor on the state that a filter predicts, linearised there: the input of its update.
+    """One factor on a filter's predicted state, linearised there, as the input of its update.
 
     Attributes:
         residual: (r,) whitened.
@@ -41,7 +41,7 @@ class FilterInnovation:
             factor: on the state, and perhaps on the coefficients behind it in the filter's state.
             mean: (d,) m, m/s, rad/s, then the coefficients in their own units, then the tracker's biases in m.
             covariance: (d, d) in the squares of these units.
-            biases: how many numbers at the end of the mean are biases, which the factor does not look at.
+            biases: number of biases at the end of the mean, which the factor does not see.
         """
         own = slice(STATE_DIM, len(mean) - biases)
         inputs = (mean[None, :STATE_DIM], mean[None, own])[: factor.variables.shape[1]]
@@ -78,16 +78,16 @@ def leave_position_out(states: Array, covariances: Array, measured: Array, noise
     scale = 1.0 / np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
     both = scale[:, :, None] * scale[:, None, :]
     others = (information - jacobian.swapaxes(-1, -2) @ jacobian) * both
-    # a sample that alone decides its position leaves nothing: bound C, the whitened distance goes to zero
+    # a sample that alone determines its position leaves nothing: bound C, the whitened distance goes to zero
     covariance = _inverse_of_rest(others) * both
     distance = measured - states[:, POSITION] - (covariance @ pull[..., None])[..., 0]
     return whitened(distance, np.asarray(covariance + noise, dtype=np.float64))
 
 
 def _inverse_of_rest(information: Array) -> Array:
-    """(n, r, r) inverse of what is left of an information near one after a share was taken out of it.
+    """(n, r, r) inverse of the remaining information near one, after a share was subtracted.
 
-    Nothing less than zero can be left; where all of it goes, a difference of two nearly equal matrices may be so.
+    It cannot be negative; if nearly all is subtracted, rounding may make it so.
     """
     values, vectors = np.linalg.eigh(0.5 * (information + information.swapaxes(-1, -2)))
     inverse = 1.0 / (np.maximum(values, 0.0) + LEAST_INFORMATION)
@@ -95,12 +95,12 @@ def _inverse_of_rest(information: Array) -> Array:
 
 
 def leave_one_out(rows: Rows, covariances: Covariances) -> Array:
-    """(m, r) whitened innovations of factors on one state each, and on the coefficients where they see them.
+    """(m, r) whitened innovations of factors on one state each, and on the coefficients if they see them.
 
-    As `leave_position_out`, in the units of whitened residuals: with H the Jacobian of a measurement and S = H P H^T
-    its share of what is known of it, the others know what it will show to C = S (1 - S)^-1, and see it at a distance
-    -(r + C r) from there; for a robust loss, H and r in S and in the pull are the weighted ones. The covariance of that
-    is 1 + C.
+    As `leave_position_out`, in the units of whitened residuals: with the Jacobian H of a measurement and its share S =
+    H P H^T of the information, the other measurements predict it with covariance C = S (1 - S)^-1, at a distance -(r +
+    C r); for a robust loss, H and r in S and in the pull are the weighted ones. The covariance of that distance is 1 +
+    C.
 
     Args:
         rows: the factors, linearised at the minimum.
@@ -115,7 +115,7 @@ def leave_one_out(rows: Rows, covariances: Covariances) -> Array:
         both = np.broadcast_to(covariances.coefficients, (len(state), *covariances.coefficients.shape))
         joint = np.block([[joint, cross], [cross.swapaxes(-1, -2), both]])
     gain = joint @ pulled.swapaxes(-1, -2)
-    # a measurement that alone decides what it shows leaves nothing: bound C, the whitened distance goes to zero
+    # a measurement that alone determines its value leaves nothing: bound C, the whitened distance goes to zero
     left = _inverse_of_rest(unit - pulled @ gain)
     others = joint + gain @ left @ gain.swapaxes(-1, -2)
     pull = pulled.swapaxes(-1, -2) @ residual[..., None]

@@ -1,7 +1,7 @@
-"""What an observation is: measurements of one sort, and all that estimators ask of them.
+"""Defines the interface of an observation: measurements of one kind, with all methods that estimators call.
 
-Estimators know this interface only. A sort of measurement of one's own is a subclass and a registration
-(docs/custom_factors.md); most are a `Reading`, which asks for one function in torch.
+Estimators know this interface only. A user's own kind of measurement is a subclass and a registration
+(docs/custom_factors.md); most are a `Reading`, which needs one function in torch.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Unknowns:
-    """Unknowns that an observation adds to those of a track: the time offset of a camera, for instance.
+    """Unknowns that an observation adds to those of a track, such as the time offset of a camera.
 
     Attributes:
         names: of q unknowns, different from those of other observations.
         means: (q,) in the unknowns' own units, of their prior, from the origins on.
         sigmas: (q,) in the unknowns' own units, standard deviations of their prior.
-        origins: (q,) in the unknowns' own units, what the factors count them from; a minimisation starts there.
+        origins: (q,) in the unknowns' own units, the origin of the factors' values; a minimisation starts there.
     """
 
     names: tuple[str, ...] = ()
@@ -47,15 +47,15 @@ class Unknowns:
 
 @dataclass(frozen=True)
 class Context:
-    """All that an observation needs to make its factors.
+    """The inputs that an observation needs to make its factors.
 
     Attributes:
-        track: that it belongs to.
+        track: of the observation.
         model: the ball.
         settings: noise, losses and priors.
-        sigma: (n, 3) m, standard deviation of the white error of each position of the track, samples of bad quality
-            included.
-        velocities: (n, 3) m/s, rough, of the ball; None where stamps are exact.
+        sigma: (n, 3) m, standard deviation of the white error of each position of the track, including samples of bad
+            quality.
+        velocities: (n, 3) m/s, rough, of the ball; None if stamps are exact.
         columns: place of each unknown, by name, among the coefficients that all factors of the track share.
     """
 
@@ -68,15 +68,15 @@ class Context:
 
 
 class Observation(ABC):
-    """Measurements of one sort that belong to a track.
+    """Measurements of one kind that belong to a track.
 
     Attributes:
-        name: of the sort; a track holds one observation of a name.
+        name: of the kind; a track holds one observation of a name.
         state: (m,) index of the sample of the track that each of the m measurements belongs to, ascending.
-        locates: whether it measures where the ball is. The positions of such a track were made from it.
-        file: name of its table in the folder of a dataset; None where it has no table of its own.
+        locates: True if it measures the ball's place; the positions of such a track are computed from it.
+        file: name of its table in the folder of a dataset; None without a table of its own.
         columns: of that table, beside `trajectory`, `t` (s) and `sigma`.
-        largest: size, in the units of the columns, that no value of a ball exceeds; larger ones are refused.
+        largest: largest possible size of a value, in the units of the columns; larger ones are refused.
     """
 
     name: ClassVar[str]
@@ -96,19 +96,19 @@ class Observation(ABC):
     def batch(self, context: Context) -> FactorBatch:
         """The factors of all m measurements, in order, each on the state of its sample.
 
-        Where the observation has unknowns, `COEFFICIENTS` is a second variable, and `context.columns` tells their
-        places in it.
+        If the observation has unknowns, `COEFFICIENTS` is a second variable, and `context.columns` gives their places
+        in it.
         """
 
     @abstractmethod
-    def taken(self, samples: NDArray[np.bool_]) -> Self:
-        """The measurements of some samples of the track, whose samples are then numbered anew.
+    def select(self, samples: NDArray[np.bool_]) -> Self:
+        """The measurements of some samples of the track; the selected samples are renumbered.
 
-        Args: samples: (n,) bool, which samples of the track stay.
+        Args: samples: (n,) bool, the selected samples of the track.
         """
 
     def turned(self, rotation: Tensor, shift: Tensor) -> Observation:
-        """The same measurements as seen in another frame: p -> rotation p + shift.
+        """The same measurements in another frame: p -> rotation p + shift.
 
         Args: rotation: (3, 3) about the vertical, dimensionless.  shift: (3,) m.
         Raises: ValueError: if the observation cannot be turned.
@@ -129,7 +129,7 @@ class Observation(ABC):
         """(m, dim) whitened: each measurement against its prediction from all others.
 
         Args:
-            context: that the factors were made with.
+            context: of the factors.
             rows: the factors linearised at the minimum.
             values: the minimum.
             covariances: of the states there and of the coefficients.
@@ -137,13 +137,13 @@ class Observation(ABC):
         return leave_one_out(rows, covariances)
 
     def retimed(self, track: Track, estimate: Estimate) -> Track | None:
-        """The track with the stamps that the unknowns call for; None, the default, where its stamps stay."""
+        """The track with stamps corrected by the unknowns; None, the default, if its stamps stay."""
         return None
 
     def onto(self, old: Track, new: Track) -> Observation:
         """The same measurements on a track of the same ball with other stamps.
 
-        Args: old: track that the observation belongs to.  new: track without it.
+        Args: old: track of the observation.  new: track without it.
         Raises: ValueError: if the observation cannot change its stamps.
         """
         raise ValueError(
@@ -157,26 +157,26 @@ class Observation(ABC):
         """The observation of a track from its rows of the table.
 
         Args: track: with its stamps.  rows: (m, 2 + dim) t s, the columns and sigma in their own units.
-        Raises: ValueError: if the observation has no table, or the rows do not suit the track.
+        Raises: ValueError: if the observation has no table, or the rows do not fit the track.
         """
         raise ValueError(f"the observation '{cls.name}' has no table of its own: {cls.__name__}.file is None")
 
     def table(self, track: Track) -> Mapping[str, Array]:
         """The columns `t`, those of the values, and `sigma`, (m,) each, in s and their own units.
 
-        Args: track: that the observation belongs to.
+        Args: track: of the observation.
         Raises: ValueError: if the observation has no table.
         """
         raise ValueError(f"the observation '{self.name}' has no table of its own: {type(self).__name__}.file is None")
 
     def filter_rows(self, sample: int) -> Index:
-        """(k,) index of the rows of the batch that a filter updates with at a sample; none where positions stand in."""
+        """(k,) index of the batch's rows that a filter uses at a sample; empty if it uses positions in their place."""
         return np.zeros(0, dtype=np.int64) if self.locates else np.flatnonzero(self.state == sample)
 
     def single_rows(self, batch: FactorBatch) -> Iterator[tuple[int, FactorBatch]]:
-        """The measurements one by one, as they come in on a stream: sample, and a batch of one factor on state 0."""
+        """The measurements one by one, as on a stream: sample, and a batch of one factor on state 0."""
         for row, sample in enumerate(self.state.tolist()):
-            one = batch.taken(np.array([row]))
+            one = batch.select(np.array([row]))
             one.variables = np.zeros_like(one.variables)
             yield sample, one
 

@@ -1,4 +1,4 @@
-"""Positions: the observation that most tracks have, and the usual one alone."""
+"""Positions are the usual observation of a track."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from ballfg.estimation.observations.innovation import leave_one_out, leave_posit
 from ballfg.estimation.observations.observation import Context, Observation
 from ballfg.estimation.settings import stamp_covariance
 from ballfg.factors.batch import Rows, Values
+from ballfg.factors.correlated_noise import BiasedPositionFactors
 from ballfg.factors.linear.covariance import Covariances
 from ballfg.factors.position import PositionFactors
-from ballfg.factors.tracker import BiasedPositionFactors
 from ballfg.state import STATE_DIM
 from ballfg.tracks import Track
 
@@ -42,7 +42,7 @@ class Positions(Observation):
             self.state, self.positions, context.sigma, stamps, settings.loss, settings.has_memory
         )
 
-    def taken(self, samples: NDArray[np.bool_]) -> Positions:
+    def select(self, samples: NDArray[np.bool_]) -> Positions:
         """The positions of some samples."""
         return Positions(self.positions[samples])
 
@@ -55,6 +55,6 @@ class Positions(Observation):
 
 
 def observations_of(track: Track) -> tuple[Observation, ...]:
-    """All observations of a track: its positions, unless they were made from the others, and what it brings beside."""
+    """All observations of a track: its further ones, and its positions unless they were computed from those."""
     measured = () if track.rough else (Positions(track.positions),)
     return (*measured, *track.observations)

@@ -1,10 +1,10 @@
-"""A rough path straight from sightings: at each moment a short parabola through the rays around it.
+"""Computes a rough path from sightings, at each moment by a short parabola through the rays around it.
 
-A ray says two things about a point on it, both linear in the point, so a free fall p + v t + g t^2 / 2 is a linear
-least-squares problem in (p, v) over the sightings of any cameras at any times: nothing is interpolated, and no two
-cameras need a common shutter. Windows lie about the moment, before it and after it; of these the one that promises the
-smallest error counts, its own residuals taken into account, so that no bounce lies within the window that is used. A
-window of one camera alone does not count: all points on its rays fit, those at the camera best.
+A ray gives two linear equations of a point on it, so a free fall p + v t + g t^2 / 2 is a linear least-squares problem
+in (p, v) over the sightings of any cameras at any times: nothing is interpolated, and cameras need no common shutter.
+Windows lie around, before and after the moment; the one with the smallest expected error counts, its own residuals
+included, so that the chosen window holds no bounce. A window of one camera alone does not count: all points on its rays
+fit, those at the camera best.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from ballfg.vision.camera import Camera
 AROUND: Final = ((-1.6, 1.6), (-2.2, 0.0), (0.0, 2.2), (-1.2, 0.0), (0.0, 1.2))
 """Windows about a moment, in periods of the slowest camera: each holds two sightings or more of every camera."""
 BEFORE: Final = ((-3.2, 0.0), (-2.2, 0.0), (-1.2, 0.0))
-"""Windows for a stream, in which nothing later is known."""
+"""Windows for a stream, without later sightings."""
 LEAST_SPARE: Final = 2
-"""Equations beyond the six unknowns, for residuals to tell whether a window holds a bounce."""
+"""Least number of equations beyond the six unknowns, for residuals to show a bounce within a window."""
 ROUNDS: Final = 4
-"""Solutions of a window: the first takes all depths for equal, the others weigh wrong candidates down."""
+"""Solutions of a window: the first assumes equal depths, the others weight wrong candidates down."""
 ROBUST: Final = 5.0
 """Scale of Cauchy's loss on a sighting, in standard deviations of its noise."""
 SPEED: Final = 30.0
-"""m/s, standard deviation of the velocity before anything was seen: bounds what a single camera leaves open."""
+"""m/s, prior standard deviation of the velocity: bounds the direction that a single camera leaves undetermined."""
 SPREAD: Final = 100.0
-"""m, standard deviation of the position before anything was seen, about the cameras."""
+"""m, prior standard deviation of the position about the cameras."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Path:
 
 @dataclass(frozen=True)
 class Rays:
-    """Sightings as linear equations A X = b of the point seen, in units of x/z and y/z times depth.
+    """Sightings as linear equations A X = b of the ball's position, in units of x/z and y/z times depth.
 
     Attributes:
         times: (m,) s, true, ascending.
@@ -99,7 +99,7 @@ class Rays:
         return cls(times, sightings.camera, matrix, target, root, depth_row, max(periods, default=0.0))
 
     def joined(self, later: Rays, most: int, period: float) -> Rays:
-        """These rays and later ones, the newest `most` of them, with the period that is now known, s."""
+        """These rays and later ones, the newest `most` of them, with a new period, s."""
 
         def newest(mine: Array, others: Array) -> Array:
             return np.concatenate((mine, others))[-most:]
@@ -116,7 +116,7 @@ class Rays:
 
 
 def rough_path(rays: Rays, moments: Array, windows: Sequence[tuple[float, float]] = AROUND) -> Path:
-    """Where the ball was at moments (n,) s, by the best of several windows about each.
+    """The ball's positions at moments (n,) s, by the best of several windows around each.
 
     Args:
         rays: of all sightings that may be used.

@@ -1,4 +1,4 @@
-"""Readings of an instrument: numbers that follow from the state of the ball, by one function in torch."""
+"""A reading compares an instrument's numbers with one torch function of the ball's state."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from torch import Tensor
 from ballfg.arrays import Array, Index
 from ballfg.checks import check_array, check_instance, shown
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.integrate import batch_jacobian, rk4_step
+from ballfg.dynamics.motion.flight_step import rk4_step
+from ballfg.dynamics.motion.integrate import batch_jacobian
 from ballfg.estimation.observations.observation import Context, Observation
 from ballfg.factors.batch import FactorBatch
 from ballfg.factors.loss import Loss
@@ -25,21 +26,21 @@ from ballfg.tracks.stamps import elapsed
 from ballfg.tracks.track import FASTEST_BALL, FASTEST_SPIN
 
 FARTHEST: Final = 0.05
-"""s. A reading that lies farther from every sample is refused: over so long the ball may bounce."""
+"""s. A reading farther from every sample is refused: the ball may bounce in so long a time."""
 
 
 class Reading(Observation):
     """Readings of one instrument, with independent Gaussian noise.
 
-    A subclass names itself, its columns in a file, and writes `predicted`. Jacobians, the gradient of learning, the
-    update of filters, innovations, reading and writing follow from that.
+    A subclass declares its name and its columns in a file, and implements `predicted`. Jacobians, the gradient of
+    learning, the update of filters, innovations, reading and writing follow from that.
 
     Args:
-        state: (m,) index of the sample that is nearest in time to each reading.
+        state: (m,) index of the sample nearest in time to each reading.
         values: (m, dim), or (m,) where dim is 1, in the units of the columns.
         sigma: standard deviation of each value in the same units; a number, (m,), or (m, dim).
-        delay: (m,) s, time of each reading minus the stamp of its sample; zero where None. The state is carried so
-            far in free flight.
+        delay: (m,) s, time of each reading minus the stamp of its sample; None: zero. The state is carried over it in
+            free flight.
 
     Attributes:
         file: name of the table in the folder of a dataset, with the columns `trajectory`, `t`, those of the values,
@@ -83,18 +84,18 @@ class Reading(Observation):
 
     @abstractmethod
     def predicted(self, state: Tensor) -> Tensor:
-        """(..., dim) what the instrument would read of balls in states (..., 9), without noise."""
+        """(..., dim) noise-free readings of balls in states (..., 9)."""
 
     @classmethod
     def at(cls, track: Track, times: ArrayLike, values: ArrayLike, sigma: ArrayLike) -> Self:
-        """Readings at times of their own, each with the nearest sample of the track.
+        """Readings at any times, each with the nearest sample of the track.
 
         Args:
             track: with its stamps.
             times: (m,) s, in any order.
             values: (m, dim), or (m,) where dim is 1, in the units of the columns.
             sigma: as for the class.
-        Raises: ValueError: a reading that is farther than `FARTHEST` from every sample, or as for the class.
+        Raises: ValueError: a reading farther than `FARTHEST` from every sample, or as for the class.
         """
         check_instance("track", track, Track, "Make one with Track(times, positions).")
         when, given = check_array("times", times), check_array("values", values)
@@ -126,7 +127,7 @@ class Reading(Observation):
         """The readings of a track from its rows of the table."""
         return cls.at(track, rows[:, 0], rows[:, 1:-1], rows[:, -1])
 
-    def taken(self, samples: NDArray[np.bool_]) -> Self:
+    def select(self, samples: NDArray[np.bool_]) -> Self:
         """The readings of some samples."""
         kept = samples[self.state]
         number = np.cumsum(samples) - 1
@@ -143,7 +144,7 @@ class Reading(Observation):
     def table(self, track: Track) -> Mapping[str, Array]:
         """Columns of the file, in order, without the trajectory: t (m,) s, the values (m,) and sigma (m,).
 
-        Raises: ValueError: if the values of one reading have different sigmas, for which the table has no place.
+        Raises: ValueError: if the values of one reading have different sigmas, which a table cannot hold.
         """
         if (self.sigma != self.sigma[:, :1]).any():
             raise ValueError(f"sigma of '{self.name}' must be one number a reading in a table; got several.")
@@ -154,7 +155,7 @@ class Reading(Observation):
 def _checked_index(name: str, state: ArrayLike) -> Index:
     """The indices of samples as whole numbers.
 
-    Raises: ValueError: a negative or broken number, as where times are given in place of indices.
+    Raises: ValueError: a negative or fractional number, such as a time in place of an index.
     """
     given = check_array(f"state of '{name}'", state)
     if not np.isfinite(given).all() or (given < 0.0).any() or (given % 1.0).any():
@@ -166,7 +167,7 @@ def _checked_index(name: str, state: ArrayLike) -> Index:
 
 
 class RadarSpeed(Reading):
-    """The speed of the ball, m/s, as a radar beside the flight or a speed gun with a known angle tells it."""
+    """The speed of the ball, m/s, from a radar beside the flight or a speed gun at a known angle."""
 
     name: ClassVar[str] = "speed"
     file: ClassVar[str | None] = "speeds.csv"
@@ -183,11 +184,11 @@ class RadarSpeed(Reading):
 
 
 LEAST_SPEED: Final = 1e-6
-"""m/s. Below it the direction of the velocity, and so the derivative of its length, is taken to be none."""
+"""m/s. Below it the derivative of the velocity's length is set to zero."""
 
 
 class SpinReading(Reading):
-    """The spin of the ball, rad/s, as a camera that reads its marks tells it in mid-flight."""
+    """The spin of the ball, rad/s, from a camera that reads its marks in mid-flight."""
 
     name: ClassVar[str] = "spin"
     file: ClassVar[str | None] = "spins.csv"
@@ -214,7 +215,7 @@ class ReadingFactors(FactorBatch):
 
     Args:
         reading: gives h, z, sigma, the delays and the loss.
-        model: carries states in free flight; asked only where a delay is not zero.
+        model: carries states in free flight; used only for delays other than zero.
     """
 
     row_arrays: ClassVar[tuple[str, ...]] = ("variables", "values", "sigma", "delay")
@@ -228,7 +229,7 @@ class ReadingFactors(FactorBatch):
 
     @property
     def group(self) -> Hashable:
-        """Besides the usual: the sort of the reading and the model."""
+        """Further entries of the group: the kind of the reading and the model."""
         return (*super().group, self.sort, id(self.model))  # type: ignore[misc]
 
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:

@@ -1,4 +1,4 @@
-"""The sorts of observation by name: those of the package, of the user, and of other installed packages."""
+"""Registers the kinds of observation by name: those of the package, of the user, and of other installed packages."""
 
 from pathlib import Path
 from typing import Final
@@ -14,13 +14,13 @@ OBSERVATIONS: Final[Registry[Observation]] = Registry(
     "observation", group="ballfg.observations", base=Observation, remedy="docs/custom_factors.md has an example."
 )
 register_observation = OBSERVATIONS.register
-"""Lets an observation be read from the folder of a dataset; may decorate the class."""
+"""Registers an observation, so that it is read from the folder of a dataset; may decorate the class."""
 for _own in (Positions, CameraSightings, RadarSpeed, SpinReading):
     register_observation(_own)
 
 
 def load_observations(path: str | Path) -> tuple[type[Observation], ...]:
-    """Run a Python file and register the observations that it defines; those whose class begins with `_` are left out.
+    """Runs a Python file and registers its observations, except for classes whose name begins with `_`.
 
     Args: path: of a file that you trust: all of its code runs.
     Returns: the classes, in the order in which they stand there.

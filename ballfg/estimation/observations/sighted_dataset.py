@@ -1,4 +1,4 @@
-"""The balls of a dataset as its cameras saw them: `detections.csv` and `cameras.yaml` of its folder."""
+"""Makes tracks from the sightings in a dataset's folder: `detections.csv` and `cameras.yaml`."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -19,13 +19,13 @@ from ballfg.vision.camera_file import CAMERAS_FILE, read_cameras
 
 
 class SightedDataset(TrackFolder):
-    """The tracks of a folder as cameras saw them; made by `read_sighted`. A table of tracks need not be there.
+    """The tracks of a folder from its sightings; made by `read_sighted`. The folder needs no table of tracks.
 
     Attributes:
         path: the folder.
         info: what `dataset.yaml` states.
         cameras: of the rig.
-        notes: what was ignored or left out, one sentence each.
+        notes: ignored rows and balls, one sentence each.
 
     Raises: ValueError: cameras with numbers that no lens has.
     """
@@ -34,7 +34,7 @@ class SightedDataset(TrackFolder):
     """The positions of the tracks are made from the sightings."""
 
     has_sigmas: Final = False
-    """Nobody states how far these positions are off."""
+    """The errors of these positions are not stated."""
 
     def __init__(
         self,
@@ -92,7 +92,7 @@ def read_sighted(folder: str | PathLike[str]) -> SightedDataset:
     Args:
         folder: holds `dataset.yaml`, `cameras.yaml`, `detections.csv` with the trajectory of each row, and optionally
             `labels.csv`.
-    Returns: the balls that two cameras saw; `notes` tell of others.
+    Returns: the balls that two cameras saw; `notes` list the others.
     Raises:
         FileNotFoundError: one of the files is missing.
         ValueError: the content breaks a rule, or there is no ball in it; the message names file, line and remedy.

@@ -1,4 +1,4 @@
-"""Sightings: what cameras saw of one ball, each at its own stamp, and the track with rough positions made from them."""
+"""Holds the sightings of one ball by several cameras, and makes a track with rough positions from them."""
 
 from __future__ import annotations
 
@@ -28,38 +28,38 @@ if TYPE_CHECKING:
 
 
 TIME_OFFSET: Final = "time_offset."
-"""What the name of a camera's time offset begins with among the unknowns of a track."""
+"""Prefix of the name of a camera's time offset among the unknowns of a track."""
 OFFSET_SETTLED: Final = 1e-5
-"""s. An offset that moves by less is settled: the path bends by a nanometre meanwhile."""
+"""s. An offset that changes by less has converged: the path bends by a nanometre meanwhile."""
 
 SAME_MOMENT: Final = 2e-4
-"""s. Sightings closer than this share a state, and a camera factor carries it over the rest in a straight line: at
-20 m/s^2 that is wrong by 0.4 um. States closer together would cost time and tell nothing."""
+"""s. Sightings closer than this share a state, and a camera factor carries it over the rest in a straight line: at 20
+m/s^2 that is wrong by 0.4 um. States closer together would cost time without gain."""
 LOOSE: Final = 0.05
-"""m. Where the rays around a moment leave the position more open than this, its neighbours in time tell it better."""
+"""m. If the rays at a moment leave the position more uncertain, its neighbours in time replace it."""
 LOOSE_SIGMA: Final = 0.1
 """m, standard deviation of a position that was interpolated in time: a bounce may lie between its neighbours."""
 LOOSE_GROWTH: Final = 2.0
-"""m/s, growth of that with the time to the next moment that rays fix: what a window's velocity is worth."""
+"""m/s, growth of that with the time to the next determined moment: the error of a window's velocity."""
 
 
 class NeverSeenByTwoError(ValueError):
-    """No two cameras saw the ball within a few frames: there is no telling where it was."""
+    """No two cameras saw the ball within a few frames, so its position is unknown."""
 
 
 class CameraSightings(Observation):
-    """Where cameras saw the ball, in pixels.
+    """Pixels of the ball in the images of cameras.
 
     The stamps of its track are the true times of sightings; those closer than `SAME_MOMENT` share a sample. Where
     `Settings.time_offsets` names cameras, their time offsets are unknowns of the track.
 
     Args:
         sightings: m of them, in order of true time.
-        cameras: c of them, in the order of `sightings.cameras`; their time offsets are in the stamps of the track.
+        cameras: c of them, in the order of `sightings.cameras`; the stamps of the track include their time offsets.
         state: (m,) index of the sample that each sighting belongs to, ascending.
         delay: (m,) s, true time of each sighting minus the stamp of its sample: 0 to `SAME_MOMENT`.
-        moved: (c,) s, by which the time offsets were moved since the track was made: the prior of an offset is about
-            where it was then.
+        moved: (c,) s, change of the time offsets since the track was made: the prior of an offset is about its first
+            value.
     """
 
     name: ClassVar[str] = "sighting"
@@ -81,7 +81,7 @@ class CameraSightings(Observation):
 
     @property
     def time_offsets(self) -> Array:
-        """(c,) s, of the cameras as they are in the stamps."""
+        """(c,) s, of the cameras, as the stamps include them."""
         return np.array([camera.time_offset for camera in self.cameras])
 
     def batch(self, context: Context) -> CameraFactors:
@@ -119,7 +119,7 @@ class CameraSightings(Observation):
     def found_offsets(self, estimate: Estimate) -> tuple[Array, Array]:
         """Time offsets (c,) s of all cameras after an estimate, and their covariance (c, c) s^2.
 
-        Those that were not estimated are the cameras' own, with zero covariance.
+        Fixed offsets are the cameras' own, with zero covariance.
         """
         rows = [estimate.unknown_names.index(n) for n in estimate.unknown_names if n.startswith(TIME_OFFSET)]
         cameras = [self.sightings.cameras.index(estimate.unknown_names[r].removeprefix(TIME_OFFSET)) for r in rows]
@@ -129,24 +129,24 @@ class CameraSightings(Observation):
         return offsets, covariance
 
     def retimed(self, track: Track, estimate: Estimate) -> Track | None:
-        """The track with the time offsets that were found; None where they moved by less than `OFFSET_SETTLED`."""
+        """The track with the estimated time offsets; None if they changed by less than `OFFSET_SETTLED`."""
         offsets, _ = self.found_offsets(estimate)
         return None if np.abs(offsets - self.time_offsets).max() < OFFSET_SETTLED else self.with_offsets(track, offsets)
 
     def with_offsets(self, track: Track, offsets: Array) -> Track:
-        """The track as it is with other time offsets (c,) s; `moved` tells by how much they moved."""
+        """The track with other time offsets (c,) s; `moved` holds their change."""
         cameras = tuple(replace(c, time_offset=float(d)) for c, d in zip(self.cameras, offsets, strict=True))
         again = sighted_track(track.name, in_order(self.sightings, cameras), cameras, track.labels)
         seen = sightings_of(again)
         seen.moved = self.moved + offsets - self.time_offsets
         return again.observed(*(other.onto(track, again) for other in track.observations if other is not self))
 
-    def taken(self, samples: NDArray[np.bool_]) -> CameraSightings:
+    def select(self, samples: NDArray[np.bool_]) -> CameraSightings:
         """The sightings of some samples."""
         rows = samples[self.state]
         number = np.cumsum(samples) - 1
         return CameraSightings(
-            self.sightings.taken(rows), self.cameras, number[self.state[rows]], self.delay[rows], self.moved
+            self.sightings.select(rows), self.cameras, number[self.state[rows]], self.delay[rows], self.moved
         )
 
 
@@ -166,17 +166,17 @@ def sightings_of(track: Track) -> CameraSightings:
 def sighted_track(
     name: str, sightings: Sightings, cameras: Sequence[Camera], labels: Mapping[str, Label] | None = None
 ) -> Track:
-    """The track of one ball that cameras saw.
+    """The track of one ball from the sightings of cameras.
 
-    Its `positions` and `sigmas` are rough, made from the rays about each stamp: good enough to find events in and to
-    start from. The smoother and the online estimator use camera factors in their place; the extended Kalman filter and
-    the sliding window know positions only, and use these. Neighbouring ones share rays, so their errors go together.
+    Its `positions` and `sigmas` are rough, from the rays around each stamp: good enough for finding events and for a
+    start. The smoother and the online estimator use camera factors instead; the extended Kalman filter and the sliding
+    window use positions only, and take these. Neighbouring ones share rays, so their errors are correlated.
 
     Args:
         name: of the trajectory.
         sightings: of the ball, in order of true time.
-        cameras: of the rig, in any order; those that `sightings` names must be among them.
-        labels: what is known of the shot.
+        cameras: of the rig, in any order, with all that `sightings` names.
+        labels: of the shot.
     Raises: ValueError: if a camera is missing, rows are not in order of true time, or the ball was never in the view of
         two cameras within a few frames.
     """
@@ -212,15 +212,15 @@ def cameras_of(sightings: Sightings, cameras: Sequence[Camera]) -> tuple[Camera,
 
 
 def true_times_of(sightings: Sightings, cameras: Sequence[Camera]) -> Array:
-    """(m,) s, when sightings happened: stamps less the time offsets of the cameras, in the order of their numbers."""
+    """(m,) s, true times of sightings: stamps less the time offsets of the cameras, in the order of their numbers."""
     offsets = np.array([camera.time_offset for camera in cameras])
     return np.asarray(sightings.times - offsets[sightings.camera])
 
 
 def in_order(sightings: Sightings, cameras: Sequence[Camera]) -> Sightings:
-    """The sightings in order of true time, as the cameras' time offsets have it."""
+    """The sightings in order of true time, by the cameras' time offsets."""
     times = true_times_of(sightings, cameras_of(sightings, cameras))
-    return sightings.taken(np.argsort(times, kind="stable"))
+    return sightings.select(np.argsort(times, kind="stable"))
 
 
 @lru_cache(maxsize=64)
@@ -229,7 +229,7 @@ def _bank(cameras: tuple[Camera, ...]) -> CameraBank:
 
 
 def _firsts(times: Array) -> NDArray[np.bool_]:
-    """(m,) whether a sighting begins a state of its own."""
+    """(m,) True if a sighting begins a state of its own."""
     first = np.ones(len(times), dtype=bool)
     begun = times[0]
     for row in range(1, len(times)):
@@ -239,10 +239,10 @@ def _firsts(times: Array) -> NDArray[np.bool_]:
 
 
 def filled(moments: Array, path: Path, name: str) -> Path:
-    """The path with what rays leave open interpolated in time, extrapolated at its ends.
+    """The path, with undetermined positions interpolated in time and extrapolated at its ends.
 
     Args: moments: (n,) s, of the path.  path: from `rough_path`.  name: of the track, for the message.
-    Raises: NeverSeenByTwoError: if rays fix no position at all.
+    Raises: NeverSeenByTwoError: if rays determine no position at all.
     """
     firm = path.sigmas.max(axis=1) <= LOOSE
     if not firm.any():
@@ -269,7 +269,7 @@ def filled(moments: Array, path: Path, name: str) -> Path:
 
 
 def _fallen(path: Path, rows: NDArray[np.int64], elapsed: Array) -> Array:
-    """(k, 3) m, where the free fall from some moments is after some time, s."""
+    """(k, 3) m, positions of the free fall from some moments after some time, s."""
     points = path.positions[rows] + elapsed[:, None] * path.velocities[rows]
     points[:, Z] -= 0.5 * STANDARD_GRAVITY * elapsed**2
     return points

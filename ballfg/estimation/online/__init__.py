@@ -1,1 +1,1 @@
-"""The online estimator: iSAM2 over a window of the newest samples."""
+"""The online estimator smooths the newest samples of a stream in a window, by iSAM2 or a chain."""

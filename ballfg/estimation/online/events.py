@@ -1,4 +1,4 @@
-"""Events as a stream brings them: what the segmenter believes now, laid over the samples of the window."""
+"""Keeps the segmenter's current events on a stream and applies them to the samples of the window."""
 
 import copy
 import math
@@ -10,10 +10,12 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.online.sample import Sample
-from ballfg.estimation.segmentation import Event, EventKind, Segmentation, SegmentationPhysics, Segmenter
 from ballfg.estimation.segmentation.assembly import BREAKS, contacts_of, intervals_of, quality_of, rests_of
-from ballfg.estimation.segmentation.result import Quality
+from ballfg.estimation.segmentation.events import Event, EventKind
+from ballfg.estimation.segmentation.physics import SegmentationPhysics
+from ballfg.estimation.segmentation.result import Quality, Segmentation
 from ballfg.estimation.segmentation.second_look import SIDE, hits_at_contacts
+from ballfg.estimation.segmentation.segmenter import Segmenter
 from ballfg.estimation.segmentation.settings import SegmentationSettings
 from ballfg.estimation.smoother.motion import Motion
 from ballfg.estimation.smoother.problem import QUALITY_SIGMA
@@ -22,11 +24,11 @@ from ballfg.state import STANDARD_GRAVITY, VZ, Z
 SIGMA_FACTOR = np.array([QUALITY_SIGMA.get(quality, 1.0) for quality in Quality])
 """Standard deviation of a sample of each quality, in multiples of a good one's."""
 UNUSABLE = QUALITY_SIGMA[Quality.SHIFTED]
-"""Multiple of the standard deviation from which a sample does not shape its state."""
+"""Multiple of the standard deviation from which a sample does not influence its state."""
 MOVE_MARGIN = 0.02
-"""Share of an interval by which the estimated contact must lie outside it before it moves: keeps it from flapping."""
+"""Share of an interval by which the estimated contact must lie outside before it moves, against oscillation."""
 MOST_MOVES = 6
-"""How often one contact may move."""
+"""Largest number of moves of one contact."""
 
 
 class EventTracker:
@@ -47,7 +49,7 @@ class EventTracker:
         self._moves: dict[tuple[int, float], list[int]] = {}  # steps of each contact, by the place it was found at
 
     def copy(self) -> "EventTracker":
-        """Events of a stream of its own, which has had the same samples so far."""
+        """An event tracker with the same samples, independent of this one."""
         other = copy.copy(self)
         other.segmenter = self.segmenter.copy()
         other._final = list(self._final)
@@ -55,7 +57,7 @@ class EventTracker:
         return other
 
     def push(self, time: float, position: Array, sigma: Array) -> bool:
-        """Takes in a sample; returns whether the explanation of the window may differ from the last one."""
+        """Takes in a sample; True if the explanation of the window may have changed."""
         decision = self.segmenter.push(time, position, sigma)
         before = (*self._final, *self._pending)
         self._final += decision.final
@@ -69,7 +71,7 @@ class EventTracker:
         return bool(state) and state[-1] is EventKind.REST
 
     def _second_look_due(self) -> bool:
-        """A contact has just got enough samples after it to be told from a hit."""
+        """True if a contact has just enough samples after it to be distinguished from a hit."""
         newest = self.segmenter.count - 1
         return any(e.kind is EventKind.CONTACT and e.index + SIDE == newest for e in self._pending)
 
@@ -93,8 +95,8 @@ class EventTracker:
         )
         return found if self.find_events else found.only_contacts()
 
-    def moved(self, segmentation: Segmentation, first: int) -> Segmentation:
-        """The segmentation with its contacts where the estimate has moved them."""
+    def with_moved_contacts(self, segmentation: Segmentation, first: int) -> Segmentation:
+        """The segmentation with its contacts at their refined places."""
         if not self._moves:
             return segmentation
         self._moves = {place: steps for place, steps in self._moves.items() if place[0] >= first - 1}
@@ -105,7 +107,7 @@ class EventTracker:
         return replace(segmentation, contacts=tuple(contacts))
 
     def move(self, interval: int, height: float, step: int) -> bool:
-        """Note that the contact in an interval of the stream belongs to a neighbour; False if it moved too often."""
+        """Assigns the contact in an interval of the stream to a neighbour; False if it moved too often."""
         for place, steps in self._moves.items():
             if place[1] == height and place[0] + sum(steps) == interval:
                 if len(steps) >= MOST_MOVES:
@@ -124,7 +126,7 @@ _REST_KINDS = (EventKind.REST, EventKind.LEAVE, *BREAKS)
 
 
 def _matters(event: Event, first: int) -> bool:
-    """An event inside the window, or the rest that the window begins in."""
+    """True for an event inside the window, or the rest at its beginning."""
     inside = event.index >= first - (event.kind is EventKind.REST)
     return inside or event.kind is EventKind.REST
 
@@ -137,7 +139,7 @@ def _still_needed(events: list[Event], first: int) -> list[Event]:
 
 
 def contact_step(state: Array, rise: float, dt: float) -> int:
-    """Where a contact belongs, seen from the interval it is in: -1 the one before, 1 the next, 0 it stays.
+    """The interval of a contact relative to the present one: -1 the one before, 1 the next, 0 the same.
 
     The ball's path over one interval is a parabola to some micrometres.
 
@@ -154,7 +156,7 @@ def contact_step(state: Array, rise: float, dt: float) -> int:
 
 
 def first_difference(samples: Sequence[Sample], motions: Sequence[Motion], factors: Array) -> int | None:
-    """The first sample that was reached otherwise, or whose usability differs, from what is now believed.
+    """The first sample whose motion or usability differs from the present explanation.
 
     None if only noise levels differ: those change without going back.
     """

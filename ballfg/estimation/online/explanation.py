@@ -1,4 +1,4 @@
-"""What the events found so far mean for the samples of a window: which motions change, and where contacts belong."""
+"""Applies the events of a stream to the window's samples: it changes motions and moves contacts."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from ballfg.estimation.online.windows.stream_window import StreamWindow
 from ballfg.estimation.smoother.motion import FLIGHT, Motion, motions_of
 
 LATEST_CHANGE = 80
-"""Samples. The segmenter's events are final after 64; nothing older is built again."""
+"""Samples. The segmenter's events are final after 64; older states are never rebuilt."""
 YOUNG = 20
-"""Samples after a contact in which the estimate may still move it to another interval."""
+"""Number of samples after a contact in which the estimate may still move it to another interval."""
 
 
 def explain(window: StreamWindow, samples: list[Sample], events: EventTracker) -> list[Sample]:
-    """Lay the events over the samples; those from the first difference on are taken back and returned.
+    """Applies the events to the samples; samples from the first difference on are retracted and returned.
 
-    Args: window: holds the first of the samples.  samples: that it is to hold.  events: found in them.
+    Args: window: holds the first of the samples.  samples: the wanted content.  events: found in them.
     """
     held = len(window)
     times, positions = np.array([s.time for s in samples]), np.array([s.position for s in samples])
     segmentation = events.segmentation(window.first, times, positions)
-    motions = motions_of(events.moved(segmentation, window.first), times)
+    motions = motions_of(events.with_moved_contacts(segmentation, window.first), times)
     measured = np.array([s.measured for s in samples])
     factors = np.where(measured, SIGMA_FACTOR[segmentation.quality], 1.0)  # the loss sets wrong sightings aside
     settled = max(held - LATEST_CHANGE, 0)
@@ -48,10 +48,10 @@ def explain(window: StreamWindow, samples: list[Sample], events: EventTracker) -
 
 
 def move_contacts(window: StreamWindow, samples: Sequence[Sample], events: EventTracker) -> Sequence[Sample]:
-    """Put young contacts where the estimate says they are; the newest one may not have happened yet.
+    """Moves young contacts to their estimated places; the newest one may not have happened yet.
 
     Args: as for `explain`.
-    Returns: the samples that were taken back for it, to be appended again.
+    Returns: the retracted samples, to be appended again.
     """
     n = len(window)
     for k in range(max(n - YOUNG, 1), n):
@@ -73,9 +73,9 @@ def move_contacts(window: StreamWindow, samples: Sequence[Sample], events: Event
 
 
 def tell_velocities(window: StreamWindow, samples: Sequence[Sample]) -> None:
-    """Rough velocities of the samples to come, by line fits between the events; they shape the errors of stamps.
+    """Sets rough velocities of the coming samples, by line fits between the events, for the errors of their stamps.
 
-    A start or a hit just before the last sample in the window left its velocity open; now there are more samples.
+    A start or a hit just before the window's last sample left its velocity undetermined; now there are more samples.
 
     Args: as for `explain`.
     """

@@ -1,4 +1,4 @@
-"""The last word on a track: the window minimised to a tight tolerance, and the states that left it before."""
+"""Computes the final estimate of a streamed track: the window's minimum and the states that left the window."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from ballfg.arrays import Array, Index
 from ballfg.estimation.online.events import SIGMA_FACTOR
+from ballfg.estimation.online.linear_factors import without_bias
 from ballfg.estimation.online.sample import Sample
-from ballfg.estimation.online.tracker import without_bias
 from ballfg.estimation.online.windows.stream_window import StreamWindow
 from ballfg.estimation.result import Estimate
-from ballfg.estimation.segmentation import Contact, Segmentation
+from ballfg.estimation.segmentation.result import Contact, Segmentation
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.settle import Earlier
 from ballfg.estimation.smoother.smoother import Smoother
@@ -22,7 +22,7 @@ from ballfg.tracks import Track
 
 @dataclass(frozen=True)
 class Frozen:
-    """A state as it was when it left the window.
+    """A state at the moment when it left the window.
 
     Attributes:
         sample: its observation.  state: (9,).  joint: (9 + p, 9 + p) covariance with the coefficients.
@@ -40,7 +40,7 @@ def freeze(window: StreamWindow, count: int) -> list[Frozen]:
 
 
 def unknown(sample: Sample, settings: Settings, p: int) -> Frozen:
-    """A state of which nothing but its observation is known, because its window could not be solved."""
+    """A state known by its observation alone, because its window could not be solved."""
     state, sigma = np.zeros(STATE_DIM), np.empty(STATE_DIM + p)
     state[POSITION], sigma[POSITION] = sample.position, sample.sigma
     sigma[VELOCITY], sigma[SPIN] = settings.velocity_prior, settings.spin_prior

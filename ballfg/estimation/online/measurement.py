@@ -1,4 +1,4 @@
-"""One measurement in the window of iSAM2: its factor, and the last answer that its torch batch gave."""
+"""A measurement in the window of iSAM2 holds its factor and the last result of its torch batch."""
 
 from collections import defaultdict
 from collections.abc import Hashable, Sequence
@@ -21,10 +21,10 @@ from ballfg.tracks import Track
 class Measurement:
     """One measurement of a state.
 
-    Args: batch: of one factor on one state, which alone it looks at.
+    Args: batch: of one factor on a single state.
 
     Attributes:
-        innovation: (dim,) whitened, against the prediction at the moment it came in; NaN where there was none.
+        innovation: (dim,) whitened, against the prediction when it came in; NaN without a prediction.
     """
 
     def __init__(self, batch: FactorBatch) -> None:
@@ -37,10 +37,10 @@ class Measurement:
         return self.bridge.factor(0, [state])
 
     def corrected(self, state: Array, covariance: Array) -> tuple[Array, Array]:
-        """State (9,) and its covariance (9, 9), moved by the measurement as an extended Kalman filter would.
+        """State (9,) and covariance (9, 9) after an extended Kalman filter's update with the measurement.
 
-        A tracker's bias may stand behind the state; the measurement does not look at it.
-        A robust loss gets the weight that the innovation gives it. The innovation is kept the first time.
+        A tracker's bias may follow the state; the measurement does not depend on it. A robust loss weights the update
+        by the innovation, which is stored the first time.
         """
         found = FilterInnovation.of(self.batch, state, covariance)
         if np.isnan(self.innovation).any():
@@ -50,9 +50,9 @@ class Measurement:
 
 
 def prepare(measurements: Sequence[Measurement], states: Array) -> None:
-    """Evaluate measurements at their states (k, 9), one call for each sort, and keep the answers for iSAM2's questions.
+    """Evaluates measurements at their states (k, 9), one call per kind, and stores the results for iSAM2's queries.
 
-    Biases may stand behind the states.
+    Biases may follow the states.
 
     Raises: ValueError: if a residual is not finite: a ball is not in front of its camera, for instance.
     """
@@ -70,10 +70,10 @@ def prepare(measurements: Sequence[Measurement], states: Array) -> None:
 def measurements_beside(
     track: Track, model: BallModel, settings: Settings, sigma: Array
 ) -> dict[str, list[tuple[int, Measurement]]]:
-    """What was measured beside positions, by name of the observation: each with the number of its sample.
+    """All measurements other than positions, by name of the observation: each with the number of its sample.
 
     Args: sigma: (n, 3) m, of the positions.
-    Raises: ValueError: an observation that looks at several states, or settings that ask it for unknowns.
+    Raises: ValueError: an observation of several states, or settings that give it unknowns.
     """
     refuse_unknowns(track.observations, settings, "online")
     context, found = Context(track, model, settings, sigma), {}

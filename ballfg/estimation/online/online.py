@@ -1,4 +1,4 @@
-"""The online estimator: iSAM2, one observation at a time, within a window of bounded length."""
+"""The online estimator updates a window of states by one observation at a time, with iSAM2 or the own solver."""
 
 import copy
 import gc
@@ -39,7 +39,7 @@ from ballfg.estimation.online.windows.stream_window import StreamWindow
 from ballfg.estimation.online.windows.window import IsamWindow
 from ballfg.estimation.plausible import plausible, possible
 from ballfg.estimation.result import Estimate, Status
-from ballfg.estimation.segmentation import physics_of
+from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.settings import Settings, Solver, sample_sigmas, total_sigmas
 from ballfg.estimation.sides.hypotheses import HypothesisModel, SampleMeasurement
 from ballfg.estimation.sides.monitor import ContactMonitor, ContactState
@@ -54,23 +54,23 @@ from ballfg.tracks.stamps import StreamOrigin
 from ballfg.vision.camera import Camera
 
 LAG = 128
-"""States that stay when the window is cut: 0.7 s at 180 Hz, after which new samples say nothing about an old state."""
+"""States that stay when the window is cut: 0.7 s at 180 Hz; new samples carry no information on older ones."""
 WINDOWS: Final[Mapping[Solver, type[StreamWindow]]] = {"gtsam": IsamWindow, "ballfg": ChainWindow}
 EARLIER: Final[Mapping[str, Solver]] = {"isam2": "gtsam", "chain": "ballfg"}
-"""Names that solvers had as an argument of `Online`."""
+"""Earlier names of solvers as an argument of `Online`."""
 
 
 class Online(Estimator):
     """Incremental smoothing: every observation updates the states of the whole window.
 
-    Use `push` on a live stream of positions, `push_sighting` on one of what cameras saw, or `estimate` on a track,
-    which ends by minimising over the window to a tight tolerance.
+    Use `push` on a live stream of positions, `push_sighting` on one of sightings, or `estimate` on a track, which ends
+    by minimising over the window to a tight tolerance.
 
-    The settings' solver holds the linear system: "gtsam", which is what None means here, is iSAM2, which can be opened
-    up and takes further factors; "ballfg" gives the same answers in less time.
+    The settings' solver holds the linear system: "gtsam", the default, is iSAM2, which can be inspected and takes
+    further factors; "ballfg" gives the same results in less time.
 
     Args:
-        model: the ball.  surfaces: that it may bounce on.
+        model: the ball.  surfaces: table and floor.
         settings: noise and priors; time offsets of cameras are not estimated here, see `estimate_time_offsets`.
         lag: the window is cut to this many states whenever it holds twice as many.
         cameras: that sightings come from.
@@ -114,7 +114,7 @@ class Online(Estimator):
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: the next observation begins a new stream."""
+        """Forgets everything: the next observation begins a new stream."""
         self.window: StreamWindow | None = None
         self.events = EventTracker(self.surfaces, self.physics, self.settings.find_events)
         self._samples: list[Sample] = []  # of the window, also while iSAM2 is out of order
@@ -125,10 +125,10 @@ class Online(Estimator):
         self._origin = StreamOrigin()
 
     def copy(self) -> "Online":
-        """An estimator that has taken in the same observations; what either takes in from now on is its own.
+        """An independent estimator with the same observations.
 
-        A copy kept from before a late sample lets a stream go back: what follows the sample is pushed into it again,
-        and the states are those of the samples in order. It costs about as much as one sample.
+        A copy from before a late sample lets a stream go back: the sample and its successors are pushed into the copy
+        in order, and its states are those of the ordered samples. It costs about as much as one sample.
         """
         other = copy.copy(self)
         other._samples = [copy.copy(sample) for sample in self._samples]
@@ -145,11 +145,11 @@ class Online(Estimator):
         return other
 
     def warm_up(self) -> None:
-        """Run on a made-up ball what a stream will ask for, so that its first samples are no slower than later ones.
+        """Runs a made-up ball through the estimator, so that a stream's first samples are no slower than later ones.
 
-        Updates through a bounce, predictions and events are compiled or loaded. What lives in the process by then is
-        left out of later garbage collections (`gc.freeze`), each of which would look through torch and take 0.2 s. The
-        stream itself is left alone.
+        Updates through a bounce, predictions and events are compiled or loaded. All present objects of the process are
+        excluded from later garbage collections (`gc.freeze`), each of which would scan torch and take 0.2 s. The stream
+        itself stays untouched.
         """
         warmed_up(self)
         gc.collect()
@@ -162,14 +162,14 @@ class Online(Estimator):
         sigma: ArrayLike | None = None,
         observations: Sequence[Observation] = (),
     ) -> OnlineState:
-        """Take in a measured position, and other measurements of that time.
+        """Takes in a measured position, and other measurements of that time.
 
         Args:
             time: s, later than the last.
             position: (3,) m.
-            sigma: (3,) m, its standard deviation; the settings' where None.
-            observations: of this moment, as of a track with this one sample: `RadarSpeed(0, 6.2, 0.1)`, for instance.
-        Returns: the newest state. It is valid for good; the window's own arrays move on.
+            sigma: (3,) m, its standard deviation; None: the settings'.
+            observations: of this moment, as of a track with this single sample, such as `RadarSpeed(0, 6.2, 0.1)`.
+        Returns: the newest state, a copy that later samples do not change.
         Raises: ValueError: if the time does not increase, or a number is not finite.
         """
         own = None if sigma is None else check_array("sigma", sigma, most=np.inf)[None]
@@ -200,14 +200,14 @@ class Online(Estimator):
         return self._origin.written(seconds)
 
     def push_sighting(self, time: float, camera: str, pixel: ArrayLike, covariance: ArrayLike) -> OnlineState | None:
-        """Take in what one camera saw, at its own stamp.
+        """Takes in one camera's sighting, at its own stamp.
 
         Args:
             time: s, the camera's stamp; less the camera's time offset it must not be earlier than the last one's.
             camera: its name, one of `cameras`.
             pixel: (2,) px, of the ball's centre.
             covariance: (2, 2) px^2.
-        Returns: the newest state; None as long as rays do not tell where the ball is: with two cameras or more, for the
+        Returns: the newest state; None while rays do not determine the ball's place: with two cameras or more, for the
             first two or three frames of a flight.
         Raises: ValueError: an unknown camera, a time that runs backwards, a number that is not finite.
         """
@@ -225,9 +225,9 @@ class Online(Estimator):
                 state = self._observe(sample)
         return state and replace(state, time=self.stamp_of(state.time))
 
-    @np.errstate(over="ignore", invalid="ignore")  # samples that no ball flew end in a status, not in warnings
+    @np.errstate(over="ignore", invalid="ignore")  # samples that no ball flew give a status, not warnings
     def _observe(self, sample: Sample) -> OnlineState:
-        """Take in a sample."""
+        """Takes in a sample."""
         self._tell_whole_error(sample)
         changed = self.events.push(sample.time, sample.position, sample.whole)  # also checks the numbers
         if self.window is None:
@@ -259,7 +259,7 @@ class Online(Estimator):
     def _near_contact(self, before: tuple[Array, Array] | None, sample: Sample) -> ContactState | None:
         """The state to report of a ball that may be on either side of a contact; None far from one.
 
-        Args: before: what was known at the sample before.  sample: the newest one.
+        Args: before: the belief at the sample before.  sample: the newest one.
         """
         assert self._monitor is not None
         motion = sample.motion
@@ -272,11 +272,11 @@ class Online(Estimator):
         return self._monitor.step(before, dt, measured, self._has_bounced)
 
     def _has_bounced(self, count: int) -> bool:
-        """Whether the window's ball has bounced in the last `count` intervals."""
+        """True if the window's ball has bounced in the last `count` intervals."""
         return any(sample.motion.heights for sample in self._samples[-count:])
 
     def _tell_whole_error(self, sample: Sample) -> None:
-        """Standard deviations of a new sample's whole error, and the rough velocity that its stamp's error needs."""
+        """Sets standard deviations of a new sample's whole error, and the rough velocity for its stamp's error."""
         sample.whole = sample.stated
         if not sample.measured:
             return
@@ -289,7 +289,7 @@ class Online(Estimator):
 
     @np.errstate(over="ignore", invalid="ignore")
     def _join(self, sighting: Measurement) -> OnlineState:
-        """Take in one more sighting of the newest sample."""
+        """Takes in one more sighting of the newest sample."""
         assert self.window is not None
         self._counts[:] = 0
         status, rebuilt, sample = Status.OK, False, self._samples[-1]
@@ -306,7 +306,7 @@ class Online(Estimator):
         return self._state(self.window, sample, update, 0, rebuilt, status, contact)
 
     def _take_in(self, window: StreamWindow, sample: Sample, changed: bool) -> tuple[int, Update]:
-        """Explain, go back to where the explanation changed, append, move contacts, keep the window's length."""
+        """Explains, goes back to where the explanation changed, appends, moves contacts, cuts the window."""
         again = explain(window, self._samples, self.events) if changed else []
         if self.settings.stamp_jitter > 0.0 and sample.measured:
             tell_velocities(window, self._samples)
@@ -329,7 +329,7 @@ class Online(Estimator):
         return update
 
     def _repair(self, error: Exception, status: Status) -> tuple[Status, Update]:
-        """Build the window anew from its samples; if that fails as well, begin a new one with the newest sample."""
+        """Rebuilds the window from its samples; if that fails as well, begins a new one with the newest sample."""
         assert self.window is not None
         try:
             return status, self.window.start_anew(self._samples)
@@ -383,10 +383,10 @@ class Online(Estimator):
         )
 
     def estimate(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Estimate:
-        """The states of a track: all samples pushed, then the window minimised to a tight tolerance.
+        """The states of a track: all samples are pushed, then the window is minimised to a tight tolerance.
 
-        States that left the window before the end are as they were when they left it. The innovations are those of the
-        pushes. Events are found in the positions, also where these are rough.
+        States that left the window before the end stay as they were then. The innovations are those of the pushes.
+        Events are found in the positions, even if these are rough.
         """
         stamps, track = track.times, self.prepared(track, factors).since_first()
         self.reset()
@@ -409,7 +409,7 @@ class Online(Estimator):
         smoother = Smoother(self.model, self.surfaces, self.settings)
         first = self.window.first
         found = self.events.segmentation(first, track.times[first:], track.positions[first:])
-        found = self.events.moved(found, first)  # the window's states go with contacts where they are now
+        found = self.events.with_moved_contacts(found, first)  # the window's states fit the refined contacts
         result = final_estimate(smoother, self.window, track, found, self._frozen)
         self.reset()
         lost = any(state.status is Status.FAILED for state in states)

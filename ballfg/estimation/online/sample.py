@@ -1,4 +1,4 @@
-"""One observation of a stream with what is believed of it, and what taking it in did."""
+"""A sample holds one observation of a stream with its explanation; an update records its costs."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from ballfg.estimation.smoother.motion import FLIGHT, Motion
 
 @dataclass
 class Sample:
-    """One observation, and what is believed of it.
+    """One observation and its explanation.
 
     Attributes:
         time: s.  position: (3,) m.
         stated: (3,) m, standard deviation of its white error as stated.
-        whole: (3,) m, that of its whole error: with a lasting part and the error of the stamp.
-        velocity: (3,) m/s, rough, along which the stamp's error moves it.
-        factor: multiple of the whole error with which it takes part if it is not good; 1 if it is.
+        whole: (3,) m, standard deviation of its whole error, with a lasting part and the error of the stamp.
+        velocity: (3,) m/s, rough; the stamp's error displaces the sample along it.
+        factor: multiple of the whole error for a sample that is not good; 1 for a good one.
         motion: how the ball got here from the sample before.
-        label: what is known of the spin, on the first sample of a track.
-        slots: where iSAM2 keeps the sample's own factors: its position's first, where it was measured.
-        bias_slot: where it keeps the factor that leads here from the bias of the sample before; None without.
-        measured: whether the position was measured; if not, it was made from the measurements and helps to find events.
-        measurements: everything else that was measured at this moment.
+        label: prior of the spin, on the first sample of a track.
+        slots: places in iSAM2 of the sample's own factors: its position's first, if it was measured.
+        bias_slot: place of the factor from the previous sample's bias to this one's; None without.
+        measured: True if the position was measured; else it was computed from the measurements to find events.
+        measurements: all other measurements of this moment.
     """
 
     time: float
@@ -45,19 +45,19 @@ class Sample:
 
     @property
     def sigma(self) -> Array:
-        """(3,) m, standard deviation of the white error with which it takes part."""
+        """(3,) m, standard deviation of the white error in its factor."""
         return self.stated if self.factor == 1.0 else self.whole * self.factor
 
 
 @dataclass(frozen=True)
 class Update:
-    """What one update did.
+    """The results and costs of one update.
 
     Attributes:
-        innovation: (dim,) whitened, of the position or of what stands for it; NaN where nothing predicted the sample.
-        evaluated: factors of the motion evaluated, the new one among them.
-        calls: torch calls for them.
-        variables: states that iSAM2 eliminated again.
+        innovation: (dim,) whitened, of the position or of its substitute; NaN without a prediction.
+        evaluated: number of evaluated factors of the motion, including the new one.
+        calls: number of torch calls for them.
+        variables: number of states that iSAM2 eliminated again.
     """
 
     innovation: Array

@@ -1,4 +1,4 @@
-"""What an online estimator knows after an observation."""
+"""An online state is the belief after an observation, with a record of the update."""
 
 from dataclasses import dataclass
 
@@ -10,16 +10,15 @@ from ballfg.prediction.state import BallState
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class OnlineState(BallState):
-    """The state of the ball after a measurement, and what the update did.
+    """The state of the ball after a measurement, with a record of the update.
 
     Attributes:
-        innovation: (3,) the position against its prediction, whitened, (2,) of a sighting; NaN where nothing
-            predicted it.
-        motion: how the ball got here from the last observation.
-        revised: how many of the last samples were taken back and explained anew.
-        evaluated: factors of the motion evaluated.  calls: torch calls for them.
-        rebuilt: iSAM2 failed, and the window was built anew.
-        status: OK, or what to try.
+        innovation: (3,) the position against its prediction, whitened, (2,) of a sighting; NaN without a prediction.
+        motion: how the ball moved since the last observation.
+        revised: number of last samples that were retracted and explained anew.
+        evaluated: number of evaluated factors of the motion.  calls: number of torch calls for them.
+        rebuilt: True if iSAM2 failed and the window was rebuilt.
+        status: OK, or a remedy.
     """
 
     innovation: Array

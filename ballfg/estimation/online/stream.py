@@ -1,8 +1,8 @@
-"""From a stream of sightings to samples: which state each belongs to, and roughly where the ball was.
+"""Assigns the sightings of a stream to samples with rough positions.
 
-Events are found in positions, and one ray is none. So each new moment gets the position of a parabola through the rays
-before it, the newest among them. As long as rays leave it open, at the start of a flight, sightings are held back; a
-single camera later on gets positions carried on from the last that was firm.
+Events are found in positions, and one ray gives none. So each new moment gets the position of a parabola through the
+last rays, including the newest. While the rays leave it undetermined, at the start of a flight, sightings are held
+back; a single camera later on gets positions extrapolated from the last determined one.
 """
 
 from collections import deque
@@ -24,13 +24,13 @@ from ballfg.vision.camera import Camera
 from ballfg.vision.projection import CameraBank
 
 MOST_RAYS: Final = 96
-"""Rays that are remembered: more than the windows of four cameras hold."""
+"""Number of stored rays: more than the windows of four cameras hold."""
 PATIENCE: Final = 0.3
-"""s. A flight that only one camera sees is carried on for so long; then its sightings are held back."""
+"""s. A flight with a single camera is extrapolated for so long; then its sightings are held back."""
 FORGET: Final = 0.5
-"""s. Sightings held back for longer are dropped: nothing links them to what comes."""
+"""s. Sightings held back for longer are dropped: nothing links them to later ones."""
 STAMPS: Final = 9
-"""Stamps of a camera from which its period is taken."""
+"""Number of a camera's stamps that give its period."""
 
 
 class SightingStream:
@@ -54,11 +54,11 @@ class SightingStream:
     def take(
         self, time: float, camera: str, pixel: ArrayLike, covariance: ArrayLike
     ) -> tuple[list[Sample], Measurement | None]:
-        """Take in a sighting.
+        """Takes in a sighting.
 
         Args: as those of `Online.push_sighting`.
-        Returns: new samples, oldest first: none while sightings are held back; and the sighting, if it joins the newest
-            sample that was given out.
+        Returns: new samples, oldest first, none while sightings are held back; and the sighting, if it joins the newest
+            returned sample.
         Raises: ValueError: an unknown camera, a wrong shape, a number that is not finite, a time before the last.
         """
         check_choice("camera", camera, self.cameras)
@@ -102,7 +102,7 @@ class SightingStream:
         return max((float(np.median(np.diff(s))) for s in seen), default=0.0)
 
     def _placed(self) -> list[Sample]:
-        """The samples that were held back, with positions, once the newest one's is known."""
+        """The samples that were held back, with positions, once the newest one's is determined."""
         assert self._rays is not None
         now = self._held[-1].time
         path = rough_path(self._rays, np.array([now]), BEFORE)

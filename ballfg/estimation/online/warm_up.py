@@ -1,4 +1,4 @@
-"""A made-up ball, estimated and predicted through a bounce: the first real one then meets no compiler."""
+"""Estimates and predicts a made-up ball through a bounce, so that a real one waits for no compiler."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.estimation.online.state import OnlineState
-from ballfg.prediction import Crossing
+from ballfg.prediction.crossing import Crossing
 
 if TYPE_CHECKING:
     from ballfg.estimation.online.online import Online
 
 SAMPLES = 40
 PERIOD = 0.01
-"""s between them."""
+"""s between samples."""
 DROP = 0.2
 """m, from which the ball falls."""
 LOOKED_AHEAD = (15, SAMPLES - 1)
-"""Samples from which the path is predicted: before the bounce, and after it."""
+"""Samples at which the path is predicted: before the bounce, and after it."""
 HORIZON = 0.5
 """s, long enough for the next bounce."""
 
 
 def warmed_up(online: Online) -> list[OnlineState]:
-    """Estimate a ball that falls onto the table and bounces, with a copy of an estimator, and predict it in every way.
+    """Estimates a ball that falls onto the table and bounces, by a copy of an estimator, and makes all predictions.
 
-    Args: online: stays as it is.
+    Args: online: not changed.
     Returns: its state before the bounce, and the last.
     """
     trial, states = online.copy(), []
@@ -60,7 +60,7 @@ def falling_ball(online: Online) -> tuple[Array, Array]:
 
 
 def _looked_ahead(state: OnlineState) -> Crossing | None:
-    """The next contact; everything else that is asked of a prediction is computed too."""
+    """The next contact; all other predictions are computed too."""
     ahead = state.predict(HORIZON)
     _ = ahead.apex, ahead.crossing(x=2.0)
     return ahead.next_contact

@@ -1,4 +1,4 @@
-"""From a chain of events to the parts of a segmentation."""
+"""Assembles a segmentation from a chain of events."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -10,7 +10,7 @@ from ballfg.estimation.segmentation.events import Event, EventKind
 from ballfg.estimation.segmentation.result import Contact, Quality, Rest
 
 BREAKS = (EventKind.HIT, EventKind.RESTART)
-"""After these, nothing of the past is known."""
+"""Events after which nothing is known of the past."""
 
 
 def contacts_of(events: Sequence[Event]) -> list[Contact]:
@@ -19,15 +19,15 @@ def contacts_of(events: Sequence[Event]) -> list[Contact]:
 
 
 def intervals_of(events: Sequence[Event], *kinds: EventKind) -> list[int]:
-    """The intervals that hold an event of some kinds, ascending."""
+    """The intervals with an event of some kinds, ascending."""
     return sorted({e.index for e in events if e.kind in kinds})
 
 
 def rests_of(events: Sequence[Event], samples: int) -> list[Rest]:
     """The rests: from the first whole interval on a surface to the last.
 
-    A rest begins in the interval of its event and is whole from the next one on; a ball that leaves does so at the
-    end of its interval, one that is hit somewhere inside.
+    A rest begins in the interval of its event and is whole from the next one on; a ball leaves at the end of its
+    interval, but a hit may fall anywhere inside.
     """
     rests = []
     start: Event | None = None
@@ -43,7 +43,7 @@ def rests_of(events: Sequence[Event], samples: int) -> list[Rest]:
 
 
 def quality_of(events: Sequence[Event], samples: int, shift_level: float) -> NDArray[np.int8]:
-    """(samples,) quality; being shifted is worse than being wide, and better than being an outlier."""
+    """(samples,) quality; a shift counts more than a wide noise, and less than an outlier."""
     quality = np.full(samples, Quality.GOOD, dtype=np.int8)
     quality[intervals_of(events, EventKind.WIDE)] = Quality.WIDE
     quality[shifted(events, samples, shift_level)] = Quality.SHIFTED
@@ -52,10 +52,10 @@ def quality_of(events: Sequence[Event], samples: int, shift_level: float) -> NDA
 
 
 def shifted(events: Sequence[Event], samples: int, level: float) -> NDArray[np.bool_]:
-    """(samples,) whether a sample's offset differs by more than `level` m from the most common one of its segment.
+    """(samples,) True if a sample's offset differs by more than `level` m from the most common one of its segment.
 
-    Which of two offsets is the true one cannot be seen within a segment; the tracker is taken to be right for most of
-    the time. A lone shift in the interval of a contact is left out: its jump is the contact's own as well.
+    A segment does not show which of two offsets is the true one; the tracker is assumed to be right most of the time. A
+    lone shift in the interval of a contact is left out: the jump belongs to the contact as well.
     """
     jumps = np.zeros((samples, 3))
     shifts = [event for event in events if event.kind is EventKind.SHIFT]

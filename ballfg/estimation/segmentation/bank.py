@@ -1,20 +1,20 @@
-"""Hypotheses, the events they pass through and the surfaces, as machine code keeps them: one record each."""
+"""Defines the records of machine code for hypotheses, their events and the surfaces."""
 
-from typing import Any, Final, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
-from numba import from_dtype
+from numba import from_dtype, types
 from numpy.typing import NDArray
 
-from ballfg.arrays import Index
+from ballfg.arrays import Array, Index
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, NOTHING, REAL
+from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, NOTHING, ONE, REAL
 
 FLYING: Final = -1
 """Value of `surface` for a ball in the air."""
 
 NO_EVENT: Final = -(2**62)
-"""The `tip` of a hypothesis before which nothing happened."""
+"""The `tip` of a hypothesis without events."""
 
 HYPOTHESIS: Final = np.dtype(
     [
@@ -30,8 +30,8 @@ HYPOTHESIS: Final = np.dtype(
 """One explanation of the past. The axes x, y, z are filtered independently; (p, v, b) are position, velocity, slack.
 
 - mean: axis by (p m, v m/s, b m/s^2).  cov: axis by covariance of (p, v, b).
-- shift: m, by which the tracker is believed to be off; `mean` is what it sees, surfaces appear so moved.
-- score: nats, log evidence less the prices of events; a constant per sample is left out.
+- shift: m, assumed offset of the tracker; `mean` is the measured motion, and surfaces are offset likewise.
+- score: nats, log evidence less the prices of events, apart from a constant per sample.
 - surface: index of the surface on which the ball rests, or `FLYING`.
 - age: samples used since the last event.
 - tip: its last event: the row of a log, or -1 - k for the last event of hypothesis k before the sample.
@@ -47,10 +47,10 @@ LOGGED: Final = np.dtype(
         ("offset", np.float64, (3,)),
     ]
 )
-"""An event that some hypotheses pass through during one sample.
+"""An event of some hypotheses during one sample.
 
-- kind: value of an `EventKind`.  index: the interval, or the sample.  surface: its index, -1 where none is involved.
-- before: the event before, as the `tip` of a hypothesis.  time: s.  offset: m, of a shift.
+- kind: value of an `EventKind`.  index: the interval, or the sample.  surface: its index, -1 without one.
+- before: the previous event, as the `tip` of a hypothesis.  time: s.  offset: m, of a shift.
 """
 
 SURFACE: Final = np.dtype([("centre", np.float64), ("restitution_sigma", np.float64)])
@@ -59,8 +59,8 @@ SURFACE: Final = np.dtype([("centre", np.float64), ("restitution_sigma", np.floa
 Records: TypeAlias = NDArray[np.void]
 """Rows of one of these types."""
 Record: TypeAlias = Any
-"""One row; its fields are attributes in machine code, where a row does not keep its array alive: what may be the last
-use of an array hands on the array and the number of the row."""
+"""One row; its fields are attributes in machine code. A row does not keep its array alive: functions that may hold the
+last reference to an array pass the array and the number of the row."""
 
 BANK: Final[Any] = from_dtype(HYPOTHESIS)[::1]
 ONE_HYPOTHESIS: Final[Any] = from_dtype(HYPOTHESIS)
@@ -68,24 +68,45 @@ LOG: Final[Any] = from_dtype(LOGGED)[::1]
 SURFACES: Final[Any] = from_dtype(SURFACE)[::1]
 
 USED, WRITTEN = range(2)
-"""Places in the `fill` of a bank and its log: rows of each that are in use."""
+"""Indices in the `fill` of a bank and its log: number of used rows of each."""
 
 
-@machine_code(COUNT(BANK, COUNTS, BANK, COUNT))
-def add(bank: Records, fill: Index, source: Records, place: int) -> int:
+class Work(NamedTuple):
+    """Hypotheses that become more during a sample, the events that they pass through, how many there are of each."""
+
+    bank: Records
+    log: Records
+    fill: Index
+
+
+class Sample(NamedTuple):
+    """What is measured: position (3,) m, its noise sigma (3,) m, number of the sample, and its stamp, s."""
+
+    position: Array
+    sigma: Array
+    number: int
+    time: float
+
+
+WORK: Final[Any] = types.NamedTuple((BANK, LOG, COUNTS), Work)
+SAMPLE: Final[Any] = types.NamedTuple((ONE, ONE, COUNT, REAL), Sample)
+
+
+@machine_code(COUNT(WORK, BANK, COUNT))
+def add(work: Work, source: Records, place: int) -> int:
     """Puts a copy of one hypothesis of `source` behind the others of a bank; returns its row."""
-    row = fill[USED]
-    bank[row] = source[place]
-    fill[USED] += 1
+    row = work.fill[USED]
+    work.bank[row] = source[place]
+    work.fill[USED] += 1
     return row
 
 
-@machine_code(NOTHING(ONE_HYPOTHESIS, LOG, COUNTS, COUNT, COUNT, COUNT, REAL))
-def pass_through(h: Record, log: Records, fill: Index, kind: int, index: int, surface: int, time: float) -> None:
+@machine_code(NOTHING(ONE_HYPOTHESIS, WORK, COUNT, COUNT, COUNT, REAL))
+def pass_through(h: Record, work: Work, kind: int, index: int, surface: int, time: float) -> None:
     """Lets a hypothesis pass through an event, which is written to the log; arguments as in `LOGGED`."""
-    row = fill[WRITTEN]
-    fill[WRITTEN] += 1
-    event = log[row]
+    row = work.fill[WRITTEN]
+    work.fill[WRITTEN] += 1
+    event = work.log[row]
     event.kind, event.index, event.surface, event.before, event.time = kind, index, surface, h.tip, time
     for axis in range(3):
         event.offset[axis] = 0.0

@@ -1,4 +1,4 @@
-"""Segmentation of a whole track: the forward pass over all samples, then a second look."""
+"""Segments a whole track by a forward pass over all samples and a second look at its contacts."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -6,7 +6,7 @@ from numpy.typing import ArrayLike
 from ballfg.arrays import Array
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.segmentation.assembly import BREAKS, contacts_of, intervals_of, quality_of, rests_of
-from ballfg.estimation.segmentation.events import Event, EventKind
+from ballfg.estimation.segmentation.events import EventKind
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.estimation.segmentation.result import Quality, Segmentation
 from ballfg.estimation.segmentation.second_look import hits_at_contacts
@@ -28,11 +28,11 @@ def segment(
     Args:
         times: (n,) s, strictly increasing.
         positions: (n, 3) m, world frame, z up.
-        sigma: (3,) or (n, 3) m, standard deviation of each coordinate. It matters: half the truth makes false shifts.
-            `estimate_position_noise` reads it off the data.
+        sigma: (3,) or (n, 3) m, standard deviation of each coordinate. Half the true noise makes false shifts.
+            `estimate_position_noise` estimates it from the data.
         surfaces: table and floor; the ball's centre bounces a radius and the physics' offset above them.
-        physics: of the ball, see `physics_of`; table tennis where None.
-        settings: noise model and prices of events; defaults where None.
+        physics: of the ball, see `physics_of`; None: table tennis.
+        settings: noise model and prices of events; None: defaults.
     Returns: the best explanation; n = 0 gives an empty one.
     Raises: ValueError: if shapes disagree, something is not finite, or times do not increase.
     Source: docs/derivations/segmentation.md.
@@ -40,26 +40,14 @@ def segment(
     t, x, s = _checked(times, positions, sigma)
     physics, settings = physics or SegmentationPhysics(), settings or SegmentationSettings()
     events = Segmenter(surfaces, physics, settings).push_all(t, x, s)
-    return _assemble(t, x, events, physics, settings)
-
-
-def _assemble(
-    times: Array,
-    positions: Array,
-    events: list[Event],
-    physics: SegmentationPhysics,
-    settings: SegmentationSettings,
-) -> Segmentation:
-    """The segmentation that a chain of events amounts to, with the hits of the second look."""
     contacts, hits = contacts_of(events), intervals_of(events, *BREAKS)
-    quality = quality_of(events, len(times), settings.shift_level)
-    usable = quality <= Quality.WIDE
-    hits += hits_at_contacts(times, positions, usable, contacts, hits, physics, settings)
+    quality = quality_of(events, len(t), settings.shift_level)
+    hits += hits_at_contacts(t, x, quality <= Quality.WIDE, contacts, hits, physics, settings)
     return Segmentation(
         contacts=tuple(contacts),
         hits=np.array(sorted(hits), dtype=np.int64),
         restarts=np.array(intervals_of(events, EventKind.RESTART), dtype=np.int64),
-        rests=tuple(rests_of(events, len(times))),
+        rests=tuple(rests_of(events, len(t))),
         quality=quality,
     )
 

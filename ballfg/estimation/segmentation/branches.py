@@ -1,154 +1,111 @@
-"""Events that no surface explains: starts, hits, tracker shifts, a resting ball that leaves."""
+"""Adds hypotheses with events that no surface explains: starts, hits, tracker shifts, a ball that leaves its rest."""
 
 import math
 from typing import Final
 
 import numpy as np
 
-from ballfg.arrays import Array, Index
+from ballfg.arrays import Array
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, NOTHING, ONE, REAL
+from ballfg.dynamics.compiled.signatures import COUNT, NOTHING, ONE, REAL
 from ballfg.estimation.segmentation.bank import (
     BANK,
     FLYING,
-    LOG,
     ONE_HYPOTHESIS,
+    SAMPLE,
     SURFACES,
     USED,
+    WORK,
     WRITTEN,
     Record,
     Records,
+    Sample,
+    Work,
     add,
     pass_through,
-)
+)  # fmt: skip
 from ballfg.estimation.segmentation.events import HIT, LEAVE, OUTLIER, REST, SHIFT
 from ballfg.estimation.segmentation.evidence import AS_OUTLIER, rank, update
 from ballfg.estimation.segmentation.motion import lift, put_down
 from ballfg.estimation.segmentation.scene import SCENE
 
 SHORTEST_STEP: Final = 1e-3
-"""s. An event is not made dearer than this by stamps that lie closer."""
+"""s. Least interval for the price of an event."""
 SHIFTED_PREDICTIONS: Final = 3
-"""How many of the best predictions are tried with a shift; beside a bounce the right one may be the third."""
+"""Number of best predictions that are tried with a shift; beside a bounce the right one may be the third."""
 MOST_ADDED: Final = 2 + 2 * SHIFTED_PREDICTIONS
-"""Hypotheses that these events add at most, besides one for each surface."""
+"""Largest number of hypotheses from these events, besides one for each surface."""
 
 
-@machine_code(NOTHING(BANK, COUNTS, LOG, COUNT, REAL, ONE, ONE, COUNT, REAL, SCENE, SURFACES))
-def start(
-    bank: Records,
-    fill: Index,
-    log: Records,
-    tip: int,
-    score: float,
-    position: Array,
-    sigma: Array,
-    sample: int,
-    time: float,
-    scene: Record,
-    surfaces: Records,
-) -> None:
+@machine_code(NOTHING(WORK, COUNT, REAL, SAMPLE, SCENE, SURFACES))
+def start(work: Work, tip: int, score: float, sample: Sample, scene: Record, surfaces: Records) -> None:
     """Hypotheses after a first sample: a flying ball, one that rests on a surface nearby, or the sample an outlier.
 
-    All expect the ball within the spread of outliers of the sample, so that their evidence compares.
+    All expect the ball within the spread of outliers around the sample, so that their evidences are comparable.
 
     Args:
-        bank, fill, log: empty; afterwards those hypotheses.
+        work: empty; afterwards those hypotheses.
         tip: the last event before.
         score: nats, carried on.
-        position: (3,) m.
-        sigma: (3,) m, its noise.
-        sample: index of the sample.
-        time: s, its stamp.
         scene, surfaces: of a `Scene`.
     """
-    fill[USED] = 1
-    _forget(bank[0], position, scene.outlier_spread**2, scene)
+    work.fill[USED] = 1
+    bank = work.bank
+    _forget(bank[0], sample.position, scene.outlier_spread**2, scene)
     bank[0].score, bank[0].tip = score, tip
-    _rested(bank, fill, log, 0, position, sample - 1, time, scene, surfaces)
+    _rested(work, 0, sample, scene, surfaces)
     flying = bank[:1].copy()
-    update(bank, fill, log, 0, position, sigma, sample, time, scene)
-    lost = bank[add(bank, fill, flying, 0)]
+    update(work, 0, sample, scene)
+    lost = bank[add(work, flying, 0)]
     lost.score += scene.log_shares[AS_OUTLIER] - 3.0 * math.log(scene.outlier_spread)
-    pass_through(lost, log, fill, OUTLIER, sample, -1, time)
+    pass_through(lost, work, OUTLIER, sample.number, -1, sample.time)
 
 
-@machine_code(NOTHING(BANK, COUNTS, LOG, BANK, ONE, REAL, COUNT, REAL, SCENE, SURFACES))
-def hit(
-    bank: Records,
-    fill: Index,
-    log: Records,
-    before: Records,
-    position: Array,
-    dt: float,
-    interval: int,
-    time: float,
-    scene: Record,
-    surfaces: Records,
-) -> None:
+@machine_code(NOTHING(WORK, BANK, SAMPLE, REAL, SCENE, SURFACES))
+def hit(work: Work, before: Records, sample: Sample, dt: float, scene: Record, surfaces: Records) -> None:
     """Adds the best explanation of the past, its velocity forgotten: in the air, and on a surface if it is near one.
 
     Over a short interval the ball reappears close to where it was; over a long one it may be anywhere.
     """
-    row = add(bank, fill, before, 0)
-    h = bank[row]
-    at = h.mean[:, 0].copy() if dt < scene.short_gap else position
+    row = add(work, before, 0)
+    h = work.bank[row]
+    at = h.mean[:, 0].copy() if dt < scene.short_gap else sample.position
     reach = scene.hit_spread**2 + (scene.velocity_spread * min(dt, scene.short_gap)) ** 2
     _forget(h, at, reach, scene)
     h.score -= _rarity(scene.hit_rate, dt) + scene.hit_cost * math.exp(-dt / scene.short_gap)
-    pass_through(h, log, fill, HIT, interval, -1, time)
-    _rested(bank, fill, log, row, position, interval, time, scene, surfaces)
+    pass_through(h, work, HIT, sample.number - 1, -1, sample.time)
+    _rested(work, row, sample, scene, surfaces)
 
 
-@machine_code(NOTHING(BANK, COUNTS, LOG, BANK, ONE, ONE, REAL, COUNT, REAL, SCENE))
-def shift(
-    bank: Records,
-    fill: Index,
-    log: Records,
-    predicted: Records,
-    position: Array,
-    sigma: Array,
-    dt: float,
-    interval: int,
-    time: float,
-    scene: Record,
-) -> None:
+@machine_code(NOTHING(WORK, BANK, SAMPLE, REAL, SCENE))
+def shift(work: Work, predicted: Records, sample: Sample, dt: float, scene: Record) -> None:
     """Adds the best predictions, with the measurements jumping by an unknown offset: off from now on, or until now.
 
-    Which of the two shows at the next surface only.
+    Only the next surface shows which of the two holds.
     """
-    n, first = len(predicted), fill[USED]
+    n, bank, first = len(predicted), work.bank, work.fill[USED]
     rows = np.empty(n, np.int64)
     rank(predicted, 0, n, rows)
     for row in rows[:SHIFTED_PREDICTIONS]:
-        h = bank[add(bank, fill, predicted, row)]
+        h = bank[add(work, predicted, row)]
         h.score = h.score - _rarity(scene.shift_rate, dt) - scene.shift_cost
         h.age = 0
-        pass_through(h, log, fill, SHIFT, interval, -1, time)
+        pass_through(h, work, SHIFT, sample.number - 1, -1, sample.time)
         for axis in range(3):
             h.cov[axis, 0, 0] += scene.shift_spread**2
             # the shift's expectation, not the innovation: after a gap most of that is the path's own uncertainty
-            known = scene.shift_spread**2 / (h.cov[axis, 0, 0] + sigma[axis] ** 2)
-            offset = (position[axis] - h.mean[axis, 0]) * known
+            known = scene.shift_spread**2 / (h.cov[axis, 0, 0] + sample.sigma[axis] ** 2)
+            offset = (sample.position[axis] - h.mean[axis, 0]) * known
             h.shift[axis] += offset
-            log[fill[WRITTEN] - 1].offset[axis] = offset
-    for row in range(first, fill[USED]):
-        right = bank[add(bank, fill, bank, row)]
+            work.log[work.fill[WRITTEN] - 1].offset[axis] = offset
+    for row in range(first, work.fill[USED]):
+        right = bank[add(work, bank, row)]
         for axis in range(3):
             right.shift[axis] = 0.0
 
 
-@machine_code(NOTHING(BANK, COUNTS, LOG, BANK, REAL, COUNT, REAL, SCENE))
-def leave(
-    bank: Records,
-    fill: Index,
-    log: Records,
-    predicted: Records,
-    dt: float,
-    interval: int,
-    time: float,
-    scene: Record,
-) -> None:
+@machine_code(NOTHING(WORK, BANK, SAMPLE, REAL, SCENE))
+def leave(work: Work, predicted: Records, sample: Sample, dt: float, scene: Record) -> None:
     """Adds the best resting prediction, in the air from now on."""
     best = -1
     for row in range(len(predicted)):
@@ -156,8 +113,8 @@ def leave(
             best = row
     if best < 0:
         return
-    h = bank[add(bank, fill, predicted, best)]
-    pass_through(h, log, fill, LEAVE, interval, h.surface, time)
+    h = work.bank[add(work, predicted, best)]
+    pass_through(h, work, LEAVE, sample.number - 1, h.surface, sample.time)
     lift(h, scene)
     h.score = h.score - _rarity(scene.hit_rate, dt) - scene.leave_cost
     h.age = 0
@@ -165,7 +122,7 @@ def leave(
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, ONE, REAL, SCENE))
 def _forget(h: Record, position: Array, variance: float, scene: Record) -> None:
-    """Makes a hypothesis a flying one at a position (3,) m with a variance m^2, of which nothing else is known."""
+    """Makes a hypothesis fly at a position (3,) m with a variance m^2, with all else unknown."""
     h.surface, h.age = FLYING, 0
     for axis in range(3):
         h.shift[axis] = 0.0
@@ -179,28 +136,18 @@ def _forget(h: Record, position: Array, variance: float, scene: Record) -> None:
         h.cov[axis, 2, 2] = scene.slack**2
 
 
-@machine_code(NOTHING(BANK, COUNTS, LOG, COUNT, ONE, COUNT, REAL, SCENE, SURFACES))
-def _rested(
-    bank: Records,
-    fill: Index,
-    log: Records,
-    row: int,
-    position: Array,
-    interval: int,
-    time: float,
-    scene: Record,
-    surfaces: Records,
-) -> None:
+@machine_code(NOTHING(WORK, COUNT, SAMPLE, SCENE, SURFACES))
+def _rested(work: Work, row: int, sample: Sample, scene: Record, surfaces: Records) -> None:
     """Adds a flying hypothesis as one that rests, for each surface that the sample is near."""
     for surface in range(len(surfaces)):
-        if abs(position[2] - surfaces[surface].centre) < scene.rest_range:
-            down = bank[add(bank, fill, bank, row)]
+        if abs(sample.position[2] - surfaces[surface].centre) < scene.rest_range:
+            down = work.bank[add(work, work.bank, row)]
             put_down(down, surface, surfaces)
             down.score -= scene.start_at_rest_cost
-            pass_through(down, log, fill, REST, interval, surface, time)
+            pass_through(down, work, REST, sample.number - 1, surface, sample.time)
 
 
 @machine_code(REAL(REAL, REAL))
 def _rarity(rate: float, dt: float) -> float:
-    """nats, minus log probability that an event of a rate (1/s) falls into an interval."""
+    """nats, minus log probability of an event with a rate (1/s) in an interval."""
     return -math.log(-math.expm1(-rate * max(dt, SHORTEST_STEP)))

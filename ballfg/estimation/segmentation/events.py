@@ -1,7 +1,7 @@
-"""Events, and the chains of them that hypotheses share.
+"""Events form chains that hypotheses share.
 
-Each hypothesis ends in a node; nodes link back to the event before. Hypotheses that differ only recently share all
-older nodes, so that a copy of a hypothesis costs one pointer.
+Each hypothesis ends in a node; nodes link back to the previous event. Hypotheses with a common past share all its
+nodes, so that a copy of a hypothesis costs one pointer.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 
 class EventKind(Enum):
-    """What can happen in an interval, or to a sample."""
+    """Kinds of events in an interval or at a sample."""
 
     CONTACT = auto()
     """Between two samples: the ball meets a surface."""
@@ -32,11 +32,11 @@ class EventKind(Enum):
     WIDE = auto()
     """At a sample: its noise is larger than stated."""
     OUTLIER = auto()
-    """At a sample: it says nothing."""
+    """At a sample: it carries no information on the ball."""
 
 
 CONTACT, HIT, RESTART, SHIFT, REST, LEAVE, WIDE, OUTLIER = (kind.value for kind in EventKind)
-"""The same as numbers, for machine code."""
+"""The values of `EventKind`, for machine code."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,10 +45,10 @@ class Event:
 
     Attributes:
         kind: what happened.
-        index: the interval it lies in (-1: before the first sample), or the sample.
-        time: s, on the track's clock: of a contact itself; of anything else the stamp of the sample that shows it.
-        height: m, declared height of the surface, where one is involved.
-        offset: (3,) m, by which measurements jumped, for a shift.
+        index: the interval of the event (-1: before the first sample), or the sample.
+        time: s, on the track's clock: of a contact itself; for other events the stamp of the first sample after it.
+        height: m, declared height of the surface, if any.
+        offset: (3,) m, jump of the measurements, for a shift.
     """
 
     kind: EventKind
@@ -59,9 +59,9 @@ class Event:
 
 
 class Node:
-    """An event and the one before it; `final` once every living hypothesis contains it.
+    """An event and the previous one; `final` once every living hypothesis contains it.
 
-    The event is made when it is first asked for: most hypotheses are dropped before anybody does.
+    The event object is made on demand: most hypotheses are dropped before.
     """
 
     __slots__ = ("_event", "final", "parent")
@@ -73,16 +73,16 @@ class Node:
 
     @property
     def event(self) -> Event:
-        """What happened."""
+        """The event of the node."""
         if not isinstance(self._event, Event):
             self._event = self._event()
         return self._event
 
 
 def copied(node: Node | None, known: dict[int, Node]) -> Node | None:
-    """A chain of its own with the same events: making one chain final leaves the other as it is.
+    """An independent chain with the same events: making one chain final leaves the other unchanged.
 
-    Args: known: copies made so far, by the identity of their original; chains that share nodes go on sharing them.
+    Args: known: copies so far, by the identity of their original; chains that share nodes still share their copies.
     """
     if node is None:
         return None
@@ -108,7 +108,7 @@ def open_nodes(node: Node | None) -> list[Node]:
 
 
 def contains(tip: Node | None, node: Node) -> bool:
-    """Whether the chain that ends in `tip` goes through `node`."""
+    """True if the chain that ends in `tip` goes through `node`."""
     while tip is not None and tip is not node:
         tip = tip.parent
     return tip is node

@@ -1,4 +1,4 @@
-"""Evidence: what a sample says about each hypothesis, and which hypotheses are worth keeping."""
+"""Weighs hypotheses by the evidence of a sample, and keeps the likely ones."""
 
 import math
 from typing import Any, Final
@@ -8,47 +8,44 @@ import numpy as np
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, NOTHING, ONE, REAL
-from ballfg.estimation.segmentation.bank import BANK, LOG, ONE_HYPOTHESIS, USED, Record, Records, add, pass_through
+from ballfg.estimation.segmentation.bank import (
+    BANK,
+    ONE_HYPOTHESIS,
+    SAMPLE,
+    USED,
+    WORK,
+    Record,
+    Records,
+    Sample,
+    Work,
+    add,
+    pass_through,
+)  # fmt: skip
 from ballfg.estimation.segmentation.events import OUTLIER, WIDE
 from ballfg.estimation.segmentation.scene import SCENE
 
 AS_GOOD, AS_WIDE, AS_OUTLIER = range(3)
 """The components of the noise, as in a scene's `log_shares`."""
 SURPRISE: Final = 3
-"""Behind the evidences of the components: squared whitened innovation of a good sample."""
+"""Index after the evidences of the components: squared whitened innovation of a good sample."""
 
 
-@machine_code(REAL(BANK, COUNTS, LOG, COUNT, ONE, ONE, COUNT, REAL, SCENE))
-def update(
-    bank: Records,
-    fill: Index,
-    log: Records,
-    first: int,
-    position: Array,
-    sigma: Array,
-    sample: int,
-    time: float,
-    scene: Record,
-) -> float:
+@machine_code(REAL(WORK, COUNT, SAMPLE, SCENE))
+def update(work: Work, first: int, sample: Sample, scene: Record) -> float:
     """Takes a sample into every hypothesis from row `first` on: its noise component, the Kalman update, the evidence.
 
-    Where the prediction is too vague to tell, the sample is also tried as an outlier: those hypotheses come last. That
-    is so where little is known of where the ball is: its second sample, the first ones after a hit or a gap.
-    Explanations that are far behind already are not multiplied.
+    If the prediction is too uncertain to decide, the sample is also tried as an outlier: those hypotheses come last.
+    This happens where the ball's place is hardly known: at its second sample, and at the first ones after a hit or a
+    gap. Explanations that are far behind already are not multiplied.
 
-    Args:
-        bank, fill, log: predicted hypotheses; afterwards the updated ones.
-        first: row.
-        position: (3,) m.  sigma: (3,) m, stated noise.
-        sample: its index.  time: s, its stamp.
-        scene: of a `Scene`.
+    Args: work: predicted hypotheses; afterwards the updated ones.  first: row.  sample.  scene: of a `Scene`.
     Returns: squared whitened innovation, as of a good sample, of the hypothesis that is the best afterwards.
     """
-    n, best, surprise = fill[USED], -math.inf, 0.0
+    bank, n, best, surprise = work.bank, work.fill[USED], -math.inf, 0.0
     evidence = np.empty((n - first, 4))
     for row in range(first, n):
         said = evidence[row - first]
-        weigh(bank[row], position, sigma, scene, said)
+        weigh(bank[row], sample.position, sample.sigma, scene, said)
         for component in range(3):
             if bank[row].score + said[component] > best:
                 best, surprise = bank[row].score + said[component], said[SURPRISE]
@@ -60,19 +57,20 @@ def update(
         margin = said[component] - said[AS_OUTLIER]
         apart = 0.0 < margin < scene.outlier_doubt
         if apart and bank[row].score + said[AS_OUTLIER] > best - scene.doubt_margin:
-            lost = bank[add(bank, fill, bank, row)]
+            lost = bank[add(work, bank, row)]
             lost.score += said[AS_OUTLIER]
-            pass_through(lost, log, fill, OUTLIER, sample, -1, time)
-        _take_in(bank[row], position, sigma, component, scene)
+            pass_through(lost, work, OUTLIER, sample.number, -1, sample.time)
+        _take_in(bank[row], sample.position, sample.sigma, component, scene)
         bank[row].score += said[component]
         if component != AS_GOOD:
-            pass_through(bank[row], log, fill, WIDE if component == AS_WIDE else OUTLIER, sample, -1, time)
+            kind = WIDE if component == AS_WIDE else OUTLIER
+            pass_through(bank[row], work, kind, sample.number, -1, sample.time)
     return surprise
 
 
 @machine_code(REAL(ONE_HYPOTHESIS, COUNT, REAL, COUNT, SCENE))
 def _variance(h: Record, axis: int, sigma: float, component: int, scene: Record) -> float:
-    """m^2, of the innovation of one coordinate, if the sample is of a component."""
+    """m^2, of the innovation of one coordinate, for a sample of a component."""
     if component == AS_OUTLIER:
         return h.cov[axis, 0, 0] + scene.outlier_spread**2
     noise = (scene.stamp_jitter * h.mean[axis, 1]) ** 2 + sigma**2
@@ -81,11 +79,11 @@ def _variance(h: Record, axis: int, sigma: float, component: int, scene: Record)
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, ONE, ONE, SCENE, ONE))
 def weigh(h: Record, position: Array, sigma: Array, scene: Record, said: Array) -> None:
-    """What a sample says about a hypothesis; constants that all share (3/2 log 2 pi) are left out.
+    """Evidence of a sample for a hypothesis, without the common constant (3/2 log 2 pi).
 
     Args:
         h: predicted.  position: (3,) m.  sigma: (3,) m.  scene: of a `Scene`.
-        said: (4,) written: nats, of a good sample, a wide one and an outlier; and the surprise.
+        said: (4,) written: nats, of a good sample, a wide one and an outlier; and the squared innovation.
     """
     said[SURPRISE] = 0.0
     for component in range(3):
@@ -100,7 +98,7 @@ def weigh(h: Record, position: Array, sigma: Array, scene: Record, said: Array) 
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, ONE, ONE, COUNT, SCENE))
 def _take_in(h: Record, position: Array, sigma: Array, component: int, scene: Record) -> None:
-    """The Kalman update with a sample of a component; an outlier says nothing."""
+    """The Kalman update with a sample of a component; an outlier changes nothing."""
     if component == AS_OUTLIER:
         return
     h.age += 1
@@ -118,7 +116,7 @@ def _take_in(h: Record, position: Array, sigma: Array, component: int, scene: Re
 
 @machine_code(NOTHING(BANK, COUNT, COUNT, COUNTS))
 def rank(bank: Records, first: int, stop: int, rows: Index) -> None:
-    """Writes the rows first..stop - 1 of a bank, best first; of equals the earlier first."""
+    """Writes the rows first..stop - 1 of a bank, best first; equal ones in their order."""
     for row in range(first, stop):  # sorted as they come: few hypotheses, most of them in order
         place = row - first
         while place > 0 and bank[rows[place - 1]].score < bank[row].score:
@@ -129,10 +127,10 @@ def rank(bank: Records, first: int, stop: int, rows: Index) -> None:
 
 @machine_code(BANK(BANK, COUNT, SCENE))
 def prune(bank: Records, n: int, scene: Record) -> Any:
-    """The hypotheses worth keeping of the first n, best first. A tracker that has been shifted for long is believed.
+    """Selects the likely ones of the first n hypotheses, best first, and accepts a tracker shift that has lasted long.
 
-    Hypotheses whose last event is old predict the same from now on if they are in the same mode, so the best of them
-    stands for all (the Viterbi step).
+    Hypotheses in the same mode whose last event is old have the same predictions, so the best of them represents all
+    (the Viterbi step).
     """
     rows = np.empty(n, np.int64)
     rank(bank, 0, n, rows)

@@ -1,4 +1,4 @@
-"""Flight and rest of one hypothesis over a time step: gravity, drag, and a slack acceleration per axis."""
+"""Moves one hypothesis over a time step of flight or rest: gravity, drag, and a slack acceleration per axis."""
 
 import math
 from typing import Final
@@ -11,8 +11,8 @@ from ballfg.estimation.segmentation.bank import FLYING, ONE_HYPOTHESIS, SURFACES
 from ballfg.estimation.segmentation.scene import SCENE
 
 STRONGEST_DRAG: Final = 0.5
-"""Largest share of its velocity that a ball may lose to drag in one step: keeps absurd velocities, as two outliers
-1 ms apart give them, from growing without bound."""
+"""Largest share of its velocity that a ball may lose to drag in one step: bounds absurd velocities, such as those from
+two outliers 1 ms apart."""
 REST_SIGMA: Final = 0.003
 """m. Spread of the measured height of a resting ball about its surface, constant during the rest."""
 REST_SLACK: Final = 0.5
@@ -25,8 +25,8 @@ LANDING_SIGMA: Final = 0.2
 def carry(h: Record, t: float, scene: Record) -> None:
     """A hypothesis t s later, without an event: a flying ball flies, a resting one stays down; changes `h`.
 
-    Drag is linearised at the present speed, the same on the three axes: v' = (1 - k |v| dt) v + (b - g) dt. Negative
-    steps go back, and add noise like positive ones.
+    Drag is linearised at the present speed, equal on the three axes: v' = (1 - k |v| dt) v + (b - g) dt. Negative steps
+    go back, and add noise like positive ones.
     """
     step, half = abs(t), 0.5 * t * t
     speed = math.sqrt(h.mean[0, 1] ** 2 + h.mean[1, 1] ** 2 + h.mean[2, 1] ** 2)
@@ -54,7 +54,7 @@ def carry(h: Record, t: float, scene: Record) -> None:
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, COUNT, SURFACES))
 def put_down(h: Record, surface: int, surfaces: Records) -> None:
-    """Makes a hypothesis one that rests on a surface."""
+    """Makes a hypothesis rest on a surface."""
     h.surface = surface
     h.mean[2, 0] = surfaces[surface].centre + h.shift[2]
     h.mean[2, 1] = h.mean[2, 2] = 0.0
@@ -72,7 +72,7 @@ def put_down(h: Record, surface: int, surfaces: Records) -> None:
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, SCENE))
 def lift(h: Record, scene: Record) -> None:
-    """Makes a resting hypothesis a flying one, with a small unknown vertical speed."""
+    """Makes a resting hypothesis fly, with a small unknown vertical speed."""
     h.surface = FLYING
     h.cov[2, 1, 1] += scene.leave_speed**2
     for axis in range(3):

@@ -1,4 +1,4 @@
-"""What the segmentation needs to know of a ball, read off any ball model by asking it."""
+"""Derives the six numbers of the segmentation's ball from the answers of any ball model."""
 
 import math
 import weakref
@@ -13,12 +13,12 @@ from ballfg.dynamics.model import BallModel, is_substituted
 from ballfg.state import STANDARD_GRAVITY, STATE_DIM, VELOCITY, VZ, Z
 
 PROBE_SPEEDS = (2.0, 4.0, 8.0)
-"""m/s, at which drag is read off."""
+"""m/s, for the drag."""
 PROBE_FALLS = (1.0, 2.0, 4.0)
-"""m/s, at which restitution and friction are read off."""
+"""m/s, for restitution and friction."""
 PROBE_SLIDE = 12.0
-"""m/s, tangential: fast enough to slide through a bounce, so that the change of velocity shows the friction, and no
-faster than strong spin makes a ball slip: a learned contact knows nothing beyond what it has seen."""
+"""m/s, tangential: fast enough to slide through a bounce, so that the change of velocity shows the friction, and within
+the slip of a ball with strong spin: a learned contact is valid only within its training data."""
 BOUNDS = {
     "gravity": (0.1, 100.0),
     "drag": (0.0, 5.0),
@@ -32,7 +32,7 @@ BOUNDS = {
 
 @dataclass(frozen=True)
 class SegmentationPhysics:
-    """A ball without spin, in six numbers; the slack of the segmentation covers what they leave out.
+    """A ball without spin, in six numbers; the slack of the segmentation covers the rest.
 
     Attributes:
         gravity: m/s^2, downwards.
@@ -64,11 +64,11 @@ class SegmentationPhysics:
 
 
 def physics_of(model: BallModel) -> SegmentationPhysics:
-    """The physics of a model, analytic or learned, from its answers at a few states without spin.
+    """The physics of a model, analytic or learned, from its values at a few states without spin.
 
     Gravity, and the offset of the surfaces, come from a ball that hangs still; drag is the least-squares k over
     horizontal flight in four directions; restitution and friction are means over bounces. A value outside `BOUNDS`,
-    which a learned model may give where it was never asked, says nothing: a table-tennis ball's takes its place.
+    which a learned model may give outside of its training data, is replaced by that of a table-tennis ball.
 
     Args: model: any `BallModel`; it is neither changed nor differentiated.
     """
@@ -83,7 +83,7 @@ def physics_of(model: BallModel) -> SegmentationPhysics:
 
 _Known = tuple[Hashable, Sequence[Tensor], SegmentationPhysics]
 _known: weakref.WeakKeyDictionary[BallModel, _Known] = weakref.WeakKeyDictionary()
-"""Of each model: the stamp of its numbers, its tables, and what it answered."""
+"""For each model: the stamp of its numbers, its tables, and the result."""
 
 
 def _asked(model: BallModel) -> SegmentationPhysics:

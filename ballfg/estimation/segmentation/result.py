@@ -1,4 +1,4 @@
-"""What a segmentation says about a track."""
+"""A segmentation holds the contacts, hits, rests and sample qualities of a track."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 
 
 class Quality(IntEnum):
-    """How far a sample can be trusted."""
+    """Quality of a sample."""
 
     GOOD = 0
-    """Explained within its stated noise."""
+    """Fits within its stated noise."""
     WIDE = 1
-    """Explained with a noise some times larger than stated."""
+    """Fits with a noise some times larger than stated."""
     SHIFTED = 2
-    """Off by an offset that it shares with its neighbours: the tracker followed something else for a while."""
+    """Has an offset in common with its neighbours: the tracker followed something else for a while."""
     OUTLIER = 3
-    """Says nothing about the ball."""
+    """Carries no information on the ball."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Segmentation:
     share an interval: the ball touched both."""
 
     restarts: NDArray[np.int64]
-    """(r,) the hits that lie in gaps so long that nothing links the two sides."""
+    """(r,) those of the hits in gaps so long that nothing links the two sides."""
 
     rests: tuple[Rest, ...]
     """In the order of time; they do not overlap."""
@@ -74,7 +74,7 @@ class Segmentation:
 
     @property
     def segments(self) -> list[tuple[int, int]]:
-        """First and last sample, inclusive, of each stretch without a hit; all samples are one where there is none."""
+        """First and last sample, inclusive, of each stretch without a hit; one stretch if there is none."""
         if len(self.quality) == 0:
             return []
         ends = [*self.hits.tolist(), len(self.quality) - 1]
@@ -82,11 +82,11 @@ class Segmentation:
         return list(zip(starts, ends, strict=True))
 
     def only_contacts(self) -> Segmentation:
-        """The same contacts and rests, without hits, every sample trusted: for tracks known to be undisturbed."""
+        """The same contacts and rests, without hits and with every sample good: for undisturbed tracks."""
         none = np.zeros(0, dtype=np.int64)
         return Segmentation(self.contacts, none, none, self.rests, np.zeros_like(self.quality))
 
     @property
     def usable(self) -> NDArray[np.bool_]:
-        """(n,) samples that measure the ball: good or wide."""
+        """(n,) True for samples that measure the ball: good or wide ones."""
         return self.quality <= Quality.WIDE

@@ -1,4 +1,4 @@
-"""What stays the same during a segmentation, as machine code takes it: the ball, the surfaces, the settings."""
+"""Holds the constants of a segmentation for machine code: the ball, the surfaces, the settings."""
 
 from dataclasses import dataclass, field, fields
 from typing import Any, Final
@@ -6,6 +6,7 @@ from typing import Any, Final
 import numpy as np
 from numba import from_dtype
 
+from ballfg.dynamics.compiled.flight import white_acceleration
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.segmentation.bank import SURFACE, Record, Records
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
@@ -19,7 +20,7 @@ NUMBERS: Final = np.dtype(
         ("extent", np.float64, (4,)),
     ]
 )
-"""The fields of `SegmentationPhysics` and of `SegmentationSettings` in their units, and what follows from them.
+"""The fields of `SegmentationPhysics` and of `SegmentationSettings` in their units, and derived numbers.
 
 - log_shares: log prior of good, wide and outlying samples.  drift: process noise of (p, v, b) per dt, dt^2, dt^3.
 - extent: m, (x low, x high, y low, y high) within which a contact with the table is tried.
@@ -43,11 +44,9 @@ class Scene:
     rows: Records = field(init=False)
 
     def __post_init__(self) -> None:
-        s, walk = self.settings, self.settings.velocity_drift**2
-        drift = np.zeros((3, 3, 3))
-        drift[0, 1, 1], drift[0, 2, 2] = walk, s.slack_drift**2
-        drift[1, 0, 1] = drift[1, 1, 0] = walk / 2.0
-        drift[2, 0, 0] = walk / 3.0
+        s, drift = self.settings, np.zeros((3, 3, 3))
+        drift[2, 0, 0], drift[1, 0, 1], drift[0, 1, 1] = white_acceleration(1.0, s.velocity_drift**2)
+        drift[1, 1, 0], drift[0, 2, 2] = drift[1, 0, 1], s.slack_drift**2
         shares = np.log([1.0 - s.wide_share - s.outlier_share, s.wide_share, s.outlier_share])
         extent = np.array((-np.inf, np.inf, -np.inf, np.inf) if (known := self.surfaces.extent) is None else known)
         extent += s.extent_margin * np.array((-1.0, 1.0, -1.0, 1.0))

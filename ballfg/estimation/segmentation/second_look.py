@@ -1,6 +1,6 @@
-"""A second look at contacts: a bat, a net or a frame touched in the same interval changes more than friction can.
+"""Finds hits in the interval of a contact (a bat, a net, a frame) by a jump larger than friction allows.
 
-The forward pass takes such an event for a contact, whose unknown friction it pays less for than for a hit.
+The forward pass takes such an event for a contact, whose unknown friction costs less than a hit.
 """
 
 from collections.abc import Sequence
@@ -14,13 +14,13 @@ from ballfg.estimation.segmentation.result import Contact
 from ballfg.estimation.segmentation.settings import SegmentationSettings
 
 SIDE = 8
-"""Samples used on each side: at 180 Hz and 1.5 mm they give the velocity to 0.1 m/s."""
+"""Number of samples on each side: at 180 Hz and 1.5 mm they give the velocity to 0.1 m/s."""
 LEAST_SIDE = 4
-"""Samples without which nothing is said."""
+"""Least number of samples on each side for a decision."""
 LONGEST_INTERVAL = 0.02
 """s. Over longer intervals, drag and the unknown moment of the touch blur the jump."""
 LEEWAY = 0.3
-"""m/s, of tangential jump that noise and the Magnus force over the samples used may fake."""
+"""m/s, of tangential jump that noise and the Magnus force over these samples may feign."""
 
 
 def hits_at_contacts(
@@ -32,16 +32,16 @@ def hits_at_contacts(
     physics: SegmentationPhysics,
     settings: SegmentationSettings,
 ) -> list[int]:
-    """Intervals of contacts whose tangential jump exceeds what Coulomb friction gives: mu (1 + e) v_n.
+    """Intervals of contacts with a tangential jump beyond Coulomb friction: mu (1 + e) v_n.
 
     Args:
         times: (n,) s.
         positions: (n, 3) m.
         usable: (n,) samples that measure the ball.
-        contacts: as found, in order.
-        hits: intervals; they bound the samples used, as neighbouring contacts do.
+        contacts: of the forward pass, in order.
+        hits: intervals; they bound the used samples, as neighbouring contacts do.
         physics: of the ball.
-        settings: for the excess.
+        settings: with the tolerated excess.
     """
     ends = sorted({-1, len(times) - 1, *hits, *(contact.interval for contact in contacts)})
     found = []

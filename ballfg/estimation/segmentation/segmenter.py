@@ -1,4 +1,4 @@
-"""The forward pass: a multi-hypothesis (Viterbi) Kalman filter, one sample at a time, with bounded memory."""
+"""Explains a stream by a multi-hypothesis (Viterbi) Kalman filter, one sample at a time, in bounded memory."""
 
 import copy
 import math
@@ -20,12 +20,11 @@ from ballfg.estimation.segmentation.settings import SegmentationSettings
 
 @dataclass(frozen=True)
 class Decision:
-    """What is believed after a sample.
+    """The explanation after a sample.
 
     Attributes:
         final: events that became final with this sample, oldest first; each event is reported once.
-        pending: the best explanation of what came after all final events, oldest first. It may change with the
-            next sample.
+        pending: the best explanation of all later samples, oldest first. It may change with the next sample.
     """
 
     final: tuple[Event, ...]
@@ -58,7 +57,7 @@ class Segmenter:
         self._time = -math.inf
 
     def copy(self) -> "Segmenter":
-        """A segmenter that has taken in the same samples; what either takes in from now on is its own."""
+        """An independent segmenter with the same samples."""
         other = copy.copy(self)
         known: dict[int, Node] = {}
         other._tips = [copied(tip, known) for tip in self._tips]
@@ -84,7 +83,7 @@ class Segmenter:
         return Decision(final, tuple(node.event for node in open_nodes(self._tips[0])))
 
     def push_all(self, times: Array, positions: Array, sigmas: Array) -> list[Event]:
-        """Takes in samples that are known to be in order and finite, and tells the events of all samples so far.
+        """Takes in samples that are in order and finite, and returns the events of all samples so far.
 
         Args: times: (n,) s.  positions, sigmas: (n, 3) m.
         Returns: the events that became final, then the best explanation of the rest, oldest first.
@@ -96,7 +95,7 @@ class Segmenter:
         return events + ([node.event for node in open_nodes(self._tips[0])] if self._tips else [])
 
     def _taken(self, time: float, position: Array, sigma: Array) -> tuple[Event, ...]:
-        """The events that a sample makes final."""
+        """Takes in a sample; returns the events that become final."""
         last, scene = (self._bank, self._time), self._scene
         self._bank, log = explain(*last, time, position, sigma, self._count, scene.numbers, scene.rows)
         self._tips = self._followed(self._bank["tip"].tolist(), log)
@@ -105,7 +104,7 @@ class Segmenter:
         return self._made_final()
 
     def _followed(self, tips: list[int], log: Records) -> list[Node | None]:
-        """The last node of each hypothesis after a sample; hypotheses that pass through the same event share its node.
+        """The last node of each hypothesis after a sample; hypotheses with the same event share its node.
 
         Args: tips: as in `HYPOTHESIS`.  log: the events of the sample.
         """
@@ -140,7 +139,7 @@ class Segmenter:
 
 
 def _event(log: Records, row: int, scene: Scene) -> Event:
-    """What happened, as a row of a log says it."""
+    """The event in a row of a log."""
     number, index, surface, _, time, offset = log[row].tolist()
     kind = EventKind(number)
     return Event(kind, index, time, scene.height(surface), np.array(offset) if kind is EventKind.SHIFT else None)

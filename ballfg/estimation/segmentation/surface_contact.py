@@ -1,26 +1,28 @@
-"""Contacts: a hypothesis that may meet a surface branches: it did not, it bounced, it stayed down."""
+"""Branches hypotheses at a possible contact with a surface: no contact, a bounce, or rest."""
 
 import math
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numba import types
 
-from ballfg.arrays import Index
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, FLAG, NOTHING, REAL, several
+from ballfg.dynamics.compiled.signatures import COUNT, FLAG, NOTHING, REAL, several
+from ballfg.dynamics.surfaces import within
 from ballfg.estimation.segmentation.bank import (
     BANK,
     FLYING,
     HYPOTHESIS,
-    LOG,
     ONE_HYPOTHESIS,
     SURFACES,
     USED,
+    WORK,
     Record,
     Records,
+    Work,
     add,
     pass_through,
-)
+)  # fmt: skip
 from ballfg.estimation.segmentation.events import CONTACT, REST
 from ballfg.estimation.segmentation.motion import carry, put_down
 from ballfg.estimation.segmentation.scene import SCENE
@@ -28,74 +30,58 @@ from ballfg.estimation.segmentation.scene import SCENE
 SLOWEST_CLOSING: Final = 0.2
 """m/s. Bounds the time margin of a slow contact."""
 LEAST_FALL: Final = 0.05
-"""m/s. A path that meets a surface more slowly grazes it: no contact."""
+"""m/s. A path that meets a surface more slowly grazes it without a contact."""
 POSITION_JITTER: Final = 1e-3
-"""m, by which the horizontal position is less certain after a contact."""
+"""m, additional uncertainty of the horizontal position after a contact."""
 KNOWN_SPEED: Final = 1.0
-"""m/s. A path whose vertical speed is less certain, as after a single sample, is not said to land slowly."""
+"""m/s. A path with a less certain vertical speed, as after a single sample, is not taken to land slowly."""
 BOUNCE_JITTER: Final = 0.03
 """m/s, of the normal velocity after a bounce, whatever its speed."""
 SLIDE_JITTER: Final = 0.05
 """m/s, of the tangential velocity, likewise."""
 WEAKEST_FALL: Final = 0.2
-"""Share of gravity below which the slack is not believed to hold the ball up."""
+"""Share of gravity below which the slack cannot hold the ball up."""
 
 
-@machine_code(NOTHING(BANK, COUNTS, LOG, REAL, COUNT, REAL, FLAG, SCENE, SURFACES))
-def step(
-    bank: Records,
-    fill: Index,
-    log: Records,
-    dt: float,
-    interval: int,
-    start: float,
-    strict: bool,
-    scene: Record,
-    surfaces: Records,
-) -> None:
-    """All hypotheses after dt s, branched at the contacts that may have happened.
+class Step(NamedTuple):
+    """A part of an interval: its duration dt s, the number of the interval, when it starts on the track's clock (s).
 
-    Args:
-        bank, fill, log: hypotheses at time `start`; those after the step.
-        dt: s.
-        interval: index of the interval that this step is, or is a part of.
-        start: s, on the track's clock.
-        strict: only contacts inside the step; otherwise also such as the uncertainty of the path lets in. Parts of an
-            interval are strict, or each contact would be tried by two of them.
-        scene, surfaces: of a `Scene`.
+    `strict`: only contacts inside it; otherwise also such as the uncertainty of the path lets in. Parts of an interval
+    are strict, or each contact would be tried by two of them.
     """
-    h, lowest = fill[USED], math.inf
-    before = bank[:h].copy()
+
+    dt: float
+    interval: int
+    start: float
+    strict: bool
+
+
+STEP: Final[Any] = types.NamedTuple((REAL, COUNT, REAL, FLAG), Step)
+
+
+@machine_code(NOTHING(WORK, STEP, SCENE, SURFACES))
+def advance(work: Work, step: Step, scene: Record, surfaces: Records) -> None:
+    """All hypotheses of `work` after a step, branched at the contacts that may have happened."""
+    h, lowest = work.fill[USED], math.inf
+    before = work.bank[:h].copy()
     for row in range(h):
-        free = bank[row]
-        carry(free, dt, scene)
+        free = work.bank[row]
+        carry(free, step.dt, scene)
         slope = min(free.mean[2, 1], -SLOWEST_CLOSING)
         lowest = min(lowest, free.mean[2, 0] - free.shift[2] + scene.contact_window * slope)
     for surface in range(len(surfaces)):
         if lowest < surfaces[surface].centre:
-            _branch(before, bank, fill, log, surface, dt, interval, start, strict, scene, surfaces)
+            _branch(before, work, surface, step, scene, surfaces)
 
 
-@machine_code(NOTHING(BANK, BANK, COUNTS, LOG, COUNT, REAL, COUNT, REAL, FLAG, SCENE, SURFACES))
-def _branch(
-    before: Records,
-    bank: Records,
-    fill: Index,
-    log: Records,
-    surface: int,
-    dt: float,
-    interval: int,
-    start: float,
-    strict: bool,
-    scene: Record,
-    surfaces: Records,
-) -> None:
+@machine_code(NOTHING(BANK, WORK, COUNT, STEP, SCENE, SURFACES))
+def _branch(before: Records, work: Work, surface: int, step: Step, scene: Record, surfaces: Records) -> None:
     """Adds the hypotheses that meet one surface on the way: those that stay down, then those that bounce."""
     h = len(before)
     landed, times, count = np.empty(h, HYPOTHESIS), np.empty(h), 0
     for row in range(h):
         time, speed = _meeting(before[row], surfaces[surface].centre, scene)
-        if not _is_tried(before[row], time, speed, surface, dt, strict, scene):
+        if not _is_tried(before[row], time, speed, surface, step, scene):
             continue
         landed[count], times[count] = before[row], time
         here = landed[count]
@@ -103,17 +89,17 @@ def _branch(
         carry(here, time, scene)
         here.score -= scene.contact_cost
         here.age = 0
-        pass_through(here, log, fill, CONTACT, interval, surface, start + time)
+        pass_through(here, work, CONTACT, step.interval, surface, step.start + time)
         if speed < scene.rest_speed and here.cov[2, 1, 1] < KNOWN_SPEED**2:
-            down = bank[add(bank, fill, landed, count - 1)]
+            down = work.bank[add(work, landed, count - 1)]
             put_down(down, surface, surfaces)
-            carry(down, dt - time, scene)
+            carry(down, step.dt - time, scene)
             down.score -= scene.rest_cost
-            pass_through(down, log, fill, REST, interval, surface, start + dt)
+            pass_through(down, work, REST, step.interval, surface, step.start + step.dt)
     for k in range(count):
-        up = bank[add(bank, fill, landed, k)]
+        up = work.bank[add(work, landed, k)]
         _bounce(up, surfaces[surface], scene)
-        carry(up, dt - times[k], scene)
+        carry(up, step.dt - times[k], scene)
 
 
 @machine_code(several(REAL, 2)(ONE_HYPOTHESIS, REAL, SCENE))
@@ -122,43 +108,34 @@ def _meeting(h: Record, centre: float, scene: Record) -> Any:
     height, rise = h.mean[2, 0] - h.shift[2] - centre, h.mean[2, 1]
     drag = scene.drag * math.sqrt(h.mean[0, 1] ** 2 + h.mean[1, 1] ** 2 + rise**2)
     pull = max(scene.gravity - h.mean[2, 2] + drag * rise, WEAKEST_FALL * scene.gravity)
-    speed = math.sqrt(max(rise * rise + 2.0 * pull * height, 0.0))  # zero where the path stays below
+    speed = math.sqrt(max(rise * rise + 2.0 * pull * height, 0.0))  # zero if the path stays below
     return (rise + speed) / pull, speed
 
 
-@machine_code(FLAG(ONE_HYPOTHESIS, REAL, REAL, COUNT, REAL, FLAG, SCENE))
-def _is_tried(
-    h: Record,
-    time: float,
-    speed: float,
-    surface: int,
-    dt: float,
-    strict: bool,
-    scene: Record,
-) -> bool:
+@machine_code(FLAG(ONE_HYPOTHESIS, REAL, REAL, COUNT, STEP, SCENE))
+def _is_tried(h: Record, time: float, speed: float, surface: int, step: Step, scene: Record) -> bool:
     """Whether a meeting lies in the step, and on the surface as far as is known."""
     if h.surface != FLYING or not speed > LEAST_FALL:
         return False
     if surface == 0:
         x = h.mean[0, 0] - h.shift[0] + h.mean[0, 1] * time
         y = h.mean[1, 0] - h.shift[1] + h.mean[1, 1] * time
-        low_x, high_x, low_y, high_y = scene.extent[0], scene.extent[1], scene.extent[2], scene.extent[3]
-        if not (low_x <= x <= high_x and low_y <= y <= high_y):
+        if not within(x, y, scene.extent):
             return False
-    if strict:
-        return 0.0 <= time < dt
+    if step.strict:
+        return 0.0 <= time < step.dt
     reach = 3.0 * math.sqrt(h.cov[2, 0, 0]) + 2.0 * scene.surface_sigma
     margin = min(reach / max(speed, SLOWEST_CLOSING), scene.contact_window)
     # one sample between two contacts, or one contact would be tried in two intervals running
-    return -margin < time < dt + margin and h.age >= 1
+    return -margin < time < step.dt + margin and h.age >= 1
 
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, SURFACES.dtype, SCENE))
 def _bounce(h: Record, surface: Record, scene: Record) -> None:
     """A hypothesis at a contact, bounced: mirrored in z, slowed by the friction of an unknown spin.
 
-    Friction changes the tangential velocity by mu (1 + e) v_n at most, either way: half of that is expected, but no
-    more than a ball without spin would lose, and half is the spread.
+    Friction changes the tangential velocity by mu (1 + e) v_n at most, either way: half of that is expected, up to the
+    loss of a ball without spin, and half is the spread.
     """
     e, speed = scene.restitution, abs(h.mean[2, 1])
     friction = 0.5 * scene.friction * (1.0 + e) * speed

@@ -1,1 +1,1 @@
-"""Balls of which it is not certain whether they have bounced: what is known of them on either side of the contact."""
+"""Follows balls that may or may not have bounced, with a belief for either side of the contact."""

@@ -1,4 +1,4 @@
-"""Gaussian mixtures over the state of one ball: measurement updates, truncation at a surface, moments."""
+"""Updates, truncates and merges Gaussian mixtures over the state of one ball."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class GaussianMixture:
 
     @staticmethod
     def concatenated(parts: Sequence[GaussianMixture]) -> GaussianMixture:
-        """All Gaussians of some mixtures."""
+        """All Gaussians of several mixtures."""
         fields = ("log_weights", "means", "covariances")
         return GaussianMixture(*(np.concatenate([getattr(part, field) for part in parts]) for field in fields))
 
@@ -51,7 +51,7 @@ class GaussianMixture:
         return float(logsumexp(self.log_weights)) if len(self) else -np.inf
 
     def selected(self, rows: NDArray[np.bool_]) -> GaussianMixture:
-        """Some of the Gaussians, by a mask (n,)."""
+        """A part of the Gaussians, by a mask (n,)."""
         return GaussianMixture(self.log_weights[rows], self.means[rows], self.covariances[rows])
 
     def updated_by_position(self, position: Array, noise: Array, H: Array) -> tuple[GaussianMixture, Array]:
@@ -72,9 +72,9 @@ class GaussianMixture:
         return GaussianMixture(log_weights, means, covariances), squares
 
     def updated_by_factor(self, factor: FactorBatch, biases: int) -> GaussianMixture:
-        """The same with another measurement, a batch of one factor; its robust loss bounds what an outlier does.
+        """The same update with another measurement, a batch of one factor; its robust loss bounds outliers.
 
-        Args: biases: how many numbers at the end of the state are biases, which the factor does not look at.
+        Args: biases: number of biases at the end of the state, which the factor does not see.
         """
         log_weights, means, covariances = self.log_weights.copy(), self.means.copy(), self.covariances.copy()
         for i, (mean, covariance) in enumerate(zip(self.means, self.covariances, strict=True)):
@@ -89,7 +89,7 @@ class GaussianMixture:
         return GaussianMixture(log_weights, means, covariances)
 
     def truncated(self, gaps: Array, gradients: Array) -> GaussianMixture:
-        """The part above a surface: each Gaussian is cut where the gap is zero, and weighed by what is left of it.
+        """The part above a surface: each Gaussian is cut where the gap is zero, and weighted by its remaining share.
 
         Args: gaps: (n,) m, between ball and surface at the means.  gradients: (n, d) of the gap.
         """
@@ -113,5 +113,5 @@ class GaussianMixture:
         return GaussianMixture(np.array([log_weight]), mean[None], 0.5 * (covariance + covariance.T)[None])
 
     def divided(self, log_weight: float) -> GaussianMixture:
-        """The same with all weights divided by one of that logarithm."""
+        """The mixture with all weights divided by one, given by its logarithm."""
         return replace(self, log_weights=self.log_weights - log_weight)

@@ -1,9 +1,9 @@
-"""Two hypotheses of a ball near a surface: it has not bounced yet, or it has, each weighed by the measurements.
+"""Follows two hypotheses of a ball near a surface, bounced and not yet bounced, weighted by the measurements.
 
-A Kalman filter follows each of them from a sample on at which the ball had certainly not bounced. A bounce somewhat
-before or after a stamp is a smooth continuation of the motion (docs/derivations/contact.md). So one Gaussian a
-hypothesis is enough whatever the time of the contact; it is truncated where the ball would be below the surface.
-Friction is not smooth: it has a kink between sliding and rolling. So a bounce is computed at nine spins.
+A Kalman filter follows each of them from a sample before the bounce. A bounce somewhat before or after a stamp is a
+smooth continuation of the motion (docs/derivations/contact.md). So one Gaussian per hypothesis is enough for any time
+of the contact; it is truncated where the ball would be below the surface. Friction is not smooth: it has a kink between
+sliding and rolling. So a bounce is computed at nine spins.
 """
 
 from __future__ import annotations
@@ -24,35 +24,35 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.settings import Settings, stamp_covariance
 from ballfg.estimation.sides.gaussians import GaussianMixture
 from ballfg.factors.batch import FactorBatch
+from ballfg.factors.correlated_noise import bias_step
 from ballfg.factors.dynamics import model_width
-from ballfg.factors.tracker import bias_step
 from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, STATE_DIM, VELOCITY, VZ, Z
 
 FAR: Final = 4.5
 """Standard deviations of the gap beyond which a ball has certainly not touched: one in 300,000."""
 MOST_OFFSET: Final = 0.05
-"""m. Coefficients and slopes raise a surface by less than that."""
+"""m. Upper bound on the rise of a surface by coefficients and slopes."""
 WIDE_VELOCITY: Final = 1.0
-"""m/s. Where the velocity is less well known, as at the start of a flight, no sample is certainly before a contact."""
+"""m/s. With a less certain velocity, as at the start of a flight, no sample is certainly before a contact."""
 SLOWEST: Final = 0.3
 """m/s. A ball that falls more slowly makes several small hops between samples, or comes to rest: two hypotheses do not
 describe it."""
 STEEPEST_FALL: Final = 2.0 * STANDARD_GRAVITY
 """m/s^2, a bound on the downward acceleration; topspin adds to the weight."""
 NODES: Final = np.array([-(3.0**0.5), 0.0, 3.0**0.5])
-"""Standard deviations at which Gauss-Hermite quadrature of order three evaluates, and"""
+"""Nodes of a Gauss-Hermite quadrature of order three, in standard deviations."""
 NODE_WEIGHTS: Final = np.array([1.0, 4.0, 1.0]) / 6.0
-"""its weights."""
+"""Weights of these nodes."""
 HORIZONTAL_SPIN: Final = slice(SPIN.start, SPIN.start + 2)
 """The components of the spin that friction at a level surface depends on."""
 
 
 @dataclass(frozen=True)
 class SampleMeasurement:
-    """What was measured at one stamp.
+    """The measurements at one stamp.
 
     Attributes:
-        position: (3,) m; None where none was measured, or it was rejected.
+        position: (3,) m; None if it was not measured or was rejected.
         sigma: (3,) m, of its white error.
         factors: all other measurements, batches of one factor each.
     """
@@ -64,13 +64,13 @@ class SampleMeasurement:
 
 @dataclass(frozen=True)
 class HypothesisModel:
-    """How a ball moves and is measured.
+    """Motion and measurement of a ball.
 
-    Attributes:
-        ball: its model, with the estimated coefficients in columns behind the state.
+    ball: its model, with the estimated coefficients in columns after the state.
+        surfaces: table and floor.
         surfaces: that it may bounce on.
         settings: noise.
-        biases: how many numbers of the tracker's bias stand behind state and coefficients: 0 or 3.
+        biases: number of the tracker's biases after state and coefficients: 0 or 3.
     """
 
     ball: BallModel
@@ -80,7 +80,7 @@ class HypothesisModel:
 
     @property
     def width(self) -> int:
-        """How many numbers move with the ball: state and coefficients."""
+        """Number of values that move with the ball: state and coefficients."""
         return STATE_DIM + model_width(self.ball)
 
     def level(self, mean: Array) -> float:
@@ -98,9 +98,9 @@ class HypothesisModel:
         return gaps.detach().numpy(), gradients
 
     def may_touch(self, mean: Array, covariance: Array, dt: float) -> bool:
-        """Whether a ball may come down to a surface within dt s.
+        """True if a ball may come down to a surface within dt s.
 
-        Most samples are far from one: a coarse bound spares them the gap's gradient.
+        Most samples are far from a surface: a coarse bound avoids the gap's gradient.
         """
         way = mean[VZ] * dt - 0.5 * STEEPEST_FALL * dt**2
         reach = MOST_OFFSET + FAR * (np.sqrt(covariance[Z, Z]) + dt * np.sqrt(covariance[VZ, VZ]))
@@ -118,14 +118,14 @@ class HypothesisModel:
         return bool(gap + way < FAR * np.sqrt(gradient @ covariance @ gradient))
 
     def predict_flight(self, balls: GaussianMixture, dt: float) -> GaussianMixture:
-        """Balls after dt s of free flight, as if there were no surface."""
+        """Balls after dt s of free flight, without surfaces."""
         start = torch.from_numpy(np.ascontiguousarray(balls.means[:, : self.width]))
         after, jacobian = fly_jacobian(self.ball, start, torch.full((len(start),), dt, dtype=torch.float64))
         noise = np.repeat(self.settings.process.flight(np.array([dt])), len(start), axis=0)
         return self._predicted(balls, after.numpy(), jacobian.numpy(), noise, dt)
 
     def predict_bounce(self, balls: GaussianMixture, dt: float, level: float) -> GaussianMixture:
-        """Balls after dt s with one bounce on the way; those that never come down are left out."""
+        """Balls after dt s with one bounce on the way, without those that never come down."""
         start = torch.from_numpy(np.ascontiguousarray(balls.means[:, : self.width]))
         durations = torch.full((len(start),), dt, dtype=torch.float64)
         after, times, jacobian = fly_through_jacobian(self.ball, start, durations, (level,))
@@ -165,7 +165,7 @@ class HypothesisModel:
 
 
 def _at_nodes(balls: GaussianMixture) -> GaussianMixture:
-    """One Gaussian as nine that have no spread in the horizontal spin."""
+    """One Gaussian as nine without spread in the horizontal spin."""
     (mean,), (covariance,) = balls.means, balls.covariances
     spin = covariance[HORIZONTAL_SPIN, HORIZONTAL_SPIN]
     slope = np.linalg.solve(spin, covariance[HORIZONTAL_SPIN]).T
@@ -178,14 +178,14 @@ def _at_nodes(balls: GaussianMixture) -> GaussianMixture:
 
 @dataclass(frozen=True)
 class ContactHypotheses:
-    """A ball that has not bounced, and a ball that has.
+    """Two hypotheses of a ball: not yet bounced, and bounced.
 
     Attributes:
         model: of the ball.
-        flying: one Gaussian, as if there were no surface.
+        flying: one Gaussian, without the surface.
         bounced: Gaussians; none before the first step.
         level: m, height of the surface.
-        nearest: squared whitened innovation of the last position under the hypothesis that it fits best.
+        nearest: squared whitened innovation of the last position under its best hypothesis.
     """
 
     model: HypothesisModel
@@ -196,13 +196,13 @@ class ContactHypotheses:
 
     @classmethod
     def start(cls, model: HypothesisModel, mean: Array, covariance: Array) -> ContactHypotheses:
-        """Of a ball that has not bounced, with mean (d,) and covariance (d, d)."""
+        """Hypotheses of a ball that has not bounced, with mean (d,) and covariance (d, d)."""
         flying = GaussianMixture.single(mean, covariance)
         return cls(model, flying, flying.selected(np.zeros(1, dtype=bool)), model.level(mean))
 
     def step(self, dt: float, measured: SampleMeasurement) -> ContactHypotheses:
         """The hypotheses dt s later, after a measurement."""
-        weights = self._above.log_weights  # of the parts above the surface; not truncated, so that they stay Gaussian
+        weights = self._above.log_weights  # of the parts above the surface; the Gaussians stay whole
         still = replace(self.flying, log_weights=weights[:1])
         bouncing = self.model.predict_bounce(_at_nodes(still), dt, self.level)
         flying = [self.flying]
@@ -220,7 +220,7 @@ class ContactHypotheses:
         return replace(self, flying=flying, bounced=bounced, nearest=min(nearest, other))
 
     def sides(self) -> tuple[GaussianMixture, GaussianMixture]:
-        """One Gaussian of the ball that has not bounced, one of the ball that has; their weights are probabilities."""
+        """A Gaussian for each side of the contact, not yet bounced and bounced; the weights are probabilities."""
         first = np.arange(len(self._above)) == 0
         flying, bounced = self._above.selected(first), self._above.selected(~first)
         bounced = bounced.merged() if len(bounced) else flying.divided(np.inf)
@@ -229,6 +229,6 @@ class ContactHypotheses:
 
     @cached_property
     def _above(self) -> GaussianMixture:
-        """The parts of all Gaussians above the surface, that of the flying ball first."""
+        """The parts of all Gaussians above the surface, the flying ball's first."""
         both = GaussianMixture.concatenated([self.flying, self.bounced])
         return both.truncated(*self.model.gaps(both.means, self.level))

@@ -1,4 +1,4 @@
-"""Finds the samples at which a ball may be on either side of a contact, and the state to report there."""
+"""Finds the samples at which a ball may be on either side of a contact, and the states to report there."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from ballfg.factors.linear.definite import compatible, definite, variances_posit
 from ballfg.state import STATE_DIM
 
 NEGLIGIBLE: Final = 1e-6
-"""Probability of a side that does not count."""
+"""Probability below which a side is neglected."""
 LONGEST: Final = 8
-"""Samples after which the estimator must have found what happened."""
+"""Number of samples within which the estimator must have found the contact."""
 MOST_REJECTED: Final = 2
-"""Samples in a row that fit neither hypothesis: something else has happened to the ball."""
+"""Number of consecutive samples without a fitting hypothesis after which another event is assumed."""
 GATE_CHANCE: Final = 1e-6
 """Share of good positions that are rejected."""
 
 
 @dataclass(frozen=True)
 class ContactState:
-    """The state to report near a contact: that of the more probable side, widened by the other one.
+    """The state to report near a contact: the more probable side's, widened by the other one.
 
     Attributes:
-        mean: (d,) state, coefficients and bias on that side.
+        mean: (d,) state, coefficients and bias on the more probable side.
         covariance: (d, d) on that side alone.
         other: (9, 9) to be added to the state's covariance.
-        bounced: whether that side is the one of a ball that has bounced.
+        bounced: True if that side has bounced.
     """
 
     mean: Array
@@ -46,14 +46,14 @@ class ContactState:
 
     @property
     def widened(self) -> Array:
-        """(d, d) covariance that holds both sides."""
+        """(d, d) covariance that includes both sides."""
         covariance = self.covariance.copy()
         covariance[:STATE_DIM, :STATE_DIM] += self.other
         return covariance
 
 
 class ContactMonitor:
-    """Runs beside an estimator, and follows both hypotheses of a ball while it is near a contact.
+    """Runs beside an estimator and follows both hypotheses of a ball near a contact.
 
     Args: model: of the ball.
     """
@@ -65,11 +65,11 @@ class ContactMonitor:
         self._rejected = 0
 
     def copy(self) -> ContactMonitor:
-        """A monitor in the same state, which goes on by itself."""
+        """An independent monitor in the same state."""
         return copy.copy(self)
 
     def reset(self) -> None:
-        """Drop the hypotheses: the ball did something else than fly and bounce."""
+        """Drops the hypotheses, after an event other than flight and bounce."""
         self._hypotheses = None
 
     def step(
@@ -85,8 +85,8 @@ class ContactMonitor:
             before: the estimator's mean (d,) and covariance (d, d) of state, coefficients and bias a sample ago.
             dt: s since then.
             measured: at the sample.
-            bounced: whether, by the estimator, the ball has bounced within the last so many intervals.
-        Returns: None far from a contact, where the estimator's own state holds.
+            bounced: True if, by the estimator, the ball has bounced within that number of last intervals.
+        Returns: None far from a contact, where the estimator's own state is valid.
         """
         if self._hypotheses is None:
             if not self.model.may_touch(*before, dt):
@@ -139,7 +139,7 @@ class ContactMonitor:
     def _state(
         self, hypotheses: ContactHypotheses, bounced: Callable[[int], bool], *, new: bool
     ) -> ContactState | None:
-        """None where the hypotheses and the estimator agree on what has certainly happened, or no state is possible."""
+        """None if hypotheses and estimator agree on which side is certain, or if no state is possible."""
         sides = hypotheses.sides()
         chances = np.exp([side.log_weight for side in sides])
         if not np.isfinite(chances).all():
@@ -159,7 +159,7 @@ class ContactMonitor:
 
 
 def with_contact_states(estimate: Estimate, found: Mapping[int, ContactState]) -> Estimate:
-    """The estimate with other states at some samples; its coefficients stay as they are known with all states.
+    """The estimate with other states at some samples; its coefficients keep their values.
 
     Args: estimate: of a track.  found: states by sample.
     """

@@ -1,4 +1,4 @@
-"""By how much covariances are widened to hold both sides of a contact: at one stamp, and in a whole estimate."""
+"""Widens covariances to include both sides of a contact, at one stamp and in a whole estimate."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.integrate import fly
 from ballfg.estimation.plausible import possible
 from ballfg.estimation.result import Estimate
-from ballfg.estimation.segmentation import Contact
+from ballfg.estimation.segmentation.result import Contact
 from ballfg.state import STATE_DIM, VZ
 
 FAR: Final = 4.0
-"""Standard deviations of a contact's time beyond which a stamp is taken to lie on one side of it."""
+"""Standard deviations of a contact's time beyond which a stamp lies on one side of it."""
 LEAST_SPEED: Final = 1e-3
 """m/s, least vertical speed in the uncertainty of a contact's time."""
 MORE: Final = 3.0
-"""By which the chance of the less probable side is multiplied in a covariance,"""
+"""Factor on the chance of the less probable side in a covariance,"""
 ENOUGH: Final = 0.3
-"""until it is this. With the chance itself the truth lies within the stated 30 of NEES in 99 of 100 states just after
-a bounce, with more it does so on the other hundred states too. Chosen on `tests.estimation.both_sides --seed 1`."""
+"""up to this. With the chance itself the truth lies within the stated 30 of NEES in 99 of 100 states right after a
+bounce, with more it does so in the remaining states too. Chosen on `tests.estimation.both_sides --seed 1`."""
 SPREAD: Final = 0.01
-"""Chance from which on the other side's spread counts whole. A bounce scatters velocity and spin in five directions: as
-a mixture's covariance has it, a share q of that spread, each of them would add 1 / q to the NEES of a ball that is on
-the less probable side after all."""
+"""Chance from which the other side's spread counts fully. A bounce scatters velocity and spin in five directions: a
+mixture's covariance has only a share q of that spread, and each of them would add 1 / q to the NEES of a ball that is
+on the less probable side after all."""
 
 
 def widening(near: Array, far: Array, jump: Array, chance: float) -> Array:
-    """(9, 9) what a covariance of one side of a contact lacks to hold the other one too; positive semidefinite.
+    """(9, 9) difference from a covariance of one side of a contact to one that includes both; positive semidefinite.
 
     Args: near, far: (9, 9) covariances on the two sides.  jump: (9,) from the one to the other.
         chance: of the far side, at most a half.
@@ -44,7 +44,7 @@ def widening(near: Array, far: Array, jump: Array, chance: float) -> Array:
 
 
 def _excess(far: Array, near: Array) -> Array:
-    """(9, 9) far - near, in those directions in which it is positive."""
+    """(9, 9) far - near, restricted to the directions in which it is positive."""
     root = np.linalg.cholesky(near)
     half = np.linalg.solve(root, far - near)
     values, axes = np.linalg.eigh(np.linalg.solve(root, half.T))
@@ -68,11 +68,11 @@ class Shared:
 
 
 def widened_near_contacts(estimate: Estimate, model: BallModel) -> Estimate:
-    """The estimate, its covariances with the chance that a ball is on the other side of a near contact.
+    """The estimate with its covariances widened for the chance of the other side of a near contact.
 
-    Args: estimate: without it.  model: the ball, its coefficients in columns behind the state.
+    Args: estimate: without it.  model: the ball, its coefficients in columns after the state.
     """
-    if estimate.status.failed:  # its states do not know of contacts
+    if estimate.status.failed:  # its states have no contacts
         return replace(estimate, other_sides=np.zeros_like(estimate.covariances))
     shared = Shared(estimate.coefficients, estimate.coefficient_covariance, estimate.cross_covariances)
     others = widening_near_contacts(
@@ -89,18 +89,18 @@ def widening_near_contacts(
     model: BallModel,
     shared: Shared,
 ) -> Array:
-    """What the covariances of states beside contacts lack for the chance that a ball is on the other side.
+    """The difference of covariances near contacts for the chance that a ball is on the other side.
 
-    The estimate holds the order of contact and stamp to be as it took it. The gap between ball and surface at a stamp
-    is known to a sigma, that of the surface's height in it, and the contact's time to sigma / |v_z|: often 0.1 ms, so
-    that few stamps are concerned.
+    The estimate fixes the order of contact and stamp. The gap between ball and surface at a stamp is known to a sigma,
+    including that of the surface's height, and the contact's time to sigma / |v_z|: often 0.1 ms, so that few stamps
+    are concerned.
 
     Args:
         times: (n,) s.
         states: (n, 9).
         covariances: (n, 9, 9).
-        contacts: with the times that the estimate gives them.
-        model: the ball, its coefficients in columns behind the state.
+        contacts: with their estimated times.
+        model: the ball, its coefficients in columns after the state.
         shared: the coefficients.
     Returns: (n, 9, 9), to be added; zero far from contacts.
     """
@@ -115,7 +115,7 @@ def widening_near_contacts(
     for i in np.flatnonzero(margins < FAR):
         k, other = stamps[i], beyond[i]
         there = _carried(model, np.append(states[other], shared.mean), times[k] - times[other])
-        if possible(there):  # back over a long gap, drag would have been push
+        if possible(there):  # back over a long gap, drag accelerates
             chance = 0.5 * math.erfc(max(float(margins[i]), 0.0) / math.sqrt(2.0))
             lacking[k] += widening(covariances[k], covariances[other], there - states[k], chance)
     return lacking

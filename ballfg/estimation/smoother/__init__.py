@@ -1,1 +1,1 @@
-"""The smoother: the factor graph of a track and its minimum."""
+"""The smoother builds the factor graph of a track and finds its minimum."""

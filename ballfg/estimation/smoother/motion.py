@@ -1,4 +1,4 @@
-"""How a ball gets from one sample to the next: the events of a track interval by interval, and their factors."""
+"""Lists the events of a track as motions from one sample to the next, and makes the dynamics factors of these."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ import numpy as np
 
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.integrate import steps_over_each
-from ballfg.estimation.segmentation import Contact, Segmentation
+from ballfg.dynamics.motion.limits import steps_over_each
+from ballfg.estimation.segmentation.result import Contact, Segmentation
 from ballfg.factors.dynamics import ContactFactors, DynamicsFactors, FlightFactors, RestFactors
 from ballfg.factors.noise import Kicks, ProcessNoise
 
 
 @dataclass(frozen=True)
 class Motion:
-    """How the ball gets from one sample to the next.
+    """The events between two samples.
 
     Attributes:
-        heights: m, the surfaces met, in order.
-        times: s since the interval's start, when they are met, as far as known when the factor was made.
-        rest: m, the surface on which the ball lies all the time; None if it does not.
-        hit: something hits the ball at an unknown moment.
-        linked: False where nothing is known of what happened; the next state starts anew.
+        heights: m, the surfaces of contact, in order.
+        times: s since the interval's start, of contacts, as known when the factor was made.
+        rest: m, the surface of a ball that rests all the time, or None.
+        hit: True if something hits the ball at an unknown moment.
+        linked: False if the motion is unknown; the next state starts anew.
     """
 
     heights: tuple[float, ...] = ()
@@ -36,27 +36,27 @@ class Motion:
     linked: bool = True
 
     def same(self, other: Motion) -> bool:
-        """Whether both are the same events, at whatever moments."""
+        """True if both have the same events, at any times."""
         mine = (self.heights, self.rest, self.hit, self.linked)
         return mine == (other.heights, other.rest, other.hit, other.linked)
 
     def kick_times(self, dt: float) -> tuple[float, ...]:
-        """`times` for the process noise over dt s: in whole `KICK_PARTS`."""
+        """`times` for the process noise over dt s: rounded to `KICK_PARTS`."""
         return tuple(round(time / dt * KICK_PARTS) * dt / KICK_PARTS for time in self.times)
 
     def covariance(self, dt: Array, noise: ProcessNoise) -> Array:
-        """(1, 9, 9) process noise over dt (1,) s: flight, each contact's kick, a hit at an unknown time."""
+        """(1, 9, 9) process noise over dt (1,) s: flight, each contact's noise, a hit at an unknown time."""
         return noise.flight(dt) + noise.kicks(dt, kicks_of([self], dt))
 
 
 FLIGHT = Motion()
 KICK_PARTS = 64
-"""Of an interval, in which contact times enter the process noise. Finer, and an estimate would depend on how a
-segmentation rounds, which knows the axes of the frame: with these parts it turns with the data."""
+"""Parts of an interval to which contact times are rounded for the process noise. With finer ones an estimate would
+depend on the rounding of a segmentation, which knows the axes of the frame: with these parts it turns with the data."""
 
 
 def kicks_of(motions: Sequence[Motion], dt: Array) -> Kicks:
-    """The contacts and hits of m motions with as many contacts each, over dt (m,) s."""
+    """The contacts and hits of m motions with equal numbers of contacts, over dt (m,) s."""
     times = [motion.kick_times(duration) for motion, duration in zip(motions, dt.tolist(), strict=True)]
     return Kicks(np.array(times), np.array([motion.hit for motion in motions]))
 
@@ -71,7 +71,7 @@ def motions_of(segmentation: Segmentation, times: Array) -> list[Motion]:
 
 
 def eventful_motions(segmentation: Segmentation, times: Array) -> dict[int, Motion]:
-    """The motion of every interval in which something happens, in their order.
+    """The motion of every interval with an event, in their order.
 
     Args: segmentation: of n samples.  times: (n,) s.
     """
@@ -103,9 +103,9 @@ def contacts_by_interval(contacts: tuple[Contact, ...]) -> dict[int, list[Contac
 
 
 class TrackDynamics:
-    """Makes the dynamics factors of one track. Those of free flight are made once, for all that is tried.
+    """Makes the dynamics factors of one track. Those of free flight are made once, for all arrangements.
 
-    Args: times: (n,) s.  model: the ball, with the coefficients that are estimated.  noise: that it strays by.
+    Args: times: (n,) s.  model: the ball, with the estimated coefficients.  noise: of its motion.
     """
 
     def __init__(self, times: Array, model: BallModel, noise: ProcessNoise) -> None:
@@ -125,7 +125,7 @@ class TrackDynamics:
     def factors(self, events: Segmentation) -> list[DynamicsFactors]:
         """One factor per linked interval, in batches that share a motion and a number of integration steps.
 
-        Args: events: with the contacts where they are to be.
+        Args: events: with contacts in the wanted intervals.
         """
         motions = eventful_motions(events, self.times)
         flying = np.ones(len(self.dt), dtype=bool)
@@ -144,11 +144,11 @@ class TrackDynamics:
         return sorted((batch for batch in found if len(batch)), key=lambda batch: int(batch.variables[0, 0]))
 
     def _flown(self, steps: int, flying: Array, hit: Index) -> FlightFactors:
-        """Flights in some of the intervals; the process noise of some holds a hit."""
+        """Flights in some of the intervals; for `hit` ones the process noise contains a hit."""
         flights = self._flights[steps]
         intervals = flights.variables[:, 0]
         kept = flying[intervals]
-        flights = flights if kept.all() else flights.taken(np.flatnonzero(kept))
+        flights = flights if kept.all() else flights.select(np.flatnonzero(kept))
         struck = np.flatnonzero(np.isin(flights.variables[:, 0], hit))
         return flights.with_hits(struck, self.noise) if len(struck) else flights
 
@@ -161,7 +161,7 @@ class TrackDynamics:
         return RestFactors(self.model, rows, self.dt[rows], covariance, heights, kicks)
 
     def _kicked(self, rows: Index, motions: list[Motion]) -> tuple[Kicks, Array]:
-        """Contacts and hits of some intervals, as many contacts in each, and the process noise with them."""
+        """Contacts and hits of intervals with equal numbers of contacts, and their process noise."""
         dt = self.dt[rows]
         kicks = kicks_of(motions, dt)
         return kicks, self.noise.flight(dt) + self.noise.kicks(dt, kicks)

@@ -1,8 +1,8 @@
-"""The problem of one track: its observations, and the factor graph that they and the events in the track make.
+"""Builds the factor graph of one track from its observations and its events.
 
-Every interval between two samples gets one dynamics factor: free flight, flight through the contacts found in it, or
-rest on a surface; a hit adds its jump to the process noise. An interval that nothing links (a long gap with a hit in
-it) gets none. Every observation of the track gives its factors; the first state of each linked piece gets a prior.
+Every interval between two samples gets one dynamics factor: free flight, flight through its contacts, or rest on a
+surface; a hit adds its jump to the process noise. An interval without a link (a long gap with a hit in it) gets none.
+Every observation of the track gives its factors; the first state of each linked piece gets a prior.
 """
 
 from dataclasses import dataclass, replace
@@ -16,11 +16,12 @@ from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.launcher import SpinLabel
 from ballfg.estimation.observations.observation import Context, Observation, Unknowns, unknowns_of
 from ballfg.estimation.observations.positions import observations_of
-from ballfg.estimation.segmentation import Contact, Quality, Segmentation
+from ballfg.estimation.segmentation.result import Contact, Quality, Segmentation
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, total_sigmas
 from ballfg.estimation.smoother.motion import TrackDynamics
 from ballfg.estimation.smoother.second_look.low_hops import LowHops
 from ballfg.factors.batch import FactorBatch, Values
+from ballfg.factors.correlated_noise import BIAS_DIM, BiasFactors, BiasStartFactors
 from ballfg.factors.dynamics import ContactFactors, model_width
 from ballfg.factors.graph import BallGraph
 from ballfg.factors.launcher import LauncherSpinFactors
@@ -33,39 +34,38 @@ from ballfg.factors.prior import (
     spin_prior,
     state_prior,
 )
-from ballfg.factors.tracker import BIAS_DIM, BiasFactors, BiasStartFactors
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 from ballfg.tracks import Track
 
 LEAST_SPIN_PRIOR = 60.0
 """rad/s, of a ball after a hit, however well a launcher repeats its spin."""
 START_POSITION_SIGMA = 5.0
-"""m, prior of the first position about its measurement: wide enough to say nothing."""
+"""m, prior of the first position about its measurement: wide enough to carry no information."""
 QUALITY_SIGMA = {Quality.WIDE: 4.0, Quality.SHIFTED: 20.0, Quality.OUTLIER: 200.0}
 """Standard deviation of a sample that is not good, in multiples of a good one's."""
 
 
 @dataclass(frozen=True)
 class Events:
-    """What happens in a track: its segmentation, with the contacts as refined so far."""
+    """The events of a track: its segmentation, with refined contacts."""
 
     contacts: tuple[Contact, ...]
     segmentation: Segmentation
 
 
 def trackwise_model(model: BallModel, settings: Settings) -> BallModel:
-    """The model, augmented by the coefficients that are estimated for each track."""
+    """The model, augmented by the coefficients that are estimated with each track."""
     return AugmentedModel(model, tuple(settings.coefficients)) if settings.coefficients else model
 
 
 def coefficient_means(model: BallModel, settings: Settings) -> Array:
-    """(p,) the model's own values of the coefficients that are estimated."""
+    """(p,) the model's own values of the estimated coefficients."""
     parameters = dict(model.named_parameters())
     return np.array([float(parameters[name].detach()) for name in settings.coefficients])
 
 
 def effective_sigmas(track: Track, segmentation: Segmentation, settings: Settings) -> Array:
-    """(n, 3) m: standard deviations of the samples' white errors, larger for wide, shifted ones and outliers."""
+    """(n, 3) m: standard deviations of the samples' white errors, larger for wide or shifted samples and outliers."""
     settings = settings.for_track(track)
     sigma = sample_sigmas(settings, len(track), track.sigmas)
     whole = total_sigmas(settings, sigma, window_velocities(track.times, track.positions))
@@ -76,24 +76,24 @@ def effective_sigmas(track: Track, segmentation: Segmentation, settings: Setting
 
 
 class TrackProblem:
-    """The minimisation of one track: made once, solved for all arrangements of events that are tried.
+    """The minimisation of one track: built once, solved for all tried arrangements of events.
 
     Args:
         track: stamps, positions, observations, labels.
-        model: the ball, without the coefficients that are estimated with the track.
+        model: the ball, without the estimated coefficients.
         settings: noise and priors.
         segmentation: the events to start from.
-        sigma: (n, 3) m, standard deviations of the positions; those of `effective_sigmas` where None.
-        hops: the low hops that the segmentation allows for, where they were looked for.
+        sigma: (n, 3) m, standard deviations of the positions; None: those of `effective_sigmas`.
+        hops: the low hops compatible with the segmentation, if searched.
 
     Attributes:
-        ball: the model with the coefficients that are estimated.
+        ball: the model with the estimated coefficients.
         observations: of the track, positions among them.
-        unknowns: that the observations add; they follow the coefficients of the ball.
+        unknowns: those of the observations; they follow the coefficients of the ball.
         observed: the factors of each observation, by its name.
-        added: further factors, empty; append to it before the problem is solved.
+        added: further factors, at first empty; append to it before the problem is solved.
 
-    Raises: ValueError: if the settings ask an observation for unknowns that it does not have.
+    Raises: ValueError: if the settings give an observation unknowns that it does not have.
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class TrackProblem:
         return BallGraph(tuple(batches))
 
     def start(self, states: Array) -> Values:
-        """Values to start from: states (n, 9), the model's own coefficients, unknowns and biases of zero."""
+        """Initial values: states (n, 9), the model's own coefficients, unknowns and biases of zero."""
         means = coefficient_means(self.model, self.settings)
         biases = np.zeros((len(states), BIAS_DIM)) if self.biased else None
         return Values(states, np.append(means, np.zeros(len(self.unknowns.names))), biases)
@@ -157,7 +157,7 @@ class TrackProblem:
 
 
 def _velocities(track: Track, segmentation: Segmentation, settings: Settings) -> Array | None:
-    """(n, 3) m/s, along which the errors of stamps move the samples; None where stamps are exact."""
+    """(n, 3) m/s, along which the errors of stamps displace the samples; None if stamps are exact."""
     if settings.stamp_jitter == 0.0:
         return None
     breaks = np.array([c.interval for c in segmentation.contacts], dtype=np.int64)
@@ -166,7 +166,7 @@ def _velocities(track: Track, segmentation: Segmentation, settings: Settings) ->
 
 
 def bridged_positions(track: Track, segmentation: Segmentation) -> Array:
-    """(n, 3) m: measured positions, those of outliers and shifted runs replaced by a line between their neighbours."""
+    """(n, 3) m: measured positions, with lines between neighbours in place of outliers and shifted runs."""
     trusted = segmentation.quality <= Quality.WIDE
     if trusted.all() or not trusted.any():
         return track.positions.copy()
@@ -175,7 +175,7 @@ def bridged_positions(track: Track, segmentation: Segmentation) -> Array:
 
 
 def _biases(times: Array, settings: Settings) -> list[FactorBatch]:
-    """The tracker's errors that last: about zero at the start, fading from sample to sample."""
+    """Factors of the tracker's lasting errors: about zero at the start, decaying from sample to sample."""
     sigma, before = settings.bias_sigmas, np.arange(len(times) - 1)
     fading = BiasFactors(before, np.diff(times), sigma, settings.memory_time)
     return [BiasStartFactors(np.array([0]), sigma), fading]
@@ -187,9 +187,9 @@ def contact_batches(graph: BallGraph) -> list[ContactFactors]:
 
 
 def _priors(track: Track, segmentation: Segmentation, settings: Settings) -> list[FactorBatch]:
-    """Wide priors on the first state of each piece, and what is known of its spin.
+    """Wide priors on the first state of each piece, with a prior of its spin.
 
-    Of the first one that is the label, where there is one, or what the launcher's settings say; else the spin prior.
+    The first piece's spin is the label's, if any, or that of the launcher's settings; else the spin prior.
     """
     batches: list[FactorBatch] = []
     launch = None if settings.launcher is None else settings.launcher.settings(track)
@@ -207,12 +207,12 @@ def _priors(track: Track, segmentation: Segmentation, settings: Settings) -> lis
 
 
 def start_priors(state: int, position: Array, label: SpinLabel | None, settings: Settings) -> list[FactorBatch]:
-    """Priors on a state that nothing leads up to.
+    """Priors on a state without a link to a previous one.
 
     Args:
         state: its index.
         position: (3,) m, as measured.
-        label: what is known of the spin; None for the spin prior.
+        label: prior of the spin; None for the spin prior.
         settings: spreads and losses.
     """
     spin, spread = spin_start(label, settings)
@@ -232,4 +232,4 @@ def _wide_prior(state: int, position: Array, settings: Settings) -> PriorFactors
 
 
 UNINFORMATIVE_SPIN = 2000.0
-"""rad/s, prior about zero beside the label or the spin prior, should their robust loss set them aside."""
+"""rad/s, prior about zero beside the label or the spin prior, in case their robust loss rejects them."""

@@ -1,12 +1,11 @@
-"""What the search for a minimum needs: where it begins, the arrangement of contacts, and what has it begin again.
+"""Starts the search for a minimum, arranges its contacts, and starts it again where it went wrong.
 
-A minimum is found for one arrangement of contacts. Those whose estimated time lies outside of their interval then move,
-and the next minimum is asked for, until they stay; the lowest minimum is the answer.
+A minimum is found for one arrangement of contacts. Contacts whose estimated time lies outside of their interval then
+move, and the next minimum is computed, until they stay; the lowest minimum is the result.
 
-A spin label that was set aside on the way is asked once more: Cauchy's loss lets go. On the way from a rough start a
-spin may leave its label so far behind that it hardly pulls any more; the search then ends in another minimum, or on a
-slope. Where a label ends like that, convex losses lead to where it holds, and the search begins again from there; the
-lower minimum is the answer. A hit that went unseen is marked, and all is searched for once more.
+Cauchy's loss lets go. From a rough start a spin may move so far from its label that it hardly pulls any more; the
+search then ends in another minimum, or on a slope. In that case convex losses lead to the label's minimum, where the
+search starts again; the lower minimum is the result.
 """
 
 from __future__ import annotations
@@ -23,54 +22,54 @@ from ballfg.dynamics.motion.contact import fly_through
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.launcher import SpinLabel
-from ballfg.estimation.segmentation import Contact, Segmentation
+from ballfg.estimation.segmentation.result import Contact, Segmentation
 from ballfg.estimation.smoother.motion import contacts_by_interval
 from ballfg.estimation.smoother.problem import Events, TrackProblem, bridged_positions, contact_batches
 from ballfg.factors.batch import FactorBatch, Values
+from ballfg.factors.correlated_noise import BiasStartFactors
 from ballfg.factors.dynamics import DynamicsFactors, model_width
 from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Minimum
 from ballfg.factors.launcher import LauncherSpinFactors
 from ballfg.factors.prior import PriorFactors, SpinLabelFactors
-from ballfg.factors.tracker import BiasStartFactors
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ, Z
 from ballfg.tracks import Track
 
 ROUGH = 1e-2
-"""Posterior standard deviations. Where contacts and hits lie shows at minima that are known to this; only the last one
-is found to the optimizer's own tolerance."""
+"""Posterior standard deviations. Minima of this accuracy show the places of contacts and hits; only the last one is
+found to the optimizer's own tolerance."""
 BROKEN = 8.0
 """Norm of a whitened dynamics residual (9 dimensions) beyond which its interval hides a hit; chance: one in 1e9."""
 NOWHERE = (Convergence.STUCK, Convergence.TOO_MANY_ITERATIONS)
 LEAST_GAIN = 0.9
-"""Of the objective. Where a search leads nowhere and the worst of up to eight hits leaves more than this, hits are not
-what is missing: the noise is stated far too small, and every further hit would cost a long search."""
+"""Of the objective. If a search fails and the worst of up to eight hits leaves more than this share, missing hits are
+not the reason: the stated noise is far too small, and every further hit would cost a long search."""
 LEAST_FALL = 0.05
-"""m/s, least downward speed that a guess has before a contact."""
-LABELS = (LauncherSpinFactors, SpinLabelFactors)
-"""Factors that tell a spin before the flight is looked at. A few of many sightings are far off as a matter of course;
-the one label that a track has is not."""
+"""m/s, least downward speed of a guess before a contact."""
 MAX_REFINEMENTS = 6
-"""How often contacts may move to a neighbouring interval; two were the most seen on measured tracks."""
+"""Largest number of moves of contacts to a neighbouring interval; measured tracks needed two."""
+LABELS = (LauncherSpinFactors, SpinLabelFactors)
+"""Factors of a spin known before the flight. A few of many sightings are far off as a matter of course; a track's
+single label is not."""
 
 
 @dataclass(frozen=True)
 class Solution:
-    """A minimised graph and the events it was built on."""
+    """A minimised graph and its events."""
 
     events: Events
     graph: BallGraph
     minimum: Minimum
     rival: Array | None = None
-    """(3,) rad/s, first spin of another minimum that is nearly as low, where one was found."""
+    """(3,) rad/s, first spin of another minimum that is nearly as low, if any."""
 
 
 @dataclass(frozen=True)
 class Earlier:
-    """What is known from samples that came before those of a problem.
+    """The information from samples before those of a problem.
 
     Attributes:
-        start: values to start the minimisation from.
-        summaries: factors that stand for what left; they replace priors on the same variables.
+        start: initial values of the minimisation.
+        summaries: factors with the information of removed states; they replace priors on the same variables.
     """
 
     start: Values
@@ -90,10 +89,10 @@ def initial_states(
     model: BallModel,
     label: SpinLabel | None,
 ) -> Array:
-    """(n, 9) states from the sliding window: measured positions, mean velocities of windows that no event cuts.
+    """(n, 9) states from the sliding window: measured positions, mean velocities of windows without events.
 
-    The spin is the label's, or zero, up to the first contact; each contact changes it as the model says. A ball that
-    rests is put on its surface and rolls.
+    The spin is the label's, or zero, up to the first contact; each contact changes it by the model. A resting ball is
+    put on its surface and rolls.
     """
     states = np.zeros((len(track), STATE_DIM))
     states[:, POSITION] = bridged_positions(track, segmentation)
@@ -109,7 +108,7 @@ def initial_states(
 
 
 def _start_contact(states: Array, contact: Contact, model: BallModel) -> None:
-    """Put the state before a contact where the contact can be reached, and give later states the spin after it."""
+    """Moves the state before a contact to where it can reach the contact, and gives later states the spin after it."""
     before = torch.from_numpy(states[contact.interval].copy())
     with torch.no_grad():
         gap = float(model.gap(before, contact.height))
@@ -120,7 +119,7 @@ def _start_contact(states: Array, contact: Contact, model: BallModel) -> None:
 
 
 def _start_rest(states: Array, height: float, model: BallModel) -> None:
-    """Put states on a surface, rolling: friction that has saturated does not tell in which direction the spin lies."""
+    """Puts states on a surface, rolling: saturated friction does not determine the direction of the spin."""
     states[:, Z] -= model.gap(torch.from_numpy(states), height).detach().numpy()
     states[:, VZ] = 0.0
     states[:, SPIN.start] = -states[:, VELOCITY.start + 1] / model.radius
@@ -128,9 +127,9 @@ def _start_rest(states: Array, height: float, model: BallModel) -> None:
 
 
 class ContactSearch:
-    """The arrangements of a track's contacts, from that of its segmentation on.
+    """The arrangements of a track's contacts, beginning with its segmentation.
 
-    Args: problem: of the track.  surfaces: that the ball may touch.  segmentation: its events.
+    Args: problem: of the track.  surfaces: table and floor.  segmentation: its events.
     """
 
     def __init__(self, problem: TrackProblem, surfaces: Surfaces, segmentation: Segmentation) -> None:
@@ -141,13 +140,13 @@ class ContactSearch:
 
     @property
     def best(self) -> Solution:
-        """The lowest minimum so far; where contacts stayed, of those for which they do."""
+        """The lowest minimum so far; among those with consistent contacts, if any."""
         return min(self._seen.values(), key=lambda s: s.minimum.error) if self._best is None else self._best
 
     def after(self, solution: Solution) -> tuple[Events, Values] | None:
-        """The next arrangement with values to start from; None where the search has ended.
+        """The next arrangement with initial values; None at the end of the search.
 
-        Args: solution: for the arrangement before.
+        Args: solution: for the previous arrangement.
         """
         times, ball = self.problem.track.times, self.problem.ball
         places = places_of(solution.events.contacts)
@@ -168,9 +167,9 @@ class ContactSearch:
 
 
 def contacts_at_ends(times: Array, solution: Solution, model: BallModel, surfaces: Surfaces) -> tuple[Contact, ...]:
-    """Contacts that a single sample at either end could show, too little for the segmentation.
+    """Contacts that only a single sample at either end shows, too few for the segmentation.
 
-    The last state has fallen through a surface; or the first, where later samples lead back to, rises from below one.
+    The last state has fallen through a surface; or the first, extrapolated from later samples, rises from below one.
     """
     values, events, last = solution.minimum.values, solution.events, len(times) - 1
     taken = {c.interval for c in events.contacts} | set(events.segmentation.hits.tolist())
@@ -194,7 +193,7 @@ def contacts_at_ends(times: Array, solution: Solution, model: BallModel, surface
 
 
 def refined_contacts(times: Array, solution: Solution) -> tuple[Contact, ...]:
-    """The contacts, each in the interval that its estimated time lies in; those outside the track are dropped."""
+    """The contacts, each in the interval of its estimated time, without those outside the track."""
     refined = []
     for contact in timed_contacts(times, solution):
         if not times[0] <= contact.time <= times[-1]:
@@ -208,19 +207,19 @@ def refined_contacts(times: Array, solution: Solution) -> tuple[Contact, ...]:
 def move_contacts(
     values: Values, times: Array, old: Sequence[tuple[int, float]], new: Sequence[tuple[int, float]], model: BallModel
 ) -> Values:
-    """Values to go on from when contacts have moved: a state after its contact is now before it, or vice versa.
+    """Values for a continued search after contacts moved: a state after its contact is now before it, or vice versa.
 
     Args:
-        values: the states that went with the old contacts.
+        values: the states for the old contacts.
         times: (n,) s.
-        old: interval and height of each contact so far.  new: the same of those to come.
+        old: interval and height of each contact so far.  new: the same of the next contacts.
         model: gives the state at the end of the first interval that gained or lost a contact, from that at its start.
     """
     states = values.states.copy()
     changed = sorted({i for i, _ in set(old) ^ set(new)})
     for interval in changed:
         if interval - 1 in changed:
-            continue  # the contact came from there or went there; the state after both is right already
+            continue  # the contact entered or left this interval; the state after both is right already
         heights = tuple(height for i, height in new if i == interval)
         start = torch.from_numpy(np.concatenate((states[interval], values.coefficients[: model_width(model)]))[None])
         gap = float(model.gap(start, heights[0])[0].detach()) if heights else 0.0
@@ -235,12 +234,12 @@ def move_contacts(
 
 
 def places_of(contacts: tuple[Contact, ...]) -> tuple[tuple[int, float], ...]:
-    """Interval and height of each."""
+    """Interval and height of each contact."""
     return tuple((c.interval, c.height) for c in contacts)
 
 
 def timed_contacts(times: Array, solution: Solution) -> tuple[Contact, ...]:
-    """The contacts with the times that the estimate gives them; unchanged where it gives none."""
+    """The contacts with their estimated times; unchanged without an estimate."""
     grouped = contacts_by_interval(solution.events.contacts)
     timed: list[Contact] = []
     for batch in contact_batches(solution.graph):
@@ -254,25 +253,25 @@ def timed_contacts(times: Array, solution: Solution) -> tuple[Contact, ...]:
 
 
 def label_let_go(graph: BallGraph, values: Values) -> bool:
-    """Whether the loss of a label pulls less the further away the spin is, and the spin is far away."""
+    """True if the spin is so far from its label that the label's loss pulls less with distance."""
     able = [batch for batch in graph.batches if isinstance(batch, LABELS) and batch.loss.convex != batch.loss]
     return any((np.linalg.norm(batch.linearize(values).residual, axis=-1) > batch.loss.scale).any() for batch in able)
 
 
 def minimise_with_restart(optimizer: LevenbergMarquardt, graph: BallGraph, start: Values, found: Minimum) -> Minimum:
-    """The lower of a minimum that was found and of the one that convex losses on labels lead to."""
+    """The lower of a given minimum and of the one reached by convex losses on labels."""
     held = optimizer.minimize(_convex(graph), start)
     again = optimizer.minimize(graph, held.values)
     return again if again.error < found.error else found
 
 
 def _convex(graph: BallGraph) -> BallGraph:
-    """The graph with labels that never let go."""
+    """The graph with convex losses on labels."""
     return BallGraph(tuple(b.with_loss(b.loss.convex) if isinstance(b, LABELS) else b for b in graph.batches))
 
 
 def worst_break(solution: Solution) -> int | None:
-    """The interval whose dynamics factor is broken most, if any is; intervals with a hit have theirs in the noise."""
+    """The interval with the largest broken dynamics residual, if any; a hit widens the noise of its interval."""
     worst, where = BROKEN, None
     for batch, rows in zip((b for b in solution.graph.batches if len(b)), solution.minimum.linearized, strict=True):
         if isinstance(batch, DynamicsFactors):
@@ -285,6 +284,6 @@ def worst_break(solution: Solution) -> int | None:
 
 
 def leads_nowhere(solution: Solution, before: Solution) -> bool:
-    """Whether one more hit left the search without a minimum, and the objective nearly as high."""
+    """True if one more hit left the search without a minimum and hardly lowered the objective."""
     found, gone = solution.minimum, solution.minimum.convergence in NOWHERE
     return gone and found.error > LEAST_GAIN * before.minimum.error

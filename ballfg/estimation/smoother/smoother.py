@@ -1,4 +1,4 @@
-"""The smoother: the most probable states of a whole track, by Levenberg-Marquardt on its factor graph."""
+"""The smoother finds the most probable states of a whole track by Levenberg-Marquardt on its factor graph."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.plausible import measured_only, plausible
 from ballfg.estimation.result import Estimate, Status
-from ballfg.estimation.segmentation import Segmentation, physics_of, segment
+from ballfg.estimation.segmentation.batch import segment
+from ballfg.estimation.segmentation.physics import physics_of
+from ballfg.estimation.segmentation.result import Segmentation
 from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
 from ballfg.estimation.sides.widening import widened_near_contacts
 from ballfg.estimation.smoother.problem import Events, TrackProblem
@@ -42,28 +44,28 @@ from ballfg.state import STATE_DIM
 from ballfg.tracks import Ball, Track
 
 MAX_UNSEEN_HITS = 8
-"""How many hits the estimate may add to those that the segmentation found; measured logs needed three at most."""
+"""Largest number of hits that the estimate adds to the segmentation's; measured logs needed three at most."""
 OFFSET_ROUNDS = 6
-"""How often stamps may be moved by the time offsets that were estimated; 4 ms need three."""
+"""Largest number of corrections of stamps by estimated time offsets; 4 ms need three."""
 FIRST_STEPS = 15
-"""Linear solutions of the first round, after which stamps move anyhow."""
+"""Linear solutions of the first round, after which stamps are corrected in any case."""
 
 
 class Smoother(Estimator):
     """Maximum a posteriori estimate of all states of a track.
 
-    Contacts, hits, outliers are found by the segmentation; contacts are then refined by the estimate: one whose
-    estimated time lies outside its interval moves to where it belongs, and the graph is solved again.
+    The segmentation finds contacts, hits and outliers; the estimate then refines contacts: one whose estimated time
+    lies outside its interval moves to the right one, and the graph is solved again.
 
-    Where observations add unknowns that move stamps (`settings.time_offsets` of cameras), stamps move by what was
-    found, until they stay.
+    If observations add unknowns that change stamps (`settings.time_offsets` of cameras), stamps are corrected by their
+    estimates until they converge.
 
-    A track is smoothed at once, with 20 kB a sample; bf.estimate and `make_estimator` give the `PiecewiseSmoother`,
-    which takes long ones in pieces.
+    A track is smoothed at once, whatever its length, with 20 kB a sample. bf.estimate and `make_estimator` give the
+    `PiecewiseSmoother`, which smooths long ones in pieces.
 
     Args:
-        model: the ball.  surfaces: what it may bounce on.  settings: noise and priors.
-        optimizer: settings of the minimisation; where None, those of the settings' solver.
+        model: the ball.  surfaces: table and floor.  settings: noise and priors.
+        optimizer: settings of the minimisation; None: those of the settings' solver.
     """
 
     name = "smoother"
@@ -84,7 +86,7 @@ class Smoother(Estimator):
     def estimate(self, track: Track, factors: Sequence[FactorBatch] = (), *, move_stamps: bool = True) -> Estimate:
         """The states of a track, one per stamp, with the covariances of the Laplace approximation.
 
-        Args: track, factors: as for every estimator.  move_stamps: False leaves stamps where they are.
+        Args: track, factors: as for every estimator.  move_stamps: False leaves stamps unchanged.
         """
         track = self.prepared(track, factors)
         moving = move_stamps and bool(self.settings.time_offsets)
@@ -105,17 +107,17 @@ class Smoother(Estimator):
         return replace(estimate, status=Status.NOT_CONVERGED)
 
     def in_pieces(self, track: Track) -> Estimate | None:
-        """The estimate of a track that is too long to be smoothed at once; here there is none (`pieces/`).
+        """The estimate of a track that is too long to be smoothed at once; None for all others, and always here.
 
-        Args: track: prepared.
+        `PiecewiseSmoother` has one. Args: track: prepared.
         """
         return None
 
     def first_look(self) -> Smoother:
-        """The smoother for while stamps are milliseconds off.
+        """The smoother for stamps with errors of milliseconds.
 
-        A flight then seems to be full of hits, which would only let the offsets go; and where contacts do not fit, no
-        step is good, while the offsets are nearly right after a few.
+        A flight then seems to be full of hits, which would absorb the offsets; and with wrong contacts no step reduces
+        the objective, while the offsets are nearly right after a few steps.
         """
         calm = replace(self.settings, find_events=False)
         return Smoother(self.model, self.surfaces, calm, replace(self.optimizer, max_iterations=FIRST_STEPS))
@@ -125,7 +127,7 @@ class Smoother(Estimator):
         return self._segmented(track)[0]
 
     def _segmented(self, track: Track) -> tuple[Segmentation, tuple[LowHops, ...]]:
-        """The events in a track, and the low hops that they allow for."""
+        """The events in a track, and the compatible low hops."""
         settings = self.settings.for_track(track)
         white = sample_sigmas(settings, len(track), track.sigmas)
         sigma = total_sigmas(settings, white, window_velocities(track.times, track.positions))
@@ -136,30 +138,30 @@ class Smoother(Estimator):
         return counted(found, hops, track.times), hops
 
     def low_hops(self, track: Track, events: Segmentation) -> tuple[LowHops, ...]:
-        """The stretches in which the ball hops too low for its bounces to be told one by one."""
+        """The stretches with hops too low for distinguishing single bounces."""
         return low_hops(track, events, self.model, self.surfaces, self.settings)
 
     def problem(
         self, track: Track, segmentation: Segmentation | None = None, sigma: Array | None = None
     ) -> TrackProblem:
-        """What is to be minimised for a track.
+        """The minimisation problem of a track.
 
         Args:
             track: with its observations.
-            segmentation: the events to start from; found in the track where None.
-            sigma: (n, 3) m, of the positions; the settings' or the track's own where None.
+            segmentation: the initial events; None: found in the track.
+            sigma: (n, 3) m, of the positions; None: the settings' or the track's own.
         """
         events, hops = self._segmented(track) if segmentation is None else (segmentation, None)
         return TrackProblem(track, self.model, self.settings, events, sigma, hops)
 
     def settle(self, problem: TrackProblem, earlier: Earlier | None = None) -> Solution:
-        """The minimum with the events that go with it.
+        """The minimum with its events.
 
-        Contacts move to where the estimate has them; where no label chooses the spin, a lower minimum with another one
-        is looked for; where the motion still breaks the model by far more than its noise, a hit went unseen, and is
-        marked. All this is decided at rough minima (`ROUGH`).
+        Contacts move to their estimated intervals; without a label that determines the spin, lower minima with another
+        spin are searched; if the motion still contradicts the model by far more than its noise, an unseen hit is added.
+        All this is decided at rough minima (`ROUGH`).
 
-        Args: problem: of a track.  earlier: what came before, where the track is the end of a longer one.
+        Args: problem: of a track.  earlier: information from before, if the track is the end of a longer one.
         """
         rough = replace(self.optimizer, tolerance=max(ROUGH, self.optimizer.tolerance))
         segmentation, before = problem.segmentation, None
@@ -191,7 +193,7 @@ class Smoother(Estimator):
     def _begin(
         self, problem: TrackProblem, segmentation: Segmentation, earlier: Earlier | None
     ) -> tuple[Events, Values]:
-        """The events that the segmentation found, and values to start from."""
+        """The segmentation's events, and initial values."""
         if earlier is not None:
             return Events(segmentation.contacts, segmentation), earlier.start
         label = self.settings.spin_label(problem.track)
@@ -199,7 +201,7 @@ class Smoother(Estimator):
         return Events(segmentation.contacts, segmentation), problem.start(states)
 
     def result(self, problem: TrackProblem, solution: Solution) -> Estimate:
-        """What a solution says about the track."""
+        """The estimate of a track from a solution."""
         known = self.optimizer.covariances(solution.graph, solution.minimum)
         estimate = with_both_sides(self, problem, self.at_minimum(problem, solution, known))
         segmentation = solution.events.segmentation
@@ -211,7 +213,7 @@ class Smoother(Estimator):
     def at_minimum(self, problem: TrackProblem, solution: Solution, known: Covariances | None) -> Estimate:
         """The estimate at a minimum, before a second look at the end of the track and at low hops.
 
-        Args: problem: of a track.  solution: of it.  known: covariances there; None where they are not determined.
+        Args: problem: of a track.  solution: of it.  known: covariances there; None if undetermined.
         """
         minimum, segmentation = solution.minimum, solution.events.segmentation
         track, values = problem.track, solution.minimum.values
@@ -247,7 +249,7 @@ class Smoother(Estimator):
 
 
 def status_of(minimum: Minimum, linked: int) -> Status:
-    """How the estimate of a track ended.
+    """The status of a track's estimate.
 
     Args: linked: intervals between samples over which the motion of the ball is followed.
     """
@@ -260,7 +262,7 @@ def status_of(minimum: Minimum, linked: int) -> Status:
 
 
 def prior_covariances(problem: TrackProblem) -> Covariances:
-    """What is known of each state by itself, where the graph could not be solved."""
+    """Covariance of each state by itself, for a graph that could not be solved."""
     coefficients = problem.coefficient_sigmas
     _, states = measured_only(problem.track.positions, problem.sigma, problem.settings)
     return Covariances(states, np.diag(coefficients**2), np.zeros((len(states), STATE_DIM, len(coefficients))))

@@ -1,4 +1,4 @@
-"""Time offsets of a rig's cameras from a whole recording: every track says a little, together they say it well."""
+"""Estimates the time offsets of a rig's cameras from all tracks of a recording."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -19,12 +19,12 @@ from ballfg.tracks import Track
 from ballfg.vision.camera import Camera
 
 PRIOR: Final = 0.01
-"""s, standard deviation of a time offset beforehand, about the camera's own: a frame or so."""
+"""s, prior standard deviation of a time offset about the camera's own: a frame or so."""
 ROUNDS: Final = 8
-"""How often stamps are moved at most; 4 ms settle in three rounds, a whole frame in five."""
+"""Largest number of corrections of the stamps; 4 ms converge in three rounds, a whole frame in five."""
 USABLE: Final = (Status.OK, Status.NOT_CONVERGED)
 SETTLED: Final = 0.1
-"""Standard deviations. Offsets that move by less are settled."""
+"""Standard deviations. Offsets that change by less have converged."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,10 +32,10 @@ class TimeOffsets:
     """The clocks of a rig.
 
     Attributes:
-        cameras: the rig's, with the time offsets that were found.
+        cameras: the rig's, with the estimated time offsets.
         covariance: (c, c) s^2 of the offsets; zero for the reference.
-        settled: whether another round would leave the offsets as they are; if not, look at the calibration.
-        tracks: how many tracks say so.
+        settled: True if another round would not change the offsets; if False, check the calibration.
+        tracks: number of tracks in the estimate.
     """
 
     cameras: tuple[Camera, ...]
@@ -62,19 +62,19 @@ def estimate_time_offsets(
     reference: str | None = None,
     prior: float = PRIOR,
 ) -> TimeOffsets:
-    """How late each camera's stamps are, compared with a reference camera.
+    """Delays of each camera's stamps, relative to a reference camera.
 
-    Each track is smoothed with its own offsets. What it says of them is its posterior's information less the prior's;
-    the sum over all tracks, the prior counted once, is the estimate. Then all stamps move by it, because a camera
-    factor follows the ball in a straight line, and the tracks are smoothed anew, until the offsets stay.
+    Each track is smoothed with its own offsets. Its information on them is its posterior's less the prior's; the sum
+    over all tracks, with the prior counted once, is the estimate. Then all stamps are corrected by it, because a camera
+    factor follows the ball in a straight line, and the tracks are smoothed again, until the offsets converge.
 
     Args:
-        tracks: of one rig. One of half a second tells offsets to 0.1 ms, where cameras see a pixel's third.
-        model: the ball.  surfaces: what it may bounce on.
-        settings: noise and priors; their `time_offsets` are not asked.
-        reference: name of the camera whose offset stays; the first where None.
-        prior: s, standard deviation of the other offsets beforehand.
-    Raises: ValueError: no tracks, tracks of different rigs, an unknown reference, or no track that could be smoothed.
+        tracks: of one rig. One of half a second gives offsets to 0.1 ms, if cameras resolve a third of a pixel.
+        model: the ball.  surfaces: table and floor.
+        settings: noise and priors; their `time_offsets` are ignored.
+        reference: name of the camera with the fixed offset; None: the first.
+        prior: s, prior standard deviation of the other offsets.
+    Raises: ValueError: no tracks, tracks of different rigs, an unknown reference, or no track that can be smoothed.
     """
     tracks = list(tracks)
     names = _rig_of(tracks)
@@ -122,7 +122,7 @@ def _rig_of(tracks: list[Track]) -> tuple[str, ...]:
 def _fused(
     found: list[tuple[Array, Array]], believed: Array, free: NDArray[np.int64], prior: float
 ) -> tuple[Array, Array]:
-    """Offsets (c,) and their covariance (c, c) from those of all tracks, the prior counted once."""
+    """Offsets (c,) and their covariance (c, c) from all tracks, with the prior counted once."""
     before = np.eye(len(free)) / prior**2
     information, pull = before.copy(), np.zeros(len(free))
     for offsets_of_track, covariance_of_track in found:

@@ -1,4 +1,4 @@
-"""The factor graph of a track as GTSAM's objects, for those who add factors of their own and solve with GTSAM."""
+"""Gives the factor graph of a track as GTSAM's objects, for further factors and for GTSAM's solvers."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ from ballfg.tracks import Track
 
 NEAR: Final = 0.1
 """Posterior standard deviations from the minimum at which an estimate counts as converged; GTSAM's default tolerances
-leave about so much."""
+leave about that distance."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrackGraph:
-    """The factor graph of a track, with the events that the smoother found in it.
+    """The factor graph of a track, with the events found by the smoother.
 
     Symbols x and c belong to it. `symbol("x", i)` is the state at stamp i, a vector of 9 (position m, velocity m/s,
-    spin rad/s); where the settings give the tracker a memory, 3 errors of its positions (m) follow. `symbol("c", 0)` is
-    the vector of the coefficients and of the unknowns of observations, where there are any.
+    spin rad/s); with a memory of the tracker, 3 errors of its positions (m) follow. `symbol("c", 0)` is the vector of
+    the coefficients and of the observations' unknowns, if any.
 
     Attributes:
         factors: all factors of the track; `push_back` adds further ones.
-        values: the smoother's estimate, to start from; `insert` adds further variables.
+        values: the smoother's estimate, as initial values; `insert` adds further variables.
         keys: (n,) GTSAM's indices (keys) of the states.
         times: (n,) s, their stamps.
-        model: the ball, its coefficients that are estimated behind the state.
+        model: the ball, with its estimated coefficients after the state.
         coefficients: names of the numbers in `symbol("c", 0)`.
     """
 
@@ -55,10 +55,10 @@ class TrackGraph:
 
     @classmethod
     def of(cls, smoother: Smoother, track: Track) -> TrackGraph:
-        """The graph of a track, after the smoother has found its events.
+        """The graph of a track with the events of the smoother.
 
         Args: smoother: with model, surfaces and settings.  track: stamps, positions, observations.
-        Raises: ValueError: a track of which no graph can be made, or as `Estimator.estimate`.
+        Raises: ValueError: a track without a graph, or as `Estimator.estimate`.
         """
         prepared = smoother.prepared(track)
         problem = smoother.problem(prepared.since_first())
@@ -80,7 +80,7 @@ class TrackGraph:
     def estimate(self, values: gtsam.Values) -> Estimate:
         """The estimate at values, with the marginals of all factors.
 
-        Its states are those given: no second look is taken at the end of a track near a contact.
+        Its states are the given ones, without a second look at the end of a track near a contact.
 
         Args: values: of all variables of the factors.
         Raises: RuntimeError: GTSAM's, if the factors leave a variable undetermined.

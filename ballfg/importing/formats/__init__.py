@@ -1,1 +1,1 @@
-"""Files, folders and data in memory to tables, nothing interpreted yet."""
+"""Reads files, folders and data in memory as tables, without interpreting them."""

@@ -1,4 +1,4 @@
-"""Files that hold tables of numbers as such: Parquet, Excel, npz, HDF5, ROS bags."""
+"""Reads containers of tables of numbers: Parquet, Excel, npz, HDF5, ROS bags."""
 
 import math
 import sys
@@ -16,18 +16,18 @@ from ballfg.importing.formats.raw import RawTable, table_of
 from ballfg.importing.formats.text_files import text_table
 
 MAX_DEPTH: Final = 40
-"""Groups within groups."""
+"""Largest depth of nested groups."""
 MAX_MEMBERS: Final = 20_000
-"""Files within an archive, and datasets and groups within an HDF5 file: four for each of 5,000 shots."""
+"""Largest number of files in an archive, or of datasets and groups in an HDF5 file: four for each of 5,000 shots."""
 EXCEL_FREE: Final = 1_000_000
-"""Bytes of XML that any Excel file may hold, before its size counts: openpyxl reads some 2 MB a second."""
+"""Bytes of XML that any Excel file may hold, whatever its size: openpyxl reads some 2 MB a second."""
 EXCEL_CELLS: Final = 25_000
-"""Cells that any Excel file may have, and one more for each two bytes of its size: a number takes three or more."""
+"""Cells that any Excel file may have, plus one for each two bytes of its size: a number takes three or more."""
 _PLAIN: Final = "Save plain arrays of numbers with numpy.savez."
 
 
 def read_parquet(path: Path) -> list[RawTable]:
-    """The table of a Parquet file. Raises: ValueError: it is none."""
+    """The table of a Parquet file. Raises: ValueError: not a Parquet file."""
     import pyarrow as pa
 
     from ballfg.files.parquet import open_parquet
@@ -44,7 +44,7 @@ def read_parquet(path: Path) -> list[RawTable]:
 
 
 def _columns(pa: Any, table: Any) -> dict[str, Any]:
-    """The columns of an Arrow table by name: arrays of numbers and dates, lists of all else."""
+    """The columns of an Arrow table by name: arrays of numbers and dates, else lists."""
     from ballfg.files.parquet import texts_of
 
     columns: dict[str, Any] = {}
@@ -61,7 +61,7 @@ def _columns(pa: Any, table: Any) -> dict[str, Any]:
 
 
 def _copied(array: Any, inside: bool = False) -> int:
-    """Bytes of the texts within lists and structures, each of which becomes a copy of its own."""
+    """Bytes of the texts within lists and structures, each of which becomes a separate copy."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
@@ -76,7 +76,7 @@ def _copied(array: Any, inside: bool = False) -> int:
 
 
 def read_excel(path: Path) -> list[RawTable]:
-    """The tables of an Excel file, one a sheet. Raises: ValueError: no openpyxl, or not an Excel file."""
+    """The tables of an Excel file, one per sheet. Raises: ValueError: no openpyxl, or not an Excel file."""
     try:
         import openpyxl
     except ImportError:
@@ -97,7 +97,7 @@ def read_excel(path: Path) -> list[RawTable]:
     with library_reads(path, "Excel"):
         book = openpyxl.load_workbook(io.BytesIO(path.read_bytes()), read_only=True, data_only=True)
         for sheet in book.worksheets:
-            sheet.reset_dimensions()  # rows end at their last cell, whatever size the sheet says it has
+            sheet.reset_dimensions()  # rows end at their last cell, whatever size the sheet declares
             rows = list(_rows(path, sheet, left))
             left -= sum(map(len, rows))
             width = max(map(len, rows), default=0)
@@ -110,7 +110,7 @@ def read_excel(path: Path) -> list[RawTable]:
     for title, written in sheets.items():
         try:
             found += [text_table(written, title, str(path))] if written else []
-        except ValueError:  # a sheet of text beside the data is no table
+        except ValueError:  # a sheet of text beside the data is not a table
             continue
     if not found:
         raise ValueError(f"{path} must have a sheet with rows of numbers; got {listed(sheets)}. Add one.")
@@ -118,7 +118,7 @@ def read_excel(path: Path) -> list[RawTable]:
 
 
 def _rows(path: Path, sheet: Any, most: int) -> Iterator[list[str]]:
-    """The rows of a sheet that have a cell, as text. Raises: ValueError: more cells than `most`."""
+    """The non-empty rows of a sheet, as text. Raises: ValueError: more cells than `most`."""
     count = 0
     for row in sheet.iter_rows(values_only=True):
         count += len(row)
@@ -143,7 +143,7 @@ def _cells(row: Iterable[Any]) -> list[str]:
 
 
 def read_npz(path: Path) -> list[RawTable]:
-    """The tables of an npz or npy file. Raises: ValueError: not one, or it holds Python objects."""
+    """The tables of an npz or npy file. Raises: ValueError: not one, or with Python objects."""
     with library_reads(path, "npz or npy", _PLAIN):
         size = _array_bytes(path)
     check_unpacked(path, size)
@@ -201,7 +201,7 @@ def _h5py(path: Path) -> Any:
 
 
 class _Group:
-    """Reads the groups of an HDF5 file within bounds: links may lead round in circles, empty data be of any size."""
+    """Reads the groups of an HDF5 file within bounds: links may form cycles, empty data may have any size."""
 
     def __init__(self, h5py: Any, path: Path) -> None:
         self._h5py, self._path = h5py, path
@@ -220,7 +220,7 @@ class _Group:
         for key in group:
             if self._is_known(group, key):
                 continue
-            value = group.get(key)  # None where a link leads nowhere
+            value = group.get(key)  # None for a link that leads nowhere
             if isinstance(value, self._h5py.Group):
                 if not key.startswith("#"):  # MATLAB keeps the parts of cells there
                     content[key] = self.content(value, depth + 1)
@@ -229,7 +229,7 @@ class _Group:
         return content
 
     def _is_known(self, group: Any, key: str) -> bool:
-        """Whether another link has led there: two links in each of 40 groups would be 2^40 ways.
+        """True if another link has led there: two links in each of 40 groups would be 2^40 ways.
 
         Raises: ValueError: a link to another file.
         """
@@ -245,7 +245,7 @@ class _Group:
         return known
 
     def _data(self, key: str, value: Any) -> Any:
-        """The array of a dataset, whose bytes and those of its largest chunk are counted first."""
+        """The array of a dataset, after a count of its bytes and those of its largest chunk."""
         if value.external or value.is_virtual:
             raise ValueError(f"{self._path} must hold its data itself; those of {shown(key)} are in another file.")
         width = max(value.dtype.itemsize, NUMBER)
@@ -253,7 +253,7 @@ class _Group:
         check_unpacked(self._path, self._size)
         if not value.dtype.hasobject or value.ndim == 0 or value.size == 0:
             return value[()]
-        # texts and lists of any length: many may be one in the file, and each becomes a copy of its own
+        # texts and lists of any length: many may be one in the file, and each becomes a separate copy
         parts, few = [], max(1, FREE * len(value) // (self._path.stat().st_size * value.size))
         for start in range(0, len(value), few):
             parts.append(value[start : start + few])
@@ -263,12 +263,12 @@ class _Group:
 
 
 def _length(value: Any) -> int:
-    """Bytes or so of a text, a list, or a row of them."""
+    """Approximate number of bytes of a text, a list, or a row of them."""
     return sum(map(_length, value)) if isinstance(value, tuple) else getattr(value, "nbytes", 0) or len(str(value))
 
 
 def _array_bytes(path: Path) -> int:
-    """Bytes that the arrays of an npz or npy file take, as their headers and the archive say."""
+    """Number of bytes of the arrays in an npz or npy file, by their headers and the archive."""
     if not zipfile.is_zipfile(path):
         with path.open("rb") as file:
             return _header_bytes(file)
@@ -286,7 +286,7 @@ def _array_bytes(path: Path) -> int:
 
 
 def _header_bytes(file: IO[bytes]) -> int:
-    """Bytes that the array of an npy file takes, by its header."""
+    """Number of bytes of an npy file's array, by its header."""
     version = np.lib.format.read_magic(file)
     header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, kind = header(file)

@@ -1,4 +1,4 @@
-"""MATLAB files of any version. Those before 7.3 are read in a process of their own, which a damaged file may end."""
+"""Reads MATLAB files of any version, those before 7.3 in a process that a damaged file may crash."""
 
 import pickle
 import subprocess
@@ -14,9 +14,9 @@ from ballfg.importing.formats.nested import nested_tables
 from ballfg.importing.formats.raw import RawTable
 
 _HEADER: Final = 128
-"""Bytes before the first variable; the last two tell the order of bytes."""
+"""Bytes before the first variable; the last two give the byte order."""
 _COMPRESSED: Final = 15
-"""The kind of a variable that is packed."""
+"""The kind of a compressed variable."""
 _BLOCK: Final = 1 << 20
 
 
@@ -33,7 +33,7 @@ def read_matlab(path: Path) -> list[RawTable]:
 
 
 def _check_packed(path: Path) -> None:
-    """Counts what the variables of a file of version 5 unpack to, which its structures do not say.
+    """Counts the unpacked bytes of a version 5 file's variables, which its structures do not state.
 
     Source: MathWorks, MAT-File Format, level 5. Raises: ValueError: more than the file may.
     """
@@ -53,12 +53,12 @@ def _check_packed(path: Path) -> None:
 
 
 def _in_a_process(path: Path) -> tuple[str, Any]:
-    """Outcome and content, as `matlab_child` says them. Raises: ValueError: the process ended without an answer."""
+    """Outcome and content from `matlab_child`. Raises: ValueError: the process ended without an answer."""
     child = Path(__file__).with_name("matlab_child.py")
     command = [sys.executable, "-P", str(child), str(path.absolute()), str(most_unpacked(path))]
     done = subprocess.run(command, capture_output=True, check=False)
     if done.returncode:
         said = done.stderr.decode("utf-8", "replace").strip().splitlines()
         raise ValueError(said[-1] if done.returncode > 0 and said else "its parts have sizes that cannot be")
-    found: tuple[str, Any] = pickle.loads(done.stdout)  # of this project's own process
+    found: tuple[str, Any] = pickle.loads(done.stdout)  # from this project's own process
     return found

@@ -1,4 +1,4 @@
-"""Tables in nested data: JSON, MATLAB structures, dicts and lists of arrays, groups of HDF5."""
+"""Finds tables in nested data: JSON, MATLAB structures, dicts and lists of arrays, groups of HDF5."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,18 +9,18 @@ import numpy as np
 from ballfg.importing.formats.raw import RawTable, table_of
 
 _LEAST: Final = 3
-"""Rows from which on a list is taken for a table; shorter lists are points or settings."""
+"""Least number of rows of a list as a table; shorter lists are points or settings."""
 _POINT: Final = 4
-"""Most numbers of a point in one row."""
+"""Largest number of coordinates of a point in one row."""
 MAX_PARTS: Final = 100_000
-"""Lists and mappings that are looked into; each shot is one or a few."""
+"""Largest number of searched lists and mappings; each shot is one or a few."""
 
 
 def nested_tables(content: Any, name: str, source: str) -> list[RawTable]:
-    """All tables in nested dicts, lists and arrays. A scalar beside a table becomes a constant column of it.
+    """All tables in nested dicts, lists and arrays. A scalar beside a table becomes a constant column.
 
     Args: content: to search.  name: of the whole.  source: the file, for messages.
-    Raises: ValueError: lists within lists beyond some hundred levels, or more than `MAX_PARTS`.
+    Raises: ValueError: lists nested more than some hundred levels deep, or more than `MAX_PARTS`.
     """
     try:
         return _tables(content, name, _Source(source), {})
@@ -30,13 +30,13 @@ def nested_tables(content: Any, name: str, source: str) -> list[RawTable]:
 
 @dataclass
 class _Source:
-    """The file that is searched, and how many parts of it have been found."""
+    """The searched file, and the number of its parts so far."""
 
     name: str
     parts: int = 0
 
     def add(self, parts: int) -> None:
-        """Counts parts before they are looked into. Raises: ValueError: too many."""
+        """Counts parts before they are searched. Raises: ValueError: too many."""
         self.parts += parts
         if self.parts > MAX_PARTS:
             raise ValueError(f"{self.name} must have at most {MAX_PARTS} lists of samples; got more. Split it.")
@@ -141,7 +141,7 @@ def _of_list(items: list[Any], name: str, source: _Source, known: Mapping[str, A
 
 
 def _flat(item: Mapping[str, Any], prefix: str = "") -> dict[str, Any] | None:
-    """One row: nested dicts and points become columns; None if it holds more than a row."""
+    """One row: nested dicts and points become columns; None for anything else."""
     row: dict[str, Any] = {}
     for key, value in item.items():
         label = f"{prefix}{key}"

@@ -1,4 +1,4 @@
-"""A table as it was found in a file: named columns of numbers or text, nothing interpreted yet."""
+"""A raw table holds named columns of numbers or text as found in a file, not interpreted."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -31,11 +31,11 @@ MISSING: Final = (
     "inf",
     "-inf",
 )
-"""What files write, in lower case, where a number is missing."""
+"""Marks of a missing number in files, in lower case."""
 WITH_UNIT: Final = re.compile(r"^\s*([-+]?(?:\d++\.?\d*+|\.\d++)(?:[eE][-+]?\d++)?)\s*([^\W\d_]{1,3})\s*$")
 """A number with its unit, such as 12.5 mm."""
 _MOSTLY: Final = 0.5
-"""Share of a column's cells that must be numbers, where it is taken for one of numbers."""
+"""Least share of numbers among the cells of a numeric column."""
 
 
 @dataclass
@@ -43,21 +43,21 @@ class RawTable:
     """One table of a source."""
 
     name: str
-    """Of the table in its file; the file's own name where that holds one table."""
+    """Name of the table in its file; the file's own name for a single table."""
     columns: dict[str, Column]
     """By name, in the order of the file."""
     source: str = ""
-    """The file, for messages."""
+    """Name of the file, for messages."""
     named: bool = True
-    """Whether the columns have names of their own."""
+    """True if the columns have names of their own."""
     notes: list[str] = field(default_factory=list)
-    """What was left out while it was read."""
+    """Omissions during reading."""
     texts: dict[str, Column] = field(default_factory=dict)
-    """Columns of numbers with some cells that are none, as they were written."""
+    """Columns of numbers with some other cells, as written."""
 
     @property
     def doubts(self) -> dict[str, str]:
-        """A sentence for each column of numbers in which cells that are none count as missing."""
+        """A sentence for each column of numbers with other cells that count as missing."""
         found = {}
         for name, text in self.texts.items():
             wrong = [cell for cell in text.tolist() if cell.lower() not in MISSING and _real(cell) is None]
@@ -74,7 +74,7 @@ class RawTable:
 
 
 def table_of(name: str, columns: Mapping[str, Any], source: str = "", named: bool = True) -> RawTable:
-    """A table whose columns are arrays or lists (n,) of anything; text that is numbers becomes numbers.
+    """A table from columns that are arrays or lists (n,) of anything; text that is numbers becomes numbers.
 
     Raises: ValueError: more than `MAX_COLUMNS`.
     """
@@ -91,14 +91,14 @@ def table_of(name: str, columns: Mapping[str, Any], source: str = "", named: boo
 
 
 def numbers(column: Column) -> NDArray[np.float64]:
-    """The column as float64 (n,); NaN where it holds text."""
+    """The column as float64 (n,); NaN for text."""
     if column.dtype.kind in "iuf":
         return column.astype(np.float64)
     return np.full(len(column), np.nan)
 
 
 def is_number(column: Column) -> bool:
-    """Whether the column holds numbers."""
+    """True if the column holds numbers."""
     return column.dtype.kind in "iuf"
 
 
@@ -126,7 +126,7 @@ def _array(values: Sequence[Any]) -> Column:
         if held and all(isinstance(value, kind) for value in held):
             try:
                 return np.array(held, dtype=dtype)
-            except OverflowError:  # digits without end: no number that was measured
+            except OverflowError:  # digits without end are not a measured number
                 continue
     made = np.empty(len(held), dtype=object)
     made[:] = held
@@ -143,8 +143,8 @@ def _cell(value: Any) -> str:
 
 
 def _from_text(label: str, cells: list[str]) -> tuple[Column, str, Column | None]:
-    """Numbers where most cells are numbers; whole numbers keep all their digits."""
-    if any(len(cell) > 1 and cell[0] == "0" and cell.isdigit() for cell in cells):  # 007 names something
+    """Numbers if most cells are numbers; whole numbers keep all their digits."""
+    if any(len(cell) > 1 and cell[0] == "0" and cell.isdigit() for cell in cells):  # 007 is a name
         return _text(cells), label, None
     present = [i for i, cell in enumerate(cells) if cell.lower() not in MISSING]
     for convert in (_whole, _real):

@@ -1,4 +1,4 @@
-"""File formats that are imported beside those of the package: of a user, or of other installed packages."""
+"""Registers further file formats for imports, of a user or of other installed packages."""
 
 from abc import ABC, abstractmethod
 from pathlib import Path
@@ -8,7 +8,7 @@ from ballfg.registry import Registry
 
 
 class Format(ABC):
-    """A file format of one's own: a name, the endings of its files, and a reader.
+    """A user's file format: a name, the endings of its files, and a reader.
 
     Attributes:
         name: of the format.
@@ -21,9 +21,9 @@ class Format(ABC):
     @staticmethod
     @abstractmethod
     def read(path: Path) -> Any:
-        """What a file holds: a mapping of column names to arrays, an array (n, 4), or a list of such parts.
+        """The content of a file: a mapping of column names to arrays, an array (n, 4), or a list of such parts.
 
-        Times are in s and positions in m where the names of columns state no unit.
+        Times are in s and positions in m, unless column names state a unit.
 
         Raises: ValueError: if the file cannot be read; the message names it.
         """
@@ -33,4 +33,4 @@ FORMATS: Final[Registry[Format]] = Registry(
     "format", group="ballfg.formats", base=Format, remedy="docs/add_an_effect.md has an example."
 )
 register_format = FORMATS.register
-"""Lets files of a format be imported; may decorate the class."""
+"""Registers a format, so that its files can be imported; may decorate the class."""

@@ -1,4 +1,4 @@
-"""From what a user names - files, folders, data in memory - to tables."""
+"""Turns the files, folders or data of a user into tables."""
 
 import json
 import zipfile
@@ -27,7 +27,7 @@ _MAGIC: Final = (
     (b"PAR1", read_parquet), (b"\x89HDF", read_hdf5), (b"\x93NUMPY", read_npz), (b"MATLAB 5.0", read_matlab),
 )  # fmt: skip
 _OWN: Final = ("import.html", "truth.csv", "truth.parquet")
-"""Files in a dataset's folder that are no measurements."""
+"""Files in a dataset's folder that hold no measurements."""
 
 
 def tables_of(data: Any, topic: str | None = None, key: str | None = None) -> list[RawTable]:
@@ -35,7 +35,7 @@ def tables_of(data: Any, topic: str | None = None, key: str | None = None) -> li
 
     Args:
         data: a path or several, of files and folders; a DataFrame, a dict of arrays, an array, or a list of these.
-        topic: of a ROS bag.  key: part of the name of the tables to take.
+        topic: of a ROS bag.  key: part of the names of the wanted tables.
     Raises: FileNotFoundError: no such path. ValueError: unreadable, or no table of that key.
     """
     if isinstance(data, str | PathLike):

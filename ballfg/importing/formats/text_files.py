@@ -1,4 +1,4 @@
-"""Tables of text: CSV, TSV and their kin, with any separator, decimal sign, header and comments."""
+"""Reads tables of text, CSV, TSV and similar, with any separator, decimal sign, header and comments."""
 
 import csv
 import math
@@ -19,17 +19,17 @@ _COMMENTS: Final = ("#", "%", "//")
 _NUMBER: Final = re.compile(r"^[-+]?(\d++\.?\d*+|\.\d++)([eE][-+]?\d++)?$")
 _DECIMAL_COMMA: Final = re.compile(r"^[-+]?\d*,\d+([eE][-+]?\d++)?$")
 _LOOK: Final = 200
-"""Lines that are looked at to find the separator."""
+"""Number of lines for finding the separator."""
 _HEAD: Final = 4096
-"""Bytes at the beginning that tell whether a file is text."""
+"""Number of bytes at the beginning for recognising text."""
 _CONTROL: Final = 0.02
-"""Share of control characters from which on a file is not text."""
+"""Share of control characters from which a file is not text."""
 
 
 def read_text_table(path: Path) -> list[RawTable]:
     """The one table of a text file.
 
-    Raises: ValueError: not text, empty, or without rows of numbers; the message says what was seen.
+    Raises: ValueError: not text, empty, or without rows of numbers; the message describes the content.
     """
     return [text_table(decoded(path), path.stem, str(path))]
 
@@ -60,7 +60,7 @@ def _text(path: Path, content: bytes) -> str:
 
 
 def text_table(text: str, name: str, source: str) -> RawTable:
-    """The table that a text holds. Raises: ValueError: it has no rows of numbers, or a cell of a book's length."""
+    """The table in a text. Raises: ValueError: no rows of numbers, or an enormous cell."""
     try:
         return _text_table(text, name, source)
     except csv.Error as error:  # more than 131,072 characters without a separator
@@ -105,7 +105,7 @@ def _text_table(text: str, name: str, source: str) -> RawTable:
 
 
 def _separator(lines: Sequence[str]) -> str:
-    """The separator that gives most lines the same number of cells, and most of these cells a number."""
+    """The separator that gives most lines the same number of cells, most of them numbers."""
     best, most = ",", (0.0, -math.inf)
     for separator in SEPARATORS:
         rows = _cells(lines[-_LOOK:], separator)
@@ -120,9 +120,9 @@ def _separator(lines: Sequence[str]) -> str:
 
 
 def _numbers(rows: Sequence[Sequence[str]]) -> float:
-    """How many cells are numbers, less four for each that is text: of 0,1;0,2 a comma would leave the cell 1;0.
+    """Number of cells with numbers, less four for each with text: in 0,1;0,2 a comma would leave the cell 1;0.
 
-    A separator that leaves fewer numbers than there are rows does not count.
+    A separator with fewer numbers than rows does not count.
     """
     cells = [cell for row in rows for cell in row if cell.lower() not in MISSING]
     found = sum(1 for cell in cells if _NUMBER.match(cell) or _DECIMAL_COMMA.match(cell) or WITH_UNIT.match(cell))

@@ -1,1 +1,1 @@
-"""Where positions come from: pipes, sockets, datasets, bags of ROS 2; a queue in which live lines wait."""
+"""Sources give positions from pipes, sockets, datasets and ROS 2 bags; live lines wait in a queue."""

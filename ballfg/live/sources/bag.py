@@ -1,4 +1,4 @@
-"""Positions out of rosbag2 folders and MCAP files, without ROS: the extra `ros`."""
+"""Reads positions from rosbag2 folders and MCAP files, without ROS; it needs the extra `ros`."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ from ballfg.live.sources.lines import Sample
 
 Point = Any
 Reading = tuple[Sequence[Point], Any]
-"""The points of a message, and the covariance (36,) of the only one or None."""
+"""The points of a message, and the covariance (36,) of a single one or None."""
 
 READERS: dict[str, Callable[[Any], Reading]] = {
     "geometry_msgs/msg/PointStamped": lambda m: ([m.point], None),
@@ -24,11 +24,11 @@ READERS: dict[str, Callable[[Any], Reading]] = {
     "geometry_msgs/msg/TransformStamped": lambda m: ([m.transform.translation], None),
     "nav_msgs/msg/Odometry": lambda m: ([m.pose.pose.position], m.pose.covariance),
 }
-"""How positions are read from each type of message."""
+"""Reader of positions for each type of message."""
 
 
 def need_rosbags() -> None:
-    """Refuses to go on without the extra. Raises: ValueError."""
+    """Raises ValueError without the extra."""
     try:
         import rosbags  # noqa: F401
     except ImportError as error:
@@ -60,7 +60,7 @@ def _opened(bag: Path) -> Any:
 
 
 def _topic(bag: Path, topic: str | None) -> str:
-    """The topic to read. Raises: ValueError: there is none such."""
+    """The topic to read. Raises: ValueError: no such topic."""
     with library_reads(bag, "bag"), _opened(bag) as reader:
         kinds = {connection.topic: str(connection.msgtype) for connection in reader.connections}
     good = [name for name, kind in kinds.items() if kind in READERS]
@@ -87,7 +87,7 @@ def _samples(bag: Path, topic: str) -> Iterator[Sample]:
 
 
 def _sigmas(covariance: Any) -> list[list[float]] | None:
-    """m, from the covariance (36,) of a pose; None where it states none."""
+    """m, from the covariance (36,) of a pose; None without one."""
     if covariance is None:
         return None
     variances = np.asarray(covariance, dtype=np.float64).reshape(6, 6).diagonal()[:3]

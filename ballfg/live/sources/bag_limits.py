@@ -1,4 +1,4 @@
-"""What a bag unpacks to, counted before it is opened: chunks of MCAP, compressed files, and SQL in place of tables."""
+"""Checks the unpacked size of a bag before it is opened, and refuses SQL views in place of tables."""
 
 import importlib
 import sqlite3
@@ -18,21 +18,21 @@ _CHUNK: Final = 6
 """Opcode of a chunk in MCAP, the only record that is compressed."""
 _BLOCK: Final = 1 << 20
 _GENERATED: Final = 2
-"""From which on sqlite's `table_xinfo` marks a column as computed."""
+"""Value of sqlite's `table_xinfo` from which a column is computed."""
 
 
 def check_bag(bag: Path) -> None:
-    """Refuses a bag that holds far more than its size can tell, or that computes what it should hold.
+    """Refuses a bag that holds far more than its size allows, or computed content.
 
     Args: bag: a folder of rosbag2, or a file .mcap or .db3.
-    Raises: ValueError: naming the file.
+    Raises: ValueError: with the name of the file.
     """
     if not bag.is_dir():
         if bag.suffix in ENDINGS:  # the reader refuses others
             _check_file(bag, bag.suffix)
         return
     if not (bag / METADATA).is_file():
-        return  # the reader says what is missing
+        return  # the reader reports the missing file
     about = read_mapping(bag / METADATA).get("rosbag2_bagfile_information")
     mode = str(about.get("compression_mode", "")).lower() if isinstance(about, dict) else ""
     for path in sorted(bag.iterdir()):
@@ -44,7 +44,7 @@ def check_bag(bag: Path) -> None:
 
 
 def _check_file(path: Path, ending: str, messages: bool = False) -> None:
-    """Args: messages: whether each message is compressed by itself."""
+    """Args: messages: True if each message is compressed by itself."""
     with library_reads(path, "bag"):
         size = 0
         for data, compression in _mcap(path) if ending == ".mcap" else _database(path):
@@ -70,7 +70,7 @@ def _mcap(path: Path) -> Iterator[tuple[bytes, str]]:
 
 
 def _database(path: Path) -> Iterator[tuple[bytes, str]]:
-    """The data of each message, which no table says to be compressed.
+    """The data of each message, whose compression no table states.
 
     Raises: ValueError: a view, a virtual table or a computed column, which may take any time and room.
     """
@@ -85,7 +85,7 @@ def _database(path: Path) -> Iterator[tuple[bytes, str]]:
 
 
 def _count(path: Path, stream: Any, size: int) -> int:
-    """Bytes of a stream and of those before it. Raises: ValueError: more than the file may unpack to."""
+    """Adds up the bytes of a stream. Raises: ValueError: more than the file may unpack to."""
     while block := stream.read(_BLOCK):
         size += len(block)
         check_unpacked(path, size)
@@ -93,7 +93,7 @@ def _count(path: Path, stream: Any, size: int) -> int:
 
 
 def _opened(file: IO[bytes], compression: str) -> Any:
-    """What a compressed file holds, as a stream."""
+    """The content of a compressed file, as a stream."""
     if compression == "lz4":
         return importlib.import_module("lz4.frame").open(file)
     for name in ("compression.zstd", "backports.zstd"):

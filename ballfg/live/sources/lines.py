@@ -1,4 +1,4 @@
-"""Lines of a stream to samples: CSV `t,x,y,z` or JSON, each line by itself."""
+"""Reads the lines of a stream as samples: CSV `t,x,y,z` or JSON, each line by itself."""
 
 import json
 from collections.abc import Sequence
@@ -8,22 +8,22 @@ from typing import Any
 from ballfg.files.json_file import parse_json
 
 LONGEST = 65536
-"""Bytes of a line; of a longer one the rest is skipped."""
+"""Largest number of bytes of a line; the rest of a longer one is skipped."""
 MOST_POSITIONS = 64
-"""Positions of one stamp: more than are followed. Thousands would keep everybody waiting."""
+"""Largest number of positions of one stamp: more than the tracker follows. Thousands would delay everybody."""
 COLUMNS = ("t", "x", "y", "z")
 SIGMAS = ("sigma_x", "sigma_y", "sigma_z")
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What one line says: the positions of one stamp.
+    """The content of one line: the positions of one stamp.
 
     Attributes:
         time: s.
         positions: of each ball x, y, z in m.
-        sigmas: as many standard deviations, m; None where the line has none.
-        tag: further fields of the answer: the trajectory of a replay, for instance.
+        sigmas: as many standard deviations, m; None without them.
+        tag: further fields of the answer, such as the trajectory of a replay.
     """
 
     time: float
@@ -41,9 +41,9 @@ class LineReader:
         self._width = 0
 
     def read(self, line: bytes) -> Sample | None:
-        """The sample of a line; None of a header, a comment or an empty line.
+        """The sample of a line; None for a header, a comment or an empty line.
 
-        Raises: ValueError: a line that is none of these.
+        Raises: ValueError: any other line.
         """
         if len(line) > LONGEST:
             raise ValueError(f"a line must have at most {LONGEST} bytes; got more. Send one sample a line.")

@@ -1,4 +1,4 @@
-"""What listening over TCP and over UDP have in common: an address of its own, and words to senders and to the user."""
+"""A listener binds an address for TCP or UDP and tells senders and the user about problems."""
 
 import selectors
 import socket
@@ -11,17 +11,17 @@ from typing import Any
 from ballfg.live.sources.source import Source
 
 WAIT = 0.1
-"""s, after which a quiet listener looks whether it shall stop."""
+"""s, after which a quiet listener checks whether it should stop."""
 SENDERS = 64
-"""Senders at once."""
+"""Largest number of senders at once."""
 IDLE = 300.0
-"""s, after which a TCP sender without a line is dropped."""
+"""s, after which a silent TCP sender is dropped."""
 NOTICE = 5.0
 """s between two notices of the same kind."""
 
 
 class Listener(Source):
-    """What TCP and UDP share: an address that is bound once, and words to senders and to the user.
+    """The common part of TCP and UDP: one bound address, and notices to senders and the user.
 
     Args: host: name or address.  port: 0 takes a free one.  idle: s.
     Raises: OSError: the address cannot be bound.
@@ -51,7 +51,7 @@ class Listener(Source):
         self._socket.bind(place)
 
     def say(self, kind: str, text: str) -> bool:
-        """Print a notice, unless one of its kind has just been printed. Returns: whether it was."""
+        """Prints a notice, unless one of its kind has just been printed. Returns: True if printed."""
         now = perf_counter()
         if now - self._said.get(kind, -NOTICE) < NOTICE:
             return False
@@ -65,7 +65,7 @@ class Listener(Source):
 
 
 def readable(sockets: Collection[socket.socket], timeout: float) -> list[Any]:
-    """Those sockets of which something can be read, after a timeout (s) if there is none."""
+    """The readable sockets, after a timeout (s) if there is none."""
     with selectors.PollSelector() as selector:
         for each in sockets:
             selector.register(each, selectors.EVENT_READ)

@@ -1,4 +1,4 @@
-"""A dataset as a stream: its tracks one after the other, at the rate at which they were measured."""
+"""Replays a dataset as a stream: its tracks one after the other, at their measured rate."""
 
 import threading
 from collections.abc import Iterable, Iterator
@@ -17,7 +17,7 @@ PAUSE = 1.0
 class Replay(Source):
     """Samples at their own pace, or a multiple of it.
 
-    Args: samples: with their stamps, which the pace follows.  speed: 1 is real time; 0 as fast as they are taken.
+    Args: samples: with their stamps, which set the pace.  speed: 1 is real time; 0 is without pauses.
     """
 
     repeats = True
@@ -43,12 +43,12 @@ class Replay(Source):
 
 
 def dataset_samples(dataset: Dataset) -> Iterator[Sample]:
-    """The samples of a dataset on one clock: each track begins `PAUSE` after the end of the one before.
+    """The samples of a dataset on one clock: each track begins `PAUSE` after the end of the previous one.
 
-    Their tags tell the trajectory and the stamp on its own clock.
+    Their tags hold the trajectory and the stamp on its own clock.
     """
     origin: float | None = None
-    begins = 0.0  # s, the track's first sample since that of the first track
+    begins = 0.0  # s, from the first track's first sample to this one's
     for track in dataset:
         origin = float(track.times[0]) if origin is None else origin
         moments = zip(track.times.tolist(), track.seconds.tolist(), track.positions.tolist(), strict=True)

@@ -1,4 +1,4 @@
-"""One who sends lines: bytes to lines, lines that wait, lines of one stamp to samples."""
+"""A sender's bytes become lines, its lines wait in a queue, and lines of one stamp become samples."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from typing import NamedTuple
 from ballfg.live.sources.lines import LONGEST, MOST_POSITIONS, LineReader, Sample
 
 WAITING = 1024
-"""Lines that may wait in all; the senders that have lines waiting share them."""
+"""Largest number of waiting lines in all, shared by the senders with waiting lines."""
 PAUSE = 0.005
-"""s between two looks at whether a full sender may go on."""
+"""s between two checks whether a full sender may continue."""
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,8 @@ class Arrival:
 
     Attributes:
         read: s, `time.perf_counter` when it was read.
-        sample: what it says; None of a line that cannot be used.
-        problem: why not.
+        sample: its content; None for an unusable line.
+        problem: reason for an unusable line.
     """
 
     read: float
@@ -33,16 +33,16 @@ class Arrival:
 
 
 class LineBuffer:
-    """Cuts the bytes of one sender into lines. A line that is too long is cut off, and its rest is skipped."""
+    """Cuts the bytes of one sender into lines. The rest of a line that is too long is skipped."""
 
     def __init__(self) -> None:
         self._rest = b""
         self._skips = False
 
     def feed(self, chunk: bytes) -> list[bytes]:
-        """The lines that a chunk completes, without the empty ones."""
+        """The lines completed by a chunk, without the empty ones."""
         *lines, self._rest = (self._rest + chunk).split(b"\n")
-        if lines and self._skips:  # the rest of a line that was cut off
+        if lines and self._skips:  # the rest of a line that is too long
             del lines[0]
             self._skips = False
         if len(self._rest) > LONGEST:
@@ -52,20 +52,20 @@ class LineBuffer:
         return [line for line in lines if line]
 
     def end(self) -> list[bytes]:
-        """The last line, if no line feed ended it."""
+        """The last line, if it has no line feed."""
         lines = [self._rest] if self._rest and not self._skips else []
         self._rest, self._skips = b"", False
         return lines
 
 
 class Sender:
-    """One who sends lines, and those of its lines that wait to be answered.
+    """A sender and its waiting lines.
 
     Attributes:
         waiting: lines, or samples of a replay, with the time at which they were read (s, `time.perf_counter`).
-        most: how many may wait now.
-        heard: s, `time.perf_counter` when its last line ended.
-        dropped: lines that had to make room for newer ones.
+        most: largest present number of waiting lines.
+        heard: s, `time.perf_counter` at the end of its last line.
+        dropped: number of lines dropped for newer ones.
     """
 
     def __init__(self, name: str = "") -> None:
@@ -80,23 +80,23 @@ class Sender:
 
     @property
     def full(self) -> bool:
-        """Whether a source should read no more of it now."""
+        """True if a source should not read more of it now."""
         return len(self.waiting) >= self.most
 
     @property
     def busy(self) -> bool:
-        """Whether something of it waits to be answered."""
+        """True if something of it waits for an answer."""
         return bool(self.waiting) or self._next is not None
 
     def wait_for_room(self, stop: threading.Event) -> None:
-        """Wait while it is full, until `stop` is set."""
+        """Waits while it is full, until `stop` is set."""
         while self.full and not stop.wait(PAUSE):
             pass
 
     def cut(self, chunk: bytes, *, last: bool = False) -> Iterator[Line]:
-        """The lines that a chunk completes, which has just been read.
+        """The lines completed by a chunk that was just read.
 
-        Args: last: whether nothing continues the chunk.
+        Args: last: True if nothing continues the chunk.
         """
         now = perf_counter()
         found = self._buffer.feed(chunk)
@@ -107,11 +107,11 @@ class Sender:
         return (Line(self, now, line) for line in found)
 
     def take(self) -> list[Arrival]:
-        """The oldest arrivals of one stamp, as far as they wait; empty if only comments or headers waited."""
+        """The oldest waiting arrivals of one stamp; empty if only comments or headers waited."""
         return self.take_from(self.waiting.popleft() for _ in range(len(self.waiting)))
 
     def take_from(self, lines: Iterable[tuple[float, bytes | Sample]]) -> list[Arrival]:
-        """The next arrivals of one stamp out of lines. The first arrival of another stamp is kept for the next call."""
+        """The next arrivals of one stamp from lines. The first arrival of another stamp is kept for the next call."""
         group, self._next = [] if self._next is None else [self._next], None
         for read, line in lines:
             arrival = self._arrival(read, line)
@@ -134,7 +134,7 @@ class Sender:
 
 
 class Line(NamedTuple):
-    """A line, or a sample of a replay, and when it was read (s, `time.perf_counter`)."""
+    """A line, or a sample of a replay, and its time of reading (s, `time.perf_counter`)."""
 
     sender: Sender
     read: float
@@ -142,7 +142,7 @@ class Line(NamedTuple):
 
 
 def _are_together(group: list[Arrival], other: Arrival) -> bool:
-    """Whether an arrival has the stamp of a group, and the group is not so large that other senders would wait."""
+    """True if an arrival has the stamp of a group that is small enough not to delay other senders."""
     first = group[0].sample
     if first is None or other.sample is None or first.time != other.sample.time:
         return False

@@ -1,4 +1,4 @@
-"""Samples from the network: lines over TCP, or packets over UDP."""
+"""Receives samples from the network: lines over TCP, or packets over UDP."""
 
 import re
 
@@ -14,8 +14,8 @@ ADDRESS = re.compile(r"(tcp|udp)://(\[[0-9a-fA-F:.]+\]|[^:/\[\]]*):(\d{1,5})")
 def listen(address: str, idle: float = IDLE) -> Source:
     """A source that listens at tcp://HOST:PORT or udp://HOST:PORT; port 0 takes a free one.
 
-    Args: address: without a host, this machine alone can send.  idle: s, after which silent senders are dropped.
-    Raises: ValueError: another form of address, or one that cannot be listened at.
+    Args: address: without a host, only this machine can send.  idle: s, after which silent senders are dropped.
+    Raises: ValueError: another form of address, or one that cannot be bound.
     """
     found = ADDRESS.fullmatch(address)
     if found is None or int(found[3]) > 65535:

@@ -1,4 +1,4 @@
-"""Where samples come from: the interface of all sources, standard input, and the inbox in which live lines wait."""
+"""Defines the interface of all sources, standard input, and the inbox in which live lines wait."""
 
 import os
 import stat
@@ -12,9 +12,9 @@ from time import perf_counter
 from ballfg.live.sources.sender import WAITING, Arrival, Line, Sender
 
 LEAST = 16
-"""Lines of each sender that may wait, however many senders have lines waiting."""
+"""Least number of lines that each sender may have waiting."""
 CHUNK = 65536
-"""Bytes read at once from standard input, or of a packet."""
+"""Number of bytes read at once from standard input, or of a packet."""
 
 
 class Source:
@@ -22,11 +22,11 @@ class Source:
 
     Attributes:
         name: for messages.
-        trust: a sentence on who may send to it; empty if nobody else can.
-        live: whether lines come at their own pace, so that they must be read at once. Other sources wait until asked.
-        repeats: whether the stream begins at its beginning again when it is opened again, as a file does.
-        lossy: whether the oldest lines of a full sender are dropped; else the source reads no more of it.
-        lost: lines or packets that the system dropped before they could be read.
+        trust: a sentence on who may send to it; empty if only this process's user can.
+        live: True if lines come at their own pace, so that they must be read at once. Other sources wait until read.
+        repeats: True if the stream starts from its beginning when opened again, as a file does.
+        lossy: True if the oldest lines of a full sender are dropped; else the source reads no more of it.
+        lost: number of lines or packets that the system dropped unread.
     """
 
     name = ""
@@ -41,11 +41,11 @@ class Source:
         raise NotImplementedError
 
     def close(self) -> None:
-        """Let go of sockets; by default there are none."""
+        """Closes sockets; by default there are none."""
 
 
 class Pipe(Source):
-    """Standard input: a pipe or terminal is live, a file is read as it is needed."""
+    """Standard input: a pipe or terminal is live, a file is read on demand."""
 
     name = "standard input"
 
@@ -66,13 +66,13 @@ class Pipe(Source):
 
 
 class Inbox:
-    """The samples of a source, those of one stamp together as far as they are there.
+    """The samples of a source, grouped by stamp as far as they have arrived.
 
-    A live source is read by a thread of its own, so that the moment of reading is told truly. Its senders take turns:
-    one that sends much delays another by the answers to one of its stamps at most. A source that waits is read when a
-    sample is wanted; that is the moment which counts.
+    A thread reads a live source, so that the moment of reading is true. Its senders take turns: a busy one delays
+    another by the answers to one of its stamps at most. A source that waits is read when a sample is needed; that
+    moment counts.
 
-    Attributes: dropped: lines of a lossy source that waited too long.
+    Attributes: dropped: number of a lossy source's lines that waited too long.
     """
 
     def __init__(self, source: Source) -> None:
@@ -87,7 +87,7 @@ class Inbox:
             threading.Thread(target=self._fill, name="ballfg live input", daemon=True).start()
 
     def groups(self) -> Iterator[list[Arrival]]:
-        """Arrivals of one stamp at a time, those of a sender in the order in which they came.
+        """Arrivals of one stamp at a time, each sender's in their order.
 
         Raises: OSError: from the source.
         """
@@ -102,21 +102,21 @@ class Inbox:
 
     @property
     def waiting(self) -> bool:
-        """Whether something of a live source waits."""
+        """True if something of a live source waits."""
         return bool(self._turns)
 
     def interrupt(self) -> None:
-        """End the samples as if the source had ended; a signal handler may call it."""
+        """Ends the samples as if the source had ended; a signal handler may call it."""
         self._stop.set()
         self._end()
 
     def close(self) -> None:
-        """Stop reading."""
+        """Stops reading."""
         self._stop.set()
         self.source.close()
 
     def _turn(self) -> list[Arrival] | None:
-        """What the next sender has waiting of one stamp; None at the end."""
+        """The next sender's waiting arrivals of one stamp; None at the end."""
         with self._changed:
             self._changed.wait_for(lambda: self._turns or self._ended)
             if self._stop.is_set() or not self._turns:
@@ -128,7 +128,7 @@ class Inbox:
             return group
 
     def _asked(self) -> Iterator[list[Arrival]]:
-        """The same of a source that waits. It has one sender."""
+        """The same for a source that waits, which has one sender."""
         sender = Sender()
         lines = ((line.read, line.content) for line in self.source.lines(self._stop))
         now = perf_counter()

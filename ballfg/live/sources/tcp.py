@@ -1,4 +1,4 @@
-"""Lines over TCP."""
+"""Receives lines over TCP."""
 
 import socket
 import threading
@@ -12,13 +12,13 @@ from ballfg.live.sources.listener import SENDERS, WAIT, Listener, readable, writ
 from ballfg.live.sources.sender import PAUSE, Line, Sender
 
 PIECE = 4096
-"""Bytes read at once of a sender: no more than takes a millisecond."""
+"""Number of bytes read at once of a sender: less than a millisecond's work."""
 
 
 class Connection(Sender):
     """A TCP sender.
 
-    Attributes: open: whether more may come.
+    Attributes: open: True if more may come.
     """
 
     def __init__(self, connected: socket.socket, name: str) -> None:
@@ -28,7 +28,7 @@ class Connection(Sender):
         self.open = True
 
     def receive(self) -> Iterator[Line]:
-        """The lines that it has sent, the last one too if it has gone."""
+        """Its new lines, including the last one if it has gone."""
         try:
             chunk = self.socket.recv(PIECE)
         except BlockingIOError:
@@ -41,7 +41,7 @@ class Connection(Sender):
         return self.cut(chunk, last=not chunk)
 
     def dismiss(self, reason: str) -> None:
-        """Tell it why no more lines are taken, and close."""
+        """Tells it why no more lines are taken, and closes."""
         with suppress(OSError):
             self.socket.send(encoded(refusal(reason), 0.0))
             self.socket.shutdown(socket.SHUT_WR)
@@ -53,10 +53,10 @@ class Connection(Sender):
 
 
 class TcpServer(Listener):
-    """Lines of every sender that connects; one that goes leaves the others and the balls alone."""
+    """Receives the lines of every sender that connects; one that leaves does not affect the others."""
 
     def _open(self, place: Any) -> None:
-        # the port of a command that has just ended is free at once; two that listen still exclude each other
+        # the port of a command that has just ended is free at once; two listeners still exclude each other
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self._socket.bind(place)
         self._socket.listen()
@@ -82,15 +82,15 @@ class TcpServer(Listener):
                 sender.socket.close()
 
     def _is_leaving(self) -> bool:
-        """Whether all places are taken, but soon one will be free: its sender has gone, and its lines are answered."""
+        """True if all places are taken, but a sender has gone and its lines are answered."""
         return len(self._senders) >= SENDERS and not all(sender.open for sender in self._senders)
 
     def _accept(self) -> None:
-        """Let in those who have come, or refuse one."""
+        """Accepts new senders, or refuses one."""
         for _ in range(max(SENDERS - len(self._senders), 1)):
             try:
                 connected, address = self._socket.accept()
-            except OSError:  # nobody is left, or he went before he was let in
+            except OSError:  # nobody is left, or the sender has left already
                 return
             sender = Connection(connected, written(address))
             if len(self._senders) < SENDERS:
@@ -102,7 +102,7 @@ class TcpServer(Listener):
             self.say("refused", text)
 
     def _drop_idle(self) -> None:
-        """Dismiss senders without a line, and forget those that have gone and are answered."""
+        """Drops silent senders, and forgets those that have gone and are answered."""
         now = perf_counter()
         for sender in self._senders:
             if sender.full:

@@ -1,4 +1,4 @@
-"""Lines in UDP packets."""
+"""Receives lines in UDP packets."""
 
 import socket
 import sys
@@ -14,9 +14,9 @@ from ballfg.live.sources.sender import PAUSE, WAITING, Line, Sender
 from ballfg.live.sources.source import CHUNK
 
 SILENT = 1.0
-"""s, after which a sender makes room for a new one: it can come back at any time."""
+"""s, after which a silent sender makes room for a new one: it can return at any time."""
 DROPS = 40
-"""The option SO_RXQ_OVFL of Linux: a packet comes with the number of packets that the system has dropped before it."""
+"""The option SO_RXQ_OVFL of Linux: a packet comes with the number of packets dropped before it."""
 DROP_SPACE = 64
 """Bytes for that number."""
 
@@ -24,11 +24,11 @@ DROP_SPACE = 64
 class Correspondent(Sender):
     """A UDP sender.
 
-    Args: address: of it.  own: a socket for its packets alone; None if the system grants none.
+    Args: address: of the sender.  own: a socket for its packets alone; None if the system grants none.
 
     Attributes:
-        lost: packets that the system dropped.
-        told: of how many dropped lines and packets it was told.
+        lost: number of packets that the system dropped.
+        told: number of dropped lines and packets that it was told.
     """
 
     def __init__(self, address: Any, own: socket.socket | None) -> None:
@@ -40,15 +40,15 @@ class Correspondent(Sender):
 
     @property
     def surplus(self) -> int:
-        """Lines and packets of it that were dropped."""
+        """Number of its dropped lines and packets."""
         return self.dropped + self.lost
 
 
 class UdpServer(Listener):
-    """Packets of one or more whole lines.
+    """Receives packets of one or more whole lines.
 
-    The first packet of a sender comes through the common socket. Later ones come through a socket that is connected to
-    that sender: the system keeps packets for each apart, so that one that floods fills its own buffer alone.
+    The first packet of a sender comes through the common socket. Later ones come through a socket connected to that
+    sender: the system queues each sender's packets separately, so that a flood fills its own buffer alone.
     """
 
     scheme = "udp"
@@ -69,11 +69,11 @@ class UdpServer(Listener):
                 senders = [sender for sender in self._senders.values() if sender.socket is not None]
                 read = [sender for sender in senders if not sender.full]
                 timeout = WAIT if len(read) == len(senders) else PAUSE
-                if perf_counter() > look:  # now and then the full ones too: the system drops the rest at less cost
+                if perf_counter() > look:  # now and then the full ones too: dropping here costs less than in the system
                     read, look = senders, perf_counter() + PAUSE
                 own = [sender.socket for sender in read if sender.socket is not None]
                 for ready in readable([self._socket, *own], timeout):
-                    most = WAITING if ready is self._socket else 1  # what came before a sender had its own goes first
+                    most = WAITING if ready is self._socket else 1  # packets from before its own socket come first
                     for _ in range(most):
                         found = self._receive(ready)
                         if found is None:
@@ -85,10 +85,10 @@ class UdpServer(Listener):
                 _close(sender.socket)
 
     def _receive(self, place: socket.socket) -> Iterator[Line] | None:
-        """The lines of a packet; None if there is no packet, or nobody to whom it may belong."""
+        """The lines of a packet; None without a packet, or for an unknown sender."""
         try:
             packet, extra, _, address = place.recvmsg(CHUNK, DROP_SPACE)
-        except OSError:  # none is left, or the system tells that nobody heard a notice
+        except OSError:  # none is left, or the system reports an unheard notice
             return None
         sender = self._senders.get(address) or self._newcomer(address)
         if sender is None:
@@ -114,7 +114,7 @@ class UdpServer(Listener):
         return sender
 
     def _refuse(self, address: Any) -> None:
-        """Tell a sender that it is one too many, once for each notice."""
+        """Tells a sender that there are too many, once for each notice."""
         if self.say("refused", f"{SENDERS} senders are heard: the packets of {written(address)} are refused"):
             self._refused.clear()
         if address not in self._refused and len(self._refused) < SENDERS:
@@ -138,7 +138,7 @@ class UdpServer(Listener):
         return own
 
     def _tell_surplus(self) -> None:
-        """Tell senders how much of theirs was dropped, and the user of the worst."""
+        """Tells senders the number of their dropped lines and packets, and the user the worst."""
         new = [sender for sender in self._senders.values() if sender.surplus > sender.told]
         if not new:
             return
@@ -155,7 +155,7 @@ class UdpServer(Listener):
 
 
 def _count_drops(own: socket.socket) -> None:
-    """Ask the system to tell how many packets it drops, where it can."""
+    """Makes the system report the number of dropped packets, where it can."""
     if sys.platform == "linux":
         own.setsockopt(socket.SOL_SOCKET, DROPS, 1)
 

@@ -1,5 +1,1 @@
-"""Synthetic recordings: the simulator's balls, filmed by cameras over a table, with the truth beside the videos."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+"""Films the simulator's balls by cameras over a table, with their true states beside the videos."""

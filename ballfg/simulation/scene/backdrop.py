@@ -1,4 +1,4 @@
-"""What a camera sees when nothing moves: every ray of the image is followed to what it hits in the room."""
+"""Draws a camera's view of the still room by following every ray of the image."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -27,17 +27,17 @@ from ballfg.vision.camera import Camera
 Image = NDArray[np.float32]
 
 SAMPLES: Final = 6
-"""Rays along each axis of a pixel on an edge: an edge is drawn to a twelfth of a pixel."""
+"""Number of rays along each axis of a pixel on an edge: an edge is drawn to a twelfth of a pixel."""
 EDGE_REACH: Final = 5
-"""px, side of the square about an edge that is drawn finely."""
+"""px, side of the finely drawn square around an edge."""
 TEXTURE_SIDE: Final = 512
-"""Texels along a side of the texture; it repeats."""
+"""Number of texels along a side of the repeated texture."""
 TEXELS_PER_METRE: Final = 90.0
 """About one texel to four pixels at 3 m: smooth for a camera, yet nowhere flat."""
 TEXTURE_DEPTH: Final = 0.09
 """Standard deviation of the texture, relative to the colour."""
 ROW: Final = 1024
-"""Points that are looked up in the texture as one row: OpenCV counts rows and columns in 16 bits."""
+"""Number of points looked up in the texture as one row: OpenCV counts rows and columns in 16 bits."""
 FACES: Final = 6
 """Numbers of faces for each box: across x, y and z, and a line on the last. Two opposite faces are never neighbours."""
 _SIDE_LIGHT: Final = (0.72, 0.85, 1.0)
@@ -52,11 +52,11 @@ class Backdrop:
     """(h, w, 3) blue, green, red, grey levels."""
 
     distance: Image
-    """(h, w) m, from the camera to what is seen."""
+    """(h, w) m, from the camera to the visible surface."""
 
 
 def backdrop(camera: Camera, kind: BallKind, rng: np.random.Generator) -> Backdrop:
-    """Draws the room as a camera sees it; the same generator state gives every camera the same textures.
+    """Draws the room in a camera's view; the same generator state gives every camera the same textures.
 
     Args: camera: must stand in the room.
     Raises: ValueError: the camera stands outside the room.
@@ -80,7 +80,7 @@ def backdrop(camera: Camera, kind: BallKind, rng: np.random.Generator) -> Backdr
 
 
 def _edges(faces: NDArray[np.uint8], thin: Array) -> NDArray[np.bool_]:
-    """(h, w) pixels about which one face ends and another begins, and those near pixels (n, 2) of a thin line."""
+    """(h, w) pixels around borders of faces, and those near pixels (n, 2) of a thin line."""
     around = np.ones((EDGE_REACH, EDGE_REACH), dtype=np.uint8)
     column, row = np.round(thin[np.isfinite(thin).all(axis=1)]).astype(int).T
     shown = (column >= 0) & (column < faces.shape[1]) & (row >= 0) & (row < faces.shape[0])
@@ -91,7 +91,7 @@ def _edges(faces: NDArray[np.uint8], thin: Array) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """What n rays hit."""
+    """Colours, distances and faces that n rays hit."""
 
     colours: Image
     """(n, 3)."""
@@ -100,12 +100,12 @@ class _Seen:
     """(n,) m."""
 
     faces: NDArray[np.uint8]
-    """(n,) numbers of faces; a white line of the table is one too."""
+    """(n,) numbers of faces, including the white lines of the table."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Room:
-    """The room, as one camera looks into it."""
+    """The room in the view of one camera."""
 
     camera: Camera
     kind: BallKind
@@ -113,7 +113,7 @@ class _Room:
     texture: Image
 
     def look(self, pixels: Array) -> _Seen:
-        """What is seen at pixels (n, 2)."""
+        """The visible surfaces at pixels (n, 2)."""
         camera = self.camera
         rays = (camera.normalized(pixels) @ camera.rotation[:2] + camera.rotation[2]).astype(np.float32)
         start = camera.centre.astype(np.float32)
@@ -136,7 +136,7 @@ class _Room:
 
 
 def _may_show(camera: Camera, box: Box, pixels: Array) -> NDArray[np.bool_]:
-    """(n,) pixels (n, 2) at which a box may be seen; all if the lens cannot show all of its corners."""
+    """(n,) True for pixels (n, 2) that may show a box; all if the lens cannot show all of its corners."""
     margin = 24 + camera.size[0] // 40  # straight edges bend between their corners
     corners = camera.project(box.corners())
     if not np.isfinite(corners).all():

@@ -1,4 +1,4 @@
-"""The image of a moving ball: which share of the exposure it covers each pixel, and how brightly it is lit.
+"""Draws the image of a moving ball: its cover of each pixel over the exposure, and its light.
 
 A pixel sees the ball where the angle between its ray and the ball's centre is below asin(R / distance): the exact
 outline of a sphere through the full camera model, the small ellipse of perspective included. Over the exposure the
@@ -15,13 +15,13 @@ from ballfg.simulation.scene.view import Rect, clipped
 from ballfg.vision.camera import Camera
 
 STEP: Final = 0.25
-"""px, longest step of the path along which the outline is averaged."""
+"""px, longest step of the path for averaging the outline."""
 MARGIN: Final = 2
-"""px of nothing about the outline."""
+"""px of empty margin around the outline."""
 SHADING: Final = 0.12
-"""How mildly the ball is shaded: a point facing away from the lamp has 1 - 2 `SHADING` of the light."""
+"""Depth of the ball's shading: a point facing away from the lamp has 1 - 2 `SHADING` of the light."""
 TINY: Final = 1e-12
-"""Stands for the zero distance of a pixel that looks at the very centre: any small number makes it covered."""
+"""Replaces the zero distance of a pixel at the very centre; any small number makes it covered."""
 _LAMP: Final = np.array([0.3, 0.25, 0.92]) / np.linalg.norm([0.3, 0.25, 0.92])
 """Direction to the lamp, world."""
 
@@ -31,7 +31,7 @@ class BallImage:
     """A ball within a part of the image."""
 
     rect: Rect
-    """Which part."""
+    """Its part of the image."""
 
     cover: Array
     """(h, w) share of the exposure and of the pixel that the ball covers, 0 to 1."""
@@ -75,7 +75,7 @@ def _unit_rays(camera: Camera, pixels: Array) -> Array:
 
 
 def _resampled(path: Array, steps: int) -> Array:
-    """(steps, 3) the path in the middle of each of some equal shares of its time."""
+    """(steps, 3) the path at the middles of equal shares of its time."""
     place = (np.arange(steps) + 0.5) / steps * (len(path) - 1)
     before = np.minimum(place.astype(int), len(path) - 2)
     share = (place - before)[:, None]
@@ -85,7 +85,7 @@ def _resampled(path: Array, steps: int) -> Array:
 def _swept(rays: Array, per_pixel: Array, centres: Array, radius: float, lamp: Array) -> tuple[Array, Array]:
     """Cover and light (p,) of the pixels of rays (h, w, 3), averaged over centres (s, 3) m, camera's frame.
 
-    `per_pixel` (2, 3) is how a ray turns from one pixel to the next, to the right and down.
+    `per_pixel` (2, 3) is the change of a ray from one pixel to the next, to the right and down.
     Chords between unit vectors stand for angles: the outline is where |ray - towards| is the chord of asin(R / d). The
     signed distance to it, divided by how fast the chord grows per pixel, is in pixels; a pixel whose middle is x px
     inside is covered by 1/2 + x, between 0 and 1.

@@ -1,11 +1,12 @@
-"""The configuration of a synthetic recording: shots, clocks of the cameras, shutter, noise."""
+"""Configures a synthetic recording: shots, clocks of the cameras, shutter, noise."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
 from ballfg.checks import check_choice, check_flag
-from ballfg.dynamics import AnalyticModel, Effect
+from ballfg.dynamics import AnalyticModel
+from ballfg.dynamics.effect import Effect
 from ballfg.simulation.balls import BallKind, table_tennis
 from ballfg.simulation.bounded import bounded, check_bounds
 from ballfg.simulation.composition import true_model
@@ -15,12 +16,12 @@ from ballfg.simulation.settings import Settings, all_settings
 MAX_SHOTS: Final = 10_000
 COLOURS: Final = ("white", "orange")
 LONGEST_EXPOSURE: Final = 0.95
-"""As a share of the frame interval; a sensor needs the rest to be read out."""
+"""As a share of the frame interval; a sensor needs the rest for its readout."""
 
 
 @dataclass(frozen=True)
 class Clock:
-    """The times at which a camera takes its frames, and the delay of its stamps.
+    """The exposure times of a camera, and the delay of its stamps.
 
     Raises: ValueError, TypeError: a value out of its bounds; the message names it.
     """
@@ -52,7 +53,7 @@ class SceneConfig:
     """Seed of all random numbers."""
 
     settings: Mapping[str, Sequence[int]] = field(default_factory=dict)
-    """Levels by launcher setting (topspin, sidespin, speed), for those that are not to run through all levels."""
+    """Levels by launcher setting (topspin, sidespin, speed), for restricted settings."""
 
     undeclared: tuple[Effect, ...] = ()
     """Effects that act on the ball although no model file declares them."""
@@ -61,16 +62,16 @@ class SceneConfig:
     """Hz, frames per second of every camera."""
 
     exposure: float = bounded(0.002, 1e-5, 0.1)
-    """s, for which the shutter is open; a frame's stamp is its middle."""
+    """s, duration of the open shutter; a frame's stamp is its middle."""
 
     clocks: Mapping[str, Clock] = field(default_factory=dict)
-    """By camera; a camera that is not named has `Clock()`: all of those expose at once."""
+    """By camera; all unnamed cameras have `Clock()` and expose at once."""
 
     dropout: float = bounded(0.0, 0.0, 0.95)
     """Probability that a frame is missing, for each frame by itself."""
 
     jitter: float = bounded(0.0, 0.0, 1.0)
-    """s, standard deviation of the written stamp about the true time; cut off at 3 sigma. At most 0.15 frames."""
+    """s, standard deviation of the recorded stamp about the true time; cut off at 3 sigma. At most 0.15 frames."""
 
     colour: Literal["white", "orange"] = "white"
     """Colour of the ball."""
@@ -82,7 +83,7 @@ class SceneConfig:
     """Relative amplitude of the lamps' flicker at 100 Hz, from the mains."""
 
     distractors: bool = True
-    """Whether things other than the ball move: people in white shirts who swing an arm, a gliding reflection."""
+    """True to draw other moving objects: people in white shirts who swing an arm, a gliding reflection."""
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -104,13 +105,13 @@ class SceneConfig:
 
     @property
     def ball(self) -> BallKind:
-        """The ball that is launched, with its table."""
+        """The launched ball, with its table."""
         return table_tennis()
 
     def combinations(self) -> Settings:
-        """(m, 3) numbers of the launcher's levels that are shot."""
+        """(m, 3) numbers of the levels of all shots."""
         return all_settings(self.settings)
 
     def model(self) -> AnalyticModel:
-        """How the ball truly moves: as declared, and with what is undeclared."""
+        """The true motion of the ball, with declared and undeclared effects."""
         return true_model(self.ball.model, self.undeclared)

@@ -1,7 +1,7 @@
-"""The true balls of a recording, at any moment: each flight is kept as knots, and advanced from the knot before.
+"""Computes the true balls of a recording at any time, from knots along each flight.
 
-Between knots the simulator's own integration runs on to the very moment that is asked for, through a contact if there
-is one: nothing is interpolated, so that a bounce stays as sharp as it is in the simulator.
+From the last knot the simulator's own integration runs on to the requested time, through a contact if there is one:
+nothing is interpolated, so that a bounce stays as sharp as in the simulator.
 """
 
 from dataclasses import dataclass, field
@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike
 
 from ballfg.arrays import Array
 from ballfg.checks import shown
-from ballfg.dynamics import AnalyticModel, Surfaces, advance
+from ballfg.dynamics import AnalyticModel, Surfaces
+from ballfg.dynamics.motion.rollout import advance
 from ballfg.simulation.config import MotionNoise
 from ballfg.simulation.motion import simulate_motion
 from ballfg.simulation.scene.config import SceneConfig
@@ -26,7 +27,7 @@ KNOT_RATE: Final = 200.0
 BEFORE: Final = 0.5
 """s of empty scene before the first launch, and after the last flight."""
 START_SPREAD: Final = 0.05
-"""s over which launches are spread about their interval, so that they do not keep step with the frames."""
+"""s, spread of launches about their interval, so that they do not keep step with the frames."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,14 +44,14 @@ class Flight:
     """(k, 9) states every 1 / `KNOT_RATE` s from the launch on."""
 
     model: AnalyticModel = field(repr=False)
-    """How it moves."""
+    """Model of its motion."""
 
     surfaces: Surfaces = field(repr=False)
-    """What it bounces on."""
+    """Its surfaces."""
 
     @property
     def end(self) -> float:
-        """S, true time of the last knot; then the ball is gone."""
+        """True time in s of the last knot, at which the ball disappears."""
         return self.start + (len(self.knots) - 1) / KNOT_RATE
 
     @torch.no_grad()
@@ -91,5 +92,5 @@ def fly_shots(config: SceneConfig) -> list[Flight]:
 
 
 def duration(flights: list[Flight]) -> float:
-    """S, true time at which a recording of these flights ends; it begins at zero."""
+    """True time in s at which a recording of these flights ends; it begins at zero."""
     return max(flight.end for flight in flights) + BEFORE

@@ -1,6 +1,6 @@
-"""What else moves: people in white shirts who sway and swing an arm, and a bright reflection that glides along.
+"""Draws other moving objects: people in white shirts who sway and swing an arm, and a gliding reflection.
 
-All are capsules (a ball swept along a segment) that stand in the world, so that every camera sees the same thing.
+All are capsules (a ball swept along a segment) in the world, so that every camera sees the same objects.
 """
 
 from dataclasses import dataclass
@@ -15,8 +15,8 @@ from ballfg.simulation.scene.view import Rect, clipped
 from ballfg.vision.camera import Camera
 
 PEOPLE: Final = ((0.35, -3.1, 1.5, 0.0), (2.6, 3.2, -1.7, 0.4))
-"""m, m, rad, s: x and y of each, which way they face (from +x), how late they sway and swing. They watch from the
-sides, behind the cameras of `ballfg.simulation.cameras.table_rig` or behind the table, never between."""
+"""m, m, rad, s: x and y of each person, direction (from +x), delay of sway and swing. They stand at the sides, behind
+the cameras of `ballfg.simulation.cameras.table_rig` or behind the table, never between."""
 SWAY: Final = (0.03, 0.35)
 """m and Hz."""
 SWING: Final = (0.9, 0.8)
@@ -28,13 +28,13 @@ _TROUSERS: Final[Colour] = (62.0, 46.0, 40.0)
 _SKIN: Final[Colour] = (108.0, 138.0, 192.0)
 _REFLECTION: Final[Colour] = (232.0, 240.0, 238.0)
 _SHOULDER: Final = np.array([0.05, 0.24, 1.42])
-"""m, of the arm that swings: ahead, to the left, up."""
+"""m, of the swinging arm: ahead, to the left, up."""
 SHORTLY: Final = 1e-4
-"""s, over which speeds are taken: in it nothing moves by a pixel."""
+"""s, interval for speeds: within it nothing moves by a pixel."""
 SHORTEST: Final = 1e-6
-"""px^2, squared length of a segment that is seen end on: it is a disc then."""
+"""px^2, least squared length of a segment; a shorter one is drawn as a disc."""
 ROUND_SHADE: Final = 0.3
-"""How much darker a capsule is at its edge than along its middle."""
+"""Difference in brightness between a capsule's edge and its middle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,11 +51,11 @@ class Capsule:
     """Grey levels, blue green red."""
 
     velocity: Array
-    """(2, 3) m/s of the ends; blurs the outline."""
+    """(2, 3) m/s of the ends, for the blur of the outline."""
 
 
 def movers(time: float) -> list[Capsule]:
-    """What moves besides the ball, at a true time in s."""
+    """The moving objects besides the ball, at a true time in s."""
     now, later = _places(time), _places(time + SHORTLY)
     velocities = [(after - before) / SHORTLY for (before, _, _), (after, _, _) in zip(now, later, strict=True)]
     return [Capsule(ends, radius, colour, v) for (ends, radius, colour), v in zip(now, velocities, strict=True)]
@@ -70,7 +70,7 @@ def _places(time: float) -> list[tuple[Array, float, Colour]]:
 
 
 def _person(x: float, y: float, facing: float, time: float) -> list[tuple[Array, float, Colour]]:
-    """The capsules of a person who stands at x, y m; `facing` rad from +x."""
+    """The capsules of a person at x, y m; `facing` rad from +x."""
     angle = SWING[0] * np.sin(2 * np.pi * SWING[1] * time) - 0.5
     forearm = 1.3 * angle + 0.4
     elbow = _SHOULDER + 0.3 * np.array([np.cos(angle), 0.3, np.sin(angle)])
@@ -93,13 +93,13 @@ def _person(x: float, y: float, facing: float, time: float) -> list[tuple[Array,
 def draw(
     image: NDArray[np.float32], distance: NDArray[np.float32], camera: Camera, capsule: Capsule, exposure: float
 ) -> Rect | None:
-    """Draws a capsule where nothing of the still room is nearer.
+    """Draws a capsule where the still room is not nearer.
 
     Args:
         image: (h, w, 3) grey levels, changed in place.
         distance: (h, w) m, of the room.
         exposure: s, for the blur of its motion.
-    Returns: the part of the image that has changed; None if none has.
+    Returns: the changed part of the image, or None.
     """
     pixels = camera.project(capsule.ends)
     if not np.isfinite(pixels).all():

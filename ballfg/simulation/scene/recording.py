@@ -1,4 +1,4 @@
-"""A recording before it is drawn: the balls, the cameras, and what each camera's frames hold and show."""
+"""A recording holds the balls, the cameras, and the content of each camera's frames, before drawing."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -18,10 +18,10 @@ from ballfg.vision.camera import Camera
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What happened, and when each camera looked. Cameras are counted in the order of `cameras`."""
+    """Balls and frames of a recording. Cameras are counted in the order of `cameras`."""
 
     config: SceneConfig
-    """What was asked for."""
+    """The settings."""
 
     cameras: tuple[Camera, ...]
     """The rig."""
@@ -30,13 +30,13 @@ class Recording:
     """The balls, in the order of their launches."""
 
     frames: tuple[Frames, ...]
-    """Of each camera."""
+    """Frames of each camera."""
 
     passages: tuple[tuple[Passage, ...], ...]
-    """Of each camera, in the order of `flights`."""
+    """Passages of each camera, in the order of `flights`."""
 
     def clock(self, name: str) -> Clock:
-        """That of the camera with this name."""
+        """The clock of the camera with this name."""
         return self.config.clocks.get(name, Clock())
 
     def images(self, number: int) -> Iterator[NDArray[np.uint8]]:
@@ -46,15 +46,15 @@ class Recording:
 
     @property
     def image_count(self) -> int:
-        """Frames of all cameras together."""
+        """Number of frames of all cameras together."""
         return sum(len(frames.times) for frames in self.frames)
 
 
 def record(config: SceneConfig, cameras: Sequence[Camera]) -> Recording:
-    """Launches the balls and opens the shutters; images are drawn when they are asked for.
+    """Launches the balls and opens the shutters; images are drawn on demand.
 
-    Args: cameras: with names of their own; `ballfg.simulation.cameras.table_rig` makes a rig.
-    Raises: ValueError: no camera, two of one name, or a clock of a camera that is not there.
+    Args: cameras: with unique names; `ballfg.simulation.cameras.table_rig` makes a rig.
+    Raises: ValueError: no camera, two of one name, or a clock of an unknown camera.
     """
     names = [camera.name for camera in cameras]
     if not names or len(set(names)) < len(names):
@@ -70,12 +70,12 @@ def record(config: SceneConfig, cameras: Sequence[Camera]) -> Recording:
 
 
 def visible_columns(recording: Recording, number: int) -> dict[str, Any]:
-    """The table of one camera, against which tracks are judged: a row for each frame and ball centre in the image.
+    """The table of one camera, for the evaluation of tracks: a row for each frame and ball centre in the image.
 
-    Columns: `camera`; `frame`, counted from 0 over the frames that were written; `t` (s), its stamp; `t_true` (s), the
-    true time of the middle of its exposure; `trajectory`, the ball's; `u,v` (px), where its centre is in the middle of
-    the exposure; `u_open,v_open,u_close,v_close` (px), where it is as the shutter opens and closes; `radius` (px),
-    the mean one of its outline; `whole`, 1 if all of its outline lies in the image throughout the exposure, else 0.
+    Columns: `camera`; `frame`, counted from 0 over the written frames; `t` (s), its stamp; `t_true` (s), the true time
+    of the middle of its exposure; `trajectory`, the ball's; `u,v` (px), its centre in the middle of the exposure;
+    `u_open,v_open,u_close,v_close` (px), its centre as the shutter opens and closes; `radius` (px), the mean one of its
+    outline; `whole`, 1 if all of its outline lies in the image throughout the exposure, else 0.
     """
     camera, frames = recording.cameras[number], recording.frames[number]
     rows: list[dict[str, Any]] = []

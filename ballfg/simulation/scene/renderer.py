@@ -1,6 +1,6 @@
-"""Frames of one camera: the still room, what moves in it, the lens, flickering light, noise, eight bits.
+"""Renders the frames of one camera: still room, moving objects, lens, flickering light, noise, eight bits.
 
-The room is drawn once. A frame redraws only where something moves; the lens and the level of noise are redone there.
+The room is drawn once. A frame redraws only the moving parts; the lens and the level of noise are redone there.
 """
 
 from collections.abc import Iterator, Sequence
@@ -27,19 +27,19 @@ Pixels = NDArray[np.uint8]
 LENS_BLUR: Final = 0.7
 """px, standard deviation of the point spread of the lens."""
 _REACH: Final = 3
-"""px to which the blur reaches: four standard deviations."""
+"""px, extent of the blur: four standard deviations."""
 MAINS: Final = 100.0
 """Hz at which lamps flicker on a 50 Hz mains."""
 MIDDLE_GREY: Final = 128.0
 """Grey level at which the noise has twice the variance of black."""
 NOISE_MARGIN: Final = 256
-"""px by which the field of noise is larger than the image: each frame cuts its noise from another place of it."""
+"""px by which the field of noise exceeds the image: each frame cuts its noise from another place of it."""
 BALL_COLOURS: Final[dict[str, Colour]] = {"white": (226.0, 230.0, 230.0), "orange": (40.0, 128.0, 236.0)}
 """Blue, green, red of a ball in full light, grey levels."""
 
 
 class Renderer:
-    """Draws what a camera sees of a recording.
+    """Draws a camera's images of a recording.
 
     Args: number: of the camera in the rig; it picks the random streams.
     """
@@ -74,8 +74,8 @@ class Renderer:
 
         Args:
             time: s, true time of the middle of the exposure.
-            paths: of each ball that is there, (m, 3) m, its centre from the shutter's opening to its closing. Balls are
-                drawn in front of everything else.
+            paths: for each ball, (m, 3) m, its centre from the shutter's opening to its closing. Balls are drawn in
+                front of everything else.
         """
         moving = movers(time) if self._config.distractors else []
         drawn = [draw(self._sharp, self._distance, self._camera, thing, self._config.exposure) for thing in moving]
@@ -100,7 +100,7 @@ class Renderer:
         return ball.rect
 
     def _through_lens(self, rect: Rect) -> Rect:
-        """Blurs a part of the sharp image into the image; returns the part that the blur reaches."""
+        """Blurs a part of the sharp image into the image; returns the part changed by the blur."""
         outer, wider = (grown(self._camera, rect, by) for by in (_REACH, 2 * _REACH))
         part = _blurred(self._sharp[wider[1] : wider[3], wider[0] : wider[2]])
         x, y = outer[0] - wider[0], outer[1] - wider[1]

@@ -1,4 +1,4 @@
-"""The room that a recording is made in: boxes, their colours, the table's lines. Geometry; nothing is drawn here."""
+"""Describes the room of a recording: boxes, their colours, the table's lines; geometry without drawing."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -45,7 +45,7 @@ class Box:
     """Of its sides, and of its top unless `lined`."""
 
     lined: bool = False
-    """Whether its top is the playing surface."""
+    """True if its top is the playing surface."""
 
     def corners(self) -> Array:
         """(8, 3) m."""
@@ -54,7 +54,7 @@ class Box:
 
 
 def furniture(kind: BallKind) -> list[Box]:
-    """What stands in the room: the table on its legs, the launcher, a bench, posters at the walls."""
+    """The furniture of the room: the table on its legs, the launcher, a bench, posters at the walls."""
     if kind.surfaces.extent is None:
         raise ValueError("surfaces must have an extent to be drawn as a table; got None. Use a ball over a table.")
     x0, x1, y0, y1 = kind.surfaces.extent
@@ -76,7 +76,7 @@ def furniture(kind: BallKind) -> list[Box]:
 
 
 def is_line(kind: BallKind, x: NDArray[np.floating], y: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Whether points of the playing surface, x and y in m, lie on a white line."""
+    """True for points of the playing surface, x and y in m, on a white line."""
     if kind.surfaces.extent is None:
         return np.zeros(np.shape(x), dtype=bool)
     x0, x1, y0, y1 = kind.surfaces.extent

@@ -1,4 +1,4 @@
-"""When each camera's shutter is open, what it writes about that, and where the balls are meanwhile."""
+"""Computes each camera's exposures, its stamps, and the places of the balls meanwhile."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,8 +15,8 @@ from ballfg.state import POSITION
 from ballfg.vision.camera import Camera
 
 PATH_POINTS: Final = 17
-"""Points of a ball's path through one exposure, the first at the opening, the last at the closing, the middle one at
-the stamp. Sixteen chords: a bounce within 2 ms is off by less than 0.1 mm over one of them."""
+"""Number of points of a ball's path through one exposure, the first at the opening, the last at the closing, the middle
+one at the stamp. Sixteen chords: a bounce within 2 ms is off by less than 0.1 mm over one of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,12 +27,12 @@ class Frames:
     """(f,) s, true time of the middle of each exposure."""
 
     stamps: Array
-    """(f,) s, what the camera writes."""
+    """(f,) s, stamps recorded by the camera."""
 
 
 @dataclass(frozen=True, eq=False)
 class Passage:
-    """One ball's way through the frames of one camera, seen or not."""
+    """One ball's way through the frames of one camera, visible or not."""
 
     name: str
     """Of the ball's track."""
@@ -50,12 +50,12 @@ class Passage:
 
 
 def free_running(names: Sequence[str], rate: float, seed: int) -> dict[str, Clock]:
-    """Clocks of cameras that nobody synchronised: first exposures fall all over one frame interval, never together.
+    """Clocks of unsynchronised cameras: first exposures are spread over one frame interval, never together.
 
     Args:
         names: of the cameras.
         rate: Hz.
-        seed: draws which camera comes when, each within the middle half of a share of the interval of its own.
+        seed: draws the order of cameras, each within the middle half of its own share of the interval.
     """
     rng = generator(seed, Purpose.SCENE_PHASE)
     place = rng.permutation(len(names)) + rng.uniform(0.25, 0.75, len(names))
@@ -63,11 +63,11 @@ def free_running(names: Sequence[str], rate: float, seed: int) -> dict[str, Cloc
 
 
 def frames_of(config: SceneConfig, camera: Camera, number: int, until: float) -> Frames:
-    """The frames that a camera takes from its first one on.
+    """The frames of a camera from its first one on.
 
     Args:
         config: rate, clocks, dropped frames, jitter.
-        camera: for its name and the time offset that it is known to have.
+        camera: for its name and its known time offset.
         number: of the camera in its rig; it picks the random streams.
         until: s, true time of the end of the recording.
     """
@@ -82,7 +82,7 @@ def frames_of(config: SceneConfig, camera: Camera, number: int, until: float) ->
 
 
 def passages_of(config: SceneConfig, flights: Sequence[Flight], frames: Frames) -> list[Passage]:
-    """Where each ball is during the exposures of a camera."""
+    """The place of each ball during the exposures of a camera."""
     within = config.exposure * np.linspace(-0.5, 0.5, PATH_POINTS)
     passages = []
     for flight in flights:

@@ -1,4 +1,4 @@
-"""Where points appear in an image, and parts of images."""
+"""Locates points in an image, and parts of images."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,11 +7,11 @@ from ballfg.arrays import Array
 from ballfg.vision.camera import Camera
 
 Rect = tuple[int, int, int, int]
-"""Left, top, right, bottom in pixels; right and bottom are the first that are out."""
+"""Left, top, right, bottom in pixels; right and bottom are the first ones outside."""
 
 
 def inside(camera: Camera, pixels: Array, reach: Array | float = 0.0) -> NDArray[np.bool_]:
-    """(...) whether discs of radius `reach` (...) px about pixels (..., 2) lie in the image; False for NaN."""
+    """(...) True for discs of radius `reach` (...) px about pixels (..., 2) inside the image; False for NaN."""
     reach = np.asarray(reach)[..., None]
     return np.asarray(((pixels - reach >= -0.5) & (pixels + reach < np.array(camera.size) - 0.5)).all(axis=-1))
 
@@ -26,7 +26,7 @@ def clipped(camera: Camera, pixels: Array, margin: float) -> Rect | None:
 
 
 def grown(camera: Camera, rect: Rect, by: int) -> Rect:
-    """A part of the image with a margin in px, as far as the image goes."""
+    """A part of the image with a margin in px, clipped at the image's border."""
     left, top, right, bottom = rect
     width, height = camera.size
     return max(left - by, 0), max(top - by, 0), min(right + by, width), min(bottom + by, height)

@@ -1,4 +1,4 @@
-"""A recording as files: videos or images, stamps, cameras, and the truth about every ball and frame."""
+"""Writes a recording as files: videos or images, stamps, cameras, and the truth of every ball and frame."""
 
 import glob
 import itertools
@@ -52,10 +52,10 @@ def write_scene(
     Args:
         folder: new or empty; its parent must exist.
         images: PNG files in place of videos.
-        force: replace a scene that is there already.
-        watch: sees the images that are drawn.
+        force: replace an existing scene.
+        watch: called with the drawn images.
     Raises:
-        ValueError: the folder holds something else, or a camera cannot be a file's name.
+        ValueError: other content in the folder, or a camera's name that cannot be a file's name.
         FileNotFoundError: the folder's parent does not exist.
         OSError: OpenCV cannot write a video or an image here.
     """
@@ -86,7 +86,7 @@ def write_scene(
 
 
 def earlier_files(scene: Path) -> list[str]:
-    """Names of the files of the scene that is to be replaced. Raises: ValueError: its file was damaged."""
+    """Names of the files of an earlier scene. Raises: ValueError: its file was damaged."""
     names = read_mapping(scene).get("files") if scene.is_file() else []
     if not isinstance(names, list):
         raise ValueError(
@@ -101,7 +101,7 @@ def check_scene_folder(folder: Path, *, force: bool) -> None:
 
 
 def scene_content(recording: Recording) -> dict[str, Any]:
-    """The content of `scene.yaml`: everything that determines the recording."""
+    """The content of `scene.yaml`: all settings of the recording."""
     config = recording.config
     return {
         **{name: getattr(config, name) for name in ("seed", "shots", "interval", "rate", "exposure")},

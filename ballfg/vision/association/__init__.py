@@ -1,1 +1,1 @@
-"""From candidates of several cameras to balls in space."""
+"""Associates the candidates of several cameras to balls in space."""

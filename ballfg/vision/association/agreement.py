@@ -1,4 +1,4 @@
-"""Whether the cameras agree; if not, the camera that has moved since its calibration.
+"""Checks whether the cameras agree, and finds a camera that has moved since its calibration.
 
 Each camera in turn is turned and moved (six numbers) together with all points until the reprojection error is least,
 while the other cameras are fixed. The camera that moved then explains the disagreement, and no other one does. Three
@@ -21,12 +21,12 @@ from ballfg.vision.calibration.lens_covariance import POSE, slopes_of
 from ballfg.vision.camera import Camera
 
 LEAST_MISFIT: Final = 3.0
-"""Squared error, relative to that of noise, up to which cameras agree: half a pixel where centres are good to 0.3."""
+"""Largest squared error of agreeing cameras, relative to noise: half a pixel for centres good to 0.3."""
 LEAST_EXPLAINED: Final = 0.8
-"""Share of what is beyond noise that a culprit must explain."""
+"""Least share of the error beyond noise that a culprit must explain."""
 CLEARLY: Final = 4.0
-"""Least ratio of the error that another camera leaves unexplained: correcting the wrong one of three cameras may halve
-the disagreement, but never ends it."""
+"""Least ratio of the unexplained error of another camera: correcting the wrong one of three cameras may halve the
+disagreement, but never ends it."""
 CLEARLY_WORSE: Final = 1.5
 """Least ratio of the squared errors, noise included."""
 LEAST_POINTS: Final = 20
@@ -34,9 +34,9 @@ LEAST_POINTS: Final = 20
 MOST_POINTS: Final = 600
 """Most points that are used, evenly spread: more do not change the answer."""
 _LOOSE: Final = 20.0
-"""px, noise with which points are made of views that may be wrong."""
+"""px, noise for points from views that may be wrong."""
 _UNSEEN: Final = 1e4
-"""px, error of a sighting whose point lies behind the camera or beyond its lens: further than any image is wide."""
+"""px, error of a sighting whose point lies behind the camera or beyond its lens: more than any image's width."""
 _FAR: Final = 9.0
 """Median squared errors at which a point counts half."""
 _STEPS: Final = 8
@@ -53,7 +53,7 @@ class CameraAgreement:
     """px, median distance of its sightings from the points of the others; NaN if fewer than two others saw them."""
 
     explained: float
-    """Share of the disagreement beyond noise that is gone once this camera is corrected; NaN where there is none."""
+    """Share of the disagreement beyond noise that a correction of this camera removes; NaN without disagreement."""
 
     rotation: float
     """Degrees, turn of that correction."""
@@ -67,7 +67,7 @@ class CameraAgreement:
 
 @dataclass(frozen=True)
 class Agreement:
-    """Whether calibrated cameras agree about the balls that they saw."""
+    """The agreement of calibrated cameras on the balls that they saw."""
 
     culprit: str | None
     """The one camera whose correction explains the disagreement; None if they agree or if no single one does."""
@@ -79,7 +79,7 @@ class Agreement:
     """Median squared reprojection error over that of the noise: about 1 where cameras agree; NaN if not known."""
 
     sentence: str
-    """All this for a reader."""
+    """A summary for readers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +93,7 @@ class _Scene:
 
 
 def check_agreement(balls: Sequence[SeenBall], cameras: Sequence[Camera]) -> Agreement:
-    """Whether the cameras agree and, if not, which one has moved.
+    """Checks whether the cameras agree and, if not, which one has moved.
 
     Args: balls: as `associate` gives them, for the same cameras.
     Source: docs/associate.md.
@@ -123,7 +123,7 @@ def check_agreement(balls: Sequence[SeenBall], cameras: Sequence[Camera]) -> Agr
 
 
 def _views(balls: Sequence[SeenBall], cameras: list[Camera]) -> tuple[Array, Array]:
-    """Where every camera saw the balls at their points' times: pixels (n, c, 2), covariances; NaN where it did not."""
+    """Pixels (n, c, 2) of the balls in every camera at their points' times, covariances; NaN where not seen."""
     pixels, covariances = [np.zeros((0, len(cameras), 2))], [np.zeros((0, len(cameras), 2, 2))]
     for ball in balls:
         seen = ball.sightings
@@ -154,7 +154,7 @@ def _scene(cameras: list[Camera], pixels: Array, covariances: Array) -> _Scene:
 
 
 def _errors(scene: _Scene, cameras: list[Camera], points: Array) -> Array:
-    """(n, c, 2) px, seen minus projected; zero where not seen, `_UNSEEN` where it was seen and cannot be."""
+    """(n, c, 2) px, seen minus projected; zero where not seen, `_UNSEEN` for an impossible sighting."""
     projected = np.stack([camera.project(points) for camera in cameras], axis=1)
     return np.where(np.isnan(scene.pixels), 0.0, np.nan_to_num(scene.pixels - projected, nan=_UNSEEN))
 
@@ -198,7 +198,7 @@ def _refined(scene: _Scene, cameras: list[Camera], points: Array, nudged: int | 
 
 
 def _against_others(scene: _Scene, cameras: list[Camera], k: int) -> float:
-    """px, median distance of a camera's sightings from the points that the others make."""
+    """px, median distance of a camera's sightings from the points of the others."""
     others = scene.pixels.copy()
     others[:, k] = np.nan
     points = triangulate(cameras, others, np.broadcast_to(_LOOSE**2 * np.eye(2), (*others.shape, 2))).points

@@ -1,4 +1,4 @@
-"""From every camera's candidates to balls in space; docs/associate.md tells how.
+"""Turns every camera's candidates into balls in space; docs/associate.md explains the steps.
 
 The steps: pieces of smooth motion in each image; matching of pieces between cameras; points in space; joining of pieces
 of one flight; unassigned candidates that fit; removal of tracks that do not fall like a ball.
@@ -128,14 +128,14 @@ def _joined(footage: Footage, balls: list[Gathered]) -> list[Gathered]:
 
 
 def _may_follow(footage: Footage, one: Gathered, other: Gathered) -> bool:
-    """Whether hardly any camera saw both in one frame; where one did, one of the candidates is wrong."""
+    """True if hardly any camera saw both in one frame; where one did, one of the candidates is wrong."""
     frames = [seen.frame for seen in footage.detections]
     pairs = zip(frames, one.rows, other.rows, strict=True)
     return all(np.isin(frame[mine], frame[theirs]).sum() <= _DISPUTED for frame, mine, theirs in pairs)
 
 
 def _undisputed(seen: Detections, rows: Index) -> Index:
-    """Ascending, without those of frames that have two."""
+    """Rows in ascending order, without frames that have two."""
     _, position, count = np.unique(seen.frame[rows], return_inverse=True, return_counts=True)
     return np.sort(rows[count[position] == 1])
 

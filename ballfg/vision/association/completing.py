@@ -1,4 +1,4 @@
-"""Unassigned candidates near the predicted track of a ball, between its own candidates and at the ends."""
+"""Adds unassigned candidates near a ball's predicted track, between its own candidates and at the ends."""
 
 from collections.abc import Sequence
 from typing import Final

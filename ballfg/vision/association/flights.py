@@ -1,4 +1,4 @@
-"""Tracks in space that fall as a ball does, and tracks that are parts of one flight.
+"""Selects tracks in space that fall as a ball does, and joins tracks of one flight.
 
 Between bounces a ball's acceleration is gravity, drag and lift; a waved arm's is not. Two tracks belong together if the
 continuation of the first meets that of the second in the gap, with a kink where the ball bounced or was hit.
@@ -59,7 +59,7 @@ _STEPS: Final = 25
 
 
 def is_ball(track: Path) -> bool:
-    """Whether a track in space (d = 3) is a ball's: long enough, not too fast, and falling."""
+    """True for a track in space (d = 3) of a ball: long enough, not too fast, and falling."""
     if np.ptp(track.values, axis=0).max() < LEAST_WAY:
         return False
     for length in _WINDOWS:
@@ -70,7 +70,7 @@ def is_ball(track: Path) -> bool:
 
 
 def _falling(track: Path, length: float) -> list[bool]:
-    """Whether the motion is a free ball's, for each informative window of a length (s)."""
+    """(w,) True for each informative window of a length (s) with a free ball's motion."""
     found = []
     for number in range(int(track.parts[-1]) + 1):
         rows = np.flatnonzero(track.parts == number)
@@ -83,7 +83,7 @@ def _falling(track: Path, length: float) -> list[bool]:
 
 
 def _falls(track: Path, window: NDArray[np.intp]) -> bool | None:
-    """Whether the motion in a window is a free ball's; None where the noise hides it."""
+    """True if the motion in a window is a free ball's; None if the noise hides it."""
     time = track.times[window] - track.times[window].mean()
     solved = np.linalg.pinv(np.stack((np.ones_like(time), time, 0.5 * time**2), axis=1))
     _, velocity, acceleration = solved @ track.values[window]

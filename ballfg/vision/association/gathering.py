@@ -1,4 +1,4 @@
-"""Which candidates of which camera are one ball, and the points in space that they make on one clock."""
+"""Gathers the candidates of a ball from all cameras and makes its points in space on one clock."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections
 
 SAME_SHUTTER: Final = 2e-4
-"""s, stamps of different cameras that are closer belong to one shutter: at 15 m/s the ball moves 3 mm."""
+"""s, largest difference between stamps of one shutter: at 15 m/s the ball moves 3 mm."""
 
 
 @dataclass(frozen=True, eq=False)
 class Footage:
-    """A recording: what its cameras saw, on one clock that begins with the first frame of all."""
+    """A recording of all cameras, on one clock that begins with the first frame of all."""
 
     cameras: Sequence[Camera]
     detections: Sequence[Detections]
@@ -30,7 +30,7 @@ class Footage:
     origin: float = 0.0
     """s, stamp of the first frame of all; the detections' stamps are counted from it."""
     stamps: Sequence[Array] = ()
-    """For each camera (f,) s, the stamps of its frames as the camera wrote them."""
+    """For each camera (f,) s, the recorded stamps of its frames."""
     offset: float = 0.0
     """px, error of the calibration, added to every pixel's noise."""
 
@@ -46,14 +46,14 @@ class Footage:
 
 @dataclass(frozen=True, eq=False)
 class Gathered:
-    """A ball in the making."""
+    """A ball during the association."""
 
     rows: tuple[Index, ...]
     """For each camera the numbers of its candidates, ascending; never two of one frame."""
     track: Path
     """Its points in space over true time, with the covariances that noise gives them."""
     covariances: Array
-    """(n, 3, 3) m^2, the calibration's error included."""
+    """(n, 3, 3) m^2, including the calibration's error."""
     views: Index
     """(n,) cameras that made each point."""
 
@@ -72,7 +72,7 @@ class SeenBall:
     """(n, 3, 3) m^2, of each point by itself; interpolated points share samples and so a little of their error."""
 
     sightings: Sightings
-    """What the points come from, each at its own camera's stamp."""
+    """The sightings behind the points, each at its own camera's stamp."""
 
     views: Index
     """(n,) number of cameras that made each point."""
@@ -82,7 +82,7 @@ class SeenBall:
 
 
 def gather(footage: Footage, rows: Sequence[Index]) -> Gathered:
-    """The points that candidates of several cameras make; none where fewer than two agree.
+    """The points of candidates of several cameras; none if fewer than two agree.
 
     Args: rows: for each camera the numbers of its candidates, one a frame at most, ascending.
     """
@@ -102,7 +102,7 @@ def gather(footage: Footage, rows: Sequence[Index]) -> Gathered:
 
 
 def _stamps(footage: Footage, rows: Sequence[Index]) -> Array:
-    """(k,) s, true times at which a point is wanted: stamps of the shared shutter or of the camera that saw most."""
+    """(k,) s, true times of the points: stamps of the shared shutter or of the camera that saw most."""
     most = int(np.argmax([len(mine) for mine in rows]))
     stamps = footage.shared if footage.shared is not None else footage.frames(most)
     seen = [footage.frames(c)[footage.detections[c].frame[mine[[0, -1]]]] for c, mine in enumerate(rows) if len(mine)]
@@ -121,7 +121,7 @@ def nearest(stamps: Array, times: Array) -> NDArray[np.intp]:
 
 
 def shared_stamps(frames: Sequence[Array], within: float) -> Array | None:
-    """The stamps that cameras share, if they do: those of all of them, each once.
+    """The stamps of a shared shutter, all cameras' together, each once; None without one.
 
     They share a shutter if most frames of the camera with fewer frames, of every two, lie within `within` s of one of
     the other's. Frames may be missing anywhere, and one camera may take every second frame only.

@@ -1,8 +1,8 @@
-"""Which pieces of different cameras show the same thing: those whose rays meet, frame after frame.
+"""Matches pieces of different cameras whose rays meet, frame after frame.
 
-How far rays of right pairs miss each other is not known beforehand: a camera that was nudged by half a degree is off by
+The distance between rays of right pairs is not known beforehand: a camera that was nudged by half a degree is off by
 nine pixels. It is measured first, for each pair of cameras, on the pairs of pieces that choose each other over a long
-time; then everything is judged by that scale.
+time; then all pairs are judged by that scale.
 """
 
 from collections.abc import Sequence
@@ -17,11 +17,11 @@ from ballfg.vision.association.paths import Path
 from ballfg.vision.camera import Camera
 
 WORST_OFFSET: Final = 5.0
-"""px, standard deviation of a calibration's error, as long as the recording has not said otherwise."""
+"""px, prior standard deviation of a calibration's error."""
 LEAST_OFFSET: Final = 0.3
-"""px, a calibration is never taken to be better than this when pieces are matched."""
+"""px, least error of a calibration in the matching."""
 _SIGNIFICANT: Final = 0.5
-"""Share of the noise's variance by which rays of right pairs must miss each other more than noise would."""
+"""Least excess of the miss of right pairs' rays, as a share of the noise's variance."""
 _MEDIAN_SQUARE: Final = 0.4549
 """Median of the square of a standard normal number."""
 _GATE: Final = 9.0
@@ -33,7 +33,7 @@ _LEAST_SUPPORT: Final = 1.5
 _LONG: Final = 8
 """Common times from which a pair of pieces says something about the calibration."""
 _SPEEDING: Final = 2.0
-"""By how much faster than both pieces something may move between them: at a bounce or a hit."""
+"""Largest excess of a speed between two pieces over those of both: at a bounce or a hit."""
 _NEARBY: Final = 15.0
 """px, how far apart two successive pieces of one camera may be at least, however slow they are."""
 _NEAREST: Final = 0.1
@@ -42,7 +42,7 @@ _NEAREST: Final = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A smoothly moving thing in one camera."""
+    """A smoothly moving object in one camera."""
 
     camera: int
     """Number of the camera."""
@@ -51,7 +51,7 @@ class Piece:
     """(k,) its candidates."""
 
     path: Path
-    """Where it was in the image, over true time."""
+    """Its place in the image, over true time."""
 
     @property
     def start(self) -> float:
@@ -70,11 +70,11 @@ class _Pair:
 
     first: int
     second: int
-    misses: Array  # (k,) px, what is left between the rays; NaN where they do not meet in front
+    misses: Array  # px, distance between the rays; NaN where they do not meet in front
     variances: Array  # (k,) px^2, of the misses by noise and interpolation
 
     def support(self, offset: float) -> float:
-        """In common times: how many speak for the pair, less what speaks against it. `offset`: px, of calibration."""
+        """Common times that support the pair, less those against it. `offset`: px, of calibration."""
         square = self.misses**2 / (self.variances + offset**2)
         square = np.where(np.isnan(square), 2.0 * _GATE, np.minimum(square, 2.0 * _GATE))
         return float((1.0 - square / _GATE).sum())
@@ -82,17 +82,17 @@ class _Pair:
 
 @dataclass(frozen=True)
 class Matching:
-    """What belongs together."""
+    """The result of a matching."""
 
     groups: list[list[int]]
-    """Numbers of pieces that show the same thing, in the order of the first; pieces that match no other left out."""
+    """Numbers of pieces of the same object, in the order of the first; unmatched pieces are left out."""
 
     offset: float
-    """px, by how much rays of one thing miss each other beyond noise, in the worst pair of cameras; 0 if by none."""
+    """px, excess miss of rays of one object beyond noise, in the worst pair of cameras; 0 without any."""
 
 
 def match(pieces: Sequence[Piece], cameras: Sequence[Camera]) -> Matching:
-    """Groups the pieces that show the same thing. A group holds no two pieces of a camera at the same time."""
+    """Groups the pieces of the same object. A group holds no two pieces of a camera at the same time."""
     pairs = _pairs(pieces, cameras)
     offsets = _offsets(pieces, pairs, len(cameras))
     supported = []
@@ -184,7 +184,7 @@ def _offsets(pieces: Sequence[Piece], pairs: Sequence[_Pair], count: int) -> dic
 def _grouped(
     pieces: Sequence[Piece], supported: Sequence[tuple[float, int, int]], against: set[tuple[int, int]]
 ) -> list[list[int]]:
-    """Joins pieces along their links, the best supported first, unless that puts together what cannot be one thing."""
+    """Joins pieces along their links, the best supported first, unless the pieces exclude each other."""
     group_of = {number: [number] for _, *ends in supported for number in ends}
     for _, first, second in supported:
         one, other = group_of[first], group_of[second]

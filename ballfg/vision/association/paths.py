@@ -1,8 +1,8 @@
-"""Where something was between its samples: local polynomials that do not reach across bounces, with honest covariance.
+"""Interpolates paths by local polynomials that do not extend across bounces, with interpolation errors.
 
 A path is a sequence of samples cut into smooth parts. Between two samples of one part the value is that of the cubic
 through the nearest four. Between two parts, where the path has a kink, both sides are continued to where they meet.
-Nothing is said before the first sample, after the last, or in a long gap.
+No value exists before the first sample, after the last, or in a long gap.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from ballfg.arrays import Array, Index, Mask
 
 MAX_GAP: Final = 0.06
-"""s, longest gap between two samples of a smooth part that is bridged: three frames lost at 60 Hz."""
+"""s, longest bridged gap between two samples of a smooth part: three frames lost at 60 Hz."""
 RATE_OF_CHANGE: Final = 5.0
 """1/s, how fast an acceleration changes by its own size, in an image or in space: 15 m/s seen from 3 m away. What a
 polynomial leaves out is taken to be the acceleration times a power of this."""
@@ -145,7 +145,7 @@ def _least_squares(design: Array) -> Array:
 
 
 def _kinks(times: Array, values: Array, covariances: Array) -> Mask:
-    """(n - 1) whether the path bends sharply in an interval: one cubic does not fit three samples on either side.
+    """(n - 1) True for intervals with a sharp bend: one cubic does not fit three samples on either side.
 
     A kink spoils the fits of the neighbouring intervals too; the worst of five marks it. Where the path as a whole is
     rougher than its covariances say, its own roughness is the measure.

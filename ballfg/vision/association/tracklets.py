@@ -1,4 +1,4 @@
-"""Short pieces of one camera's view: candidates that follow each other as one smoothly moving thing would.
+"""Finds short pieces of smooth motion among one camera's candidates.
 
 A piece starts with three candidates in (nearly) successive frames, goes on where its quadratic continuation leads, and
 ends where two answers are equally good or nothing is found for a few frames. At a bounce, for instance, a new one
@@ -25,9 +25,9 @@ _PULL: Final = 7.0
 _GATE: Final = 16.0
 """Squared deviation, in variances of the prediction, up to which a candidate continues a piece: 4 sigma."""
 _MARGIN: Final = 9.0
-"""By how much the best answer's cost must beat the next for it to be clear."""
+"""Least advantage of the best answer's cost over the next for an unambiguous choice."""
 _LEAST_VARIANCE: Final = 0.06
-"""px^2, a candidate is never taken to be better placed than to a quarter of a pixel: compression, shading, the lens."""
+"""px^2, least variance of a candidate, a quarter of a pixel's sigma: compression, shading, the lens."""
 _SCORE_COST: Final = 6.0
 """Cost of a candidate of score 0 against one of score 1."""
 _STILL: Final = 3.0
@@ -102,7 +102,7 @@ def _offer(pieces: list[_Piece], candidates: list[_Seen], focal: float) -> None:
 
 
 def _accept(pieces: list[_Piece], done: list[_Piece]) -> None:
-    """Gives every piece its candidate where that is clear; moves pieces for which it is not to `done`."""
+    """Gives every piece its unambiguous candidate; moves the other pieces to `done`."""
     claims: dict[int, list[float]] = {}
     for piece in pieces:
         for cost, seen in piece.answers:
@@ -125,7 +125,7 @@ def _accept(pieces: list[_Piece], done: list[_Piece]) -> None:
 
 
 def _predicted(seen: list[_Seen], time: float, focal: float) -> tuple[float, float, float]:
-    """Where a piece continues at `time`: u, v, variance (px^2), by a parabola through three of its last samples.
+    """Continuation of a piece at `time`: u, v, variance (px^2), by a parabola through three of its last samples.
 
     Neighbours are a short lever, samples farther apart leave more curvature out; the surer answer counts.
     """

@@ -1,4 +1,4 @@
-"""Triangulation: where the rays of several cameras meet, how sure that is, and which of the cameras say so."""
+"""Triangulates the rays of several cameras to points with covariances, and leaves out wrong views."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _AROUND: Final = 0.5 * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0
 
 @dataclass(frozen=True, eq=False)
 class Triangulated:
-    """Points and what speaks for them. A row without a point has NaN there and in its covariance, and uses no view."""
+    """Points with their support. A row without a point has NaN there and in its covariance, and uses no view."""
 
     points: Array
     """(n, 3) m, world."""
@@ -42,15 +42,15 @@ class Triangulated:
     """(n, 3, 3) m^2."""
 
     used: Mask
-    """(n, c) whether the view took part; wrong ones do not."""
+    """(n, c) True for views that took part; wrong ones do not."""
 
     residuals: Array
-    """(n, c, 2) px, what was seen minus the point's projection, of views that did not take part too; NaN where none."""
+    """(n, c, 2) px, seen minus projected, including views that did not take part; NaN without a sighting."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Views:
-    """What c cameras see, in the planes z = 1 of their own frames, where projection is a division."""
+    """The views of c cameras, in the planes z = 1 of their own frames, where projection is a division."""
 
     rotations: Array  # (c, 3, 3) from the world to the cameras
     translations: Array  # (c, 3) m

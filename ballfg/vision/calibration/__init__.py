@@ -1,1 +1,1 @@
-"""Lens and place of cameras, from images of a board and from points of known place."""
+"""Calibrates lens and pose of cameras, from images of a board and from points of known place."""

@@ -1,4 +1,4 @@
-"""Calibration boards, chessboard and ChArUco: where their corners are in an image, to a fraction of a pixel."""
+"""Finds the corners of calibration boards, chessboard and ChArUco, in images."""
 
 import glob
 from collections.abc import Iterable, Iterator, Sequence
@@ -17,17 +17,17 @@ from ballfg.vision.arrays import Image
 from ballfg.vision.image_file import ENDINGS, read_image
 
 MIN_CORNERS: Final = 8
-"""Corners that a view must show: a homography needs 4, and twice as many tell when one of them is wrong."""
+"""Least number of corners in a view: a homography needs 4, and twice as many reveal a wrong one."""
 DICTIONARIES: Final = tuple(sorted(n.removeprefix("DICT_") for n in dir(cv2.aruco) if n.startswith("DICT_")))
 """Names of ArUco's dictionaries, without `DICT_`."""
 _SEARCH: Final = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
 _REFINE: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-3)
 _WINDOW: Final = 0.25
-"""Of the distance to the next corner: half the window of the refinement, which must not see another corner."""
+"""Half the window of the refinement, as a share of the distance to the next corner, which it must not contain."""
 _WINDOW_LIMITS: Final = (2, 8)
 """px, least and largest half window: smaller sees no edges, larger sees the lens bend them."""
 _IN_SQUARE: Final = 0.3
-"""Of a square's side: where, from a corner, the four squares around it are looked at."""
+"""Distance from a corner at which the four squares around it are sampled, as a share of a square's side."""
 _UNLIKE: Final = 0.5
 """Two squares that touch at a corner only may differ by this share of the contrast; more, and it is no such corner."""
 _TRIED: Final = 3
@@ -141,10 +141,10 @@ Board: TypeAlias = Chessboard | Charuco
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What one image shows of a board."""
+    """The corners of a board in one image."""
 
     name: str
-    """Of the image's file."""
+    """Name of the image's file."""
 
     size: tuple[int, int]
     """px, width and height of the image."""
@@ -192,7 +192,7 @@ def find_views(files: Iterable[Path], board: Board) -> Iterator[View]:
 
 
 def suggested(files: Sequence[Path], board: Board) -> str:
-    """What to say where no image shows the board: whether it has other numbers of squares; empty if that is not it."""
+    """A suggestion for images without a found board: another number of squares; empty without one."""
     for more in (1, -1):
         if min(board.columns, board.rows) + more < board.least:
             continue
@@ -210,7 +210,7 @@ def _dictionary(name: str) -> cv2.aruco.Dictionary:
 
 
 def _where_squares_meet(image: Image, grid: Array | NDArray[np.float32]) -> bool:
-    """Whether at every corner two dark and two light squares meet, like ones opposite.
+    """True if at every corner two dark and two light squares meet, with equal ones opposite.
 
     Where a row of the board lies outside the image, OpenCV's search takes the board's edge for it.
     """

@@ -1,4 +1,4 @@
-"""Where a camera stands: its pose from points of the world that it sees, for instance the table's corners."""
+"""Finds a camera's pose from world points in its image, such as the table's corners."""
 
 from dataclasses import dataclass, replace
 from typing import Final
@@ -15,22 +15,22 @@ from ballfg.vision.camera import Camera
 MIN_POINTS: Final = 4
 """Three points have up to four poses."""
 FLAT: Final = 0.01
-"""Of the points' extent: less out of line or out of plane than that is none at all."""
+"""Share of the points' extent: points closer to a line or plane count as lying in it."""
 MAX_RMS: Final = 4.0
-"""Times the sigma of a pixel: beyond it a point has a wrong name or stands elsewhere."""
+"""Multiple of the pixels' sigma: with larger residuals a point has a wrong name or place."""
 CLEARLY: Final = 9.0
-"""By which the second best pose must be worse, in sums of squared whitened residuals: three sigmas."""
+"""Least excess of the second best pose, in sums of squared whitened residuals: three sigmas."""
 _REFINE: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 
 
 @dataclass(frozen=True, eq=False)
 class Extrinsics:
-    """A camera whose place is known."""
+    """A camera with a known pose."""
 
     camera: Camera
 
     marked: Marked
-    """What it was found from."""
+    """The points of its calibration."""
 
     covariance: Array
     """(6, 6) of a small turn of the camera about the world's axes (rad) and of its centre (m), for an exact lens."""
@@ -47,17 +47,17 @@ class Extrinsics:
 
     @property
     def turn_sigma(self) -> float:
-        """rad, standard deviation of the camera's direction: of its worst axis."""
+        """rad, standard deviation of the camera's direction along its worst axis."""
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
 
     @property
     def centre_sigma(self) -> float:
-        """m, standard deviation of the camera's place: along its worst axis."""
+        """m, standard deviation of the camera's place along its worst axis."""
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1]))
 
 
 def calibrate_extrinsics(lens: Camera, marked: Marked) -> Extrinsics:
-    """The lens put where it sees the marked points where they were seen.
+    """Poses the lens such that the marked points project to their pixels.
 
     Every pose that could be meant is refined: a flat target has two. One from which the points would be seen from
     below is not meant.
@@ -90,7 +90,7 @@ def calibrate_extrinsics(lens: Camera, marked: Marked) -> Extrinsics:
 
 
 def _check_points(lens: Camera, marked: Marked) -> bool:
-    """Whether the points lie in a plane; refuses those that cannot tell a pose."""
+    """True if the points lie in a plane; refuses points that do not determine a pose."""
     if len(marked.points) < MIN_POINTS:
         raise ValueError(
             f"camera {shown(lens.name)}: at least {MIN_POINTS} points must be marked; got {len(marked.points)} "
@@ -147,14 +147,14 @@ def _squares(camera: Camera, marked: Marked) -> float:
 
 
 def _is_above(camera: Camera, points: Array) -> bool:
-    """Whether the camera stands above the points' plane; one upright has two sides that are both good."""
+    """True if the camera stands above the points' plane; an upright plane has two valid sides."""
     centre = points.mean(axis=0)
     normal = np.linalg.svd(points - centre)[2][2]
     return bool((camera.centre - centre) @ normal * normal[2] >= 0.0)
 
 
 def _apart(one: Camera, other: Camera) -> bool:
-    """Whether two poses are not the same one found twice."""
+    """True if two poses differ."""
     return bool(np.linalg.norm(one.centre - other.centre) > FLAT * np.linalg.norm(one.tvec))
 
 
@@ -173,7 +173,7 @@ def _check_fit(found: Extrinsics) -> None:
 
 
 def _culprit(found: Extrinsics) -> str:
-    """A sentence that names the one point without which all is well, if there is one."""
+    """A sentence with the one point whose removal resolves the error, if there is one."""
     marked = found.marked
     for i in range(len(marked.names)):
         rest = Marked(

@@ -1,4 +1,4 @@
-"""The lens of a camera from views of a board: OpenCV's calibration, and whether the views can tell what it says."""
+"""Calibrates a lens from views of a board, and checks whether the views determine it."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -22,19 +22,19 @@ board: OpenCV then reports tiny deviations of a focal length that is wrong by ha
 MAX_FOCAL_SIGMA: Final = 0.02
 """Relative standard deviation of the focal length: 2 % are 6 cm at a distance of 3 m."""
 MIN_COVERAGE: Final = 0.4
-"""Of the image's cells that hold corners: outside, the distortion is not measured but extrapolated."""
+"""Least share of the image's cells with corners: outside of them, the distortion is extrapolated."""
 CELLS: Final = (8, 5)
-"""Across and down, into which the image is divided for that."""
+"""Number of such cells across and down."""
 OUTLYING: Final = 3.0
 """Times the median of the views' errors: a view beyond it has a wrong corner or moved while it was exposed."""
 MIN_OUTLYING: Final = 0.15
-"""px. A view as good as that is kept, however good the others are."""
+"""px. A view with a smaller error is kept, however good the others are."""
 MAX_LEFT_OUT: Final = 1 / 3
-"""Of the views: if more disagree with the rest, it is not they that are wrong."""
+"""Largest share of views that are left out: if more disagree with the rest, the rest may be wrong."""
 MAX_RAY_SIGMA: Final = 1.0
-"""px, standard deviation of where the lens puts a ray: 3 mm at a distance of 3 m."""
+"""px, largest standard deviation of a projected ray: 3 mm at a distance of 3 m."""
 RAYS: Final = 0.95
-"""Of the image in which that must hold: the outermost corners of a wide lens hardly ever see a board."""
+"""Share of the image to which that applies: the outermost corners of a wide lens rarely see a board."""
 MAX_FOLD: Final = 0.05
 """px. Distortion undone and done again must lead back to each pixel, or the model folds the image there."""
 _CRITERIA: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
@@ -51,7 +51,7 @@ _FLAGS: Final = {
 
 @dataclass(frozen=True, eq=False)
 class FittedView:
-    """A view with the pose of its board and what the lens leaves of it."""
+    """A view with the pose of its board and the residuals of the lens."""
 
     view: View
 
@@ -80,16 +80,16 @@ class Intrinsics:
     """A calibrated lens."""
 
     camera: Camera
-    """At the world's origin, unturned: its place is not known."""
+    """The camera at the world's origin, unturned: its pose is unknown."""
 
     covariance: Array
     """(4 + k, 4 + k) of fx, fy, cx, cy (px) and the k coefficients of the distortion."""
 
     views: tuple[FittedView, ...]
-    """Those that it rests on."""
+    """The views of the calibration."""
 
     left_out: tuple[FittedView, ...]
-    """Those that disagree with them, in the order in which that was found."""
+    """The views that disagree with it, in the order of their removal."""
 
     missed: tuple[str, ...]
     """Names of the images in which no board was found."""
@@ -104,7 +104,7 @@ class Intrinsics:
 
     @property
     def ray_sigma(self) -> tuple[float, float]:
-        """px, standard deviation of where the lens puts a ray: the most in `RAYS` of the image, and in all of it."""
+        """px, standard deviation of the projected rays: the largest in `RAYS` of the image, and in all of it."""
         sigmas = np.sort(sigma_of_rays(self.camera, self.covariance))
         return float(sigmas[int(RAYS * (len(sigmas) - 1))]), float(sigmas[-1])
 
@@ -154,7 +154,7 @@ def turn(normals: Array) -> float:
 
 
 def coverage(size: tuple[int, int], pixels: Array) -> float:
-    """Share of the cells of an image of `size` that hold any of pixels (n, 2)."""
+    """Share of the cells of an image of `size` that contain any of pixels (n, 2)."""
     cells = np.clip((pixels + 0.5) / np.array(size) * CELLS, 0, np.array(CELLS) - 1).astype(int)
     return len(np.unique(cells, axis=0)) / (CELLS[0] * CELLS[1])
 
@@ -223,7 +223,7 @@ def _pose(camera: Camera, view: View) -> FittedView:
 
 
 def _outlying(fitted: Intrinsics) -> int | None:
-    """The view that disagrees most with the others, if one does."""
+    """The view that disagrees most with the others, or None."""
     errors = np.array([view.rms for view in fitted.views])
     worst = int(errors.argmax())
     return worst if errors[worst] > max(OUTLYING * float(np.median(errors)), MIN_OUTLYING) else None
@@ -271,7 +271,7 @@ def _check_fold(camera: Camera) -> None:
 
 
 def _has_pole(camera: Camera, limit: float) -> bool:
-    """Whether a rational distortion is infinite somewhere up to a squared radius of the plane at z = 1.
+    """True if a rational distortion is infinite somewhere up to a squared radius of the plane at z = 1.
 
     Where a lens needs no denominator, it and the numerator share zeros, but not exactly.
     """

@@ -1,4 +1,4 @@
-"""How well views of a board tell the lens: the covariance of its parameters, and what it means in pixels."""
+"""Computes the covariance of a lens from views of a board, and its effect in pixels."""
 
 from collections.abc import Sequence
 from typing import Final, TypeAlias
@@ -21,7 +21,7 @@ POSE: Final = 6
 def covariance_of_lens(camera: Camera, boards: Sequence[PosedBoard]) -> Array:
     """(4 + k, 4 + k) covariance of fx, fy, cx, cy and the k coefficients, the poses of the boards unknown as well.
 
-    The noise of a corner is what the residuals say. What the views cannot tell at all is infinite.
+    The residuals give the noise of a corner. Undetermined directions are infinite.
 
     Source: the inverse of the Schur complement of the poses in the normal equations; B. Triggs et al., "Bundle
         adjustment - a modern synthesis", 2000, section 6.

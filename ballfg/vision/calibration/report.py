@@ -1,4 +1,4 @@
-"""What a calibration found: lines and a picture for people, a mapping for programs."""
+"""Reports a calibration as lines and a picture for people, and as a mapping for programs."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,9 +22,9 @@ BLUE, VERMILION, GREY = "#0072b2", "#d55e00", "#8c8c8c"
 OUTLINED: Final = withStroke(linewidth=1.5, foreground="white")
 """For letters that must be read over any image."""
 ARROW: Final = 0.05
-"""Of the image's width: the length at which a residual of three times the median is drawn."""
+"""Length of a residual of three times the median in the drawing, as a share of the image's width."""
 PARTS: Final = 40
-"""Of a line: how finely it is drawn, since the lens bends it."""
+"""Number of parts of a drawn line, which the lens bends."""
 PANEL: Final = (5.0, 3.4)
 """Inches, width and height of a panel."""
 DPI: Final = 120
@@ -34,19 +34,19 @@ IN_A_LINE: Final = 6
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What was found about one camera."""
+    """The calibration of one camera."""
 
     camera: Camera
 
     lens: Intrinsics | None
-    """None where the lens was known before."""
+    """None if the lens was known before."""
 
     place: Extrinsics | None
-    """None where the camera's place was not asked for."""
+    """None if the camera's pose was not calibrated."""
 
 
 def summary(found: Calibration) -> Iterator[str]:
-    """Lines that say how well the camera is known."""
+    """Lines on the accuracy of the camera's calibration."""
     width, height = found.camera.size
     yield f"{found.camera.name}: {width}x{height}"
     if found.lens is not None:

@@ -1,4 +1,4 @@
-"""Points of a table-tennis table whose place in the world is known, and the file that says where cameras see them."""
+"""Defines points of a table-tennis table with known places, and reads their pixels from a file."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,13 +19,13 @@ TABLE_WIDTH: Final = 1.525
 TABLE_HEIGHT: Final = 0.76
 """m, ITTF Laws of Table Tennis 2.1.1 and 2.1.2."""
 CLICK_SIGMA: Final = 0.5
-"""px, standard deviation of a coordinate that somebody read off an image with care."""
+"""px, standard deviation of a coordinate that was read off an image with care."""
 _FIELDS: Final = ("table_height", "sigma", "points", "cameras")
 
 
 @dataclass(frozen=True, eq=False)
 class Marked:
-    """Points of the world that one camera sees."""
+    """World points with their pixels in one camera."""
 
     names: tuple[str, ...]
 
@@ -62,17 +62,17 @@ def table_outline(height: float = TABLE_HEIGHT) -> list[Array]:
 
 @dataclass(frozen=True, eq=False)
 class TableFile:
-    """What a table file says."""
+    """The content of a table file."""
 
     table_height: float
     """m, z of the table's surface."""
 
     cameras: Mapping[str, Marked]
-    """By name, what each camera sees."""
+    """The marked points of each camera, by name."""
 
 
 def read_table(path: str | PathLike[str]) -> TableFile:
-    """Reads where cameras see points of the table; docs/calibrate.md shows such a file.
+    """Reads the pixels of table points; docs/calibrate.md shows such a file.
 
     Raises: FileNotFoundError: no such file. ValueError: a field that is missing, not known or wrong; the message
         names file, camera and point.

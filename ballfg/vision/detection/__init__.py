@@ -1,1 +1,1 @@
-"""From videos to what may be a ball, frame by frame."""
+"""Detects candidates for balls in videos, frame by frame."""

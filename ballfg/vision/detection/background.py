@@ -1,4 +1,4 @@
-"""What a camera sees without the ball: learned from frames of the recording, followed slowly, in flickering light."""
+"""Learns a camera's background from frames of the recording and follows slow changes and flickering light."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -11,15 +11,15 @@ from ballfg.arrays import Array
 from ballfg.vision.arrays import Array32, Image
 
 SHRINK: Final = 4
-"""Pixels of the image per pixel of the small picture in which candidates are looked for."""
+"""Pixels of the image per pixel of the small picture for the search."""
 GRID: Final = (16, 9)
 """Blocks, across and down, whose brightness tells how bright the light is; their median is no moving thing."""
 BRIGHT: Final = (8.0, 245.0)
-"""Grey levels between which a block is asked: darker ones are noise, brighter ones are clipped."""
+"""Grey levels of the blocks that count: darker ones are noise, brighter ones are clipped."""
 STRIPS: Final = 32
 """A frame refreshes one of so many strips of the background: all of it would cost more than the search."""
 WEIGHT: Final = 0.08
-"""Of a frame in the strip that it refreshes; what is not the ball fades in over STRIPS / WEIGHT = 400 frames."""
+"""Weight of a frame in the strip that it refreshes; a still object fades in over STRIPS / WEIGHT = 400 frames."""
 COVERED_WEIGHT: Final = 0.008
 """The same where something was found: a passing ball leaves 0.5 of 60 grey levels, a moved chair is gone in 4000
 frames."""
@@ -78,7 +78,7 @@ class Background:
         return (self.full.shape[0], self.full.shape[1])
 
     def _thresholds(self, smalls: list[Image]) -> Image:
-        """Where the picture is restless - noise, edges under compression, leaves - a change must be larger."""
+        """Thresholds of a change: larger at noise, at edges under compression, and at moving leaves."""
         spread = _median([cv2.absdiff(small, self.small.astype(np.uint8)) for small in smalls])
         restless = cv2.dilate(spread.max(axis=2), np.ones((3, 3), dtype=np.uint8))
         sigma = np.hypot(1.4826 * restless, np.sqrt(self.noise.max()) / SHRINK)
@@ -164,7 +164,7 @@ def _mean_near(images: Sequence[NDArray], middle: Image, near: float) -> Array32
 
 
 def _noise(images: Sequence[NDArray], middle: Image) -> Array:
-    """(3, 3) covariance of the channels about the median, of those pixels where nothing passed."""
+    """(3, 3) covariance of the channels about the median, from pixels where nothing passed."""
     stride = max(1, middle.shape[0] * middle.shape[1] // 20000)
     flat = middle.reshape(-1, 3)[::stride].astype(np.float64)
     rest = np.concatenate([image.reshape(-1, 3)[::stride] - flat for image in images])

@@ -1,4 +1,4 @@
-"""Videos through detectors, ballfg's or a user's: one after the other, or each camera in a process of its own."""
+"""Runs detectors, ballfg's or a user's, over videos, one after the other or each in its process."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
@@ -27,11 +27,11 @@ Maker = Callable[[Video], Detector]
 """Makes the detector of a camera from its video."""
 
 SAMPLE: Final = 15
-"""Frames from which a background is learned: what stands in the same place in eight of them is background."""
+"""Number of frames for a background: objects at the same place in eight of them are background."""
 LOOKS: Final = 0.05
-"""s. When nothing was told for so long, it is looked which processes have ended."""
+"""s without a message after which the processes are checked."""
 TELLS: Final = 20
-"""Frames after which a process says how far it is."""
+"""Number of frames between progress messages of a process."""
 SEARCHED: Final = "frames searched"
 
 
@@ -135,7 +135,7 @@ def _in_processes(videos: Mapping[str, Video], make: Maker, jobs: int, watch: Wa
 
 
 def _job(chunk: Sequence[tuple[Video, str, Maker]]) -> Detections:
-    """One camera, in a process of its own, which tells how many frames are done."""
+    """Detects in one camera's video in a process of its own, and reports the number of finished frames."""
     cv2.setNumThreads(1)
     ((video, camera, make),) = chunk
     return detect(video, camera, make(video), _telling)
@@ -179,7 +179,7 @@ def _run(video: Video, detector: Detector, seen: list[tuple[float, Candidates]])
 
 
 def _made(found: Detector | type[Detector], path: Path, video: Video) -> Detector:
-    """The detector of a camera, which serves no other; what it raises is told with file, line, video and frame."""
+    """The detector of a single camera; its errors are reported with file, line, video and frame."""
     with blamed(path, f"making the detector of {video.name}"):
         detector = found() if isinstance(found, type) else found
     frames = count()

@@ -1,4 +1,4 @@
-"""What a camera saw: the candidates of one frame, the candidates of a recording, and the contract of a detector."""
+"""Holds the candidates of a frame and of a recording, and defines the interface of a detector."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from ballfg.tracks.sightings import are_covariances
 from ballfg.vision.arrays import Image
 
 _SHAPES: Final = {"pixels": (2,), "covariances": (2, 2), "scores": (), "streaks": (2, 2)}
-"""What is known of each candidate, of a frame and of a recording alike, and its shape."""
+"""Fields of each candidate with their shapes, for a frame and a recording alike."""
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """What may be a ball in one frame: k candidates, in any order. Arrays are copied, converted and checked.
+    """Possible balls in one frame: k candidates, in any order. Arrays are copied, converted and checked.
 
     Raises: ValueError: a wrong shape, a pixel that is not finite, a covariance that is not positive definite, a score
         outside [0, 1]; the message names the field and the candidate.
     """
 
     pixels: Array
-    """(k, 2) px, where the ball's centre was in mid exposure; (0, 0) is the centre of the top left pixel."""
+    """(k, 2) px, the ball's centre in mid exposure; (0, 0) is the centre of the top left pixel."""
 
     covariances: Array
     """(k, 2, 2) px^2."""
 
     scores: Array
-    """(k,) dimensionless, in [0, 1], how ball-like."""
+    """(k,) dimensionless, in [0, 1], similarity to a ball."""
 
     streaks: Array
     """(k, 2, 2) px, centre at the shutter's opening and closing, in unknown order; NaN where not blurred."""
@@ -46,12 +46,12 @@ class Candidates:
 
     @classmethod
     def none(cls) -> Candidates:
-        """Of a frame in which nothing looks like a ball."""
+        """The candidates of a frame without any."""
         return cls(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros((0, 2, 2)))
 
     @classmethod
     def at(cls, pixels: ArrayLike, sigma: float, scores: ArrayLike | None = None) -> Candidates:
-        """Of a detector that gives centres only.
+        """The candidates of a detector that gives centres only.
 
         Args: pixels: (k, 2).  sigma: px, of each coordinate.  scores: (k,) dimensionless, in [0, 1]; 1 by default.
         """
@@ -78,19 +78,19 @@ class Detections:
     """Name of the camera."""
 
     frames: Array
-    """(f,) s, stamps of all frames, strictly increasing, as the camera writes them."""
+    """(f,) s, recorded stamps of all frames, strictly increasing."""
 
     frame: Index
-    """(n,) number of the frame in which each candidate was seen, not decreasing."""
+    """(n,) number of each candidate's frame, not decreasing."""
 
     pixels: Array
-    """(n, 2) px, where the ball's centre was in mid exposure; (0, 0) is the centre of the top left pixel."""
+    """(n, 2) px, the ball's centre in mid exposure; (0, 0) is the centre of the top left pixel."""
 
     covariances: Array
     """(n, 2, 2) px^2."""
 
     scores: Array
-    """(n,) dimensionless, in [0, 1], how ball-like."""
+    """(n,) dimensionless, in [0, 1], similarity to a ball."""
 
     streaks: Array
     """(n, 2, 2) px, centre at the shutter's opening and closing, in unknown order; NaN where not blurred."""
@@ -118,7 +118,7 @@ class Detections:
 
     @property
     def times(self) -> Array:
-        """(n,) s, the stamp of each candidate, as the camera writes it."""
+        """(n,) s, the recorded stamp of each candidate."""
         return np.asarray(self.frames[self.frame])
 
     def in_frame(self, number: int) -> Candidates:
@@ -130,9 +130,9 @@ class Detections:
         return Candidates(*(getattr(self, field)[rows] for field in _SHAPES))
 
     def select(self, keep: Mask) -> Detections:
-        """Some of the candidates.
+        """A part of the candidates.
 
-        Args: keep: (n,) bool, whether a candidate stays.
+        Args: keep: (n,) bool, the candidates to keep.
         Returns: the detections with these candidates and all frames.
         """
         return replace(self, **{field: getattr(self, field)[keep] for field in ("frame", *_SHAPES)})
@@ -183,7 +183,7 @@ def _check_increasing(what: str, stamps: Array) -> None:
 
 
 def _check_fields(owner: Candidates | Detections, what: str) -> None:
-    """What the candidates of a frame and those of a recording have in common."""
+    """Checks the fields that candidates of a frame and of a recording share."""
     count = len(np.asarray(owner.pixels))
     for field, shape in _SHAPES.items():
         object.__setattr__(owner, field, _numbers(what, field, getattr(owner, field), (count, *shape)))

@@ -1,4 +1,4 @@
-"""Candidates from a table: `detections.csv`, of a detector of any kind, as a recording of each camera."""
+"""Reads candidates from a table `detections.csv`, of any detector, as a recording of each camera."""
 
 from collections.abc import Sequence
 from pathlib import Path

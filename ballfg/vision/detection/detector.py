@@ -1,4 +1,4 @@
-"""The detector that ballfg brings: background, regions, a swept disc fitted to each, a score of how ball-like it is."""
+"""Detects small fast balls: background, regions, a swept disc fitted to each, and a score."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ compression, which makes the blotches, moves edges."""
 LEARNS: Final = 0.8
 """Score from which a candidate teaches what edge and shading to expect."""
 FORGETS: Final = 0.98
-"""Of what was learned, per teaching candidate: the light on the ball changes as it flies."""
+"""Factor on earlier information per teaching candidate: the light on the ball changes as it flies."""
 SUREST: Final = (0.15, 0.08, 0.08)
 """Least sigmas of the expected edge (px) and shading: they change along a flight, and may be learned wrong."""
 VISIBLE_STREAK: Final = 3.0
@@ -35,7 +35,7 @@ VISIBLE_STREAK: Final = 3.0
 
 @dataclass(frozen=True)
 class DetectorSettings:
-    """What is known about the balls' images.
+    """Assumptions on the balls' images.
 
     Raises: ValueError: sizes that are not positive or out of order, an unknown colour.
     """
@@ -44,13 +44,13 @@ class DetectorSettings:
     """px, least and greatest diameter."""
 
     longest_streak: float = 60.0
-    """px that a ball moves at most while the shutter is open."""
+    """px, largest motion of a ball during an exposure."""
 
     colour: Colour | None = None
-    """Of the ball; None: any, lighter or darker than what is behind it."""
+    """Colour of the ball; None: any colour that differs from the background's."""
 
     most: int = 6
-    """Candidates per frame that are looked at closely."""
+    """Largest number of closely examined candidates per frame."""
 
     def __post_init__(self) -> None:
         low, high = check_array("diameter", self.diameter, (2,), "Give the smallest and the largest in px.").tolist()
@@ -75,7 +75,7 @@ class BallDetector:
         """A detector with the background that frames of the recording show.
 
         Args: images: at least three, (h, w, 3) grey levels, spread over the recording; see `Background`.
-            settings: what is known about the ball; the default ones if None.
+            settings: assumptions on the ball; None: the default ones.
         Returns: the detector of that camera.
         Raises: ValueError: too few images, or of several sizes.
         """
@@ -118,7 +118,7 @@ class BallDetector:
         return fit, score(fit, patch, change, behind, self.settings.diameter, self.settings.colour)
 
     def _plausible(self, values: Array) -> bool:
-        """Whether radius and streak are within a factor of two of what is asked for."""
+        """True if radius and streak are within a factor of two of the limits."""
         low, high = self.settings.diameter
         return bool(low / 4.0 <= values[4] <= high and np.hypot(*values[2:4]) <= self.settings.longest_streak)
 
@@ -148,7 +148,7 @@ def patch_of(change: np.ndarray, behind: np.ndarray, region: Region, noise: Arra
 
 
 def learned(look: Look, fit: StreakFit, blotches: float) -> Look:
-    """What to expect after another ball was seen: means weighted by information, which ages towards the first."""
+    """Expected look after another ball: means weighted by information, which decays towards the first."""
     doubt = max(fit.scatter, 1.0) ** 2 * blotches
     first = Look.unknown()
     old = FORGETS * (look.information - first.information)
@@ -161,7 +161,7 @@ def learned(look: Look, fit: StreakFit, blotches: float) -> Look:
 
 
 def _candidates(rated: Sequence[tuple[StreakFit, float]], floor: float) -> Candidates:
-    """Of the fits of a frame with their scores; floor: px, sigma added to that of each centre."""
+    """Candidates from the fits of a frame and their scores; floor: px, sigma added to each centre's."""
     if not rated:
         return Candidates.none()
     covariances = np.stack([fit.covariance for fit, _ in rated])

@@ -1,4 +1,4 @@
-"""Where in a frame to look closer: connected changes of a sane size, found in the small picture."""
+"""Finds regions of a frame for a closer look: connected changes of plausible size in the small picture."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ class Region:
 
     Attributes:
         rows, columns: of the image, with a margin.
-        free: (rows, columns) whether a pixel is this region's or the background's, not another's; None if all are.
+        free: (rows, columns) True for pixels of this region or the background, not of another; None if all are.
         mass: grey levels x small pixels, the change summed.
     """
 
@@ -34,7 +34,7 @@ class Region:
     mass: float
 
     def free_of(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(m, ...) those of values (rows, columns, ...) whose pixels are free."""
+        """(m, ...) the values (rows, columns, ...) of free pixels."""
         if self.free is None:
             return values.reshape(-1, *values.shape[2:])
         return values[self.free]

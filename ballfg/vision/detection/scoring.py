@@ -1,4 +1,4 @@
-"""How ball-like a fitted candidate is: a product of marks between 0 and 1 for shape, contrast, size and colour."""
+"""Scores the similarity of a fitted candidate to a ball: shape, contrast, size and colour."""
 
 from typing import Final, Literal
 
@@ -16,9 +16,9 @@ per sigma. Sleeves, with the light on their upper side, pass for half a ball in 
 STRENGTH: Final = 15.0
 """Ratio of signal to noise, over the whole candidate, at which the mark for contrast is 1 - 1/e."""
 SIZE: Final = 0.2
-"""Relative error of the diameter, beyond what is asked for, at which the mark for size is 1/e."""
+"""Relative error of the diameter, beyond the limits, at which the mark for size is 1/e."""
 UNSETTLED: Final = 0.5
-"""Mark of a fit that did not settle."""
+"""Mark of a fit that did not converge."""
 WHITE: Final = (0.25, 0.2)
 """Saturation (greatest less least channel, over the greatest) up to which a ball is white, and the scale beyond."""
 ORANGE: Final = (8.0, 48.0, 12.0)
@@ -53,7 +53,7 @@ def score(
 
 
 def _colour_mark(coverage: Array32, change: Array32, behind: Array32, colour: Literal["white", "orange"]) -> float:
-    column = coverage[:, None]  # the background that shines through the streak is taken out
+    column = coverage[:, None]  # without the background that shines through the streak
     ball = (column * (change + column * behind)).sum(axis=0) / (column**2).sum()
     blue, green, red = np.maximum(ball.astype(np.float64), 0.0)
     most, least = max(blue, green, red, 1.0), min(blue, green, red)

@@ -1,4 +1,4 @@
-"""A ball in an image: a disc with soft edges swept along a segment while the shutter is open, fitted to pixels.
+"""Fits a ball's image: a disc with soft edges swept along a segment while the shutter is open.
 
 With coverage a(x) in [0, 1], the share of the exposure during which pixel x lies on the ball, a pixel shows
 b(x) + a(x) (f - b(x)): background b, ball f. The ball's shading, linear across the disc, adds a swept gradient. The fit
@@ -52,12 +52,12 @@ _ROUNDING: Final = np.float32(1e-6)
 SMALLEST: Final = 1.0
 """px, the least radius: less is a point, and all shapes of it look alike."""
 CENTRE, HALF, RADIUS, CONTRAST, LOOK = slice(0, 2), slice(2, 4), 4, 5, slice(6, 9)
-"""Where the parameters stand in a vector of nine."""
+"""Places of the parameters in a vector of nine."""
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What a ball's edge and shading are expected to be: they are a camera's, its lens's and its lamps', not a frame's.
+    """Expected edge and shading of a ball: they depend on camera, lens and lamps, not on the frame.
 
     Attributes:
         mean: (3,) softness e of the edge (px): coverage falls as tanh(distance / e); shading in x and in y, from the
@@ -70,7 +70,7 @@ class Look:
 
     @classmethod
     def unknown(cls) -> Look:
-        """Before any ball was seen.
+        """The expectation before any ball was seen.
 
         A lens blur of 0.6 px and a square pixel make an edge of 0.85 px; a ball under one lamp is brighter by a quarter
         towards it.
@@ -80,7 +80,7 @@ class Look:
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """Pixels around a candidate, as the fit takes them.
+    """Pixels around a candidate, in the form for the fit.
 
     Attributes:
         x, y: (m,) px, where the pixels are.
@@ -98,13 +98,13 @@ class Patch:
     noise: float
 
     def at(self, rows: NDArray[np.intp]) -> Patch:
-        """Some of the pixels."""
+        """A part of the pixels."""
         return Patch(self.x[rows], self.y[rows], self.change[rows], self.background[rows], self.level, self.noise)
 
 
 @dataclass(frozen=True, eq=False)
 class StreakFit:
-    """A disc that was swept along a segment.
+    """A disc swept along a segment.
 
     Attributes:
         values: (9,) centre x, y (px); half the streak (px, a vector); radius (px); contrast against the background's
@@ -114,7 +114,7 @@ class StreakFit:
         unexplained: share of the change's energy beyond the noise that the fit leaves over, 0 to 1 or more.
         strength: signal to noise of the whole change: root of its energy beyond the noise, over the noise.
         scatter: residual's root mean square over the noise.
-        settled: whether the steps became small.
+        settled: True if the steps converged.
     """
 
     values: Array
@@ -137,7 +137,7 @@ class StreakFit:
 
     @property
     def oddness(self) -> float:
-        """Sigmas, root mean square of three, by which edge and shading are off what is expected of any ball."""
+        """Sigmas, root mean square of three, between edge and shading and those expected of any ball."""
         first = Look.unknown()
         off = self.values[LOOK] - first.mean
         return float(np.sqrt(off @ first.information @ off / len(off)))
@@ -160,7 +160,7 @@ def _nodes(half: Array) -> int:
 
 
 def swept(x: Array32, y: Array32, values: Array) -> tuple[Array32, Array32]:
-    """What the swept disc shows at pixels, and how that changes.
+    """Coverage of pixels by the swept disc, and its derivatives.
 
     Args:
         x, y: (m,) px.
@@ -220,7 +220,7 @@ def start(patch: Patch, look: Look) -> Array | None:
 
 
 def fit_streak(patch: Patch, values: Array, look: Look) -> StreakFit:
-    """Least squares from first values (9,), by Gauss-Newton; edge and shading are drawn to what is expected of them.
+    """Least squares from first values (9,), by Gauss-Newton, with a prior on edge and shading.
 
     Where the fit ends far from where it began, the pixels around the end are fitted once more.
     """
@@ -231,7 +231,7 @@ def fit_streak(patch: Patch, values: Array, look: Look) -> StreakFit:
 
 
 def _fitted(patch: Patch, values: Array, look: Look) -> StreakFit:
-    """Of the pixels around the first values."""
+    """The fit to the pixels around the first values."""
     values = values.copy()
     near = _near(patch, values)
     close = patch.at(near[:: 1 + int(len(near) * _nodes(values[HALF]) / MOST_WORK)])

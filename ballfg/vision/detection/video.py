@@ -1,4 +1,4 @@
-"""Frames with their stamps: from a video file or a folder of images, stamped by the container or by a CSV file."""
+"""Reads frames with their stamps, from a video file or a folder of images and its CSV file."""
 
 import re
 from abc import ABC, abstractmethod
@@ -158,7 +158,7 @@ def open_video(path: str | PathLike[str], stamps: str | PathLike[str] | None = N
     Args:
         path: a file that FFmpeg decodes, or a folder.
         stamps: a CSV file with a column `t` (s), one row a frame, optionally a column `frame` that counts from 0.
-            Without it the container's stamps are taken: mp4 and avi keep them, webm rounds to ms. A folder needs it.
+            Without it the container's stamps count: mp4 and avi keep them, webm rounds to ms. A folder needs it.
     Raises:
         FileNotFoundError: nothing is there. ValueError: it cannot be decoded, is empty, or the stamps do not fit.
     """
@@ -207,7 +207,7 @@ def read_stamps(path: Path) -> Array:
 
 
 def _capture(path: Path) -> cv2.VideoCapture:
-    """Decoding on one thread: the cameras are what is spread over the cores. Opening reads headers alone."""
+    """Opens a video for decoding on one thread, since each camera has a core. Opening reads headers alone."""
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])
     if not capture.isOpened():
         raise ValueError(f"video {path} must be a file that FFmpeg decodes; it is not, or it is cut off. Convert it.")

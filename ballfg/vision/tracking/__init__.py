@@ -1,1 +1,1 @@
-"""The whole way from recordings to a dataset, with pictures to check it by."""
+"""Tracks balls from recordings to a dataset, with pictures for checking it."""

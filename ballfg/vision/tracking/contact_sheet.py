@@ -1,4 +1,4 @@
-"""The contact sheet: each track in every view and in space, so that one look tells whether they are balls."""
+"""Draws the contact sheet: each track in every view and in space, for a quick check."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -54,7 +54,7 @@ class ContactSheet:
         self._all: list[AllCandidates] = [] if count else [AllCandidates(tracking, i) for i in views]
 
     def pictures_of(self, camera: int) -> list[Picture]:
-        """The pictures that a camera's frames are wanted for."""
+        """The pictures that need a camera's frames."""
         rows: list[Sequence[Picture]] = [*self._strobes, self._all]
         return [row[camera] for row in rows if camera < len(row)]
 

@@ -1,4 +1,4 @@
-"""What was tracked as a dataset, with the pictures to look at: either all files appear, or none."""
+"""Writes the tracking as a dataset with pictures, all files or none."""
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
@@ -9,9 +9,9 @@ import numpy as np
 
 from ballfg.files.whole_folder import check_replaceable, whole_folder
 from ballfg.progress import Watch, unwatched
-from ballfg.tracks import DatasetInfo, TableWriter, write_dataset
+from ballfg.tracks import TableWriter, write_dataset
 from ballfg.tracks.detections_file import DETECTIONS_FILE, SCORE, seen_columns
-from ballfg.tracks.info import INFO_FILE, write_info
+from ballfg.tracks.info import INFO_FILE, DatasetInfo, write_info
 from ballfg.tracks.rows import KEY, SIGMAS, VALUES
 from ballfg.vision.arrays import Image
 from ballfg.vision.camera_file import CAMERAS_FILE, write_cameras
@@ -21,17 +21,17 @@ from ballfg.vision.tracking.pipeline import Tracking
 from ballfg.vision.tracking.strobe import tapped
 
 Streams = Sequence[Callable[[], Iterator[tuple[float, Image]]]]
-"""For each camera what opens its video and gives stamps (s) and images."""
+"""For each camera a function that opens its video and gives stamps (s) and images."""
 
 TRACKS: Final = "tracks.csv"
 OVERLAY: Final = "overlay.mp4"
 SHEET: Final = "contact_sheet.png"
 FILES: Final = (INFO_FILE, TRACKS, DETECTIONS_FILE, CAMERAS_FILE, OVERLAY, SHEET)
-"""All that is written."""
+"""All written files."""
 
 
 def check_result_folder(folder: Path, inputs: Sequence[Path], *, force: bool) -> None:
-    """Refuses a folder in which something would be lost.
+    """Refuses a folder in which content would be lost.
 
     Args: folder: for the dataset.  inputs: files that are read.  force: an earlier result may be replaced.
     Raises: ValueError: a file; an input that lies in it; other files; an earlier result and no `force`.

@@ -1,4 +1,4 @@
-"""The overlay: all views side by side as a video, with candidates, balls, trails, names and a line of time.
+"""Draws the overlay video: all views side by side with candidates, balls, trails, names and a line of time.
 
 The cameras are played back on one clock: each shows its frame that is nearest to the time.
 """
@@ -44,7 +44,7 @@ PAPER, INK = (40, 40, 40), (235, 235, 235)
 
 @dataclass(frozen=True, eq=False)
 class Schedule:
-    """What is on show when."""
+    """The frames on show at each time."""
 
     times: Array
     """(k,) s, true time of each moment, increasing."""
@@ -119,13 +119,13 @@ class OverlayPainter:
         return line
 
     def _place(self, time: float, first: float, last: float) -> int:
-        """Where a time stands, px from the left."""
+        """Place of a time, px from the left."""
         share = (time - first) / (last - first) if last > first else 0.0
         return round(MARGIN + share * (self.size[0] - 1 - 2 * MARGIN))
 
 
 def schedule(detections: Sequence[Detections], cameras: Sequence[Camera]) -> Schedule:
-    """The moments at which to show a recording: the frames of the camera with most, and where it is silent the others'.
+    """The times of a shown recording: the frames of the camera with most, and in its gaps the others'.
 
     Only the stamps of the detections' frames and the cameras' time offsets are used.
     """

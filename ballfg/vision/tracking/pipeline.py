@@ -1,4 +1,4 @@
-"""What cameras recorded, turned into balls: detections, tracks, and whether the cameras agree."""
+"""Turns camera recordings into balls: detections, tracks, and the agreement of the cameras."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,9 +21,9 @@ from ballfg.vision.detection.video import Video, open_video
 from ballfg.vision.tracking.recordings import check_sizes
 
 FEWEST: Final = 2
-"""Cameras: one alone does not see how far away a ball is."""
+"""Least number of cameras: a single one does not see the distance of a ball."""
 DIGITS: Final = 3
-"""Of the number that is a track's name, at least: names then sort as their tracks do."""
+"""Least number of digits in a track's name: names then sort as their tracks do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class Tracking:
     """In the order of their first points."""
 
     agreement: Agreement | None
-    """Whether the cameras agree; None where there is no ball to ask."""
+    """The agreement of the cameras; None without a ball."""
 
     @property
     def names(self) -> list[str]:
@@ -69,14 +69,14 @@ class Tracking:
 
     @property
     def rate(self) -> float | None:
-        """Points per second of the balls, Hz, to six digits; None where there is no ball."""
+        """Points per second of the balls, Hz, to six digits; None without a ball."""
         if not self.balls:
             return None
         step = float(np.median(np.concatenate([np.diff(ball.times) for ball in self.balls])))
         return float(f"{1.0 / step:.6g}")
 
     def seen(self, ball: SeenBall, camera: int) -> Seen:
-        """The frames in which a camera saw a ball, and where.
+        """The frames in which a camera saw a ball, and its pixels.
 
         Args: ball: one of `balls`.  camera: number of the camera.
         Returns: numbers of the frames, and pixels.
@@ -155,7 +155,7 @@ def check_rig(cameras: Sequence[Camera]) -> None:
 
 
 def check_overlap(detections: Sequence[Detections], cameras: Sequence[Camera]) -> None:
-    """Refuses a camera that filmed when no other did: a clock or a file is another recording's.
+    """Refuses a camera that recorded while no other did: its clock or file is another recording's.
 
     Raises: ValueError: naming the camera and when each one filmed.
     """

@@ -1,4 +1,4 @@
-"""Which file is which camera's: videos matched to the cameras of a rig, and checked against them."""
+"""Matches videos to the cameras of a rig and checks their sizes."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,7 +8,7 @@ from ballfg.checks import did_you_mean, listed, shown
 from ballfg.vision.camera import Camera
 
 SAME_SHAPE: Final = 0.01
-"""Share by which a video's proportions may differ from the camera's where it is taken for the same picture, scaled."""
+"""Largest relative difference between the proportions of a video and of its camera, for a scaled picture."""
 
 
 def match_videos(given: Sequence[str], cameras: Sequence[Camera], ignored: Sequence[str] = ()) -> dict[str, Path]:
@@ -46,7 +46,7 @@ def match_videos(given: Sequence[str], cameras: Sequence[Camera], ignored: Seque
 
 
 def named_path(text: str, names: Sequence[str]) -> tuple[str, Path]:
-    """The name and the path that a word of the command line means: `name=path`, or a path with the name as its stem."""
+    """The name and the path in a command-line argument: `name=path`, or a path with the name as its stem."""
     name, equals, rest = text.partition("=")
     if equals and rest and (name in names or not Path(text).exists()):
         return name, Path(rest)
@@ -74,7 +74,7 @@ def stamp_files(given: Sequence[str], cameras: Sequence[Camera]) -> dict[str, Pa
 
 
 def without(cameras: Sequence[Camera], names: Sequence[str]) -> list[Camera]:
-    """The cameras that are left.
+    """The remaining cameras.
 
     Raises: ValueError: a name of no camera.
     """

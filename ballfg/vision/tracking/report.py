@@ -1,4 +1,4 @@
-"""What was tracked, in words."""
+"""Summarises a tracking in words."""
 
 from collections.abc import Iterator
 
@@ -8,21 +8,21 @@ from ballfg.vision.tracking.pipeline import Tracking
 
 
 def summary(tracking: Tracking) -> Iterator[str]:
-    """Lines: what each camera saw, and what became of it."""
+    """Lines: the detections of each camera, and their use."""
     for number, (camera, seen) in enumerate(zip(tracking.cameras, tracking.detections, strict=True)):
         used = sum(int((ball.sightings.camera == number).sum()) for ball in tracking.balls)
         yield f"  {camera.name}: {len(seen.frames)} frames, {len(seen)} candidates, {used} of them a ball"
 
 
 def blind_cameras(tracking: Tracking) -> Iterator[str]:
-    """A sentence for each camera that had no part in any ball, where there are balls."""
+    """A sentence for each camera without a part in any ball, if there are balls."""
     for number, camera in enumerate(tracking.cameras):
         if tracking.balls and not any((ball.sightings.camera == number).any() for ball in tracking.balls):
             yield f"camera {shown(camera.name)} saw none of the balls. Check its stamps, its pose and its candidates."
 
 
 def disagreement(tracking: Tracking) -> str | None:
-    """What is to be said about the calibration; None where the cameras agree or too little was seen to tell."""
+    """A sentence on the calibration; None if the cameras agree or too little was seen."""
     found = tracking.agreement
     if found is None or not (found.culprit is not None or found.misfit > LEAST_MISFIT):
         return None

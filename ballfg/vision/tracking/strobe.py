@@ -1,4 +1,4 @@
-"""A flight in one picture: the ball cut from several frames of a camera and put into one of them, with its trail."""
+"""Draws a flight in one picture: the ball from several frames of a camera, with its trail."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Final, Protocol
@@ -34,11 +34,11 @@ LEAST_RADIUS: Final = 3.0
 MOST_RINGS: Final = 500
 """Candidates that the picture of a recording without a ball shows: the best ones."""
 BLANK: Final = 60
-"""Grey of what was not filmed."""
+"""Grey of areas that were not filmed."""
 
 
 class Picture(Protocol):
-    """A picture that is put together while a camera's frames pass by."""
+    """A picture that is composed while a camera's frames pass by."""
 
     @property
     def frames(self) -> set[int]:
@@ -82,7 +82,7 @@ class Strobe:
 
     @property
     def filmed(self) -> bool:
-        """Whether a frame that it needs has passed by."""
+        """True if a frame that it needs has passed by."""
         return self.count > 0 and bool(self._patches)
 
     def see(self, frame: int, image: Image) -> None:
@@ -165,7 +165,7 @@ class AllCandidates:
 
 
 def tapped(stream: Iterable[tuple[float, Image]], pictures: Sequence[Picture]) -> Iterator[tuple[float, Image]]:
-    """Hands the frames of a camera through; the pictures of that camera take what they need of them."""
+    """Passes the frames of a camera through; the pictures of that camera copy the parts that they need."""
     wanted: dict[int, list[Picture]] = {}
     for picture in pictures:
         for frame in picture.frames:

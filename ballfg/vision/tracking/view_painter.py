@@ -1,4 +1,4 @@
-"""One camera's view with what was found in it: candidates, the balls that they were taken for, trails and stamps."""
+"""Draws one camera's view with candidates, associated balls, trails and stamps."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -28,7 +28,7 @@ CANDIDATE: Final = 4.5
 UNLIKELY, LIKELY = (130, 130, 130), (255, 255, 255)
 """Colours of candidates of score 0 and 1; those between are mixed."""
 DIMMED: Final = 0.4
-"""Of its brightness is left of the view behind text."""
+"""Share of the view's brightness that remains behind text."""
 CAPTION: Final = 22
 """px, height of the line of text at the top."""
 _SHIFT: Final = 4
@@ -119,7 +119,7 @@ def ring(view: Image, centre: Array, radius: float, colour: Colour, thickness: i
 
 
 def uncover(view: Image, clean: Image, centre: Array, radius: float) -> None:
-    """Puts back, inside a circle, what was there before something was drawn."""
+    """Restores, inside a circle, the content before drawing."""
     disc = np.zeros(view.shape[:2], np.uint8)
     ring(disc, centre, radius, (255, 255, 255), cv2.FILLED)
     cv2.copyTo(clean, disc, view)

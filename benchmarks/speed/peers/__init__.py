@@ -1,4 +1,4 @@
-"""The same problems solved by other libraries, each in a process of its own.
+"""Solves the same problems by other libraries, each in a process of its own.
 
-What runs there, `worker.py`, `problem.py` and the modules `with_...`, needs numpy and that library alone.
+The code of that process, `worker.py`, `problem.py` and the modules `with_...`, needs numpy and that library alone.
 """

@@ -1,4 +1,4 @@
-"""The problem that every library solves: where a ball was, how fast, and one spin, from noisy positions of its flight.
+"""Defines the common problem: positions, velocities and one spin from noisy positions of a flight.
 
 Unknowns of a track of n samples: positions and velocities (n, 3) each and one spin (3,). Residuals over a step:
 [p1 - p - dt v - dt^2/2 a, v1 - v - dt a] with a taken at the step's begin; positions; the labelled spin. The

@@ -1,4 +1,4 @@
-"""One library with one problem, in a process of its own that is asked for solutions."""
+"""Runs one library with one problem in a process that is asked for solutions."""
 
 import json
 import os
@@ -17,7 +17,7 @@ WORKER: Final = Path(__file__).with_name("worker.py")
 
 
 class LibraryError(Exception):
-    """A library that is not there, or does not solve this problem."""
+    """A library is missing, or does not solve this problem."""
 
 
 class Session:

@@ -1,4 +1,4 @@
-"""The suite of `ballfg-bench speed --peers`: the same problems by every library that is installed, in turns."""
+"""Runs `ballfg-bench speed --peers`: the same problems by every installed library, in turns."""
 
 import sys
 import tempfile
@@ -34,7 +34,7 @@ from ballfg.benchmarks.speed.suite import (
 from ballfg.dynamics import rollout
 from ballfg.progress import progress
 from ballfg.state import POSITION, STANDARD_GRAVITY
-from ballfg.tracks import SPIN_LABELS
+from ballfg.tracks.track import SPIN_LABELS
 
 OWN: Final = ("ballfg", "gtsam")
 """Libraries of this environment."""
@@ -49,12 +49,12 @@ DIFFERENCE_STEPS: Final = (1e-4, 1e-5)
 
 @dataclass(frozen=True)
 class Task:
-    """What is solved.
+    """A problem for all libraries.
 
     Attributes:
         name: of the rows' case.
         kind: "estimate", "gradient" or "rollout".
-        network: whether the acceleration is the network's.
+        network: True if the acceleration is the network's.
         tracks: number of them.
         turns, runs: timed solutions: so many turns of so many runs of each library.
     """
@@ -78,7 +78,7 @@ TASKS: Final = (
 
 
 def run_peers(results: Results, peers: Mapping[str, Path], size: Size) -> None:
-    """Times of all libraries on all tasks; what is missing or differs is said on stderr and has no row.
+    """Times of all libraries on all tasks; missing or deviating ones are reported on stderr, without a row.
 
     Args:
         peers: interpreters of other environments, by library.
@@ -164,7 +164,7 @@ def _run_task(
 
 
 def _reference(task: Task, problem: Problem, path: Path, own: Session) -> dict[str, Array]:
-    """What solutions are compared with: the banded solver's, and GTSAM's to the last digits for the network.
+    """Reference solutions: the banded solver's, and GTSAM's to the last digits for the network.
 
     Of gradients central differences of the banded solver, of rollouts ballfg's own, which the others must meet.
     """

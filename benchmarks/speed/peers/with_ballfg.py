@@ -1,4 +1,4 @@
-"""ballfg: factors of the same residuals, its own Levenberg-Marquardt, derivatives in machine code."""
+"""Solves the problem by ballfg: factors of the same residuals, its own Levenberg-Marquardt, compiled derivatives."""
 
 import numpy as np
 import torch
@@ -6,9 +6,10 @@ from problem import LOSS_STEPS, ROLLOUT_STEPS, Array, Problem
 from torch import Tensor, nn
 
 from ballfg.arrays import Index
-from ballfg.dynamics import BallModel, Surfaces, model_from_dict, rollout
+from ballfg.dynamics import BallModel, Surfaces, rollout
 from ballfg.dynamics.compiled.functions import compiled
 from ballfg.dynamics.model import Rates
+from ballfg.dynamics.model_file import model_from_dict
 from ballfg.factors.batch import FactorBatch, Noise, Values
 from ballfg.factors.graph import BallGraph, LevenbergMarquardt
 from ballfg.factors.position import PositionFactors
@@ -20,9 +21,9 @@ from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 
 torch.set_num_threads(1)
 TOLERANCE = 3e-6
-"""Posterior standard deviations to the minimum: the loosest that meets what is compared on all tracks."""
+"""Posterior standard deviations to the minimum: the loosest that meets the comparison on all tracks."""
 EXACT = 1e-8
-"""Relative error of the linear solution of a gradient, in keeping with what is compared."""
+"""Relative error of the linear solution of a gradient, fine enough for the comparison."""
 HELD = 1e-6
 """rad/s, by which the spin may change over a step: one spin for the flight, within all digits that are compared."""
 

@@ -1,4 +1,4 @@
-"""GTSAM as its users drive it from Python: one CustomFactor for each step, derivatives by hand in numpy."""
+"""Solves the problem by GTSAM from Python: one CustomFactor for each step, with derivatives in numpy."""
 
 import gtsam
 import numpy as np

@@ -1,4 +1,4 @@
-"""jaxls: Gauss-Newton on sparse problems in JAX, compiled for the problem; CHOLMOD where scikit-sparse is there."""
+"""Solves the problem by jaxls: compiled sparse Gauss-Newton in JAX, with CHOLMOD if scikit-sparse is installed."""
 
 import importlib.util
 import os
@@ -14,7 +14,7 @@ from problem import ROLLOUT_STEPS, Array, Problem
 jax.config.update("jax_enable_x64", True)
 
 TOLERANCE = 1e-10
-"""Of its relative change of the cost: the loosest power of ten that meets what is compared on all tracks."""
+"""Relative change of the cost: the loosest power of ten that meets the comparison on all tracks."""
 
 
 class State(jaxls.Var[jax.Array], default_factory=lambda: jnp.zeros(6)):
@@ -22,7 +22,7 @@ class State(jaxls.Var[jax.Array], default_factory=lambda: jnp.zeros(6)):
 
 
 class Spin(jaxls.Var[jax.Array], default_factory=lambda: jnp.zeros(3)):
-    """Of a track."""
+    """Spin of a track."""
 
 
 def solver(problem: Problem, task: str):

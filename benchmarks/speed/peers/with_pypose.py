@@ -1,4 +1,4 @@
-"""PyPose: Levenberg-Marquardt with a dense Jacobian of the whole problem, by torch's autograd."""
+"""Solves the problem by PyPose: Levenberg-Marquardt with a dense Jacobian from torch's autograd."""
 
 import pypose as pp
 import torch
@@ -12,7 +12,7 @@ STEPS = 20
 MOST_TRACKS = 4
 """At once; four take seconds."""
 DAMPING = 1e-10
-"""Of the first step: as good as none, which is the quickest here."""
+"""Damping of the first step: negligible, which is the quickest here."""
 
 
 class Flight(nn.Module):

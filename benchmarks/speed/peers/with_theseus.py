@@ -1,4 +1,4 @@
-"""Theseus: Gauss-Newton on batches of problems in torch, and the gradient through its solution."""
+"""Solves the problem by Theseus: batched Gauss-Newton in torch, with the gradient through its solution."""
 
 import importlib.util
 import warnings

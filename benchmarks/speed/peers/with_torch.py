@@ -1,4 +1,4 @@
-"""The problem's acceleration in torch, shared by the libraries that are built on it; torch itself rolls out."""
+"""Computes the problem's acceleration in torch for the libraries built on it, and rolls it out."""
 
 import torch
 from problem import LOSS_STEPS, ROLLOUT_STEPS, Problem

@@ -1,7 +1,7 @@
-"""The process of one library with one problem: `python worker.py LIBRARY TASK PROBLEM.npz`.
+"""Solves one problem by one library in a process: `python worker.py LIBRARY TASK PROBLEM.npz`.
 
-It solves once, writes a line of JSON with what that took, and then obeys lines on its standard input: a number of
-timed solutions, or the name of a file for the solution. Runs in any environment that has numpy and the library.
+It solves once, writes a line of JSON with the costs, and then obeys lines on its standard input: a number of timed
+solutions, or the name of a file for the solution. Runs in any environment that has numpy and the library.
 """
 
 import gc

@@ -12,7 +12,8 @@ from ballfg.benchmarks.cameras.scenes import Filmed, Scenario, judge, scenarios,
 from ballfg.benchmarks.cameras.suite import add_clocks, add_points, add_turns, add_velocities
 from ballfg.benchmarks.cameras.turned import TURN, turned, turns
 from ballfg.benchmarks.results import Results
-from ballfg.simulation.scene import Clock, Recording
+from ballfg.simulation.scene.config import Clock
+from ballfg.simulation.scene.recording import Recording
 from ballfg.vision import Detections
 from ballfg.vision.tracking.pipeline import track_detections
 
@@ -99,6 +100,7 @@ def test_truth_ends_with_the_flight(together) -> None:
     np.testing.assert_allclose(states[1], flight.knots[0])
 
 
+@pytest.mark.thorough
 def test_camera_factors_beat_what_pretends_to_be_synchronised(apart) -> None:
     found = compare(apart)
     results = Results("cameras", 0)

@@ -249,7 +249,7 @@ def test_a_run_makes_rows_and_pictures_and_goes_on_where_it_was(
     assert again.rows == results.rows
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_real_case_of_a_strong_wind(tmp_path: Path) -> None:
     case = replace(planted_case("naming", "wind", 2.0, 0), recording=Recording(tracks=24, rate=60.0))
     kept = collect_records([case], tmp_path, 1)[case.name]

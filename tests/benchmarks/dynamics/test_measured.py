@@ -12,7 +12,7 @@ from ballfg.benchmarks.dynamics.jobs import collect_records, judged, record_path
 from ballfg.benchmarks.dynamics.measured import Measured, measured_task, measured_tasks
 from ballfg.benchmarks.dynamics.record import job_digest, task_digest
 from ballfg.benchmarks.dynamics.suite import Plan, run_dynamics
-from ballfg.benchmarks.dynamics.task import Shot, Task
+from ballfg.benchmarks.dynamics.task import Task, TaskShot
 from ballfg.benchmarks.dynamics.trained import config_of, recipe, trained_contender
 from ballfg.benchmarks.estimators.measured import run_measured
 from ballfg.benchmarks.results import Results
@@ -29,7 +29,7 @@ def simulated(folder: Path, name: str, tracks: int, seed: int, *, spin_labels: b
     return read_dataset(folder / name)
 
 
-def ten(task: Task) -> list[Shot]:
+def ten(task: Task) -> list[TaskShot]:
     """As many shots to learn from as have one that validates."""
     return [task.train[0]] * 10
 

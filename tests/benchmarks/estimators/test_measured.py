@@ -4,7 +4,8 @@ import pytest
 from ballfg.benchmarks.estimators.conformal import conformal_coverage
 from ballfg.benchmarks.estimators.measured import WHOLE, Measured, _add_smoothing, prediction_rmse
 from ballfg.benchmarks.results import Results
-from ballfg.estimation import Estimate, Status, TrackPrediction
+from ballfg.estimation import Estimate, Status
+from ballfg.estimation.track_prediction import TrackPrediction
 
 
 def test_prediction_rmse_by_hand() -> None:

@@ -7,9 +7,30 @@ import pytest
 import torch
 
 from ballfg.benchmarks.results import Results
-from ballfg.benchmarks.speed import robot
+from ballfg.benchmarks.speed import robot, suite
 from ballfg.benchmarks.speed.network import GRAVITY, fitted_network, parameter_count
-from ballfg.benchmarks.speed.suite import QUICK, problem_model, problem_track, run_speed
+from ballfg.benchmarks.speed.stopwatch import Stopwatch
+from ballfg.benchmarks.speed.suite import QUICK, banded_problem, problem_model, problem_track, run_speed
+from ballfg.dynamics import nominal_model
+
+EXPECTED = {
+    "matrix_product_time",
+    "banded_time",
+    "lm_time",
+    "lm_time_gtsam",
+    "covariances_time",
+    "estimate_time",
+    "jacobians_time_79",
+    "jacobian_time_1",
+    "online_update_median",
+    "online_update_p99",
+    "online_chain_update_median",
+    "online_chain_update_p99",
+    "prediction_time",
+    "estimate_time_two_bounces",
+}
+EVENTS = {"next_bounce_time", "plane_crossing_time"}
+GROWTH = {f"estimate_us_per_observation_{count}" for count in robot.LONG}
 
 
 def test_network_is_the_same_each_time_and_close_to_the_model() -> None:
@@ -36,31 +57,29 @@ def test_the_problem_is_eighty_samples_at_a_hundred_hertz() -> None:
     assert 4.0 < speeds.min() < speeds.max() < 7.0
 
 
+def test_an_analytic_model_has_its_times() -> None:
+    results, model = Results("test", 0), problem_model()
+    track = problem_track(model)
+    watch = Stopwatch(results, suite.CASE, 2, 1, banded_problem(track))
+    suite._time_model(watch, "analytic", model, track)
+    suite._time_coefficients(watch, model, track)
+    robot.time_bounces(watch, "analytic", nominal_model(model.radius), suite.NOISE, suite.LABEL_NOISE)
+    robot.time_growth(watch, "analytic", model, suite.START, suite.NOISE)
+    robot.time_events(watch)
+    assert {row.metric for row in results.rows if row.method == "analytic" and row.unit == "ms"} == EXPECTED
+    assert {row.metric for row in results.rows} >= EVENTS | GROWTH
+    assert all(row.value is not None and row.value > 0 for row in results.rows)
+
+
+@pytest.mark.thorough
 def test_speed_run_has_every_time() -> None:
     results = Results("test", 0)
     run_speed(results, None, replace(QUICK, runs=2, warm_up=1, fit_iterations=100, pretrain_iterations=10, flights=1))
-    expected = {
-        "matrix_product_time",
-        "banded_time",
-        "lm_time",
-        "lm_time_gtsam",
-        "covariances_time",
-        "estimate_time",
-        "jacobians_time_79",
-        "jacobian_time_1",
-        "online_update_median",
-        "online_update_p99",
-        "online_chain_update_median",
-        "online_chain_update_p99",
-        "prediction_time",
-        "estimate_time_two_bounces",
-    }
     for method in ("analytic", "network"):
         found = {row.metric for row in results.rows if row.method == method and row.unit == "ms"}
-        assert found == expected
+        assert found == EXPECTED
     assert {row.metric for row in results.rows if row.method == "control"} == {"matrix_product_time", "banded_time"}
     assert all(row.value is not None and row.value > 0 for row in results.rows)
     found = {row.metric for row in results.rows}
-    assert {"stream_push_p999", "next_bounce_time", "plane_crossing_time"} <= found
+    assert {"stream_push_p999"} | EVENTS | GROWTH <= found
     assert {"rollout_time", "rollout_time_torch"} <= found
-    assert {f"estimate_us_per_observation_{count}" for count in robot.LONG} <= found

@@ -10,10 +10,14 @@ import numpy as np
 import torch
 
 from ballfg.arrays import Array
-from ballfg.dynamics import Effect
-from ballfg.simulation import SETTING_LEVELS, SimulatedLauncher, SimulationConfig, dataset_info, simulate, table_tennis
+from ballfg.dynamics.effect import Effect
+from ballfg.simulation import SimulationConfig, simulate, table_tennis
+from ballfg.simulation.launcher import SimulatedLauncher
+from ballfg.simulation.settings import SETTING_LEVELS
+from ballfg.simulation.synthetic import dataset_info
 from ballfg.state import SPIN, VELOCITY
-from ballfg.tracks import SPIN_LABELS, Dataset, Track, read_dataset, write_dataset
+from ballfg.tracks import Dataset, Track, read_dataset, write_dataset
+from ballfg.tracks.track import SPIN_LABELS
 
 
 def shots(settings: Array, seed: int, effects: Sequence[Effect] = ()) -> list[Track]:

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ballfg.diagnosis import ShotPlan, design_shots, diagnose
+from ballfg.diagnosis import design_shots, diagnose
 from ballfg.diagnosis.design.levels import combinations, parse_levels
+from ballfg.diagnosis.design.plan import ShotPlan
 from ballfg.dynamics import EFFECTS, nominal_model
 from ballfg.simulation import parse_effects
 from ballfg.tracks import Track
@@ -47,6 +48,7 @@ def found(folder: Path, tracks: list[Track]) -> dict[str, tuple[str, ...]]:
     return {finding.name: finding.indistinguishable_from for finding in diagnosis.findings}
 
 
+@pytest.mark.thorough
 def test_ten_designed_shots_decide(campaign: Campaign, tmp_path: Path) -> None:
     plan, tracks = campaign
     assert plan.setting_names == AIMED
@@ -54,6 +56,7 @@ def test_ten_designed_shots_decide(campaign: Campaign, tmp_path: Path) -> None:
     assert found(tmp_path, tracks["designed"]) == {PAIR[1]: ()}
 
 
+@pytest.mark.thorough
 def test_thirty_random_shots_do_not(campaign: Campaign, tmp_path: Path) -> None:
     _, tracks = campaign
     assert len(tracks["random"]) == FEW + RANDOM

@@ -10,7 +10,8 @@ import torch
 
 from ballfg.diagnosis.design.flights import View, planned_flights
 from ballfg.diagnosis.design.launcher_map import learn_launcher
-from ballfg.simulation import MeasurementNoise, SimulationConfig, all_settings, simulate, table_tennis
+from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate, table_tennis
+from ballfg.simulation.settings import all_settings
 
 NAMES = ("topspin", "sidespin", "speed")
 STEADY = {"position_spread": 0.0, "speed_spread": 0.0, "aim_spread": 0.0, "spin_spread": 0.0}

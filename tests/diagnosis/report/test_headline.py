@@ -11,7 +11,6 @@ import pytest
 
 from ballfg.diagnosis.generic_test import GenericTest
 from ballfg.diagnosis.label_verdicts import LabelCheck, LabelVerdict
-from ballfg.diagnosis.remains.label_check import label_test
 from ballfg.diagnosis.report.glossary import OUTCOMES, TERMS
 from ballfg.diagnosis.report.headline import advice, answer, certainty, further, headline, where
 from ballfg.diagnosis.report.origin import Origin
@@ -21,9 +20,10 @@ from ballfg.diagnosis.report.plain_effects import OF_A_TRACKER, in_plain_words, 
 from ballfg.diagnosis.report.predictions import meaning
 from ballfg.diagnosis.report.report import content
 from ballfg.diagnosis.report.shots import distances, error_map, median_shot
+from ballfg.diagnosis.residual_tests.label_check import label_test
 from ballfg.diagnosis.result import Diagnosis, Outcome, Unexplained, Value, Verdict
 from ballfg.dynamics import EFFECTS
-from ballfg.estimation.noise.tracker import NUMBERS
+from ballfg.estimation.noise.tracker_errors import NUMBERS
 from tests.diagnosis.made_diagnosis import found, residuals, rounds, silent, unexplained
 from tests.html_page import HtmlPage
 

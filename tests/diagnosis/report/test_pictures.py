@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ballfg.diagnosis.report import pictures
 from ballfg.diagnosis.report.binned import binned, in_flight, motion_axes, slip_speed, turned
-from ballfg.diagnosis.report.shots import Shot, shot_picture
+from ballfg.diagnosis.report.shots import ShotErrors, shot_picture
 from ballfg.diagnosis.report.wording import change, fixed, joined, listed, number, plus_minus, probability
 from ballfg.diagnosis.result import Errors, PredictedPath, Value
 from tests.diagnosis.made_diagnosis import WIND, errors, found, residuals, rounds
@@ -136,7 +136,7 @@ def test_a_shot_is_seen_along_its_own_direction() -> None:
     points = np.array([1.0, 2.0, 0.5]) + along * [0.6, 0.8, 0.2]
     left = np.array([-0.08, 0.06, 0.0])
     path = PredictedPath("a", points[:3], 0.1 * np.arange(1.0, 4.0), points[3:] + left, points[3:])
-    figure = shot_picture(Shot(path, path), changed=False)
+    figure = shot_picture(ShotErrors(path, path), changed=False)
     side, top, error = figure.axes
     for axes, up in ((side, [0.5, 0.7, 0.9, 1.1, 1.3, 1.5]), (top, np.zeros(6))):
         seen, later, predicted = axes.lines

@@ -16,8 +16,9 @@ from ballfg.diagnosis.report.origin import Origin
 from ballfg.diagnosis.report.page import page
 from ballfg.diagnosis.report.report import content, write_report
 from ballfg.diagnosis.result import Diagnosis, Errors, Fallback
-from ballfg.dynamics import Architecture, build, load_model, model_to_dict, nominal_model
+from ballfg.dynamics import Architecture, build, load_model, nominal_model
 from ballfg.dynamics.analytic import AnalyticModel
+from ballfg.dynamics.model_file import model_to_dict
 from ballfg.dynamics.networks.learned import LearnedModel
 from tests.diagnosis.made_diagnosis import found, silent, unexplained
 from tests.html_page import HtmlPage

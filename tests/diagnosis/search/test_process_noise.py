@@ -12,8 +12,10 @@ from ballfg.diagnosis.fit.problem import launch_axes
 from ballfg.diagnosis.search.process_noise import calibrated_model, noise_about
 from ballfg.dynamics import load_model, nominal_model, save_model
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
-from ballfg.simulation import MeasurementNoise, SimulationConfig, dataset_info, simulate
-from ballfg.tracks import TrackNoise, read_dataset, write_dataset
+from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate
+from ballfg.simulation.synthetic import dataset_info
+from ballfg.tracks import read_dataset, write_dataset
+from ballfg.tracks.noise import TrackNoise
 
 EMBEDDING = SpinEmbedding(("group",), {"group": ("one",)})
 

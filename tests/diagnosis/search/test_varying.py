@@ -19,7 +19,8 @@ from ballfg.diagnosis.search.signatures import hypothesis_columns
 from ballfg.diagnosis.search.state import without_named
 from ballfg.diagnosis.search.trial import try_varying
 from ballfg.diagnosis.search.varying import Varying, between, groupings, near, varying_hypotheses
-from ballfg.dynamics import EFFECTS, Scene, Variation
+from ballfg.dynamics import EFFECTS, Scene
+from ballfg.dynamics.variation import Variation
 from ballfg.estimation import Settings
 from ballfg.tracks import Track
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from ballfg.diagnosis.search.hypothesis import has_effect, with_effects
-from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces, nominal_model, rollout, substitute
+from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces, nominal_model, rollout
 from ballfg.dynamics.compiled import functions
 from ballfg.dynamics.compiled.build import built
 from ballfg.dynamics.compiled.functions import compiled
@@ -17,9 +17,10 @@ from ballfg.dynamics.compiled.kept import cache_folder
 from ballfg.dynamics.compiled.motion import fly_jacobian, fly_through_jacobian, functions_of
 from ballfg.dynamics.effect import Coefficient, FlightEffect
 from ballfg.dynamics.effects.registry import GENERIC
+from ballfg.dynamics.model import substitute
 from ballfg.dynamics.motion.contact import fly_through
 from ballfg.dynamics.motion.integrate import fly
-from ballfg.estimation.segmentation import physics_of
+from ballfg.estimation.segmentation.physics import physics_of
 
 MOTION = {name: effect for name, effect in {**EFFECTS, **GENERIC}.items() if effect.kind != "measurement"}
 

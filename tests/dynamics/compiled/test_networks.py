@@ -41,16 +41,17 @@ def faded(kind):
     return model
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["mlp", *(pytest.param(kind, marks=pytest.mark.thorough) for kind in KINDS[1:])])
 def test_every_kind_of_network(kind) -> None:
     agree(network(kind))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [*(pytest.param(kind, marks=pytest.mark.thorough) for kind in KINDS[:-1]), KINDS[-1]])
 def test_corrections_of_a_model_that_fade(kind) -> None:
     agree(faded(kind))
 
 
+@pytest.mark.thorough
 def test_networks_that_give_spin_rates_and_small_ones() -> None:
     agree(network("mnn+gs", spin_rate=True))
     agree(network("mlp+gs", width_flight=5, width_contact=4, depth=1))

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.dynamics import EFFECTS, AnalyticModel, fly, substitute
+from ballfg.dynamics import EFFECTS, AnalyticModel
 from ballfg.dynamics.effect import Coefficient, FlightEffect
-from ballfg.dynamics.model import take_rows
+from ballfg.dynamics.model import substitute, take_rows
+from ballfg.dynamics.motion.integrate import fly
 
 BASE = {
     "gravity": {"g": 9.8},

@@ -7,10 +7,12 @@ import math
 import pytest
 import torch
 
-from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces, advance, fly
+from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.effects.flight import Drag, Gravity
 from ballfg.dynamics.effects.registry import effect_class
+from ballfg.dynamics.motion.integrate import fly
+from ballfg.dynamics.motion.rollout import advance
 
 SURFACES = Surfaces(0.0, -0.76)
 

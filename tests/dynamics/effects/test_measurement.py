@@ -8,10 +8,13 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch.autograd import forward_ad
 
-from ballfg.dynamics import EFFECTS, AnalyticModel, Architecture, build, fly, model_from_dict, model_to_dict, substitute
+from ballfg.dynamics import EFFECTS, AnalyticModel, Architecture, build
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.effects.generic import GenericMeasurement
 from ballfg.dynamics.effects.measurement import SOFT_DISTANCE, signed_permutations
+from ballfg.dynamics.model import substitute
+from ballfg.dynamics.model_file import model_from_dict, model_to_dict
+from ballfg.dynamics.motion.integrate import fly
 
 STATE = torch.tensor([[1.2, 0.3, 1.1, 5.0, -1.0, 2.0, 40.0, -150.0, 60.0]], dtype=torch.float64)
 POSITION, VELOCITY, SPIN = STATE[0, :3].numpy(), STATE[0, 3:6].numpy(), STATE[0, 6:].numpy()

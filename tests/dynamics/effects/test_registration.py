@@ -11,8 +11,9 @@ import pytest
 import torch
 from cloudpickle import dumps  # what worker processes are sent with
 
-from ballfg.dynamics import EFFECTS, Coefficient, FlightEffect, load_effects, model_from_dict, nominal_model, register
+from ballfg.dynamics import EFFECTS, Coefficient, FlightEffect, load_effects, nominal_model, register
 from ballfg.dynamics.measurement import MeasurementEffect
+from ballfg.dynamics.model_file import model_from_dict
 
 LIFT = '''"""Two effects, the second of which changes the first; a base of both."""
 

@@ -7,22 +7,13 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from ballfg.dynamics import (
-    EFFECTS,
-    AnalyticModel,
-    Coefficient,
-    Flight,
-    FlightEffect,
-    Surfaces,
-    advance,
-    contact_time,
-    fly_through,
-    fly_through_jacobian,
-    substitute,
-)
+from ballfg.dynamics import EFFECTS, AnalyticModel, Coefficient, Flight, FlightEffect, Surfaces
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.effects.bounce import TableTilt
+from ballfg.dynamics.model import substitute
+from ballfg.dynamics.motion.contact import contact_time, fly_through, fly_through_jacobian
 from ballfg.dynamics.motion.integrate import batch_jacobian
+from ballfg.dynamics.motion.rollout import advance
 
 TILT = (0.08, -0.05)
 TURN = torch.from_numpy(Rotation.from_rotvec([*TILT, 0.0]).as_matrix())

@@ -9,9 +9,17 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from ballfg.dynamics import contact_time, fly, fly_through, fly_through_jacobian
-from ballfg.dynamics.motion.contact import LONGEST_FALL, MAX_STEP, _newton_step, _scan
-from ballfg.dynamics.motion.integrate import batch_jacobian, derivative
+from ballfg.dynamics.motion.contact import (
+    LONGEST_FALL,
+    MAX_STEP,
+    _newton_step,
+    _scan,
+    contact_time,
+    fly_through,
+    fly_through_jacobian,
+)
+from ballfg.dynamics.motion.flight_step import derivative
+from ballfg.dynamics.motion.integrate import batch_jacobian, fly
 
 R = 0.02
 

@@ -11,8 +11,9 @@ import torch
 from scipy.integrate import solve_ivp
 from torch.autograd import forward_ad
 
-from ballfg.dynamics import fly, fly_jacobian
-from ballfg.dynamics.motion.integrate import MAX_STEP, batch_jacobian, derivative, rk4_step, step_count
+from ballfg.dynamics.motion.flight_step import derivative, rk4_step
+from ballfg.dynamics.motion.integrate import batch_jacobian, fly, fly_jacobian
+from ballfg.dynamics.motion.limits import MAX_STEP, step_count
 
 
 def seconds(*values):

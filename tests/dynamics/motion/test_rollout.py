@@ -9,10 +9,13 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from ballfg.dynamics import Surfaces, advance, fly, fly_through, rollout, substitute
+from ballfg.dynamics import Surfaces, rollout
+from ballfg.dynamics.model import substitute
+from ballfg.dynamics.motion.contact import fly_through
 from ballfg.dynamics.motion.impact import slip_velocity
+from ballfg.dynamics.motion.integrate import fly
 from ballfg.dynamics.motion.limits import REST_SPEED
-from ballfg.dynamics.motion.rollout import LONGEST_MOTION, MAX_CONTACTS, is_resting, place_on, roll
+from ballfg.dynamics.motion.rollout import LONGEST_MOTION, MAX_CONTACTS, advance, is_resting, place_on, roll
 
 R = 0.02
 TABLE_ONLY = Surfaces(0.0)

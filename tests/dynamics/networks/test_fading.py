@@ -9,19 +9,21 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.dynamics import Architecture, LearnedModel, Trained, build, load_model, nominal_model, save_model
+from ballfg.dynamics import Architecture, build, load_model, nominal_model, save_model
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.motion.integrate import fly_jacobian
 from ballfg.dynamics.networks.density import FeatureDensity
 from ballfg.dynamics.networks.fading import ABROAD, Fading, states_before_contacts
+from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.dynamics.trained import Trained
 from ballfg.estimation.configure import dataset_settings, widened, with_usual_noise
-from ballfg.estimation.outside import outside_of, outside_share
+from ballfg.estimation.out_of_distribution import out_of_distribution, out_of_distribution_share
 from ballfg.estimation.settings import MEASURED
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction.belief import Belief
 from ballfg.prediction.propagate import Propagator
-from ballfg.tracks import TrackNoise
+from ballfg.tracks.noise import TrackNoise
 
 FAR = (0.0, 0.0, 1.0, 0.2, 0.1, -0.3, 900.0, -800.0, 700.0)
 HALF_WAY = (0.0, 0.0, 1.0, 3.9, 0.2, -1.5, 8.0, 118.0, 6.0)
@@ -203,11 +205,13 @@ def test_coefficients_are_estimated_in_foreign_rooms_only(model):
 
 def test_the_share_outside_is_one_less_the_weight(model):
     near, far = states(5).numpy(), np.array([FAR] * 3)
-    assert outside_of(model, far) == pytest.approx(1.0, abs=1e-6)
-    assert outside_of(model, near) == pytest.approx(1.0 - model.inside(torch.from_numpy(near)).numpy())
-    assert outside_share(model, [near, far]) == pytest.approx((outside_of(model, near).mean() + 1.0) / 2, abs=1e-6)
-    assert outside_of(nominal_model(0.02), near) is None
-    assert outside_share(nominal_model(0.02), [near]) is None
+    assert out_of_distribution(model, far) == pytest.approx(1.0, abs=1e-6)
+    assert out_of_distribution(model, near) == pytest.approx(1.0 - model.inside(torch.from_numpy(near)).numpy())
+    assert out_of_distribution_share(model, [near, far]) == pytest.approx(
+        (out_of_distribution(model, near).mean() + 1.0) / 2, abs=1e-6
+    )
+    assert out_of_distribution(nominal_model(0.02), near) is None
+    assert out_of_distribution_share(nominal_model(0.02), [near]) is None
 
 
 def test_a_density_without_kernels_is_nowhere():

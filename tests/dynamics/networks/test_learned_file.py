@@ -12,20 +12,12 @@ import safetensors.torch
 import torch
 import yaml
 
-from ballfg.dynamics import (
-    AnalyticModel,
-    Architecture,
-    BallModel,
-    LearnedModel,
-    SpinEmbedding,
-    Trained,
-    Variation,
-    build,
-    load_model,
-    model_to_dict,
-    nominal_model,
-    save_model,
-)
+from ballfg.dynamics import AnalyticModel, Architecture, BallModel, build, load_model, nominal_model, save_model
+from ballfg.dynamics.model_file import model_to_dict
+from ballfg.dynamics.networks.learned import LearnedModel
+from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.dynamics.trained import Trained
+from ballfg.dynamics.variation import Variation
 from ballfg.tracks import Track
 
 KINDS = ("mlp", "mlp+gs", "skip+gs", "mnn+gs")

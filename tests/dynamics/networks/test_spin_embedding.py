@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.dynamics import SpinEmbedding
-from ballfg.dynamics.networks.spin_embedding import SOFT_SPEED
+from ballfg.dynamics.networks.spin_embedding import SOFT_SPEED, SpinEmbedding
 
 
 def local_spins(*rows):

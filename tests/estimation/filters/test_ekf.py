@@ -17,7 +17,7 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.filters.ekf import ExtendedKalmanFilter
 from ballfg.estimation.filters.sliding_window import SlidingWindow
 from ballfg.estimation.result import Status
-from ballfg.estimation.segmentation import Quality
+from ballfg.estimation.segmentation.result import Quality
 from ballfg.estimation.settings import Settings
 from ballfg.factors.noise import ProcessNoise
 from ballfg.state import POSITION, STATE_DIM, VELOCITY

@@ -15,7 +15,7 @@ from ballfg.dynamics.motion.advance_jacobian import advance_jacobian
 from ballfg.estimation.filters.ball_filter import BallFilter
 from ballfg.estimation.filters.ekf import ExtendedKalmanFilter, _Run
 from ballfg.estimation.result import Status
-from ballfg.estimation.segmentation import Quality
+from ballfg.estimation.segmentation.result import Quality
 from ballfg.estimation.settings import Settings
 from ballfg.factors.noise import ProcessNoise
 from ballfg.state import POSITION, VELOCITY

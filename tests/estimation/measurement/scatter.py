@@ -14,7 +14,8 @@ import itertools
 import numpy as np
 
 from ballfg.dynamics import nominal_model
-from ballfg.estimation import Settings, fitted_settings
+from ballfg.estimation import Settings
+from ballfg.estimation.configure import fitted_settings
 from ballfg.estimation.measurement.position_noise import noise_doubts
 from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate
 from ballfg.tracks import read_dataset

@@ -7,10 +7,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces, Variation, advance, nominal_model
+from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces, nominal_model
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.effects.measurement import signed_permutations
 from ballfg.dynamics.measurement import Later
+from ballfg.dynamics.motion.rollout import advance
+from ballfg.dynamics.variation import Variation
 from ballfg.estimation.measurement.as_measured import (
     LabelMap,
     measured_positions,

@@ -9,13 +9,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from ballfg.dynamics import EFFECTS, AnalyticModel, Architecture, Coefficient, Effect, build
+from ballfg.dynamics import EFFECTS, AnalyticModel, Architecture, Coefficient, build
+from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.measurement import Later, MeasurementEffect
-from ballfg.estimation import ESTIMATORS, Estimate, Settings, Smoother, Status, make_estimator
+from ballfg.estimation import Estimate, Settings, Smoother, Status
 from ballfg.estimation.measurement import invert_measurement as through_measurement
 from ballfg.estimation.measurement.invert_measurement import InvertMeasurement
+from ballfg.estimation.registry import ESTIMATORS, make_estimator
 from ballfg.factors.noise import ProcessNoise
-from ballfg.simulation import MeasurementNoise, SimulatedTrack, SimulationConfig, parse_effects, simulate
+from ballfg.simulation import MeasurementNoise, SimulationConfig, parse_effects, simulate
+from ballfg.simulation.measure import SimulatedTrack
 from ballfg.state import POSITION, SPIN, VELOCITY
 
 CONFIG = SimulationConfig(tracks=3, rate=60.0, seed=3, noise=MeasurementNoise(position=0.002, spin=4.0))
@@ -143,6 +146,7 @@ def test_coefficients_of_the_track_are_estimated_as_usual(plain) -> None:
     assert (np.abs(away) < 0.05).all()
 
 
+@pytest.mark.thorough
 def test_a_residual_model_measures_as_its_base(plain, reference) -> None:
     """Untrained, it is its base; one short track."""
     effects = parse_effects(["frame_tilt.x=0.02"])

@@ -41,19 +41,19 @@ def run(tracks: LinearFilter, noise: Noise) -> tuple[Tensor, Tensor, Tensor, Ten
     biases = noise.memory.expand(tracks.count, -1)[:, : tracks.biases]
     covariance = torch.diag_embed(torch.cat((prior, biases), dim=1))
     mean = torch.nn.functional.pad(linear.starts, (0, tracks.biases))
-    means, covariances, squares, following = [], [], [], torch.zeros(tracks.count, dtype=torch.float64)
+    means, covariances, nis, nll = [], [], [], torch.zeros(tracks.count, dtype=torch.float64)
     for k in range(tracks.samples):
         if k:
             step = transitions[:, k - 1]
             mean = (step @ mean[..., None])[..., 0]
-            mean = mean + torch.nn.functional.pad(linear.departures[:, k - 1], (0, tracks.biases))
+            mean = mean + torch.nn.functional.pad(linear.offsets[:, k - 1], (0, tracks.biases))
             covariance = step @ covariance @ step.mT + gathered[:, k - 1]
         innovation = (linear.errors[:, k] - mean @ observe.T)[..., None]
         spread = observe @ covariance @ observe.T + measured[:, k]
         square = (innovation.mT @ torch.linalg.solve(spread, innovation))[:, 0, 0]
         if k >= NEXT_FROM:
             loss = torch.where(square < NEXT_TAIL**2, square / 2, NEXT_TAIL * square.sqrt() - NEXT_TAIL**2 / 2)
-            following = following + linear.used[:, k] * (loss + torch.logdet(spread) / 2)
+            nll = nll + linear.used[:, k] * (loss + torch.logdet(spread) / 2)
         gain = (
             torch.linalg.solve(spread, observe @ covariance).mT * (linear.used[:, k] & (square < GATE))[:, None, None]
         )
@@ -61,6 +61,6 @@ def run(tracks: LinearFilter, noise: Noise) -> tuple[Tensor, Tensor, Tensor, Ten
         kept = torch.eye(tracks.width, dtype=torch.float64) - gain @ observe
         covariance = kept @ covariance @ kept.mT + gain @ measured[:, k] @ gain.mT
         means.append(mean)
-        squares.append(square)
+        nis.append(square)
         covariances.append(covariance)
-    return torch.stack(means, dim=1), torch.stack(covariances, dim=1), following, torch.stack(squares, dim=1)
+    return torch.stack(means, dim=1), torch.stack(covariances, dim=1), nll, torch.stack(nis, dim=1)

@@ -30,7 +30,8 @@ from ballfg.simulation.composition import KickedModel
 from ballfg.simulation.launcher import SimulatedLauncher
 from ballfg.simulation.motion import simulate_motion
 from ballfg.state import POSITION, VELOCITY
-from ballfg.tracks import SPIN_LABELS, Track
+from ballfg.tracks import Track
+from ballfg.tracks.track import SPIN_LABELS
 
 KIND = table_tennis()
 LAUNCHER = SimulatedLauncher(x_low=-90.0, x_high=90.0, y_far=90.0, duration=0.8)

@@ -4,14 +4,8 @@ import numpy as np
 import pytest
 
 from ballfg.dynamics import load_model
-from ballfg.estimation import (
-    Smoother,
-    dataset_settings,
-    dataset_surfaces,
-    estimate_noise,
-    predict_tracks,
-    spread_over,
-)
+from ballfg.estimation import Smoother, dataset_settings, dataset_surfaces, estimate_noise, predict_tracks
+from ballfg.estimation.noise.estimate import spread_over
 from ballfg.simulation import MeasurementNoise, MotionNoise, SimulationConfig, parse_effects, write_simulation
 from ballfg.tracks import read_dataset
 from tests.estimation.noise import intervals
@@ -50,6 +44,7 @@ def test_error_bars_are_of_the_size_of_the_errors(found):
         assert abs(np.log(value / 0.003)) < 3.0 * found.relative_errors[f"memory.{axis}"]
 
 
+@pytest.mark.thorough
 def test_factors_hold_where_the_curvature_is_not_honest():
     """White noise of 0.5 mm beside 2 mm that last for 10 ms: upwards it is known, downwards hardly."""
     rows = []

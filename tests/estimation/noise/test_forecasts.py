@@ -62,7 +62,7 @@ def dense(linear, forecaster, noise, track):
         now, last = slice(k * width, (k + 1) * width), slice((k - 1) * width, k * width)
         step = transitions[k - 1]
         mean[now] = step @ mean[last]
-        mean[k * width : k * width + own] += linear.departures[track, k - 1].numpy()
+        mean[k * width : k * width + own] += linear.offsets[track, k - 1].numpy()
         cov[now, : k * width] = step @ cov[last, : k * width]
         cov[: k * width, now] = cov[now, : k * width].T
         cov[now, now] = step @ cov[last, last] @ step.T + gathered[k - 1]

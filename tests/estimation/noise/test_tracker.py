@@ -11,7 +11,7 @@ from ballfg.estimation.noise.estimate import linearised
 from ballfg.estimation.noise.linear_filter import LinearFilter
 from ballfg.estimation.noise.marginal import MarginalFit
 from ballfg.estimation.noise.parameters import parameters_of, tensors_of
-from ballfg.estimation.noise.tracker import JITTER, MEMORY, tracker_noise
+from ballfg.estimation.noise.tracker_errors import JITTER, MEMORY, tracker_noise
 from ballfg.factors.noise import ProcessNoise
 from ballfg.simulation import MeasurementNoise
 

@@ -83,7 +83,7 @@ def seen(
     late = np.array([c.time_offset for c in rig])[camera]
     noise = np.tile(NOISE**2 * np.eye(2), (len(times), 1, 1))
     names = tuple(c.name for c in rig)
-    return Scene(Sightings(names, camera, times + late, pixels, noise).taken(inside), states[inside])
+    return Scene(Sightings(names, camera, times + late, pixels, noise).select(inside), states[inside])
 
 
 def scene(

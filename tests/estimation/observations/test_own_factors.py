@@ -11,8 +11,8 @@ import pytest
 
 from ballfg.arrays import Array, Index
 from ballfg.dynamics import nominal_model
-from ballfg.estimation import Context, ExtendedKalmanFilter, Online, RadarSpeed, Settings, Smoother
-from ballfg.estimation.observations.observation import Unknowns
+from ballfg.estimation import ExtendedKalmanFilter, Online, RadarSpeed, Settings, Smoother
+from ballfg.estimation.observations.observation import Context, Unknowns
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Values
 from ballfg.factors.check import check_factor
 from ballfg.factors.loss import Loss

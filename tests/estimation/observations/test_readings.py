@@ -8,8 +8,9 @@ import torch
 from scipy.stats import chi2
 
 from ballfg.dynamics import AnalyticModel, Surfaces, nominal_model
-from ballfg.estimation import Context, ExtendedKalmanFilter, Online, RadarSpeed, Smoother, SpinReading
+from ballfg.estimation import ExtendedKalmanFilter, Online, RadarSpeed, Smoother, SpinReading
 from ballfg.estimation.observations.innovation import FilterInnovation
+from ballfg.estimation.observations.observation import Context
 from ballfg.estimation.observations.reading import FARTHEST, Reading
 from ballfg.estimation.online.windows.linear import LinearFactors
 from ballfg.factors.batch import COEFFICIENTS, Values

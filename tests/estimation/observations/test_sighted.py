@@ -57,7 +57,7 @@ def test_path_before_a_moment_knows_nothing_later(made: Scene) -> None:
     times = made.sightings.times
     moments = times[30:]
     path = rough_path(Rays.of(made.sightings, times, RIG), moments, BEFORE)
-    short = made.sightings.taken(np.arange(101))
+    short = made.sightings.select(np.arange(101))
     again = rough_path(Rays.of(short, times[:101], RIG), moments[70:71], BEFORE)
     np.testing.assert_allclose(again.positions[0], path.positions[70], atol=1e-9)
     away = np.abs(moments[:, None] - bounces(made)).min(axis=1) > 0.02
@@ -81,7 +81,7 @@ def test_one_camera_alone_still_gives_states(ball: World) -> None:
     made = scene(2, ball)
     t = made.sightings.times
     kept = (made.sightings.camera == 0) | (t < 0.1) | (t > 0.2)
-    track = track_of(Scene(made.sightings.taken(kept), made.truth[kept]))
+    track = track_of(Scene(made.sightings.select(kept), made.truth[kept]))
     alone = (track.times > 0.12) & (track.times < 0.18)
     assert alone.sum() == 7
     assert (track.sigmas[alone] >= 0.1).all()
@@ -105,12 +105,12 @@ def test_refuses_what_is_no_track(made: Scene) -> None:
     with pytest.raises(ValueError, match=r"in order of true time; row 1, camera 'right', is earlier"):
         sighted_track("a", made.sightings, (RIG[0], replace(RIG[1], time_offset=0.004), RIG[2]))
     with pytest.raises(ValueError, match="seen by two cameras within a few frames"):
-        sighted_track("a", made.sightings.taken(made.sightings.camera == 1), RIG)
+        sighted_track("a", made.sightings.select(made.sightings.camera == 1), RIG)
 
 
 def nearest_stamp_positions(made: Scene) -> Track:
     """Points of the first camera's frames with the nearest frames of the others, as if all shutters opened together."""
-    own = [made.sightings.taken(made.sightings.camera == c) for c in range(3)]
+    own = [made.sightings.select(made.sightings.camera == c) for c in range(3)]
     points = []
     for time in own[0].times:
         rows, sides = [], []
@@ -184,7 +184,7 @@ def test_covariances_and_innovations_are_honest() -> None:
 
 def test_innovation_is_the_distance_from_what_all_others_predict(ball: World, made: Scene) -> None:
     """A sighting really left out: what it would show, and how surely, by the smoother on the others."""
-    made = Scene(made.sightings.taken(np.arange(60)), made.truth[:60])
+    made = Scene(made.sightings.select(np.arange(60)), made.truth[:60])
     estimator = smoother(ball, sighting_loss=Loss(), spin_loss=Loss(), find_events=False)
     track = track_of(made)
     whole = estimator.estimate(track)
@@ -228,7 +228,7 @@ def test_others_use_the_rough_positions(ball: World, made: Scene, method: str) -
 
 def test_order_of_sightings_is_free(ball: World, made: Scene) -> None:
     """Grouped by camera, as files have them; put in order by true time they are the same track."""
-    shuffled = made.sightings.taken(np.argsort(made.sightings.camera, kind="stable"))
+    shuffled = made.sightings.select(np.argsort(made.sightings.camera, kind="stable"))
     np.testing.assert_array_equal(in_order(shuffled, RIG).pixels, made.sightings.pixels)
 
 

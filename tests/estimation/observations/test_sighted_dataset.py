@@ -29,7 +29,7 @@ def scenes() -> dict[str, Scene]:
 def folder(tmp_path: Path, scenes: dict[str, Scene]) -> Path:
     write_info(tmp_path / "dataset.yaml", DatasetInfo("seen", TABLE, TABLE_TENNIS))
     write_cameras(tmp_path / "cameras.yaml", RIG)
-    lonely = scenes["one"].sightings.taken(scenes["one"].sightings.camera == 0)
+    lonely = scenes["one"].sightings.select(scenes["one"].sightings.camera == 0)
     balls = {name: made.sightings for name, made in scenes.items()} | {"lonely": lonely}
     write_sightings(tmp_path / "detections.csv", balls.items())
     return tmp_path

@@ -8,7 +8,8 @@ import pytest
 from ballfg.dynamics import nominal_model
 from ballfg.estimation.online.events import EventTracker, contact_step
 from ballfg.estimation.online.online import Online
-from ballfg.estimation.segmentation import Contact, Segmentation, physics_of
+from ballfg.estimation.segmentation.physics import physics_of
+from ballfg.estimation.segmentation.result import Contact, Segmentation
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.tracks import Track
@@ -74,7 +75,7 @@ def test_a_contact_moves_six_times_at_most():
     assert events.move(10, -0.76, 1)
     none, good = np.zeros(0, dtype=np.int64), np.zeros(20, dtype=np.int8)
     found = Segmentation((Contact(10, 0.1, 0.0), Contact(10, 0.1, -0.76)), none, none, (), good)
-    assert [contact.interval for contact in events.moved(found, 0).contacts] == [10, 11]
+    assert [contact.interval for contact in events.with_moved_contacts(found, 0).contacts] == [10, 11]
 
 
 def hit_track():

@@ -120,7 +120,7 @@ def test_one_camera_is_carried_on_then_held_back(ball: World) -> None:
     made = scene(3, ball, duration=0.55)
     t = made.sightings.times
     kept = (made.sightings.camera == 0) | (t < 0.1)
-    alone = Scene(made.sightings.taken(kept), made.truth[kept])
+    alone = Scene(made.sightings.select(kept), made.truth[kept])
     online = Online(ball.model, ball.surfaces, Settings(), cameras=RIG)
     states = pushed(online, alone)
     times = alone.sightings.times

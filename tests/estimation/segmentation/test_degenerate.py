@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from ballfg.dynamics import Surfaces, nominal_model
-from ballfg.estimation.segmentation import Quality, segment
+from ballfg.estimation.segmentation.batch import segment
 from ballfg.estimation.segmentation.branches import _rarity
+from ballfg.estimation.segmentation.result import Quality
 
 TABLE = Surfaces(0.75)
 T = np.arange(60) / 180

@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from ballfg.dynamics import Architecture, BallModel, build, model_from_dict
-from ballfg.estimation.segmentation import SegmentationPhysics, physics_of
+from ballfg.dynamics import Architecture, BallModel, build
+from ballfg.dynamics.model_file import model_from_dict
+from ballfg.estimation.segmentation.physics import SegmentationPhysics, physics_of
 
 
 def test_the_numbers_of_an_analytic_model_are_its_own():

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from ballfg.dynamics import Surfaces, nominal_model
-from ballfg.estimation.segmentation import Quality, physics_of, segment
+from ballfg.estimation.segmentation.batch import segment
+from ballfg.estimation.segmentation.physics import physics_of
+from ballfg.estimation.segmentation.result import Quality
 
 PHYSICS = physics_of(nominal_model())
 SIGMA = 0.0015

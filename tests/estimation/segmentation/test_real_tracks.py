@@ -5,7 +5,9 @@ import pytest
 
 from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.estimation.measurement.position_noise import estimate_position_noise
-from ballfg.estimation.segmentation import Quality, physics_of, segment
+from ballfg.estimation.segmentation.batch import segment
+from ballfg.estimation.segmentation.physics import physics_of
+from ballfg.estimation.segmentation.result import Quality
 from ballfg.tracks import read_dataset
 from tests.places import DATA
 

@@ -7,14 +7,11 @@ import numpy as np
 import pytest
 
 from ballfg.dynamics import Surfaces, nominal_model
-from ballfg.estimation.segmentation import (
-    Event,
-    EventKind,
-    SegmentationSettings,
-    Segmenter,
-    physics_of,
-    segment,
-)
+from ballfg.estimation.segmentation.batch import segment
+from ballfg.estimation.segmentation.events import Event, EventKind
+from ballfg.estimation.segmentation.physics import physics_of
+from ballfg.estimation.segmentation.segmenter import Segmenter
+from ballfg.estimation.segmentation.settings import SegmentationSettings
 
 PHYSICS = physics_of(nominal_model())
 SIGMA = np.full(3, 0.0015)

@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ballfg.dynamics import Surfaces, model_from_dict, nominal_model
-from ballfg.estimation.segmentation import physics_of, segment
+from ballfg.dynamics import Surfaces, nominal_model
+from ballfg.dynamics.model_file import model_from_dict
+from ballfg.estimation.segmentation.batch import segment
+from ballfg.estimation.segmentation.physics import physics_of
 
 EDGED = Surfaces(0.75, 0.0, (-0.76, 0.76, -1.37, 1.37))
 UNKNOWN = Surfaces(0.75, 0.0)

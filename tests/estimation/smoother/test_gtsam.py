@@ -15,11 +15,14 @@ import ballfg as bf
 from ballfg.dynamics import EFFECTS
 from ballfg.estimation.online.windows.chain import ChainWindow
 from ballfg.estimation.online.windows.window import IsamWindow
-from ballfg.estimation.segmentation import Contact, Segmentation
+from ballfg.estimation.segmentation.result import Contact, Segmentation
 from ballfg.estimation.smoother.second_look.low_hops import LowHops
-from ballfg.factors import GtsamLevenbergMarquardt, LevenbergMarquardt, Loss
+from ballfg.factors import LevenbergMarquardt
+from ballfg.factors.gtsam_solver import GtsamLevenbergMarquardt
+from ballfg.factors.loss import Loss
 from ballfg.simulation import SimulationConfig
-from ballfg.tracks import DatasetInfo, dataset_in_memory
+from ballfg.tracks.info import DatasetInfo
+from ballfg.tracks.memory import dataset_in_memory
 from tests.estimation.gtsam_solver import SAME, Solvers, difference, distance, simulated
 from tests.estimation.observations.sighted_rig import scene, track_of, world
 

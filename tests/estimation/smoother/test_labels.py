@@ -15,7 +15,8 @@ from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.noise import ProcessNoise
-from ballfg.simulation import SimulationConfig, simulate, with_model
+from ballfg.simulation import SimulationConfig, simulate
+from ballfg.simulation.balls import with_model
 from ballfg.state import SPIN
 from ballfg.tracks import Track
 

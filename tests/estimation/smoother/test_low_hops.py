@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ballfg.estimation.result import Status
-from ballfg.estimation.segmentation import Segmentation
+from ballfg.estimation.segmentation.result import Segmentation
 from ballfg.estimation.smoother.second_look.hop_grid import RESTS, SPEEDS, HopGrid, HopLaw, averaged
 from ballfg.estimation.smoother.second_look.low_hops import _Ball, counted, uncounted_note
 from ballfg.estimation.smoother.smoother import Smoother
@@ -99,7 +99,7 @@ def test_averages_over_heights_are_moments_of_the_mixture() -> None:
     assert (np.linalg.eigvalsh(spread) > 0.0).all()
 
 
-@pytest.mark.parametrize("name", SETTINGS)
+@pytest.mark.parametrize("name", ["exact model", pytest.param("coefficients estimated", marks=pytest.mark.thorough)])
 def test_no_ball_that_hops_out_is_sure_of_a_wrong_state(name) -> None:
     """Eight tracks; `python -m tests.estimation.low_bounces` is the same over hundreds."""
     smoother, fine = Smoother(MODEL, SURFACES, SETTINGS[name]), 0
@@ -135,13 +135,13 @@ def test_a_part_of_a_stretch_is_what_the_stretch_has_there() -> None:
     track = hopping_out(1, seed=1)[0][1]
     smoother = Smoother(MODEL, SURFACES, SETTINGS["exact model"])
     (one,) = smoother.low_hops(track, smoother.segment(track))
-    part = one.taken(one.first + 10, one.first + 30)
+    part = one.select(one.first + 10, one.first + 30)
     assert part is not None
     assert part.first == 0
     assert part.last == 19
     np.testing.assert_array_equal(part.known.mean, one.known.mean[10:30])
     np.testing.assert_array_equal(part.known.bounces, one.known.bounces[10:29])
-    assert one.taken(one.last + 1, one.last + 5) is None
+    assert one.select(one.last + 1, one.last + 5) is None
 
 
 def test_tracks_without_low_hops_keep_their_events() -> None:

@@ -75,7 +75,9 @@ CASES = {
 """Settings, and the shots after which the ball vanishes for a second."""
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", ["exact model", *(pytest.param(case, marks=pytest.mark.thorough) for case in ("coefficients", "memory"))]
+)
 def test_pieces_find_the_minimum_of_the_whole_track(case):
     settings, every = CASES[case]
     smoother, track = Smoother(MODEL, TABLE, settings, TIGHT), rally(3000, seed=3, every=every)

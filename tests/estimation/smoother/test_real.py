@@ -10,7 +10,7 @@ import pytest
 from ballfg.dynamics import nominal_model
 from ballfg.estimation.configure import dataset_settings, dataset_surfaces
 from ballfg.estimation.result import Estimate, Status
-from ballfg.estimation.segmentation import Quality
+from ballfg.estimation.segmentation.result import Quality
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.tracks import read_dataset
 from tests.places import DATA

@@ -10,7 +10,7 @@ import torch
 
 import ballfg.estimation.smoother.smoother as room
 from ballfg.dynamics.motion.impact import slip_velocity
-from ballfg.estimation.segmentation import Contact
+from ballfg.estimation.segmentation.result import Contact
 from ballfg.estimation.smoother.second_look.spin_ambiguity import Bounce, bounces_of, other_sides
 from ballfg.estimation.smoother.settle import Solution
 from ballfg.estimation.smoother.smoother import Smoother

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.dynamics import LearnedModel, load_model
+from ballfg.dynamics import load_model
+from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.estimation import dataset_settings
 from ballfg.learning import TrainConfig, build
 from ballfg.learning.end_to_end.elsewhere import by_room

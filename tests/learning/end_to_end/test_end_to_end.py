@@ -18,7 +18,7 @@ from ballfg.learning.end_to_end.learnables import Learnables, NoiseScales
 from ballfg.learning.end_to_end.solving import Pose
 from ballfg.learning.gradient.conjugate_gradients import ConjugateGradients
 from ballfg.learning.gradient.implicit import GaussNewtonGradient, ImplicitGradient
-from ballfg.learning.shots import Shot
+from ballfg.learning.shots import TrainingShot
 from tests.learning.end_to_end.gradients import gradient, network
 from tests.learning.estimates import (
     NOISE,
@@ -253,7 +253,7 @@ def test_predictions_turn_with_the_data() -> None:
         np.testing.assert_allclose(found, pose.positions(known), rtol=0, atol=1e-9)
 
 
-def predictions(made: list[Shot], learnables: Learnables) -> list[np.ndarray]:
+def predictions(made: list[TrainingShot], learnables: Learnables) -> list[np.ndarray]:
     """(n, 3) m for each shot."""
     learner = EndToEnd(made, learnables, LossConfig(), optimizer=TIGHT)
     solved, failed = learner.solver(range(len(made)), {})

@@ -13,7 +13,8 @@ from ballfg.factors.graph import LevenbergMarquardt
 from ballfg.learning.augment import augmentation
 from ballfg.learning.end_to_end.learnables import Learnables, NoiseScales
 from ballfg.learning.end_to_end.solving import BatchSolver, Pose, WarmStarts
-from ballfg.tracks import SPIN_LABELS, Track
+from ballfg.tracks import Track
+from ballfg.tracks.track import SPIN_LABELS
 from tests.learning.estimates import NOISE, OBSERVED, SETTINGS, TABLE, TIGHT, launcher, measured, shots, usual_ball
 
 POSE = Pose(*augmentation(3, 1, 4))

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ballfg.dynamics import Surfaces
 from ballfg.estimation.filters.window_velocity import window_velocities
-from ballfg.estimation.segmentation import Segmentation
+from ballfg.estimation.segmentation.result import Segmentation
 from ballfg.factors.linear.covariance import NeighbourCovariances, marginal_covariances
 from ballfg.factors.loss import Loss
 from ballfg.learning.end_to_end.learnables import NoiseScales

@@ -82,7 +82,7 @@ def check_same(a: Path, b: Path) -> None:
     assert load_file(a / "ball.safetensors")["drag"] == pytest.approx(load_file(b / "ball.safetensors")["drag"])
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.usefixtures("script")
 def test_torchrun_and_another_number_of_processes_on_resume_give_what_one_gives(
     folder: Path, one: Path, capfd: pytest.CaptureFixture[str]
@@ -101,7 +101,7 @@ def test_torchrun_and_another_number_of_processes_on_resume_give_what_one_gives(
     assert len(read_metrics(folder / "more" / "metrics.csv")) == 6
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.usefixtures("script")
 def test_a_stop_is_said_once(capfd: pytest.CaptureFixture[str]) -> None:
     failing = ("--data", "failing-1", "--data", "failing-4", "--data", "failing-7")
@@ -111,7 +111,7 @@ def test_a_stop_is_said_once(capfd: pytest.CaptureFixture[str]) -> None:
     assert said.count("\n") == 2  # with the note
 
 
-@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.thorough)])
 @pytest.mark.usefixtures("script")
 def test_ctrl_c_keeps_the_last_epoch(tmp_path: Path, jobs: int) -> None:
     """Ctrl-C after the second epoch, in a copy of this process."""

@@ -11,12 +11,13 @@ import torch
 from ballfg.dynamics import rollout
 from ballfg.simulation import SimulationConfig, parse_effects, simulate, table_tennis
 from ballfg.simulation.cameras import looking_at, table_rig
-from ballfg.simulation.scene import Clock, Recording, Renderer, SceneConfig, free_running, record
 from ballfg.simulation.scene.backdrop import backdrop
+from ballfg.simulation.scene.config import Clock, SceneConfig
 from ballfg.simulation.scene.movers import movers
-from ballfg.simulation.scene.recording import visible_columns
+from ballfg.simulation.scene.recording import Recording, record, visible_columns
+from ballfg.simulation.scene.renderer import Renderer
 from ballfg.simulation.scene.room import furniture
-from ballfg.simulation.scene.shutter import PATH_POINTS
+from ballfg.simulation.scene.shutter import PATH_POINTS, free_running
 
 SMALL = (320, 180)
 CLEAN: dict[str, Any] = {"noise": 0.0, "flicker": 0.0, "distractors": False}

@@ -198,7 +198,7 @@ def test_the_strobe_holds_balls_of_several_frames() -> None:
 
 def test_a_camera_that_never_saw_the_ball_has_a_blank_picture() -> None:
     tracking = made()
-    only_left = tracking.balls[0].sightings.taken(tracking.balls[0].sightings.camera == 0)
+    only_left = tracking.balls[0].sightings.select(tracking.balls[0].sightings.camera == 0)
     tracking = replace(tracking, balls=(replace(tracking.balls[0], sightings=only_left),))
     strobe = Strobe(tracking, 0, 1, RADIUS)
     assert strobe.count == 0

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from cloudpickle import dumps
 
-from ballfg.tracks import TABLE_TENNIS, DatasetInfo, read_dataset
+from ballfg.tracks import TABLE_TENNIS, read_dataset
+from ballfg.tracks.info import DatasetInfo
 from ballfg.vision import Camera
 from ballfg.vision.camera_file import read_cameras
 from ballfg.vision.detection.detect import load_detector

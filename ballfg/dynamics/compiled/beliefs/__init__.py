@@ -1,1 +1,1 @@
-"""Means and covariances of balls carried ahead in machine code: steps, table edges, mixtures, events on the way."""
+"""Carries means and covariances of balls ahead in machine code: steps, table edges, mixtures and events."""

@@ -1,7 +1,7 @@
-"""Machine code that carries means and covariances of balls forward, step by step, through flight and plain bounces.
+"""Carries means and covariances of balls forward in machine code, through flight and plain bounces.
 
-A ball that bounces has neighbours within its uncertainty that have not bounced yet. One that flies on through the
-surface as if it were not there, *unbounced*, stands for them for a while: `mixture.py` makes use of it.
+Within the uncertainty of a ball that bounces, some balls have not bounced yet. For a while, a second ball that flies on
+through the surface, *unbounced*, stands for them: `mixture.py` uses it.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ from ballfg.dynamics.compiled.beliefs.edges import (
 )
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.contacts import contact_times, contacts
-from ballfg.dynamics.compiled.flight import fly_one
+from ballfg.dynamics.compiled.flight import fly_one, white_acceleration
 from ballfg.dynamics.compiled.signatures import (
     COUNT,
     FLAG,
@@ -38,7 +38,7 @@ from ballfg.dynamics.motion.limits import BEYOND, NEGLIGIBLE, REST_SPEED
 
 @machine_code(NOTHING(TWO, TWO, TWO))
 def through(jacobian, covariance, after):
-    """J P J^T of covariance P (d, d); J (9, d) of the state, the coefficients stay. Writes after (d, d)."""
+    """J P J^T of covariance P (d, d), with J (9, d) of the state; coefficients stay. Writes after (d, d)."""
     d = len(covariance)
     half = covariance.copy()  # J P
     for i in range(9):
@@ -60,18 +60,19 @@ def through(jacobian, covariance, after):
 @machine_code(NOTHING(TWO, REAL, ONE))
 def add_flight(covariance, h, noise):
     """Add what h s of free flight gather; noise (5,) as in `carry`."""
-    acceleration, spin = noise[0] ** 2, noise[1] ** 2
+    position, between, velocity = white_acceleration(h, noise[0] ** 2)
+    spin = noise[1] ** 2
     for i in range(3):
-        covariance[i, i] += acceleration * h**3 / 3.0
-        covariance[3 + i, i] += acceleration * h**2 / 2.0
-        covariance[i, 3 + i] += acceleration * h**2 / 2.0
-        covariance[3 + i, 3 + i] += acceleration * h
+        covariance[i, i] += position
+        covariance[3 + i, i] += between
+        covariance[i, 3 + i] += between
+        covariance[3 + i, 3 + i] += velocity
         covariance[6 + i, 6 + i] += spin * h
 
 
 @machine_code(NOTHING(TWO, REAL, ONE))
 def add_impact(covariance, since, noise):
-    """Add what an impact `since` s ago has left; noise (5,) as in `carry`."""
+    """Adds the effect of an impact's noise `since` s later; noise (5,) as in `carry`."""
     for i in range(3):
         velocity = noise[3] if i < 2 else noise[2]
         covariance[i, i] += (since * velocity) ** 2

@@ -1,4 +1,4 @@
-"""Gaussian beliefs of balls at a sequence of times, and the machine code that carries them on."""
+"""Holds Gaussian beliefs of balls at a sequence of times and carries them on by machine code."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, Z
 
 BOUNCES: Final = 1.0
-"""A ball whose bounce is not a plain one."""
+"""A ball whose bounce is not plain."""
 RESTS: Final = 2.0
 """A ball that lies on a surface."""
 
 
 @dataclass(frozen=True)
 class Course:
-    """Beliefs of n balls at k times, linear about the mean, and of balls beside them that fly on without a bounce.
+    """Beliefs of n balls at k times, linear about the mean, and of their unbounced neighbours.
 
     Attributes:
         mean: (k, n, 9 + p) states and coefficients.  covariance: (k, n, 9 + p, 9 + p).
-        beside, besides: the same of a ball that went through a surface a short while ago as if it were not there.
-        level: (k, n) m, that surface.  age: (k, n) s since then; NaN where there is no such ball.
+        beside, besides: mean and covariance of a neighbour that flew on through a surface a short while ago. level: (k,
+        n) m, that surface.  age: (k, n) s since then; NaN without such a neighbour.
     """
 
     mean: Array
@@ -47,7 +47,7 @@ class Course:
 
     @classmethod
     def start(cls, mean: Array, covariance: Array) -> Course:
-        """One time, with no ball beside: mean (n, d), covariance (n, d, d)."""
+        """One time, without neighbours: mean (n, d), covariance (n, d, d)."""
         none = np.full((1, len(mean)), np.nan)
         return cls(mean[None], covariance[None], mean[None], covariance[None], none, none)
 
@@ -55,12 +55,12 @@ class Course:
         return len(self.mean)
 
     def at(self, rows: Any) -> Course:
-        """Some of the times: a slice or indices."""
+        """A part of the times: a slice or indices."""
         return Course(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     @staticmethod
     def joined(parts: Sequence[Course]) -> Course:
-        """All times of some parts."""
+        """All times of several courses."""
         if len(parts) == 1:
             return parts[0]
         return Course(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Course)))
@@ -72,7 +72,7 @@ class Carrier:
     Args:
         model: of the balls; coefficients that travel with the states are columns of theirs.
         mean: (n, 9 + p) at the start.
-        surfaces: that they may meet.
+        surfaces: table and floor.
         noise: (5,) densities of the acceleration, m/s^2/sqrt(Hz), and of the spin, rad/s/sqrt(s); of an impact along
             the vertical and along the surface, m/s, and of its spin, rad/s.
     """
@@ -90,8 +90,8 @@ class Carrier:
     def carry(self, course: Course, h: Array) -> tuple[Course, Array]:
         """Carry the last beliefs of a course on by steps of h (n, k) s of at most `MAX_STEP`.
 
-        Returns: the course from that time on, 1 + j times for j <= k steps; and hard (n,). If any of it is not zero,
-            then the last time of the course is one that these balls have not reached: `BOUNCES`, `RESTS`, or 0.
+        Returns: the course from that time on, 1 + j times for j <= k steps; and hard (n,). A ball with a nonzero entry
+            has not reached the last time of the course: `BOUNCES` or `RESTS`; 0 for the others.
         """
         last, steps, n = course.at(slice(-1, None)), h.shape[1], h.shape[0]
         whole = Course(*(np.empty((steps + 1, *getattr(last, f.name).shape[1:])) for f in fields(Course)))
@@ -111,7 +111,7 @@ class Carrier:
         Args:
             horizon, earliest: s from there; only events up to the one and after the other count.
             line: (9,) and an offset: the event is that normal . state falls through it. None: the next contact.
-            either_way: take a rise through the offset as well.
+            either_way: count a rise through the offset as well.
         Returns: `events.NONE`, `FOUND` or `HARD`; the time (s) from there at which the search ended; the belief then.
         """
         mean, covariance = course.mean[-1, 0].copy(), course.covariance[-1, 0].copy()
@@ -133,7 +133,7 @@ class Carrier:
         return end, time, Course.start(mean[None], covariance[None])
 
     def slopes(self, mean: Array, line: tuple[Array, float] | None) -> tuple[Array, Array]:
-        """Gradient (9 + p,) of the event of `find` at a mean (9 + p,), and how the mean changes in flight."""
+        """Gradient (9 + p,) of the event of `find` at a mean (9 + p,), and the mean's rate of change in flight."""
         width = len(mean)
         gradient, rate, moved = np.zeros(width), np.zeros(width), np.zeros((3, width))
         rates, _, surface, c, _, _, _, s, st, w, _, ws = self._given
@@ -157,6 +157,6 @@ class Carrier:
 
 
 def density_of(noise: Any) -> Array:
-    """(5,) the numbers that `Carrier` takes, of a process noise."""
+    """(5,) the numbers for `Carrier` from a process noise."""
     along = np.hypot(noise.contact_velocity, noise.contact_tangential)
     return np.array([noise.acceleration, noise.spin, noise.contact_velocity, along, noise.contact_spin])

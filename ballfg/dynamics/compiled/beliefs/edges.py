@@ -1,4 +1,4 @@
-"""Where a ball lies, and whether it comes down on a table or past its ends, in machine code."""
+"""Decides in machine code whether a ball lies on the table, comes down on it or falls past its ends."""
 
 import math
 
@@ -18,6 +18,7 @@ from ballfg.dynamics.compiled.signatures import (
     TWO,
 )
 from ballfg.dynamics.motion.limits import BEYOND, DEEPEST, LEAST_SIGMA, NEGLIGIBLE, REST_GAP, REST_SPEED
+from ballfg.dynamics.surfaces import within
 
 
 @machine_code(REAL(FUNCTION, ONE, ONE, ONE, REAL, REAL))
@@ -30,7 +31,7 @@ def gap_of(surface, x, s, ws, level, radius):
 
 @machine_code(REAL(REAL, ONE))
 def level_below(z, world):
-    """Height (m) of the surface whose level a ball with its centre at z (m) falls to; -inf where there is none."""
+    """Height (m) of the surface that a ball with its centre at z (m) falls to; -inf if there is none."""
     if z > world[0]:
         return world[0]
     return world[1] if z > world[1] - DEEPEST else -np.inf
@@ -39,19 +40,19 @@ def level_below(z, world):
 @machine_code(FLAG(ONE, ONE))
 def over_table(x, world):
     """Whether a state (9,) lies within the table's ends."""
-    return world[3] <= x[0] <= world[4] and world[5] <= x[1] <= world[6]
+    return within(x[0], x[1], world[3:7])
 
 
 @machine_code(FLAG(ONE, REAL, REAL, ONE))
 def at_rest(x, gap, level, world):
-    """Whether a state (9,) lies on the surface at a level (m), to which it has this gap (m)."""
+    """True if a state (9,) with this gap (m) to the surface at a level (m) rests on it."""
     beside = level == world[0] and not over_table(x, world)
     return abs(gap) <= REST_GAP and abs(x[5]) <= REST_SPEED / 2 and not beside
 
 
 @machine_code(REAL(ONE, TWO, ONE))
 def share_over_table(touch, covariance, world):
-    """Probability that a ball which is at `touch` (9,) in the mean when it comes down is then above the table."""
+    """Probability that a ball with mean `touch` (9,) when it comes down is above the table."""
     within, along = 1.0, np.empty(9)
     for axis in range(2):
         along[:] = 0.0
@@ -73,7 +74,7 @@ def share_over_table(touch, covariance, world):
 def come_down(rates, surface, x, c, s, w, ws, level, world, touch):
     """Time (s) at which a falling ball x (9,) reaches a level; writes its state there to touch (9,).
 
-    NaN, and its state as it is, where it never was above that level: it has come from below.
+    NaN, with its state unchanged, if it was never above that level.
     """
     tau, state = np.empty(1), x.copy().reshape((1, 9))
     contact_times(rates, surface, state, c, s, w, ws, np.full(1, level), np.full(1, BEYOND), world[2], tau)
@@ -85,7 +86,7 @@ def come_down(rates, surface, x, c, s, w, ws, level, world, touch):
 
 @machine_code(FLAG(THREE_FUNCTIONS, THREE_VALUES, THREE_WEIGHTS, TWO, ONE, REAL, REAL, ONE, ONE, TWO))
 def falls_past(functions, values, weights, covariance, touch, tau, h, world, after, spread):
-    """Whether a ball, in the mean, falls past the table whose level it reaches at `touch` (9,) after tau s.
+    """True if a ball's mean falls past the table whose level it reaches at `touch` (9,) after tau s.
 
     Args: covariance (d, d): before the step of h s.  after (9,): its mean after the step.
     Adds: to the covariance `spread` (d, d) after the step the share of balls that bounce on the table instead, as

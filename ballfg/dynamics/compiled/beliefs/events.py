@@ -1,4 +1,4 @@
-"""Machine code that looks for an event on the way of one ball: a contact, or a linear function that falls to zero."""
+"""Finds an event on the way of one ball in machine code: a contact, or a linear function that falls to zero."""
 
 import math
 
@@ -12,20 +12,20 @@ from ballfg.dynamics.compiled.signatures import FLAG, FUNCTION, ONE, REAL, THREE
 from ballfg.dynamics.motion.limits import MAX_STEP
 
 LOOKS = 16
-"""How often a step of `MAX_STEP` is looked at: two crossings within 1.25 ms may pass unseen."""
+"""Number of looks in a step of `MAX_STEP`: two crossings within 1.25 ms may pass unseen."""
 NEWTON_STEPS = 20
-"""Upper bound on the steps to a crossing, of which three or four are enough."""
+"""Largest number of steps to a crossing; three or four are enough."""
 TIME_TOLERANCE = 1e-12
-"""s. A crossing is known to this."""
+"""s. Accuracy of the time of a crossing."""
 INSTANT = 1e-9
-"""s, in which a ball bounces that has touched a surface already."""
+"""s, within which a ball that has already touched a surface bounces."""
 NONE, FOUND, HARD = 0.0, 1.0, 2.0
-"""What a search ends with: nothing within the horizon; the event; a step that is not one of flight or plain bounces."""
+"""Ends of a search: nothing within the horizon; the event; a step other than flight or a plain bounce."""
 
 
 @machine_code(several(REAL, 2)(FUNCTION, ONE, ONE, ONE, ONE, REAL))
 def _value(rates, x, c, w, normal, offset):
-    """Normal . x - offset of a state (9,), and its derivative by time."""
+    """Normal . x - offset of a state (9,), and its time derivative."""
     a, value, rate = np.empty(6), -offset, 0.0
     evaluate(rates, x, c, w, np.empty((9, 0)), np.empty((len(c), 0)), a, np.empty((6, 0)))
     for i in range(9):
@@ -77,10 +77,10 @@ def _zero(rates, x, c, w, normal, offset, h, earliest, either_way):
 
 @machine_code(several(REAL, 3)(FUNCTION, FUNCTION, ONE, TWO, TWO, ONE, ONE, REAL, ONE, ONE))
 def _contact_within(rates, surface, x, c, s, w, ws, h, world, touch):
-    """The level (m) that a ball (9,) comes down on within h s and when; h where it does not, NaN where it is unclear.
+    """The level (m) that a ball (9,) comes down on within h s and when; h if it does not, NaN if that is unclear.
 
-    It is where the ball rests, or falls past the table to the floor within the step. The third number is the time at
-    which it falls past the table, NaN where it does not; writes its state there to touch (9,).
+    It is unclear if the ball rests there, or falls past the table to the floor within the step. The third number is the
+    time at which it falls past the table, else NaN; writes its state there to touch (9,).
     """
     low, after = level_below(x[2], world), x.copy()
     if at_rest(x, gap_of(surface, x, s[0], ws, low, world[2]), low, world):
@@ -126,11 +126,11 @@ def find(
     mean,
     covariance,
 ):
-    """Carry one ball on to an event, in place: to its next contact, or to where normal . x falls through an offset.
+    """Carries one ball to an event, in place: its next contact, or the time when normal . x falls through an offset.
 
     Args:
         c, b, s: coefficients of rates, impact and surface, (1, p) with tangents (1, p, d); w, wb, ws: their weights.
-        contact: look for the next contact.  either_way: take a rise through the offset too.  normal (9,).
+        contact: look for the next contact.  either_way: count a rise through the offset too.  normal (9,).
         earliest, horizon: s from the start; only events after the one and up to the other count.
         world (11,), noise (5,): as `beliefs.carry`.
     Writes: mean (d,) and covariance (d, d) at the event, or where the search ended.

@@ -1,4 +1,4 @@
-"""Machine code for beliefs near a contact of uncertain time: some balls have bounced by then, the others have not.
+"""Mixes the beliefs of balls that have bounced and of those that have not, near a contact of uncertain time.
 
 The linear propagation takes all balls to be on the mean's side of the contact. Near the contact a belief is therefore
 reported as a mixture of both sides, by its mean and covariance (docs/derivations/prediction.md).
@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from ballfg.dynamics.compiled.beliefs.carry import add_impact, through
-from ballfg.dynamics.compiled.beliefs.edges import gap_of, level_below
+from ballfg.dynamics.compiled.beliefs.edges import gap_of, level_below, over_table
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.contacts import contacts
 from ballfg.dynamics.compiled.flight import evaluate, fly_one
@@ -31,12 +31,12 @@ from ballfg.dynamics.motion.limits import BEYOND, LEAST_SIGMA
 
 FAR = 4.5
 """Standard deviations of the gap beyond which all balls are on one side of a contact. One in 300,000 is on the other
-then; with a jump of 5 m/s it adds 9 mm/s to a velocity's sigma. At 4 it would add 28 mm/s, as much as a usual sigma."""
+side; with a jump of 5 m/s it adds 9 mm/s to a velocity's sigma. At 4 it would add 28 mm/s, a usual sigma."""
 
 
 @machine_code(REAL(FUNCTION, ONE, TWO, ONE, TWO, ONE, REAL, REAL, ONE))
 def _below(surface, mean, covariance, s, st, ws, level, radius, k):
-    """c, and writes k (d,): with a standard normal u, a ball is k u off its mean and below the surface where u < c."""
+    """Writes k (d,) and returns c: a ball at k u off its mean (u standard normal) is below the surface where u < c."""
     d = len(mean)
     xt, offset, moved, gradient = np.zeros((9, d)), np.empty(3), np.empty((3, d)), np.empty(d)
     for i in range(9):
@@ -80,10 +80,10 @@ def _moved(values, tangents, change):
 
 @machine_code(FLAG(THREE_FUNCTIONS, THREE_VALUES, THREE_TANGENTS, THREE_WEIGHTS, ONE, ONE, TWO, REAL, ONE, ONE))
 def _bounced(functions, values, tangents, weights, change, mean, covariance, level, world, noise):
-    """Move balls below the surface through the bounce that they have gone through, linear about their mean.
+    """Moves balls below the surface through their past bounce, linear about their mean.
 
     Args: values: coefficients of the mean on both sides, from which theirs differ by a change (d,).
-    Returns: False where this does not describe them: they would bounce a second time, or never came down.
+    Returns: False if this does not describe them: they would bounce a second time, or never came down.
     """
     d, radius = len(mean), world[2]
     rates, impact, surface = functions
@@ -133,7 +133,7 @@ def _bounced(functions, values, tangents, weights, change, mean, covariance, lev
 
 @machine_code(NOTHING(REAL, ONE, TWO, ONE, TWO, ONE, TWO))
 def _join(share, above, aboves, below, belows, mean, covariance):
-    """Mean (d,) and covariance (d, d) of balls of which a share is as `below` says; nothing, if that is no number."""
+    """Mean (d,) and covariance (d, d) of a mixture with a share of `below`; unchanged if the share is not a number."""
     d, total = len(above), 0.0
     for i in range(d):
         for j in range(d):
@@ -157,7 +157,7 @@ def _join(share, above, aboves, below, belows, mean, covariance):
 def mix(
     rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws, world, noise, mean, covariance, beside, besides, level, age
 ):
-    """Give beliefs the mean and covariance of the mixture where a ball may or may not have bounced, in place.
+    """Writes the mean and covariance of the mixture for balls that may or may not have bounced, in place.
 
     Args: as `carry`, of any number of times.
     """
@@ -171,9 +171,8 @@ def mix(
                 low = level[time, r]
                 below[:], belows[:] = beside[time, r], besides[time, r]
                 c0 = _below(surface, below, belows, s[r], st[r], ws, low, world[2], k)
-            inside = world[3] <= at[0] <= world[4] and world[5] <= at[1] <= world[6]
             under = level_below(at[2], world)
-            if at[5] < 0.0 and math.isfinite(under) and (under != world[0] or inside):
+            if at[5] < 0.0 and math.isfinite(under) and (under != world[0] or over_table(at, world)):
                 c1 = _below(surface, at, spread, s[r], st[r], ws, under, world[2], own)
                 if abs(c1) < abs(c0):  # of two contacts of a ball the nearer one
                     c0, low = c1, under

@@ -1,1 +1,1 @@
-"""From a function of torch to the source of machine code."""
+"""Translates a torch function to the source of machine code."""

@@ -1,4 +1,4 @@
-"""Python source, for numba, of derivatives that run backward: of few numbers of an array by all it was made from."""
+"""Writes numba source for reverse-mode derivatives of a few entries of an array by all its operands."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ballfg.dynamics.compiled.translation.loops import EACH_STATE, Entries, inde
 
 
 def carried_back(arrays: Arrays, block: int, places: Sequence[int], adjoint: Entries) -> list[str]:
-    """Lines that fill the derivatives of some places of a block by all numbers of the blocks that it is made from.
+    """Lines that compute derivatives of some places of a block by all entries of its operand blocks.
 
     The derivatives of place k by a block lie among the adjoints of that block, as its derivative number k.
     """
@@ -49,7 +49,7 @@ def _to_operands(arrays: Arrays, block: int, adjoint: Entries) -> list[str]:
 
 
 def _product(adjoint: Entries, into: View, left: tuple[View, Entries], right: tuple[View, Entries]) -> list[str]:
-    """Lines that add products to a view: at once where its rows lie one behind another."""
+    """Lines that add products to a view: by one call if its rows lie one behind another."""
     if into == View.whole(into.block, into.shape, into.offset):
         return product((into, adjoint), left, right)
     (one, ones), (other, others) = left, right

@@ -1,4 +1,4 @@
-"""What torch's operations do to arrays of a program."""
+"""Translates torch's operations on arrays of a program."""
 
 from __future__ import annotations
 
@@ -9,38 +9,7 @@ import numpy as np
 
 from ballfg.dynamics.compiled.translation.arrays import Arrays, Each, Product, Total, View
 from ballfg.dynamics.compiled.translation.program import Program
-from ballfg.dynamics.compiled.translation.rules import RULES, Rules, UnknownOperationError, aten
-
-EACH: Final = frozenset(
-    {
-        aten.add.Tensor,
-        aten.add.Scalar,
-        aten.sub.Tensor,
-        aten.sub.Scalar,
-        aten.rsub.Scalar,
-        aten.mul.Tensor,
-        aten.mul.Scalar,
-        aten.div.Tensor,
-        aten.div.Scalar,
-        aten.neg.default,
-        aten.sqrt.default,
-        aten.exp.default,
-        aten.log.default,
-        aten.sin.default,
-        aten.cos.default,
-        aten.tanh.default,
-        aten.abs.default,
-        aten.reciprocal.default,
-        aten.rsqrt.default,
-        aten.square.default,
-        aten.pow.Tensor_Scalar,
-        aten.clamp.default,
-        aten.clamp_min.default,
-        aten.clamp_max.default,
-        aten.addcmul.default,
-    }
-)
-"""Operations number by number."""
+from ballfg.dynamics.compiled.translation.rules import EACH, Rules, UnknownOperationError, aten
 
 
 def each_of(arrays: Arrays, target: Any, args: Sequence[Any], kwargs: Mapping[str, Any]) -> View:
@@ -51,7 +20,7 @@ def each_of(arrays: Arrays, target: Any, args: Sequence[Any], kwargs: Mapping[st
     inputs = [program.input() for _ in views]
     numbers = iter(inputs)
     given = [np.array(next(numbers), dtype=object) if isinstance(a, View) else a for a in args]
-    result = int(RULES[target](Rules(program), *given, **kwargs).item())
+    result = int(EACH[target](Rules(program), *given, **kwargs).item())
     operands = tuple(view.broadcast(shape) for view in views)
     return arrays.make(Each(program, tuple(inputs), result, operands), shape)
 

@@ -1,7 +1,7 @@
-"""Arrays in a program: layers of networks and other tables, which are too large to be taken apart into numbers.
+"""Holds the arrays of a program: network layers and other tables that are too large to split into numbers.
 
-An array is made from numbers of the program and from weights by loops. It is read by numbers again. Its derivatives
-run forward, by the few numbers through which all of its inputs depend on those of the program, or backward.
+Loops make an array from numbers of the program and from weights; the program reads its entries as numbers. Its
+derivatives run forward, by the few numbers through which all inputs depend on those of the program, or backward.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from ballfg.dynamics.compiled.translation.program import Number, Operation, Program
 
 INPUTS: Final = ("input",)
-"""Operations by which derivatives may be asked for."""
+"""Operations that give inputs, by which derivatives are taken."""
 SMALL: Final = 12
-"""Numbers that an array may hold to be taken apart."""
+"""Largest number of entries in an array that is split into numbers."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class View:
     """An array: where its numbers lie, in a block or among the weights.
 
     Attributes:
-        block: its number; None where they lie among the weights.
+        block: its number; None for an array among the weights.
         shape: of the array.
         strides: how many numbers further the next entry along each dimension lies.
         offset: of the first number.
@@ -47,19 +47,19 @@ class View:
 
     @property
     def size(self) -> int:
-        """How many numbers it has."""
+        """Number of its entries."""
         return prod(self.shape)
 
     @property
     def places(self) -> list[int]:
-        """Where its numbers lie, in the order of the array."""
+        """Places of its entries, in the order of the array."""
         found = [self.offset]
         for length, stride in zip(self.shape, self.strides, strict=True):
             found = [place + k * stride for place in found for k in range(length)]
         return found
 
     def reshaped(self, shape: Sequence[int]) -> View | None:
-        """The same numbers in another shape; None where that needs a copy."""
+        """The same numbers in another shape; None if that needs a copy."""
         known = [n for n in shape if n != -1]
         full = tuple(self.size // prod(known) if n == -1 else n for n in shape)
         plain = View.whole(self.block, self.shape, self.offset)
@@ -107,7 +107,7 @@ class Load:
 
 @dataclass(frozen=True)
 class Each:
-    """An operation number by number, of views of one shape; the operation is a small program of its own.
+    """An elementwise operation on views of one shape, written as a small program.
 
     Attributes:
         program, inputs, result: the operation, its operands and its result.
@@ -141,7 +141,7 @@ Making = Load | Each | Product | Total
 
 
 def operands_of(making: Making) -> list[View]:
-    """The views from which a block is made."""
+    """The operand views of a block."""
     match making:
         case Load():
             return []

@@ -1,4 +1,4 @@
-"""Python source of one operation on numbers."""
+"""Writes one operation on numbers as Python source."""
 
 from collections.abc import Mapping
 from typing import Final
@@ -21,7 +21,7 @@ CALLS: Final = {
 
 
 def expression(program: Program, number: Number, names: Mapping[Number, str], inputs: Mapping[Number, str]) -> str:
-    """The operation that gives a number, in terms of the names of others."""
+    """Source of the operation that gives a number, in terms of its operands' names."""
     operation = program.operations[number]
     o = [names[n] for n in operation.operands]
     match operation.name:

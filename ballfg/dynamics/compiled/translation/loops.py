@@ -1,4 +1,4 @@
-"""Python source, for numba, of the arrays of a program, for many states: loops that fill them, and their derivatives.
+"""Writes numba source for the arrays of a program: loops over many states that fill them, and their derivatives.
 
 Array `k` of all states lies one behind another in `a<k>`: number i of state r at r * size + i. Derivatives by (or of)
 `count` numbers lie in an array of another name, the q-th of state r at (r * count + q) * size + i.
@@ -18,7 +18,7 @@ EACH_STATE = "for r in range(n):"
 
 @dataclass(frozen=True)
 class Entries:
-    """How entries of blocks are called: their values, or derivatives of which every state has `count`.
+    """Names of the entries of blocks: values, or derivatives of which every state has `count`.
 
     Attributes:
         arrays: all of them.
@@ -31,11 +31,11 @@ class Entries:
     count: int | None = None
 
     def name(self, block: int | None) -> str:
-        """Of a block, or of the weights."""
+        """Name of a block, or of the weights."""
         return "w" if block is None else f"{self.kind}{block}"
 
     def step(self, block: int | None) -> int:
-        """How far the numbers of the next state, or of its next derivative, lie behind; 0 for weights."""
+        """Distance to the numbers of the next state, or of its next derivative; 0 for weights."""
         return 0 if block is None else self.arrays.sizes[block]
 
     def empty(self, block: int, how: str) -> str:
@@ -60,7 +60,7 @@ class Entries:
 
 
 def filled(arrays: Arrays, block: int) -> list[str]:
-    """Lines that fill a block from weights `w` and from other blocks; a `Load` is filled by whoever has its numbers."""
+    """Lines that fill a block from weights `w` and other blocks; the caller of a `Load` fills it with its numbers."""
     making, values = arrays.makings[block], Entries(arrays)
     lines = [values.empty(block, "zeros" if isinstance(making, Product | Total) else "empty")]
     match making:
@@ -85,7 +85,7 @@ def filled(arrays: Arrays, block: int) -> list[str]:
 
 
 def moved(arrays: Arrays, block: int, moving: Entries) -> list[str]:
-    """Lines that fill the derivatives of a block, forward from those of the blocks that it is made from."""
+    """Lines that fill a block's derivatives, forward from those of its operand blocks."""
     making, values = arrays.makings[block], Entries(arrays)
     each_one = f"for q in range({moving.count}):"
     lines = [moving.empty(block, "zeros")]
@@ -135,14 +135,14 @@ def product(whole: tuple[View, Entries], left: tuple[View, Entries], right: tupl
 
 
 def _first(view: View, entries: Entries, together: bool) -> str:
-    """Place of the first entry of a view: of all states, or of state r."""
+    """Place of the first entry of a view: for all states, or for state r."""
     if together or view.block is None:
         return str(view.offset)
     return f"{view.offset} + r * {(entries.count or 1) * entries.step(view.block)}"
 
 
 def given_names(making: Each, values: Entries) -> dict[Number, str]:
-    """How the operands of an operation are called in its loops."""
+    """Names of the operands of an operation in its loops."""
     return {n: values.at(v) for n, v in zip(making.inputs, making.operands, strict=True)}
 
 
@@ -159,7 +159,7 @@ def slopes(making: Each, block: int, values: Entries) -> tuple[list[str], dict[N
 def computed(
     program: Program, results: Sequence[Number], given: Mapping[Number, str]
 ) -> tuple[list[str], dict[Number, str]]:
-    """Lines that compute results of a small program, and how its numbers are called; `given` ones are known."""
+    """Lines that compute results of a small program, and the names of its numbers; `given` names are known."""
     needed, wanted = set[Number](), list(results)
     while wanted:
         number = wanted.pop()
@@ -182,13 +182,13 @@ def indented(lines: Sequence[str], depth: int = 1) -> list[str]:
 
 
 def _shape(making: Making) -> tuple[int, ...]:
-    """Of the loops of an operation number by number, or of a sum."""
+    """Shape of the loops of an elementwise operation, or of a sum."""
     assert isinstance(making, Each | Total)
     return making.of.shape if isinstance(making, Total) else making.operands[0].shape
 
 
 def _is_tanh(arrays: Arrays, making: Each) -> bool:
-    """Whether an operation is the hyperbolic tangent of a whole block."""
+    """True if an operation is the hyperbolic tangent of a whole block."""
     operation, operand = making.program.operations[making.result], making.operands[0]
     if operation.name != "tanh" or operation.operands != making.inputs or operand.block is None:
         return False

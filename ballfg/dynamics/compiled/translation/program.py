@@ -1,4 +1,4 @@
-"""Scalar programs: straight-line arithmetic that was traced from a model, its derivatives, and what it needs.
+"""A scalar program is straight-line arithmetic that was traced from a model, with symbolic derivatives.
 
 A program is a list of operations on numbers, each used as often as it is needed and computed once. Derivatives are
 programs too: the chain rule adds their operations, and terms that are zero or one never become operations.
@@ -28,7 +28,7 @@ FOLDED: Final[dict[str, Callable[..., float]]] = {
     "maximum": max,
     "tan": math.tan,
 }
-"""Operations whose result is written down at once where all operands are constants."""
+"""Operations that are evaluated at once if all operands are constants."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,9 @@ class Operation:
     Attributes:
         name: what it does.
         operands: the numbers it takes.
-        constant: that belongs to it: an exponent, a value.
-        where: of a number that is read from an array or from its derivatives: the array, the place in it, by how many
-            of the operands derivatives are taken (0: they run backward, to each operand), and by which of them.
+        constant: a number of the operation itself, such as an exponent or a value.
+        where: for a number read from an array or its derivatives: the array, the place in it, the number of operands by
+            which derivatives are taken (0: they run backward, to each operand), and the operand.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Operation:
 
 @dataclass
 class Program:
-    """Operations in an order in which each comes after what it takes."""
+    """Operations in an order in which each follows its operands."""
 
     operations: list[Operation] = field(default_factory=list)
     _known: dict[Operation, Number] = field(default_factory=dict)
@@ -66,12 +66,12 @@ class Program:
         return self.place(Operation("constant", constant=float(value)))
 
     def value(self, number: Number) -> float | None:
-        """The value of a constant; None where it is none."""
+        """The value of a constant; None for another operation."""
         operation = self.operations[number]
         return operation.constant if operation.name == "constant" else None
 
     def apply(self, name: str, *operands: Number, constant: float | None = None) -> Number:
-        """The result of an operation, simplified where an operand is a zero, a one or all are constants."""
+        """The result of an operation, simplified if an operand is zero or one, or if all are constants."""
         values = [self.value(operand) for operand in operands]
         known = [value for value in values if value is not None]
         if name in FOLDED and len(known) == len(values):
@@ -91,7 +91,7 @@ class Program:
         return result
 
     def place(self, operation: Operation) -> Number:
-        """The place of an operation, which is listed once."""
+        """The place of an operation, which is listed only once."""
         if operation not in self._known:
             self._known[operation] = len(self.operations)
             self.operations.append(operation)
@@ -174,7 +174,7 @@ Partial = Callable[[Program, Number, Operation, int], Number]
 
 
 def _chosen(comparison: str) -> Partial:
-    """The derivative of a minimum or maximum: one for the operand that is taken."""
+    """The derivative of a minimum or maximum: one for the selected operand."""
 
     def partial(p: Program, _: Number, operation: Operation, place: int) -> Number:
         taken = p.apply(comparison, operation.operands[place], operation.operands[1 - place])
@@ -201,10 +201,7 @@ def _of_pow(p: Program, _: Number, operation: Operation, __: int) -> Number:
 
 
 def _of_read(p: Program, number: Number, operation: Operation, place: int) -> Number:
-    """The derivative by one of the numbers through which an array depends on others; for the others it is zero.
-
-    Where derivatives run backward, it is that by a number that the array was made from.
-    """
+    """The derivative by one of the numbers through which an array depends on others; zero by all other numbers."""
     block, entry, through = operation.where
     if not through:
         return p.place(Operation("back", (number, operation.operands[place]), where=(block, entry)))

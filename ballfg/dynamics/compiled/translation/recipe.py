@@ -1,4 +1,4 @@
-"""Operations of torch on tables, in a form that a file can hold: they make the weights of compiled functions."""
+"""Records torch operations on tables in a file; they compute the weights of compiled functions."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ import torch
 from torch import Tensor
 
 RESHAPES: Final = frozenset({"view", "_unsafe_view"})
-"""Operations that need numbers to lie together; `reshape` does the same without that."""
+"""Operations that need contiguous numbers; `reshape` does the same without that."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """Operations on tables, in a form that can be written to a file.
+    """Operations on tables, in a form for files.
 
     Values are numbered: tables first, then constants, then the result of each step.
 
     Attributes:
         constants: as nested lists, with their type.
         steps: name of the operation, arguments, further ones by name; {"value": k} stands for a value.
-        taken: numbers of the values that make up the weights.
+        taken: numbers of the values that are the weights.
     """
 
     constants: Sequence[tuple[Any, str]]

@@ -1,4 +1,4 @@
-"""What torch's operations do to small tensors that were taken apart into numbers of a program."""
+"""Translates torch's operations on small tensors to operations on numbers of a program."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ aten: Any = torch.ops.aten
 
 
 class UnknownOperationError(Exception):
-    """An operation that no rule takes apart."""
+    """No rule covers an operation."""
 
 
 class Rules:
-    """What torch's operations do to tensors of numbers."""
+    """Rules for torch's operations on tensors of numbers."""
 
     def __init__(self, program: Program) -> None:
         self.program = program
@@ -38,7 +38,7 @@ class Rules:
         return value if isinstance(value, np.ndarray) else np.array(self.program.constant(float(value)), dtype=object)
 
     def each(self, name: str, *operands: Any, constant: float | None = None) -> Numbers:
-        """An operation number by number."""
+        """An elementwise operation."""
         arrays = np.broadcast_arrays(*map(self.numbers, operands))
         made = [
             self.program.apply(name, *(int(a) for a in one), constant=constant)
@@ -138,7 +138,7 @@ def _new(rules: Rules, _: Numbers, shape: Sequence[int], value: float = 0.0, **_
     return np.full(tuple(shape), rules.program.constant(value), dtype=object)
 
 
-RULES: Final[dict[Any, Callable[..., Any]]] = {
+EACH: Final[dict[Any, Callable[..., Numbers]]] = {
     aten.add.Tensor: _add,
     aten.add.Scalar: _add,
     aten.sub.Tensor: _sub,
@@ -152,22 +152,27 @@ RULES: Final[dict[Any, Callable[..., Any]]] = {
     aten.neg.default: _each("neg"),
     aten.sqrt.default: _each("sqrt"),
     aten.exp.default: _each("exp"),
-    aten.tan.default: _each("tan"),
     aten.tanh.default: _each("tanh"),
     aten.abs.default: _each("abs"),
-    aten.minimum.default: _each("minimum"),
-    aten.maximum.default: _each("maximum"),
     aten.reciprocal.default: lambda r, x: r.each("div", 1.0, x),
     aten.rsqrt.default: lambda r, x: r.each("div", 1.0, r.each("sqrt", x)),
     aten.sin.default: _each("sin"),
     aten.cos.default: _each("cos"),
     aten.log.default: _each("log"),
-    aten.sign.default: _each("sign"),
     aten.square.default: lambda r, x: r.each("mul", x, x),
     aten.pow.Tensor_Scalar: _pow,
     aten.clamp.default: _clamp,
     aten.clamp_min.default: lambda r, x, low: r.each("maximum", x, low),
     aten.clamp_max.default: lambda r, x, high: r.each("minimum", x, high),
+}
+"""Rules of operations number by number that arrays have too."""
+
+RULES: Final[dict[Any, Callable[..., Any]]] = {
+    **EACH,
+    aten.tan.default: _each("tan"),
+    aten.minimum.default: _each("minimum"),
+    aten.maximum.default: _each("maximum"),
+    aten.sign.default: _each("sign"),
     aten.where.self: _each("where"),
     aten.lt.Scalar: _each("lt"),
     aten.lt.Tensor: _each("lt"),

@@ -1,4 +1,4 @@
-"""Python source, for numba, of a program and of how its outputs move with its inputs."""
+"""Writes numba source for a program and for the tangents of its outputs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ OF_ARRAYS = frozenset({"read", "slope", "back"})
 def function_source(traced: Traced, state: Sequence[Number], others: Sequence[Number]) -> str:
     """Source of `compute(x, c, w, xt, ct, y, yt)`: outputs (n, m) of a program for n states, and their tangents.
 
-    The same arithmetic has the same source, whatever else the program holds: it is known by its hash.
+    Equal arithmetic has equal source, whatever else the program holds: its hash identifies it.
 
     Args:
         traced: the program, its arrays and its outputs, which are written to y.
@@ -46,14 +46,14 @@ def function_source(traced: Traced, state: Sequence[Number], others: Sequence[Nu
 
 @dataclass
 class _Writer:
-    """Writes lines that compute numbers, and before them the arrays that they are read from.
+    """Writes lines that compute numbers, after lines that fill the arrays they are read from.
 
     Attributes:
         traced: the program.
         names: of its numbers.  inputs: how its inputs are called.
         lines: written so far.
-        done: blocks that are filled, or whose derivatives are, by the names of these.
-        kinds: names of derivatives, by the numbers by which they are.
+        done: blocks that are filled, or whose derivatives are, by their names.
+        kinds: names of derivatives, by the numbers with respect to which they are taken.
     """
 
     traced: Traced
@@ -66,7 +66,7 @@ class _Writer:
     def compute(self, numbers: Sequence[Number], then: Sequence[str]) -> None:
         """Compute numbers of each state and then do something with them.
 
-        What several computations need is computed in each of them, which costs less than keeping it for all states.
+        Common subexpressions are computed in each loop, which costs less than storing them for all states.
         """
         needed, program = self._up_to_arrays(numbers), self.traced.program
         for number in needed:
@@ -78,7 +78,7 @@ class _Writer:
             self.lines += [EACH_STATE, *indented([*body, *then])]
 
     def _up_to_arrays(self, numbers: Sequence[Number]) -> list[Number]:
-        """What numbers depend on, but for what is read from arrays."""
+        """Operations that numbers depend on, down to reads of arrays."""
         found, wanted, operations = set[Number](), list(numbers), self.traced.program.operations
         while wanted:
             number = wanted.pop()
@@ -89,7 +89,7 @@ class _Writer:
         return sorted(found)
 
     def _fill_for(self, operation: Operation) -> None:
-        """Fill the arrays, or their derivatives, that an operation reads."""
+        """Fills the arrays, or their derivatives, that an operation reads."""
         arrays, block = self.traced.arrays, operation.where[0]
         for source in arrays.sources(block):
             if f"a{source}" not in self.done:
@@ -136,11 +136,11 @@ class _Writer:
         return Entries(self.traced.arrays, self.kinds.setdefault(by, f"t{len(self.kinds)}_"), len(by))
 
     def _adjoint(self, block: int) -> Entries:
-        """Derivatives of the places of a block that are asked for."""
+        """Derivatives of those places of a block that are read."""
         return Entries(self.traced.arrays, f"g{block}_", len(self.traced.arrays.asked[block]))
 
     def _one(self, number: Number) -> str:
-        """A number in terms of others, and of arrays that are filled."""
+        """A number in terms of others and of filled arrays."""
         operation, arrays = self.traced.program.operations[number], self.traced.arrays
         if operation.name == "read":
             block, place, _ = operation.where

@@ -1,8 +1,8 @@
-"""From a torch function to a program, by torch's own tracer.
+"""Traces a torch function to a program by torch's own tracer.
 
-Small tensors are taken apart into numbers (`rules.py`), and so is what is made of them. What is made of large ones,
-the layers of a network for instance, stays an array (`array_rules.py`). What depends on tables alone, such as weights,
-torch computes once for all states (`weights.py`).
+Small tensors are split into numbers (`rules.py`), and so are results made from them. Results of large tensors, such as
+the layers of a network, stay arrays (`array_rules.py`). Torch computes values that depend on tables alone, such as
+weights, once for all states (`weights.py`).
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from torch import Tensor
 from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 
-from ballfg.dynamics.compiled.translation.array_rules import ARRAY_RULES, EACH, each_of
+from ballfg.dynamics.compiled.translation.array_rules import ARRAY_RULES, each_of
 from ballfg.dynamics.compiled.translation.arrays import SMALL, Arrays, Load, View
 from ballfg.dynamics.compiled.translation.program import Number, Operation, Program
 from ballfg.dynamics.compiled.translation.recipe import Recipe
-from ballfg.dynamics.compiled.translation.rules import RULES, Numbers, Rules, UnknownOperationError
+from ballfg.dynamics.compiled.translation.rules import EACH, RULES, Numbers, Rules, UnknownOperationError
 from ballfg.dynamics.compiled.translation.weights import Known, Weights
 
 MOST_READ = 500
-"""Numbers of an array that is taken apart for an operation which arrays do not have."""
+"""Largest array that is split into numbers for an operation without an array rule."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,8 @@ def trace(function: Callable[..., Tensor], lengths: Sequence[int], tables: Seque
     Args:
         function: of float64 vectors and tables; its branches must not depend on their values.
         lengths: of the vectors.
-        tables: of any shape, derivatives by which nobody asks for.
-    Raises: UnknownOperationError: if the function does what no rule covers.
+        tables: of any shape; no derivatives by them.
+    Raises: UnknownOperationError: if no rule covers an operation of the function.
     """
     examples = [torch.linspace(0.5, 1.5, size, dtype=torch.float64) for size in lengths]
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""What a traced function makes of its tables alone: torch computes it once for all states, and the program takes it."""
+"""Collects the values that a traced function computes from its tables alone, once for all states, as weights."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ballfg.dynamics.compiled.translation.recipe import Recipe
 from ballfg.dynamics.compiled.translation.rules import UnknownOperationError
 
 IDLE: Final = frozenset({"memory_format", "pin_memory", "device", "layout"})
-"""Arguments that change nothing about numbers in the memory of a computer."""
+"""Arguments without influence on numbers in the memory of a computer."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Weights:
     length: int = 0
 
     def take(self, known: Known) -> View:
-        """Where the numbers of a tensor lie among the weights."""
+        """Places of the numbers of a tensor among the weights."""
         shape = tuple(known.example.shape)
         if known.node not in self.taken:
             self.taken[known.node] = self.length
@@ -48,7 +48,7 @@ class Weights:
         return View.whole(None, shape, self.taken[known.node])
 
     def recipe(self, graph: GraphModule, vectors: int) -> Recipe | None:
-        """How the weights come from the tables, which are placeholders after so many vectors; None: there are none.
+        """The recipe of the weights from the tables, which are placeholders after `vectors` vectors; None: no weights.
 
         Raises: UnknownOperationError: for an argument that cannot be written down.
         """

@@ -1,1 +1,1 @@
-"""The last samples of a stream as a factor graph: what a window predicts and holds, and two ways to solve it."""
+"""A window is a factor graph of a stream's last samples, solved by iSAM2 or as a chain of triangles."""

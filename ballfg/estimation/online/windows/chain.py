@@ -1,9 +1,9 @@
-"""A window whose linear system is a chain of triangles, eliminated from the oldest state to the newest.
+"""A chain window eliminates its states from the oldest to the newest and keeps the triangles.
 
-The triangle that the states before leave on each state is kept. A new sample then costs one step of the elimination,
-and states that move only the steps from the oldest of them on. Where the chain is cut, the triangle there is all that
-the states before know. The same factors at the same points have the same solution as in iSAM2 (`window.py`), to
-rounding and without its objects.
+It keeps the triangle that the earlier states leave on each state. A new sample then costs one step of the elimination,
+and a moved state only the steps from it on. Where the chain is cut, the triangle there is the whole information of the
+earlier states. The same factors at the same points have the same solution as in iSAM2 (`window.py`), to rounding and
+without its objects.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from ballfg.estimation.online.windows.interval import Interval
 from ballfg.estimation.online.windows.linear import LinearFactors
 from ballfg.estimation.online.windows.stream_window import Arrival, StreamWindow
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch
+from ballfg.factors.correlated_noise import BiasFactors, BiasStartFactors
 from ballfg.factors.dynamics import DynamicsFactors
 from ballfg.factors.linear.covariance import marginal_covariances
 from ballfg.factors.linear.elimination import Root, eliminate_on, padded
 from ballfg.factors.linear.substitution import solution_of
 from ballfg.factors.prior import coefficient_prior
-from ballfg.factors.tracker import BiasFactors, BiasStartFactors
 from ballfg.state import STATE_DIM
 
 Answer = tuple[Array, tuple[Array, ...]]
@@ -38,7 +38,7 @@ class ChainWindow(StreamWindow):
     """The window as a chain: arguments and attributes as those of `StreamWindow`."""
 
     def _clear(self) -> None:
-        """No states; what states that left know of the first one stays."""
+        """Removes all states; the information from earlier states on the first one stays."""
         super()._clear()
         self._columns = padded(2 * self.width + self.p + 1)
         self._priors: list[list[FactorBatch]] = []  # of each state, and of its tracker's bias
@@ -51,7 +51,7 @@ class ChainWindow(StreamWindow):
             self._summary: LinearFactors | None = None  # of the first state and the coefficients
 
     def _room(self, count: int) -> None:
-        """Arrays of the chain for twice as many states; what is eliminated stays."""
+        """Enlarges the arrays of the chain to twice as many states; eliminated rows stay."""
         w, p, size = self.width, self.p, 2 * count + 64
         shapes = ((size + 1, w, self._columns), (size + 1, p, self._columns), (size, w, 2 * w + p + 1))
         carries, shared, root = (np.zeros(shape) for shape in shapes)
@@ -61,7 +61,7 @@ class ChainWindow(StreamWindow):
         self._chain: tuple[Array, Array, Array] = carries, shared, root
 
     def copy(self, samples: Sequence[Sample]) -> Self:
-        """A window with the same states and factors, which goes on by itself."""
+        """An independent window with the same states and factors."""
         other = copy.copy(self)
         other.samples = list(samples)
         other.intervals = [copy.copy(interval) for interval in self.intervals]
@@ -72,7 +72,7 @@ class ChainWindow(StreamWindow):
         return other
 
     def _insert(self, arrivals: Sequence[Arrival]) -> int:
-        """Take in new states with their factors, one after another, and solve."""
+        """Takes in new states with their factors, one after another, and solves."""
         first = len(self.samples)
         for arrival in arrivals:
             sample, own = arrival.sample, list(arrival.priors)
@@ -91,7 +91,7 @@ class ChainWindow(StreamWindow):
         return self._solve()
 
     def retract(self, count: int) -> None:
-        """Take the newest samples back, with their states and factors."""
+        """Removes the newest samples, with their states and factors."""
         self._move()
         for held in (self.samples, self._priors, self._positions, self._answers, self._rows):
             del held[count:]
@@ -102,7 +102,7 @@ class ChainWindow(StreamWindow):
         self._solve()
 
     def attach(self, measurement: Measurement) -> Update:
-        """One more measurement of the newest sample, which holds it already."""
+        """Adds one more measurement of the newest sample, which holds it already."""
         count, calls = self._move()
         measurement.corrected(self.points[-1], self.newest_covariance[: self.width, : self.width])
         beside = self.samples[-1].measurements
@@ -111,7 +111,7 @@ class ChainWindow(StreamWindow):
         return Update(measurement.innovation, count, calls, self._solve())
 
     def reweigh(self, numbers: list[int]) -> None:
-        """Put in anew the factors of the positions of some samples of the window, whose noise has changed."""
+        """Replaces the position factors of some samples of the window, whose noise has changed."""
         self._move()
         for k in numbers:
             self._positions[k] = self._measured(k)
@@ -119,7 +119,7 @@ class ChainWindow(StreamWindow):
         self._solve()
 
     def shorten(self, keep: int) -> None:
-        """Let go of all but the newest states; the triangle that is left where they end is what they know."""
+        """Drops all but the newest states; the triangle at the cut keeps their information."""
         leaving = len(self.samples) - keep
         self._move()
         self._solve()
@@ -137,7 +137,7 @@ class ChainWindow(StreamWindow):
         if self.biased and not linked:
             self._priors[0].append(BiasStartFactors(np.zeros(1, dtype=np.int64), self.settings.bias_sigmas))
         self._room(0)
-        self._renew([0], moved=False)  # the first one's rows alone change; all are eliminated again
+        self._renew([0], moved=False)  # only the first one's rows change; all are eliminated again
         self._solve()
 
     def joint_covariances(self, count: int) -> list[Array]:
@@ -146,7 +146,7 @@ class ChainWindow(StreamWindow):
         return [found.joint(k) for k in range(count)]
 
     def summaries(self) -> list[FactorBatch]:
-        """What states that left know, as one linear factor."""
+        """The information of removed states, as one linear factor."""
         if not self.first or self._summary is None:
             return []
         if self.p:
@@ -158,12 +158,12 @@ class ChainWindow(StreamWindow):
         return self._summary is not None and bool(self._summary.blocks[0].any())
 
     def _move(self) -> tuple[int, int]:
-        """Relinearise what left the thresholds; factors evaluated, calls for them."""
+        """Relinearises the states that left the thresholds; returns the evaluated factors and calls."""
         _, count, calls = self._relinearize(None)
         return count, calls
 
     def _relinearize(self, new: Interval | None) -> tuple[Array, int, int]:
-        """As the base's; the rows of all that was evaluated anew are no longer those of the chain."""
+        """As the base's; the chain's rows of all evaluated factors become stale."""
         before, shared = self.theta, self.coefficient_theta
         found = super()._relinearize(new)
         if self.coefficient_theta is not shared:
@@ -173,19 +173,19 @@ class ChainWindow(StreamWindow):
         return found
 
     def _renew(self, numbers: Sequence[int], moved: bool = True) -> None:
-        """Have the rows of some states written anew; where they moved, those of the states before see them too."""
+        """Marks the rows of some states as stale; if they moved, those of the states before as well."""
         for k in numbers:
             self._stale[k] = moved or self._stale.get(k, False)
             if moved and k:
                 self._stale[k - 1] = True
 
     def _rows_of(self, k: int, moved: bool) -> Array:
-        """(r, columns) of all factors of which k is the first state; the right side last.
+        """(r, columns) of all factors whose first state is k; the right side last.
 
-        Args: moved: whether the factors that ask the model or a camera have been evaluated anew.
+        Args: moved: True if the factors of the model or a camera have been evaluated anew.
         """
         sample, interval = self.samples[k], self.intervals[k] if k < len(self.intervals) else None
-        if moved:  # bridges are shared with copies of the window, answers are not
+        if moved:  # bridges are shared with copies of the window, results are not
             asked = [(m.batch, m.bridge) for m in sample.measurements]
             asked += [] if interval is None else [(interval.batch, interval.bridge)]
             self._answers[k] = [(batch, _batched(bridge.kept(0))) for batch, bridge in asked]
@@ -211,11 +211,11 @@ class ChainWindow(StreamWindow):
         return written
 
     def _measured(self, k: int) -> list[FactorBatch]:
-        """The factor of a state's position, where it was measured."""
+        """The factor of a state's position, if it was measured."""
         return [self._position_batch(self.samples[k], k)] if self.samples[k].measured else []
 
     def _of_the_beginning(self) -> list[tuple[FactorBatch, Answer]]:
-        """What is known of the first state and of the coefficients from before."""
+        """The prior information on the first state and the coefficients."""
         if self._summary is not None:
             points = (self.theta[:1], self.coefficient_theta[None])
             return [(self._summary, self._summary.compute(slice(None), points))]
@@ -225,13 +225,13 @@ class ChainWindow(StreamWindow):
         return [(prior, prior.compute(slice(None), (self.coefficient_theta[None],)))]
 
     def _seen(self, batch: FactorBatch, k: int) -> Array:
-        """(1, d) what a batch sees of state k."""
+        """(1, d) the inputs of a batch at state k."""
         return self.theta[k : k + 1] if batch.sees_biases else self.theta[k : k + 1, :STATE_DIM]
 
     def _solve(self) -> int:
-        """Eliminate from the first state whose rows have changed; solutions and the newest covariance.
+        """Eliminates from the first state whose rows have changed; writes solutions and the newest covariance.
 
-        Returns: how many states were eliminated again.
+        Returns: number of eliminated states.
         Raises: RuntimeError: if the system is singular.
         """
         n = len(self.samples)
@@ -268,7 +268,7 @@ def _batched(answer: Answer) -> Answer:
 
 
 def _weight(batch: FactorBatch, residual: Array) -> float:
-    """By which a batch's loss scales one factor, as GTSAM's noise models do; residual (r,)."""
+    """The scale of one factor by its batch's loss, as in GTSAM's noise models; residual (r,)."""
     if batch.loss.name == "squared":
         return 1.0
     return math.sqrt(float(batch.loss.weight(np.sqrt(residual @ residual))))

@@ -1,27 +1,27 @@
-"""An extended Kalman filter ahead of a window: where a new state will be, to be linearised there."""
+"""Predicts new states of a window by an extended Kalman filter, as linearisation points."""
 
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.estimation.online.linear_factors import carried_with_bias
 from ballfg.estimation.online.sample import Sample
-from ballfg.estimation.online.tracker import carried_with_bias
 from ballfg.estimation.online.windows.interval import Interval
 from ballfg.estimation.settings import Settings, stamp_covariance
+from ballfg.factors.correlated_noise import BIAS_DIM
 from ballfg.factors.linear.definite import whitened as whitened_by
-from ballfg.factors.tracker import BIAS_DIM
 from ballfg.state import POSITION, STATE_DIM, VELOCITY
 
 WIDE_VELOCITY = 1.0
-"""m/s. A predicted velocity that is less well known does not tell along which way a stamp's error moved the ball."""
+"""m/s. A less certain predicted velocity does not give the direction of a stamp's error."""
 
 
 class WindowFilter:
     """One step at a time over states of a window, with coefficients behind them.
 
-    What comes out is a linearisation point only: closer to the final answer than the prediction, it saves
-    relinearisations, and a robust loss gets a weight near the one that it ends with.
+    Its result is a linearisation point only: closer to the final solution than the prediction, it saves
+    relinearisations, and a robust loss gets a weight near its final one.
 
-    Args: settings: noise.  width: w, 9, or 12 where the tracker's bias stands behind each state.
+    Args: settings: noise.  width: w, 9, or 12 if the tracker's bias follows each state.
     """
 
     def __init__(self, settings: Settings, width: int) -> None:
@@ -37,12 +37,12 @@ class WindowFilter:
         interval: Interval,
         sample: Sample,
     ) -> tuple[Array, Array, Array]:
-        """Over an interval, and with the sample at its end.
+        """Predicts over an interval and updates with the sample at its end.
 
         Args:
             piece: (9, 1 + 9 + p) propagation from `point` (w,) and the coefficients `shared` (p,).
             mean, covariance: (w + p,) and (w + p, w + p) of state, bias and coefficients before.
-            interval: between the samples.  sample: gets the velocity along which its stamp's error moves it.
+            interval: between the samples.  sample: gets the rough velocity for its stamp's error.
         Returns: mean and covariance after the sample, and its whitened innovation.
         """
         carried, noise, w = piece, interval.covariance, self.width
@@ -61,7 +61,7 @@ class WindowFilter:
         return self._with(sample, predicted, spread)
 
     def _with(self, sample: Sample, mean: Array, covariance: Array) -> tuple[Array, Array, Array]:
-        """Mean and covariance moved by a sample, and its whitened innovation."""
+        """Mean and covariance after the update by a sample, and its whitened innovation."""
         if not sample.measured:
             for measurement in sample.measurements:
                 mean, covariance = measurement.corrected(mean, covariance)
@@ -80,5 +80,5 @@ class WindowFilter:
         return mean, covariance, whitened
 
     def _measured_part(self, rows: Array) -> Array:
-        """(3, ...) the rows (w + p, ...) that a measured position looks at: those of position and bias, added."""
+        """(3, ...) the sum of the position and bias rows of (w + p, ...), which a measured position depends on."""
         return rows[POSITION] + rows[STATE_DIM : STATE_DIM + BIAS_DIM] if self.biased else rows[POSITION]

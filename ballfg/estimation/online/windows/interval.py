@@ -1,4 +1,4 @@
-"""What happens between two samples, as a dynamics factor of its own that joins others in one batch."""
+"""An interval is a dynamics factor between two samples that is evaluated together with others."""
 
 import copy
 import math
@@ -8,8 +8,9 @@ import numpy as np
 import torch
 
 from ballfg.arrays import Array
+from ballfg.dynamics.compiled.flight import white_acceleration
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.integrate import steps_over
+from ballfg.dynamics.motion.limits import steps_over
 from ballfg.estimation.smoother.motion import FLIGHT, Motion
 from ballfg.factors.batch import merge
 from ballfg.factors.bridge import Bridge, checked
@@ -19,15 +20,15 @@ from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 
 
 class Interval:
-    """One linked interval: its factor, and the last answer that its torch batch gave.
+    """One linked interval: its factor, and the last result of its torch batch.
 
     Args:
         batch: one row, between states i and i + 1 of the stream.
-        motion: what happens.
+        motion: events in the interval.
         covariance: (9, 9) of the process noise.
 
     Attributes:
-        slot: where iSAM2 keeps the factor; None before it does.
+        slot: place of the factor in iSAM2; None outside of it.
         group: intervals of one group can be evaluated together.
     """
 
@@ -43,7 +44,7 @@ class Interval:
 
 
 class IntervalMaker:
-    """Makes intervals for one model and noise; those of free flight, the usual case, quickly.
+    """Makes intervals for one model and noise; the usual ones, free flights, quickly.
 
     The correlation of the noise in flight does not depend on dt, so its root is computed once and scaled.
     """
@@ -74,8 +75,9 @@ class IntervalMaker:
 
     def _flight(self, index: int, dt: float) -> Interval:
         scale = np.empty(STATE_DIM)
-        scale[POSITION] = self.noise.acceleration * math.sqrt(dt**3 / 3)
-        scale[VELOCITY] = self.noise.acceleration * math.sqrt(dt)
+        position, _, velocity = white_acceleration(dt, 1.0)
+        scale[POSITION] = self.noise.acceleration * math.sqrt(position)
+        scale[VELOCITY] = self.noise.acceleration * math.sqrt(velocity)
         scale[SPIN] = self.noise.spin * math.sqrt(dt)
         batch = copy.copy(self._template)
         batch.variables = batch.variables.copy()
@@ -85,15 +87,15 @@ class IntervalMaker:
 
 
 def evaluate(intervals: Sequence[Interval], start: Array, after: Array, coefficients: Array) -> tuple[list[Array], int]:
-    """Residuals and Jacobians of some intervals, one torch call for all that share a motion, kept in their bridges.
+    """Residuals and Jacobians of intervals, one torch call for all that share a motion, stored in their bridges.
 
     Args:
         intervals: k of them.
-        start: (k, 9) states at which they begin; biases may stand behind these and the next.
-        after: (l, 9) states at which the first l of them end; what the others lack is for `store` to put.
+        start: (k, 9) states at which they begin; biases may follow these and the next.
+        after: (l, 9) states at which the first l of them end; `store` completes the others.
         coefficients: (p,).
     Returns: for each interval the propagated state and its Jacobian side by side, (9, 1 + 9 + p); number of calls.
-    Raises: ValueError: if the model gives something that is not finite.
+    Raises: ValueError: if a value of the model is not finite.
     """
     groups: dict[tuple[type, int, int], list[int]] = {}
     for k, interval in enumerate(intervals):
@@ -119,7 +121,7 @@ def evaluate(intervals: Sequence[Interval], start: Array, after: Array, coeffici
 
 
 def store(intervals: Sequence[Interval], start: Array, after: Array, coefficients: Array, pieces: Array) -> None:
-    """Whiten the propagations of k intervals and keep them for iSAM2's questions; `pieces` as from `evaluate`."""
+    """Whitens the propagations of k intervals and stores them for iSAM2's queries; `pieces` as from `evaluate`."""
     roots = np.concatenate([interval.batch.whitening for interval in intervals])
     answers = _whitened(intervals[0].batch, roots, pieces, start, after, coefficients)
     for row, interval in enumerate(intervals):

@@ -1,6 +1,6 @@
-"""iSAM2 over a window of states: what GTSAM is given for a sample, and the solution read back.
+"""Holds the linear system of a window in iSAM2 and reads the solution back.
 
-The window evaluates factors ahead in batches; when GTSAM asks for one, its callback finds the answer ready.
+The window evaluates factors ahead in batches; when GTSAM asks for one, its callback returns the stored result.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ import gtsam
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.estimation.online.linear_factors import bias_link, bias_start, linear_factor
 from ballfg.estimation.online.measurement import prepare
 from ballfg.estimation.online.sample import Sample
-from ballfg.estimation.online.tracker import bias_link, bias_start, linear_factor
 from ballfg.estimation.online.windows.stream_window import COEFFICIENT_THRESHOLD, Arrival, StreamWindow
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY, Bridge
 from ballfg.factors.prior import coefficient_prior
@@ -23,12 +23,12 @@ WILDFIRE = 1e-7
 
 
 class IsamCore(StreamWindow):
-    """A window whose linear system iSAM2 holds: arguments and attributes as those of `StreamWindow`.
+    """A window with its linear system in iSAM2: arguments and attributes as those of `StreamWindow`.
 
     Attributes:
         isam: of GTSAM.
-        shared: factors that belong to no sample: the prior of the coefficients; once the window was cut, the linear
-            factors that took its place and that of all states that left.
+        shared: factors without a sample: the prior of the coefficients; after a cut, the linear factors that replaced
+            it and the removed states.
     """
 
     def _clear(self) -> None:
@@ -46,7 +46,7 @@ class IsamCore(StreamWindow):
         return gtsam.ISAM2(_parameters(self.threshold, COEFFICIENT_THRESHOLD * self._own_sigmas))
 
     def _insert(self, arrivals: Sequence[Arrival]) -> int:
-        """Give iSAM2 new states with their factors, and read back the solution."""
+        """Adds new states with their factors to iSAM2, and reads back the solution."""
         graph, values, ends = gtsam.NonlinearFactorGraph(), gtsam.Values(), []
         last = {STATE_KEY + self.first + len(self.samples) + len(arrivals) - 1: 1, COEFFICIENT_KEY: 2}
         older = len(self.samples) > 0
@@ -80,7 +80,7 @@ class IsamCore(StreamWindow):
         return int(self._result.getVariablesReeliminated())
 
     def _factors_of(self, arrival: Arrival, key: int) -> list[gtsam.NonlinearFactor]:
-        """The factors that a new state brings: of its interval first, then those that look at it alone."""
+        """The factors of a new state: that of its interval first, then its own."""
         factors: list[gtsam.NonlinearFactor] = []
         if arrival.interval is not None:
             factors.append(arrival.interval.bridge.factor(0))
@@ -93,12 +93,12 @@ class IsamCore(StreamWindow):
         return factors
 
     def _measured(self, sample: Sample, state: int) -> list[gtsam.NonlinearFactor]:
-        """The factors of what was measured at a sample."""
+        """The factors of a sample's measurements."""
         position = [self._position_factor(sample, state)] if sample.measured else []
         return position + [measurement.factor(state) for measurement in sample.measurements]
 
     def _position_factor(self, sample: Sample, state: int) -> gtsam.NonlinearFactor:
-        """The observation's factor; without a robust loss it is linear."""
+        """The observation's factor; linear without a robust loss."""
         batch = self._position_batch(sample, state)
         if batch.loss.name != "squared":
             return Bridge(batch, "row").factor(0)
@@ -108,10 +108,10 @@ class IsamCore(StreamWindow):
     def _update(
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, remove: list[int], last: dict[int, int]
     ) -> list[int]:
-        """One iSAM2 update; `last` are keys eliminated after all others, by group; empty leaves it to GTSAM.
+        """One iSAM2 update; keys in `last` are eliminated after all others, by group; empty: GTSAM's order.
 
-        By itself GTSAM eliminates the newest states last, but not the coefficients: every state would then hang
-        on them from below, and no update would be local.
+        By itself GTSAM eliminates the newest states last, but not the coefficients: every state would then depend on
+        them from below, and no update would be local.
         """
         if last:
             groups = gtsam.KeyGroupMap()

@@ -1,4 +1,4 @@
-"""What states that left the window know of the first one that stays: one linear factor."""
+"""A linear factor keeps the information of removed states on the first state that stays."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class LinearFactors(FactorBatch):
         points: (1, d) each, v_i* in the variable's own units.
         blocks: (r, d) each, A_i whitened, per unit of the variable.
         b: (r,) whitened.
-        sees_biases: whether biases stand behind the states.
+        sees_biases: True if biases follow the states.
     """
 
     def __init__(

@@ -1,8 +1,8 @@
-"""A window of states that takes in one sample after another: what it predicts, evaluates and holds.
+"""A stream window predicts, evaluates and holds the last samples of a stream as a factor graph.
 
-The window keeps linearisation points and the linear solution about them. Before an update it knows which states have
-left the thresholds and moves them, and evaluates their factors, together with the new one, in one call of the model.
-How the linear system is kept and solved is another class's: iSAM2 (`window.py`) or a chain of triangles (`chain.py`).
+The window keeps linearisation points and the linear solution about them. Before an update it moves the states that have
+left the thresholds, and evaluates their factors, together with the new one, in one call of the model. Other classes
+keep and solve the linear system: iSAM2 (`window.py`) or a chain of triangles (`chain.py`).
 docs/derivations/online.md explains the choices.
 """
 
@@ -18,28 +18,28 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
+from ballfg.estimation.online.linear_factors import without_bias
 from ballfg.estimation.online.measurement import Measurement, prepare
 from ballfg.estimation.online.sample import Sample, Update
-from ballfg.estimation.online.tracker import without_bias
 from ballfg.estimation.online.windows.filter import WindowFilter
 from ballfg.estimation.online.windows.interval import Interval, IntervalMaker, evaluate, store
 from ballfg.estimation.settings import Settings, stamp_covariance
 from ballfg.estimation.smoother.problem import coefficient_means, start_priors
 from ballfg.factors.batch import FactorBatch, Values
+from ballfg.factors.correlated_noise import BIAS_DIM, BiasedPositionFactors
 from ballfg.factors.dynamics import model_width
 from ballfg.factors.position import PositionFactors
-from ballfg.factors.tracker import BIAS_DIM, BiasedPositionFactors
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 
 
 @dataclass(frozen=True)
 class Arrival:
-    """A sample that a window takes in.
+    """A new sample of a window.
 
     Attributes:
-        sample: what came.
-        state: (w,) the point at which it is linearised.
-        interval: what leads to it from the sample before; None where nothing does.
+        sample: the sample.
+        state: (w,) its linearisation point.
+        interval: the one from the sample before; None without a link.
         priors: factors of its own, numbered 0.
     """
 
@@ -50,16 +50,16 @@ class Arrival:
 
 
 VELOCITY_THRESHOLD = 0.3
-"""m/s. Linearised this far off, drag is wrong by k dv^2 = 0.012 m/s^2, and by 0.04 m/s^2 where the spin is off by
-`SPIN_THRESHOLD` as well: a third of the acceleration that the process noise allows over half a second, for as long as
-it takes the next state to be relinearised. Three times less costs twice the evaluations and changes nothing
+"""m/s. With an error this large in the linearisation point, drag is wrong by k dv^2 = 0.012 m/s^2, and by 0.04 m/s^2
+with `SPIN_THRESHOLD` as well: a third of the acceleration that the process noise allows over half a second, until the
+next state is relinearised. A third of it costs twice the evaluations and changes nothing
 (docs/derivations/online.md)."""
 SPIN_THRESHOLD = 40.0
-"""rad/s. The Magnus force is linear in the spin: only its product with an error in velocity matters."""
+"""rad/s. The Magnus force is linear in the spin: only its product with a velocity error matters."""
 POSITION_THRESHOLD = 0.5
 """Measurement standard deviations. Flight does not depend on the position; a robust loss's weight does."""
 COEFFICIENT_THRESHOLD = 0.5
-"""Prior standard deviations. The coefficients touch every factor: moving them relinearises the whole window."""
+"""Prior standard deviations. The coefficients enter every factor: a change relinearises the whole window."""
 
 
 class StreamWindow(ABC):
@@ -68,11 +68,11 @@ class StreamWindow(ABC):
     Args:
         model: the ball, from `problem.trackwise_model`.  settings: noise and priors.
         position_sigma: m, of a good measurement; scales the threshold of relinearisation in position.
-        biased: whether the tracker's bias, a vector of three, stands behind each state.
+        biased: True if the tracker's bias, a vector of three, follows each state.
 
     Attributes:
         first: number of the window's first state since the stream began.
-        samples: n of them.  intervals: n - 1, None where nothing links two samples.
+        samples: n of them.  intervals: n - 1, None without a link between two samples.
         theta: (n, w) linearisation points of states and biases, w = 9 or 12.  delta: (n, w) solution about them.
         coefficient_theta, coefficient_delta: (p,) the same for the coefficients.
         newest_covariance: (w + p, w + p) of the newest state with its bias and the coefficients.
@@ -101,32 +101,32 @@ class StreamWindow(ABC):
 
     @abstractmethod
     def copy(self, samples: Sequence[Sample]) -> Self:
-        """A window with the same states and factors, which goes on by itself.
+        """An independent window with the same states and factors.
 
         Args: samples: copies of the window's.
         """
 
     @abstractmethod
     def retract(self, count: int) -> None:
-        """Take the newest samples back, with their states and factors.
+        """Removes the newest samples, with their states and factors.
 
-        Args: count: how many stay, at least 1.
+        Args: count: number of samples to keep, at least 1.
         """
 
     @abstractmethod
     def attach(self, measurement: Measurement) -> Update:
-        """One more measurement of the newest sample, which holds it already.
+        """Adds one more measurement of the newest sample, which holds it already.
 
         Raises: RuntimeError or ValueError: as `append`.
         """
 
     @abstractmethod
     def reweigh(self, numbers: list[int]) -> None:
-        """Put in anew the factors of the positions of some samples of the window, whose noise has changed."""
+        """Replaces the position factors of some samples of the window, whose noise has changed."""
 
     @abstractmethod
     def shorten(self, keep: int) -> None:
-        """Let go of all but the newest states; what the others know becomes a linear factor on the first that stays.
+        """Drops all but the newest states; a linear factor on the first that stays keeps their information.
 
         Raises: RuntimeError: when the leaving part is singular.
         """
@@ -137,18 +137,18 @@ class StreamWindow(ABC):
 
     @abstractmethod
     def summaries(self) -> list[FactorBatch]:
-        """What the states that left know of the first state and of the coefficients, numbered as in the window."""
+        """The information of removed states on the first state and the coefficients, numbered as in the window."""
 
     @abstractmethod
     def _insert(self, arrivals: Sequence[Arrival]) -> int:
-        """Take in new states with their factors, one after another, and solve.
+        """Takes in new states with their factors, one after another, and solves.
 
-        Returns: how many states were eliminated again.
+        Returns: number of eliminated states.
         """
 
     @abstractmethod
     def _first_is_known(self) -> bool:
-        """Whether states that left know something of the window's first state."""
+        """True if removed states left information on the window's first state."""
 
     def _clear(self) -> None:
         """No states."""
@@ -157,9 +157,9 @@ class StreamWindow(ABC):
         self.newest_covariance = np.zeros((0, 0))
 
     def start_anew(self, samples: list[Sample]) -> Update:
-        """Throw the solution away, after an error left it half-updated, and take in all samples again, oldest first.
+        """Drops the solution, after an error left it half-updated, and takes in all samples again, oldest first.
 
-        Returns: of the last sample's update.
+        Returns: the last sample's update.
         Raises: RuntimeError or ValueError: if that fails as well.
         """
         start, coefficients = self.points[:1], self.coefficients
@@ -189,7 +189,7 @@ class StreamWindow(ABC):
 
     @property
     def values(self) -> Values:
-        """The present estimate of everything."""
+        """The present estimate of all variables."""
         return Values(self.states, self.coefficients, self.points[:, STATE_DIM:] if self.biased else None)
 
     @property
@@ -215,19 +215,19 @@ class StreamWindow(ABC):
         return np.array([sample.time for sample in self.samples])
 
     def append(self, sample: Sample) -> Update:
-        """Take in a sample.
+        """Takes in a sample.
 
-        Raises: RuntimeError or ValueError: what GTSAM or the model raised; the window must then be built anew.
+        Raises: RuntimeError or ValueError: from GTSAM or the model; the window must then be rebuilt.
         """
         return self.append_all([sample])
 
     def append_all(self, samples: Sequence[Sample]) -> Update:
-        """Take in several samples and solve once: those that were taken back when an event changed.
+        """Takes in several samples and solves once: those that were retracted when an event changed.
 
-        An extended Kalman filter over them gives the points at which they are linearised. Where these turn out to be
-        too far from the solution, the next sample moves them, as it does after `append`.
+        An extended Kalman filter over them gives their linearisation points. If these are too far from the solution,
+        the next sample moves them, as after `append`.
 
-        Returns: of the last one.
+        Returns: the last one's update.
         Raises: RuntimeError or ValueError: as `append`.
         """
         update, begin = Update(np.full(3, np.nan), 0, 0, 0), 0
@@ -244,7 +244,7 @@ class StreamWindow(ABC):
         return update
 
     def _append_linked(self, samples: Sequence[Sample]) -> Update:
-        """Take in samples that are linked to the newest one and to each other."""
+        """Takes in samples that are linked to the newest one and to each other."""
         mean, covariance = np.concatenate((self.points[-1], self.coefficients)), self.newest_covariance
         points: list[Array] = []
         intervals: list[Interval] = []
@@ -271,7 +271,7 @@ class StreamWindow(ABC):
         return Update(innovation, count, calls, variables)
 
     def _append_start(self, sample: Sample) -> Update:
-        """A sample that nothing predicts: its state has a wide prior of its own."""
+        """Takes in a sample without a prediction: its state has a wide prior of its own."""
         state = np.zeros(self.width)
         state[POSITION] = sample.position
         if sample.label is not None:
@@ -281,7 +281,7 @@ class StreamWindow(ABC):
         return Update(np.full(3, np.nan), count, calls, self._insert([Arrival(sample, state, None, priors)]))
 
     def _relinearize(self, new: Interval | None) -> tuple[Array, int, int]:
-        """Do ahead what iSAM2 will do: move the states whose solution left the thresholds, evaluate their factors.
+        """Moves states whose solution left the thresholds, and evaluates their factors, ahead of iSAM2.
 
         Returns: the new interval's propagation (9, 1 + 9 + p), factors evaluated, torch calls.
         """
@@ -302,7 +302,7 @@ class StreamWindow(ABC):
         ends = [k + 1 for k in begins]
         if new is not None:
             touched.append(new)
-            begins.append(len(self.theta) - 1)  # its end comes out of this call: `store` puts it
+            begins.append(len(self.theta) - 1)  # this call computes its end: `store` completes it
         if not touched:
             return np.empty(0), 0, 0
         pieces, calls = evaluate(touched, self.theta[begins], self.theta[ends], self.coefficient_theta)

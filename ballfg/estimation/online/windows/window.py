@@ -1,4 +1,4 @@
-"""A window that can also go back, change its mind, let go of its oldest state, and start anew."""
+"""A window in iSAM2 retracts samples, replaces factors, drops its oldest states and restarts."""
 
 import copy
 from collections.abc import Sequence
@@ -7,9 +7,9 @@ from typing import Self
 import gtsam
 
 from ballfg.arrays import Array
+from ballfg.estimation.online.linear_factors import bias_start
 from ballfg.estimation.online.measurement import Measurement, prepare
 from ballfg.estimation.online.sample import Sample, Update
-from ballfg.estimation.online.tracker import bias_start
 from ballfg.estimation.online.windows.isam import IsamCore
 from ballfg.estimation.online.windows.linear import LinearFactors
 from ballfg.factors.batch import FactorBatch
@@ -20,10 +20,10 @@ class IsamWindow(IsamCore):
     """The window in iSAM2: arguments and attributes as those of `IsamCore`."""
 
     def copy(self, samples: Sequence[Sample]) -> Self:
-        """A window with the same states and factors, which goes on by itself.
+        """An independent window with the same states and factors.
 
-        iSAM2 is copied with its cliques. The factors are shared: their bridges answer for any state, from what they
-        keep or by evaluating anew.
+        iSAM2 is copied with its cliques. The factors are shared: their bridges answer for any state, from stored
+        results or by a new evaluation.
         """
         other = copy.copy(self)
         other.isam = gtsam.ISAM2(self.isam)
@@ -34,7 +34,7 @@ class IsamWindow(IsamCore):
         return other
 
     def retract(self, count: int) -> None:
-        """Take the newest samples back, with their states and factors; iSAM2 forgets them."""
+        """Removes the newest samples, with their states and factors, from iSAM2 as well."""
         gone = self.samples[count:]
         slots = [slot for sample in gone for slot in sample.slots]
         slots += [i.slot for i in self.intervals[count - 1 :] if i is not None and i.slot is not None]
@@ -46,7 +46,7 @@ class IsamWindow(IsamCore):
         self._read_back()
 
     def attach(self, measurement: Measurement) -> Update:
-        """One more measurement of the newest sample, which holds it already."""
+        """Adds one more measurement of the newest sample, which holds it already."""
         _, count, calls = self._relinearize(None)
         measurement.corrected(self.points[-1], self.newest_covariance[: self.width, : self.width])
         prepare([measurement], self.theta[-1:])
@@ -61,7 +61,7 @@ class IsamWindow(IsamCore):
         return Update(measurement.innovation, count, calls, int(self._result.getVariablesReeliminated()))
 
     def reweigh(self, numbers: list[int]) -> None:
-        """Put in anew the factors of the positions of some samples of the window, whose noise has changed."""
+        """Replaces the position factors of some samples of the window, whose noise has changed."""
         self._relinearize(None)
         graph, old = gtsam.NonlinearFactorGraph(), []
         for k in numbers:
@@ -73,13 +73,13 @@ class IsamWindow(IsamCore):
         self._read_back()
 
     def shorten(self, keep: int) -> None:
-        """Let go of all but the newest states; what the others know becomes a linear factor on the first that stays.
+        """Drops all but the newest states; a linear factor on the first that stays keeps their information.
 
-        The factors of the leaving states are eliminated, by QR, at their linearisation points; iSAM2 is then made
-        anew from those that stay, whose linearisations are all at hand: no torch call. Where nothing but a bias links
-        the first that stays to them, after a long gap, the bias starts anew.
+        The factors of the removed states are eliminated, by QR, at their linearisation points; iSAM2 is then rebuilt
+        from the others, whose linearisations are all at hand: no torch call. If only a bias links the first of these to
+        the removed ones, after a long gap, the bias restarts.
 
-        Raises: RuntimeError: from GTSAM, when the leaving part is singular.
+        Raises: RuntimeError: from GTSAM, when the removed part is singular.
         """
         leaving = len(self.samples) - keep
         self._relinearize(None)
@@ -101,12 +101,12 @@ class IsamWindow(IsamCore):
         return [self.isam.jointMarginalCovariance([first + k, *shared]).fullMatrix() for k in range(count)]
 
     def summaries(self) -> list[FactorBatch]:
-        """The linear factors that states left, about the present estimate."""
+        """The linear factors from removed states, about the present estimate."""
         values = self.values if self.first else None
         return [] if values is None else [LinearFactors.of_gtsam(f, values, self.first) for f in self.shared]
 
     def _summary(self, leaving: int) -> list[gtsam.NonlinearFactor]:
-        """What the oldest states know, as linear factors on the first state that stays and on the coefficients."""
+        """The information of the oldest states, as linear factors on the first that stays and on the coefficients."""
         point = self._point(range(leaving + 1))
         old = gtsam.GaussianFactorGraph()
         cut = leaving - (self.intervals[leaving - 1] is None)
@@ -134,7 +134,7 @@ class IsamWindow(IsamCore):
         return values
 
     def _factors(self, samples: range, intervals: range, biases: range) -> list[gtsam.NonlinearFactor]:
-        """Factors out of iSAM2: of some samples, of some intervals, those that lead to the biases of some samples."""
+        """Slots in iSAM2 of factors: of some samples, of some intervals, and of those to the biases of some samples."""
         held = self.isam.getFactorsUnsafe()
         slots = [slot for k in samples for slot in self.samples[k].slots]
         slots += [i.slot for k in intervals if (i := self.intervals[k]) is not None and i.slot is not None]
@@ -142,7 +142,7 @@ class IsamWindow(IsamCore):
         return [held.at(slot) for slot in slots]
 
     def _renew(self, linked: bool) -> None:
-        """A new iSAM2 out of the window as it is; its first state may have no link to those that left."""
+        """A new iSAM2 from the present window; its first state may have no link to the removed ones."""
         n = len(self.samples)
         graph = gtsam.NonlinearFactorGraph()
         for factor in self._factors(range(n), range(n - 1), range(1, n)):

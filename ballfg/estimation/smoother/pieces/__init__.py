@@ -1,1 +1,1 @@
-"""Long tracks: smoothed piece by piece, joined to the minimum of the whole track; docs/derivations/long_tracks.md."""
+"""Smooths long tracks piece by piece and joins the pieces to the whole track's minimum."""

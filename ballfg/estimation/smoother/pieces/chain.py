@@ -1,4 +1,4 @@
-"""The whole track as a chain of the ends of its sections: small, and solved in one go."""
+"""Solves the whole track as a small chain of the ends of its sections."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class Chain:
     """The solution for all ends.
 
     Attributes:
-        states: (k + 1, w) where the ends of k sections are to go.
-        coefficients: (p,) the same of the coefficients.
+        states: (k + 1, w) target states at the ends of k sections.
+        coefficients: (p,) target of the coefficients.
         root: of the linear problem.
     """
 
@@ -33,7 +33,7 @@ class Chain:
     root: Root
 
     def target(self, section: int) -> Point:
-        """Where a section's ends are to go."""
+        """Target of a section's ends."""
         return Point(self.states[section], self.states[section + 1], self.coefficients)
 
     @cached_property
@@ -52,15 +52,15 @@ class Chain:
 
 
 def solve_chain(ends: Sequence[Ends], points: Sequence[Point], priors: Sequence[Rows], anchor: Array) -> Chain | None:
-    """The step of all ends and coefficients that minimises the linearised objective.
+    """The step of all ends and coefficients to the minimum of the linearised objective.
 
-    The sections need not have been linearised at the same point: each says where it was.
+    The sections may have different linearisation points.
 
     Args:
-        ends: of each section.  points: where each was linearised.
+        ends: of each section.  points: linearisation point of each.
         priors: factors on the coefficients alone.
-        anchor: (p,) in the coefficients' own units, where those were linearised; the solution is a step from there.
-    Returns: None where the system is singular.
+        anchor: (p,) linearisation point of the coefficients, in their own units; the solution is a step from there.
+    Returns: None if the system is singular.
     """
     states = np.stack([*(point.first for point in points), points[-1].last])
     rows = [_moved(*each, anchor) for each in zip(ends, points, states[1:], strict=True)]
@@ -76,7 +76,7 @@ def solve_chain(ends: Sequence[Ends], points: Sequence[Point], priors: Sequence[
 
 
 def _moved(ends: Ends, point: Point, last: Array, coefficients: Array) -> tuple[Array, Array, Array, Array]:
-    """Right side and blocks of a section's rows, as seen from the point that all sections share."""
+    """Right side and blocks of a section's rows, relative to the common linearisation point."""
     y = ends.y - ends.by_last @ (last - point.last) - ends.by_coefficients @ (coefficients - point.coefficients)
     return y, ends.by_first, ends.by_last, ends.by_coefficients
 

@@ -1,9 +1,8 @@
-"""The estimate of a long track: pieces by themselves, then all of them together, exactly.
+"""Estimates a long track exactly: first its pieces by themselves, then all of them together.
 
-Every piece is looked at by itself. Its events are kept; its states and coefficients are where the minimum of the whole
-track is looked for. That goes on by Gauss-Newton steps of the whole track: each piece tells what it means to its ends
-and to the coefficients that all share, and learns where these go. Memory holds some numbers a sample, and the matrices
-of the pieces under way.
+A first look at every piece fixes its events; its states and coefficients are initial values of the whole track.
+Gauss-Newton steps of the whole track follow: each piece passes its information on its ends and the shared coefficients,
+and gets their steps back. Memory holds some numbers a sample, and the matrices of the pieces in progress.
 """
 
 from __future__ import annotations
@@ -30,36 +29,36 @@ from ballfg.progress import doing
 from ballfg.tracks import Track
 
 if TYPE_CHECKING:
-    from ballfg.estimation.segmentation import Segmentation
+    from ballfg.estimation.segmentation.result import Segmentation
     from ballfg.estimation.smoother.smoother import Smoother
 
 T = TypeVar("T")
 R = TypeVar("R")
 
 PIECE: Final = 2000
-"""Samples of a piece. Shorter ones are looked at twice in a larger share of their samples, longer ones take memory."""
+"""Number of samples in a piece. Shorter ones repeat a larger share of their samples, longer ones take memory."""
 OVERLAP: Final = 64
-"""Samples beyond both ends of a piece that it is looked at with: as many as the segmentation takes to be sure."""
+"""Number of further samples at both ends of a piece in its first look: as many as make the segmentation certain."""
 MARGIN: Final = 8
-"""Samples beyond the ends of a section that velocities from line fits ask for."""
+"""Number of further samples at the ends of a section for velocities from line fits."""
 TOGETHER: Final = 2
-"""Pieces handed to a process at once."""
+"""Number of pieces in one task of a process."""
 REACH: Final = 128
-"""States at either end of a section that follow the end at once."""
+"""Number of states at either end of a section that follow the end at once."""
 ROUNDS: Final = 30
-"""Gauss-Newton steps of the whole track at most; half a dozen are usual, the later ones of a few sections."""
+"""Largest number of Gauss-Newton steps of the whole track; usual are six, the later ones of a few sections."""
 
 
 @dataclass(frozen=True)
 class Told:
-    """What a section says at a point.
+    """The information of a section, linearised at a point.
 
     Attributes:
         values: the point.
         error: of the section's factors.
-        inner: by which its inner states alone promise to reduce it.
-        ends: what it means to the ends and the coefficients.
-        response: how its states follow these.
+        inner: predicted decrease of the error by the inner states alone.
+        ends: information on the ends and the coefficients.
+        response: dependence of its states on these.
     """
 
     values: Values
@@ -69,28 +68,28 @@ class Told:
     response: Response
 
     def length(self, step: Point) -> float:
-        """Of a step of the whole section, in posterior standard deviations."""
+        """Length of a step of the whole section, in posterior standard deviations."""
         return float(np.sqrt(2.0 * self.inner + (self.ends.change(step) ** 2).sum()))
 
     def moved(self, step: Point) -> Values:
         """The values after a step of the ends and the coefficients."""
-        return self.values.moved(self.response.steps(step), step.coefficients)
+        return self.values.retract(self.response.steps(step), step.coefficients)
 
     def promised(self, step: Point) -> float:
-        """The error after a step of the whole section, as the linear problem has it."""
+        """The error after a step of the whole section, predicted by the linear problem."""
         y = self.ends.y
         return self.error - self.inner - 0.5 * float((y**2).sum() - ((y - self.ends.change(step)) ** 2).sum())
 
 
 @dataclass(frozen=True)
 class Found:
-    """How the search for the minimum of the whole track ended.
+    """The result of the search for the minimum of the whole track.
 
     Attributes:
         states: the sections, one step before the minimum.
         chain: that step, with the covariances.
         error: the objective after it.
-        convergence, rounds: why the search ended, and its linear solutions.
+        convergence, rounds: reason for the end of the search, and number of its linear solutions.
     """
 
     states: Sequence[State]
@@ -108,7 +107,7 @@ class Joined:
         found: the sections and the last step.
         segmentation: of the whole track.
         cuts: (k + 1,) first samples of the sections, and the track's last.
-        rival: another first spin, if any.
+        rival: another first spin, or None.
     """
 
     found: Found
@@ -118,7 +117,7 @@ class Joined:
 
 
 def told_by(smoother: Smoother, state: State) -> Told:
-    """What a section says where it is.
+    """The information of a section at its present values.
 
     Args: smoother: of the track.  state: the section and its values.
     """
@@ -134,8 +133,8 @@ def joined_minimum(smoother: Smoother, track: Track, length: int | None = None) 
     Args:
         smoother: of the track.
         track: prepared.
-        length: samples of a piece, about.
-    Returns: None where a piece has no finite explanation by itself.
+        length: approximate number of samples in a piece.
+    Returns: None if a piece has no finite explanation by itself.
     """
     rough = type(smoother)(
         smoother.model, smoother.surfaces, smoother.settings,
@@ -150,7 +149,7 @@ def joined_minimum(smoother: Smoother, track: Track, length: int | None = None) 
     events = joined(looks, [0, *inner, len(track)])
     cuts = [0, *inner, len(track) - 1]
     states = [
-        State(section_of(track, events, first, last, MARGIN), one.taken(first, last + 1))
+        State(section_of(track, events, first, last, MARGIN), one.select(first, last + 1))
         for one, first, last in zip(looks, cuts[:-1], cuts[1:], strict=True)
     ]
     found = _search(smoother, states)
@@ -161,7 +160,7 @@ def _search(smoother: Smoother, states: list[State]) -> Found | None:
     """Gauss-Newton steps of the whole track until those of all sections are shorter than the optimizer's tolerance.
 
     Lengths are distances to the minimum in posterior standard deviations, as in
-    `ballfg.factors.graph.LevenbergMarquardt`. A section that is near enough waits where it was linearised.
+    `ballfg.factors.graph.LevenbergMarquardt`. A section that is near enough keeps its linearisation point.
     """
     told = list(watched(partial(told_by, smoother), states, "joined, round 1"))
     problem = smoother.problem(states[0].section.track, states[0].section.segmentation)
@@ -192,20 +191,20 @@ def _search(smoother: Smoother, states: list[State]) -> Found | None:
 
 
 def _ended(near: NDArray[np.bool_], length: Array) -> Convergence:
-    """How the search ended, by what is left to go in each section."""
+    """The reason for the end of the search, by the remaining distance of each section."""
     if near.all():
         return Convergence.CONVERGED
     return Convergence.AT_KINK if (near | (length < AT_KINK)).all() else Convergence.TOO_MANY_ITERATIONS
 
 
 def _is_near(length: Array, last: Array, tolerance: float) -> NDArray[np.bool_]:
-    """Which sections need no step, or none after this one, if lengths go on to fall as they do."""
+    """True for sections that need no step, or none after this one if lengths fall at the same rate."""
     rate = np.divide(length, last, out=np.full_like(length, np.inf), where=np.isfinite(last))
     return np.asarray((length < tolerance) | (RATE_MARGIN * length * rate < tolerance))
 
 
 def watched(function: Callable[[T], R], parts: Sequence[T], what: str) -> Iterator[R]:
-    """The results of parts; says how far they are."""
+    """The results of parts; reports progress."""
     with doing(f"0 of {len(parts)} pieces {what}") as stage:
         for done, result in enumerate(in_parts(function, parts, TOGETHER), start=1):
             stage.text = f"{done} of {len(parts)} pieces {what}"

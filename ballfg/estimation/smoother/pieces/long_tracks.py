@@ -1,4 +1,4 @@
-"""The smoother that takes long tracks in pieces: the one that is named "smoother"."""
+"""Smooths long tracks in pieces and all others at once; the registry names this estimator "smoother"."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.tracks import Track
 
 LONG: Final = 10_000
-"""Samples from which a track is smoothed in pieces that are then joined (docs/derivations/long_tracks.md)."""
+"""Number of samples from which a track is smoothed in pieces that are then joined (docs/derivations/long_tracks.md)."""
 
 
 class PiecewiseSmoother(Smoother):
-    """The smoother around which long tracks are cut into pieces; all others are smoothed at once.
+    """The smoother, with pieces around it for long tracks.
 
     Args: as for `Smoother`.
     """
 
     def is_long(self, track: Track) -> bool:
-        """Whether a track is smoothed in pieces; where stamps move, or GTSAM solves it, it is smoothed at once."""
+        """True if a track is smoothed in pieces; with changing stamps or GTSAM's solver it is smoothed at once."""
         return len(track) >= LONG and not self.settings.time_offsets and self.settings.solver != "gtsam"
 
     def in_pieces(self, track: Track) -> Estimate | None:
-        """The estimate of a long track; None of any other, or where pieces cannot be joined."""
+        """The estimate of a long track; None for any other, or if its pieces cannot be joined."""
         if not self.is_long(track):
             return None
-        from ballfg.estimation.smoother.pieces.whole import in_pieces  # which few tracks need
+        from ballfg.estimation.smoother.pieces.whole import in_pieces  # most tracks do not need it
 
         joined = in_pieces(self, track.since_first())
         return None if joined is None else joined.dated(track.times)

@@ -1,4 +1,4 @@
-"""A first look at a part of a long track by itself: its events, and states near the minimum."""
+"""Finds the events and approximate states of a part of a long track by itself."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array, Index
-from ballfg.estimation.segmentation import Contact, Rest, Segmentation
+from ballfg.estimation.segmentation.result import Contact, Rest, Segmentation
 from ballfg.estimation.smoother.pieces.section import Section, events_of, part_of, shifted
 from ballfg.estimation.smoother.settle import places_of, timed_contacts
 from ballfg.factors.batch import Values
@@ -23,16 +23,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Look:
-    """What a part of a track shows by itself.
+    """Events and states of a part of a track by itself.
 
     Attributes:
-        begin: sample of the track with which the part begins.
+        begin: first sample of the part, in the track.
         values: of its states.
-        segmentation: its events, the contacts in the intervals that the estimate asks for; counted from the track's
-            first sample.
-        moved: whether one of its contacts came into another interval.
-        timed: the contacts with the times that the estimate gives them, counted alike.
-        rival: (3,) rad/s, another first spin that explains the part nearly as well, if any.
+        segmentation: its events, the contacts in their estimated intervals; counted from the track's first sample.
+        moved: True if one of its contacts moved into another interval.
+        timed: the contacts with their estimated times, with the same numbering.
+        rival: (3,) rad/s, another first spin that explains the part nearly as well, or None.
     """
 
     begin: int
@@ -48,13 +47,13 @@ class Look:
         return self.begin + len(self.values.states)
 
     def busy(self) -> Index:
-        """Intervals and samples of the track at which something happens."""
+        """Intervals and samples of the track with events."""
         s = self.segmentation
         bounds = [edge for rest in s.rests for edge in (rest.first, rest.last)]
         bad = self.begin + np.flatnonzero(s.quality)
         return np.concatenate(([c.interval for c in s.contacts], s.hits, bounds, bad)).astype(np.int64)
 
-    def taken(self, begin: int, end: int) -> Values:
+    def select(self, begin: int, end: int) -> Values:
         """The values of the states begin to end - 1 of the track."""
         inside = slice(begin - self.begin, end - self.begin)
         biases = None if self.values.biases is None else self.values.biases[inside]
@@ -62,9 +61,9 @@ class Look:
 
 
 def bounds_of(samples: int, length: int, overlap: int) -> list[tuple[int, int]]:
-    """First sample of each part and the one after its last; neighbours share 2 `overlap` samples.
+    """First sample of each part and the one after its last; neighbours share twice `overlap` samples.
 
-    Args: samples: of the track.  length: of a part without the shared ones, about.  overlap: beyond each cut.
+    Args: samples: of the track.  length: approximate length without shared samples.  overlap: beyond each cut.
     """
     parts = max(1, round(samples / length))
     cuts = np.linspace(0, samples, parts + 1).round().astype(int).tolist()
@@ -72,9 +71,9 @@ def bounds_of(samples: int, length: int, overlap: int) -> list[tuple[int, int]]:
 
 
 def look(smoother: Smoother, part: tuple[int, Track]) -> Look | None:
-    """The events and states of a part by itself; None where nothing finite explains it.
+    """The events and states of a part by itself; None without a finite explanation.
 
-    Args: smoother: that need not find the exact minimum.  part: its first sample's number, and its track.
+    Args: smoother: may be rough.  part: its first sample's number, and its track.
     """
     begin, track = part
     solution = smoother.settle(smoother.problem(track))
@@ -88,10 +87,10 @@ def look(smoother: Smoother, part: tuple[int, Track]) -> Look | None:
 
 
 def cut_between(one: Look, other: Look) -> int:
-    """The sample, among those that two neighbours share, that is furthest from all that happens in either of them.
+    """The shared sample of two neighbours that is furthest from all events in either of them.
 
-    There they agree on what happened, and no event is lost or told twice. The outer quarters of the shared samples are
-    left alone: a part knows little of what happens at its end.
+    There they agree on the events, and no event is lost or counted twice. The outer quarters of the shared samples are
+    excluded: a part is uncertain of the events at its end.
     """
     margin = (one.end - other.begin) // 4
     candidates = np.arange(other.begin + margin, one.end - margin)
@@ -102,9 +101,9 @@ def cut_between(one: Look, other: Look) -> int:
 
 
 def joined(looks: Sequence[Look], cuts: Sequence[int]) -> Segmentation:
-    """The events of the whole track: each interval's from the part that it belongs to.
+    """The events of the whole track: each interval's from its own part.
 
-    Where a contact has moved, all get the times that the estimate gives them, as in a track that is smoothed at once.
+    If a contact has moved, all get their estimated times, as in a track that is smoothed at once.
 
     Args: looks: in order.  cuts: (k + 1,) first sample of each part, and the number of samples.
     """

@@ -1,8 +1,8 @@
-"""The linear problem of a section, reduced to what it says of its two ends and the coefficients, and taken up again.
+"""Reduces the linear problem of a section to its two ends and the coefficients, and recovers its states.
 
-The inner states are eliminated; the first state waits among the coefficients. What is left are rows of the two ends
-and the coefficients, exactly what the section means to the rest of the track. Once the rest has answered, the inner
-states follow.
+The inner states are eliminated; the first state waits among the coefficients. The remaining rows of the two ends and
+the coefficients are exactly the section's information for the rest of the track. Once the rest has been solved, the
+inner states follow.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from ballfg.factors.linear.substitution import substitute_back
 
 @dataclass(frozen=True)
 class Point:
-    """Where the ends and the coefficients of a section are or are to go, or a step of them.
+    """A point or a step of the ends and the coefficients of a section.
 
     Attributes:
-        first, last: (w,) states with the tracker's biases behind them.
+        first, last: (w,) states, followed by the tracker's biases.
         coefficients: (p,) in their own units.
     """
 
@@ -50,7 +50,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Ends:
-    """What a section says of its ends: |by_first d_first + by_last d_last + by_coefficients d_c - y|^2.
+    """A section's information on its ends: |by_first d_first + by_last d_last + by_coefficients d_c - y|^2.
 
     Attributes:
         by_first, by_last: (w + w + p, w) or less rows, whitened, per unit of the state.
@@ -64,19 +64,19 @@ class Ends:
     y: Array
 
     def change(self, step: Point) -> Array:
-        """(..,) whitened, by which the rows change along a step of the ends and the coefficients."""
+        """(..,) whitened change of the rows along a step of the ends and the coefficients."""
         return self.by_first @ step.first + self.by_last @ step.last + self.by_coefficients @ step.coefficients
 
 
 @dataclass(frozen=True)
 class Response:
-    """How the states of a section move with its ends and the coefficients.
+    """Dependence of a section's states on its ends and the coefficients.
 
     Attributes:
-        alone: (n, w) step of the states where ends and coefficients stay.
-        by_first, by_last: (r, w, w) what a step of an end adds to the states next to it, in the track's order. Beyond
-            those it is neglected: the section's next linearisation makes up for it.
-        by_coefficients: (n, w, p) what a step of the coefficients adds.
+        alone: (n, w) step of the states for fixed ends and coefficients.
+        by_first, by_last: (r, w, w) effect of a step of an end on the states next to it, in the track's order. Beyond
+            those it is neglected: the section's next linearisation compensates for it.
+        by_coefficients: (n, w, p) effect of a step of the coefficients.
     """
 
     alone: Array
@@ -94,13 +94,13 @@ class Response:
 
 
 class Reduction:
-    """A section whose inner states are eliminated.
+    """A section with eliminated inner states.
 
     Args: linearized: the section's factors, at values.  values: of its n states, at least two, and the coefficients.
 
     Attributes:
-        root: of the states but the first, with the coefficients and the first state behind them.
-        inner: half the squares that a step of the inner states alone takes off the objective.
+        root: of the states but the first, followed by the coefficients and the first state.
+        inner: predicted decrease of the objective by the inner states alone.
     """
 
     def __init__(self, linearized: Sequence[Rows], values: Values) -> None:
@@ -114,7 +114,7 @@ class Reduction:
 
     @property
     def ends(self) -> Ends:
-        """What is left of the section."""
+        """The section's rows of its ends and the coefficients."""
         w, p = self.width, self.coefficients
         last, shared = self.root.states[-1], self.root.coefficients
         rows = np.concatenate((last, np.concatenate((np.zeros((len(shared), w)), shared[:, w:]), axis=1)))
@@ -129,7 +129,7 @@ class Reduction:
         return np.concatenate((ends.first[None], _solved(inner, right), ends.last[None]))
 
     def response(self, reach: int) -> Response:
-        """How the states follow. Args: reach: states that an end is taken to move, at most."""
+        """The dependence of the states. Args: reach: largest number of states that an end moves."""
         w, p, inner = self.width, self.coefficients, self.root.states[:-1]
         near, far = inner[:reach], inner[max(len(inner) - reach, 0) :]
         by_end = np.zeros((*far.shape[:2], w))
@@ -143,7 +143,7 @@ class Reduction:
         )
 
     def covariances(self, ends: Array) -> Covariances:
-        """Of all states and the coefficients, where the joint covariance of the ends and the coefficients is known.
+        """Covariances of all states and the coefficients, from the joint covariance of the ends and the coefficients.
 
         Args: ends: (w + p + w, w + p + w) of the last state, the coefficients, the first state.
         """
@@ -165,7 +165,7 @@ class Reduction:
 
 
 def _solved(rows: Array, right: Array) -> Array:
-    """What some states are, by their rows of R (m, w, ..), where the state after them stays.
+    """Solves the rows of R (m, w, ..) for some states, with the state after them fixed.
 
     Args: right: (m, w) or (m, w, k), the right side or k of them.
     """
@@ -178,7 +178,7 @@ def _solved(rows: Array, right: Array) -> Array:
 
 
 def _triangle(covariance: Array) -> Array:
-    """The upper triangle R with (R^T R)^-1 = C, where C may have lost its last digits."""
+    """The upper triangle R with (R^T R)^-1 = C, for a C that may have lost its last digits."""
     scale = np.sqrt(np.diagonal(covariance))
     size, axes = np.linalg.eigh((covariance / (scale[:, None] * scale))[::-1, ::-1])
     size = np.maximum(size, len(size) * np.finfo(float).eps * size[-1])

@@ -1,4 +1,4 @@
-"""A section of a long track: its samples with a few more on both sides, its events, and its own factors."""
+"""A section of a long track has samples, margins on both sides, events, and factors of its own."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array, Index
-from ballfg.estimation.segmentation import Contact, Rest, Segmentation
+from ballfg.estimation.segmentation.result import Contact, Rest, Segmentation
 from ballfg.estimation.smoother.problem import Events, TrackProblem
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Rows, Values
 from ballfg.tracks import Track
@@ -19,14 +19,14 @@ from ballfg.tracks import Track
 class Section:
     """Samples `first` to `last` of a part of a track. The last one is the first of the next section.
 
-    A factor belongs to the section of its first state. So the factors on the last state alone are the next section's,
-    except where the track ends.
+    A factor belongs to the section of its first state. So the factors on the last state alone belong to the next
+    section, except at the end of the track.
 
     Attributes:
-        track: the part, with some samples more on both sides; labels only where the track begins.
-        segmentation: the events in the part, its contacts as refined.
+        track: the part, with margins on both sides; labels only at the beginning of the track.
+        segmentation: the events in the part, with refined contacts.
         first, last: index in the part.
-        ends: whether the track ends with the section.
+        ends: True if the track ends with the section.
     """
 
     track: Track
@@ -41,15 +41,15 @@ class Section:
 
     @property
     def events(self) -> Events:
-        """What happens in the part."""
+        """The events in the part."""
         return Events(self.segmentation.contacts, self.segmentation)
 
     def inside(self, array: Array) -> Array:
-        """The entries of the section's states, of one per sample of the part."""
+        """The entries of the section's states, from one per sample of the part."""
         return array[self.first : self.last + 1]
 
     def padded(self, array: Array) -> Array:
-        """One entry per sample of the part from one per state: the outer ones repeat those at the ends."""
+        """One entry per sample of the part from one per state; the margins repeat those at the ends."""
         index = np.clip(np.arange(len(self.track)) - self.first, 0, len(self) - 1)
         return np.asarray(array[index])
 
@@ -59,7 +59,7 @@ class Section:
         return replace(values, states=self.padded(values.states), biases=biases)
 
     def owns(self, states: Index) -> NDArray[np.bool_]:
-        """Which of the factors with these first states (m,), index in the part, are the section's; (m,) bool."""
+        """(m,) bool: True for the section's own factors, by their first states (m,), index in the part."""
         return (states >= self.first) & (states < self.last + self.ends)
 
     def linearized(self, own: Sequence[FactorBatch], values: Values) -> list[Rows]:
@@ -77,19 +77,19 @@ class Section:
     def own(self, problem: TrackProblem) -> list[FactorBatch]:
         """The section's factors, states counted as in the part. Args: problem: of the part."""
         batches = ((batch, self.owns(first_states(batch))) for batch in problem.graph(self.events).batches)
-        return [batch.taken(np.flatnonzero(own)) for batch, own in batches if own.any()]
+        return [batch.select(np.flatnonzero(own)) for batch, own in batches if own.any()]
 
 
 @dataclass(frozen=True)
 class State:
-    """A section and where its states and coefficients are."""
+    """A section with its present states and coefficients."""
 
     section: Section
     values: Values
 
 
 def first_states(batch: FactorBatch) -> Index:
-    """(m,) index of the first state of each factor; -1 where it looks at coefficients alone."""
+    """(m,) index of the first state of each factor; -1 for factors of coefficients alone."""
     states = batch.variables
     least = np.where(states == COEFFICIENTS, np.iinfo(np.int64).max, states).min(axis=1, initial=np.iinfo(np.int64).max)
     return np.where(least == np.iinfo(np.int64).max, -1, least)
@@ -102,11 +102,11 @@ def prior_rows(problem: TrackProblem, section: Section, values: Values) -> list[
 
 
 def part_of(track: Track, begin: int, end: int) -> Track:
-    """The samples begin to end - 1; labels tell of the first sample of the track only."""
+    """The samples begin to end - 1; labels belong to the first sample of the track only."""
     if track.observations:
         mask = np.zeros(len(track), dtype=bool)
         mask[begin:end] = True
-        track = replace(track, observations=tuple(one.taken(mask) for one in track.observations))
+        track = replace(track, observations=tuple(one.select(mask) for one in track.observations))
     inside = slice(begin, end)
     return replace(
         track,
@@ -119,7 +119,7 @@ def part_of(track: Track, begin: int, end: int) -> Track:
 
 
 def events_of(segmentation: Segmentation, begin: int, end: int) -> Segmentation:
-    """The events among the samples begin to end - 1, whose first gets the number 0."""
+    """The events among the samples begin to end - 1, renumbered from 0."""
 
     def inside(intervals: Index) -> Index:
         return intervals[(intervals >= begin) & (intervals < end - 1)] - begin

@@ -1,4 +1,4 @@
-"""The estimate of a long track, from the minimum that its sections have together."""
+"""Assembles the estimate of a long track from the common minimum of its sections."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array, Index
 from ballfg.estimation.plausible import plausible
 from ballfg.estimation.result import Estimate, Status
-from ballfg.estimation.segmentation import Contact
+from ballfg.estimation.segmentation.result import Contact
 from ballfg.estimation.settings import sample_sigmas
 from ballfg.estimation.sides.widening import Shared, widening_near_contacts
 from ballfg.estimation.smoother.pieces.chain import Point
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Smoothed:
-    """A section of the estimate, with n states: those of the section.
+    """A section of the estimate, with the section's n states.
 
     Attributes:
         values: at the minimum.
@@ -60,18 +60,18 @@ class Smoothed:
 def in_pieces(smoother: Smoother, track: Track, length: int | None = None) -> Estimate | None:
     """The estimate of a long track.
 
-    Args: smoother: of the track.  track: prepared.  length: samples of a piece, about.
-    Returns: None where pieces cannot be joined, because no finite motion explains one of them.
+    Args: smoother: of the track.  track: prepared.  length: approximate number of samples in a piece.
+    Returns: None if pieces cannot be joined, because one of them has no finite explanation.
     """
     parts = sections(smoother, track, length)
     return None if parts is None else _assembled(track, parts)
 
 
 def sections(smoother: Smoother, track: Track, length: int | None = None) -> Iterator[Estimate] | None:
-    """The estimate of a long track, section by section, so that nobody need hold all of its covariances.
+    """The estimate of a long track, section by section, so that the caller need not hold all covariances.
 
     Args: smoother, track, length: as for `in_pieces`.
-    Returns: estimates that follow one another, with the status and the coefficients of all; None as for `in_pieces`.
+    Returns: consecutive estimates, with the status and the coefficients of the whole; None as for `in_pieces`.
     """
     found = joined_minimum(smoother, track, length)
     return None if found is None else _sections(smoother, track, found)
@@ -82,14 +82,14 @@ def smoothed(smoother: Smoother, task: tuple[State, Array, Point]) -> Smoothed:
 
     Args:
         smoother: of the track.
-        task: the section, the joint covariance of its ends and the coefficients, and where the last step leads them.
+        task: the section, the joint covariance of its ends and the coefficients, and their target.
     """
     state, joint, target = task
     section, values = state.section, state.values
     problem = smoother.problem(section.track, section.segmentation)
     reduction = Reduction(section.linearized(section.own(problem), values), values)
     step = target.since(Point.of(values))
-    values = values.moved(reduction.steps(step), step.coefficients)
+    values = values.retract(reduction.steps(step), step.coefficients)
     known = reduction.covariances(joint)
     covariances = np.ascontiguousarray(known.states[:, :STATE_DIM, :STATE_DIM])
     contacts = _contacts(problem, state, values)
@@ -104,7 +104,7 @@ def smoothed(smoother: Smoother, task: tuple[State, Array, Point]) -> Smoothed:
 
 
 def _contacts(problem: TrackProblem, state: State, values: Values) -> tuple[Contact, ...]:
-    """The section's contacts with the times that the estimate gives them."""
+    """The section's contacts with their estimated times."""
     section = state.section
     graph = BallGraph(tuple(section.own(problem)))
     minimum = Minimum(section.padded_values(values), 0.0, None, Convergence.CONVERGED, 0)
@@ -113,7 +113,7 @@ def _contacts(problem: TrackProblem, state: State, values: Values) -> tuple[Cont
 
 
 def _innovations(problem: TrackProblem, state: State, values: Values, known: Covariances) -> dict[str, Array]:
-    """Of the section's own measurements. What is known of its ends stands in for the samples beyond them."""
+    """Innovations of the section's own measurements. The covariance of its ends stands for the samples beyond them."""
     section = state.section
     around = Covariances(section.padded(known.states), known.coefficients, section.padded(known.cross))
     found = problem.innovations(section.padded_values(values), around)
@@ -121,7 +121,7 @@ def _innovations(problem: TrackProblem, state: State, values: Values, known: Cov
 
 
 def _sections(smoother: Smoother, track: Track, found: Joined) -> Iterator[Estimate]:
-    """The estimates of the sections, in order. The last state of each is told by the next one."""
+    """The estimates of the sections, in order. The last state of each is the first of the next one."""
     end, hops = found.found, smoother.low_hops(track, found.segmentation)
     doubts = (*smoother.doubts(track), *uncounted_note(hops, track.times))
     beginning = end.states[0].section
@@ -144,7 +144,7 @@ def _sections(smoother: Smoother, track: Track, found: Joined) -> Iterator[Estim
         if last == len(track) - 1:
             ending = track.between(float(track.times[first]), float(track.times[last]))
             section = with_both_sides(smoother, smoother.problem(ending), section)
-        yield with_low_hops(section, [one for h in hops if (one := h.taken(first, first + count))], smoother.model)
+        yield with_low_hops(section, [one for h in hops if (one := h.select(first, first + count))], smoother.model)
 
 
 def _section(
@@ -192,7 +192,7 @@ def _section(
 
 
 def _rival_note(found: Joined, first: Smoothed) -> tuple[str, ...]:
-    """Says whether another spin at the start explains the track nearly as well."""
+    """A note if another spin at the start explains the track nearly as well."""
     minimum = Minimum(first.values, found.found.error, None, found.found.convergence, found.found.rounds)
     solution = Solution(found.found.states[0].section.events, BallGraph(()), minimum, found.rival)
     return rival_note(solution, first.covariances[0])

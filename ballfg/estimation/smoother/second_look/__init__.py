@@ -1,1 +1,1 @@
-"""What a first minimum may have missed: another spin, the other side of a contact, low hops."""
+"""Looks again at what a first minimum may have missed: another spin, the other side of a contact, low hops."""

@@ -1,4 +1,4 @@
-"""The last state of a track that ends near a contact: no later sample shows on which side of it the ball is."""
+"""Estimates the last state of a track that ends near a contact, where no later sample shows the side."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ if TYPE_CHECKING:
     from ballfg.estimation.smoother.smoother import Smoother
 
 REACH: Final = 3
-"""Intervals at the end in which a contact may still be in doubt."""
+"""Number of intervals at the end in which a contact may be uncertain."""
 LEAST: Final = 3
-"""Samples that must come before them."""
+"""Least number of samples before them."""
 MEMORY: Final = 256
-"""Samples that say all about a state at their end."""
+"""Number of samples that determine a state at their end."""
 
 
 def with_both_sides(smoother: Smoother, problem: TrackProblem, estimate: Estimate) -> Estimate:
-    """The estimate, its last state that of the more probable side where the track ends near a contact.
+    """The estimate; if the track ends near a contact, its last state is that of the more probable side.
 
     The samples before the contact are estimated by themselves; from there on both hypotheses are followed
     (`ballfg.estimation.sides`).
 
-    Args: smoother: of the track.  problem: of the track.  estimate: without regard to the other side.
+    Args: smoother: of the track.  problem: of the track.  estimate: without the other side.
     """
     track, n = problem.track, len(problem.track)
     disturbed = np.concatenate((estimate.hits, problem.segmentation.restarts))
@@ -51,7 +51,7 @@ def with_both_sides(smoother: Smoother, problem: TrackProblem, estimate: Estimat
 
 
 def _before_contact(estimate: Estimate, model: HypothesisModel, track: Track) -> int | None:
-    """The last sample that is certainly before a contact near the track's end; None where there is no such contact."""
+    """The last sample that is certainly before a contact near the track's end; None without such a contact."""
     n = len(track)
     near = [contact.interval for contact in estimate.contacts if contact.interval >= n - 1 - REACH]
     if near:
@@ -64,7 +64,7 @@ def _before_contact(estimate: Estimate, model: HypothesisModel, track: Track) ->
 
 
 def _filtered(smoother: Smoother, track: Track) -> tuple[Array, Array] | None:
-    """Mean and covariance of state, coefficients and bias at the end of a track; None where they are not known."""
+    """Mean and covariance of state, coefficients and bias at the end of a track; None if undetermined."""
     problem = smoother.problem(track)
     solution = smoother.settle(problem)
     known = smoother.optimizer.covariances(solution.graph, solution.minimum)
@@ -79,8 +79,8 @@ def _filtered(smoother: Smoother, track: Track) -> tuple[Array, Array] | None:
 
 
 def _measured(problem: TrackProblem, sample: int) -> SampleMeasurement:
-    """What was measured at a sample of a track; rough positions stand for pixels."""
+    """The measurements at a sample of a track; rough positions stand for pixels."""
     beside = [one for one in problem.observations if not one.locates]
     rows = [(problem.observed[one.name], row) for one in beside for row in one.filter_rows(sample)]
-    factors = [batch.taken(np.array([row])) for batch, row in rows]
+    factors = [batch.select(np.array([row])) for batch, row in rows]
     return SampleMeasurement(problem.track.positions[sample], problem.sigma[sample], factors)

@@ -1,9 +1,9 @@
-"""The vertical motion of a ball that hops low, followed on a grid of all hops that are possible.
+"""Follows the vertical motion of a low-hopping ball on a grid of all possible hops.
 
-Hops as low as the noise can be told by no single sample, and a search for one arrangement of bounces finds one of many
-that explain the samples about as well. So all of them are followed at once: a hop is the speed with which the ball
-left the surface and the share of the hop that is over, and a hidden Markov model on a grid of both is filtered forwards
-and smoothed backwards. What comes out is an average over all arrangements of bounces.
+No single sample shows hops as low as the noise, and a search for one arrangement of bounces finds one of many that
+explain the samples about as well. So all of them are followed at once: a hop is its take-off speed and the elapsed
+share of its duration, and a hidden Markov model on a grid of both is filtered forwards and smoothed backwards. The
+result is an average over all arrangements of bounces.
 
 Source: L. R. Rabiner, "A tutorial on hidden Markov models", Proceedings of the IEEE 77, 1989;
 docs/derivations/smoother.md, "Low hops".
@@ -23,31 +23,31 @@ from ballfg.arrays import Array, Index
 from ballfg.dynamics.motion.limits import REST_SPEED
 
 SPEEDS: Final = 64
-"""Take-off speeds of the grid."""
+"""Number of take-off speeds in the grid."""
 POINTS: Final = ((-np.sqrt(3.0), 1.0 / 6.0), (0.0, 2.0 / 3.0), (np.sqrt(3.0), 1.0 / 6.0))
 """Places and weights of the Gauss-Hermite rule with three points."""
 STRAY_SHARE: Final = 0.01
-"""Prior share of samples that are not of the ball."""
+"""Prior share of samples that are not the ball."""
 STRAY_SPREAD: Final = 0.3
 """m, of their heights."""
 RESTS: Final = 0.1
 """Prior probability that the ball lies still at the first sample."""
 FAR_BEHIND: Final = 15.0
-"""nats. A height of the surface that is so much less likely than another is given up."""
+"""nats. A height of the surface that is so much less likely than another is dropped."""
 MILLIONTH: Final = 1e-6
-"""Probability of anything but rest below which a ball is taken to lie still from there on."""
+"""Probability of motion below which a ball is taken to lie still from there on."""
 
 
 @dataclass(frozen=True)
 class HopLaw:
-    """What a hop hangs on.
+    """The parameters of a hop.
 
     Attributes:
         gravity: m/s^2.
         fastest: m/s, take-off speed of the highest hop.
-        rebound: (`SPEEDS`,) m/s, speed after an impact at each of the speeds of the grid.
+        rebound: (`SPEEDS`,) m/s, speed after an impact for each speed of the grid.
         scatter: (`SPEEDS`,) m/s, standard deviation of that.
-        acceleration: m/s^2/sqrt(Hz), density of the acceleration that the model lacks.
+        acceleration: m/s^2/sqrt(Hz), density of the unmodelled acceleration.
     """
 
     gravity: float
@@ -64,13 +64,13 @@ class HopLaw:
 
 @dataclass(frozen=True)
 class HopMoments:
-    """What is known of the ball at n samples, over all arrangements of bounces.
+    """Moments of the ball's motion at n samples, over all arrangements of bounces.
 
     Attributes:
         mean: (n, 2) m and m/s, height above the surface and vertical velocity.
         second: (n, 2, 2) their second moments about zero.
         higher: (n, 2) third and fourth moment of the vertical velocity about zero.
-        speed: (n,) m/s, take-off speed of the hop that the ball is in.
+        speed: (n,) m/s, take-off speed of the ball's present hop.
         resting: (n,) probability that it lies still.
         bounces: (n - 1,) expected number of bounces in each interval.
     """
@@ -83,7 +83,7 @@ class HopMoments:
     bounces: Array
 
     def spread(self, point: Array) -> Array:
-        """(n, 2, 2) second moments about points (n, 2), the velocity's raised to what its fourth moment asks for."""
+        """(n, 2, 2) second moments about points (n, 2), the velocity's raised to match its fourth moment."""
         cross = self.mean[:, :, None] * point[:, None, :]
         found = self.second - cross - cross.swapaxes(1, 2) + point[:, :, None] * point[:, None, :]
         v, (third, fourth) = point[:, 1], self.higher.T
@@ -91,8 +91,8 @@ class HopMoments:
         found[:, 1, 1] = np.maximum(found[:, 1, 1], np.sqrt(np.maximum(about, 0.0) / 3.0))
         return np.asarray(found)
 
-    def taken(self, inside: slice) -> HopMoments:
-        """Those of some of the samples."""
+    def select(self, inside: slice) -> HopMoments:
+        """The moments of some of the samples."""
         between = slice(inside.start, inside.stop - 1)
         return HopMoments(
             self.mean[inside],
@@ -109,7 +109,7 @@ class HopGrid:
 
     Args:
         law: of the hops.
-        phases: cells into which the duration of each hop is cut.
+        phases: number of cells for the duration of each hop.
         tick: s, to which stamps are rounded, so that few transition matrices are needed.
     """
 
@@ -149,18 +149,18 @@ class HopGrid:
         left = [
             np.log(self._likelihood(heights[j] - levels[alive], sigma[j])[:, -1]) for j in range(k + 1, len(heights))
         ]
-        found[alive] = said + np.sum(left, axis=0)  # while it lies still
+        found[alive] = said + np.sum(left, axis=0)  # while the ball lies still
         return found
 
     def moments(self, times: Array, heights: Array, sigma: Array) -> HopMoments:
-        """What samples tell of the ball, by the forward-backward algorithm.
+        """Moments of the ball's motion from samples, by the forward-backward algorithm.
 
         Args: times: (n,) s.  heights: (n,) m, measured above the surface.  sigma: (n,) m, their noise.
         """
         steps = self.ticks(times)
         filtered = self._filtered(steps, heights, sigma)
         known, bounces = np.zeros((len(times), self._features.shape[1])), np.zeros(len(times) - 1)
-        known[len(filtered) :, -1] = 1.0  # it lies still
+        known[len(filtered) :, -1] = 1.0  # the ball lies still
         later = np.ones(len(self.speed))
         known[len(filtered) - 1] = filtered[-1] @ self._features
         for k in range(len(filtered) - 2, -1, -1):
@@ -188,7 +188,7 @@ class HopGrid:
         return shares
 
     def _filtered(self, steps: Index, heights: Array, sigma: Array) -> list[Array]:
-        """(k,) probabilities of the cells after each sample, up to where the ball surely lies still."""
+        """(k,) probabilities of the cells after each sample, until the ball surely lies still."""
         before, found = self._first(), list[Array]()
         for k in range(len(heights)):
             now = before * self._likelihood(heights[k], sigma[k])
@@ -199,7 +199,7 @@ class HopGrid:
         return found
 
     def _step(self, ticks: int) -> tuple[csr_array, csr_array]:
-        """(k, k) probabilities of the cells some ticks later, by the cell before; and these times the bounces between.
+        """(k, k) transition probabilities of the cells over some ticks; and these times the number of bounces.
 
         The velocity is disturbed at the start of the step, and the first bounce scatters.
         """
@@ -216,9 +216,9 @@ class HopGrid:
         return self._steps[ticks]
 
     def _moved(self, dt: float, push: float, kick: float, share: float) -> tuple[Index, Array, Array]:
-        """Cells that all cells go to over dt s, four each, their probabilities and the bounces on the way.
+        """Target cells of all cells over dt s, four each, their probabilities and the bounces on the way.
 
-        Args: push, kick: standard deviations by which the velocity and the first bounce are off.  share: of both.
+        Args: push, kick: standard deviations of the velocity and of the first bounce.  share: of both.
         """
         law, rests = self.law, self.speed == 0.0
         rise = self.rise + push * law.acceleration * np.sqrt(dt)
@@ -243,11 +243,11 @@ class HopGrid:
 
 
 def averaged(known: Sequence[HopMoments], levels: Array, weights: Array) -> HopMoments:
-    """What is known where the height of the surface is uncertain.
+    """The moments averaged over an uncertain height of the surface.
 
     Args:
-        known: for each height.
-        levels: (k,) m, the heights, above the one from which the result counts.
+        known: moments for each height.
+        levels: (k,) m, the heights, above the reference height of the result.
         weights: (k,) their probabilities.
     """
     shift = np.zeros((len(levels), 1, 2))

@@ -1,8 +1,8 @@
-"""Stretches of a track in which the ball hops too low for its bounces to be told one by one, and what is known there.
+"""Finds stretches of a track with hops too low for distinguishing single bounces, and their uncertainty.
 
-The segmentation takes the height of every surface to be uncertain by millimetres, and one arrangement of bounces for
-certain. Where hops are as low as that, `HopGrid` follows all arrangements at once. It says how many bounces there were
-and in which intervals, and how far the ball may be from where the estimate, which holds one arrangement, has it.
+The segmentation takes the height of every surface as uncertain by millimetres, and one arrangement of bounces as
+certain. For such low hops, `HopGrid` follows all arrangements at once. It gives the number of bounces and their
+intervals, and the distance of the ball from the estimate, which holds one arrangement.
 """
 
 from __future__ import annotations
@@ -22,24 +22,25 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.limits import REST_SPEED
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.result import Estimate
-from ballfg.estimation.segmentation import Contact, Rest, Segmentation, SegmentationSettings
+from ballfg.estimation.segmentation.result import Contact, Rest, Segmentation
+from ballfg.estimation.segmentation.settings import SegmentationSettings
 from ballfg.estimation.settings import Settings, sample_sigmas
 from ballfg.estimation.smoother.second_look.hop_grid import HopGrid, HopLaw, HopMoments, averaged
 from ballfg.state import POSITION, STATE_DIM, VZ, Z
 from ballfg.tracks import Track
 
 LOW: Final = 10.0
-"""Standard deviations of the noise. The segmentation tells the bounces of hops that are higher."""
+"""Standard deviations of the noise. The segmentation distinguishes the bounces of higher hops."""
 LOWEST: Final = 0.02
-"""m. Of hops that are lower it does not, whatever the noise: it takes surfaces to be off by 4 mm."""
+"""m. Lower hops it does not distinguish whatever the noise: it assumes an error of 4 mm in surface heights."""
 LEAST_PHASES, MOST_PHASES = 48, 192
-"""Cells into which a hop is cut: so many that the ball moves by no more than its noise within one, if that can be."""
+"""Number of cells in a hop: if possible so many that the ball moves by no more than its noise within one."""
 UNLIKELY: Final = 1e-2
-"""Of the likelihood of the best height of the surface; others that are less likely are left out."""
+"""Share of the likelihood of the best surface height; less likely heights are left out."""
 WIDEST: Final = 2.5
-"""Standard deviations of the surface's height within which it is looked for."""
+"""Standard deviations of the surface's height within which it is searched."""
 SURE: Final = 0.95
-"""Probability of rest from which on nothing is said about bounces that may have been missed."""
+"""Probability of rest from which no missed bounces are reported."""
 UNCOUNTED: Final = (
     "from {:.2f} s after the first sample on the ball may hop lower than the noise: bounces there are not counted, "
     "covariances allow for them"
@@ -54,9 +55,9 @@ class LowHops:
     Attributes:
         first: sample with which it begins.
         height: m, declared height of the surface.
-        level: m, height of the ball's centre when it touches, as the model has it.
-        least: m/s, take-off speed of a hop that is as high as the noise; bounces of lower ones are not counted.
-        known: of the ball, heights counted from `level`.
+        level: m, height of the ball's centre at contact, by the model.
+        least: m/s, take-off speed of a hop as high as the noise; bounces of lower ones are not counted.
+        known: moments of the ball's motion, with heights above `level`.
     """
 
     first: int
@@ -70,18 +71,18 @@ class LowHops:
         """Its last sample."""
         return self.first + len(self.known.speed) - 1
 
-    def taken(self, begin: int, end: int) -> LowHops | None:
-        """Its part among the samples begin to end - 1 of the track, the first of which gets the number 0, if any."""
+    def select(self, begin: int, end: int) -> LowHops | None:
+        """The part within samples begin to end - 1 of the track, renumbered from 0; None if empty."""
         first, last = max(self.first, begin), min(self.last, end - 1)
         inside = slice(first - self.first, last + 1 - self.first)
         if first > last:
             return None
-        return replace(self, first=first - begin, level=self.level[inside], known=self.known.taken(inside))
+        return replace(self, first=first - begin, level=self.level[inside], known=self.known.select(inside))
 
     def events(self, times: Array) -> tuple[list[Contact], list[Rest]]:
-        """The bounces that can be counted, and the rest that takes the place of lower hops.
+        """The bounces that can be counted, and the rest that replaces lower hops.
 
-        The number of bounces is the expected one, rounded; the k-th is where k - 1/2 are expected so far.
+        The number of bounces is the expected one, rounded; the k-th is where the expected number reaches k - 1/2.
 
         Args: times: (n,) s, of the whole track.
         """
@@ -96,7 +97,7 @@ class LowHops:
         return contacts, [Rest(down, self.last - 1, self.height)] if down < self.last else []
 
     def first_unclear(self) -> int | None:
-        """The first sample at which the ball may hop without its bounces being counted."""
+        """The first sample at which the ball may hop with uncounted bounces."""
         unclear = np.flatnonzero((self.known.speed < self.least) & (self.known.resting < SURE))
         return self.first + int(unclear[0]) if len(unclear) else None
 
@@ -106,14 +107,14 @@ def low_hops(
 ) -> tuple[LowHops, ...]:
     """The stretches of a track in which the ball hops low.
 
-    A ball in flight stays below a height for no longer than a hop of that height takes: where samples stay there for
-    longer, it hops or lies.
+    A ball in flight stays below a height no longer than a hop of that height takes: if samples stay there longer, it
+    hops or lies still.
 
     Args:
         track: the samples.
-        events: hits, gaps and the ends of rests, at which stretches end.
-        model: the ball, without the coefficients that are estimated with the track.
-        surfaces: that it may hop on.
+        events: hits, gaps and the ends of rests, which end stretches.
+        model: the ball, without the estimated coefficients.
+        surfaces: table and floor.
         settings: noise and priors.
     """
     if len(track) < 2:
@@ -140,9 +141,9 @@ def low_hops(
 
 
 def counted(events: Segmentation, hops: Sequence[LowHops], times: Array) -> Segmentation:
-    """The events of a track, those within stretches of low hops as all arrangements of bounces have them.
+    """The events of a track; within stretches of low hops, those expected over all arrangements of bounces.
 
-    Args: events: as the segmentation has them.  hops: of the track.  times: (n,) s.
+    Args: events: from the segmentation.  hops: of the track.  times: (n,) s.
     """
     for one in hops:
         contacts, rests = one.events(times)
@@ -159,13 +160,13 @@ def counted(events: Segmentation, hops: Sequence[LowHops], times: Array) -> Segm
 
 
 def with_low_hops(estimate: Estimate, hops: Sequence[LowHops], model: BallModel) -> Estimate:
-    """An estimate whose covariances allow for the arrangements of bounces that it does not hold.
+    """An estimate with covariances for all arrangements of bounces.
 
-    With that, height and vertical velocity vary about the estimate at least as much as over all arrangements. The
-    variance of the velocity is that of the normal distribution with the same fourth moment: a ball that with a
-    probability of 1 % is on the other side of a bounce would else be ten standard deviations away once in 100 times.
-    Where the vertical velocity may differ because a bounce came earlier or later, the other velocities and the spin may
-    differ by what friction does at that bounce.
+    Height and vertical velocity then vary about the estimate at least as much as over all arrangements. The variance of
+    the velocity is that of the normal distribution with the same fourth moment: a ball that with a probability of 1 %
+    is on the other side of a bounce would else be ten standard deviations away once in 100 times. Where the vertical
+    velocity may differ because a bounce came earlier or later, the other velocities and the spin may differ by the
+    effect of friction at that bounce.
 
     Args: estimate: of the track.  hops: of the track.  model: the ball.
     """
@@ -187,9 +188,9 @@ def with_low_hops(estimate: Estimate, hops: Sequence[LowHops], model: BallModel)
 
 
 def _jumps(estimate: Estimate, hops: LowHops, model: BallModel) -> Array:
-    """(n, 9) how a state differs, for each m/s of vertical velocity, because a bounce came earlier or later.
+    """(n, 9) change of a state per m/s of vertical velocity, for a bounce that came earlier or later.
 
-    It is the jump of the nearest bounce that the estimate holds; where the ball rests, that of one more bounce.
+    It is the jump of the nearest bounce in the estimate; for a resting ball, that of one more bounce.
     """
     states = estimate.states[hops.first : hops.last + 1]
     before = states.copy()
@@ -207,13 +208,13 @@ def _jumps(estimate: Estimate, hops: LowHops, model: BallModel) -> Array:
 
 
 def uncounted_note(hops: Sequence[LowHops], times: Array) -> tuple[str, ...]:
-    """Says from when on bounces are too low to be counted. Args: hops: of the track.  times: (n,) s."""
+    """A note on when bounces become too low to count. Args: hops: of the track.  times: (n,) s."""
     unclear = [sample for one in hops if (sample := one.first_unclear()) is not None]
     return (UNCOUNTED.format(float(times[min(unclear)] - times[0])),) if unclear else ()
 
 
 class _Ball:
-    """A ball that hops, asked for what a hop hangs on, and for how well that is known."""
+    """A hopping ball whose model gives the parameters of hops, with their uncertainty."""
 
     def __init__(self, model: BallModel, settings: Settings) -> None:
         names = tuple(settings.coefficients)
@@ -233,7 +234,7 @@ class _Ball:
         return float(np.linalg.norm(gaps[1:] - gaps[0]))
 
     def law(self, position: Array, most: float) -> HopLaw:
-        """What hops up to a height `most` m above a surface hang on, at a position (3,) m."""
+        """Parameters of hops up to a height `most` m above a surface, at a position (3,) m."""
         varied = self._varied(position)
         with torch.no_grad():
             gravity = -float(self.model.rates(varied[:1])[0][0, Z])
@@ -246,13 +247,13 @@ class _Ball:
         return HopLaw(gravity, float(speeds[-1]), slower, scatter, self.process.acceleration)
 
     def _rebound(self, states: Tensor, speeds: Tensor) -> Tensor:
-        """(m, k) m/s, vertical speeds after impacts with each of k speeds, of balls as in m states."""
+        """(m, k) m/s, vertical speeds after impacts with each of k speeds, for balls in m states."""
         falling = states[:, None].repeat(1, len(speeds), 1)
         falling[..., VZ] = -speeds
         return self.model.after_bounce(falling.reshape(-1, falling.shape[-1]))[:, VZ].reshape(len(states), -1)
 
     def _varied(self, position: Array) -> Tensor:
-        """(1 + p, 9 + p) a ball that hangs still: as is, then with each coefficient a standard deviation larger."""
+        """(1 + p, 9 + p) a ball that hangs still: as is, then with each coefficient raised by its sigma."""
         rows = np.concatenate((np.zeros((1, len(self.means))), np.diag(self.sigmas)))
         return self._still(np.tile(position, (len(rows), 1)), self.means + rows)
 
@@ -264,7 +265,7 @@ class _Ball:
 
 
 def _height_sigmas(track: Track, settings: Settings) -> Array:
-    """(n,) m, noise of the heights. Errors that last are taken for fresh ones that tell as little of a mean."""
+    """(n,) m, noise of the heights. Lasting errors are replaced by white ones with equal information on a mean."""
     settings = settings.for_track(track)
     white = sample_sigmas(settings, len(track), track.sigmas)[:, 2]
     fading = np.exp(-float(np.median(np.diff(track.times))) / settings.memory_time)
@@ -272,7 +273,7 @@ def _height_sigmas(track: Track, settings: Settings) -> Array:
 
 
 def _runs(low: NDArray[np.bool_], events: Segmentation) -> list[tuple[int, int]]:
-    """First and last samples of runs of low ones that no hit, gap or end of a rest interrupts."""
+    """First and last samples of runs of low samples without a hit, a gap or an end of a rest."""
     ends = [rest.last + 1 for rest in events.rests]
     broken = np.zeros(len(low) + 1, dtype=bool)
     broken[np.array([*events.hits.tolist(), *events.restarts.tolist(), *ends], dtype=np.int64) + 1] = True
@@ -282,7 +283,7 @@ def _runs(low: NDArray[np.bool_], events: Segmentation) -> list[tuple[int, int]]
 
 
 def _known(grid: HopGrid, times: Array, gap: Array, sigma: Array, spread: float) -> HopMoments:
-    """What samples tell of the ball, averaged over the heights that the surface may have.
+    """Moments of the ball's motion, averaged over the possible heights of the surface.
 
     Args: times: (n,) s.  gap: (n,) m.  sigma: (n,) m.  spread: m, standard deviation of the surface's height.
     """
@@ -295,7 +296,7 @@ def _known(grid: HopGrid, times: Array, gap: Array, sigma: Array, spread: float)
 
 
 def _beyond(larger: Array, own: Array) -> Array:
-    """(n, 2, 2) the part of some matrices that exceeds others, which are covariances."""
+    """(n, 2, 2) the positive part of the difference of some matrices and others, as covariances."""
     root = np.linalg.cholesky(own)
     inverse = np.linalg.inv(root)
     values, vectors = np.linalg.eigh(inverse @ (larger - own) @ inverse.swapaxes(1, 2))

@@ -1,12 +1,11 @@
-"""A second look at a bounce: friction slides or grips, and the track may have a minimum of each kind.
+"""Searches a second minimum at bounces, where friction may slide or grip.
 
-While the ball slides, friction tells the direction of the slip only; once it grips, friction tells all of the slip. On
-the way from a start on one side the search may settle before it reaches the other. So it begins again on the other
-side and goes on while it stays there; the lower minimum is the answer. A spin label, where there is one, chooses the
-side.
+While the ball slides, friction determines the direction of the slip only; once it grips, friction determines all of the
+slip. A search that starts on one side may stop before it reaches the other. So a second search starts on the other side
+and continues while it stays there; the lower minimum is the result. A spin label, if any, chooses the side.
 
 A search of a whole long chain for every bounce would take a time that grows with the square of its length. There the
-other side is tried first on the samples around the bounce, and only what is clearly no better is left out.
+samples around a bounce decide first, and only spins that are clearly worse there are skipped.
 """
 
 from __future__ import annotations
@@ -28,32 +27,32 @@ from ballfg.factors.prior import PriorFactors, spin_prior
 from ballfg.state import SPIN, STATE_DIM, VELOCITY
 
 SLIDES = 0.05
-"""Slope of log(friction) by log(slip): 0 while the ball slides, 1 once it grips, between them a gradual transition."""
+"""Slope of log(friction) by log(slip): 0 while the ball slides, 1 once it grips, with a gradual transition."""
 SCALES = 2.0 ** np.arange(-4.0, 5.0)
-"""Multiples of the slip that was found at which the ball may begin to slide."""
+"""Multiples of the estimated slip at which the ball may begin to slide."""
 WELL_BEYOND = 1.5
-"""Of the slip at which the ball begins to slide, for a start."""
+"""Multiple of the slip at which the ball begins to slide, for a start."""
 NEXT = 1.1
-"""Of a slip at which the ball gripped or nearly so: a minimum where it slides has more."""
+"""Multiple of a gripping slip: a minimum with a sliding ball has more."""
 NUDGE = 1.01
 LEAST_SLIP = 1e-3
 """m/s, below which a slip has no direction."""
 TIE = 2.0
 """Of the objective, a log likelihood: a minimum that is higher by less has at least a seventh of the probability."""
 RIVAL_APART = 2.5
-"""Posterior standard deviations of the spin, beyond which another spin is said to explain the track too."""
+"""Posterior standard deviations of the spin beyond which another spin is reported."""
 LONG_CHAIN = 500
-"""States from which a bounce is looked at by itself first."""
+"""Number of states from which a bounce is first tested by itself."""
 REACH = 8
-"""Samples beyond those whose spin the bounce ties together."""
+"""Number of samples beyond those whose spin the bounce determines."""
 SPIN_SPREAD = 60.0
-"""rad/s, about the spin that was found, of the first state that is kept: it stands for all that came before."""
+"""rad/s, prior about the estimated spin of the first state in the test: it stands for all earlier samples."""
 
 
 def with_other_spins(solution: Solution, model: BallModel, optimizer: LevenbergMarquardt) -> Solution:
-    """The lower of a solution and of those with which the ball grips instead of slides at a bounce, or slides.
+    """The lowest of a solution and those where bounces grip instead of slide, or slide instead of grip.
 
-    Args: solution: so far.  model: of the ball, with the coefficients that are estimated.  optimizer: for the others.
+    Args: solution: so far.  model: the ball, with the estimated coefficients.  optimizer: for the other minima.
     """
     least, bounces = optimizer.tolerance, bounces_of(solution)
     sides = other_sides(solution.minimum.values, bounces, model)
@@ -74,7 +73,7 @@ def with_other_spins(solution: Solution, model: BallModel, optimizer: LevenbergM
 
 
 def rival_note(solution: Solution, covariance: Array) -> tuple[str, ...]:
-    """Says that another spin explains the track nearly as well, where the covariance does not include it.
+    """A note on another spin that explains the track nearly as well, if the covariance does not include it.
 
     Args: solution: of the track.  covariance: (9, 9), of its first state.
     """
@@ -90,7 +89,7 @@ def rival_note(solution: Solution, covariance: Array) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Bounce:
-    """One bounce of a track: its interval, and the states whose spin it ties together."""
+    """One bounce of a track: its interval, and the states whose spin it determines."""
 
     interval: int
     first: int
@@ -98,9 +97,9 @@ class Bounce:
 
 
 def bounces_of(solution: Solution) -> list[Bounce]:
-    """The bounces of a solution that no hit disturbs, in their order.
+    """The bounces of a solution without a hit nearby, in their order.
 
-    The spin before one holds back to the bounce, hit or start before it, the spin after it to the next of these.
+    The spin before a bounce extends back to the previous bounce, hit or start, the spin after it to the next one.
     """
     segmentation, count = solution.events.segmentation, len(solution.minimum.values.states)
     broken = {*segmentation.hits.tolist(), *segmentation.restarts.tolist()}
@@ -117,13 +116,13 @@ def bounces_of(solution: Solution) -> list[Bounce]:
 
 @dataclass(frozen=True)
 class OtherSide:
-    """Where a search begins on the other side of the slip at which a ball begins to slide.
+    """Initial values of a search on the other side of the slip at which a ball begins to slide.
 
     Attributes:
         values: to start from.
         interval: of the bounce.
         edge: m/s, the slip at which this side ends.
-        slides: whether the ball slides on this side.
+        slides: True if the ball slides on this side.
         radius: m, of the ball.
     """
 
@@ -134,19 +133,19 @@ class OtherSide:
     radius: float
 
     def holds(self, values: Values) -> bool:
-        """Whether the ball is still on this side of the edge."""
+        """True if the ball is still on this side of the edge."""
         slip = np.linalg.norm(_slip(values.states[self.interval], self.radius))
         return bool((slip >= self.edge) == self.slides)
 
 
 def other_sides(values: Values, bounces: Sequence[Bounce], model: BallModel) -> Iterator[OtherSide | None]:
-    """The starts with another spin at each of some bounces: rolling where the ball slid, sliding where it gripped.
+    """Starts with another spin at each of some bounces: rolling in place of sliding, sliding in place of gripping.
 
     Args:
         values: of a minimum.
-        bounces: whose spin changes, from the first to the last state that belongs to one; each by itself.
-        model: of the ball, with the coefficients that are estimated.
-    Yields: one for each bounce; None for bounces at which the ball does not slip, or never slides.
+        bounces: their spin changes, from the first to the last state of each; one at a time.
+        model: the ball, with the estimated coefficients.
+    Yields: one for each bounce; None for bounces without slip, or at which the ball never slides.
     """
     at = np.array([bounce.interval for bounce in bounces], dtype=np.int64)
     known = np.tile(values.coefficients[: model_width(model)], (len(at), 1))
@@ -171,12 +170,12 @@ def other_sides(values: Values, bounces: Sequence[Bounce], model: BallModel) -> 
 def worth_a_search(
     solution: Solution, bounce: Bounce, side: OtherSide, optimizer: LevenbergMarquardt, margin: float
 ) -> bool:
-    """Whether, near a bounce, the minimum on its other side is another one, and higher by less than a margin.
+    """True if the minimum on the other side of a bounce is, nearby, another one and higher by less than a margin.
 
     Args:
         solution: of the whole chain.
         bounce: in it.
-        side: where a search on the other side begins.
+        side: start of a search on the other side.
         optimizer: for both minima.
         margin: of the objective, a log likelihood.
     """
@@ -202,7 +201,7 @@ def _taken(values: Values, first: int, last: int) -> Values:
 
 
 def _around(solution: Solution, first: int, last: int) -> BallGraph:
-    """The factors among some states; the coefficients are known as well as the whole chain knows them."""
+    """The factors among some states; the whole chain's covariance is the prior of the coefficients."""
     values, step = solution.minimum.values, solution.minimum.step
     assert step is not None
     batches: list[FactorBatch] = []
@@ -211,7 +210,7 @@ def _around(solution: Solution, first: int, last: int) -> BallGraph:
         inside = ((states >= first) & (states <= last) | (states == COEFFICIENTS)).all(axis=1)
         inside &= (states != COEFFICIENTS).any(axis=1)
         if inside.any():
-            part = batch.taken(np.flatnonzero(inside))
+            part = batch.select(np.flatnonzero(inside))
             part.variables = np.where(part.variables == COEFFICIENTS, COEFFICIENTS, part.variables - first)
             batches.append(part)
     w, p = step.root.width, len(values.coefficients)
@@ -225,7 +224,7 @@ def _around(solution: Solution, first: int, last: int) -> BallGraph:
 
 
 def _turned(values: Values, bounce: Bounce, before: Array, after: Array) -> Values:
-    """Values with more spin on both sides of a bounce."""
+    """Values with another spin on both sides of a bounce."""
     states = values.states.copy()
     states[bounce.first : bounce.interval + 1, SPIN] += before
     states[bounce.interval + 1 : bounce.last + 1, SPIN] += after

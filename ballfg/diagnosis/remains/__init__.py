@@ -1,1 +1,0 @@
-"""Tests for patterns that remain after the search, and descriptions of them without a cause."""

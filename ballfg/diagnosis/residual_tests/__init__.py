@@ -1,0 +1,1 @@
+"""Tests for patterns that remain after the search, and describes them without a cause."""

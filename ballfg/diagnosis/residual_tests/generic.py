@@ -1,0 +1,127 @@
+"""Tests for remaining patterns of any cause, and locates them.
+
+Each block of patterns (module `patterns`) is tested like a candidate effect: by the scores of its columns, with states
+and declared coefficients projected out and tracks as independent units. Only the most visible directions of a large
+block are tested; their choice does not depend on the residuals.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.fit.system import System
+from ballfg.diagnosis.generic_test import GenericTest
+from ballfg.diagnosis.residual_tests.patterns import (
+    DRIFT,
+    EVERYWHERE,
+    PLAUSIBLE,
+    Block,
+    blocks_of,
+    describe_drift,
+    drift_block,
+)
+from ballfg.diagnosis.residual_tests.whiteness import whiteness
+from ballfg.diagnosis.search.score import pattern_tests
+from ballfg.diagnosis.search.signatures import signatures_of
+from ballfg.tracks.noise import TrackNoise
+
+TRACKS_PER_DIRECTION = 4
+"""Number of tracks per tested direction of a block: their scatter must determine the directions' covariance."""
+LEAST_INFORMATION = 1.0
+"""Least information of a tested direction: its strength is known to the size of a pattern large in practice."""
+MOST_SEEN = 95.0
+"""Percentile over the data in the words "up to"."""
+
+
+@dataclass(frozen=True)
+class _Test:
+    """One test of one fit; p-value not corrected for their number. `quantities` are those of a block, else none.
+
+    The ratio of the pattern's size to the initial one is its share.
+    """
+
+    kind: str
+    quantities: tuple[str, ...]
+    where: str
+    p_value: float
+    size: float
+
+
+def generic_tests(fit: Fit, reference: Fit | None = None, tracker: TrackNoise | None = None) -> tuple[GenericTest, ...]:
+    """All tests of a fit, with p-values corrected for their number.
+
+    Args:
+        fit: of the model so far.
+        reference: the fit of the declared model, for shares; None: `fit` itself.
+        tracker: found noise of a tracker with errors that are not white.
+    Returns: the tests, the least probable first.
+    """
+    tests = _tests_of(fit, tracker)
+    first = tests if reference is None or reference is fit else _tests_of(reference, tracker)
+    sizes = {(test.kind, test.quantities): test.size for test in first}
+    found = []
+    for test in tests:
+        whole = max(test.size, sizes.get((test.kind, test.quantities), 0.0))
+        share = test.size / whole if whole > 0.0 else 0.0
+        found.append(GenericTest(test.kind, test.where, min(1.0, len(tests) * test.p_value), share))
+    return tuple(sorted(found, key=lambda t: t.p_value))
+
+
+def _tests_of(fit: Fit, tracker: TrackNoise | None) -> list[_Test]:
+    system = fit.linearised()
+    drifting = drift_block(fit, system)
+    drift = whiteness(fit, system, tracker)
+    tests = _block_tests(fit, system, [*blocks_of(fit), *([] if drifting is None else [drifting])])
+    tests.append(_Test("time", (), drift.where, drift.p_value, drift.drift**2))
+    return tests
+
+
+def _block_tests(fit: Fit, system: System, blocks: list[Block]) -> list[_Test]:
+    """Tests of all visible blocks."""
+    signatures = signatures_of(fit, system, np.concatenate([block.columns for block in blocks], axis=-1))
+    efficient = signatures.efficient()
+    information, score, at = efficient.total, efficient.score.sum(axis=0), 0
+    seen: list[tuple[Block, str]] = []
+    directions: list[Array] = []
+    for block in blocks:
+        own = slice(at, at := at + block.columns.shape[-1])
+        turn = _leading(information[own, own], signatures.tracks, own, len(score))
+        if turn.shape[1]:
+            strengths = np.linalg.solve(information[own, own] + np.eye(own.stop - own.start), score[own])
+            strengths = strengths.reshape(len(block.axes), -1)
+            words = describe_drift(fit, block, strengths) if block.kind == DRIFT else where(block, strengths)
+            seen.append((block, words))
+            directions.append(turn)
+    noise = float((fit.noise.position**2).mean())  # shares use residuals that are not whitened
+    return [
+        _Test(block.kind, block.quantities, words, p.p_value, noise * max(0.0, p.explained - p.rank))
+        for (block, words), p in zip(seen, pattern_tests(signatures, directions), strict=True)
+    ]
+
+
+def _leading(information: Array, tracks: int, own: slice, count: int) -> Array:
+    """(count, r) the most visible directions of a block's columns, among all `count` columns."""
+    values, vectors = np.linalg.eigh(information)
+    most = max(1, tracks // TRACKS_PER_DIRECTION)
+    shown = np.flatnonzero(values >= LEAST_INFORMATION)[::-1][:most]
+    turn = np.zeros((count, len(shown)))
+    turn[own] = vectors[:, shown]
+    return turn
+
+
+def where(block: Block, strengths: Array) -> str:
+    """The place of a block's pattern, in words; strengths: (3, f) of its columns, in units of plausible sizes."""
+    pattern = PLAUSIBLE[block.kind] * strengths @ block.values.T  # (3, m)
+    axis = int(np.argmax((pattern**2).mean(axis=1)))
+    share = strengths[axis] ** 2 * (block.values**2).mean(axis=0)
+    name = block.quantities[int(np.argmax(share))]
+    size = float(np.percentile(np.abs(pattern[axis]), MOST_SEEN))
+    what, unit, factor = {
+        "flight": ("acceleration", "m/s^2", 1.0),
+        "contact": ("velocity after a contact", "m/s", 1.0),
+        "measurement": ("error of position", "mm", 1e3),
+    }[block.kind]
+    depends = f"is off {EVERYWHERE}" if name == EVERYWHERE else f"depends on {name}"
+    return f"{block.kind}: {what} {block.axes[axis]} {depends}, up to {factor * size:.2g} {unit}"

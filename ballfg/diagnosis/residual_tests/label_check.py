@@ -1,0 +1,120 @@
+"""Finds the spin labels that contradict their flights, with probabilities.
+
+A label is right, with its stated error, or wrong, with a far larger one. Both are compared with the flight's spin,
+including the scatter of flight and bounces. The share of wrong labels, the size of their errors, and the excess of
+right labels' errors are unknown; all labels of the recording determine them together, and they are integrated out. So
+each label has a probability of being wrong, and a single doubtful one among many does not count.
+"""
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.diagnosis.fit.holdout import Holdout
+from ballfg.diagnosis.generic_test import GenericTest
+from ballfg.diagnosis.label_verdicts import LabelCheck, LabelVerdict
+from ballfg.diagnosis.residual_tests.label_flights import LabelledFlight, labelled_flights
+from ballfg.diagnosis.residual_tests.label_model import scattering_model
+from ballfg.dynamics import AnalyticModel
+from ballfg.tracks.noise import TrackNoise
+
+LABEL: Final = "label"
+"""Kind of the test."""
+NONE_WRONG: Final = 0.5
+"""Prior probability that all labels are right; else all shares of wrong ones are equally probable."""
+SHARES: Final = (np.arange(40) + 0.5) / 40
+"""Shares of wrong labels, the middles of fortieths."""
+RIGHT: Final = np.exp(np.linspace(0.0, 1.4, 8))
+"""Errors of right labels, as multiples of the stated ones: up to four times."""
+RIGHT_SPREAD: Final = 0.7
+"""Standard deviation of the logarithm of such a multiple: stated noise is known to a factor of two."""
+WRONG: Final = np.exp(np.linspace(-1.1, 1.1, 9))
+"""Errors of wrong labels, as multiples of `wrong_error`: a third to three times."""
+
+
+def check_labels(
+    model: AnalyticModel,
+    declared: AnalyticModel,
+    holdout: Holdout,
+    tracker: TrackNoise | None = None,
+    *,
+    jobs: int = 1,
+) -> LabelCheck | None:
+    """Computes the verdicts on all spin labels of a dataset.
+
+    Args:
+        model: corrected by the diagnosis, fitted to the tracks.
+        declared: the model before the diagnosis.
+        holdout: the tracks of both halves.
+        tracker: memory of the tracker and jitter of the stamps, if found.
+        jobs: processes.
+    Returns: None without labels.
+    """
+    return judged(label_evidence(model, declared, holdout, tracker, jobs=jobs))
+
+
+def label_evidence(
+    model: AnalyticModel,
+    declared: AnalyticModel,
+    holdout: Holdout,
+    tracker: TrackNoise | None = None,
+    *,
+    jobs: int = 1,
+) -> list[LabelledFlight]:
+    """The labels with the spins of their flights. Args: as `check_labels`."""
+    parts = (*holdout.search_tracks, *holdout.held_out_tracks)
+    tracks = sorted((p for p in parts if p.track.spin_label is not None), key=lambda p: p.track.name)
+    if not tracks:
+        return []
+    ball, settings = scattering_model(model, declared, tracks, holdout, tracker, jobs=jobs)
+    return labelled_flights(ball, holdout.surfaces, settings, tracks, jobs)
+
+
+def judged(flights: Sequence[LabelledFlight]) -> LabelCheck | None:
+    """The verdicts on labels with their flights; None without labels."""
+    if not flights:
+        return None
+    right = np.stack([f.right.log_densities(RIGHT * f.right.error) for f in flights])
+    wrong = np.stack([f.wrong.log_densities(_errors_of_wrong(f)) for f in flights])
+    probability, p_all_right = _mixture(right, wrong)
+    verdicts = [
+        LabelVerdict(f.name, p, f.wrong.off, f.wrong.off_sigma)
+        for f, p in zip(flights, probability.tolist(), strict=True)
+    ]
+    return LabelCheck(p_all_right, tuple(sorted(verdicts, key=lambda v: (-v.probability, -v.off))))
+
+
+def label_test(check: LabelCheck, before: LabelCheck | None = None) -> GenericTest:
+    """The check as a test; before: of the declared model, for the share of contradicted labels."""
+    now = len(check.contradicted)
+    whole = now if before is None else max(now, len(before.contradicted))
+    return GenericTest(LABEL, check.where, check.p_all_right, now / whole if whole else 0.0)
+
+
+def _errors_of_wrong(flight: LabelledFlight) -> Array:
+    """(r w,) rad/s, errors of a wrong label, for each error of right ones."""
+    total = np.hypot(RIGHT[:, None] * flight.right.error, WRONG * flight.wrong.error)
+    return np.asarray(total.ravel())
+
+
+def _mixture(right: Array, wrong: Array) -> tuple[Array, float]:
+    """Probability (n,) that each label is wrong, and that none is.
+
+    Args: right: (n, r) log densities of labels that err by `RIGHT`.  wrong: (n, r w) of wrong ones.
+    """
+    wrong = wrong.reshape(*right.shape, -1)
+    stated = np.exp(-0.5 * (np.log(RIGHT) / RIGHT_SPREAD) ** 2)
+    prior = np.log(stated / stated.sum())
+    least = np.maximum(right.max(axis=1), wrong.max(axis=(1, 2)))[:, None]
+    as_right, as_wrong = right - least, wrong - least[..., None]
+    one, other = np.log1p(-SHARES), np.log(SHARES)
+    each_wrong = other + as_wrong[..., None]  # (n, r, w, shares)
+    either = np.logaddexp(one + as_right[:, :, None, None], each_wrong)
+    some = either.sum(axis=0) + prior[:, None, None] - np.log(len(WRONG) * len(SHARES)) + np.log1p(-NONE_WRONG)
+    none = as_right.sum(axis=0) + prior + np.log(NONE_WRONG)
+    top = max(some.max(), none.max())
+    weights, sure = np.exp(some - top), np.exp(none - top).sum()
+    total = weights.sum() + sure
+    return (np.exp(each_wrong - either) * weights).sum(axis=(1, 2, 3)) / total, float(sure / total)

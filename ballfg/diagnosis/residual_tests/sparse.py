@@ -1,0 +1,125 @@
+"""Chooses a few generic terms by sparse regression that describe an effect without a name.
+
+Forward selection on projected Gram matrices: each step takes the term with the largest additional gain, until none
+exceeds its penalty. Terms that later ones made superfluous are then dropped. Source: J. Chen and Z. Chen 2008,
+"Extended Bayesian information criteria for model selection with large model spaces", with gamma = 1.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.diagnosis.fit.fit import fit_problem
+from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.search.candidates import with_hypothesis
+from ballfg.diagnosis.search.hypothesis import Hypothesis, has_effect
+from ballfg.diagnosis.search.signatures import hypothesis_signatures
+from ballfg.dynamics.effects.registry import GENERIC
+
+MOST_TERMS = 12
+"""Largest number of terms; more describe noise, and are unreadable."""
+LEAST_LEFT = 1e-6
+"""Least share of a term's information that is independent of the earlier terms."""
+
+
+@dataclass(frozen=True)
+class SparseTerms:
+    """Chosen terms.
+
+    Attributes:
+        hypotheses: the generic effects of these terms, with the chosen terms as strengths.
+        estimates: one-step coefficients by parameter name.
+        explained: squared whitened residual that they would explain together.
+    """
+
+    hypotheses: tuple[Hypothesis, ...]
+    estimates: Mapping[str, float]
+    explained: float
+
+
+def sparse_terms(before: Fit) -> SparseTerms | None:
+    """The generic terms that a fit lacks.
+
+    Args: before: the fit so far.
+    Returns: the terms; None if none exceeds its penalty.
+    """
+    library = _library(before)
+    found, _ = hypothesis_signatures(before, library)
+    efficient = found.efficient()
+    loose = np.concatenate([[c.sigma for c in h.free().values()] for h in library])
+    information = efficient.total + np.diag(loose**-2.0)
+    score = efficient.score.sum(axis=0)
+    samples = 3 * int(before.problem.stretches.used.sum())
+    chosen = select(information, score, np.log(samples) + 2.0 * np.log(len(score)))
+    if not chosen:
+        return None
+    estimate = np.linalg.solve(information[np.ix_(chosen, chosen)], score[chosen])
+    names = [name for h in library for name in h.columns]
+    taken = {names[i] for i in chosen}
+    kept = [replace(h, strengths=tuple(s for s in h.strengths if h.parameter(s) in taken)) for h in library]
+    estimates = {names[i]: float(e) for i, e in zip(chosen, estimate, strict=True)}
+    return SparseTerms(tuple(h for h in kept if h.strengths), estimates, float(estimate @ score[chosen]))
+
+
+def fit_with_terms(before: Fit, terms: SparseTerms) -> Fit:
+    """The joint fit with the terms in the model, at the noise of the previous fit."""
+    problem = before.problem
+    for hypothesis in terms.hypotheses:
+        problem = with_hypothesis(problem, hypothesis)
+    listed = problem.free
+    start = {n: float(np.clip(v, listed[n].low, listed[n].high)) for n, v in terms.estimates.items()}
+    unknowns = replace(before.unknowns, values={**before.unknowns.values, **start})
+    return fit_problem(problem, unknowns, before.noise, settle_noise=False)
+
+
+def select(information: Array, score: Array, penalty: float) -> list[int]:
+    """Indices of the terms above their penalty, in the order of choice, from information (p, p) and score (p,).
+
+    Args: penalty: least gain of a term, as twice a log likelihood.
+    """
+    chosen: list[int] = []
+    while len(chosen) < MOST_TERMS:
+        gain = _gains(information, score, chosen)
+        best = int(np.argmax(gain))
+        if gain[best] < penalty:
+            break
+        chosen.append(best)
+    return _pruned(information, score, penalty, chosen)
+
+
+def _gains(information: Array, score: Array, chosen: list[int]) -> Array:
+    """(p,) squared residual that each further term would explain beside the chosen ones; zero for these."""
+    across = information[:, chosen]
+    solved = np.linalg.solve(information[np.ix_(chosen, chosen)], across.T) if chosen else np.zeros((0, len(score)))
+    left = score - solved.T @ score[chosen]
+    own = np.diagonal(information) - (across * solved.T).sum(axis=1)
+    seen = own > LEAST_LEFT * np.diagonal(information)
+    return np.where(seen, left**2 / np.where(seen, own, 1.0), 0.0)
+
+
+def _pruned(information: Array, score: Array, penalty: float, chosen: list[int]) -> list[int]:
+    """The chosen terms without those that the others nearly replace."""
+    while chosen:
+        inverse = np.linalg.inv(information[np.ix_(chosen, chosen)])
+        loss = (inverse @ score[chosen]) ** 2 / np.diagonal(inverse)
+        least = int(np.argmin(loss))
+        if loss[least] >= penalty:
+            break
+        chosen = [term for k, term in enumerate(chosen) if k != least]
+    return chosen
+
+
+def _library(before: Fit) -> list[Hypothesis]:
+    """All generic terms about the middle of the data; those of contacts only if there are contacts."""
+    stretches = before.problem.stretches
+    positions = stretches.positions.numpy()[stretches.used.numpy()]
+    middle = dict(zip(("center_x", "center_y", "center_z"), np.median(positions, axis=0).tolist(), strict=True))
+    bounces, listed = bool(stretches.heights.isfinite().any()), []
+    for effect in GENERIC.values():
+        if (effect.kind != "bounce" or bounces) and not has_effect(before.problem.model, effect.name):
+            shape = {c.name: middle[c.name] for c in effect.coefficients if c.name in middle}
+            strengths = tuple(c.name for c in effect.coefficients if c.absent is not None)
+            listed.append(Hypothesis(effect, shape, strengths))
+    return listed

@@ -1,0 +1,201 @@
+"""Tests for whiteness along the tracks: neighbouring errors correlate if the motion differs from the model.
+
+Residuals of a good fit are not white themselves: r = M e, with white noise e and the projection M of the fit. For a
+kernel W over pairs of different samples, U = r'(W + c) r over the stretch's own mean square, with c = -tr(M W) / tr(M),
+has mean zero whatever the scale of the noise on that stretch, and cumulants that are traces of powers of M (W + c). The
+sum of U over stretches is compared with the gamma distribution of the same first three cumulants.
+
+Errors of a tracker with known memory or jitter are whitened by their covariance first.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from ballfg.arrays import Array, Mask
+from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.fit.system import System
+from ballfg.tracks.noise import TrackNoise
+
+REACHES = (0.02, 0.06, 0.18)
+"""s. Widths of the Gaussian kernels in the time between two samples: from a contact's duration to an arc's."""
+LEAST_WEIGHT = 0.5
+"""Samples with a smaller robust weight are outliers: their products carry no information on drift."""
+LEAST_FREEDOM = 1e-6
+"""Least degrees of freedom of a stretch; one whose samples are all outliers has none."""
+
+
+@dataclass(frozen=True)
+class Whiteness:
+    """The test.
+
+    Attributes:
+        p_value: one-sided, corrected for the number of reaches.
+        reach: s, of the most significant kernel.
+        drift: m, root of the mean product of such pairs' errors: the common part of neighbouring samples.
+        explained: for each reach, the sum of U.
+        spread: for each reach, the standard deviation of that sum without drift.
+    """
+
+    p_value: float
+    reach: float
+    drift: float
+    explained: Array
+    spread: Array
+
+    @property
+    def where(self) -> str:
+        """The time and size of the common error, in words."""
+        return f"time: samples within {1e3 * self.reach:.0f} ms err alike, by {1e3 * self.drift:.2g} mm"
+
+
+def whiteness(fit: Fit, system: System, tracker: TrackNoise | None = None) -> Whiteness:
+    """The test of a fit for drift along its tracks.
+
+    Args:
+        fit: at its minimum.
+        system: of the fit, linearised there.
+        tracker: white noise, memory and jitter of the tracker; None: errors are assumed white.
+    """
+    stretches = fit.problem.stretches
+    n, k = stretches.times.shape
+    kept = stretches.used.numpy() & (fit.robust.samples >= LEAST_WEIGHT)
+    rows = np.ones(system.residual.shape)  # without outliers, whose pull on the fit would look like drift
+    rows[:, : 3 * k] = np.repeat(kept, 3, axis=1)
+    system = System(system.residual * rows, system.by_start * rows[..., None], system.by_common * rows[..., None])
+    if tracker is not None:
+        system = _whitened(fit, system, kept, tracker)
+    projected = system.projected()
+    if tracker is not None:  # the fit has weighted its samples as if their errors were white
+        projected[..., -1] -= projected[..., :-1] @ _common_step(fit, system)
+    residual = projected[:, : 3 * k, -1].reshape(n, k, 3)
+    taken = _absorbed(fit, system, projected[..., :-1]).reshape(n, k, 3, -1)
+    sums, spreads, p_values, products = [], [], [], []
+    for reach in REACHES:
+        kernel = _kernel(stretches.times.numpy(), kept, reach)
+        total, variance, third = _summed(residual, taken, kept, kernel)
+        sums.append(total)
+        spreads.append(np.sqrt(max(variance, 0.0)))
+        p_values.append(_p_value(total, variance, third))
+        products.append(total / (3.0 * kernel.sum()))
+    most = int(np.argmin(p_values))
+    sigma = float(np.sqrt((fit.sigmas[stretches.used.numpy()] ** 2).mean()))
+    return Whiteness(
+        p_value=min(1.0, len(REACHES) * p_values[most]),
+        reach=REACHES[most],
+        drift=sigma * float(np.sqrt(max(0.0, products[most]))),
+        explained=np.array(sums),
+        spread=np.array(spreads),
+    )
+
+
+def _p_value(total: float, variance: float, third: float) -> float:
+    """Probability of sums this large by chance; 1 if the fit has absorbed all scatter."""
+    if not variance > 0.0:
+        return 1.0
+    return float(stats.pearson3.sf(total / np.sqrt(variance), third / variance**1.5))
+
+
+def _whitened(fit: Fit, system: System, kept: Mask, tracker: TrackNoise) -> System:
+    """The rows of positions, transformed so that the errors of a tracker with memory and jitter are white."""
+    stretches = fit.problem.stretches
+    (n, k), times = stretches.times.shape, stretches.times.numpy()
+    stated = stretches.sigmas.numpy()
+    typical = np.median(stated[stretches.used.numpy()], axis=0)
+    assert tracker.position is not None
+    white = np.where(kept[..., None], stated / typical * tracker.position, 1.0)
+    spread = np.zeros((n, k, 3, k, 3))
+    sample = np.arange(k)
+    both = kept[:, :, None] & kept[:, None, :]
+    if tracker.memory is not None and tracker.memory_time is not None:
+        lasting = np.exp(-np.abs(times[:, :, None] - times[:, None, :]) / tracker.memory_time) * both
+        for axis in range(3):
+            spread[:, :, axis, :, axis] = tracker.memory[axis] ** 2 * lasting
+    if tracker.stamp_jitter is not None:
+        way = tracker.stamp_jitter * _velocities(fit) * kept[..., None]
+        spread[:, sample, :, sample, :] += (way[..., :, None] * way[..., None, :]).swapaxes(0, 1)
+    for axis in range(3):
+        spread[:, sample, axis, sample, axis] += white[..., axis] ** 2
+    root = np.linalg.cholesky(spread.reshape(n, 3 * k, 3 * k))
+    metres = np.where(kept[..., None], fit.sigmas, 1.0).reshape(n, 3 * k, 1)
+
+    def turned(rows: Array) -> Array:
+        return np.concatenate((np.linalg.solve(root, metres * rows[:, : 3 * k]), rows[:, 3 * k :]), axis=1)
+
+    return System(turned(system.residual[..., None])[..., 0], turned(system.by_start), turned(system.by_common))
+
+
+def _velocities(fit: Fit) -> Array:
+    """(n, k, 3) m/s from one predicted sample to the next; zero for padding."""
+    steps = np.diff(fit.problem.stretches.times.numpy(), axis=1)[..., None]
+    moved = np.diff(fit.predicted.positions, axis=1)
+    velocities = np.where(steps > 0.0, moved / np.where(steps > 0.0, steps, 1.0), 0.0)
+    return np.concatenate((velocities, velocities[:, -1:]), axis=1)
+
+
+def _common_step(fit: Fit, system: System) -> Array:
+    """(q,) change of the shared unknowns under the weights of another system."""
+    problem, values = fit.problem, np.array([fit.unknowns.values[name] for name in fit.problem.free])
+    away = np.concatenate((problem.centres - values, -fit.unknowns.launcher.ravel()))
+    free = np.full(len(away), np.inf)
+    return system.eliminated().common_step(problem.common_precision, problem.common_precision * away, -free, free)
+
+
+def _summed(residual: Array, taken: Array, kept: Mask, kernel: Array) -> tuple[float, float, float]:
+    """Sum of U over stretches, its variance and third cumulant without drift, from residuals (n, k, 3).
+
+    Args: taken: (n, k, 3, d) directions that the fit absorbs.  kept: (n, k) samples that count.  kernel: (n, k, k).
+    """
+    freedom = 3.0 * kept.sum(axis=1) - (taken**2).sum(axis=(1, 2, 3))
+    tells = freedom > LEAST_FREEDOM
+    if not tells.any():
+        return 0.0, 0.0, 0.0
+    residual, taken, kernel, freedom = residual[tells], taken[tells], kernel[tells], freedom[tells]
+    n, k, _ = residual.shape
+    once = np.einsum("nst,ntad->nsad", kernel, taken)
+    rows, moved = taken.reshape(n, 3 * k, -1), once.reshape(n, 3 * k, -1)
+    inner = rows.swapaxes(-1, -2) @ moved
+    squared = moved.swapaxes(-1, -2) @ moved
+    cubed = moved.swapaxes(-1, -2) @ np.einsum("nst,ntad->nsad", kernel, once).reshape(n, 3 * k, -1)
+    first = -_trace(inner)
+    second = 3.0 * (kernel**2).sum(axis=(1, 2)) - 2.0 * _trace(squared) + (inner**2).sum(axis=(1, 2))
+    third = 3.0 * ((kernel @ kernel) * kernel).sum(axis=(1, 2)) - 3.0 * _trace(cubed)
+    third += 3.0 * (squared * inner).sum(axis=(1, 2)) - _trace(inner @ inner @ inner)
+    c = -first / freedom
+    variance = 2.0 * (second + 2.0 * c * first + c**2 * freedom)
+    skew = 8.0 * (third + 3.0 * c * second + 3.0 * c**2 * first + c**3 * freedom)
+    scale = (residual**2).sum(axis=(1, 2)) / freedom
+    products = residual @ residual.swapaxes(-1, -2)
+    sums = (kernel * products).sum(axis=(1, 2)) / scale + c * freedom
+    # noise that differs from sample to sample (jitter on a fast ball) raises the variance
+    seen = (kernel**2 * products**2).sum(axis=(1, 2)) / scale**2
+    uneven = max(1.0, float(seen.sum() / (3.0 * (kernel**2).sum())))
+    return float(sums.sum()), uneven * float(variance.sum()), uneven**1.5 * float(skew.sum())
+
+
+def _trace(matrices: Array) -> Array:
+    return np.asarray(np.trace(matrices, axis1=-2, axis2=-1))
+
+
+def _absorbed(fit: Fit, system: System, shared: Array) -> Array:
+    """(n, 3 k, 9 + q) directions of the samples' noise that the fit absorbs, of unit length over all rows.
+
+    First states absorb theirs in each stretch; shared unknowns absorb directions of unit length over all of them.
+
+    Args: shared: (n, m, q) columns of the shared unknowns, first states projected out.
+    """
+    own, _ = np.linalg.qr(system.by_start)
+    precision = (shared.swapaxes(-1, -2) @ shared).sum(axis=0) + np.diag(fit.problem.common_precision)
+    root = np.linalg.inv(np.linalg.cholesky(precision)).T
+    rows = system.residual.shape[1] - 3
+    return np.concatenate((own[:, :rows], (shared @ root)[:, :rows]), axis=-1)
+
+
+def _kernel(times: Array, kept: Mask, reach: float) -> Array:
+    """(n, k, k) weights of pairs of different samples."""
+    apart = (times[:, :, None] - times[:, None, :]) / reach
+    weight = np.exp(-0.5 * apart**2) * (kept[:, :, None] & kept[:, None, :])
+    diagonal = np.arange(times.shape[1])
+    weight[:, diagonal, diagonal] = 0.0
+    return np.asarray(weight)

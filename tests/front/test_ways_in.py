@@ -1,0 +1,111 @@
+"""The names of `import ballfg as bf` on arrays, tracks, datasets and folders."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ballfg as bf
+from ballfg.dynamics import save_model
+from ballfg.estimation import dataset_settings
+from ballfg.estimation.track_prediction import TrackPrediction
+from ballfg.simulation import tennis
+from tests.front.my_shots import same, written
+
+
+def test_a_track_of_a_dataset_brings_ball_table_and_noise(shots: bf.Dataset, track: bf.Track) -> None:
+    model = bf.nominal_model(shots.ball)
+    by_hand = bf.Smoother(model, bf.Surfaces.table_tennis(shots.table), dataset_settings(shots, model))
+    same(bf.estimate(track), by_hand.estimate(track))
+    assert shots.table == pytest.approx(0.76)
+
+
+def test_folder_and_dataset_give_the_estimates_of_their_tracks(folder: Path, shots: bf.Dataset) -> None:
+    found = bf.estimate(folder, method="ekf")
+    assert list(found) == shots.names
+    for name, one in bf.estimate(shots, method="ekf", jobs=2).items():
+        same(one, found[name])
+        same(one, bf.estimate(shots[name], method="ekf"))
+    assert list(bf.estimate(str(folder), method="sliding-window")) == shots.names
+
+
+def test_arrays_are_a_track(track: bf.Track, shots: bf.Dataset, estimate: bf.Estimate) -> None:
+    """With ball, table and noise named by hand it is the estimate of the dataset's track."""
+    made = bf.Track(track.times, track.positions, labels=track.labels)
+    settings = dataset_settings(shots, bf.nominal_model())
+    same(bf.estimate(made, model=bf.nominal_model(), surfaces=shots.table, settings=settings), estimate)
+    plain = bf.estimate(bf.Track(track.times, track.positions), surfaces=shots.table)
+    assert (plain.name, plain.status) == ("track", bf.Status.OK)
+    same(bf.estimate((track.times, track.positions), surfaces=shots.table), plain)
+    rows = np.column_stack((track.times, track.positions))
+    same(bf.estimate(rows, surfaces=shots.table), plain)
+    np.testing.assert_array_equal(bf.predict(rows, surfaces=shots.table).positions, plain.predict(0.3).positions)
+
+
+def test_a_model_file_takes_the_place_of_the_nominal_model(track: bf.Track, tmp_path: Path) -> None:
+    model = bf.nominal_model()
+    with_drag = dict(model.named_parameters())["flight.drag.k"]
+    with_drag.data.fill_(0.15)
+    save_model(model, tmp_path / "model.yaml")
+    same(bf.estimate(track, model=tmp_path / "model.yaml"), bf.estimate(track, model=model))
+    found = bf.estimate(track, model=str(tmp_path / "model.yaml"), method="ekf").world
+    assert found is not None
+    assert float(dict(found.model.named_parameters())["flight.drag.k"].detach()) == 0.15
+
+
+def test_prediction_of_an_estimate_a_state_a_track_and_a_folder(
+    folder: Path, track: bf.Track, estimate: bf.Estimate
+) -> None:
+    ahead = bf.predict(estimate, horizon=0.3)
+    for other in (bf.predict(estimate.last, 0.3), bf.predict(track, 0.3), estimate.predict(0.3)):
+        np.testing.assert_array_equal(ahead.positions, other.positions)
+        np.testing.assert_array_equal(ahead.sigmas, other.sigmas)
+    np.testing.assert_allclose(ahead.times, estimate.times[-1] + 0.01 * np.arange(1, 31), atol=1e-12)
+    assert (np.diff(ahead.sigmas[:10].max(axis=1)) > 0.0).all()
+    found = bf.predict(folder, 0.2, observe=0.35)
+    assert list(found) == ["000", "001", "002"]
+    assert isinstance(found["000"], TrackPrediction)
+    miss = found["000"].measured - found["000"].positions
+    assert np.abs(miss / found["000"].sigmas).max() < 5.0
+
+
+@pytest.mark.thorough
+def test_diagnosis_finds_a_model_that_can_be_saved(tmp_path: Path) -> None:
+    shots = bf.read(written(tmp_path / "shots", 6))
+    found = bf.diagnose(shots)
+    found.model.save(tmp_path / "model.yaml")
+    again = bf.load_model(tmp_path / "model.yaml")
+    expected = dict(found.model.named_parameters())
+    for name, value in again.named_parameters():
+        assert float(value.detach()) == pytest.approx(float(expected[name].detach()), rel=1e-9)
+
+
+def test_tennis_balls_get_their_own_model(tmp_path: Path) -> None:
+    shots = bf.read(written(tmp_path / "serves", 1, ball=tennis()))
+    (track,) = shots
+    estimate = bf.estimate(track)
+    assert estimate.world is not None
+    found = dict(estimate.world.model.named_parameters())
+    for name, expected in bf.nominal_model(shots.ball).named_parameters():
+        assert float(found[name].detach()) == float(expected.detach())
+    table_tennis = dict(bf.nominal_model().named_parameters())
+    assert float(found["flight.drag.k"].detach()) < 0.5 * float(table_tennis["flight.drag.k"].detach())
+    assert estimate.world.model.radius == pytest.approx(0.033, abs=2e-3)
+
+
+def test_a_ball_stands_for_its_nominal_model(track: bf.Track) -> None:
+    found = bf.estimate(track, model=bf.Ball(0.033, 0.057)).world
+    assert found is not None
+    assert found.model.radius == 0.033
+
+
+def test_the_door_itself_is_light() -> None:
+    code = "import sys, ballfg as bf; bf.__version__; dir(bf); print({'torch', 'gtsam', 'numpy'} & sys.modules.keys())"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert said.stdout == "set()\n"
+    for name in ("read", "estimate", "predict", "diagnose", "Online", "BallState", "RadarSpeed", "SpinReading"):
+        assert name in dir(bf)
