@@ -19,7 +19,7 @@ from ballfg.estimation.noise.parameters import with_noise
 from ballfg.estimation.observations.sighted_dataset import SightedDataset
 from ballfg.estimation.out_of_distribution import out_of_distribution_share
 from ballfg.estimation.settings import MEASURED, Settings
-from ballfg.estimation.smoother.smoother import Smoother
+from ballfg.estimation.smoother.pieces.long_tracks import PiecewiseSmoother
 from ballfg.estimation.table_extent import TableExtent, find_table_extent
 from ballfg.factors.noise import PROCESS_NOISE, ProcessNoise
 from ballfg.progress import Watch, doing, unwatched
@@ -141,9 +141,8 @@ def tracks_settings(
     """
     doubts = {name: sigma for name, sigma in settings.coefficients.items() if name.startswith(DOUBT)}
     plain = replace(settings, coefficients={n: s for n, s in settings.coefficients.items() if n not in doubts})
-    outside = out_of_distribution_share(
-        model, [Smoother(model, surfaces, plain).estimate(part).states for part in parts]
-    )
+    smoother = PiecewiseSmoother(model, surfaces, plain)
+    outside = out_of_distribution_share(model, [smoother.estimate(part).states for part in parts])
     begun = plain if outside is None else with_usual_noise(plain, model, outside)
     found = estimate_noise(model, surfaces, begun, parts, position_known=position_known, errors=False, watch=watch)
     if found is None or outside is None:

@@ -16,7 +16,7 @@ ESTIMATORS: Final[Registry[Estimator]] = Registry(
     base=Estimator,
     remedy="docs/estimators.md has an example.",
     own={
-        "smoother": "ballfg.estimation.smoother.smoother:Smoother",
+        "smoother": "ballfg.estimation.smoother.pieces.long_tracks:PiecewiseSmoother",
         "online": "ballfg.estimation.online.online:Online",
         "ekf": "ballfg.estimation.filters.ekf:ExtendedKalmanFilter",
         "sliding-window": "ballfg.estimation.filters.sliding_window:SlidingWindow",

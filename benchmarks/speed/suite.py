@@ -24,8 +24,8 @@ from ballfg.dynamics.model_file import model_from_dict
 from ballfg.dynamics.motion.integrate import fly_jacobian
 from ballfg.estimation import Online, Settings, Smoother, dataset_settings, dataset_surfaces
 from ballfg.estimation.settings import Solver
-from ballfg.estimation.smoother.initial import initial_states
 from ballfg.estimation.smoother.problem import Events
+from ballfg.estimation.smoother.settle import initial_states
 from ballfg.factors.batch import Values
 from ballfg.factors.graph import BallGraph
 from ballfg.factors.gtsam_solver import GtsamLevenbergMarquardt

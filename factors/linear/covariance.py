@@ -1,6 +1,5 @@
 """Computes covariances of states and coefficients from the triangles of eliminations."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,71 +42,45 @@ class Covariances:
 
 @dataclass(frozen=True)
 class NeighbourCovariances:
-    """Covariances of t tracks with up to n states of w numbers (biases among them) and p coefficients each.
+    """Covariances of n states of w numbers (biases among them) and p coefficients, those of neighbours among them.
 
     Attributes:
-        states: (t, n, w, w).
-        cross: (t, n, w, w + p), of each state with the next one and the coefficients.
-        coefficients: (t, p, p).
+        states: (n, w, w).
+        cross: (n, w, w + p), of each state with the next one and with the coefficients.
+        coefficients: (p, p).
     """
 
     states: Array
     cross: Array
     coefficients: Array
 
-    def joint(self, track: int, left: Index, right: Index) -> Array:
-        """(m, d, e) covariances of pairs of one track's variables: equal, neighbours, or with the coefficients.
+    @classmethod
+    def of(cls, root: Root) -> "NeighbourCovariances":
+        """Blocks of (R^T R)^-1."""
+        (n, w), p = root.states.shape[:2], len(root.coefficients)
+        found = cls(np.empty((n, w, w)), np.empty((n, w, w + p)), np.empty((p, p)))
+        covariances_of(root, found.states, found.cross, found.coefficients)
+        return found
+
+    def joint(self, left: Index, right: Index) -> Array:
+        """(m, d, e) covariances of pairs of variables: equal, neighbours, or with the coefficients.
 
         Args: left: (m,) variable numbers.  right: (m,).
         """
         if left[0] == COEFFICIENTS or right[0] == COEFFICIENTS:
             if left[0] == right[0]:
-                return np.broadcast_to(self.coefficients[track], (len(left), *self.coefficients.shape[1:]))
+                return np.broadcast_to(self.coefficients, (len(left), *self.coefficients.shape))
             if left[0] == COEFFICIENTS:
-                return self.joint(track, right, left).swapaxes(-1, -2)
-            return self.cross[track, left][:, :, self.states.shape[-1] :]
+                return self.joint(right, left).swapaxes(-1, -2)
+            return self.cross[left][:, :, self.states.shape[-1] :]
         if (left == right).all():
-            return self.states[track, left]
+            return self.states[left]
         if left[0] > right[0]:
-            return self.joint(track, right, left).swapaxes(-1, -2)
-        return self.cross[track, left][:, :, : self.states.shape[-1]]
-
-
-class SquareRootInformation:
-    """The triangles R of several tracks.
-
-    Args: roots: one a track, all with as many coefficients.
-
-    Attributes:
-        tracks: their number t.  lengths: (t,) number of states of each.
-        width: numbers w of a state, biases among them.  coefficients: number p of them.
-    """
-
-    def __init__(self, roots: Sequence[Root]) -> None:
-        self.roots = tuple(roots)
-        self.tracks, self.lengths = len(roots), np.array([len(root.states) for root in roots])
-        self.width, self.coefficients = roots[0].width, len(roots[0].coefficients)
-
-    def log_determinants(self) -> Array:
-        """(t,) log det R, dimensionless."""
-        w, p = self.width, self.coefficients
-        own = [np.diagonal(root.states[:, :, :w], axis1=1, axis2=2) for root in self.roots]
-        shared = [np.diagonal(root.coefficients[:, 2 * w : 2 * w + p]) for root in self.roots]
-        return np.array([np.log(np.abs(a)).sum() + np.log(np.abs(b)).sum() for a, b in zip(own, shared, strict=True)])
-
-    def covariances(self) -> NeighbourCovariances:
-        """Blocks of (R^T R)^-1 of all tracks."""
-        t, n, w, p = self.tracks, max(self.lengths), self.width, self.coefficients
-        found = NeighbourCovariances(np.zeros((t, n, w, w)), np.zeros((t, n, w, w + p)), np.zeros((t, p, p)))
-        for k, (root, length) in enumerate(zip(self.roots, self.lengths, strict=True)):
-            states, cross = found.states[k, :length], found.cross[k, :length]
-            covariances_of(root, states, cross, found.coefficients[k])
-        return found
+            return self.joint(right, left).swapaxes(-1, -2)
+        return self.cross[left][:, :, : self.states.shape[-1]]
 
 
 def marginal_covariances(root: Root) -> Covariances:
     """Covariances of the states and coefficients of one track."""
-    (n, w), p = root.states.shape[:2], len(root.coefficients)
-    states, cross, coefficients = np.empty((n, w, w)), np.empty((n, w, w + p)), np.empty((p, p))
-    covariances_of(root, states, cross, coefficients)
-    return Covariances(states, coefficients, cross[:, :, w:])
+    found = NeighbourCovariances.of(root)
+    return Covariances(found.states, found.coefficients, found.cross[:, :, root.width :])

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ballfg.arrays import Array, Index
 from ballfg.factors.batch import Rows, Values
-from ballfg.factors.linear import elimination
+from ballfg.factors.linear import elimination, placement
 from ballfg.factors.linear.elimination import Root
 from ballfg.factors.linear.substitution import solution_of
 
@@ -110,7 +110,7 @@ def damped_rows(
     system, start, free = _system(pieces, n, p - held, p, w, further=damping > 0.0)
     diagonal = np.zeros((n + 1, w + p))
     if damping:
-        elimination.damp(system, start, free, w, damping, diagonal)
+        placement.damp(system, start, free, w, damping, diagonal)
     return system, start, diagonal
 
 
@@ -123,7 +123,7 @@ def _system(
     """
     counts = np.zeros(n + 1, dtype=np.int64)
     for variables, residual, _ in pieces:
-        wrong = elimination.count_rows(counts, _plain(variables), residual.shape[1])
+        wrong = placement.count_rows(counts, _plain(variables), residual.shape[1])
         if wrong >= 0:
             linked = sorted({int(v) for v in variables[wrong] if v >= 0})
             raise ValueError(
@@ -136,9 +136,9 @@ def _system(
     free, system = start[:-1].copy(), np.zeros((start[-1], elimination.padded(2 * width + p + 1)))
     for variables, residual, jacobians in pieces:
         rows, firsts = np.empty(len(variables), dtype=np.int64), np.empty(len(variables), dtype=np.int64)
-        elimination.place_residuals(system, free, _plain(variables), _plain(residual), rows, firsts)
+        placement.place_residuals(system, free, _plain(variables), _plain(residual), rows, firsts)
         for which, block in enumerate(jacobians):
-            elimination.place_block(system, width, own, rows, firsts, _plain(variables), which, _plain(block))
+            placement.place_block(system, width, own, rows, firsts, _plain(variables), which, _plain(block))
     return system, start, free
 
 

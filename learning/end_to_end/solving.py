@@ -12,8 +12,7 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import Smoother
 from ballfg.estimation.segmentation.result import Contact
 from ballfg.estimation.smoother.problem import effective_sigmas
-from ballfg.estimation.smoother.smoother import Earlier
-from ballfg.estimation.smoother.solution import Solution
+from ballfg.estimation.smoother.settle import Earlier, Solution
 from ballfg.factors.batch import Values
 from ballfg.factors.graph import Convergence, LevenbergMarquardt
 from ballfg.learning.augment import apply, rotate, undo

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ballfg.factors.linear.covariance import SquareRootInformation
+from ballfg.factors.linear.elimination import Root
 from ballfg.factors.linear.substitution import substitute_back, substitute_forward
 
 Product = Callable[[Tensor], Tensor]
@@ -31,8 +31,20 @@ class NotAMinimum(ValueError):  # noqa: N818 - the name is the statement
         self.tracks = tuple(tracks)
 
 
-class GaussNewtonFactors(SquareRootInformation):
-    """The factorisations R^T R of the Gauss-Newton matrices of several tracks, which solves all of them at once."""
+class GaussNewtonFactors:
+    """The factorisations R^T R of the Gauss-Newton matrices of several tracks, which solves all of them at once.
+
+    Args: roots: the triangle R of each track, all with as many coefficients.
+
+    Attributes:
+        tracks: their number t.  lengths: (t,) number of states of each.
+        width: numbers w of a state, biases among them.  coefficients: number p of them.
+    """
+
+    def __init__(self, roots: Sequence[Root]) -> None:
+        self.roots = tuple(roots)
+        self.tracks, self.lengths = len(roots), np.array([len(root.states) for root in roots])
+        self.width, self.coefficients = roots[0].width, len(roots[0].coefficients)
 
     def solve(self, vector: Tensor) -> Tensor:
         """R^-1 R^-T times a vector (n,) in the order of `Layout`: the solution (n,), in SI units."""

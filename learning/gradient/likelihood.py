@@ -33,37 +33,36 @@ def negative_log_likelihood(
         factors: their Gauss-Newton factorisations there.
         noise: relative to that of the graphs, to which its value must be equal.
     """
-    posterior = factors.covariances()
-    log_roots = factors.log_determinants()
     totals = []
-    for track, (graph, minimum) in enumerate(zip(graphs, minima, strict=True)):
+    for root, graph, minimum in zip(factors.roots, graphs, minima, strict=True):
+        posterior = NeighbourCovariances.of(root)
         rows = graph.linearize(minimum)
         kinds = [kind for kind in graph.batches if len(kind)]
-        value = log_roots[track] + sum(r.error() for r in rows) + sum(kind.log_spread() for kind in kinds)
+        value = root.log_determinant + sum(r.error() for r in rows) + sum(kind.log_spread() for kind in kinds)
         expected = torch.zeros((), dtype=torch.float64)
         for kind, linearized in zip(kinds, rows, strict=True):
             change = kind.noise_scale(noise)
             if change is not None:
-                expected = expected + _expected(kind, linearized, posterior, track, change)
+                expected = expected + _expected(kind, linearized, posterior, change)
         totals.append(float(value) + expected - expected.detach())
     return torch.stack(totals)
 
 
-def _expected(kind: FactorBatch, rows: Rows, posterior: NeighbourCovariances, track: int, change: Tensor) -> Tensor:
+def _expected(kind: FactorBatch, rows: Rows, posterior: NeighbourCovariances, change: Tensor) -> Tensor:
     """Expected negative log density of a kind's factors, as a function of the change that rewhitens them."""
-    square = torch.from_numpy(_mean_square(rows, posterior, track))
+    square = torch.from_numpy(_mean_square(rows, posterior))
     if change.dim():
         spread = -change.diagonal(dim1=-2, dim2=-1).log().sum()
         return 0.5 * (change * (change @ square)).sum() + spread
     return 0.5 * change.square() * torch.einsum("nii->", square) - len(kind) * kind.dim * change.log()
 
 
-def _mean_square(rows: Rows, posterior: NeighbourCovariances, track: int) -> Array:
+def _mean_square(rows: Rows, posterior: NeighbourCovariances) -> Array:
     """(m, r, r) r r^T + J C J^T of each factor; residuals and Jacobians weighted as those of C."""
     weight = rows.loss.weight(np.linalg.norm(rows.residual, axis=-1))
     total = weight[:, None, None] * rows.residual[:, :, None] * rows.residual[:, None, :]
     _, jacobians = weighted(rows)
     for a, left in enumerate(jacobians):
         for b, right in enumerate(jacobians):
-            total += left @ posterior.joint(track, rows.variables[:, a], rows.variables[:, b]) @ right.swapaxes(-1, -2)
+            total += left @ posterior.joint(rows.variables[:, a], rows.variables[:, b]) @ right.swapaxes(-1, -2)
     return np.asarray(total)

@@ -15,8 +15,8 @@ from ballfg.estimation.launcher import Launcher
 from ballfg.estimation.segmentation.result import Segmentation
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.problem import effective_sigmas
-from ballfg.estimation.smoother.smoother import Earlier, Smoother
-from ballfg.estimation.smoother.solution import Solution
+from ballfg.estimation.smoother.settle import Earlier, Solution
+from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.batch import Values
 from ballfg.factors.graph import Convergence, LevenbergMarquardt
 from ballfg.factors.loss import Loss

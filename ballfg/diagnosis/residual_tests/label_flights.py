@@ -19,12 +19,11 @@ from ballfg.dynamics import AnalyticModel, Surfaces
 from ballfg.estimation import Settings, Smoother, TrackProblem
 from ballfg.estimation.batch import map_tracks
 from ballfg.estimation.measurement.invert_measurement import InvertMeasurement
-from ballfg.estimation.smoother.initial import initial_states
 from ballfg.estimation.smoother.problem import UNINFORMATIVE_SPIN
-from ballfg.estimation.smoother.solution import Solution
+from ballfg.estimation.smoother.settle import Solution, initial_states
 from ballfg.factors.batch import Values
 from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Minimum
-from ballfg.factors.linear.covariance import SquareRootInformation, marginal_covariances
+from ballfg.factors.linear.covariance import marginal_covariances
 from ballfg.factors.loss import Loss
 from ballfg.state import SPIN
 from ballfg.tracks import Track
@@ -167,7 +166,6 @@ def _posterior(problem: TrackProblem, minimum: Minimum) -> LabelPosterior:
     assert label is not None
     assert minimum.step is not None
     root = minimum.step.root
-    log_root = float(SquareRootInformation([root]).log_determinants()[0])
     covariance = marginal_covariances(root).states[0][SPIN, SPIN]
-    log_density = -(minimum.error + log_root + 3.0 * np.log(label.sigma))
+    log_density = -(minimum.error + root.log_determinant + 3.0 * np.log(label.sigma))
     return LabelPosterior(label.spin, label.sigma, log_density, minimum.values.states[0, SPIN], covariance)

@@ -27,6 +27,7 @@ from ballfg.estimation.measurement.as_measured import (
 )
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.settings import Settings, sample_sigmas
+from ballfg.estimation.smoother.pieces.long_tracks import PiecewiseSmoother
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.batch import FactorBatch
 from ballfg.state import POSITION, STATE_DIM
@@ -83,8 +84,8 @@ class InvertMeasurement(Estimator):
         self.labels = LabelMap.of(model)
         own = replace(settings, spin_label_noise=settings.spin_label_noise / self.labels.gain)
         plain = plainly_measured(model)
-        self.smoother = Smoother(plain, self.surfaces, own)
-        self.inner = self.smoother if kind is Smoother else kind(plain, self.surfaces, own)
+        self.smoother = PiecewiseSmoother(plain, self.surfaces, own)
+        self.inner = self.smoother if kind in (Smoother, PiecewiseSmoother) else kind(plain, self.surfaces, own)
 
     def estimate(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Estimate:
         """The true states at the recorded stamps; `NOT_CONVERGED` if the shifts did not converge."""

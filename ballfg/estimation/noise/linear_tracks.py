@@ -21,8 +21,8 @@ from ballfg.estimation.batch import map_tracks
 from ballfg.estimation.segmentation.result import Quality
 from ballfg.estimation.settings import sample_sigmas
 from ballfg.estimation.smoother.problem import START_POSITION_SIGMA, TrackProblem, coefficient_means
+from ballfg.estimation.smoother.settle import Solution
 from ballfg.estimation.smoother.smoother import Smoother
-from ballfg.estimation.smoother.solution import Solution
 from ballfg.factors.dynamics import DynamicsFactors
 from ballfg.factors.noise import PROCESS_NOISE, Kicks
 from ballfg.progress import Watch, unwatched

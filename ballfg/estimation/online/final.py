@@ -14,7 +14,8 @@ from ballfg.estimation.online.windows.stream_window import StreamWindow
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.segmentation.result import Contact, Segmentation
 from ballfg.estimation.settings import Settings
-from ballfg.estimation.smoother.smoother import Earlier, Smoother
+from ballfg.estimation.smoother.settle import Earlier
+from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 from ballfg.tracks import Track
 

@@ -18,9 +18,8 @@ from ballfg.estimation.observations.observation import Context, Observation, Unk
 from ballfg.estimation.observations.positions import observations_of
 from ballfg.estimation.segmentation.result import Contact, Quality, Segmentation
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, total_sigmas
-from ballfg.estimation.smoother.dynamics import TrackDynamics
-from ballfg.estimation.smoother.initial import bridged_positions
-from ballfg.estimation.smoother.low_hops import LowHops
+from ballfg.estimation.smoother.motion import TrackDynamics
+from ballfg.estimation.smoother.second_look.low_hops import LowHops
 from ballfg.factors.batch import FactorBatch, Values
 from ballfg.factors.correlated_noise import BIAS_DIM, BiasFactors, BiasStartFactors
 from ballfg.factors.dynamics import ContactFactors, model_width
@@ -164,6 +163,15 @@ def _velocities(track: Track, segmentation: Segmentation, settings: Settings) ->
     breaks = np.array([c.interval for c in segmentation.contacts], dtype=np.int64)
     breaks = np.unique(np.concatenate((breaks, segmentation.hits, segmentation.restarts)))
     return window_velocities(track.times, bridged_positions(track, segmentation), breaks)
+
+
+def bridged_positions(track: Track, segmentation: Segmentation) -> Array:
+    """(n, 3) m: measured positions, with lines between neighbours in place of outliers and shifted runs."""
+    trusted = segmentation.quality <= Quality.WIDE
+    if trusted.all() or not trusted.any():
+        return track.positions.copy()
+    columns = [np.interp(track.times, track.times[trusted], axis[trusted]) for axis in track.positions.T]
+    return np.stack(columns, axis=-1)
 
 
 def _biases(times: Array, settings: Settings) -> list[FactorBatch]:

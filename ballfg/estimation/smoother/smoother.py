@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,70 +13,42 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.window_velocity import window_velocities
-from ballfg.estimation.plausible import plausible
+from ballfg.estimation.plausible import measured_only, plausible
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.batch import segment
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.segmentation.result import Segmentation
 from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
 from ballfg.estimation.sides.widening import widened_near_contacts
-from ballfg.estimation.smoother.at_end import with_both_sides
-from ballfg.estimation.smoother.contacts import ContactSearch
-from ballfg.estimation.smoother.grip import rival_note, with_other_spins
-from ballfg.estimation.smoother.initial import initial_states
-from ballfg.estimation.smoother.low_hops import LowHops, counted, low_hops, uncounted_note, with_low_hops
 from ballfg.estimation.smoother.problem import Events, TrackProblem
-from ballfg.estimation.smoother.restart import label_let_go, minimise_with_restart
-from ballfg.estimation.smoother.solution import (
+from ballfg.estimation.smoother.second_look.at_end import with_both_sides
+from ballfg.estimation.smoother.second_look.low_hops import LowHops, counted, low_hops, uncounted_note, with_low_hops
+from ballfg.estimation.smoother.second_look.spin_ambiguity import rival_note, with_other_spins
+from ballfg.estimation.smoother.settle import (
     ROUGH,
+    ContactSearch,
+    Earlier,
     Solution,
-    prior_covariances,
-    status_of,
+    initial_states,
+    label_let_go,
+    leads_nowhere,
+    minimise_with_restart,
     timed_contacts,
     worst_break,
 )
 from ballfg.factors.batch import FactorBatch, Values
-from ballfg.factors.correlated_noise import BiasStartFactors
-from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt
+from ballfg.factors.graph import Convergence, LevenbergMarquardt, Minimum
 from ballfg.factors.gtsam_solver import GtsamLevenbergMarquardt
 from ballfg.factors.linear.covariance import Covariances
-from ballfg.factors.prior import PriorFactors
 from ballfg.state import STATE_DIM
 from ballfg.tracks import Ball, Track
 
 MAX_UNSEEN_HITS = 8
 """Largest number of hits that the estimate adds to the segmentation's; measured logs needed three at most."""
-NOWHERE = (Convergence.STUCK, Convergence.TOO_MANY_ITERATIONS)
-LEAST_GAIN = 0.9
-"""Of the objective. If a search fails and the worst of up to eight hits leaves more than this share, missing hits are
-not the reason: the stated noise is far too small, and every further hit would cost a long search."""
-LONG = 10_000
-"""Number of samples from which a track is smoothed in pieces that are then joined (docs/derivations/long_tracks.md). In
-one piece it takes 20 kB a sample."""
-
 OFFSET_ROUNDS = 6
 """Largest number of corrections of stamps by estimated time offsets; 4 ms need three."""
 FIRST_STEPS = 15
 """Linear solutions of the first round, after which stamps are corrected in any case."""
-
-
-@dataclass(frozen=True)
-class Earlier:
-    """The information from samples before those of a problem.
-
-    Attributes:
-        start: initial values of the minimisation.
-        summaries: factors with the information of removed states; they replace priors on the same variables.
-    """
-
-    start: Values
-    summaries: Sequence[FactorBatch] = ()
-
-    def join(self, graph: BallGraph) -> BallGraph:
-        """The window's graph with the summaries in it."""
-        known, priors = {int(v) for s in self.summaries for v in s.variables[0]}, (PriorFactors, BiasStartFactors)
-        kept = [b for b in graph.batches if not (isinstance(b, priors) and int(b.variables[0, 0]) in known)]
-        return BallGraph((*kept, *self.summaries))
 
 
 class Smoother(Estimator):
@@ -87,6 +59,9 @@ class Smoother(Estimator):
 
     If observations add unknowns that change stamps (`settings.time_offsets` of cameras), stamps are corrected by their
     estimates until they converge.
+
+    A track is smoothed at once, whatever its length, with 20 kB a sample. bf.estimate and `make_estimator` give the
+    `PiecewiseSmoother`, which smooths long ones in pieces.
 
     Args:
         model: the ball.  surfaces: table and floor.  settings: noise and priors.
@@ -115,12 +90,9 @@ class Smoother(Estimator):
         """
         track = self.prepared(track, factors)
         moving = move_stamps and bool(self.settings.time_offsets)
-        if self.is_long(track):
-            from ballfg.estimation.smoother.pieces.whole import in_pieces  # which needs this file
-
-            joined = in_pieces(self, track.since_first())
-            if joined is not None:
-                return joined.dated(track.times)
+        joined = self.in_pieces(track)
+        if joined is not None:
+            return joined
         smoother = self.first_look() if moving else self
         for _ in range(OFFSET_ROUNDS):
             problem = smoother.problem(track.since_first())
@@ -134,23 +106,12 @@ class Smoother(Estimator):
             track, smoother = retimed[0] if retimed else track, self
         return replace(estimate, status=Status.NOT_CONVERGED)
 
-    def is_long(self, track: Track) -> bool:
-        """True if a track is smoothed in pieces; with changing stamps or GTSAM's solver it is smoothed at once."""
-        return len(track) >= LONG and not self.settings.time_offsets and self.settings.solver != "gtsam"
+    def in_pieces(self, track: Track) -> Estimate | None:
+        """The estimate of a track that is too long to be smoothed at once; None for all others, and always here.
 
-    def in_sections(self, track: Track) -> Iterator[Estimate]:
-        """The estimate of a long track section by section, of any other as a whole."""
-        if self.is_long(track):
-            from ballfg.estimation.smoother.pieces.whole import sections  # which needs this file
-
-            found = sections(self, self.prepared(track).since_first())
-            if found is not None:
-                begin = 0
-                for part in found:
-                    yield part.dated(track.times[begin : begin + len(part)], float(track.times[0]))
-                    begin += len(part)
-                return
-        yield self.estimate(track)
+        `PiecewiseSmoother` has one. Args: track: prepared.
+        """
+        return None
 
     def first_look(self) -> Smoother:
         """The smoother for stamps with errors of milliseconds.
@@ -218,7 +179,7 @@ class Smoother(Estimator):
             solution = search.best
             if earlier is None and self.settings.spin_label(problem.track) is None:
                 solution = with_other_spins(solution, problem.ball, rough)
-            if before is not None and _leads_nowhere(solution, before):
+            if before is not None and leads_nowhere(solution, before):
                 break
             interval = worst_break(solution) if left else None
             if interval is None:
@@ -287,7 +248,21 @@ class Smoother(Estimator):
         return widened_near_contacts(estimate, problem.ball)
 
 
-def _leads_nowhere(solution: Solution, before: Solution) -> bool:
-    """True if one more hit left the search without a minimum and hardly lowered the objective."""
-    found, gone = solution.minimum, solution.minimum.convergence in NOWHERE
-    return gone and found.error > LEAST_GAIN * before.minimum.error
+def status_of(minimum: Minimum, linked: int) -> Status:
+    """The status of a track's estimate.
+
+    Args: linked: intervals between samples over which the motion of the ball is followed.
+    """
+    if minimum.convergence is Convergence.NOT_FINITE or minimum.step is None:
+        return Status.FAILED
+    if linked < 1:
+        return Status.NO_VELOCITY
+    at_minimum = minimum.convergence in (Convergence.CONVERGED, Convergence.AT_KINK)
+    return Status.OK if at_minimum else Status.NOT_CONVERGED
+
+
+def prior_covariances(problem: TrackProblem) -> Covariances:
+    """Covariance of each state by itself, for a graph that could not be solved."""
+    coefficients = problem.coefficient_sigmas
+    _, states = measured_only(problem.track.positions, problem.sigma, problem.settings)
+    return Covariances(states, np.diag(coefficients**2), np.zeros((len(states), STATE_DIM, len(coefficients))))

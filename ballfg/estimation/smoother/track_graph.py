@@ -14,8 +14,8 @@ from ballfg.checks import shown
 from ballfg.dynamics.model import BallModel
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.smoother.problem import TrackProblem
+from ballfg.estimation.smoother.settle import Solution
 from ballfg.estimation.smoother.smoother import Smoother
-from ballfg.estimation.smoother.solution import Solution
 from ballfg.factors.bridge import STATE_KEY, from_gtsam, nonlinear_graph, to_gtsam
 from ballfg.factors.graph import Convergence, Minimum
 from ballfg.factors.gtsam_solver import Marginals

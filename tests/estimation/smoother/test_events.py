@@ -12,8 +12,8 @@ from ballfg.dynamics import Surfaces
 from ballfg.dynamics.motion.contact import contact_time
 from ballfg.estimation.result import Status
 from ballfg.estimation.segmentation.result import Contact
-from ballfg.estimation.smoother.initial import initial_states, move_contacts
 from ballfg.estimation.smoother.motion import Motion
+from ballfg.estimation.smoother.settle import initial_states, move_contacts
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.tracks import Track
 from tests.estimation.smoother.serve import (

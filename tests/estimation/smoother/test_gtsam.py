@@ -16,7 +16,7 @@ from ballfg.dynamics import EFFECTS
 from ballfg.estimation.online.windows.chain import ChainWindow
 from ballfg.estimation.online.windows.window import IsamWindow
 from ballfg.estimation.segmentation.result import Contact, Segmentation
-from ballfg.estimation.smoother.low_hops import LowHops
+from ballfg.estimation.smoother.second_look.low_hops import LowHops
 from ballfg.factors import LevenbergMarquardt
 from ballfg.factors.gtsam_solver import GtsamLevenbergMarquardt
 from ballfg.factors.loss import Loss

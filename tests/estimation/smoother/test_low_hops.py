@@ -9,8 +9,8 @@ import pytest
 
 from ballfg.estimation.result import Status
 from ballfg.estimation.segmentation.result import Segmentation
-from ballfg.estimation.smoother.hop_grid import RESTS, SPEEDS, HopGrid, HopLaw, averaged
-from ballfg.estimation.smoother.low_hops import _Ball, counted, uncounted_note
+from ballfg.estimation.smoother.second_look.hop_grid import RESTS, SPEEDS, HopGrid, HopLaw, averaged
+from ballfg.estimation.smoother.second_look.low_hops import _Ball, counted, uncounted_note
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.tracks import Track
 from tests.estimation.low_bounces import LIMIT, LYING, MODEL, SETTINGS, SURFACES, beside_bounces, hopping_out, nees

@@ -12,14 +12,14 @@ import pytest
 from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.settings import Settings
-from ballfg.estimation.smoother import near_bounce
-from ballfg.estimation.smoother import smoother as smoother_module
-from ballfg.estimation.smoother.pieces import joining
+from ballfg.estimation.smoother.pieces import joining, long_tracks
 from ballfg.estimation.smoother.pieces.joining import joined_minimum
+from ballfg.estimation.smoother.pieces.long_tracks import PiecewiseSmoother
 from ballfg.estimation.smoother.pieces.looks import bounds_of, cut_between, look
 from ballfg.estimation.smoother.pieces.reduction import Point, Reduction
 from ballfg.estimation.smoother.pieces.section import part_of
 from ballfg.estimation.smoother.pieces.whole import in_pieces
+from ballfg.estimation.smoother.second_look import spin_ambiguity
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.graph import LevenbergMarquardt
 from ballfg.factors.linear.step import solve
@@ -145,16 +145,16 @@ def test_a_ball_that_lies_still_across_many_pieces():
 
 
 def test_results_do_not_depend_on_the_number_of_processes(monkeypatch):
-    monkeypatch.setattr(smoother_module, "LONG", 1000)
-    smoother, track = Smoother(MODEL, TABLE, Settings.for_measured(MODEL)), rally(6500, seed=2)
+    monkeypatch.setattr(long_tracks, "LONG", 1000)
+    smoother, track = PiecewiseSmoother(MODEL, TABLE, Settings.for_measured(MODEL)), rally(6500, seed=2)
     one, two = (with_jobs(jobs, smoother.estimate, track) for jobs in (1, 2))
     assert one.states.tobytes() == two.states.tobytes()
     assert one.covariances.tobytes() == two.covariances.tobytes()
 
 
 def test_sections_follow_one_another_and_are_the_whole(monkeypatch):
-    monkeypatch.setattr(smoother_module, "LONG", 1000)
-    smoother, track = Smoother(MODEL, TABLE, Settings.for_measured(MODEL)), rally(4500, seed=4)
+    monkeypatch.setattr(long_tracks, "LONG", 1000)
+    smoother, track = PiecewiseSmoother(MODEL, TABLE, Settings.for_measured(MODEL)), rally(4500, seed=4)
     parts, whole = list(smoother.in_sections(track)), smoother.estimate(track)
     assert len(parts) == 2
     assert np.array_equal(np.concatenate([part.states for part in parts]), whole.states)
@@ -179,7 +179,7 @@ def test_a_bounce_that_is_looked_at_by_itself_first_ends_in_the_same_minimum(mon
     """Searching the whole chain for every bounce finds nothing that the short look has left out."""
     smoother, track = Smoother(MODEL, TABLE, Settings.for_measured(MODEL)), rally(900, seed=7)
     short = smoother.estimate(track)
-    monkeypatch.setattr(near_bounce, "LONG_CHAIN", 10_000)
+    monkeypatch.setattr(spin_ambiguity, "LONG_CHAIN", 10_000)
     full = smoother.estimate(track)
     assert short.error == pytest.approx(full.error, abs=1e-6)
     assert np.abs((short.states - full.states) / full.sigmas).max() < 1e-4

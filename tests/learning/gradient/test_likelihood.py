@@ -13,7 +13,7 @@ from torch import Tensor
 from ballfg.dynamics import Surfaces
 from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.segmentation.result import Segmentation
-from ballfg.factors.linear.covariance import marginal_covariances
+from ballfg.factors.linear.covariance import NeighbourCovariances, marginal_covariances
 from ballfg.factors.loss import Loss
 from ballfg.learning.end_to_end.learnables import NoiseScales
 from ballfg.learning.gradient.likelihood import negative_log_likelihood
@@ -204,14 +204,13 @@ def test_pieces_that_nothing_links() -> None:
 
 @pytest.mark.parametrize("coefficients", [False, True], ids=["states", "coefficient"])
 def test_posterior_covariances_are_the_smoother_s(coefficients) -> None:
-    """Padding of the shorter track changes nothing, and neighbours' covariances are those of a dense inverse."""
-    found = falling(coefficients=coefficients).solve()
-    posterior = factors_of(found).covariances()
-    for k, one in enumerate(found):
+    """Those of neighbours are those of a dense inverse, and so is the determinant."""
+    for one in falling(coefficients=coefficients).solve():
         n, p = len(one.minimum.values.states), int(coefficients)
-        expected = marginal_covariances(one.minimum.step.root)
-        np.testing.assert_allclose(posterior.states[k, :n], expected.states, rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(posterior.coefficients[k], expected.coefficients, rtol=1e-9)
+        root = one.minimum.step.root
+        posterior, expected = NeighbourCovariances.of(root), marginal_covariances(root)
+        np.testing.assert_allclose(posterior.states, expected.states, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(posterior.coefficients, expected.coefficients, rtol=1e-9)
         size = 9 * n + p
         information = np.zeros((size, size))
         for rows in one.graph.linearize(one.minimum.values):
@@ -224,8 +223,8 @@ def test_posterior_covariances_are_the_smoother_s(coefficients) -> None:
         sign, log = np.linalg.slogdet(information / np.outer(scale, scale))
         assert sign == 1.0
         half = 0.5 * log + np.log(scale).sum()
-        assert factors_of(found).log_determinants()[k] == pytest.approx(half, abs=1e-7)
+        assert root.log_determinant == pytest.approx(half, abs=1e-7)
         for i in range(n - 1):
             following = dense[9 * i : 9 * i + 9, 9 * i + 9 : 9 * i + 18]
             unit = np.sqrt(np.outer(np.diag(dense)[9 * i : 9 * i + 9], np.diag(dense)[9 * i + 9 : 9 * i + 18]))
-            assert np.abs((posterior.cross[k, i, :, :9] - following) / unit).max() < 1e-6
+            assert np.abs((posterior.cross[i, :, :9] - following) / unit).max() < 1e-6

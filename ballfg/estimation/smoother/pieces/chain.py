@@ -11,7 +11,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.estimation.smoother.pieces.reduction import Ends, Point
 from ballfg.factors.batch import COEFFICIENTS, Rows, Values
-from ballfg.factors.linear.covariance import NeighbourCovariances, SquareRootInformation
+from ballfg.factors.linear.covariance import NeighbourCovariances
 from ballfg.factors.linear.elimination import Root
 from ballfg.factors.linear.step import solve
 from ballfg.factors.loss import Loss
@@ -38,12 +38,12 @@ class Chain:
 
     @cached_property
     def _known(self) -> NeighbourCovariances:
-        return SquareRootInformation([self.root]).covariances()
+        return NeighbourCovariances.of(self.root)
 
     @property
     def coefficient_covariance(self) -> Array:
         """(p, p) in the products of the coefficients' units."""
-        return self._known.coefficients[0]
+        return self._known.coefficients
 
     def covariances(self) -> list[Array]:
         """For each section the joint covariance of its last end, the coefficients, its first end."""
@@ -83,10 +83,10 @@ def _moved(ends: Ends, point: Point, last: Array, coefficients: Array) -> tuple[
 
 def _joint(found: NeighbourCovariances, section: int) -> Array:
     """(2 w + p, 2 w + p) of a section's last end, the coefficients, its first end."""
-    (first, last), w = found.states[0, section : section + 2], found.states.shape[-1]
-    across, behind = np.split(found.cross[0, section], [w], axis=1)
-    shared = found.cross[0, section + 1][:, w:]
-    return np.block([[last, shared, across.T], [shared.T, found.coefficients[0], behind.T], [across, behind, first]])
+    (first, last), w = found.states[section : section + 2], found.states.shape[-1]
+    across, behind = np.split(found.cross[section], [w], axis=1)
+    shared = found.cross[section + 1][:, w:]
+    return np.block([[last, shared, across.T], [shared.T, found.coefficients, behind.T], [across, behind, first]])
 
 
 def moved_rows(rows: Rows, step: Array) -> Rows:

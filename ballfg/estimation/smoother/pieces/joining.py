@@ -21,7 +21,7 @@ from ballfg.estimation.smoother.pieces.chain import Chain, Point, moved_rows, so
 from ballfg.estimation.smoother.pieces.looks import bounds_of, cut_between, joined, look, section_of
 from ballfg.estimation.smoother.pieces.reduction import Ends, Reduction, Response
 from ballfg.estimation.smoother.pieces.section import State, part_of, prior_rows
-from ballfg.estimation.smoother.solution import ROUGH
+from ballfg.estimation.smoother.settle import ROUGH
 from ballfg.factors.batch import Values
 from ballfg.factors.graph import AT_KINK, RATE_MARGIN, Convergence, objective
 from ballfg.parallel.parts import in_parts

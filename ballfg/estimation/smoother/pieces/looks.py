@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array, Index
 from ballfg.estimation.segmentation.result import Contact, Rest, Segmentation
 from ballfg.estimation.smoother.pieces.section import Section, events_of, part_of, shifted
-from ballfg.estimation.smoother.solution import places_of, timed_contacts
+from ballfg.estimation.smoother.settle import places_of, timed_contacts
 from ballfg.factors.batch import Values
 from ballfg.tracks import Track
 

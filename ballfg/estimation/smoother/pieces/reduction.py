@@ -14,7 +14,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.factors.batch import COEFFICIENTS, Rows, Values
-from ballfg.factors.linear.covariance import Covariances, SquareRootInformation
+from ballfg.factors.linear.covariance import Covariances, marginal_covariances
 from ballfg.factors.linear.elimination import Root, eliminate
 from ballfg.factors.linear.step import WAITING, damped_rows
 from ballfg.factors.linear.substitution import substitute_back
@@ -147,11 +147,11 @@ class Reduction:
 
         Args: ends: (w + p + w, w + p + w) of the last state, the coefficients, the first state.
         """
-        w, p = self.width, self.coefficients
-        found = SquareRootInformation([self._known(_triangle(ends))]).covariances()
-        shared = found.coefficients[0]
-        states = np.concatenate((shared[None, p:, p:], found.states[0]))
-        cross = np.concatenate((shared[None, p:, :p], found.cross[0, :, :, w : w + p]))
+        p = self.coefficients
+        found = marginal_covariances(self._known(_triangle(ends)))
+        shared = found.coefficients
+        states = np.concatenate((shared[None, p:, p:], found.states))
+        cross = np.concatenate((shared[None, p:, :p], found.cross[:, :, :p]))
         return Covariances(states, shared[:p, :p], cross)
 
     def _known(self, triangle: Array) -> Root:

@@ -17,15 +17,15 @@ from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.result import Contact
 from ballfg.estimation.settings import sample_sigmas
 from ballfg.estimation.sides.widening import Shared, widening_near_contacts
-from ballfg.estimation.smoother.at_end import with_both_sides
-from ballfg.estimation.smoother.grip import rival_note
-from ballfg.estimation.smoother.low_hops import uncounted_note, with_low_hops
 from ballfg.estimation.smoother.pieces.chain import Point
 from ballfg.estimation.smoother.pieces.joining import Joined, joined_minimum, watched
 from ballfg.estimation.smoother.pieces.reduction import Reduction
 from ballfg.estimation.smoother.pieces.section import State
 from ballfg.estimation.smoother.problem import TrackProblem
-from ballfg.estimation.smoother.solution import Solution, timed_contacts
+from ballfg.estimation.smoother.second_look.at_end import with_both_sides
+from ballfg.estimation.smoother.second_look.low_hops import uncounted_note, with_low_hops
+from ballfg.estimation.smoother.second_look.spin_ambiguity import rival_note
+from ballfg.estimation.smoother.settle import Solution, timed_contacts
 from ballfg.factors.batch import Values
 from ballfg.factors.graph import BallGraph, Convergence, Minimum
 from ballfg.factors.linear.covariance import Covariances

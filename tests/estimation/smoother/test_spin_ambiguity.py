@@ -11,9 +11,9 @@ import torch
 import ballfg.estimation.smoother.smoother as room
 from ballfg.dynamics.motion.impact import slip_velocity
 from ballfg.estimation.segmentation.result import Contact
-from ballfg.estimation.smoother.grip import Bounce, bounces_of, other_sides
+from ballfg.estimation.smoother.second_look.spin_ambiguity import Bounce, bounces_of, other_sides
+from ballfg.estimation.smoother.settle import Solution
 from ballfg.estimation.smoother.smoother import Smoother
-from ballfg.estimation.smoother.solution import Solution
 from ballfg.factors.batch import Values
 from tests.estimation.smoother.one_bounce import FALSE, MODEL, SETTINGS, SURFACES, excess, flown, measured, one_bounce
 

@@ -25,7 +25,7 @@ from ballfg.estimation.result import Estimate
 from ballfg.estimation.segmentation.result import Contact, Rest, Segmentation
 from ballfg.estimation.segmentation.settings import SegmentationSettings
 from ballfg.estimation.settings import Settings, sample_sigmas
-from ballfg.estimation.smoother.hop_grid import HopGrid, HopLaw, HopMoments, averaged
+from ballfg.estimation.smoother.second_look.hop_grid import HopGrid, HopLaw, HopMoments, averaged
 from ballfg.state import POSITION, STATE_DIM, VZ, Z
 from ballfg.tracks import Track
 

@@ -3,6 +3,9 @@
 While the ball slides, friction determines the direction of the slip only; once it grips, friction determines all of the
 slip. A search that starts on one side may stop before it reaches the other. So a second search starts on the other side
 and continues while it stays there; the lower minimum is the result. A spin label, if any, chooses the side.
+
+A search of a whole long chain for every bounce would take a time that grows with the square of its length. There the
+samples around a bounce decide first, and only spins that are clearly worse there are skipped.
 """
 
 from __future__ import annotations
@@ -16,11 +19,11 @@ import torch
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.impact import slip_velocity
-from ballfg.estimation.smoother.near_bounce import worth_a_search
-from ballfg.estimation.smoother.solution import Solution
-from ballfg.factors.batch import Values
+from ballfg.estimation.smoother.settle import Solution
+from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Values
 from ballfg.factors.dynamics import model_width
-from ballfg.factors.graph import Convergence, LevenbergMarquardt
+from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt
+from ballfg.factors.prior import PriorFactors, spin_prior
 from ballfg.state import SPIN, STATE_DIM, VELOCITY
 
 SLIDES = 0.05
@@ -34,12 +37,16 @@ NEXT = 1.1
 NUDGE = 1.01
 LEAST_SLIP = 1e-3
 """m/s, below which a slip has no direction."""
-
-
 TIE = 2.0
 """Of the objective, a log likelihood: a minimum that is higher by less has at least a seventh of the probability."""
 RIVAL_APART = 2.5
 """Posterior standard deviations of the spin beyond which another spin is reported."""
+LONG_CHAIN = 500
+"""Number of states from which a bounce is first tested by itself."""
+REACH = 8
+"""Number of samples beyond those whose spin the bounce determines."""
+SPIN_SPREAD = 60.0
+"""rad/s, prior about the estimated spin of the first state in the test: it stands for all earlier samples."""
 
 
 def with_other_spins(solution: Solution, model: BallModel, optimizer: LevenbergMarquardt) -> Solution:
@@ -158,6 +165,62 @@ def other_sides(values: Values, bounces: Sequence[Bounce], model: BallModel) -> 
             yield OtherSide(start, bounce.interval, float(ends[k]), bool(slides[k]), model.radius)
         else:
             yield None
+
+
+def worth_a_search(
+    solution: Solution, bounce: Bounce, side: OtherSide, optimizer: LevenbergMarquardt, margin: float
+) -> bool:
+    """True if the minimum on the other side of a bounce is, nearby, another one and higher by less than a margin.
+
+    Args:
+        solution: of the whole chain.
+        bounce: in it.
+        side: start of a search on the other side.
+        optimizer: for both minima.
+        margin: of the objective, a log likelihood.
+    """
+    count = len(solution.minimum.values.states)
+    if count < LONG_CHAIN or solution.minimum.step is None:
+        return True
+    first, last = max(0, bounce.first - REACH), min(count - 1, bounce.last + REACH)
+    graph, begin = _around(solution, first, last), _taken(side.values, first, last)
+    holds = replace(side, interval=side.interval - first).holds
+    there = optimizer.minimize(graph, begin, holds)
+    if there.convergence is not Convergence.CONVERGED:
+        return False
+    here = optimizer.minimize(graph, _taken(solution.minimum.values, first, last))
+    higher = there.error - here.error
+    return higher < margin and abs(higher) > optimizer.tolerance
+
+
+def _taken(values: Values, first: int, last: int) -> Values:
+    inside = slice(first, last + 1)
+    return replace(
+        values, states=values.states[inside], biases=None if values.biases is None else values.biases[inside]
+    )
+
+
+def _around(solution: Solution, first: int, last: int) -> BallGraph:
+    """The factors among some states; the whole chain's covariance is the prior of the coefficients."""
+    values, step = solution.minimum.values, solution.minimum.step
+    assert step is not None
+    batches: list[FactorBatch] = []
+    for batch in solution.graph.batches:
+        states = batch.variables
+        inside = ((states >= first) & (states <= last) | (states == COEFFICIENTS)).all(axis=1)
+        inside &= (states != COEFFICIENTS).any(axis=1)
+        if inside.any():
+            part = batch.select(np.flatnonzero(inside))
+            part.variables = np.where(part.variables == COEFFICIENTS, COEFFICIENTS, part.variables - first)
+            batches.append(part)
+    w, p = step.root.width, len(values.coefficients)
+    if p:
+        known = step.root.coefficients[:, 2 * w : 2 * w + p]
+        batches.append(PriorFactors(np.array([COEFFICIENTS]), values.coefficients[None], known[None]))
+    if first > 0:
+        spread = np.full((1, 3), SPIN_SPREAD)
+        batches.append(spin_prior(np.zeros(1, dtype=np.int64), values.states[first : first + 1, SPIN], spread))
+    return BallGraph(tuple(batches))
 
 
 def _turned(values: Values, bounce: Bounce, before: Array, after: Array) -> Values:

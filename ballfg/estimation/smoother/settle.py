@@ -1,0 +1,289 @@
+"""Starts the search for a minimum, arranges its contacts, and starts it again where it went wrong.
+
+A minimum is found for one arrangement of contacts. Contacts whose estimated time lies outside of their interval then
+move, and the next minimum is computed, until they stay; the lowest minimum is the result.
+
+Cauchy's loss lets go. From a rough start a spin may move so far from its label that it hardly pulls any more; the
+search then ends in another minimum, or on a slope. In that case convex losses lead to the label's minimum, where the
+search starts again; the lower minimum is the result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from ballfg.arrays import Array
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.motion.contact import fly_through
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.filters.window_velocity import window_velocities
+from ballfg.estimation.launcher import SpinLabel
+from ballfg.estimation.segmentation.result import Contact, Segmentation
+from ballfg.estimation.smoother.motion import contacts_by_interval
+from ballfg.estimation.smoother.problem import Events, TrackProblem, bridged_positions, contact_batches
+from ballfg.factors.batch import FactorBatch, Values
+from ballfg.factors.correlated_noise import BiasStartFactors
+from ballfg.factors.dynamics import DynamicsFactors, model_width
+from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Minimum
+from ballfg.factors.launcher import LauncherSpinFactors
+from ballfg.factors.prior import PriorFactors, SpinLabelFactors
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ, Z
+from ballfg.tracks import Track
+
+ROUGH = 1e-2
+"""Posterior standard deviations. Minima of this accuracy show the places of contacts and hits; only the last one is
+found to the optimizer's own tolerance."""
+BROKEN = 8.0
+"""Norm of a whitened dynamics residual (9 dimensions) beyond which its interval hides a hit; chance: one in 1e9."""
+NOWHERE = (Convergence.STUCK, Convergence.TOO_MANY_ITERATIONS)
+LEAST_GAIN = 0.9
+"""Of the objective. If a search fails and the worst of up to eight hits leaves more than this share, missing hits are
+not the reason: the stated noise is far too small, and every further hit would cost a long search."""
+LEAST_FALL = 0.05
+"""m/s, least downward speed of a guess before a contact."""
+MAX_REFINEMENTS = 6
+"""Largest number of moves of contacts to a neighbouring interval; measured tracks needed two."""
+LABELS = (LauncherSpinFactors, SpinLabelFactors)
+"""Factors of a spin known before the flight. A few of many sightings are far off as a matter of course; a track's
+single label is not."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A minimised graph and its events."""
+
+    events: Events
+    graph: BallGraph
+    minimum: Minimum
+    rival: Array | None = None
+    """(3,) rad/s, first spin of another minimum that is nearly as low, if any."""
+
+
+@dataclass(frozen=True)
+class Earlier:
+    """The information from samples before those of a problem.
+
+    Attributes:
+        start: initial values of the minimisation.
+        summaries: factors with the information of removed states; they replace priors on the same variables.
+    """
+
+    start: Values
+    summaries: Sequence[FactorBatch] = ()
+
+    def join(self, graph: BallGraph) -> BallGraph:
+        """The window's graph with the summaries in it."""
+        known, priors = {int(v) for s in self.summaries for v in s.variables[0]}, (PriorFactors, BiasStartFactors)
+        kept = [b for b in graph.batches if not (isinstance(b, priors) and int(b.variables[0, 0]) in known)]
+        return BallGraph((*kept, *self.summaries))
+
+
+def initial_states(
+    track: Track,
+    contacts: tuple[Contact, ...],
+    segmentation: Segmentation,
+    model: BallModel,
+    label: SpinLabel | None,
+) -> Array:
+    """(n, 9) states from the sliding window: measured positions, mean velocities of windows without events.
+
+    The spin is the label's, or zero, up to the first contact; each contact changes it by the model. A resting ball is
+    put on its surface and rolls.
+    """
+    states = np.zeros((len(track), STATE_DIM))
+    states[:, POSITION] = bridged_positions(track, segmentation)
+    breaks = np.unique([c.interval for c in contacts] + segmentation.hits.tolist() + segmentation.restarts.tolist())
+    states[:, VELOCITY] = window_velocities(track.times, states[:, POSITION], breaks.astype(np.int64))
+    if label is not None:
+        states[:, SPIN] = label.spin
+    for contact in sorted(contacts, key=lambda c: c.time):
+        _start_contact(states, contact, model)
+    for rest in segmentation.rests:
+        _start_rest(states[rest.first : rest.last + 2], rest.height, model)
+    return states
+
+
+def _start_contact(states: Array, contact: Contact, model: BallModel) -> None:
+    """Moves the state before a contact to where it can reach the contact, and gives later states the spin after it."""
+    before = torch.from_numpy(states[contact.interval].copy())
+    with torch.no_grad():
+        gap = float(model.gap(before, contact.height))
+        if gap < 0.0:
+            states[contact.interval, Z] -= gap
+        states[contact.interval, VZ] = before[VZ] = min(float(before[VZ]), -LEAST_FALL)
+        states[contact.interval + 1 :, SPIN] = model.after_bounce(before)[SPIN].numpy()
+
+
+def _start_rest(states: Array, height: float, model: BallModel) -> None:
+    """Puts states on a surface, rolling: saturated friction does not determine the direction of the spin."""
+    states[:, Z] -= model.gap(torch.from_numpy(states), height).detach().numpy()
+    states[:, VZ] = 0.0
+    states[:, SPIN.start] = -states[:, VELOCITY.start + 1] / model.radius
+    states[:, SPIN.start + 1] = states[:, VELOCITY.start] / model.radius
+
+
+class ContactSearch:
+    """The arrangements of a track's contacts, beginning with its segmentation.
+
+    Args: problem: of the track.  surfaces: table and floor.  segmentation: its events.
+    """
+
+    def __init__(self, problem: TrackProblem, surfaces: Surfaces, segmentation: Segmentation) -> None:
+        self.problem, self.surfaces, self.segmentation = problem, surfaces, segmentation
+        self._seen: dict[tuple[tuple[int, float], ...], Solution] = {}
+        self._settled: Solution | None = None
+        self._best: Solution | None = None
+
+    @property
+    def best(self) -> Solution:
+        """The lowest minimum so far; among those with consistent contacts, if any."""
+        return min(self._seen.values(), key=lambda s: s.minimum.error) if self._best is None else self._best
+
+    def after(self, solution: Solution) -> tuple[Events, Values] | None:
+        """The next arrangement with initial values; None at the end of the search.
+
+        Args: solution: for the previous arrangement.
+        """
+        times, ball = self.problem.track.times, self.problem.ball
+        places = places_of(solution.events.contacts)
+        self._seen[places] = solution
+        refined = refined_contacts(times, solution)
+        if places_of(refined) == places:
+            unseen = () if self._settled else contacts_at_ends(times, solution, ball, self.surfaces)
+            if not unseen:  # a contact that only the end of the track suggests must also explain it better
+                stayed = (solution,) if self._settled is None else (self._settled, solution)
+                self._best = min(stayed, key=lambda s: s.minimum.error)
+                return None
+            self._settled = solution
+            refined = tuple(sorted((*refined, *unseen), key=lambda c: c.time))
+        if places_of(refined) in self._seen or len(self._seen) == MAX_REFINEMENTS:
+            return None
+        values = move_contacts(solution.minimum.values, times, places, places_of(refined), ball)
+        return Events(refined, self.segmentation), values
+
+
+def contacts_at_ends(times: Array, solution: Solution, model: BallModel, surfaces: Surfaces) -> tuple[Contact, ...]:
+    """Contacts that only a single sample at either end shows, too few for the segmentation.
+
+    The last state has fallen through a surface; or the first, extrapolated from later samples, rises from below one.
+    """
+    values, events, last = solution.minimum.values, solution.events, len(times) - 1
+    taken = {c.interval for c in events.contacts} | set(events.segmentation.hits.tolist())
+    for rest in events.segmentation.rests:
+        taken |= set(range(rest.first, rest.last + 1))
+    coefficients = np.tile(values.coefficients[: model_width(model)], (2, 1))
+    found = []
+    for inside, beyond in ((1, 0), (last - 1, last)) if last > 0 else ():
+        interval, speed = min(inside, beyond), float(values.states[beyond, VZ])
+        if interval in taken or (beyond - inside) * speed >= 0.0:  # it does not move away from the other samples
+            continue
+        pair = torch.from_numpy(np.concatenate((values.states[[inside, beyond]], coefficients), axis=1))
+        height = surfaces.level_below(pair)[0]
+        with torch.no_grad():
+            above, below = model.gap(pair, height).tolist()
+        if above >= 0.0 > below and bool(surfaces.over_table(pair)[1]):
+            time = times[beyond] - below / speed
+            found.append(Contact(interval, float(np.clip(time, times[interval], times[interval + 1])), float(height)))
+            taken.add(interval)
+    return tuple(found)
+
+
+def refined_contacts(times: Array, solution: Solution) -> tuple[Contact, ...]:
+    """The contacts, each in the interval of its estimated time, without those outside the track."""
+    refined = []
+    for contact in timed_contacts(times, solution):
+        if not times[0] <= contact.time <= times[-1]:
+            continue
+        interval = int(np.clip(np.searchsorted(times, contact.time, side="right") - 1, 0, len(times) - 2))
+        step = np.clip(interval - contact.interval, -1, 1)  # one interval at a time: the estimate moves along
+        refined.append(Contact(contact.interval + int(step), contact.time, contact.height))
+    return tuple(refined)
+
+
+def move_contacts(
+    values: Values, times: Array, old: Sequence[tuple[int, float]], new: Sequence[tuple[int, float]], model: BallModel
+) -> Values:
+    """Values for a continued search after contacts moved: a state after its contact is now before it, or vice versa.
+
+    Args:
+        values: the states for the old contacts.
+        times: (n,) s.
+        old: interval and height of each contact so far.  new: the same of the next contacts.
+        model: gives the state at the end of the first interval that gained or lost a contact, from that at its start.
+    """
+    states = values.states.copy()
+    changed = sorted({i for i, _ in set(old) ^ set(new)})
+    for interval in changed:
+        if interval - 1 in changed:
+            continue  # the contact entered or left this interval; the state after both is right already
+        heights = tuple(height for i, height in new if i == interval)
+        start = torch.from_numpy(np.concatenate((states[interval], values.coefficients[: model_width(model)]))[None])
+        gap = float(model.gap(start, heights[0])[0].detach()) if heights else 0.0
+        if gap < 0.0 < states[interval, VZ]:  # it was on the way up, from below: before the contact it mirrors that
+            states[interval, [Z, VZ]] -= (2.0 * gap, 2.0 * states[interval, VZ])
+            start[0, :STATE_DIM] = torch.from_numpy(states[interval])
+        with torch.no_grad():
+            after, _ = fly_through(model, start, torch.from_numpy(np.diff(times[interval : interval + 2])), heights)
+        if bool(after.isfinite().all()):
+            states[interval + 1] = after[0, :STATE_DIM].numpy()
+    return replace(values, states=states)
+
+
+def places_of(contacts: tuple[Contact, ...]) -> tuple[tuple[int, float], ...]:
+    """Interval and height of each contact."""
+    return tuple((c.interval, c.height) for c in contacts)
+
+
+def timed_contacts(times: Array, solution: Solution) -> tuple[Contact, ...]:
+    """The contacts with their estimated times; unchanged without an estimate."""
+    grouped = contacts_by_interval(solution.events.contacts)
+    timed: list[Contact] = []
+    for batch in contact_batches(solution.graph):
+        for interval, elapsed in zip(
+            batch.variables[:, 0].tolist(), batch.contact_times(solution.minimum.values), strict=True
+        ):
+            for contact, tau in zip(grouped[interval], elapsed.tolist(), strict=True):
+                time = float(times[interval] + tau) if np.isfinite(tau) else contact.time
+                timed.append(Contact(interval, time, contact.height))
+    return tuple(sorted(timed, key=lambda c: c.time))
+
+
+def label_let_go(graph: BallGraph, values: Values) -> bool:
+    """True if the spin is so far from its label that the label's loss pulls less with distance."""
+    able = [batch for batch in graph.batches if isinstance(batch, LABELS) and batch.loss.convex != batch.loss]
+    return any((np.linalg.norm(batch.linearize(values).residual, axis=-1) > batch.loss.scale).any() for batch in able)
+
+
+def minimise_with_restart(optimizer: LevenbergMarquardt, graph: BallGraph, start: Values, found: Minimum) -> Minimum:
+    """The lower of a given minimum and of the one reached by convex losses on labels."""
+    held = optimizer.minimize(_convex(graph), start)
+    again = optimizer.minimize(graph, held.values)
+    return again if again.error < found.error else found
+
+
+def _convex(graph: BallGraph) -> BallGraph:
+    """The graph with convex losses on labels."""
+    return BallGraph(tuple(b.with_loss(b.loss.convex) if isinstance(b, LABELS) else b for b in graph.batches))
+
+
+def worst_break(solution: Solution) -> int | None:
+    """The interval with the largest broken dynamics residual, if any; a hit widens the noise of its interval."""
+    worst, where = BROKEN, None
+    for batch, rows in zip((b for b in solution.graph.batches if len(b)), solution.minimum.linearized, strict=True):
+        if isinstance(batch, DynamicsFactors):
+            with np.errstate(over="ignore"):  # broken without measure
+                norm = np.linalg.norm(rows.residual, axis=-1)
+            norm[np.isin(batch.variables[:, 0], solution.events.segmentation.hits)] = 0.0
+            if not norm.max() <= worst:
+                worst, where = norm.max(), int(batch.variables[norm.argmax(), 0])
+    return where
+
+
+def leads_nowhere(solution: Solution, before: Solution) -> bool:
+    """True if one more hit left the search without a minimum and hardly lowered the objective."""
+    found, gone = solution.minimum, solution.minimum.convergence in NOWHERE
+    return gone and found.error > LEAST_GAIN * before.minimum.error
