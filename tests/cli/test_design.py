@@ -41,7 +41,8 @@ def test_table_and_file(launched: Path, tmp_path: Path, capsys: pytest.CaptureFi
 def test_pairs_of_a_diagnosis(launched: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     finding = {"name": "frame_tilt", "indistinguishable_from": ["table_tilt", "a change of cameras"]}
     (tmp_path / "report.json").write_text(json.dumps({"effects": [finding]}))
-    words = ["design", launched, "--candidates", CANDIDATES, "--diagnosis", tmp_path, "--shots", 1, "--jobs", 1]
+    few = "topspin=-3..5:4,speed=8..14:6"
+    words = ["design", launched, "--candidates", few, "--diagnosis", tmp_path, "--shots", 1, "--jobs", 1]
     assert status(*words) == 0
     assert "frame_tilt.x frame_tilt.y from table_tilt.x table_tilt.y" in capsys.readouterr().out
 

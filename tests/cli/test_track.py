@@ -260,6 +260,7 @@ def test_videos_become_the_tracks_that_were_flown(scene: Path, tracked: Path) ->
     assert (overlay.get(cv2.CAP_PROP_FRAME_WIDTH), overlay.get(cv2.CAP_PROP_FRAME_HEIGHT)) == (1920, 390)
 
 
+@pytest.mark.thorough
 def test_states_and_predictions_of_what_was_filmed_agree_with_the_truth(
     scene: Path, tracked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -13,6 +13,8 @@ from ballfg.simulation import SimulationConfig, parse_effects, write_simulation
 from ballfg.tracks import read_dataset
 
 GAIN, TILT = 1.0, 0.04
+TRACKS = 6
+"""Of each room."""
 CATALOGUE = [EFFECTS[name] for name in ("drag_spin", "magnus_saturation", "wind", "frame_tilt")]
 
 
@@ -22,7 +24,7 @@ def rooms(tmp_path_factory):
     effects = {"level": (), "leaning": (f"frame_tilt.x={TILT}",)}
     for seed, (name, own) in enumerate(effects.items()):
         ball = (f"drag_spin.gain={GAIN}",)
-        config = SimulationConfig(tracks=10, rate=60.0, seed=seed, undeclared=parse_effects((*ball, *own)))
+        config = SimulationConfig(tracks=TRACKS, rate=60.0, seed=seed, undeclared=parse_effects((*ball, *own)))
         write_simulation(folder / name, config)
     found = [read_dataset(folder / name) for name in effects]
     for dataset, name in zip(found, effects, strict=True):
@@ -52,7 +54,7 @@ def test_what_both_rooms_want_is_the_balls_and_what_one_wants_is_its_own(joint):
 def test_labels_of_all_rooms_are_judged_each_in_its_own(joint):
     judged = joint.whole.labels
     assert {verdict.track.partition("/")[0] for verdict in judged.verdicts} == {"level", "leaning"}
-    assert len(judged.verdicts) == 20
+    assert len(judged.verdicts) == 2 * TRACKS
     assert judged.contradicted == ()
     assert judged.p_all_right > 0.5
 

@@ -12,6 +12,7 @@ from ballfg.estimation import ExtendedKalmanFilter, Settings, Smoother
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.run.checkpoint import Checkpoint, RunProgress
 from ballfg.tracks import Track
+from tests.small_networks import SMALL
 
 
 @pytest.mark.parametrize(
@@ -48,7 +49,7 @@ def test_calibrations_take_the_earlier_names() -> None:
 
 def test_checkpoints_of_earlier_versions_are_of_the_same_model() -> None:
     """The coefficients of the base are called otherwise today, the network for the contact is not."""
-    architecture = Architecture.of("mnn+gs", width_flight=5, width_contact=5, depth=2, residual=True)
+    architecture = Architecture.of("mnn+gs", **SMALL, residual=True)
     module = torch.nn.ModuleDict({"model": build(architecture, radius=0.02, base=nominal_model())})
     today = module.state_dict()
     earlier = {name.replace("model.base.bounce.", "model.base.contact."): tensor for name, tensor in today.items()}

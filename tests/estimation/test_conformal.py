@@ -38,7 +38,7 @@ def heavy_tailed(rng: np.random.Generator) -> TrackPrediction:
     return prediction(ahead, errors * (1.0 + 20.0 * ahead[:, None]), sigma=rng.uniform(0.002, 0.03))
 
 
-@pytest.mark.parametrize("count", [9, 25])
+@pytest.mark.parametrize("count", [9, pytest.param(25, marks=pytest.mark.thorough)])
 def test_intervals_hold_for_exchangeable_tracks(count: int) -> None:
     """A random sample of a new track in each bin and along each axis, over 1,000 draws: good to 4 binomial sigmas."""
     rng, draws = np.random.default_rng(3), 1000

@@ -44,8 +44,14 @@ def tracks():
     return found[::2] + found[1::2]
 
 
-@pytest.mark.parametrize("settings", [SETTINGS, UNSURE], ids=["known", "unsure"])
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    ("method", "settings"),
+    [
+        *(pytest.param(method, SETTINGS, id=f"{method}-known") for method in METHODS),
+        pytest.param("smoother", UNSURE, id="smoother-unsure"),
+        *(pytest.param(m, UNSURE, marks=pytest.mark.thorough, id=f"{m}-unsure") for m in METHODS[1:]),
+    ],
+)
 def test_every_track_is_estimated_with_its_own_values(tracks, method, settings):
     """The same numbers as from a model that has those values for all tracks; they may be the mean of a prior."""
     estimator = make_estimator(method, varied(old=0.8, new=0.95), TABLE, settings)

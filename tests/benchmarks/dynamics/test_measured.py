@@ -41,19 +41,24 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Measured:
     return Measured([first, second], simulated(folder, "other", 6, 3, spin_labels=True), 4)
 
 
+@pytest.fixture(scope="module", params=["a-tune+aug", pytest.param("analytic+mnn", marks=pytest.mark.thorough)])
+def trained(request: pytest.FixtureRequest) -> str:
+    """The method that is trained: of a network machine code is made first."""
+    return str(request.param)
+
+
 @pytest.fixture(scope="module")
-def small(data: Measured, tmp_path_factory: pytest.TempPathFactory) -> tuple[Results, Path, list[Path]]:
+def small(data: Measured, trained: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[Results, Path, list[Path]]:
     results, out = Results("test", 0), tmp_path_factory.mktemp("out")
-    methods = ("nominal", "nominal+track", "analytic+mnn")
-    return results, out, run_dynamics(results, data, out, SMALL, 1, methods)
+    return results, out, run_dynamics(results, data, out, SMALL, 1, ("nominal", "nominal+track", trained))
 
 
-def test_every_dataset_is_a_case_with_rows_and_a_picture(small: tuple[Results, Path, list[Path]]) -> None:
+def test_every_dataset_is_a_case_with_rows_and_a_picture(small: tuple[Results, Path, list[Path]], trained: str) -> None:
     results, out, pictures = small
     assert {row.case for row in results.rows} == {"first", "second", "other"}
     for case, count in (("first", 2), ("second", 2), ("other", 4)):
         rows = {row.method: row for row in results.rows if (row.case, row.metric) == (case, "prediction_rmse_median")}
-        assert list(rows) == ["nominal", "nominal+track", "analytic+mnn"]
+        assert list(rows) == ["nominal", "nominal+track", trained]
         assert {row.n for row in rows.values()} == {count}
         assert {row.unit for row in rows.values()} == {"mm"}
         for method in rows:
@@ -64,11 +69,11 @@ def test_every_dataset_is_a_case_with_rows_and_a_picture(small: tuple[Results, P
     names = {picture.name for picture in pictures}
     assert {f"dynamics_rmse_{case}.png" for case in ("first", "second", "other")} <= names
     assert not any(name.startswith("dynamics_fan") for name in names)
-    assert (out / "runs" / "analytic+mnn-0-on-2.json").is_file()
+    assert (out / "runs" / f"{trained}-0-on-2.json").is_file()
 
 
-def test_one_model_learns_from_every_second_shot_of_all(small: tuple[Results, Path, list[Path]]) -> None:
-    folder = small[1] / "runs" / "analytic+mnn-0"
+def test_one_model_learns_from_every_second_shot_of_all(small: tuple[Results, Path, list[Path]], trained: str) -> None:
+    folder = small[1] / "runs" / f"{trained}-0"
     names = []
     for part, expected in (("data-0", "first"), ("data-1", "second")):
         written = read_dataset(folder / part)
@@ -92,14 +97,14 @@ def test_few_shots_all_train_unless_a_sequence_model_needs_some_to_choose_by(dat
 
 
 def test_nothing_finished_is_repeated_and_another_recipe_is_refused(
-    small: tuple[Results, Path, list[Path]], data: Measured, tmp_path: Path
+    small: tuple[Results, Path, list[Path]], trained: str, data: Measured
 ) -> None:
     tasks = measured_tasks(data, 1, None)
     runs = small[1] / "runs"
     stamps = {path: path.stat().st_mtime_ns for path in runs.glob("*.json")}
-    collect_records(tasks, ("nominal", "analytic+mnn"), [0], runs, 1, quick=True)
+    collect_records(tasks, ("nominal", trained), [0], runs, 1, quick=True)
     assert {path: path.stat().st_mtime_ns for path in runs.glob("*.json")} == stamps
-    job = Job(tuple(tasks), "analytic+mnn", 0, runs / "analytic+mnn-0", quick=False)
+    job = Job(tuple(tasks), trained, 0, runs / f"{trained}-0", quick=False)
     with pytest.raises(ValueError, match="must be a training of these tracks by this recipe"):
         trained_contender(job, tasks[0])
 

@@ -43,6 +43,7 @@ def test_a_second_process_finds_what_the_first_has_made(made) -> None:
     assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
 
 
+@pytest.mark.thorough
 def test_what_a_power_failure_has_damaged_is_made_again(made, tmp_path) -> None:
     folder = Path(shutil.copytree(made[0], tmp_path / "cache"))
     whole = {path: path.read_bytes() for path in (folder / "ballfg").rglob("*") if path.is_file()}

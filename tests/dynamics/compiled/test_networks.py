@@ -16,6 +16,7 @@ from ballfg.dynamics.motion.contact import fly_through
 from ballfg.dynamics.motion.integrate import fly
 from ballfg.dynamics.networks.fading import Fading
 from tests.dynamics.compiled.test_functions import agree, states
+from tests.small_networks import SMALL
 
 KINDS = ("mlp", "mlp+gs", "skip+gs", "mnn+gs")
 
@@ -31,7 +32,7 @@ def network(kind, *, seed=3, residual=False, **sizes):
 
 def faded(kind):
     """A correction that fades, with doubts about what is left of it."""
-    model, tracks = network(kind, residual=True), [states() for _ in range(20)]
+    model, tracks = network(kind, residual=True, **SMALL), [states() for _ in range(20)]
     model.fading = Fading.of(tracks, [track[:4] for track in tracks], 0.02)
     flying = torch.cat(tracks)
     guess = model.base.after_bounce(flying)
@@ -55,11 +56,11 @@ def test_corrections_of_a_model_that_fade(kind) -> None:
 def test_networks_that_give_spin_rates_and_small_ones() -> None:
     agree(network("mnn+gs", spin_rate=True))
     agree(network("mlp+gs", width_flight=5, width_contact=4, depth=1))
-    agree(network("mnn+gs", width_flight=6, width_contact=6, residual=True))
+    agree(network("mnn+gs", residual=True))
 
 
 def test_weights_are_those_of_the_moment() -> None:
-    model = network("mnn+gs")
+    model = faded("mnn+gs")
     other = copy.deepcopy(model)
     assert compiled(other) is compiled(model)
     agree(model)

@@ -15,6 +15,7 @@ from torch.overrides import TorchFunctionMode
 
 from ballfg.dynamics import Architecture, BallModel, Surfaces, build, nominal_model, rollout
 from ballfg.dynamics.networks.architecture import DEFAULT_SIZES
+from tests.small_networks import SMALL
 
 TABLE = Surfaces(0.0, -0.76, (-1.0, 2.7, -0.8, 0.8))
 TIMES = torch.arange(1, 80, dtype=torch.float64) / 50
@@ -31,7 +32,7 @@ STARTS = torch.tensor(
 def models() -> dict[str, BallModel]:
     made: dict[str, BallModel] = {"nominal": nominal_model(0.02)}
     for kind in DEFAULT_SIZES:
-        made[kind] = build(Architecture.of(kind, residual=True), radius=0.02, base=nominal_model(0.02))
+        made[kind] = build(Architecture.of(kind, residual=True, **SMALL), radius=0.02, base=nominal_model(0.02))
     return {name: model.requires_grad_(False) for name, model in made.items()}
 
 
@@ -59,7 +60,10 @@ def constants() -> set[int]:
     return found
 
 
-@pytest.mark.parametrize("name", models())
+QUICK = ("nominal", "mnn+gs")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.thorough] * (n not in QUICK)) for n in models()])
 def test_all_tensors_of_a_rollout_are_made_or_brought_where_the_states_are(name: str) -> None:
     model = models()[name]
     with torch.no_grad():

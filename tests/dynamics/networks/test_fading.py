@@ -24,6 +24,7 @@ from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction.belief import Belief
 from ballfg.prediction.propagate import Propagator
 from ballfg.tracks.noise import TrackNoise
+from tests.small_networks import SMALL
 
 FAR = (0.0, 0.0, 1.0, 0.2, 0.1, -0.3, 900.0, -800.0, 700.0)
 HALF_WAY = (0.0, 0.0, 1.0, 3.9, 0.2, -1.5, 8.0, 118.0, 6.0)
@@ -40,9 +41,9 @@ def states(seed: int, count: int = 40) -> torch.Tensor:
 @pytest.fixture
 def model() -> LearnedModel:
     base = nominal_model(0.02)
-    made = build(Architecture.of("mnn+gs", width_flight=6, width_contact=6, residual=True), radius=0.02, base=base)
+    made = build(Architecture.of("mnn+gs", **SMALL, residual=True), radius=0.02, base=base)
     for part in (made.flight, made.contact):
-        torch.nn.init.normal_(part.network.last.weight, std=0.2, generator=torch.Generator().manual_seed(1))
+        torch.nn.init.normal_(part.network.last.weight, std=1.5, generator=torch.Generator().manual_seed(1))
     tracks = [states(seed, 12) for seed in range(20)]
     made.fading = Fading.of(tracks, [track[:4] for track in tracks], 0.02)
     flying = torch.cat(tracks)

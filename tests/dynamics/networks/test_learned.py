@@ -159,8 +159,16 @@ def test_far_from_all_training_features_stay_bounded(kind, states):
     assert bool((drag < 2 * no_spin[:, 3:6].norm(dim=-1)).all())
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("spin_rate", [False, True])
+@pytest.mark.parametrize(
+    ("kind", "spin_rate"),
+    [
+        pytest.param(
+            kind, rate, marks=[pytest.mark.thorough] * ((kind, rate) not in (("mlp", False), ("mnn+gs", True)))
+        )
+        for kind in KINDS
+        for rate in (False, True)
+    ],
+)
 def test_jacobians(kind, spin_rate, states, differences):
     """Of a flight and of a contact, against differences."""
     model, state = model_of(kind, spin_rate=spin_rate), states(4)

@@ -182,7 +182,7 @@ def many():
     return model, cases
 
 
-@pytest.mark.parametrize("smooth", [False, True])
+@pytest.mark.parametrize("smooth", [False, pytest.param(True, marks=pytest.mark.thorough)])
 def test_nees_and_nis_lie_in_their_bands(many, smooth):
     model, cases = many
     estimator = ExtendedKalmanFilter(model, TABLE, PLAIN, smooth=smooth)

@@ -8,11 +8,12 @@ from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.dynamics.networks.learned import LearnedModel, build
 from ballfg.learning.end_to_end.end_to_end import EndToEnd
 from tests.learning.estimates import usual_ball
+from tests.small_networks import SMALL
 
 
 def network() -> LearnedModel:
     """A small network that corrects the usual ball."""
-    architecture = Architecture.of("mnn+gs", width_flight=5, width_contact=5, depth=2, residual=True)
+    architecture = Architecture.of("mnn+gs", **SMALL, residual=True)
     model = build(architecture, radius=0.02, base=usual_ball(), seed=3)
     generator = torch.Generator().manual_seed(5)
     with torch.no_grad():

@@ -12,8 +12,7 @@ from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.end_to_end.pretrain import Anchor, random_states
 from ballfg.learning.run.training import build
 from ballfg.state import VELOCITY, VZ
-
-SMALL = {"width_flight": 4, "width_contact": 4, "depth": 1, "residual": True}
+from tests.small_networks import SMALL
 
 
 def test_it_is_zero_at_the_start_and_in_the_units_of_an_acceleration() -> None:
@@ -42,13 +41,12 @@ def test_states_fly_in_all_directions_and_fall() -> None:
     assert torch.equal(random_states(1, 2000)[0], flying)
 
 
-@pytest.mark.thorough
 def test_its_weight_adds_its_gradient_for_each_track(no_spin_labels: Path) -> None:
     """Two losses that differ in the weight alone differ by the anchor's gradient, times tracks and weight."""
     gradients = []
     for weight in (1e-9, 0.5):
         given = {"data": [str(no_spin_labels)], "split": {"by": "none"}, "observe": {"samples": 25}}
-        given |= {"architecture": SMALL, "loss": {"anchor": weight}}
+        given |= {"architecture": SMALL | {"residual": True}, "loss": {"anchor": weight}}
         trainee, *_ = build(TrainConfig.model_validate(given))
         model = trainee.learnables.model
         with torch.no_grad():

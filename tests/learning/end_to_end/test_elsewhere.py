@@ -15,6 +15,7 @@ from ballfg.learning import TrainConfig, build
 from ballfg.learning.end_to_end.elsewhere import by_room
 from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.tracks import read_dataset
+from tests.small_networks import SMALL
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +26,7 @@ def exported(tmp_path_factory):
         {
             "kind": "mnn+gs",
             "data": str(folder / "hall"),
-            "architecture": {"width_flight": 4, "width_contact": 4, "depth": 2, "residual": True},
+            "architecture": SMALL | {"residual": True},
             "observe": {"samples": 20},
             "split": {"by": "none"},
         }
@@ -47,6 +48,7 @@ def test_the_exported_model_names_its_room_and_the_noise_there(exported):
     assert not dataset_settings(hall, model).coefficients
 
 
+@pytest.mark.thorough
 def test_training_tracks_lie_inside_and_other_speeds_outside(exported):
     _, trainee, file = exported
     model = load_model(file)

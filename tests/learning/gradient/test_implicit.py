@@ -23,6 +23,7 @@ from ballfg.learning.end_to_end.learnables import NoiseScales
 from ballfg.learning.gradient.implicit import GaussNewtonGradient, ImplicitGradient, UnrolledGradient
 from tests.learning.estimates import NOISE, SETTINGS, Estimates, directional, launcher, measured, usual_ball
 from tests.learning.gradient.outer_loss import TRUTH, gradients, outer
+from tests.small_networks import SMALL
 
 SAME = 1e-6
 
@@ -92,7 +93,7 @@ def test_a_tracker_with_memory_and_jitter() -> None:
 @pytest.mark.parametrize(("kind", "step"), [("mnn+gs", 1e-4), ("mlp", 3e-5)])
 def test_weights_of_networks(kind, step) -> None:
     """Random directions in all weights of a network; small steps, since a residual lies 8e-5 from Huber's bend."""
-    architecture = Architecture.of(kind, width_flight=5, width_contact=5, depth=2, residual=True, spin_rate=True)
+    architecture = Architecture.of(kind, **SMALL, residual=True, spin_rate=True)
     model = build(architecture, radius=0.02, base=usual_ball(), seed=3)
     generator = torch.Generator().manual_seed(5)
     with torch.no_grad():
