@@ -15,6 +15,7 @@ from ballfg.dynamics.motion.integrate import batch_jacobian, fly, fly_jacobian
 from ballfg.dynamics.networks.learned_parts import HIGHEST_RESTITUTION, START_RESTITUTION
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.estimation.segmentation.physics import physics_of
+from tests.small_networks import SMALL
 
 KINDS = ("mlp", "mlp+gs", "skip+gs", "mnn+gs")
 SYMMETRIC = KINDS[1:]
@@ -93,7 +94,7 @@ def test_symmetric_about_z(kind, mirror, every_effect, states):
     times = torch.linspace(0.1, 0.5, 3, dtype=torch.float64)
     surfaces = Surfaces(0.0)
     for base in (None, every_effect):
-        model = model_of(kind, base=base, spin_rate=True)
+        model = model_of(kind, base=base, spin_rate=True, **SMALL)
         assert torch.allclose(
             model.after_bounce(turned(state, matrix)), turned(model.after_bounce(state), matrix), atol=1e-11
         )
@@ -171,7 +172,7 @@ def test_far_from_all_training_features_stay_bounded(kind, states):
 )
 def test_jacobians(kind, spin_rate, states, differences):
     """Of a flight and of a contact, against differences."""
-    model, state = model_of(kind, spin_rate=spin_rate), states(4)
+    model, state = model_of(kind, spin_rate=spin_rate, **SMALL), states(4)
     dt = torch.tensor((0.01, 0.008, 0.02, 0.013), dtype=torch.float64)
     _, flight = fly_jacobian(model, state, dt)
     assert torch.allclose(flight, differences(lambda s: fly(model, s, dt), state), rtol=1e-7, atol=1e-8)
@@ -186,9 +187,9 @@ def test_jacobians(kind, spin_rate, states, differences):
     assert torch.allclose(through, expected, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [pytest.param(k, marks=[pytest.mark.thorough] * (k != "mnn+gs")) for k in KINDS])
 def test_a_gradient_reaches_every_parameter(kind, states):
-    model, state = model_of(kind, spin_rate=True), states(8)
+    model, state = model_of(kind, spin_rate=True, **SMALL), states(8)
     after = rollout(model, state, torch.tensor([0.2, 0.5], dtype=torch.float64), Surfaces(0.0))
     gradients = torch.autograd.grad((after * torch.linspace(1, 2, 9)).sum(), list(model.parameters()))
     assert all(bool(g.isfinite().all()) and bool((g != 0).any()) for g in gradients)
