@@ -209,7 +209,7 @@ class Track:
 def _checked_observations(track: str, observations: object, samples: int, rough: bool) -> tuple[Any, ...]:
     found = tuple(observations) if isinstance(observations, Iterable) else (observations,)
     for observation in found:
-        if not isinstance(getattr(observation, "name", None), str) or not hasattr(observation, "taken"):
+        if not isinstance(getattr(observation, "name", None), str) or not hasattr(observation, "select"):
             raise TypeError(
                 f"track {shown(track)}: observations must be a tuple of Observations; got "
                 f"{type_name(observation)} {shown(observation)}. Give RadarSpeed or another one of ballfg.estimation."

@@ -19,6 +19,7 @@ from ballfg.estimation.settings import MEASURED
 from ballfg.factors.launcher import LauncherSpinFactors
 from ballfg.factors.loss import Loss
 from ballfg.factors.prior import PriorFactors, SpinLabelFactors
+from ballfg.simulation.launcher import SimulatedLauncher
 from ballfg.tracks import Track, read_dataset
 from ballfg.tracks.track import SPIN_LABELS
 
@@ -209,7 +210,7 @@ def test_topspin_turns_the_top_of_the_ball_forward() -> None:
 
 
 def test_levels_give_the_spin_of_the_simulated_launcher() -> None:
-    simulated = simulate_module.SimulatedLauncher()
+    simulated = SimulatedLauncher()
     levels = Launcher.of_levels(simulated.topspin_scale, simulated.sidespin_scale, 4.0)
     for made in simulate_module.simulate(simulate_module.SimulationConfig(tracks=12, seed=2, spin_labels=False)):
         labelled = levels.labelled(made.track)

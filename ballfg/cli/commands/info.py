@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from ballfg.dynamics.effect import Effect
 
 REGISTRIES = (
-    ("effects", "ballfg.dynamics", "EFFECTS"),
-    ("observations", "ballfg.estimation", "OBSERVATIONS"),
-    ("estimators", "ballfg.estimation", "ESTIMATORS"),
-    ("trainees", "ballfg.learning", "TRAINEES"),
-    ("formats", "ballfg.importing", "FORMATS"),
+    ("effects", "ballfg.dynamics.effects.registry", "EFFECTS"),
+    ("observations", "ballfg.estimation.observations.registry", "OBSERVATIONS"),
+    ("estimators", "ballfg.estimation.registry", "ESTIMATORS"),
+    ("trainees", "ballfg.learning.registry", "TRAINEES"),
+    ("formats", "ballfg.importing.formats.registry", "FORMATS"),
 )
 """Title, module and attribute of each registry, in the order of the output."""
 WIDTH = 110

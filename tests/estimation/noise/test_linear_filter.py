@@ -53,7 +53,7 @@ def noise_of(rows):
 def test_values_and_derivatives_are_those_of_torch(linear, biased, rows):
     tracks, noise = LinearFilter(linear, 10.0, biased=biased), noise_of(rows)
     own = tracks.run(noise, tracks.measured(noise))
-    results = (own.means, own.covariances, own.following), in_torch.run(tracks, noise)[:3]
+    results = (own.means, own.covariances, own.nll), in_torch.run(tracks, noise)[:3]
     for mine, theirs in zip(*results, strict=True):
         size = float(theirs.detach().abs().max())
         np.testing.assert_allclose(mine.detach().numpy(), theirs.detach().numpy(), rtol=1e-7, atol=1e-9 * size)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.estimation.noise import tracker
+from ballfg.estimation.noise import tracker_errors
 from ballfg.estimation.noise.estimate import linearised
 from ballfg.estimation.noise.linear_filter import LinearFilter
 from ballfg.estimation.noise.marginal import MarginalFit
@@ -64,7 +64,7 @@ def test_a_white_noise_that_tracks_contradict_is_not_believed(lasting):
 
 
 def test_a_part_of_hardly_known_size_has_no_name(lasting, monkeypatch):
-    monkeypatch.setattr(tracker, "KNOWN", 100.0)  # sizes of fewer standard deviations do not count
+    monkeypatch.setattr(tracker_errors, "KNOWN", 100.0)  # sizes of fewer standard deviations do not count
     settings, linear = lasting
     found = tracker_noise(linear, every_second(linear), settings, WHITE)
     assert found.parts == ()

@@ -44,7 +44,7 @@ def test_contact_moves_to_where_the_estimate_puts_it():
     k = int(np.flatnonzero(truth[:, 5] > 0.5)[-1])
     feed(online, track.until(float(track.times[20])))
     right = Smoother(online.model, TABLE, online.settings).estimate(track).contacts[0].interval
-    original = online.events.moved
+    original = online.events.with_moved_contacts
 
     def shifted(segmentation, first):
         """The segmenter, one interval late."""
@@ -52,7 +52,7 @@ def test_contact_moves_to_where_the_estimate_puts_it():
         late = [replace(c, interval=c.interval + 1) if not online.events._moves else c for c in moved.contacts]
         return replace(moved, contacts=tuple(c for c in late if c.interval < online.events.segmenter.count - 1))
 
-    online.events.moved = shifted
+    online.events.with_moved_contacts = shifted
     for t, z in zip(track.times[21:].tolist(), track.positions[21:], strict=True):
         online.push(t, z)
     assert k > 21

@@ -8,9 +8,9 @@ import torch
 import yaml
 from safetensors.torch import load_file, save_file
 
-from ballfg.learning.sequence import LauncherSettings, SequenceArchitecture, SequencePredictor
-from ballfg.learning.sequence.architecture import SequenceKind
-from ballfg.learning.sequence.data import example
+from ballfg.learning.sequence.architecture import SequenceArchitecture, SequenceKind
+from ballfg.learning.sequence.data import LauncherSettings, example
+from ballfg.learning.sequence.predictor import SequencePredictor
 from ballfg.tracks import Track
 
 LABELS = ("topspin", "sidespin", "speed")

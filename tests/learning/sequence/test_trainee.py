@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.learning.sequence import LauncherSettings, SequenceArchitecture, SequencePredictor, SequenceTrainee
-from ballfg.learning.sequence.architecture import SequenceKind
+from ballfg.learning.sequence.architecture import SequenceArchitecture, SequenceKind
+from ballfg.learning.sequence.data import LauncherSettings
+from ballfg.learning.sequence.predictor import SequencePredictor
+from ballfg.learning.sequence.trainee import SequenceTrainee
 from ballfg.tracks import Track
 
 LABELS = ("topspin", "sidespin", "speed")
