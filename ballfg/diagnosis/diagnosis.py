@@ -11,7 +11,7 @@ from ballfg.diagnosis.fit.holdout import Holdout, hold_out
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.generic_test import ALARM, GenericTest
 from ballfg.diagnosis.label_verdicts import LabelCheck
-from ballfg.diagnosis.report.wording import refusal, sentence
+from ballfg.diagnosis.report.wording import sentence
 from ballfg.diagnosis.residual_tests.fallback import fallback
 from ballfg.diagnosis.residual_tests.generic import generic_tests
 from ballfg.diagnosis.residual_tests.label_check import check_labels, label_test
@@ -101,7 +101,7 @@ def diagnose(
         residuals_before=residuals,
         residuals_after=residuals if search.fit is search.first else residuals_of(search.fit),
         excluded=holdout.excluded,
-        remarks=(*map(refusal, search.refused.values()), *strange(calibrated, model.radius)),
+        remarks=tuple(strange(calibrated, model.radius)),
         floor_mm=floor,
         labels=labels,
     )

@@ -23,7 +23,7 @@ from ballfg.diagnosis.fit.problem import Fit, Noise, Problem
 from ballfg.diagnosis.fit.stretches import Stretches, joined
 from ballfg.diagnosis.label_verdicts import LabelCheck
 from ballfg.diagnosis.report.wording import joined as listed
-from ballfg.diagnosis.report.wording import refusal, sentence
+from ballfg.diagnosis.report.wording import sentence
 from ballfg.diagnosis.residual_tests.generic import generic_tests
 from ballfg.diagnosis.residual_tests.label_check import judged, label_evidence, label_test
 from ballfg.diagnosis.residual_tests.patterns import DRIFT
@@ -135,7 +135,7 @@ def diagnose_jointly(
         residuals_before=residuals_of(search.first),
         residuals_after=residuals_of(search.fit),
         excluded=tuple(f"{room.name}: {line}" for room in rooms for line in room.holdout.excluded),
-        remarks=(*remarks, *map(refusal, search.refused.values()), *strange(calibrated, model.radius)),
+        remarks=(*remarks, *strange(calibrated, model.radius)),
         labels=labels,
     )
     return JointDiagnosis(whole, models)

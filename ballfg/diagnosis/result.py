@@ -65,6 +65,9 @@ class Finding:
         held_out_p: probability of such a gain there by chance.
         sentence: describes the effect.
         decide: the measurement that tells the effect from others.
+        probability: that the effect is there, over all models that were compared.
+        evidence: logarithm of the density of the tracks with it over that without it, natural units.
+        usual: words on a strength outside of the usual range; empty inside.
     """
 
     name: str
@@ -77,6 +80,9 @@ class Finding:
     held_out_p: float
     sentence: str
     decide: str
+    probability: float = 1.0
+    evidence: float = float("nan")
+    usual: str = ""
 
 
 @dataclass(frozen=True)
@@ -102,6 +108,7 @@ class Candidate:
     delta_bic: float | None
     outcome: Outcome
     seen_from: Mapping[str, float] = field(default_factory=dict)
+    probability: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ _Row = tuple[Any, ...]
 
 
 @dataclass(frozen=True)
-class _Piece:
+class Piece:
     """Free kicks of one arc of one stretch: three columns for each of b bins, then six for a contact before the arc.
 
     Attributes:
@@ -54,9 +54,9 @@ def residuals_of(fit: Fit) -> Residuals:
     Returns: accelerations in flight, kicks at contacts and errors of positions, with their covariances.
     """
     path, system = fitted_path(fit), fit.linearised()
-    pieces: dict[int, list[_Piece]] = defaultdict(list)
+    pieces: dict[int, list[Piece]] = defaultdict(list)
     for arc in responses(fit, path):
-        for row, piece in zip(arc.rows.tolist(), _pieces(fit, arc), strict=True):
+        for row, piece in zip(arc.rows.tolist(), free_motion(fit, arc), strict=True):
             pieces[row].append(piece)
     flights: list[_Row] = []
     contacts: list[_Row] = []
@@ -74,7 +74,7 @@ def residuals_of(fit: Fit) -> Residuals:
     return Residuals(fit.problem.stretches.names, flight, _contact(contacts), _measurement(fit, path))
 
 
-def _pieces(fit: Fit, arc: ArcResponse) -> list[_Piece]:
+def free_motion(fit: Fit, arc: ArcResponse) -> list[Piece]:
     """One piece for each stretch of an arc."""
     m, q = arc.times.shape
     counts = np.maximum(1, np.rint(arc.step * q / BIN).astype(np.int64))
@@ -96,11 +96,11 @@ def _pieces(fit: Fit, arc: ArcResponse) -> list[_Piece]:
             own = np.concatenate((own, kicks[i]), axis=1)
             sigma = np.concatenate((sigma, np.repeat((CONTACT_VELOCITY, CONTACT_SPIN), 3)))
             contact = (arc.number - 1, float(arc.begun[i]), arc.incoming[i])
-        pieces.append(_Piece(own, sigma, times, arc.nodes[i, middle], contact))
+        pieces.append(Piece(own, sigma, times, arc.nodes[i, middle], contact))
     return pieces
 
 
-def _posterior(residual: Array, by_start: Array, pieces: list[_Piece]) -> tuple[Array, Array]:
+def _posterior(residual: Array, by_start: Array, pieces: list[Piece]) -> tuple[Array, Array]:
     """Posterior mean (d,) and covariance (d, d) of all kicks of a stretch, with a free first state."""
     columns = np.concatenate([by_start, *(piece.columns for piece in pieces)], axis=1)
     sigma = np.concatenate([piece.sigma for piece in pieces])

@@ -16,20 +16,12 @@ from ballfg.diagnosis.search.score import Score, score_tests
 from ballfg.diagnosis.search.signatures import hypothesis_signatures
 from ballfg.state import SPIN
 
-ALARM = 0.0025
-"""Probability that a hypothesis passes the score tests of one round by chance. They use all tracks, since half of them
-would find only effects 1.4 times as large."""
-HALF_ALARM = 0.05
-"""As `ALARM`, for tests that need a refit and so use the search half. The effect must then also help on the held-out
-half (`loop.CONFIRMED`), so that both happen by chance in one round of 400."""
+ALARM = 0.25
+"""Probability that a hypothesis passes the score tests of one round by chance, and so is refitted."""
 MOST_REFITS = 6
 """Largest number of refitted hypotheses in a round."""
 FRAME_CHOICE = 2.0 * float(np.log(FRAMES - 1))
 """Cost of a label frame in BIC, for the choice among all frames."""
-LEADING = 0.5
-"""Share of the best hypothesis' explained residual below which another one is not refitted."""
-ALIKE = 6.0
-"""BIC difference below which two effects are indistinguishable: odds of 20 to 1."""
 
 
 @dataclass(frozen=True)
@@ -88,14 +80,13 @@ def score_all(fitted: Fit, candidates: Sequence[Hypothesis]) -> list[Scored]:
 
 
 def shortlist(scored: Sequence[Scored], alarm: float = ALARM) -> list[Scored]:
-    """The hypotheses to refit: significant, the best shape of each effect, not far behind the first."""
+    """The hypotheses to refit: the best shape of each effect that is no mere chance."""
     best: dict[str, Scored] = {}
     for candidate in scored:
         if candidate.score is not None and candidate.p_value < alarm:
             best.setdefault(candidate.hypothesis.name, candidate)
     listed = list(best.values())[:MOST_REFITS]
-    leading = [s for s in listed if s.explained >= LEADING * listed[0].explained]
-    return [replace(s, opposite=_opposite(s, scored)) for s in leading]
+    return [replace(s, opposite=_opposite(s, scored)) for s in listed]
 
 
 def _opposite(best: Scored, scored: Sequence[Scored]) -> Hypothesis | None:
@@ -143,15 +134,6 @@ def _started_at(before: Fit, hypothesis: Hypothesis, problem: Problem, values: M
     if hypothesis.shape and not hypothesis.strengths:
         unknowns = replace(unknowns, starts=_starts_with_labels(problem, unknowns.starts))
     return fit_problem(problem, unknowns, before.noise, settle_noise=False)
-
-
-def says_the_same(candidate: Refit, better: Refit) -> bool:
-    """True if a hypothesis explains nothing beside another one that explains clearly more."""
-    hypothesis = candidate.scored.hypothesis
-    if not hypothesis.strengths or hypothesis.effect.multiplies_spin or better.delta_bic > candidate.delta_bic - ALIKE:
-        return False
-    (beside,) = score_all(better.fit, [hypothesis])
-    return beside.p_value > HALF_ALARM
 
 
 def with_hypothesis(problem: Problem, hypothesis: Hypothesis) -> Problem:

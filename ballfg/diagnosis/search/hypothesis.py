@@ -30,11 +30,13 @@ class Hypothesis:
         effect: its class.
         shape: coefficients of its form (a centre, a reference), and values that are tried as a whole.
         strengths: coefficients of its size, for score tests: at their absent values nothing changes.
+        choices: number of shapes among which this one was chosen.
     """
 
     effect: type[Effect]
     shape: Mapping[str, float] = field(default_factory=dict)
     strengths: tuple[str, ...] = ()
+    choices: int = 1
 
     @property
     def name(self) -> str:
@@ -154,7 +156,8 @@ def hypotheses(model: AnalyticModel, scene: Scene, catalogue: Iterable[type[Effe
         labels = not effect.name.startswith("spin_label") or scene.labels > 0
         if bounces and labels and all(has_effect(model, needed) for needed in effect.needs):
             strengths = tuple(c.name for c in effect.coefficients if c.absent is not None)
-            listed += [Hypothesis(effect, shape, strengths) for shape in effect.shapes(scene)]
+            shapes = tuple(effect.shapes(scene))
+            listed += [Hypothesis(effect, shape, strengths, len(shapes)) for shape in shapes]
     return listed
 
 

@@ -1,44 +1,70 @@
-"""The search loop fits, tests, adds the missing effect, and repeats until no effect helps."""
+"""The search adds, removes and exchanges effects as long as that makes the model more probable."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
+import numpy as np
+
+from ballfg.arrays import Array, Mask
+from ballfg.diagnosis.evidence.odds import Odds, odds_of
+from ballfg.diagnosis.evidence.weighed import Weighed, weighed
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.result import Errors, Outcome, Refusal
-from ballfg.diagnosis.search.candidates import ALIKE, Refit, Scored, delta_bic, says_the_same
-from ballfg.diagnosis.search.evaluation import got_worse, held_out_gain, on_all, on_others
-from ballfg.diagnosis.search.hypothesis import Hypothesis
-from ballfg.diagnosis.search.parsimony import halves_differ, insignificant
-from ballfg.diagnosis.search.plausible import implausible, range_of
+from ballfg.diagnosis.result import Candidate, Errors, Finding, Outcome
+from ballfg.diagnosis.search.candidates import Refit, Scored
+from ballfg.diagnosis.search.evaluation import on_all, on_others
+from ballfg.diagnosis.search.hypothesis import Hypothesis, has_effect, without_effect
 from ballfg.diagnosis.search.process_noise import PredictiveModel
-from ballfg.diagnosis.search.ranking import NO_NAME, as_left, finding_of, fitted_values, ranking
+from ballfg.diagnosis.search.ranking import finding_of, ranking
 from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_findings, stamp_hypotheses
-from ballfg.diagnosis.search.state import Confirmed, Search, left_out, without_named
-from ballfg.diagnosis.search.trial import try_further, try_hypotheses, try_varying
+from ballfg.diagnosis.search.trial import try_hypotheses, try_varying
 from ballfg.diagnosis.search.varying import Grouping, groupings
 from ballfg.dynamics import AnalyticModel, BallModel
 from ballfg.dynamics.effect import Effect
 from ballfg.estimation.batch import do_all
 
-MOST_EFFECTS = 4
-"""Largest number of added effects; further ones would fit the errors of earlier wrong ones."""
-CONFIRMED = 0.05
-"""Significance level of an effect's gain on the held-out half."""
-WORSE = 1.1
-"""Ratio of prediction errors above which an effect is not added, even if whole tracks are fitted better: a wrong name
-for a missing effect bends the motion to the samples, and predictions get worse."""
-PLAUSIBLE = 10.0
-"""Prior standard deviations from its usual value within which a coefficient is plausible. A stronger effect (air that
-moves at 20 m/s through a part of the room) stands for something else."""
-POORER = 0.3
-"""Share of an effect's gain that remains without the effect, above which the previous fit was in a poor minimum."""
+MOST_EFFECTS = 5
+"""Largest number of added effects: each costs a round."""
+NAMED = 0.9
+"""Probability above which an effect is named."""
 
 
-Examined = Confirmed | tuple[Outcome, Fit]
-"""A refit with its confirmation, or the reason for its refusal and its fit."""
+@dataclass(frozen=True)
+class Search:
+    """The result of a search.
+
+    Attributes:
+        first, declared: fit of the declared model to the search half, and that model for predictions.
+        fit, predictive: the same of the model with the named effects.
+        before, judged: prediction errors of both on the judging half.
+        whole: the model with the named effects, fitted to the tracks of both halves.
+        named: the effects in order.
+        findings, rounds: as in `Diagnosis`.
+        odds: probability of each effect that was weighed.
+    """
+
+    first: Fit
+    declared: PredictiveModel
+    fit: Fit
+    predictive: PredictiveModel
+    before: Errors
+    judged: Errors
+    whole: Fit
+    named: tuple[Hypothesis, ...] = ()
+    findings: tuple[Finding, ...] = ()
+    rounds: tuple[tuple[Candidate, ...], ...] = ()
+    odds: Odds = field(default_factory=Odds)
+
+
+@dataclass(frozen=True)
+class Round:
+    """Tests and refits of one round, and the name that it added."""
+
+    scored: Sequence[Scored]
+    refits: Sequence[Refit]
+    added: str = ""
 
 
 @dataclass(frozen=True)
@@ -48,7 +74,7 @@ class SearchLoop:
     `predictive` gives a fitted model the process noise that predicts the tracks of its fit; `judge` gives the errors of
     its predictions on the judging half; `watch` is called with lines of progress; refits share `jobs` processes.
     Effects `of_some` (None: all of the catalogue) may differ between tracks in `ways`, a function of the names of the
-    search half's tracks; None: by their labels and along the recording.
+    tracks; None: by their labels and along the recording. Effects are named from the probability `name_at` on.
     """
 
     holdout: Holdout
@@ -56,240 +82,166 @@ class SearchLoop:
     predictive: Callable[[Fit], PredictiveModel]
     judge: Callable[[BallModel], Errors]
     watch: Callable[[str], None]
-    plausible: float = PLAUSIBLE
     jobs: int = 1
     of_some: Sequence[type[Effect]] | None = None
     ways: Callable[[Sequence[str]], list[Grouping]] | None = None
+    name_at: float = NAMED
 
     def run(self, model: AnalyticModel, first: Fit | None = None) -> Search:
-        """Adds effects to the declared model until none helps, then removes those without which predictions are better.
+        """The most probable model, with the effects that are named.
 
         Args: model: as declared.  first: its fit, if made already.
         """
         self.watch(f"fitting the declared model to {len(self.holdout.search)} flights")
-        stamps = self.holdout.stamps
         first = first_fit(model, self.holdout) if first is None else first
+        found = _Found(self, first)
+        while len(found.best.named) < MOST_EFFECTS and found.round():
+            pass
+        found.compare()
+        return self._told(found, first)
+
+    def _told(self, found: "_Found", first: Fit) -> Search:
+        """The search with the named effects only, its predictions and findings."""
+        stamps, odds = self.holdout.stamps, found.odds
+        final = found.without([h for h in found.best.named if odds.of(h.name) < self.name_at])
+        self.watch("predicting the other half")
         declared = self.predictive(first)
         judged = self.judge(declared.model)
         before = self.judge(as_declared(declared.model, stamps)) if stamps.found else judged
-        named, findings = stamp_hypotheses(stamps), stamp_findings(first, stamps)
-        search, helped = Search(first, declared, first, declared, before, judged, first, named, findings), True
-        while helped and len(search.rounds) < MOST_EFFECTS:
-            search, helped = self._round(search)
-        search = self._pruned(search)
-        refused = {n: r for n, r in search.refused.items() if n not in {f.name for f in search.findings}}
-        findings = as_left(search.findings, search.named, search.whole, first)
-        return replace(search, findings=findings, refused=refused)
-
-    def _round(self, search: Search) -> tuple[Search, bool]:
-        """The search after one more round, and True if the round added an effect."""
-        number = len(search.rounds) + 1
-        on_before = on_others(search.fit, self.holdout.held_out)
-        scored, refits = self._tried(search, on_before, number)
-        if refits and (better := self._better_minimum(search, refits[0])) is not None:
-            search, on_before = better, on_others(better.fit, self.holdout.held_out)
-            scored, refits = self._tried(search, on_before, number)
-        outcomes: dict[str, Outcome] = {}
-        tell = partial(self._tell, number)
-        misleading: list[Refit] = []
-        winner, refused = self._confirmed(search, on_before, refits, outcomes, misleading)
-        while winner is None and (fitted := try_further(search.fit, scored, refits, tell, self.jobs)):
-            winner, further = self._confirmed(search, on_before, fitted, outcomes, misleading)
-            refits, refused = [*refits, *fitted], refused | further
-        if winner is None:  # a pattern that one effect explains for all tracks must not get a name for each group
-            ways = self.ways or partial(groupings, self.holdout.tracks)
-            some = self.of_some or self.catalogue
-            more, fitted = try_varying(search.fit, some, self.holdout.held_out, ways, tell, self.jobs)
-            winner, further = self._confirmed(search, on_before, fitted, outcomes, misleading)
-            scored, refits, refused = [*scored, *more], [*refits, *fitted], refused | further
-        if winner is None:
-            self.watch(f"round {number}: nothing helps")
-            rounds = (*search.rounds, ranking(scored, refits, outcomes))
-            return replace(search, rounds=rounds, refused=search.refused | refused), False
-        name, limit = winner.refit.name, winner.refit.delta_bic + ALIKE
-        near = [r for r in refits if r.name not in (name, *outcomes) and r.delta_bic < limit]
-        alike = tuple(r.name for r in near if not self._implausible(r.scored.hypothesis, r.fit))
-        outcomes |= dict.fromkeys(alike, Outcome.ALIKE) | {name: Outcome.ADDED}
-        self.watch(f"round {number}: {name} added")
-        kept = [f for f in search.findings if f.name in {h.name for h in winner.kept}]
-        after = replace(
-            search,
-            fit=winner.settled,
-            predictive=winner.predictive,
-            judged=winner.judged,
-            named=(*winner.kept, winner.refit.scored.hypothesis),
-            findings=(*kept, finding_of(winner.refit, winner.whole, winner.evidence, alike)),
-            rounds=(*search.rounds, ranking(scored, refits, outcomes)),
-            refused=search.refused | refused,
-        )
-        return after, True
-
-    def _tried(self, search: Search, on_before: Fit, number: int) -> tuple[list[Scored], list[Refit]]:
-        whole = on_all(search.fit, on_before)
-        return try_hypotheses(search.fit, whole, self.catalogue, partial(self._tell, number), self.jobs)
-
-    def _on_all(self, fit: Fit) -> Fit:
-        """The fit to the tracks of both halves, from one to the search half, for significance tests."""
-        return on_all(fit, on_others(fit, self.holdout.held_out))
-
-    def _tell(self, number: int, line: str) -> None:
-        self.watch(f"round {number}: {line}")
-
-    def _better_minimum(self, search: Search, best: Refit) -> Search | None:
-        """The search from a better minimum of the same model, found by a refit; None without one.
-
-        Spins without labels cause several minima. An effect that leads out of a poor one has not explained anything:
-        without it the fit stays as good.
-        """
-        if best.delta_bic >= 0.0:
-            return None
-        fit = without_named(best.fit, best.scored.hypothesis, search.first)
-        if not search.fit.cost - fit.cost > POORER * (search.fit.cost - best.fit.cost):
-            return None
-        self.watch("a better minimum of the fit was found")
-        settled = fit_problem(fit.problem, fit.unknowns, fit.noise)
-        predictive = self.predictive(settled)
-        if predictive.errors.prediction_rmse_mm > WORSE * search.predictive.errors.prediction_rmse_mm:
-            return None
-        judged = self.judge(predictive.model)
-        moved = replace(search, fit=settled, predictive=predictive, judged=judged)
-        if search.named:
-            return moved
-        return replace(moved, first=settled, declared=predictive, before=judged)
-
-    def _confirmed(
-        self,
-        search: Search,
-        on_before: Fit,
-        refits: Sequence[Refit],
-        outcomes: dict[str, Outcome],
-        misleading: list[Refit],
-    ) -> tuple[Confirmed | None, dict[str, Refusal]]:
-        """The best refit that deserves a name, and better ones that do not; fills in their outcomes.
-
-        If a better effect was refused only because it predicted a few balls worse, its pattern gets no lesser name;
-        such effects are added to `misleading`.
-        """
-        refused: dict[str, Refusal] = {}
-        waiting, examined = [r for r in refits if r.delta_bic < 0.0], dict[int, Examined]()
-        for place, candidate in enumerate(waiting):
-            if any(says_the_same(candidate, better) for better in misleading):
-                examined[id(candidate)] = Outcome.SAME_PATTERN, candidate.fit
-            elif id(candidate) not in examined:
-                examined |= self._examined_together(search, waiting[place:], on_before, misleading)
-            found = examined[id(candidate)]
-            if isinstance(found, Confirmed):
-                return found, refused
-            outcomes[candidate.name], settled = found
-            misleading += [candidate] if outcomes[candidate.name] is Outcome.MISLEADING else []
-            if outcomes[candidate.name] in NO_NAME:
-                refused[candidate.name] = self._refusal(candidate.scored.hypothesis, settled, outcomes[candidate.name])
-        return None, refused
-
-    def _examined_together(
-        self, search: Search, waiting: Sequence[Refit], on_before: Fit, misleading: Sequence[Refit]
-    ) -> dict[int, Examined]:
-        """The next refits examined in parallel, by their id: if the first is refused, the second is needed."""
-        others = [r for r in waiting if not any(says_the_same(r, better) for better in misleading)][: self.jobs]
-        silent = replace(self, watch=_untold) if len(others) > 1 else self  # progress is reported in this process
-        tasks = [partial(silent._examined, search, candidate, on_before) for candidate in others]
-        return dict(zip(map(id, others), do_all(tasks, self.jobs), strict=True))
-
-    def _examined(self, search: Search, candidate: Refit, on_before: Fit) -> Examined:
-        """A refit with its confirmation, or the reason for its refusal and its fit; cheap tests come first."""
-        hypothesis = candidate.scored.hypothesis
-        evidence = held_out_gain(search.fit, candidate.fit, self.holdout.held_out, on_before)
-        if evidence.p_value >= CONFIRMED:
-            return Outcome.NOT_HELPFUL, candidate.fit
-        settled = fit_problem(candidate.fit.problem, candidate.fit.unknowns, candidate.fit.noise)
-        whole = self._on_all(settled)
-        if self._implausible(hypothesis, whole):
-            return Outcome.IMPLAUSIBLE, whole
-        idle = insignificant(whole, [*search.named, hypothesis], search.first)
-        if hypothesis in idle:
-            return Outcome.INSIGNIFICANT, whole
-        idle += [h for h in search.named if h not in idle and self._pushed(h, search.fit, whole)]
-        kept = tuple(h for h in search.named if h not in idle)
-        if idle:
-            alone = candidate.fit
-            for other in idle:
-                alone = without_named(alone, other, search.first)
-            if delta_bic(search.fit, alone) >= 0.0:
-                return Outcome.SAME_PATTERN, whole
-            settled = fit_problem(alone.problem, alone.unknowns, alone.noise)
-            whole = self._on_all(settled)
-        if not _same_change(search, hypothesis) and halves_differ(settled, hypothesis, self.holdout.held_out):
-            return Outcome.CONTRADICTORY, whole
-        predictive = self.predictive(settled)
-        if predictive.errors.prediction_rmse_mm > WORSE * search.predictive.errors.prediction_rmse_mm:
-            return Outcome.MISLEADING, whole
-        judged = self.judge(predictive.model)
-        if got_worse(judged, search.judged):
-            return Outcome.MISLEADING, whole
-        return Confirmed(candidate, evidence, kept, settled, whole, predictive, judged)
-
-    def _implausible(self, hypothesis: Hypothesis, fit: Fit) -> str:
-        """The reason why the fitted strengths of an effect are implausible; empty if they are plausible."""
-        values = fitted_values(fit, hypothesis)
-        radius = fit.problem.model.radius
-        known = [implausible(hypothesis.known_as(n), values[n], radius) for n in hypothesis.strengths]
-        if any(known):
-            return next(text for text in known if text)
-        ranged = all(range_of(hypothesis.known_as(n), radius) for n in hypothesis.strengths)
-        if not ranged and hypothesis.strain(fit.unknowns.values) > self.plausible:
-            return f"more than {self.plausible:g} times its typical distance from the usual value"
-        return ""
-
-    def _pushed(self, hypothesis: Hypothesis, before: Fit, after: Fit) -> bool:
-        """True if an effect's strengths are plausible, but would not be beside a further effect."""
-        return bool(self._implausible(hypothesis, after)) and not self._implausible(hypothesis, before)
-
-    def _refusal(self, hypothesis: Hypothesis, fit: Fit, outcome: Outcome) -> Refusal:
-        """The refusal of an effect that fits better; fit: with it."""
-        reason = self._implausible(hypothesis, fit) if outcome is Outcome.IMPLAUSIBLE else ""
-        return Refusal(hypothesis.name, fitted_values(fit, hypothesis), outcome, reason, hypothesis.decide)
-
-    def _pruned(self, search: Search, *, examined: int = 1) -> Search:
-        """The search without effects that later ones made superfluous; the last added is tested first.
-
-        Each effect must still be plausible, differ from zero, and improve predictions of the judging half; the last
-        ones that were `examined` beside all others are not tested again.
-        """
-        whole = self._on_all(search.fit)
-        idle = insignificant(whole, search.named, search.first)
-        for hypothesis in reversed(search.named[: len(search.named) - examined]):
-            if hypothesis.name in self.holdout.stamps.found:
-                continue
-            fit = without_named(search.fit, hypothesis, search.first)
-            fit = fit_problem(fit.problem, fit.unknowns, fit.noise)
+        fit, predictive = first, declared
+        if final.named:
+            problem = replace(final.fit.problem, stretches=first.problem.stretches)
+            starts = final.fit.unknowns.starts[: len(first.problem.stretches)]
+            fit = fit_problem(problem, replace(final.fit.unknowns, starts=starts), final.fit.noise)
             predictive = self.predictive(fit)
             judged = self.judge(predictive.model)
-            refusal = None
-            if self._implausible(hypothesis, whole):
-                refusal = self._refusal(hypothesis, whole, Outcome.IMPLAUSIBLE)
-            elif hypothesis in idle:
-                refusal = self._refusal(hypothesis, whole, Outcome.INSIGNIFICANT)
-            elif got_worse(search.judged, judged):
-                reason = (
-                    f"{search.judged.prediction_rmse_mm:.1f} mm off on the judging half with it, "
-                    f"{judged.prediction_rmse_mm:.1f} mm without it"
-                )
-                refusal = replace(self._refusal(hypothesis, whole, Outcome.MISLEADING), reason=reason)
-            if refusal is not None:
-                self.watch(f"{hypothesis.name} taken out again")
-                return self._pruned(left_out(search, hypothesis, fit, predictive, judged, refusal), examined=0)
-        return replace(search, whole=whole)
+        rounds = {r.added: r for r in found.rounds}
+        findings = [
+            finding_of(h, final, found.without([h], final), odds, rounds.get(h.name, found.rounds[-1]).refits)
+            for h in final.named
+        ]
+        return Search(
+            first,
+            declared,
+            fit,
+            predictive,
+            before,
+            judged,
+            final.fit,
+            (*stamp_hypotheses(stamps), *final.named),
+            (*stamp_findings(first, stamps), *findings),
+            tuple(ranking(r.scored, r.refits, r.added, odds) for r in found.rounds),
+            odds,
+        )
 
 
-def _untold(_line: str) -> None:
-    """Reports no progress."""
+class _Found:
+    """Everything weighed so far, by the names of the effects, and the best of it."""
+
+    def __init__(self, loop: SearchLoop, first: Fit) -> None:
+        self.loop, self.first = loop, first
+        whole = on_all(first, on_others(first, loop.holdout.held_out))
+        count = len(np.unique(first.problem.stretches.track))
+        self.halves: Mask = np.arange(len(np.unique(whole.problem.stretches.track))) < count
+        self.scattering = [name for name in whole.problem.free if name not in whole.problem.deviations]
+        self.declared = self.best = weighed(whole, (), self.scattering, self.halves)
+        self.models = {self.best.names: self.best}
+        self.rounds: list[Round] = []
+
+    @property
+    def odds(self) -> Odds:
+        """Probabilities over all models weighed so far."""
+        return odds_of(list(self.models.values()), self.declared)
+
+    def round(self) -> bool:
+        """Adds the effect that makes the model most probable, and removes those that it makes superfluous."""
+        loop, best, number = self.loop, self.best, len(self.rounds) + 1
+        tell: Callable[[str], None] = lambda line: loop.watch(f"round {number}: {line}")  # noqa: E731
+        scored, refits = try_hypotheses(best.fit, loop.catalogue, tell, loop.jobs)
+        winner = self._weighed(refits)
+        if winner is None or winner.score <= best.score:
+            ways = loop.ways or partial(groupings, loop.holdout.tracks)
+            more, fitted = try_varying(best.fit, loop.of_some or loop.catalogue, ways, tell, loop.jobs)
+            scored, refits = [*scored, *more], [*refits, *fitted]
+            winner = max((w for w in (winner, self._weighed(fitted)) if w is not None), key=_score, default=None)
+        added = winner is not None and winner.score > best.score
+        self.rounds.append(Round(scored, refits, winner.named[-1].name if winner and added else ""))
+        if winner is None or not added:
+            tell("nothing makes the model more probable")
+            return False
+        tell(f"{winner.named[-1].name} added")
+        self.best = winner
+        self._better_minimum(best, winner)
+        self._pruned()
+        return True
+
+    def compare(self) -> None:
+        """Weighs the best model without each of its effects, and with its rivals in its place."""
+        for hypothesis in self.best.named:
+            self.without([hypothesis])
+
+    def without(self, gone: Sequence[Hypothesis], model: Weighed | None = None) -> Weighed:
+        """A model without some of its effects."""
+        model = model or self.best
+        kept = tuple(h for h in model.named if h not in gone)
+        names = frozenset(h.name for h in kept)
+        if names not in self.models:
+            fit = model.fit
+            for hypothesis in gone:
+                fit = without_named(fit, hypothesis, self.first)
+            self.models[names] = weighed(fit, kept, self.scattering, self.halves, model.noise)
+        return self.models[names]
+
+    def _weighed(self, refits: Sequence[Refit]) -> Weighed | None:
+        """The most probable of some refits; None without any."""
+        best = self.best
+        tasks = [
+            partial(weighed, r.fit, (*best.named, r.scored.hypothesis), self.scattering, self.halves, best.noise)
+            for r in refits
+            if np.isfinite(r.fit.cost)
+        ]
+        found = do_all(tasks, self.loop.jobs)
+        for model in found:
+            if model.names not in self.models or model.score > self.models[model.names].score:
+                self.models[model.names] = model
+        return max(found, key=_score, default=None)
+
+    def _better_minimum(self, before: Weighed, after: Weighed) -> None:
+        """Weighs the earlier model again from the later one's fit: an effect may only have led out of a poor minimum."""
+        fit = without_named(after.fit, after.named[-1], self.first)
+        again = weighed(fit, before.named, self.scattering, self.halves, before.noise)
+        if again.score > before.score:
+            self.models[before.names] = again
+            if again.score > after.score:
+                self.best = again
+        if not before.named:
+            self.declared = self.models[before.names]
+
+    def _pruned(self) -> None:
+        """Removes effects that a later one made superfluous."""
+        better = True
+        while better:
+            shorter = [self.without([h]) for h in self.best.named[:-1]]
+            least = max(shorter, key=_score, default=self.best)
+            better = least.score > self.best.score
+            self.best = least if better else self.best
 
 
-def _same_change(search: Search, hypothesis: Hypothesis) -> bool:
-    """True if an effect changes at the same track as an earlier found one.
+def _score(model: Weighed) -> float:
+    return model.score
 
-    A new table changes several coefficients at once. Until the model has all of them, each compensates for the others,
-    differently in either half.
-    """
-    found = {deviation.level for deviation in search.fit.problem.deviations.values() if deviation.first}
-    return any(deviation.level in found for deviation in hypothesis.deviations().values())
+
+def without_named(fit: Fit, hypothesis: Hypothesis, first: Fit) -> Fit:
+    """The fit without one of the effects added to the first one's model, at the same noise."""
+    problem, name = fit.problem, hypothesis.effect.name
+    gone = set(hypothesis.columns)
+    needed = has_effect(first.problem.model, name)
+    if hypothesis.deviations():  # the effect itself may have been named too, the same for all tracks
+        needed |= any(n.startswith(f"{hypothesis.effect.kind}.{name}.") for n in problem.free if n not in gone)
+    model = problem.model if needed else without_effect(problem.model, name)
+    left = dict(model.named_parameters())
+    deviations = {n: d for n, d in problem.deviations.items() if d.coefficient in left and n not in gone}
+    free = {n: c for n, c in problem.free.items() if (n in left or n in deviations) and n not in gone}
+    unknowns = replace(fit.unknowns, values={n: fit.unknowns.values[n] for n in free})
+    problem = replace(problem, model=model, free=free, deviations=deviations)
+    return fit_problem(problem, unknowns, fit.noise, settle_noise=False)

@@ -5,40 +5,67 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
+from scipy import stats
 
-from ballfg.diagnosis.fit.fit import covariance_of, values_of
+from ballfg.diagnosis.evidence.odds import Odds
+from ballfg.diagnosis.evidence.weighed import Weighed
+from ballfg.diagnosis.fit.fit import values_of
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.result import Candidate, Finding, Outcome, Value
 from ballfg.diagnosis.search.candidates import ALARM, Refit, Scored
-from ballfg.diagnosis.search.evaluation import HeldOutGain
 from ballfg.diagnosis.search.hypothesis import TWINS, Hypothesis
-from ballfg.diagnosis.search.parsimony import significance
 
-NO_NAME: Final = (
-    Outcome.IMPLAUSIBLE,
-    Outcome.INSIGNIFICANT,
-    Outcome.CONTRADICTORY,
-    Outcome.SAME_PATTERN,
-    Outcome.MISLEADING,
-)
-"""Outcomes of refused candidates that fit better on both halves: the report gives the reason."""
+ALIKE: Final = 0.05
+"""Odds of another effect in an effect's place above which the two cannot be told apart."""
 
 
-def finding_of(refit: Refit, settled: Fit, evidence: HeldOutGain, alike: tuple[str, ...]) -> Finding:
-    """An added effect, with its evidence. settled: the fit with it and a new noise estimate."""
-    hypothesis = refit.scored.hypothesis
+def finding_of(
+    hypothesis: Hypothesis, model: Weighed, without: Weighed, odds: Odds, refits: Sequence[Refit]
+) -> Finding:
+    """A named effect with its evidence.
+
+    Args:
+        model, without: the most probable model, and the same without the effect.
+        odds: of all models.
+        refits: of the round that added it.
+    """
+    values = fitted_values(model.fit, hypothesis)
+    if hypothesis.name in model.strengths and not hypothesis.deviations():
+        sigmas = np.sqrt(np.diagonal(model.strengths[hypothesis.name].covariance)).tolist()
+        values |= {n: replace(values[n], sigma=s) for n, s in zip(hypothesis.strengths, sigmas, strict=True)}
+    gains = model.held_out - without.held_out
+    error = gains.std(ddof=1) / np.sqrt(len(gains))
+    own = next((r for r in refits if r.name == hypothesis.name), None)
+    rest = model.names - {hypothesis.name}
+    likely = odds.models[model.names] * ALIKE
+    alike = [n for names, p in odds.models.items() if p > likely and rest < names for n in names - model.names]
     return Finding(
         name=hypothesis.name,
         kind=hypothesis.effect.kind,
         sentence=hypothesis.sentence,
         decide=hypothesis.decide,
-        parameters=fitted_values(settled, hypothesis),
-        p_value=refit.scored.p_value,
-        delta_bic=refit.delta_bic,
+        parameters=values,
+        p_value=1.0 if own is None else own.scored.p_value,
+        delta_bic=0.0 if own is None else own.delta_bic,
         indistinguishable_from=(*TWINS.get(hypothesis.name, ()), *alike),
-        held_out_gain=evidence.gain,
-        held_out_p=evidence.p_value,
+        held_out_gain=float(gains.mean()),
+        held_out_p=float(stats.norm.sf(gains.mean() / error)),
+        probability=odds.of(hypothesis.name),
+        evidence=model.evidence - without.evidence,
+        usual=unusual(hypothesis, values),
     )
+
+
+def unusual(hypothesis: Hypothesis, values: Mapping[str, Value]) -> str:
+    """Words on strengths outside of the usual range; empty if they are inside."""
+    known = hypothesis.effect.plausible
+    if known is None:
+        return ""
+    names = [n for n in hypothesis.strengths if not known.low <= values[n].value <= known.high]
+    if not names:
+        return ""
+    told = ", ".join(f"{n} = {values[n].value:.3g} {values[n].unit}" for n in names)
+    return f"{told}: usually between {known.low:g} and {known.high:g} ({known.source})"
 
 
 def fitted_values(fit: Fit, hypothesis: Hypothesis) -> dict[str, Value]:
@@ -48,38 +75,18 @@ def fitted_values(fit: Fit, hypothesis: Hypothesis) -> dict[str, Value]:
     return hypothesis.reported(fit, {names[name]: value for name, value in values.items()})
 
 
-def as_left(findings: Sequence[Finding], named: Sequence[Hypothesis], fit: Fit, first: Fit) -> tuple[Finding, ...]:
-    """Findings with the coefficients of the last fit, with all the others in the model.
-
-    The standard deviation of a strength is that of its significance; first: the fit without any of the findings. An
-    effect that turned out to differ between tracks is listed only in that form.
-    """
-    refreshed = []
-    varying = {h.effect.name for h in named if h.deviations()}
-    for finding, hypothesis in zip(findings, named, strict=True):
-        if not hypothesis.deviations() and hypothesis.effect.name in varying:
-            continue
-        values = fitted_values(fit, hypothesis)
-        sigmas = significance(fit, hypothesis, first).sigmas if hypothesis.strengths else np.zeros(0)
-        if hypothesis.deviations():  # the report gives the sum with the coefficient itself
-            noise = np.sqrt(np.diagonal(covariance_of(fit, hypothesis.columns)))
-            sigmas = sigmas / noise * [values[name].sigma for name in hypothesis.strengths]
-        for name, sigma in zip(hypothesis.strengths, sigmas.tolist(), strict=True):
-            if np.isfinite(sigma):
-                values[name] = replace(values[name], sigma=sigma)
-        refreshed.append(replace(finding, parameters=values))
-    return tuple(refreshed)
-
-
 def ranking(
-    scored: Sequence[Scored], refits: Sequence[Refit], outcomes: Mapping[str, Outcome]
+    scored: Sequence[Scored], refits: Sequence[Refit], added: str, odds: Odds
 ) -> tuple[Candidate, ...]:
     """One row per effect in its best shape, sorted by explained residual."""
+    outcomes = {added: Outcome.ADDED}
     refitted = {r.name: r.delta_bic for r in refits}
     best: dict[str, Scored] = {}
     for candidate in scored:
         best.setdefault(candidate.hypothesis.name, candidate)
-    return tuple(_row(s, refitted.get(n), outcomes.get(n)) for n, s in best.items())
+    return tuple(
+        replace(_row(s, refitted.get(n), outcomes.get(n)), probability=odds.of(n)) for n, s in best.items()
+    )
 
 
 def _row(scored: Scored, delta_bic: float | None, outcome: Outcome | None) -> Candidate:

@@ -94,10 +94,10 @@ def hypothesis_signatures(fit: Fit, candidates: Sequence[Hypothesis]) -> tuple[S
     """Inner products of all columns on each track, and the numbers of the candidate columns of each hypothesis."""
     ends = np.cumsum([len(hypothesis.strengths) for hypothesis in candidates]).tolist()
     chosen = [list(range(end - len(h.strengths), end)) for end, h in zip(ends, candidates, strict=True)]
-    return signatures_of(fit, fit.linearised(), _columns(fit, candidates)), chosen
+    return signatures_of(fit, fit.linearised(), columns_of(fit, candidates)), chosen
 
 
-def _columns(fit: Fit, candidates: Sequence[Hypothesis]) -> Array:
+def columns_of(fit: Fit, candidates: Sequence[Hypothesis]) -> Array:
     """Columns of all candidates, in their order.
 
     Effects on the ball are computed together, and so are effects on its measurement. The latter need states at further

@@ -6,9 +6,8 @@ from functools import partial
 from typing import cast
 
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.search.candidates import (
-    HALF_ALARM,
+    ALARM,
     Refit,
     Scored,
     refit,
@@ -17,10 +16,9 @@ from ballfg.diagnosis.search.candidates import (
     score_all,
     shortlist,
 )
-from ballfg.diagnosis.search.evaluation import on_others
 from ballfg.diagnosis.search.hypothesis import has_effect, hypotheses, scene_of
 from ballfg.diagnosis.search.label_frames import frame_hypotheses
-from ballfg.diagnosis.search.varying import Grouping, Varying, between, near, varying_hypotheses
+from ballfg.diagnosis.search.varying import Grouping, Varying, near, varying_hypotheses
 from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.effects.measurement import SpinLabelFrame
 from ballfg.dynamics.variation import place_of
@@ -38,7 +36,6 @@ LABELLED = 0.5
 def try_varying(
     before: Fit,
     catalogue: Sequence[type[Effect]],
-    held_out: Stretches,
     ways: Callable[[Sequence[str]], list[Grouping]],
     tell: Callable[[str], None],
     jobs: int = 1,
@@ -48,13 +45,12 @@ def try_varying(
     Args:
         before: the fit without any of them.
         catalogue: effects that may differ.
-        held_out: stretches of the other half.
-        ways: groupings of the tracks, by the names of the search half's tracks.
+        ways: groupings of the tracks, by their names.
         tell: called with progress.
         jobs: processes.
     """
     problem = before.problem
-    searched = list(dict.fromkeys(problem.stretches.names))
+    searched = sorted(dict.fromkeys(problem.stretches.names), key=place_of)
     known = ways(searched)
     listed = varying_hypotheses(problem.model, scene_of(before), catalogue, problem.free, known)
     tell(f"testing {len(listed)} ways in which tracks may differ")
@@ -65,25 +61,8 @@ def try_varying(
         tell(f"fitting with {candidate.hypothesis.name}")
         closer = near(cast(Varying, candidate.hypothesis), searched, names)
         best = _placed(before, closer) if len(closer) > 1 else candidate
-        same = between(cast(Varying, best.hypothesis), searched, names)
-        placed = [replace(best, hypothesis=h, p_value=candidate.p_value) for h in same]
-        fitted = do_all([partial(refit, before, one) for one in placed], jobs)
-        # the search half has no track between these places, so that only the other half separates them
-        refits.append(min(fitted, key=lambda r: on_others(r.fit, held_out).cost) if len(same) > 1 else fitted[0])
+        refits.append(refit(before, replace(best, p_value=candidate.p_value)))
     return scored, sorted(refits, key=lambda r: r.delta_bic)
-
-
-def try_further(
-    before: Fit, scored: Sequence[Scored], tried: Sequence[Refit], tell: Callable[[str], None], jobs: int = 1
-) -> list[Refit]:
-    """Refits of the next hypotheses in the ranking, the best first; empty without a further significant one.
-
-    They serve a round in which no earlier hypothesis deserves a name: flexible effects of implausible size explain most
-    of any pattern, and rank before its cause.
-    """
-    names = {refitted.name for refitted in tried}
-    tasks = _refits(before, shortlist([s for s in scored if s.hypothesis.name not in names]), tell)
-    return sorted(do_all(tasks, jobs), key=lambda r: r.delta_bic)
 
 
 def _refits(before: Fit, leading: Sequence[Scored], tell: Callable[[str], None]) -> list[Callable[[], Refit]]:
@@ -114,13 +93,12 @@ def _placed(before: Fit, closer: Sequence[Varying]) -> Scored:
 
 
 def try_hypotheses(
-    before: Fit, whole: Fit, catalogue: Sequence[type[Effect]], tell: Callable[[str], None], jobs: int = 1
+    before: Fit, catalogue: Sequence[type[Effect]], tell: Callable[[str], None], jobs: int = 1
 ) -> tuple[list[Scored], list[Refit]]:
-    """Scores all hypotheses, sorted by explained residual, and refits the best to the search half.
+    """Scores all hypotheses, sorted by explained residual, and refits the best.
 
     Args:
-        before: the fit to the search half without any of them.
-        whole: the same model's fit to the tracks of both halves, for the score tests.
+        before: the fit without any of them.
         catalogue: candidate effects.
         tell: called with progress.
         jobs: processes.
@@ -131,7 +109,7 @@ def try_hypotheses(
     tell(f"testing {len(candidates)} hypotheses")
     unlabelled = before.problem.stretches.labelled.mean() < LABELLED
     driven = [h for h in candidates if h.effect.multiplies_spin and unlabelled]
-    scored = score_all(whole, [h for h in candidates if h not in driven])
+    scored = score_all(before, [h for h in candidates if h not in driven])
     leading = shortlist(scored)
     called = {candidate.hypothesis.name for candidate in leading}
     usual = {h.name: h for h in (s.hypothesis for s in scored) if h.usual and h.name not in called}
@@ -144,9 +122,9 @@ def try_hypotheses(
     tasks += [partial(refit_usual, before, h) for h in usual.values()]
     tasks += [partial(refit_driven, before, h) for h in driven]
     refits = do_all(tasks, jobs)
-    telling = {r.name: r.scored for r in refits if r.name in usual and r.scored.p_value < HALF_ALARM}
+    telling = {r.name: r.scored for r in refits if r.name in usual and r.scored.p_value < ALARM}
     scored = [telling.get(s.hypothesis.name, s) for s in scored]
     scored += [r.scored for r in refits if r.name in {h.name for h in driven}]
-    refits = [r for r in refits if r.name in called or r.scored.p_value < HALF_ALARM]
+    refits = [r for r in refits if r.name in called or r.scored.p_value < ALARM]
     ranked = sorted(scored, key=lambda s: s.explained, reverse=True)
     return ranked, sorted(refits, key=lambda r: r.delta_bic)

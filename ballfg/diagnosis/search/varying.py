@@ -5,6 +5,7 @@ is tried only if no effect that is equal for all tracks helps.
 """
 
 import itertools
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -74,22 +75,13 @@ def steps_near(grouping: Grouping, searched: Sequence[str], names: Sequence[str]
     return [_step(names, searched[begin]) for begin in begins]
 
 
-def steps_between(grouping: Grouping, searched: Sequence[str], names: Sequence[str]) -> list[Grouping]:
-    """A step moved to every track since the previous one of the search half; other groupings stay."""
-    if grouping.by != TRACK or grouping.line:
-        return [grouping]
-    begin = next(iter(grouping.weights))
-    last = max(names.index(name) for name in searched if names.index(name) < names.index(begin))
-    return [_step(names, name) for name in names[last + 1 : names.index(begin) + 1]]
-
-
 def _by_labels(tracks: Sequence[Track], searched: set[str]) -> list[Grouping]:
     found = []
     for label in sorted({name for track in tracks for name, value in track.labels.items() if isinstance(value, str)}):
         known = {track.name: str(track.labels[label]) for track in tracks if label in track.labels}
         levels = sorted(set(known.values()))
-        halves = [[v for n, v in known.items() if (n in searched) is half] for half in (True, False)]
-        enough = all(half.count(level) >= LEAST_TRACKS for level in levels for half in halves)
+        counts = Counter(value for name, value in known.items() if name in searched)
+        enough = all(counts[level] >= 2 * LEAST_TRACKS for level in levels)
         if 2 <= len(levels) <= MOST_GROUPS and enough:
             weights = {level: {n: 1.0 for n, value in known.items() if value == level} for level in levels}
             found.append(Grouping(label, weights))
@@ -135,7 +127,7 @@ class Varying(Hypothesis):
     def of(cls, effect: type[Effect], coefficients: Sequence[str], grouping: Grouping) -> "Varying":
         """The hypothesis that some coefficients of an effect differ."""
         strengths = tuple(f"{c}[{grouping.named(level)}]" for c in coefficients for level in grouping.weights)
-        return cls(effect, {}, strengths, grouping=grouping)
+        return cls(effect, {}, strengths, PARTS if grouping.by == TRACK else 1, grouping=grouping)
 
     @property
     def name(self) -> str:
@@ -160,11 +152,11 @@ class Varying(Hypothesis):
     def coefficients(self) -> dict[str, Coefficient]:
         """The deviations as coefficients, by name."""
         listed = {c.name: c for c in self.effect.coefficients}
-        return {s: replace(listed[_varied(s)], name=s, default=0.0, absent=0.0) for s in self.strengths}
+        return {s: replace(listed[varied(s)], name=s, default=0.0, absent=0.0) for s in self.strengths}
 
     def known_as(self, coefficient: str) -> str:
         """The coefficient whose plausible range applies to a level."""
-        return f"{self.effect.name}.{_varied(coefficient)}"
+        return f"{self.effect.name}.{varied(coefficient)}"
 
     @property
     def usual(self) -> bool:
@@ -175,7 +167,7 @@ class Varying(Hypothesis):
         """The deviations; bounds apply only to the sum of a coefficient and its deviations."""
         listed = {c.name: LOOSE * spread(c) for c in self.effect.coefficients}
         return {
-            self.parameter(n): replace(c, sigma=listed[_varied(n)], low=c.low - c.high, high=c.high - c.low)
+            self.parameter(n): replace(c, sigma=listed[varied(n)], low=c.low - c.high, high=c.high - c.low)
             for n, c in self.coefficients.items()
         }
 
@@ -195,7 +187,7 @@ class Varying(Hypothesis):
         return {self.grouping.named(level): level for level in self.grouping.weights}
 
     def _coefficient(self, strength: str) -> str:
-        return self.parameter(_varied(strength))
+        return self.parameter(varied(strength))
 
     def added_to(self, model: AnalyticModel) -> AnalyticModel:
         """The model with the effect at zero strength for all tracks; the model itself if it has the effect."""
@@ -213,7 +205,7 @@ class Varying(Hypothesis):
             if name in fit.problem.free:
                 summed.append(name)
                 if first := self.grouping.first:
-                    begin = f"{_varied(strength)}[{self.grouping.named(first)}]"
+                    begin = f"{varied(strength)}[{self.grouping.named(first)}]"
                     sigma = float(np.sqrt(covariance_of(fit, [name])[0, 0]))
                     told.setdefault(begin, Value(known[first], sigma, deviation.unit))
             sigma = float(np.sqrt(covariance_of(fit, summed).sum()))
@@ -249,19 +241,12 @@ def varying_hypotheses(
 
 def near(hypothesis: Varying, searched: Sequence[str], names: Sequence[str]) -> list[Varying]:
     """The hypothesis with its step at every nearby place; itself without a step."""
-    coefficients = tuple(dict.fromkeys(_varied(s) for s in hypothesis.strengths))
+    coefficients = tuple(dict.fromkeys(varied(s) for s in hypothesis.strengths))
     ways = steps_near(hypothesis.grouping, searched, names)
     return [Varying.of(hypothesis.effect, coefficients, way) for way in ways]
 
 
-def between(hypothesis: Varying, searched: Sequence[str], names: Sequence[str]) -> list[Varying]:
-    """The hypothesis with its step before each track between two of the search half."""
-    coefficients = tuple(dict.fromkeys(_varied(s) for s in hypothesis.strengths))
-    ways = steps_between(hypothesis.grouping, searched, names)
-    return [Varying.of(hypothesis.effect, coefficients, way) for way in ways]
-
-
-def _varied(strength: str) -> str:
+def varied(strength: str) -> str:
     return strength.partition("[")[0]
 
 

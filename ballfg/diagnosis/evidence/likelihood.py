@@ -1,0 +1,227 @@
+"""The marginal likelihood of the tracks under a model with noise: first states and random motion are integrated out.
+
+Sizes of the noise maximise it for each model, so that what a wrong model cannot explain counts as its noise. Common
+unknowns have their priors; with them integrated out too the likelihood is the evidence of the model, by Laplace's
+approximation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, partial
+
+import numpy as np
+from scipy import linalg, optimize
+
+from ballfg.arrays import Array, Index, Mask
+from ballfg.diagnosis.evidence.rows import KINDS, Rows
+from ballfg.diagnosis.fit.problem import LABEL_LOSS, POSITION_LOSS
+from ballfg.diagnosis.fit.system import by_track
+from ballfg.state import STATE_DIM
+
+LEAST, MOST = -5.0, 5.0
+"""Bounds of the logarithm of a size over its unit."""
+MOST_STEPS, TOLERANCE = 30, 1e-6
+ROUNDS = 3
+"""Number of turns of robust weights and sizes."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Logarithms of the sizes: of white noise and spin rows over the stated ones, and of random motion (4,)."""
+
+    white: float = 0.0
+    spin: float = 0.0
+    random: tuple[float, ...] = (-1.0, -1.0, -1.0, -1.5)
+
+    @property
+    def vector(self) -> Array:
+        """(6,) all of them."""
+        return np.array([self.white, self.spin, *self.random])
+
+    @classmethod
+    def of(cls, vector: Array) -> Noise:
+        """The noise of (6,) logarithms."""
+        return cls(float(vector[0]), float(vector[1]), tuple(vector[2:].tolist()))
+
+
+@dataclass(frozen=True)
+class Reduced:
+    """The likelihood without first states and random motion, quadratic in the common unknowns.
+
+    Attributes:
+        constant: (n,) what does not depend on them, without the square of the residual.
+        gram: (n, c + 1, c + 1) inner products of common columns and the residual, last, over the noise.
+    """
+
+    constant: Array
+    gram: Array
+
+    def by_track(self, track: Index) -> Reduced:
+        """Summed over the stretches of each track; track: (n,) their numbers."""
+        gram = by_track(self.gram, track)
+        return Reduced(by_track(self.constant[:, None, None], track)[:, 0, 0], gram)
+
+    def of(self, tracks: Mask) -> Reduced:
+        """The part of some tracks, summed."""
+        return Reduced(self.constant[tracks].sum(keepdims=True), self.gram[tracks].sum(axis=0, keepdims=True))
+
+
+@dataclass(frozen=True)
+class Local:
+    """The eliminated unknowns of each stretch.
+
+    Attributes:
+        lower: (n, l, l) triangle of the information on first states and random motion.
+        solved: (n, l, c + 1) its inverse times their inner products with common columns and the residual.
+    """
+
+    lower: Array
+    solved: Array
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Evidence of a model, and mean (c,) and covariance (c, c) of its common unknowns, as steps from the fit."""
+
+    evidence: float
+    mean: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """Inner products of the rows under some robust weights.
+
+    Attributes:
+        rows: of a fit.
+        samples, spins: (n, k) and (n,) robust weights.
+        penalty: (n,) their cost.
+    """
+
+    rows: Rows
+    samples: Array
+    spins: Array
+    penalty: Array
+
+    @cached_property
+    def grams(self) -> tuple[Array, Array]:
+        """Two (n, d, d): of the samples, and of the spin rows; columns start, random, common, residual."""
+        r = self.rows
+        columns = np.concatenate((r.by_start, r.random, r.by_common, r.residual[..., None]), axis=-1)
+        root = np.sqrt(np.repeat(self.samples * r.used, 3, axis=1))[..., None]
+        positions, spins = columns[:, :-3] * root, columns[:, -3:] * np.sqrt(self.spins)[:, None, None]
+        return positions.swapaxes(1, 2) @ positions, spins.swapaxes(1, 2) @ spins
+
+    def inner(self, noise: Noise) -> tuple[Array, Array]:
+        """(n, d, d) information with priors of the random columns, and (n,) logarithms of the sizes."""
+        of_samples, of_spins = self.grams
+        total = of_samples * np.exp(-2.0 * noise.white) + of_spins * np.exp(-2.0 * noise.spin)
+        kinds, first = self.rows.kinds, np.arange(STATE_DIM)
+        sizes = np.append(noise.random, 0.0)[kinds]
+        place = STATE_DIM + np.arange(kinds.shape[1])
+        total[:, place, place] += np.exp(-2.0 * sizes)
+        total[:, first, first] += total[:, first, first] == 0.0
+        count = 3.0 * self.rows.used.sum(axis=1)
+        return total, -count * noise.white - 3.0 * noise.spin - sizes.sum(axis=1)
+
+    def reduced(self, noise: Noise) -> tuple[Reduced, Local]:
+        """First states and random motion integrated out."""
+        total, logs = self.inner(noise)
+        end = STATE_DIM + self.rows.kinds.shape[1]
+        lower = np.linalg.cholesky(total[:, :end, :end])
+        solved = solve_lower(lower, total[:, :end, end:])
+        gram = total[:, end:, end:] - solved.swapaxes(1, 2) @ solved
+        narrow = np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)
+        return Reduced(logs - narrow - self.penalty, gram), Local(lower, solved)
+
+    def slope(self, noise: Noise, local: Local, found: Posterior) -> Array:
+        """(6,) derivative of the evidence by the logarithms of the sizes: expected squares less their number."""
+        end = STATE_DIM + self.rows.kinds.shape[1]
+        upper = np.linalg.inv(local.lower).swapaxes(1, 2)
+        solved = upper @ local.solved  # (n, l, c + 1), what local unknowns absorb of each column
+        step = np.append(-found.mean, 1.0)
+        mean = solved @ step
+        inverse = upper @ upper.swapaxes(1, 2)
+        root = np.linalg.cholesky(found.covariance)
+        moved = solved[..., :-1] @ root
+        squares = mean**2 + np.diagonal(inverse, axis1=1, axis2=2) + (moved**2).sum(axis=-1)
+        left = np.zeros((len(mean), end + len(step), len(step)))
+        left[:, :end, 0], left[:, end:, 0] = -mean, step
+        left[:, :end, 1:], left[:, end:-1, 1:] = -moved, root
+        slopes = []
+        for gram, log, count in zip(
+            self.grams, (noise.white, noise.spin), (3.0 * self.rows.used.sum(), 3.0 * len(mean)), strict=True
+        ):
+            square = ((gram @ left) * left).sum() + (gram[:, :end, :end] * inverse).sum()
+            slopes.append(float(square) * np.exp(-2.0 * log) - count)
+        kinds, own = self.rows.kinds, squares[:, STATE_DIM:]
+        for kind, log in enumerate(noise.random):
+            slopes.append(float(own[kinds == kind].sum()) * np.exp(-2.0 * log) - int((kinds == kind).sum()))
+        return np.array(slopes)
+
+    def reweighted(self, noise: Noise, common: Array) -> Likelihood:
+        """With the robust weights of the residual that remains beside the motion; common: (c,) step of the unknowns."""
+        total, _ = self.inner(noise)
+        r, end = self.rows, STATE_DIM + self.rows.kinds.shape[1]
+        right = total[:, :end, -1] - total[:, :end, end:-1] @ common
+        motion = np.linalg.solve(total[:, :end, :end], right[..., None])[..., 0]
+        columns = np.concatenate((r.by_start, r.random), axis=-1)
+        left = r.residual - r.by_common @ common - (columns @ motion[..., None])[..., 0]
+        return weighted(r, left / np.exp(noise.white), left[:, -3:] / np.exp(noise.spin))
+
+
+def weighted(rows: Rows, left: Array, spins: Array) -> Likelihood:
+    """The likelihood with the robust weights of whitened residuals of samples (n, m) and spins (n, 3)."""
+    n, k = rows.used.shape
+    length = np.linalg.norm(left[:, :-3].reshape(n, k, 3), axis=-1) * rows.used
+    spin = np.linalg.norm(spins, axis=-1) * rows.labelled
+    samples, labels = POSITION_LOSS.weight(length), LABEL_LOSS.weight(spin)
+    penalty = (POSITION_LOSS.value(length) - 0.5 * samples * length**2).sum(axis=1)
+    return Likelihood(rows, samples, labels, penalty + LABEL_LOSS.value(spin) - 0.5 * labels * spin**2)
+
+
+def posterior(reduced: Reduced, precision: Array, away: Array) -> Posterior:
+    """The evidence with all common unknowns integrated out.
+
+    Args: precision: (c,) of their priors.  away: (c,) prior mean less present value.
+    """
+    total = reduced.gram.sum(axis=0)
+    information, gradient = total[:-1, :-1] + np.diag(precision), total[:-1, -1] + precision * away
+    lower = np.linalg.cholesky(information)
+    covariance = np.linalg.inv(information)
+    mean = covariance @ gradient
+    square = total[-1, -1] - gradient @ mean + float((precision * away**2).sum())
+    narrow = np.log(np.diagonal(lower)).sum() - 0.5 * np.log(precision).sum()
+    return Posterior(float(reduced.constant.sum() - 0.5 * square - narrow), mean, covariance)
+
+
+def settled(rows: Rows, precision: Array, away: Array, start: Noise | None = None) -> tuple[Likelihood, Noise]:
+    """The likelihood with the robust weights and sizes of noise that maximise the evidence.
+
+    Args: precision, away: as in `posterior`.  start: noise of a similar model, whose weights are good from the start.
+    """
+    now = start or Noise()
+    likelihood = weighted(rows, np.zeros_like(rows.residual), np.zeros((len(rows.residual), 3)))
+    step = np.zeros(len(precision))
+    bounds = [(LEAST, MOST)] * (2 + KINDS)
+    options = {"maxiter": MOST_STEPS, "ftol": TOLERANCE}
+    for turn in range(ROUNDS):
+        likelihood = likelihood.reweighted(now, step) if turn or start else likelihood
+
+        def missing(vector: Array, likelihood: Likelihood = likelihood) -> tuple[float, Array]:
+            noise = Noise.of(vector)
+            reduced, local = likelihood.reduced(noise)
+            found = posterior(reduced, precision, away)
+            return -found.evidence, -likelihood.slope(noise, local, found)
+
+        found = optimize.minimize(missing, now.vector, method="L-BFGS-B", jac=True, bounds=bounds, options=options)
+        now = Noise.of(found.x)
+        step = posterior(likelihood.reduced(now)[0], precision, away).mean
+    return likelihood, now
+
+
+def solve_lower(lower: Array, right: Array) -> Array:
+    """Solutions (n, l, c) with triangles (n, l, l)."""
+    solve = partial(linalg.solve_triangular, lower=True, check_finite=False)
+    return np.stack([solve(one, other) for one, other in zip(lower, right, strict=True)])

@@ -1,0 +1,57 @@
+"""Probabilities of effects from the evidence of all models that were weighed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import special
+
+from ballfg.diagnosis.evidence.weighed import Weighed
+
+SURELY = 2.0
+"""Standard errors by which the gain on the other half must fall short of the evidence to be believed instead."""
+
+
+@dataclass(frozen=True)
+class Odds:
+    """Probabilities of the models that were weighed.
+
+    Attributes:
+        models: probability by the names of the effects in it.
+    """
+
+    models: Mapping[frozenset[str], float] = field(default_factory=dict)
+
+    def of(self, name: str) -> float:
+        """Probability that an effect is there."""
+        return float(sum(p for names, p in self.models.items() if name in names))
+
+    @property
+    def nothing(self) -> float:
+        """Probability that no effect is there."""
+        return self.models.get(frozenset(), 1.0)
+
+    def effects(self) -> dict[str, float]:
+        """Probability of each effect in any model, the most probable first."""
+        names = {name for model in self.models for name in model}
+        return dict(sorted(((name, self.of(name)) for name in names), key=lambda item: -item[1]))
+
+
+def tempered(model: Weighed, declared: Weighed) -> float:
+    """The evidence of a model over that of the declared one, as far as the other half bears it out.
+
+    Each half is predicted with the coefficients of the other. If the model is right, its gain there is about the
+    evidence. Where it is smaller by more than chance, the likelihood is raised to a power that makes them equal.
+    """
+    promised = model.evidence - declared.evidence
+    gains = model.held_out - declared.held_out
+    most = float(gains.sum() + SURELY * gains.std(ddof=1) * np.sqrt(len(gains)))
+    return float(np.clip(most, 0.0, promised)) if promised > 0.0 else promised
+
+
+def odds_of(models: Sequence[Weighed], declared: Weighed) -> Odds:
+    """The probabilities of all models."""
+    scores = np.array([tempered(model, declared) + model.odds for model in models])
+    return Odds({m.names: float(p) for m, p in zip(models, special.softmax(scores), strict=True)})

@@ -1,0 +1,42 @@
+"""Prior odds of effects and the heavy-tailed prior of their strengths.
+
+A strength is normal about absence with a width that is itself unknown: some share or multiple of the effect's usual
+strength. A strength of five times the usual one so costs two nats, and no strength is forbidden.
+"""
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.diagnosis.fit.free import spread
+from ballfg.diagnosis.search.hypothesis import Hypothesis
+from ballfg.diagnosis.search.varying import Varying, varied
+
+WIDTHS: Final = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
+"""Widths of the prior, in usual strengths, each as probable as the others."""
+THERE: Final = 0.05
+"""Prior probability that an effect of the catalogue is there: one or two of some thirty."""
+VARIES: Final = 0.01
+"""Prior probability that an effect differs between tracks in some way."""
+
+
+def scales(hypothesis: Hypothesis) -> Array:
+    """(p,) usual size of each strength, in its unit; a prior standard deviation if the effect states none."""
+    usual = hypothesis.effect.usual
+    if usual is None:
+        return np.array([spread(hypothesis.coefficients[name]) for name in hypothesis.strengths])
+    largest = max(map(abs, usual.change.values()))
+    return np.array([abs(usual.change.get(varied(name), largest)) for name in hypothesis.strengths])
+
+
+def log_odds(hypotheses: Sequence[Hypothesis]) -> float:
+    """Logarithm of the prior odds of a model with these effects to one without any."""
+    chances = [VARIES if isinstance(h, Varying) else THERE for h in hypotheses]
+    return float(sum(np.log(p / (1.0 - p)) for p in chances))
+
+
+def choice_odds(hypotheses: Sequence[Hypothesis]) -> float:
+    """Logarithm of the prior probability of the shapes, among all those that were possible."""
+    return -float(sum(np.log(h.choices) for h in hypotheses))

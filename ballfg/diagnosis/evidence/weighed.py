@@ -1,0 +1,162 @@
+"""Weighs a model with some effects: its fit, its noise, its evidence, and its density of tracks that it was not fitted to."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import special
+
+from ballfg.arrays import Array, Index, Mask
+from ballfg.diagnosis.evidence.likelihood import Noise, Posterior, Reduced, posterior, settled
+from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, log_odds, scales
+from ballfg.diagnosis.evidence.rows import rows_of
+from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.search.hypothesis import Hypothesis
+
+MIDDLE = WIDTHS.index(1.0)
+
+
+@dataclass(frozen=True)
+class Strengths:
+    """Posterior of an effect's strengths: means (p,) and covariance (p, p), by the order of its hypothesis."""
+
+    mean: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """A model with its evidence.
+
+    Attributes:
+        named: effects added to the declared model.
+        fit: to the tracks of both halves.
+        noise: sizes of its noise.
+        weights: robust weights of samples (n, k) and spins (n,), and their cost (n,).
+        widths: number of each effect's most probable prior width.
+        evidence: logarithm, natural units, up to a constant that all models of the same tracks share.
+        odds: logarithm of the prior odds.
+        strengths: by name of the effect.
+        held_out: (t,) logarithm of the density of each track, with coefficients of the other half.
+    """
+
+    named: tuple[Hypothesis, ...]
+    fit: Fit
+    noise: Noise
+    weights: tuple[Array, Array, Array]
+    widths: tuple[int, ...]
+    evidence: float
+    odds: float
+    strengths: Mapping[str, Strengths]
+    held_out: Array
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Names of the effects."""
+        return frozenset(h.name for h in self.named)
+
+    @property
+    def score(self) -> float:
+        """Logarithm of the posterior odds, up to the constant of `evidence`."""
+        return self.evidence + self.odds
+
+
+@dataclass(frozen=True)
+class Priors:
+    """Normal priors of the common unknowns of a fit, with widths for the strengths of its named effects.
+
+    Attributes:
+        base: (c,) precision of the others, zero for strengths.
+        away: (c,) prior mean less present value.
+        places, sizes: for each effect, where its strengths are and their usual sizes.
+    """
+
+    base: Array
+    away: Array
+    places: tuple[Index, ...]
+    sizes: tuple[Array, ...]
+
+    @classmethod
+    def of(cls, fit: Fit, named: Sequence[Hypothesis]) -> Priors:
+        """The priors at a fit."""
+        problem, listed = fit.problem, list(fit.problem.free)
+        with_strengths = [h for h in named if h.strengths]
+        places = tuple(np.array([listed.index(c) for c in h.columns]) for h in with_strengths)
+        values = np.array([fit.unknowns.values[name] for name in listed])
+        centres = problem.centres.copy()
+        for hypothesis, place in zip(with_strengths, places, strict=True):
+            centres[place] = [float(hypothesis.coefficients[n].absent or 0.0) for n in hypothesis.strengths]
+        base = problem.common_precision.copy()
+        for place in places:
+            base[place] = 0.0
+        away = np.concatenate((centres - values, -fit.unknowns.launcher.ravel()))
+        return cls(base, away, places, tuple(scales(h) for h in with_strengths))
+
+    def precision(self, widths: Sequence[int]) -> Array:
+        """(c,) with one of `WIDTHS` for each effect."""
+        found = self.base.copy()
+        for place, size, width in zip(self.places, self.sizes, widths, strict=True):
+            found[place] = (WIDTHS[width] * size) ** -2
+        return found
+
+    def posterior(self, reduced: Reduced, widths: Sequence[int]) -> Posterior:
+        """The posterior of all common unknowns."""
+        return posterior(reduced, self.precision(widths), self.away)
+
+
+def weighed(
+    fit: Fit, named: Sequence[Hypothesis], scattering: Collection[str], halves: Mask, start: Noise | None = None
+) -> Weighed:
+    """Weighs a fitted model.
+
+    Args:
+        fit: to the tracks of both halves.
+        named: effects added to the declared model.
+        scattering: declared coefficients that may differ from track to track.
+        halves: (t,) True for tracks of the search half, in the order of the fit's tracks.
+        start: noise of a similar model.
+    """
+    rows, priors = rows_of(fit, scattering), Priors.of(fit, named)
+    widths = [MIDDLE] * len(priors.places)
+    precision = priors.precision([len(WIDTHS) - 1] * len(priors.places))
+    likelihood, noise = settled(rows, precision, priors.away, start)
+    total = likelihood.reduced(noise)[0].by_track(rows.track)
+    whole = total.of(np.full(len(halves), True))
+    mixed = 0.0
+    for turn in range(2 if widths else 0):
+        mixed = 0.0
+        for effect in range(len(widths)):
+            tried = [priors.posterior(whole, [*widths[:effect], w, *widths[effect + 1 :]]) for w in range(len(WIDTHS))]
+            found = np.array([one.evidence for one in tried])
+            widths[effect] = int(found.argmax())
+            mixed += float(special.logsumexp(found - found.max()) - np.log(len(WIDTHS)))
+    result = priors.posterior(whole, widths)
+    strengths, values = {}, np.array([fit.unknowns.values[name] for name in fit.problem.free])
+    for hypothesis, place in zip([h for h in named if h.strengths], priors.places, strict=True):
+        mean = values[place] + result.mean[place]
+        strengths[hypothesis.name] = Strengths(mean, result.covariance[np.ix_(place, place)])
+    return Weighed(
+        tuple(named),
+        fit,
+        noise,
+        (likelihood.samples, likelihood.spins, likelihood.penalty),
+        tuple(widths),
+        result.evidence + mixed + choice_odds(named),
+        log_odds(named),
+        strengths,
+        held_out(priors, total, widths, halves),
+    )
+
+
+def held_out(priors: Priors, by_tracks: Reduced, widths: Sequence[int], halves: Mask) -> Array:
+    """(t,) logarithm of the density of each track, with common unknowns from the tracks of the other half."""
+    found = np.zeros(len(halves))
+    for half in (True, False):
+        others = halves != half
+        alone = priors.posterior(by_tracks.of(others), widths).evidence
+        for track in np.flatnonzero(halves == half):
+            more = others | (np.arange(len(halves)) == track)
+            found[track] = priors.posterior(by_tracks.of(more), widths).evidence - alone
+    return found
