@@ -108,7 +108,7 @@ class Likelihood:
     def grams(self) -> tuple[Array, Array]:
         """Two (n, d, d): of the samples, and of the spin rows; columns start, random, common, residual."""
         r = self.rows
-        columns = np.concatenate((r.by_start, r.random, r.by_common, r.residual[..., None]), axis=-1)
+        columns = np.concatenate((r.by_start, r.motion.columns, r.by_common, r.residual[..., None]), axis=-1)
         root = np.sqrt(np.repeat(self.samples * r.used, 3, axis=1))[..., None]
         positions, spins = columns[:, :-3] * root, columns[:, -3:] * np.sqrt(self.spins)[:, None, None]
         return positions.swapaxes(1, 2) @ positions, spins.swapaxes(1, 2) @ spins
@@ -117,7 +117,7 @@ class Likelihood:
         """(n, d, d) information with priors of the random columns, and (n,) logarithms of the sizes."""
         of_samples, of_spins = self.grams
         total = of_samples * np.exp(-2.0 * noise.white) + of_spins * np.exp(-2.0 * noise.spin)
-        kinds, first = self.rows.kinds, np.arange(STATE_DIM)
+        kinds, first = self.rows.motion.kinds, np.arange(STATE_DIM)
         sizes = np.append(noise.random, 0.0)[kinds]
         place = STATE_DIM + np.arange(kinds.shape[1])
         total[:, place, place] += np.exp(-2.0 * sizes)
@@ -128,7 +128,7 @@ class Likelihood:
     def reduced(self, noise: Noise) -> tuple[Reduced, Local]:
         """First states and random motion integrated out."""
         total, logs = self.inner(noise)
-        end = STATE_DIM + self.rows.kinds.shape[1]
+        end = STATE_DIM + self.rows.motion.kinds.shape[1]
         lower = np.linalg.cholesky(total[:, :end, :end])
         solved = solve_lower(lower, total[:, :end, end:])
         gram = total[:, end:, end:] - solved.swapaxes(1, 2) @ solved
@@ -137,8 +137,8 @@ class Likelihood:
 
     def slope(self, noise: Noise, local: Local, found: Posterior) -> Array:
         """(6,) derivative of the evidence by the logarithms of the sizes: expected squares less their number."""
-        end = STATE_DIM + self.rows.kinds.shape[1]
-        upper = np.linalg.inv(local.lower).swapaxes(1, 2)
+        end = STATE_DIM + self.rows.motion.kinds.shape[1]
+        upper = inverses(local.lower).swapaxes(1, 2)
         solved = upper @ local.solved  # (n, l, c + 1), what local unknowns absorb of each column
         step = np.append(-found.mean, 1.0)
         mean = solved @ step
@@ -155,7 +155,7 @@ class Likelihood:
         ):
             square = ((gram @ left) * left).sum() + (gram[:, :end, :end] * inverse).sum()
             slopes.append(float(square) * np.exp(-2.0 * log) - count)
-        kinds, own = self.rows.kinds, squares[:, STATE_DIM:]
+        kinds, own = self.rows.motion.kinds, squares[:, STATE_DIM:]
         for kind, log in enumerate(noise.random):
             slopes.append(float(own[kinds == kind].sum()) * np.exp(-2.0 * log) - int((kinds == kind).sum()))
         return np.array(slopes)
@@ -163,10 +163,10 @@ class Likelihood:
     def reweighted(self, noise: Noise, common: Array) -> Likelihood:
         """With the robust weights of the residual that remains beside the motion; common: (c,) step of the unknowns."""
         total, _ = self.inner(noise)
-        r, end = self.rows, STATE_DIM + self.rows.kinds.shape[1]
+        r, end = self.rows, STATE_DIM + self.rows.motion.kinds.shape[1]
         right = total[:, :end, -1] - total[:, :end, end:-1] @ common
         motion = np.linalg.solve(total[:, :end, :end], right[..., None])[..., 0]
-        columns = np.concatenate((r.by_start, r.random), axis=-1)
+        columns = np.concatenate((r.by_start, r.motion.columns), axis=-1)
         left = r.residual - r.by_common @ common - (columns @ motion[..., None])[..., 0]
         return weighted(r, left / np.exp(noise.white), left[:, -3:] / np.exp(noise.spin))
 
@@ -206,8 +206,8 @@ def settled(rows: Rows, precision: Array, away: Array, start: Noise | None = Non
     step = np.zeros(len(precision))
     bounds = [(LEAST, MOST)] * (2 + KINDS)
     options = {"maxiter": MOST_STEPS, "ftol": TOLERANCE}
-    for turn in range(ROUNDS):
-        likelihood = likelihood.reweighted(now, step) if turn or start else likelihood
+    for turn in range(1 if start else 0, ROUNDS):
+        likelihood = likelihood.reweighted(now, step) if turn else likelihood
 
         def missing(vector: Array, likelihood: Likelihood = likelihood) -> tuple[float, Array]:
             noise = Noise.of(vector)
@@ -225,3 +225,8 @@ def solve_lower(lower: Array, right: Array) -> Array:
     """Solutions (n, l, c) with triangles (n, l, l)."""
     solve = partial(linalg.solve_triangular, lower=True, check_finite=False)
     return np.stack([solve(one, other) for one, other in zip(lower, right, strict=True)])
+
+
+def inverses(lower: Array) -> Array:
+    """(n, l, l) of triangles (n, l, l)."""
+    return np.stack([linalg.lapack.dtrtri(one, lower=1)[0] for one in lower])

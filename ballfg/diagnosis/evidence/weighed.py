@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,7 @@ from scipy import special
 from ballfg.arrays import Array, Index, Mask
 from ballfg.diagnosis.evidence.likelihood import Noise, Posterior, Reduced, posterior, settled
 from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, log_odds, scales
-from ballfg.diagnosis.evidence.rows import rows_of
+from ballfg.diagnosis.evidence.rows import Motion, rows_of
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.search.hypothesis import Hypothesis
 
@@ -107,18 +107,18 @@ class Priors:
 
 
 def weighed(
-    fit: Fit, named: Sequence[Hypothesis], scattering: Collection[str], halves: Mask, start: Noise | None = None
+    fit: Fit, named: Sequence[Hypothesis], motion: Motion, halves: Mask, start: Noise | None = None
 ) -> Weighed:
     """Weighs a fitted model.
 
     Args:
         fit: to the tracks of both halves.
         named: effects added to the declared model.
-        scattering: declared coefficients that may differ from track to track.
+        motion: random columns of this or a similar model.
         halves: (t,) True for tracks of the search half, in the order of the fit's tracks.
         start: noise of a similar model.
     """
-    rows, priors = rows_of(fit, scattering), Priors.of(fit, named)
+    rows, priors = rows_of(fit, motion), Priors.of(fit, named)
     widths = [MIDDLE] * len(priors.places)
     precision = priors.precision([len(WIDTHS) - 1] * len(priors.places))
     likelihood, noise = settled(rows, precision, priors.away, start)

@@ -8,6 +8,7 @@ import numpy as np
 
 from ballfg.arrays import Array, Mask
 from ballfg.diagnosis.evidence.odds import Odds, odds_of
+from ballfg.diagnosis.evidence.rows import random_motion
 from ballfg.diagnosis.evidence.weighed import Weighed, weighed
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.holdout import Holdout
@@ -144,7 +145,8 @@ class _Found:
         count = len(np.unique(first.problem.stretches.track))
         self.halves: Mask = np.arange(len(np.unique(whole.problem.stretches.track))) < count
         self.scattering = [name for name in whole.problem.free if name not in whole.problem.deviations]
-        self.declared = self.best = weighed(whole, (), self.scattering, self.halves)
+        self.motion = random_motion(whole, self.scattering)
+        self.declared = self.best = weighed(whole, (), self.motion, self.halves)
         self.models = {self.best.names: self.best}
         self.rounds: list[Round] = []
 
@@ -171,6 +173,7 @@ class _Found:
             return False
         tell(f"{winner.named[-1].name} added")
         self.best = winner
+        self.motion = random_motion(winner.fit, self.scattering)
         self._better_minimum(best, winner)
         self._pruned()
         return True
@@ -189,14 +192,14 @@ class _Found:
             fit = model.fit
             for hypothesis in gone:
                 fit = without_named(fit, hypothesis, self.first)
-            self.models[names] = weighed(fit, kept, self.scattering, self.halves, model.noise)
+            self.models[names] = weighed(fit, kept, self.motion, self.halves, model.noise)
         return self.models[names]
 
     def _weighed(self, refits: Sequence[Refit]) -> Weighed | None:
         """The most probable of some refits; None without any."""
         best = self.best
         tasks = [
-            partial(weighed, r.fit, (*best.named, r.scored.hypothesis), self.scattering, self.halves, best.noise)
+            partial(weighed, r.fit, (*best.named, r.scored.hypothesis), self.motion, self.halves, best.noise)
             for r in refits
             if np.isfinite(r.fit.cost)
         ]
@@ -209,7 +212,7 @@ class _Found:
     def _better_minimum(self, before: Weighed, after: Weighed) -> None:
         """Weighs the earlier model again from the later one's fit: an effect may only have led out of a poor minimum."""
         fit = without_named(after.fit, after.named[-1], self.first)
-        again = weighed(fit, before.named, self.scattering, self.halves, before.noise)
+        again = weighed(fit, before.named, self.motion, self.halves, before.noise)
         if again.score > before.score:
             self.models[before.names] = again
             if again.score > after.score:
