@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 
+from ballfg.checks import check_number
 from ballfg.diagnosis.fit.fit import noise_by_axis, values_of
 from ballfg.diagnosis.fit.holdout import Holdout, hold_out
 from ballfg.diagnosis.fit.problem import Fit
@@ -19,7 +20,7 @@ from ballfg.diagnosis.residual_tests.residuals import residuals_of
 from ballfg.diagnosis.residual_tests.tracker_errors import look_at_tracker
 from ballfg.diagnosis.result import Diagnosis, Errors, Fallback, Unexplained, Value, Verdict
 from ballfg.diagnosis.search.evaluation import prediction_errors, prediction_floor
-from ballfg.diagnosis.search.loop import Search, SearchLoop
+from ballfg.diagnosis.search.loop import NAMED, Search, SearchLoop
 from ballfg.diagnosis.search.plausible import implausible
 from ballfg.diagnosis.search.process_noise import Predicting, calibrated_model, noise_about
 from ballfg.diagnosis.search.stamp_effects import as_declared
@@ -42,6 +43,7 @@ def diagnose(
     jobs: int = 1,
     watch: Callable[[str], None] | None = None,
     catalogue: Sequence[type[Effect]] | None = None,
+    name_at: float = NAMED,
 ) -> Diagnosis:
     """Find the effects that a model lacks, their evidence and alternatives, and the gain in prediction.
 
@@ -51,11 +53,13 @@ def diagnose(
         jobs: number of processes.
         watch: called with a line for each stage.
         catalogue: candidate effects; by default all registered ones.
+        name_at: probability, 0 to 1, from which on an effect is named.
     Returns: the verdict, the findings with their evidence, errors before and after, and the corrected model.
     Raises:
         TypeError: if the model is a learned one.
         ValueError: if there are too few tracks, or none with a flight that is long enough.
     """
+    check_number("name_at", name_at, above=0.0, limit=1.0)
     if not isinstance(model, AnalyticModel):
         raise TypeError(
             f"model must be an AnalyticModel, to which effects can be added; got {type(model).__name__}. "
@@ -65,7 +69,8 @@ def diagnose(
     holdout = hold_out(dataset, model, jobs, tell)
     evaluate = partial(_errors, holdout, jobs)
     effects = tuple(catalogue or EFFECTS.values())
-    search = SearchLoop(holdout, effects, Predicting(holdout, jobs), evaluate, tell, jobs=jobs).run(model)
+    loop = SearchLoop(holdout, effects, Predicting(holdout, jobs), evaluate, tell, jobs=jobs, name_at=name_at)
+    search = loop.run(model)
     corrected, tracker, search = _with_own_noise(search, holdout, evaluate, tell, jobs)
     tell("looking at what is left")
     labels, of_labels = _labels(search, model, holdout, tracker, jobs)
@@ -104,6 +109,8 @@ def diagnose(
         remarks=tuple(strange(calibrated, model.radius)),
         floor_mm=floor,
         labels=labels,
+        probabilities=search.odds.effects(),
+        nothing_lacking=search.odds.nothing,
     )
 
 

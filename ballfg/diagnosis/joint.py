@@ -31,7 +31,7 @@ from ballfg.diagnosis.residual_tests.residuals import residuals_of
 from ballfg.diagnosis.result import Diagnosis, Errors, Finding
 from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.diagnosis.search.hypothesis import effects_of, has_effect, with_effects, without_effect
-from ballfg.diagnosis.search.loop import SearchLoop
+from ballfg.diagnosis.search.loop import NAMED, SearchLoop
 from ballfg.diagnosis.search.process_noise import PredictiveModel, calibrated_model, fitted_model, noise_about
 from ballfg.diagnosis.search.varying import Grouping, Varying
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel
@@ -75,6 +75,7 @@ def diagnose_jointly(
     jobs: int = 1,
     watch: Callable[[str], None] | None = None,
     catalogue: Sequence[type[Effect]] | None = None,
+    name_at: float = NAMED,
 ) -> JointDiagnosis:
     """Finds the effects that a model of the ball lacks in several rooms, and those of single rooms.
 
@@ -84,6 +85,7 @@ def diagnose_jointly(
         jobs: processes.
         watch: called with a line for each stage.
         catalogue: candidate effects; by default all registered ones.
+        name_at: probability, 0 to 1, from which on an effect is named.
     Returns: the findings, the model of the ball and those of the rooms.
     Raises: ValueError: for fewer than two datasets, equal names, a dataset with wrong stamps, too few tracks, or a
         model that differs between tracks.
@@ -104,7 +106,15 @@ def diagnose_jointly(
     effects = tuple(catalogue or EFFECTS.values())
     of_ball = tuple(e for e in effects if e.belongs_to == "ball")
     loop = SearchLoop(
-        halves, of_ball, predicting, predicting.judge, tell, jobs=jobs, of_some=effects, ways=lambda searched: [way]
+        halves,
+        of_ball,
+        predicting,
+        predicting.judge,
+        tell,
+        jobs=jobs,
+        of_some=effects,
+        ways=lambda searched: [way],
+        name_at=name_at,
     )
     search = loop.run(model, first)
     tell("looking at what is left")
@@ -137,6 +147,8 @@ def diagnose_jointly(
         excluded=tuple(f"{room.name}: {line}" for room in rooms for line in room.holdout.excluded),
         remarks=(*remarks, *strange(calibrated, model.radius)),
         labels=labels,
+        probabilities=search.odds.effects(),
+        nothing_lacking=search.odds.nothing,
     )
     return JointDiagnosis(whole, models)
 

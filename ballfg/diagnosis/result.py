@@ -30,12 +30,6 @@ class Outcome(enum.Enum):
     ADDED = "added"
     ALIKE = "cannot be told from the one added"
     WEAKER = "explains less"
-    NOT_HELPFUL = "did not help on the other half"
-    IMPLAUSIBLE = "would have to be stronger than is plausible"
-    MISLEADING = "fits whole tracks better and predicts them worse"
-    INSIGNIFICANT = "its coefficients do not differ from zero by themselves"
-    CONTRADICTORY = "the two halves of the tracks want different values"
-    SAME_PATTERN = "explains the same pattern as another effect, which explains more"
     NOT_NEEDED = "not needed"
     INVISIBLE = "cannot be seen in these data"
 
@@ -98,6 +92,7 @@ class Candidate:
         outcome: of the round.
         seen_from: coefficient -> size, in its unit, that the score test would have detected in 9 of 10 such recordings,
             whatever the other coefficients are; empty if nothing shows it.
+        probability: that the effect is there, over all models that were compared in the whole search.
     """
 
     name: str
@@ -109,25 +104,6 @@ class Candidate:
     outcome: Outcome
     seen_from: Mapping[str, float] = field(default_factory=dict)
     probability: float = 0.0
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """An effect that fits better but is not accepted as a name.
-
-    Attributes:
-        name: of the effect.
-        parameters: its coefficients as fitted.
-        outcome: reason for the refusal.
-        reason: numbers for it, in words; empty if the outcome is sufficient.
-        decide: the measurement that would decide whether it exists.
-    """
-
-    name: str
-    parameters: Mapping[str, Value]
-    outcome: Outcome
-    reason: str
-    decide: str
 
 
 @dataclass(frozen=True)
@@ -303,10 +279,12 @@ class Diagnosis:
         residuals_before: of the search half with the declared model.
         residuals_after: of the search half with the corrected model.
         excluded: sentences on unused tracks.
-        remarks: sentences on refused effects that fit better, and on implausible fitted values.
+        remarks: sentences on implausible fitted values.
         floor_mm: prediction error of the held-out tracks for an exact corrected model, from measurement noise and the
             unknown release alone; NaN if unknown.
         labels: verdicts on the spin labels; None without labels.
+        probabilities: that an effect is there, by name, over all models that were compared; the most probable first.
+        nothing_lacking: probability that no effect of the catalogue is lacking.
     """
 
     dataset: str
@@ -328,6 +306,8 @@ class Diagnosis:
     remarks: tuple[str, ...] = field(default=())
     floor_mm: float = float("nan")
     labels: LabelCheck | None = None
+    probabilities: Mapping[str, float] = field(default_factory=dict)
+    nothing_lacking: float = float("nan")
 
     def __repr__(self) -> str:
         effects = ", ".join(finding.name for finding in self.findings) or "none"

@@ -33,6 +33,9 @@ def diagnose(
     model: Annotated[Path | None, typer.Option(help="Model file. Default: the nominal model of the ball.")] = None,
     effects_file: EffectsFiles = None,
     observations_file: ObservationsFiles = None,
+    name_at: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Probability from which on an effect is named.")
+    ] = 0.9,
     jobs: Jobs = CORES,
     cluster: Cluster = None,
     address: Address = None,
@@ -75,10 +78,10 @@ def diagnose(
         with workers(cluster, address, jobs) as processes:
             if others:
                 together = [inputs.dataset, *(other.dataset for other in others)]
-                joint = diagnose_jointly(together, inputs.model, jobs=processes, watch=announce)
+                joint = diagnose_jointly(together, inputs.model, jobs=processes, watch=announce, name_at=name_at)
                 diagnosis, rooms = joint.whole, joint.rooms
             else:
-                diagnosis = find(inputs.dataset, inputs.model, jobs=processes, watch=announce)
+                diagnosis = find(inputs.dataset, inputs.model, jobs=processes, watch=announce, name_at=name_at)
         typed = _typed(datasets, model, effects_file, observations_file, out)
         models = tuple(map(room_file, rooms)) or (MODEL,)
         origin = Origin(typed, tuple(map(str, datasets)), "" if model is None else str(model), str(out), models)
@@ -112,10 +115,11 @@ def _summary(diagnosis: Diagnosis) -> Iterator[str]:
 
     yield headline(diagnosis)
     yield f"{diagnosis.verdict.value}: {diagnosis.sentence}"
-    rows = [("effect", "kind", "by chance", "BIC", "cannot be told from", "coefficients")]
+    rows = [("effect", "probability", "kind", "by chance", "BIC", "cannot be told from", "coefficients")]
     for f in diagnosis.findings:
         others = ", ".join(f.indistinguishable_from) or "-"
-        rows.append((f.name, f.kind, probability(f.p_value), f"{f.delta_bic:+.0f}", others, listed(f.parameters)))
+        chance, bic = probability(f.p_value), f"{f.delta_bic:+.0f}"
+        rows.append((f.name, probability(f.probability), f.kind, chance, bic, others, listed(f.parameters)))
     if diagnosis.findings:
         yield from ("", *_aligned(rows))
     before, after = diagnosis.before, diagnosis.after

@@ -1,4 +1,4 @@
-"""Weighs a model with some effects: its fit, its noise, its evidence, and its density of tracks that it was not fitted to."""
+"""Weighs a fitted model: its noise, its evidence, and its density of tracks whose half it was not fitted to."""
 
 from __future__ import annotations
 
@@ -106,9 +106,7 @@ class Priors:
         return posterior(reduced, self.precision(widths), self.away)
 
 
-def weighed(
-    fit: Fit, named: Sequence[Hypothesis], motion: Motion, halves: Mask, start: Noise | None = None
-) -> Weighed:
+def weighed(fit: Fit, named: Sequence[Hypothesis], motion: Motion, halves: Mask, start: Noise | None = None) -> Weighed:
     """Weighs a fitted model.
 
     Args:
@@ -125,7 +123,7 @@ def weighed(
     total = likelihood.reduced(noise)[0].by_track(rows.track)
     whole = total.of(np.full(len(halves), True))
     mixed = 0.0
-    for turn in range(2 if widths else 0):
+    for _ in range(2 if widths else 0):
         mixed = 0.0
         for effect in range(len(widths)):
             tried = [priors.posterior(whole, [*widths[:effect], w, *widths[effect + 1 :]]) for w in range(len(WIDTHS))]

@@ -41,12 +41,6 @@ OUTCOMES: Final = {
     Outcome.ADDED: "It was added to the model.",
     Outcome.ALIKE: "It explains these tracks as well as the one added: they cannot tell the two apart.",
     Outcome.WEAKER: "Another effect explains more of the same residuals and was added in its place.",
-    Outcome.NOT_HELPFUL: "It fits one half of the tracks and does not help on the other.",
-    Outcome.IMPLAUSIBLE: "Its fitted strength is larger than real balls, rooms and cameras have.",
-    Outcome.MISLEADING: "It fits whole tracks better, but predictions from their beginnings get worse with it.",
-    Outcome.INSIGNIFICANT: "Its fitted coefficients may as well be zero.",
-    Outcome.CONTRADICTORY: "The two halves of the tracks want values of it that exclude each other.",
-    Outcome.SAME_PATTERN: "It explains the pattern of another effect, which explains more.",
     Outcome.NOT_NEEDED: "With the model of this round nothing asks for it any more: what it would explain, the effects "
     "that were added explain, or chance.",
     Outcome.INVISIBLE: "Nothing in these tracks depends on it, so they neither show it nor rule it out.",

@@ -93,8 +93,11 @@ def _finding(finding: Finding) -> Html:
     verb = "falls" if finding.delta_bic < 0 else "rises"
     gain = "adds" if finding.held_out_gain >= 0 else "takes away"
     others = finding.indistinguishable_from
+    unusual = f"Stronger than usual: {finding.usual}." if finding.usual else ""
     evidence = items(
         (
+            f"Probability that it is there: {probability(finding.probability)}.",
+            *filter(None, (unusual,)),
             tag(
                 "span",
                 "Probability of so strong a ",

@@ -142,6 +142,8 @@ def content(diagnosis: Diagnosis) -> dict[str, Any]:
             "rounds": [[_candidate(candidate) for candidate in row] for row in diagnosis.rounds],
             "excluded": diagnosis.excluded,
             "remarks": diagnosis.remarks,
+            "probabilities": diagnosis.probabilities,
+            "nothing_lacking": diagnosis.nothing_lacking,
             "labels": None if diagnosis.labels is None else _labels(diagnosis.labels),
         }
     )
@@ -164,6 +166,7 @@ def _candidate(candidate: Candidate) -> dict[str, Any]:
         "delta_bic": candidate.delta_bic,
         "estimate": _values(candidate.estimate),
         "seen_from": candidate.seen_from,
+        "probability": candidate.probability,
     }
 
 

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 
-from ballfg.diagnosis.result import Finding, Outcome, Refusal, Unexplained, Value, Verdict
+from ballfg.diagnosis.result import Finding, Unexplained, Value, Verdict
 from ballfg.estimation.noise.tracker_errors import NUMBERS
 
 NONE = "–"
@@ -12,15 +12,6 @@ MOST_DECIMALS = 6
 """Largest number of decimals; others are written with a power of ten."""
 LEAST_PROBABILITY = 1e-99
 """Smaller probabilities depend on unknown tails of distributions."""
-
-REFUSED = {
-    Outcome.IMPLAUSIBLE: "it would have to be stronger than is plausible",
-    Outcome.INSIGNIFICANT: "its coefficients do not differ from zero by themselves",
-    Outcome.CONTRADICTORY: "the two halves of the tracks want different values of it",
-    Outcome.SAME_PATTERN: "it explains the same pattern as another effect, which explains more",
-    Outcome.MISLEADING: "predictions get worse with it",
-}
-"""Reasons against naming an effect that fits better."""
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -76,15 +67,6 @@ def change(before: float, after: float) -> str:
 def joined(names: tuple[str, ...]) -> str:
     """For instance `wind, gust_region and drag_speed`."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}" if names else ""
-
-
-def refusal(refused: Refusal) -> str:
-    """The reason against naming an effect that fits better, and the measurement that would decide."""
-    reason = f" ({refused.reason})" if refused.reason else ""
-    return (
-        f"{refused.name} ({listed(refused.parameters)}) would fit these tracks better but is not named: "
-        f"{REFUSED[refused.outcome]}{reason}. What would decide it: {refused.decide}"
-    )
 
 
 def sentence(verdict: Verdict, findings: Sequence[Finding], left: Unexplained) -> str:

@@ -1,7 +1,7 @@
 """Evaluates a model on other tracks than those of its fit, by predictions of unseen parts and by likelihood."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -11,11 +11,7 @@ from ballfg.diagnosis.fit.fit import fit_problem, reachable
 from ballfg.diagnosis.fit.holdout import EvaluationTrack
 from ballfg.diagnosis.fit.problem import Fit, Noise
 from ballfg.diagnosis.fit.stretches import Stretches, joined
-from ballfg.diagnosis.fit.system import by_track
 from ballfg.diagnosis.result import Errors, PredictedPath
-from ballfg.diagnosis.search.plausible import SIGMAS
-from ballfg.diagnosis.search.score import score_tests
-from ballfg.diagnosis.search.signatures import Signatures
 from ballfg.dynamics import BallModel, Surfaces
 from ballfg.estimation import Settings, Status, predict_tracks
 from ballfg.estimation.noise.forecasts import NINETY
@@ -29,19 +25,10 @@ OBSERVED = 0.4
 """Observed share of each track; the rest is predicted."""
 LEAST_PREDICTED = 3
 """Least number of predicted samples."""
-SURELY = 1.645
-"""Standard errors, from the scatter of tracks, by which squared errors of worse predictions must grow."""
-HARDLY = 1.01
-"""Ratio of prediction errors that counts as worse even without significance. An effect near the detection limit changes
-predictions by less than that, up or down by chance."""
 QUIET: Final = ProcessNoise(acceleration=1e-3, spin=0.05, contact_velocity=1e-3, contact_spin=0.1)
 """Process noise of an almost exact model: it changes predictions by less than a millimetre."""
 MOST_FORETOLD = 3.0
 """Ratio of a track's expected error to the median beyond which a false hit is assumed."""
-FEW_WORSE = 1.05
-MOST_BETTER = 0.9
-"""Factor by which the root mean square over all tracks may grow if half of the tracks are predicted this much better: a
-few balls that now miss another surface outweigh all others in it."""
 
 
 def prediction_errors(
@@ -137,47 +124,6 @@ def _apex_distances(evaluated: EvaluationTrack, prediction: TrackPrediction) -> 
     return np.array([d for d in found if np.isfinite(d)])
 
 
-@dataclass(frozen=True)
-class HeldOutGain:
-    """Gain of one fit over another on other tracks: log likelihood per track, and its probability by chance."""
-
-    gain: float
-    p_value: float
-
-
-def held_out_gain(before: Fit, after: Fit, held_out: Stretches, on_before: Fit | None = None) -> HeldOutGain:
-    """The gain of a larger model on tracks outside of both fits; only first states adapt to them.
-
-    The gain shows whether the larger model helps. Its significance comes from the product of the residual with the
-    larger model's change of the predictions: without an effect it scatters about zero, track by track. The sum of
-    losses would be a test with a quarter of that information, because it subtracts half the length of the change.
-
-    Args:
-        before: fit on other tracks.
-        after: fit of the larger model on the same other tracks.
-        held_out: stretches to compare on.
-        on_before: `on_others(before, held_out)`, if computed already.
-    Returns: the gain in natural units per track, and its probability by chance.
-    """
-    for fitted in (before, after):
-        held_out = _reached(fitted, held_out)
-    same = (
-        on_before is not None
-        and before.noise.same_as(after.noise)
-        and len(on_before.problem.stretches) == len(held_out)
-    )
-    old = on_before if on_before is not None and same else _on(before, held_out, after.noise)
-    new = _on(after, held_out, after.noise)
-    left = old.weighted_residual(old.robust)
-    columns = np.stack((left - new.weighted_residual(old.robust), left), axis=-1)
-    gram = by_track(columns.swapaxes(-1, -2) @ columns, held_out.track)
-    (score,) = score_tests(Signatures(gram, np.zeros(0), 0), [[0]])
-    gain = float((old.robust.losses - new.robust.losses).sum()) / len(gram)
-    if score is None or gain <= 0.0 or score.estimate[0] <= 0.0:
-        return HeldOutGain(gain, 1.0)
-    return HeldOutGain(gain, score.p_value / 2.0)
-
-
 def on_others(fitted: Fit, others: Stretches) -> Fit:
     """The fit of first states to stretches of other tracks, with all else as fitted."""
     return _on(fitted, _reached(fitted, others), fitted.noise)
@@ -202,25 +148,3 @@ def _on(fitted: Fit, stretches: Stretches, noise: Noise) -> Fit:
     problem = replace(fitted.problem, stretches=stretches, shared=False)
     unknowns = replace(fitted.unknowns, starts=stretches.starts.numpy().copy())
     return fit_problem(problem, unknowns, noise, settle_noise=False)
-
-
-def got_worse(after: Errors, before: Errors) -> bool:
-    """True if predictions got worse, by more than chance would cause.
-
-    Args: after, before: errors of the predictions (mm) of the same tracks by two models.
-    """
-    ratio = after.prediction_rmse_mm / before.prediction_rmse_mm
-    typical = float(np.median(after.by_track) / np.median(before.by_track))
-    if ratio <= 1.0 or (ratio < FEW_WORSE and typical < MOST_BETTER):
-        return False
-    growth = np.square(after.by_track) - np.square(before.by_track)
-    others = np.sign(np.delete(before.by_track - after.by_track, growth.argmax()))
-    # one ball misses the table's end, the others are better; a mean would weigh a few balls too much
-    if growth.sum() < growth.max() and others.sum() > SIGMAS * np.sqrt(len(others)):
-        return False
-    return ratio > HARDLY or _sure(growth) > SURELY
-
-
-def _sure(values: Array) -> float:
-    """The mean of some numbers in units of its standard error; 0 for a single one."""
-    return float(values.mean() / values.std(ddof=1) * np.sqrt(len(values))) if len(values) > 1 else 0.0

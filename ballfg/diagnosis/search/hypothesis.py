@@ -53,10 +53,6 @@ class Hypothesis:
         """The measurement that would decide."""
         return self.effect.decide
 
-    def known_as(self, coefficient: str) -> str:
-        """The coefficient's name in the table of plausible ranges."""
-        return f"{self.name}.{coefficient}"
-
     def deviations(self) -> dict[str, Deviation]:
         """Its unknowns that act on some tracks more than on others; none if the effect is the same for all."""
         return {}
@@ -84,12 +80,6 @@ class Hypothesis:
     def usual(self) -> bool:
         """True for a usual effect: its nominal strength is not zero, and its absence is far from it."""
         return any(self.coefficients[n].default != self.coefficients[n].absent for n in self.strengths)
-
-    def strain(self, values: Mapping[str, float]) -> float:
-        """Largest distance of a strength from its usual value in prior sigmas; values: by parameter name."""
-        listed = self.coefficients
-        far = (abs(values[self.parameter(n)] - listed[n].default) / spread(listed[n]) for n in self.strengths)
-        return max(far, default=0.0)
 
     def free(self) -> dict[str, Coefficient]:
         """Coefficients that a refit estimates in addition: strengths, and uncertain shapes."""

@@ -75,18 +75,14 @@ def fitted_values(fit: Fit, hypothesis: Hypothesis) -> dict[str, Value]:
     return hypothesis.reported(fit, {names[name]: value for name, value in values.items()})
 
 
-def ranking(
-    scored: Sequence[Scored], refits: Sequence[Refit], added: str, odds: Odds
-) -> tuple[Candidate, ...]:
+def ranking(scored: Sequence[Scored], refits: Sequence[Refit], added: str, odds: Odds) -> tuple[Candidate, ...]:
     """One row per effect in its best shape, sorted by explained residual."""
     outcomes = {added: Outcome.ADDED}
     refitted = {r.name: r.delta_bic for r in refits}
     best: dict[str, Scored] = {}
     for candidate in scored:
         best.setdefault(candidate.hypothesis.name, candidate)
-    return tuple(
-        replace(_row(s, refitted.get(n), outcomes.get(n)), probability=odds.of(n)) for n, s in best.items()
-    )
+    return tuple(replace(_row(s, refitted.get(n), outcomes.get(n)), probability=odds.of(n)) for n, s in best.items())
 
 
 def _row(scored: Scored, delta_bic: float | None, outcome: Outcome | None) -> Candidate:

@@ -154,10 +154,6 @@ class Varying(Hypothesis):
         listed = {c.name: c for c in self.effect.coefficients}
         return {s: replace(listed[varied(s)], name=s, default=0.0, absent=0.0) for s in self.strengths}
 
-    def known_as(self, coefficient: str) -> str:
-        """The coefficient whose plausible range applies to a level."""
-        return f"{self.effect.name}.{varied(coefficient)}"
-
     @property
     def usual(self) -> bool:
         """False: no ball usually differs from track to track."""
