@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     from ballfg.diagnosis.result import Diagnosis
 
 
+NAME_AT = 0.9
+"""Probability from which on an effect is named."""
+
+
 def diagnose(
     datasets: DatasetFolders,
     out: Annotated[Path, typer.Option(help="Folder of the report, new or empty.")],
@@ -35,7 +39,7 @@ def diagnose(
     observations_file: ObservationsFiles = None,
     name_at: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Probability from which on an effect is named.")
-    ] = 0.9,
+    ] = NAME_AT,
     jobs: Jobs = CORES,
     cluster: Cluster = None,
     address: Address = None,
@@ -82,7 +86,7 @@ def diagnose(
                 diagnosis, rooms = joint.whole, joint.rooms
             else:
                 diagnosis = find(inputs.dataset, inputs.model, jobs=processes, watch=announce, name_at=name_at)
-        typed = _typed(datasets, model, effects_file, observations_file, out)
+        typed = _typed(datasets, model, effects_file, observations_file, name_at, out)
         models = tuple(map(room_file, rooms)) or (MODEL,)
         origin = Origin(typed, tuple(map(str, datasets)), "" if model is None else str(model), str(out), models)
         write_report(diagnosis, out, rooms, origin)
@@ -98,6 +102,7 @@ def _typed(
     model: Path | None,
     effects: Sequence[Path] | None,
     observations: Sequence[Path] | None,
+    name_at: float,
     out: Path,
 ) -> str:
     """The command line, without options that do not change the result."""
@@ -105,6 +110,7 @@ def _typed(
     words += [] if model is None else ["--model", str(model)]
     words += [word for path in effects or () for word in ("--effects-file", str(path))]
     words += [word for path in observations or () for word in ("--observations-file", str(path))]
+    words += [] if name_at == NAME_AT else ["--name-at", f"{name_at:g}"]
     return shlex.join([*words, "--out", str(out)])
 
 

@@ -160,12 +160,16 @@ class Likelihood:
             slopes.append(float(own[kinds == kind].sum()) * np.exp(-2.0 * log) - int((kinds == kind).sum()))
         return np.array(slopes)
 
+    def local_step(self, noise: Noise, common: Array) -> Array:
+        """(n, l) first states and random motion that follow a step (c,) of the common unknowns."""
+        total, _ = self.inner(noise)
+        end = STATE_DIM + self.rows.motion.kinds.shape[1]
+        right = total[:, :end, -1] - total[:, :end, end:-1] @ common
+        return np.asarray(np.linalg.solve(total[:, :end, :end], right[..., None])[..., 0])
+
     def reweighted(self, noise: Noise, common: Array) -> Likelihood:
         """With the robust weights of the residual that remains beside the motion; common: (c,) step of the unknowns."""
-        total, _ = self.inner(noise)
-        r, end = self.rows, STATE_DIM + self.rows.motion.kinds.shape[1]
-        right = total[:, :end, -1] - total[:, :end, end:-1] @ common
-        motion = np.linalg.solve(total[:, :end, :end], right[..., None])[..., 0]
+        r, motion = self.rows, self.local_step(noise, common)
         columns = np.concatenate((r.by_start, r.motion.columns), axis=-1)
         left = r.residual - r.by_common @ common - (columns @ motion[..., None])[..., 0]
         return weighted(r, left / np.exp(noise.white), left[:, -3:] / np.exp(noise.spin))

@@ -64,7 +64,7 @@ class Rows:
 
 def rows_of(fit: Fit, motion: Motion) -> Rows:
     """The rows of a fit at its minimum; motion: `random_motion` of this or a similar fit to the same samples."""
-    system, stretches, root = fit.linearised(), fit.problem.stretches, _roots(fit)
+    system, stretches, root = fit.linearised(), fit.problem.stretches, roots(fit)
     return Rows(
         system.residual / root[..., 0],
         system.by_start / root,
@@ -76,7 +76,7 @@ def rows_of(fit: Fit, motion: Motion) -> Rows:
     )
 
 
-def _roots(fit: Fit) -> Array:
+def roots(fit: Fit) -> Array:
     """(n, m, 1) roots of the robust weights that a fit's rows have."""
     samples, spins = np.repeat(fit.robust.samples, 3, axis=1), np.repeat(fit.robust.spins[:, None], 3, axis=1)
     return np.sqrt(np.concatenate((samples, spins), axis=1))[..., None]
@@ -103,4 +103,4 @@ def random_motion(fit: Fit, scattering: Collection[str]) -> Motion:
         columns = np.concatenate([c for c, _ in pieces], axis=1)
         random[row, :, count : count + columns.shape[1]] = columns
         kinds[row, count : count + columns.shape[1]] = np.concatenate([k for _, k in pieces])
-    return Motion(random / _roots(fit), kinds)
+    return Motion(random / roots(fit), kinds)

@@ -12,10 +12,15 @@ from ballfg.arrays import Array, Index, Mask
 from ballfg.diagnosis.evidence.likelihood import Noise, Posterior, Reduced, posterior, settled
 from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, log_odds, scales
 from ballfg.diagnosis.evidence.rows import Motion, rows_of
-from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.fit.problem import Fit, Unknowns
 from ballfg.diagnosis.search.hypothesis import Hypothesis
+from ballfg.state import STATE_DIM
 
 MIDDLE = WIDTHS.index(1.0)
+MOST_STEPS = 4
+"""Largest number of steps from a deterministic fit to the most probable unknowns."""
+WORTH_A_STEP = 0.5
+"""Least expected gain of a step, natural units."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +112,10 @@ class Priors:
 
 
 def weighed(fit: Fit, named: Sequence[Hypothesis], motion: Motion, halves: Mask, start: Noise | None = None) -> Weighed:
-    """Weighs a fitted model.
+    """Weighs a model at the most probable values of its unknowns.
+
+    A deterministic fit ends where the model alone comes closest to the samples; beside random motion other values are
+    more probable. From the fit on, the unknowns follow the likelihood.
 
     Args:
         fit: to the tracks of both halves.
@@ -116,6 +124,43 @@ def weighed(fit: Fit, named: Sequence[Hypothesis], motion: Motion, halves: Mask,
         halves: (t,) True for tracks of the search half, in the order of the fit's tracks.
         start: noise of a similar model.
     """
+    found, step = _weighed_at(fit, named, motion, halves, start)
+    for _ in range(MOST_STEPS):
+        if step.gain < WORTH_A_STEP:
+            break
+        moved = step.taken(found.fit)
+        if not np.isfinite(moved.cost):
+            break
+        again, step = _weighed_at(moved, named, motion, halves, found.noise)
+        if again.evidence < found.evidence:
+            break
+        found = again
+    return found
+
+
+@dataclass(frozen=True)
+class _Step:
+    """A step of first states (n, 9) and common unknowns (c,) with the logarithm of the density that it should gain."""
+
+    starts: Array
+    common: Array
+    gain: float
+
+    def taken(self, fit: Fit) -> Fit:
+        """The fit after the step; coefficients stay within their bounds."""
+        unknowns, free = fit.unknowns, fit.problem.free
+        values = {
+            name: float(np.clip(unknowns.values[name] + step, c.low, c.high))
+            for (name, c), step in zip(free.items(), self.common[: len(free)].tolist(), strict=True)
+        }
+        launcher = unknowns.launcher + self.common[len(free) :].reshape(-1, 3)
+        return Fit.at(fit.problem, Unknowns(unknowns.starts + self.starts, values, launcher), fit.noise, fit.steps)
+
+
+def _weighed_at(
+    fit: Fit, named: Sequence[Hypothesis], motion: Motion, halves: Mask, start: Noise | None
+) -> tuple[Weighed, _Step]:
+    """The model at the unknowns of a fit, and the step to more probable ones."""
     rows, priors = rows_of(fit, motion), Priors.of(fit, named)
     widths = [MIDDLE] * len(priors.places)
     precision = priors.precision([len(WIDTHS) - 1] * len(priors.places))
@@ -135,7 +180,10 @@ def weighed(fit: Fit, named: Sequence[Hypothesis], motion: Motion, halves: Mask,
     for hypothesis, place in zip([h for h in named if h.strengths], priors.places, strict=True):
         mean = values[place] + result.mean[place]
         strengths[hypothesis.name] = Strengths(mean, result.covariance[np.ix_(place, place)])
-    return Weighed(
+    information = whole.gram[0, :-1, :-1] + np.diag(priors.precision(widths))
+    gain = 0.5 * float(result.mean @ information @ result.mean)
+    step = _Step(likelihood.local_step(noise, result.mean)[:, :STATE_DIM], result.mean, gain)
+    found = Weighed(
         tuple(named),
         fit,
         noise,
@@ -146,6 +194,7 @@ def weighed(fit: Fit, named: Sequence[Hypothesis], motion: Motion, halves: Mask,
         strengths,
         held_out(priors, total, widths, halves),
     )
+    return found, step
 
 
 def held_out(priors: Priors, by_tracks: Reduced, widths: Sequence[int], halves: Mask) -> Array:

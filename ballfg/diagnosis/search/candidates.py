@@ -8,16 +8,21 @@ import torch
 from scipy import stats
 
 from ballfg.arrays import Array
+from ballfg.diagnosis.evidence.rows import Motion
+from ballfg.diagnosis.evidence.screen import foretold
+from ballfg.diagnosis.evidence.weighed import Weighed
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.problem import Fit, Problem
 from ballfg.diagnosis.search.hypothesis import Hypothesis, with_effects
 from ballfg.diagnosis.search.label_frames import FRAMES
 from ballfg.diagnosis.search.score import Score, score_tests
-from ballfg.diagnosis.search.signatures import hypothesis_signatures
+from ballfg.diagnosis.search.signatures import columns_of, hypothesis_signatures
 from ballfg.state import SPIN
 
 ALARM = 0.25
 """Probability that a hypothesis passes the score tests of one round by chance, and so is refitted."""
+LEAST_GAIN = 0.0
+"""Natural units. Least foretold gain of a candidate that is refitted: with new noise it may gain more."""
 MOST_REFITS = 6
 """Largest number of refitted hypotheses in a round."""
 FRAME_CHOICE = 2.0 * float(np.log(FRAMES - 1))
@@ -29,7 +34,7 @@ class Scored:
     """A hypothesis and the outcome of its score test, corrected for the number of hypotheses; None: not visible.
 
     `opposite` is the best shape with the opposite sign of its effect, a possibly better minimum.
-    `tested` is the number of hypotheses.
+    `tested` is the number of hypotheses, `gain` the foretold logarithm of the ratio of evidences.
     """
 
     hypothesis: Hypothesis
@@ -37,6 +42,7 @@ class Scored:
     p_value: float
     opposite: Hypothesis | None = None
     tested: int = 1
+    gain: float = -np.inf
 
     @property
     def explained(self) -> float:
@@ -61,29 +67,32 @@ class Refit:
         return self.scored.hypothesis.name
 
 
-def score_all(fitted: Fit, candidates: Sequence[Hypothesis]) -> list[Scored]:
-    """Score tests of all hypotheses.
+def score_all(model: Weighed, motion: Motion, candidates: Sequence[Hypothesis]) -> list[Scored]:
+    """Score tests of all hypotheses, and their foretold gains.
 
     Args:
-        fitted: the fit without any of them.
+        model: without any of them.
+        motion: random columns of its fit.
         candidates: the hypotheses; those without strengths are left out.
     Returns: the tests, sorted by explained residual, invisible hypotheses last.
     """
     testable = [h for h in candidates if h.strengths]
     if not testable:
         return []
+    columns = columns_of(model.fit, testable)
+    scores = score_tests(*hypothesis_signatures(model.fit, testable, columns))
     scored = []
-    for hypothesis, score in zip(testable, score_tests(*hypothesis_signatures(fitted, testable)), strict=True):
+    for hypothesis, score, gain in zip(testable, scores, foretold(model, motion, testable, columns), strict=True):
         p_value = 1.0 if score is None else min(1.0, score.p_value * len(testable))
-        scored.append(Scored(hypothesis, score, p_value, tested=len(testable)))
+        scored.append(Scored(hypothesis, score, p_value, tested=len(testable), gain=gain))
     return sorted(scored, key=lambda s: s.explained, reverse=True)
 
 
-def shortlist(scored: Sequence[Scored], alarm: float = ALARM) -> list[Scored]:
-    """The hypotheses to refit: the best shape of each effect that is no mere chance."""
+def shortlist(scored: Sequence[Scored]) -> list[Scored]:
+    """The hypotheses to refit: the best shape of each effect that may gain."""
     best: dict[str, Scored] = {}
-    for candidate in scored:
-        if candidate.score is not None and candidate.p_value < alarm:
+    for candidate in sorted(scored, key=lambda s: s.gain, reverse=True):
+        if candidate.score is not None and candidate.gain > LEAST_GAIN:
             best.setdefault(candidate.hypothesis.name, candidate)
     listed = list(best.values())[:MOST_REFITS]
     return [replace(s, opposite=_opposite(s, scored)) for s in listed]

@@ -34,10 +34,8 @@ def frame_hypotheses(before: Fit, general: Hypothesis) -> list[Hypothesis]:
     frames = signed_permutations().numpy()[1:]
     costs = [_disagreement(labels, spins, covariances, frame, before.noise.label) for frame in frames]
     best = frames[np.argsort(costs)[:FRAMES_FITTED]].reshape(-1, 9).tolist()
-    return [
-        Hypothesis(general.effect, dict(zip(general.coefficients, frame, strict=True)), (), FRAMES - 1)
-        for frame in best
-    ]
+    shapes = [dict(zip(general.coefficients, frame, strict=True)) for frame in best]
+    return [Hypothesis(general.effect, shape, (), FRAMES - 1) for shape in shapes]
 
 
 def _spins_without_labels(before: Fit) -> tuple[Array, Array, Array]:

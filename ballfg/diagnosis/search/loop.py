@@ -6,14 +6,14 @@ from functools import partial
 
 import numpy as np
 
-from ballfg.arrays import Array, Mask
+from ballfg.arrays import Mask
 from ballfg.diagnosis.evidence.odds import Odds, odds_of
 from ballfg.diagnosis.evidence.rows import random_motion
 from ballfg.diagnosis.evidence.weighed import Weighed, weighed
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.result import Candidate, Errors, Finding, Outcome
+from ballfg.diagnosis.result import Candidate, Errors, Finding
 from ballfg.diagnosis.search.candidates import Refit, Scored
 from ballfg.diagnosis.search.evaluation import on_all, on_others
 from ballfg.diagnosis.search.hypothesis import Hypothesis, has_effect, without_effect
@@ -159,11 +159,11 @@ class _Found:
         """Adds the effect that makes the model most probable, and removes those that it makes superfluous."""
         loop, best, number = self.loop, self.best, len(self.rounds) + 1
         tell: Callable[[str], None] = lambda line: loop.watch(f"round {number}: {line}")  # noqa: E731
-        scored, refits = try_hypotheses(best.fit, loop.catalogue, tell, loop.jobs)
+        scored, refits = try_hypotheses(best, self.motion, loop.catalogue, tell, loop.jobs)
         winner = self._weighed(refits)
         if winner is None or winner.score <= best.score:
             ways = loop.ways or partial(groupings, loop.holdout.tracks)
-            more, fitted = try_varying(best.fit, loop.of_some or loop.catalogue, ways, tell, loop.jobs)
+            more, fitted = try_varying(best, self.motion, loop.of_some or loop.catalogue, ways, tell, loop.jobs)
             scored, refits = [*scored, *more], [*refits, *fitted]
             winner = max((w for w in (winner, self._weighed(fitted)) if w is not None), key=_score, default=None)
         added = winner is not None and winner.score > best.score
@@ -210,7 +210,7 @@ class _Found:
         return max(found, key=_score, default=None)
 
     def _better_minimum(self, before: Weighed, after: Weighed) -> None:
-        """Weighs the earlier model again from the later one's fit: an effect may only have led out of a poor minimum."""
+        """Weighs the earlier model again from the later one's fit: an effect may have led out of a poor minimum."""
         fit = without_named(after.fit, after.named[-1], self.first)
         again = weighed(fit, before.named, self.motion, self.halves, before.noise)
         if again.score > before.score:

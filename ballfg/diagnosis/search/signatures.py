@@ -90,11 +90,16 @@ def signatures_of(fit: Fit, system: System, columns: Array) -> Signatures:
     return Signatures(gram, fit.problem.common_precision, system.by_common.shape[-1])
 
 
-def hypothesis_signatures(fit: Fit, candidates: Sequence[Hypothesis]) -> tuple[Signatures, list[list[int]]]:
-    """Inner products of all columns on each track, and the numbers of the candidate columns of each hypothesis."""
+def hypothesis_signatures(
+    fit: Fit, candidates: Sequence[Hypothesis], columns: Array
+) -> tuple[Signatures, list[list[int]]]:
+    """Inner products of all columns on each track, and the numbers of the candidate columns of each hypothesis.
+
+    Args: columns: `columns_of(fit, candidates)`.
+    """
     ends = np.cumsum([len(hypothesis.strengths) for hypothesis in candidates]).tolist()
     chosen = [list(range(end - len(h.strengths), end)) for end, h in zip(ends, candidates, strict=True)]
-    return signatures_of(fit, fit.linearised(), columns_of(fit, candidates)), chosen
+    return signatures_of(fit, fit.linearised(), columns), chosen
 
 
 def columns_of(fit: Fit, candidates: Sequence[Hypothesis]) -> Array:

@@ -5,6 +5,8 @@ from dataclasses import replace
 from functools import partial
 from typing import cast
 
+from ballfg.diagnosis.evidence.rows import Motion
+from ballfg.diagnosis.evidence.weighed import Weighed
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.search.candidates import (
     ALARM,
@@ -24,9 +26,6 @@ from ballfg.dynamics.effects.measurement import SpinLabelFrame
 from ballfg.dynamics.variation import place_of
 from ballfg.estimation.batch import do_all
 
-VARYING_ALARM = 0.001
-"""As `ALARM`, for effects that differ between tracks: they are flexible, and the choice of the best place of a change
-is not part of the correction for the number of hypotheses."""
 AS_GOOD = 0.97
 """Share of the best place's explained residual from which another place of a change is as good."""
 LABELLED = 0.5
@@ -34,7 +33,8 @@ LABELLED = 0.5
 
 
 def try_varying(
-    before: Fit,
+    model: Weighed,
+    motion: Motion,
     catalogue: Sequence[type[Effect]],
     ways: Callable[[Sequence[str]], list[Grouping]],
     tell: Callable[[str], None],
@@ -43,24 +43,25 @@ def try_varying(
     """Tries every hypothesis of an effect that differs between tracks; refits of the leading ones, the best first.
 
     Args:
-        before: the fit without any of them.
+        model: without any of them.
+        motion: random columns of its fit.
         catalogue: effects that may differ.
         ways: groupings of the tracks, by their names.
         tell: called with progress.
         jobs: processes.
     """
-    problem = before.problem
+    before, problem = model.fit, model.fit.problem
     searched = sorted(dict.fromkeys(problem.stretches.names), key=place_of)
     known = ways(searched)
     listed = varying_hypotheses(problem.model, scene_of(before), catalogue, problem.free, known)
     tell(f"testing {len(listed)} ways in which tracks may differ")
-    scored = score_all(before, listed)
+    scored = score_all(model, motion, listed)
     names = sorted({name for way in known for level in way.weights.values() for name in level}, key=place_of)
     refits = []
-    for candidate in shortlist(scored, VARYING_ALARM):
+    for candidate in shortlist(scored):
         tell(f"fitting with {candidate.hypothesis.name}")
         closer = near(cast(Varying, candidate.hypothesis), searched, names)
-        best = _placed(before, closer) if len(closer) > 1 else candidate
+        best = _placed(model, motion, closer) if len(closer) > 1 else candidate
         refits.append(refit(before, replace(best, p_value=candidate.p_value)))
     return scored, sorted(refits, key=lambda r: r.delta_bic)
 
@@ -78,14 +79,14 @@ def _refits(before: Fit, leading: Sequence[Scored], tell: Callable[[str], None])
     return [partial(refit, before, one) for one in shaped]
 
 
-def _placed(before: Fit, closer: Sequence[Varying]) -> Scored:
+def _placed(model: Weighed, motion: Motion, closer: Sequence[Varying]) -> Scored:
     """The change along the recording at its best place.
 
     Several places explain about the same if tracks between them do not show the coefficient. Then an earlier change's
     place is chosen, since one new table changes several coefficients; else the middle of them.
     """
-    known = {deviation.level for deviation in before.problem.deviations.values()}
-    scored = {id(s.hypothesis): s for s in score_all(before, closer)}
+    known = {deviation.level for deviation in model.fit.problem.deviations.values()}
+    scored = {id(s.hypothesis): s for s in score_all(model, motion, closer)}
     most = max(s.explained for s in scored.values())
     good = [scored[id(h)] for h in closer if scored[id(h)].explained >= AS_GOOD * most]
     named = [s for h, s in ((cast(Varying, s.hypothesis), s) for s in good) if known & set(h.grouping.weights)]
@@ -93,23 +94,28 @@ def _placed(before: Fit, closer: Sequence[Varying]) -> Scored:
 
 
 def try_hypotheses(
-    before: Fit, catalogue: Sequence[type[Effect]], tell: Callable[[str], None], jobs: int = 1
+    weighed: Weighed,
+    motion: Motion,
+    catalogue: Sequence[type[Effect]],
+    tell: Callable[[str], None],
+    jobs: int = 1,
 ) -> tuple[list[Scored], list[Refit]]:
     """Scores all hypotheses, sorted by explained residual, and refits the best.
 
     Args:
-        before: the fit without any of them.
+        weighed: the model without any of them.
+        motion: random columns of its fit.
         catalogue: candidate effects.
         tell: called with progress.
         jobs: processes.
     """
-    model = before.problem.model
+    before, model = weighed.fit, weighed.fit.problem.model
     listed = hypotheses(model, scene_of(before), catalogue)
     candidates = [h for h in listed if not set(h.columns) & set(before.problem.free)]
     tell(f"testing {len(candidates)} hypotheses")
     unlabelled = before.problem.stretches.labelled.mean() < LABELLED
     driven = [h for h in candidates if h.effect.multiplies_spin and unlabelled]
-    scored = score_all(before, [h for h in candidates if h not in driven])
+    scored = score_all(weighed, motion, [h for h in candidates if h not in driven])
     leading = shortlist(scored)
     called = {candidate.hypothesis.name for candidate in leading}
     usual = {h.name: h for h in (s.hypothesis for s in scored) if h.usual and h.name not in called}

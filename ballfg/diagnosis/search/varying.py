@@ -243,6 +243,7 @@ def near(hypothesis: Varying, searched: Sequence[str], names: Sequence[str]) -> 
 
 
 def varied(strength: str) -> str:
+    """The coefficient of a strength, `e` of `e[backspin]`."""
     return strength.partition("[")[0]
 
 
