@@ -21,6 +21,8 @@ from ballfg.diagnosis.fit.free import LOOSE, Deviation, declared_free
 from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout, hold_out
 from ballfg.diagnosis.fit.problem import Fit, Noise, Problem
 from ballfg.diagnosis.fit.stretches import Stretches, joined
+from ballfg.diagnosis.hypotheses.hypothesis import effects_of, has_effect, with_effects, without_effect
+from ballfg.diagnosis.hypotheses.varying import Grouping, Varying
 from ballfg.diagnosis.label_verdicts import LabelCheck
 from ballfg.diagnosis.report.wording import joined as listed
 from ballfg.diagnosis.report.wording import sentence
@@ -30,10 +32,8 @@ from ballfg.diagnosis.residual_tests.patterns import DRIFT
 from ballfg.diagnosis.residual_tests.residuals import residuals_of
 from ballfg.diagnosis.result import Diagnosis, Errors, Finding
 from ballfg.diagnosis.search.evaluation import prediction_errors
-from ballfg.diagnosis.search.hypothesis import effects_of, has_effect, with_effects, without_effect
 from ballfg.diagnosis.search.loop import NAMED, SearchLoop
 from ballfg.diagnosis.search.process_noise import PredictiveModel, calibrated_model, fitted_model, noise_about
-from ballfg.diagnosis.search.varying import Grouping, Varying
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel
 from ballfg.dynamics.effect import Effect
 from ballfg.estimation import dataset_settings

@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ballfg.benchmarks.diagnosis.cases import LABEL_NOISE, STATED_NOISE, Case
-from ballfg.diagnosis.search.hypothesis import has_effect, with_effects, without_effect
+from ballfg.diagnosis.hypotheses.hypothesis import has_effect, with_effects, without_effect
 from ballfg.dynamics import AnalyticModel, nominal_model
 from ballfg.simulation import MeasurementNoise, SimulationConfig, parse_effects, simulate, table_tennis
 from ballfg.simulation.composition import true_model

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.diagnosis.search.hypothesis import Hypothesis
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.dynamics import EFFECTS, nominal_model
 
 

@@ -28,8 +28,8 @@ from ballfg.diagnosis.fit.fit import fit_model
 from ballfg.diagnosis.fit.holdout import launcher_labels
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.stretches import stretches_of
+from ballfg.diagnosis.hypotheses.signatures import hypothesis_signatures, visible_directions
 from ballfg.diagnosis.search.candidates import ALARM
-from ballfg.diagnosis.search.signatures import hypothesis_signatures, visible_directions
 from ballfg.estimation import Smoother, dataset_settings, dataset_surfaces
 
 LEVEL = ALARM

@@ -5,8 +5,8 @@ from collections.abc import Iterable
 from ballfg.benchmarks.diagnosis.cases import Recording
 from ballfg.benchmarks.diagnosis.effects import PLANTS
 from ballfg.benchmarks.diagnosis.record import Found, Record
+from ballfg.diagnosis.hypotheses.hypothesis import TWINS
 from ballfg.diagnosis.result import Outcome, Verdict
-from ballfg.diagnosis.search.hypothesis import TWINS
 
 LARGEST_GROUP = 3
 """Effects that a diagnosis may name together and still be right."""

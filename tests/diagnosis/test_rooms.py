@@ -11,7 +11,18 @@ import ballfg.diagnosis
 
 ROOT = Path(ballfg.diagnosis.__file__).parent
 LEVELS = (
-    *("generic_test", "label_verdicts", "result", "fit", "search", "residual_tests", "report", "design"),
+    *(
+        "generic_test",
+        "label_verdicts",
+        "result",
+        "fit",
+        "hypotheses",
+        "evidence",
+        "search",
+        "residual_tests",
+        "report",
+    ),
+    *("design",),
     *("diagnosis", "joint", "__init__"),
 )
 """From the first to the last: a module imports from its own level and from earlier ones only."""

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 from ballfg.checks import did_you_mean
 from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, hypotheses, scene_of
 from ballfg.diagnosis.search.candidates import score_all
-from ballfg.diagnosis.search.hypothesis import Hypothesis, has_effect, hypotheses, scene_of
 from ballfg.dynamics import EFFECTS
 
 

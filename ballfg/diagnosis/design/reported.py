@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ballfg.checks import one_line, short_text
+from ballfg.diagnosis.hypotheses.hypothesis import TWINS
 from ballfg.diagnosis.report.report import REPORT
 from ballfg.diagnosis.result import Diagnosis
-from ballfg.diagnosis.search.hypothesis import TWINS
 from ballfg.dynamics import EFFECTS
 from ballfg.files.json_file import read_json
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.free import spread
-from ballfg.diagnosis.search.hypothesis import Hypothesis
-from ballfg.diagnosis.search.varying import Varying, varied
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
+from ballfg.diagnosis.hypotheses.varying import Varying, varied
 
 WIDTHS: Final = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 """Widths of the prior, in usual strengths, each as probable as the others."""

@@ -15,9 +15,9 @@ from typing import Final
 import numpy as np
 
 from ballfg.arrays import Array, Index
+from ballfg.diagnosis.fit.free_motion import ACCELERATION, CONTACT_SPIN, CONTACT_VELOCITY, free_motion
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.response import fitted_path, responses
-from ballfg.diagnosis.residual_tests.residuals import ACCELERATION, CONTACT_SPIN, CONTACT_VELOCITY, free_motion
 
 ACCELERATIONS, VELOCITIES, SPINS, COEFFICIENTS = range(4)
 """Kinds of random columns; each kind has one size for all tracks."""

@@ -11,7 +11,7 @@ from ballfg.diagnosis.evidence.likelihood import Likelihood, Reduced, posterior
 from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, scales
 from ballfg.diagnosis.evidence.rows import Motion, roots, rows_of
 from ballfg.diagnosis.evidence.weighed import Priors, Weighed
-from ballfg.diagnosis.search.hypothesis import Hypothesis
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 
 
 def foretold(model: Weighed, motion: Motion, hypotheses: Sequence[Hypothesis], columns: Array) -> list[float]:

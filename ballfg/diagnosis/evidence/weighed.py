@@ -13,7 +13,7 @@ from ballfg.diagnosis.evidence.likelihood import Noise, Posterior, Reduced, post
 from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, log_odds, scales
 from ballfg.diagnosis.evidence.rows import Motion, rows_of
 from ballfg.diagnosis.fit.problem import Fit, Unknowns
-from ballfg.diagnosis.search.hypothesis import Hypothesis
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.state import STATE_DIM
 
 MIDDLE = WIDTHS.index(1.0)

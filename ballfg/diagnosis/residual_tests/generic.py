@@ -13,6 +13,7 @@ from ballfg.arrays import Array
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.system import System
 from ballfg.diagnosis.generic_test import GenericTest
+from ballfg.diagnosis.hypotheses.signatures import signatures_of
 from ballfg.diagnosis.residual_tests.patterns import (
     DRIFT,
     EVERYWHERE,
@@ -24,7 +25,6 @@ from ballfg.diagnosis.residual_tests.patterns import (
 )
 from ballfg.diagnosis.residual_tests.whiteness import whiteness
 from ballfg.diagnosis.search.score import pattern_tests
-from ballfg.diagnosis.search.signatures import signatures_of
 from ballfg.tracks.noise import TrackNoise
 
 TRACKS_PER_DIRECTION = 4

@@ -13,7 +13,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout
-from ballfg.diagnosis.search.hypothesis import with_effects
+from ballfg.diagnosis.hypotheses.hypothesis import with_effects
 from ballfg.diagnosis.search.process_noise import noise_about
 from ballfg.dynamics import AnalyticModel
 from ballfg.estimation import Estimate, Settings, Status, dataset_settings

@@ -13,9 +13,9 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect
+from ballfg.diagnosis.hypotheses.signatures import hypothesis_signatures
 from ballfg.diagnosis.search.candidates import with_hypothesis
-from ballfg.diagnosis.search.hypothesis import Hypothesis, has_effect
-from ballfg.diagnosis.search.signatures import hypothesis_signatures
 from ballfg.dynamics.effects.registry import GENERIC
 
 MOST_TERMS = 12

@@ -13,10 +13,10 @@ from ballfg.diagnosis.evidence.screen import foretold
 from ballfg.diagnosis.evidence.weighed import Weighed
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.problem import Fit, Problem
-from ballfg.diagnosis.search.hypothesis import Hypothesis, with_effects
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, with_effects
+from ballfg.diagnosis.hypotheses.signatures import columns_of, hypothesis_signatures
 from ballfg.diagnosis.search.label_frames import FRAMES
 from ballfg.diagnosis.search.score import Score, score_tests
-from ballfg.diagnosis.search.signatures import columns_of, hypothesis_signatures
 from ballfg.state import SPIN
 
 ALARM = 0.25

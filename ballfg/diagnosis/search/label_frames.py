@@ -13,7 +13,7 @@ import torch
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.problem import LABEL_LOSS, Fit
-from ballfg.diagnosis.search.hypothesis import Hypothesis
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.dynamics.effects.measurement import signed_permutations
 from ballfg.state import SPIN
 

@@ -13,15 +13,15 @@ from ballfg.diagnosis.evidence.weighed import Weighed, weighed
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, without_effect
+from ballfg.diagnosis.hypotheses.varying import Grouping, groupings
 from ballfg.diagnosis.result import Candidate, Errors, Finding
 from ballfg.diagnosis.search.candidates import Refit, Scored
 from ballfg.diagnosis.search.evaluation import on_all, on_others
-from ballfg.diagnosis.search.hypothesis import Hypothesis, has_effect, without_effect
 from ballfg.diagnosis.search.process_noise import PredictiveModel
 from ballfg.diagnosis.search.ranking import finding_of, ranking
 from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_findings, stamp_hypotheses
 from ballfg.diagnosis.search.trial import try_hypotheses, try_varying
-from ballfg.diagnosis.search.varying import Grouping, groupings
 from ballfg.dynamics import AnalyticModel, BallModel
 from ballfg.dynamics.effect import Effect
 from ballfg.estimation.batch import do_all
@@ -104,7 +104,7 @@ class SearchLoop:
     def _told(self, found: "_Found", first: Fit) -> Search:
         """The search with the named effects only, its predictions and findings."""
         stamps, odds = self.holdout.stamps, found.odds
-        final = found.without([h for h in found.best.named if odds.of(h.name) < self.name_at])
+        final = found.named_at(self.name_at)
         self.watch("predicting the other half")
         declared = self.predictive(first)
         judged = self.judge(declared.model)
@@ -182,6 +182,13 @@ class _Found:
         """Weighs the best model without each of its effects, and with its rivals in its place."""
         for hypothesis in self.best.named:
             self.without([hypothesis])
+
+    def named_at(self, probability: float) -> Weighed:
+        """The model with all effects that are at least so probable, or with most of them."""
+        odds = self.odds
+        likely = {name for name in odds.effects() if odds.of(name) >= probability}
+        able = [model for model in self.models.values() if model.names <= likely]
+        return max(able, key=lambda model: (len(model.names), odds.models[model.names]))
 
     def without(self, gone: Sequence[Hypothesis], model: Weighed | None = None) -> Weighed:
         """A model without some of its effects."""

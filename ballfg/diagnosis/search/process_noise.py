@@ -13,9 +13,9 @@ import torch
 
 from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout
 from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.hypotheses.hypothesis import with_effects
 from ballfg.diagnosis.result import Errors
 from ballfg.diagnosis.search.evaluation import prediction_errors
-from ballfg.diagnosis.search.hypothesis import with_effects
 from ballfg.dynamics import AnalyticModel, BallModel
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding

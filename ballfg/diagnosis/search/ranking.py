@@ -11,9 +11,9 @@ from ballfg.diagnosis.evidence.odds import Odds
 from ballfg.diagnosis.evidence.weighed import Weighed
 from ballfg.diagnosis.fit.fit import values_of
 from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.hypotheses.hypothesis import TWINS, Hypothesis
 from ballfg.diagnosis.result import Candidate, Finding, Outcome, Value
 from ballfg.diagnosis.search.candidates import ALARM, Refit, Scored
-from ballfg.diagnosis.search.hypothesis import TWINS, Hypothesis
 
 ALIKE: Final = 0.05
 """Odds of another effect in an effect's place above which the two cannot be told apart."""

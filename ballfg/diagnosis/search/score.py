@@ -21,7 +21,7 @@ import numpy as np
 from scipy import optimize, stats
 
 from ballfg.arrays import Array, Index
-from ballfg.diagnosis.search.signatures import Efficient, Signatures, visible_directions
+from ballfg.diagnosis.hypotheses.signatures import Efficient, Signatures, visible_directions
 
 PRIOR_TRACKS = 10.0
 """Weight, in tracks, of the scatter pooled over all patterns, beside a pattern's own, uncertain one."""

@@ -7,8 +7,8 @@ from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.fit.problem import Fit, Problem
 from ballfg.diagnosis.fit.stamps import Stamps
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, with_effects, without_effect
 from ballfg.diagnosis.result import Finding
-from ballfg.diagnosis.search.hypothesis import Hypothesis, with_effects, without_effect
 from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.effects.measurement import CountedFrames, TimeScale
 

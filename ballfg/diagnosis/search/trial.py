@@ -8,6 +8,8 @@ from typing import cast
 from ballfg.diagnosis.evidence.rows import Motion
 from ballfg.diagnosis.evidence.weighed import Weighed
 from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.hypotheses.hypothesis import has_effect, hypotheses, scene_of
+from ballfg.diagnosis.hypotheses.varying import Grouping, Varying, near, varying_hypotheses
 from ballfg.diagnosis.search.candidates import (
     ALARM,
     Refit,
@@ -18,9 +20,7 @@ from ballfg.diagnosis.search.candidates import (
     score_all,
     shortlist,
 )
-from ballfg.diagnosis.search.hypothesis import has_effect, hypotheses, scene_of
 from ballfg.diagnosis.search.label_frames import frame_hypotheses
-from ballfg.diagnosis.search.varying import Grouping, Varying, near, varying_hypotheses
 from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.effects.measurement import SpinLabelFrame
 from ballfg.dynamics.variation import place_of

@@ -18,7 +18,7 @@ from ballfg.benchmarks.diagnosis.ideal import (
     power,
     read_ideal,
 )
-from ballfg.diagnosis.search.signatures import visible_directions
+from ballfg.diagnosis.hypotheses.signatures import visible_directions
 
 
 @pytest.mark.parametrize("rank", [1, 3])

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from ballfg.diagnosis.fit.system import System, by_track
-from ballfg.diagnosis.search.signatures import Signatures
+from ballfg.diagnosis.hypotheses.signatures import Signatures
 
 N, M, STATE, Q, P = 5, 40, 9, 3, 2
 TRACK = np.array([0, 0, 1, 2, 2])

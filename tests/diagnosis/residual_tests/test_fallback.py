@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ballfg.diagnosis.hypotheses.hypothesis import with_effects
 from ballfg.diagnosis.residual_tests import fallback
-from ballfg.diagnosis.search.hypothesis import with_effects
 from ballfg.dynamics import EFFECTS, nominal_model
 from ballfg.dynamics.trained import Trained
 from ballfg.simulation import SimulationConfig, simulate

@@ -10,12 +10,12 @@ from scipy import stats
 
 from ballfg.diagnosis.fit.response import fitted_path, responses
 from ballfg.diagnosis.generic_test import ALARM
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
+from ballfg.diagnosis.hypotheses.signatures import Signatures, hypothesis_columns
 from ballfg.diagnosis.residual_tests.generic import generic_tests, where
 from ballfg.diagnosis.residual_tests.patterns import EVERYWHERE, PLAUSIBLE, WORLD, Block, blocks_of
 from ballfg.diagnosis.residual_tests.whiteness import REACHES, whiteness
-from ballfg.diagnosis.search.hypothesis import Hypothesis
 from ballfg.diagnosis.search.score import pattern_tests
-from ballfg.diagnosis.search.signatures import Signatures, hypothesis_columns
 from ballfg.dynamics.effects.generic import GenericFlight
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")  # torch's own

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import torch
 
+from ballfg.diagnosis.fit.free_motion import ACCELERATION, BIN
 from ballfg.diagnosis.fit.response import fitted_path, responses, weighted
 from ballfg.diagnosis.fit.shooting import shoot
-from ballfg.diagnosis.residual_tests.residuals import ACCELERATION, BIN, residuals_of, since_contact
-from ballfg.diagnosis.search.hypothesis import Hypothesis
-from ballfg.diagnosis.search.signatures import hypothesis_columns
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
+from ballfg.diagnosis.hypotheses.signatures import hypothesis_columns
+from ballfg.diagnosis.residual_tests.residuals import residuals_of, since_contact
 from ballfg.dynamics.effect import Flight
 from ballfg.dynamics.effects.generic import (
     MOTION_TERMS,

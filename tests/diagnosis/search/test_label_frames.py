@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.search.candidates import Scored, refit
-from ballfg.diagnosis.search.hypothesis import Hypothesis
 from ballfg.diagnosis.search.label_frames import FRAMES_FITTED, frame_hypotheses
 from ballfg.dynamics.effects.measurement import SpinLabelFrame, signed_permutations
 

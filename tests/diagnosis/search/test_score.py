@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from ballfg.diagnosis.hypotheses.signatures import Signatures
 from ballfg.diagnosis.search.score import PRIOR_TRACKS, Pattern, _p_value, score_tests
-from ballfg.diagnosis.search.signatures import Signatures
 
 SAMPLES, COMMON, COLUMNS, REPEATS = 40, 6, 6, 120
 CANDIDATES = [[0], [1, 2], [3, 4, 5]]

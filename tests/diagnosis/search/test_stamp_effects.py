@@ -11,7 +11,7 @@ import pytest
 
 from ballfg.diagnosis.fit.holdout import hold_out
 from ballfg.diagnosis.fit.stamps import Evidence, Stamps
-from ballfg.diagnosis.search.hypothesis import with_effects
+from ballfg.diagnosis.hypotheses.hypothesis import with_effects
 from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_findings, stamp_hypotheses
 from ballfg.dynamics.effects.measurement import CountedFrames, TimeScale
 from ballfg.simulation import SimulationConfig, write_simulation

@@ -17,8 +17,8 @@ from ballfg.arrays import Index
 from ballfg.diagnosis.fit.fit import covariance_of
 from ballfg.diagnosis.fit.free import LOOSE, Deviation, spread
 from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, with_effects
 from ballfg.diagnosis.result import Value
-from ballfg.diagnosis.search.hypothesis import Hypothesis, has_effect, with_effects
 from ballfg.dynamics import AnalyticModel, Coefficient, Scene
 from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.variation import TRACK, number_of, place_of

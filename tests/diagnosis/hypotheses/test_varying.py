@@ -13,16 +13,17 @@ from ballfg.diagnosis.fit.fit import covariance_of, fit_model
 from ballfg.diagnosis.fit.problem import Fit, Unknowns
 from ballfg.diagnosis.fit.sensitivity import predict
 from ballfg.diagnosis.fit.stretches import joined
+from ballfg.diagnosis.hypotheses.signatures import hypothesis_columns
+from ballfg.diagnosis.hypotheses.varying import Varying, groupings, near, varying_hypotheses
 from ballfg.diagnosis.search.candidates import Scored, refit
+from ballfg.diagnosis.search.loop import without_named
 from ballfg.diagnosis.search.ranking import fitted_values
-from ballfg.diagnosis.search.signatures import hypothesis_columns
-from ballfg.diagnosis.search.state import without_named
 from ballfg.diagnosis.search.trial import try_varying
-from ballfg.diagnosis.search.varying import Varying, between, groupings, near, varying_hypotheses
 from ballfg.dynamics import EFFECTS, Scene
 from ballfg.dynamics.variation import Variation
 from ballfg.estimation import Settings
 from ballfg.tracks import Track
+from tests.diagnosis.evidence.weighing import weigh
 
 COUNT, CHANGE = 24, 10
 OLD, NEW = 0.93, 0.88
@@ -67,7 +68,7 @@ def before(two_balls, make_ball, make_fit) -> Fit:
 @pytest.fixture(scope="module")
 def found(before, holdout):
     catalogue = [EFFECTS[name] for name in ("drag", "restitution", "wind", "table_tilt")]
-    return try_varying(before, catalogue, holdout.held_out, partial(groupings, holdout.tracks), lambda line: None)
+    return try_varying(*weigh(before), catalogue, partial(groupings, holdout.tracks), lambda line: None)
 
 
 def test_another_ball_is_found_with_both_values_and_the_track_from_which_on_it_flew(found):
@@ -88,7 +89,7 @@ def test_nothing_differs_where_one_ball_flew_all_the_time(make_ball, make_launch
     names = tuple(f"{2 * i:03d}" for i in range(COUNT))
     alike = replace(stretches, names=names)
     fit, ways = make_fit(make_ball(), alike), partial(groupings, holdout.tracks)
-    scored, refits = try_varying(fit, list(EFFECTS.values()), holdout.held_out, ways, lambda line: None)
+    scored, refits = try_varying(*weigh(fit), list(EFFECTS.values()), ways, lambda line: None)
     assert len(scored) > 20
     assert refits == []
 
@@ -193,7 +194,6 @@ def test_the_place_of_a_step_is_looked_for_between_its_neighbours():
     way = next(w for w in groupings(tracks(names), names[::2]) if "16" in w.weights)
     step = Varying.of(EFFECTS["restitution"], ("e",), way)
     assert [next(iter(h.grouping.weights)) for h in near(step, names[::2], names)] == ["12", "14", "16", "18", "20"]
-    assert [next(iter(h.grouping.weights)) for h in between(step, names[::2], names)] == ["15", "16"]
 
 
 def test_names_out_of_order_tell_no_place():

@@ -15,7 +15,7 @@ from ballfg.diagnosis.fit.free import Deviation
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.sensitivity import sensitivity
 from ballfg.diagnosis.fit.system import System, by_track
-from ballfg.diagnosis.search.hypothesis import Hypothesis
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 
 LEAST_SHARE = 1e-8
 """Least share of a column's length that survives projection: less is rounding, and the effect is invisible."""

@@ -7,7 +7,7 @@ import pytest
 
 from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.sensitivity import predict
-from ballfg.diagnosis.search.hypothesis import (
+from ballfg.diagnosis.hypotheses.hypothesis import (
     LOOSE,
     Hypothesis,
     effects_of,
@@ -116,15 +116,6 @@ def test_declared_coefficients_that_are_estimated(make_ball):
     assert "flight.gravity.g" not in free  # exact
     assert "flight.drag_speed.reference" not in free  # a shape
     assert {"flight.drag.k", "flight.magnus.k", "bounce.restitution.e", "flight.drag_speed.slope"} <= set(free)
-
-
-def test_strain_is_the_distance_from_the_usual_value_in_prior_sigmas():
-    gust = Hypothesis(EFFECTS["gust_region"], {"center_x": 3.0}, ("x", "y", "z"))
-    values = {"flight.gust_region.x": 20.0, "flight.gust_region.y": -0.5, "flight.gust_region.z": 0.0}
-    assert gust.strain(values) == pytest.approx(40.0)  # sigma 0.5 m/s
-    friction = Hypothesis(EFFECTS["friction"], {}, ("mu",))
-    assert friction.strain({"bounce.friction.mu": 0.25}) == 0.0
-    assert Hypothesis(EFFECTS["spin_label_frame"], {"yy": -1.0}, ()).strain({}) == 0.0
 
 
 def test_usual_effects_are_those_with_a_nominal_strength():

@@ -1,0 +1,110 @@
+"""The marginal likelihood against a dense Gaussian one, and its derivative against differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import linalg
+
+from ballfg.diagnosis.evidence.likelihood import Likelihood, Noise, posterior, settled
+from ballfg.diagnosis.evidence.rows import random_motion, rows_of
+from ballfg.state import STATE_DIM
+
+NOISE = Noise(0.1, 0.2, (-0.7, -1.1, -0.4, -1.2))
+
+
+@pytest.fixture(scope="module")
+def rows(make_ball, make_launches, make_shots, make_fit):
+    """Rows of five shots with a bounce; the first states have all nine numbers shown."""
+    fit = make_fit(make_ball(), make_shots(make_ball(), make_launches(5, 11), 11, rate=40.0, duration=0.6).stretches)
+    return rows_of(fit, random_motion(fit, ["flight.drag.k", "bounce.restitution.e"]))
+
+
+@pytest.fixture(scope="module")
+def likelihood(rows):
+    """With robust weights other than one."""
+    rng = np.random.default_rng(3)
+    samples = rng.uniform(0.3, 1.0, rows.used.shape)
+    return Likelihood(rows, samples, rng.uniform(0.5, 1.0, len(rows.used)), np.full(len(rows.used), 0.25))
+
+
+@pytest.fixture(scope="module")
+def prior(rows):
+    count = rows.by_common.shape[-1]
+    return np.linspace(0.5, 2.0, count) * 10.0, np.linspace(-0.2, 0.3, count)
+
+
+def dense(likelihood, noise, precision, away):
+    """The density of all rows at once, its noise a full matrix, first states free and common unknowns random."""
+    rows, parts, logs = likelihood.rows, [], 0.0
+    sizes = np.exp(2.0 * np.append(noise.random, -np.inf))
+    for i, used in enumerate(rows.used):
+        kept = np.concatenate((np.repeat(used, 3), np.full(3, True)))
+        weights = np.concatenate((np.repeat(likelihood.samples[i], 3), np.repeat(likelihood.spins[i], 3)))[kept]
+        white = np.concatenate((np.full(3 * used.sum(), np.exp(2 * noise.white)), np.full(3, np.exp(2 * noise.spin))))
+        motion = rows.motion.columns[i][kept] * np.sqrt(sizes[rows.motion.kinds[i]])
+        # a robust weight divides the variance in the square of the residual, and leaves the normalisation alone
+        parts.append((rows.residual[i][kept], rows.by_start[i][kept], rows.by_common[i][kept], motion, white / weights))
+        logs += 0.5 * np.log(weights).sum() + likelihood.penalty[i]
+    residual = np.concatenate([p[0] for p in parts])
+    common = np.concatenate([p[2] for p in parts])
+    starts = linalg.block_diag(*(p[1] for p in parts))
+    variance = linalg.block_diag(*(p[3] @ p[3].T + np.diag(p[4]) for p in parts))
+    variance += common / precision @ common.T
+    left = residual - common @ away
+    inverse = np.linalg.inv(variance)
+    information = starts.T @ inverse @ starts
+    solved = starts.T @ inverse @ left
+    square = left @ inverse @ left - solved @ np.linalg.solve(information, solved)
+    return -0.5 * (np.linalg.slogdet(variance)[1] + np.linalg.slogdet(information)[1] + square) - logs
+
+
+def test_value_is_that_of_a_dense_gaussian(likelihood, prior):
+    reduced, _ = likelihood.reduced(NOISE)
+    found = posterior(reduced, *prior).evidence
+    assert found == pytest.approx(dense(likelihood, NOISE, *prior), rel=1e-8)
+
+
+def test_derivative_is_that_of_differences(likelihood, prior):
+    def value(vector):
+        return posterior(likelihood.reduced(Noise.of(vector))[0], *prior).evidence
+
+    reduced, local = likelihood.reduced(NOISE)
+    slope = likelihood.slope(NOISE, local, posterior(reduced, *prior))
+    step = 1e-5
+    moved = [NOISE.vector + step * sign * axis for axis in np.eye(6) for sign in (1, -1)]
+    differences = np.array([value(v) for v in moved]).reshape(6, 2) @ [1, -1] / (2 * step)
+    np.testing.assert_allclose(slope, differences, rtol=1e-6, atol=1e-6 * np.abs(slope).max())
+
+
+def test_common_unknowns_are_those_of_generalised_least_squares(likelihood, prior):
+    """The posterior's mean maximises the density with the unknowns held, so that its gradient there vanishes."""
+    reduced, _ = likelihood.reduced(NOISE)
+    found = posterior(reduced, *prior)
+    precision, away = prior
+    total = reduced.gram.sum(axis=0)
+    gradient = total[:-1, -1] - total[:-1, :-1] @ found.mean - precision * (found.mean - away)
+    assert np.abs(gradient).max() < 1e-8 * np.abs(total[:-1, -1]).max()
+    np.testing.assert_allclose(found.covariance @ (total[:-1, :-1] + np.diag(precision)), np.eye(len(away)), atol=1e-8)
+
+
+def test_local_step_leaves_no_gradient(likelihood, prior):
+    total, _ = likelihood.inner(NOISE)
+    end = STATE_DIM + likelihood.rows.motion.kinds.shape[1]
+    common = 0.1 * prior[1]
+    local = likelihood.local_step(NOISE, common)
+    left = total[:, :end, -1] - total[:, :end, end:-1] @ common - (total[:, :end, :end] @ local[..., None])[..., 0]
+    assert np.abs(left).max() < 1e-8 * np.abs(total[:, :end, -1]).max()
+
+
+def test_sizes_of_noise_come_back(make_ball, make_launches, make_shots, make_fit):
+    """White noise of twice the stated size, and nothing else: random motion stays far below its unit."""
+    shots = make_shots(make_ball(), make_launches(30, 17), 17, rate=60.0, duration=0.5).stretches
+    fit = make_fit(make_ball(), shots, settle_noise=False)
+    rows = rows_of(fit, random_motion(fit, ()))
+    halved = type(rows)(**{**vars(rows), "residual": 2.0 * rows.residual})
+    precision = fit.problem.common_precision
+    _, noise = settled(halved, precision, np.zeros(len(precision)))
+    _, plain = settled(rows, precision, np.zeros(len(precision)))
+    assert noise.white - plain.white == pytest.approx(np.log(2.0), abs=0.05)
+    assert max(noise.random[0], plain.random[0]) < -1.5

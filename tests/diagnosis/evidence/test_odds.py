@@ -1,0 +1,86 @@
+"""Probabilities of effects: what the prior costs, what is invisible, and what the other half does not bear out."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from ballfg.diagnosis.evidence.odds import odds_of, tempered
+from ballfg.diagnosis.evidence.prior import THERE, WIDTHS, choice_odds, log_odds, scales
+from ballfg.diagnosis.evidence.screen import foretold
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
+from ballfg.diagnosis.hypotheses.signatures import columns_of
+from ballfg.diagnosis.search.candidates import Scored, refit
+from ballfg.dynamics import EFFECTS
+from tests.diagnosis.evidence.weighing import weigh
+
+WIND = Hypothesis(EFFECTS["wind"], {}, ("x", "y", "z"))
+
+
+def model(names, evidence, held_out=None):
+    named = [Hypothesis(EFFECTS[name], {}, ("x",)) for name in names]
+    gains = np.full(10, evidence / 10.0) if held_out is None else np.asarray(held_out)
+    return SimpleNamespace(names=frozenset(names), evidence=evidence, odds=log_odds(named), held_out=gains)
+
+
+def test_a_strength_of_five_times_the_usual_one_costs_two_nats():
+    """The density of a strength that is known exactly, beside that of the best single width."""
+
+    def density(strength):
+        widths = np.array(WIDTHS)
+        return np.mean(np.exp(-0.5 * (strength / widths) ** 2) / widths)
+
+    best = np.exp(-0.5) / 5.0
+    assert -2.5 < np.log(density(5.0) / best) < -1.0
+    assert np.log(density(5.0) / density(1.0)) > -3.0
+
+
+def test_probabilities_follow_evidence_and_prior():
+    nothing, wind, tilt = model([], 0.0), model(["wind"], 6.0), model(["frame_tilt"], 4.0)
+    odds = odds_of([nothing, wind, tilt], nothing)
+    prior = THERE / (1.0 - THERE)
+    weights = np.array([1.0, np.exp(6.0) * prior, np.exp(4.0) * prior])
+    expected = weights / weights.sum()
+    assert odds.nothing == pytest.approx(expected[0])
+    assert odds.of("wind") == pytest.approx(expected[1])
+    assert list(odds.effects()) == ["wind", "frame_tilt"]
+    assert odds.of("scale") == 0.0
+
+
+def test_what_the_other_half_does_not_bear_out_is_tempered():
+    nothing = model([], 0.0)
+    assert tempered(model(["wind"], 20.0), nothing) == pytest.approx(20.0)
+    little = np.tile([0.1, 0.3], 5)
+    assert 2.0 < tempered(model(["wind"], 20.0, little), nothing) < 3.0
+    by_one = np.array([19.0, *np.full(9, -2.0)])  # that chance may have put there: the scatter says so
+    assert tempered(model(["wind"], 20.0, by_one), nothing) == pytest.approx(20.0)
+    assert tempered(model(["wind"], 20.0, np.full(10, -1.0)), nothing) == 0.0
+    assert tempered(model(["wind"], -3.0), nothing) == -3.0
+
+
+def test_a_choice_among_shapes_is_paid_for():
+    assert choice_odds([Hypothesis(EFFECTS["gust_region"], {}, ("x",), 18)]) == pytest.approx(-np.log(18.0))
+    assert choice_odds([WIND]) == 0.0
+    np.testing.assert_array_equal(scales(WIND), 0.2)
+
+
+def test_what_is_foretold_is_what_a_refit_gains(windy_fit):
+    before, motion = weigh(windy_fit)
+    (gain,) = foretold(before, motion, [WIND], columns_of(windy_fit, [WIND]))
+    after, _ = weigh(refit(windy_fit, Scored(WIND, None, 0.0)).fit, [WIND])
+    assert gain > 20.0
+    assert after.evidence - before.evidence > 0.8 * gain  # with noise of its own it gains more
+    strengths = after.strengths["wind"]
+    sigmas = np.sqrt(np.diagonal(strengths.covariance))
+    assert (np.abs(strengths.mean - [0.5, -0.3, 0.0]) < 4.0 * sigmas).all()
+    assert (after.held_out - before.held_out).sum() > 0.5 * (after.evidence - before.evidence)
+
+
+def test_an_effect_that_is_not_there_costs_its_prior(calm_fit):
+    before, motion = weigh(calm_fit)
+    (gain,) = foretold(before, motion, [WIND], columns_of(calm_fit, [WIND]))
+    after, _ = weigh(refit(calm_fit, Scored(WIND, None, 0.0)).fit, [WIND])
+    assert gain < 1.0
+    assert after.evidence - before.evidence == pytest.approx(gain, abs=1.0)
