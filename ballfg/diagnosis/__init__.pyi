@@ -1,7 +1,10 @@
 from .design.plan import design_shots as design_shots
 from .diagnosis import diagnose as diagnose
+from .evidence.weighed import weigh as weigh
 from .fit.fit import fit_model as fit_model
 from .fit.holdout import hold_out as hold_out
+from .hypotheses.hypothesis import hypotheses as hypotheses
+from .hypotheses.hypothesis import scene_of as scene_of
 from .joint import JointDiagnosis as JointDiagnosis
 from .joint import diagnose_jointly as diagnose_jointly
 from .report.report import write_report as write_report
@@ -13,7 +16,4 @@ from .residual_tests.sparse import sparse_terms as sparse_terms
 from .result import Diagnosis as Diagnosis
 from .search.candidates import refit as refit
 from .search.candidates import score_all as score_all
-from .search.evaluation import held_out_gain as held_out_gain
 from .search.evaluation import prediction_errors as prediction_errors
-from .search.hypothesis import hypotheses as hypotheses
-from .search.hypothesis import scene_of as scene_of

@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from ballfg.checks import check_number
+from ballfg.checks import check_range
 from ballfg.diagnosis.fit.fit import noise_by_axis, values_of
 from ballfg.diagnosis.fit.holdout import Holdout, hold_out
 from ballfg.diagnosis.fit.problem import Fit
@@ -59,7 +59,7 @@ def diagnose(
         TypeError: if the model is a learned one.
         ValueError: if there are too few tracks, or none with a flight that is long enough.
     """
-    check_number("name_at", name_at, above=0.0, limit=1.0)
+    check_range("name_at", name_at, 0.0, 1.0)
     if not isinstance(model, AnalyticModel):
         raise TypeError(
             f"model must be an AnalyticModel, to which effects can be added; got {type(model).__name__}. "

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from ballfg.arrays import Array
+from ballfg.checks import check_range
 from ballfg.diagnosis.diagnosis import in_order, strange, verdict_of, what_is_left
 from ballfg.diagnosis.fit.fit import first_guess, fit_model, fit_problem, reachable, values_of
 from ballfg.diagnosis.fit.free import LOOSE, Deviation, declared_free
@@ -90,6 +91,7 @@ def diagnose_jointly(
     Raises: ValueError: for fewer than two datasets, equal names, a dataset with wrong stamps, too few tracks, or a
         model that differs between tracks.
     """
+    check_range("name_at", name_at, 0.0, 1.0)
     if model.variations:
         raise ValueError(
             f"model must be the same for all tracks of all rooms; {', '.join(model.variations)} differ between tracks. "

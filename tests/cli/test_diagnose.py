@@ -38,9 +38,15 @@ def answer(monkeypatch: pytest.MonkeyPatch) -> Answer:
 
     def answer(diagnosis: Diagnosis) -> Asked:
         def diagnose(
-            dataset: Dataset, model: AnalyticModel, *, jobs: int = 1, watch: Callable[[str], None] | None = None
+            dataset: Dataset,
+            model: AnalyticModel,
+            *,
+            jobs: int = 1,
+            watch: Callable[[str], None] | None = None,
+            name_at: float = 0.0,
         ) -> Diagnosis:
             assert watch is not None
+            assert name_at == 0.9
             watch("fitting the declared model to 25 tracks")
             asked.append((dataset.info.name, tuple(model.flight), jobs))
             return diagnosis
@@ -70,8 +76,8 @@ def test_what_is_printed_and_written(
     first, *lines = said.out.splitlines()
     assert first == headline(found())
     assert lines[0] == f"effect found: {found().sentence}"
-    assert lines[2].split()[:4] == ["effect", "kind", "by", "chance"]
-    assert lines[3].startswith("wind    flight  less than 1e-99  -598  gust_region          x 0.200 ± 0.012 m/s, ")
+    assert lines[2].split()[:4] == ["effect", "probability", "kind", "by"]
+    assert lines[3].startswith("wind    0.998        flight  less than 1e-99  -598  gust_region          x 0.2")
     assert lines[5:8] == [
         "on 25 judging tracks  before  after",
         "prediction RMSE, mm   20.1    10.2",

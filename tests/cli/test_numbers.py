@@ -15,6 +15,7 @@ WORDS = {
     "import": "{data}/tracks.csv --out {out}",
     "predict": "{data} --observe 0.1 --out {out}.csv",
     "live": "--replay {data}",
+    "diagnose": "{data} --out {out}",
     "simulate": "--out {out} --tracks 1",
     "render": "--out {out} --shots 1",
     "track": "{data}/tracks.csv --cameras {data}/cameras.yaml --out {out}",

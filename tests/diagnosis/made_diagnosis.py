@@ -146,6 +146,8 @@ def found() -> Diagnosis:
         indistinguishable_from=("gust_region",),
         held_out_gain=5.8,
         held_out_p=2e-7,
+        probability=0.998,
+        evidence=102.4,
     )
     left = tuple(
         GenericTest(name, where, p, share)

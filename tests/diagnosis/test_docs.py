@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import ballfg.diagnosis
-from ballfg.diagnosis import fit_model, hold_out, hypotheses, scene_of, score_all
+from ballfg.diagnosis import fit_model, hold_out, hypotheses, scene_of, score_all, weigh
 from ballfg.diagnosis.report.report import content
 from ballfg.dynamics import EFFECTS, load_effects, load_model
 from ballfg.simulation import SimulationConfig, parse_effects, write_simulation
@@ -88,7 +88,7 @@ def test_an_effect_of_ones_own_is_found(here: Path) -> None:
     before = fit_model(model, holdout.search, holdout.settings, settle_noise=False)
     candidates = hypotheses(model, scene_of(before), [charge, EFFECTS["wind"], EFFECTS["drag_speed"]])
     assert [h.shape["reach"] for h in candidates[:2]] == [0.05, 0.15]
-    best = score_all(before, candidates)[0]
+    best = score_all(weigh(before), candidates)[0]
     assert best.hypothesis.effect is charge
     assert best.score is not None
     assert best.p_value < 1e-3

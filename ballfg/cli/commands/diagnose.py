@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ballfg.checks import check_range
 from ballfg.cli.inputs import (
     CORES,
     Address,
@@ -37,9 +38,7 @@ def diagnose(
     model: Annotated[Path | None, typer.Option(help="Model file. Default: the nominal model of the ball.")] = None,
     effects_file: EffectsFiles = None,
     observations_file: ObservationsFiles = None,
-    name_at: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="Probability from which on an effect is named.")
-    ] = NAME_AT,
+    name_at: Annotated[float, typer.Option(help="Probability from which on an effect is named.")] = NAME_AT,
     jobs: Jobs = CORES,
     cluster: Cluster = None,
     address: Address = None,
@@ -65,6 +64,7 @@ def diagnose(
     from ballfg.dynamics import AnalyticModel
     from ballfg.files.whole_folder import reserved
 
+    check_range("--name-at", name_at, 0.0, 1.0)
     if any(out.resolve() == dataset.resolve() for dataset in datasets):
         raise ValueError(f"out must not be the dataset itself; got {out}. Choose another folder.")
     if model is not None and model.resolve() == out.resolve() / MODEL:

@@ -82,8 +82,13 @@ def roots(fit: Fit) -> Array:
     return np.sqrt(np.concatenate((samples, spins), axis=1))[..., None]
 
 
-def random_motion(fit: Fit, scattering: Collection[str]) -> Motion:
-    """The random columns of a fit; scattering: coefficients that may differ from track to track."""
+def random_motion(fit: Fit, scattering: Collection[str] | None = None) -> Motion:
+    """The random columns of a fit.
+
+    Args: scattering: coefficients that may differ from track to track; None: all that are the same for all tracks.
+    """
+    if scattering is None:
+        scattering = [name for name in fit.problem.free if name not in fit.problem.deviations]
     own: dict[int, list[tuple[Array, Array]]] = defaultdict(list)
     for arc in responses(fit, fitted_path(fit)):
         for row, piece in zip(arc.rows.tolist(), free_motion(fit, arc), strict=True):

@@ -11,7 +11,7 @@ from scipy import special
 from ballfg.arrays import Array, Index, Mask
 from ballfg.diagnosis.evidence.likelihood import Noise, Posterior, Reduced, posterior, settled
 from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, log_odds, scales
-from ballfg.diagnosis.evidence.rows import Motion, rows_of
+from ballfg.diagnosis.evidence.rows import Motion, random_motion, rows_of
 from ballfg.diagnosis.fit.problem import Fit, Unknowns
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.state import STATE_DIM
@@ -109,6 +109,18 @@ class Priors:
     def posterior(self, reduced: Reduced, widths: Sequence[int]) -> Posterior:
         """The posterior of all common unknowns."""
         return posterior(reduced, self.precision(widths), self.away)
+
+
+def weigh(fit: Fit, named: Sequence[Hypothesis] = ()) -> Weighed:
+    """The evidence of a fitted model, with the sizes of its noise.
+
+    Args:
+        fit: to all tracks; every second one counts as one half.
+        named: effects in the fit that the declared model lacks; their strengths get the priors of effects.
+    Returns: the model with its evidence; ratios of evidences compare models of the same stretches.
+    """
+    halves = np.arange(len(np.unique(fit.problem.stretches.track))) % 2 == 0
+    return weighed(fit, named, random_motion(fit), halves)
 
 
 def weighed(fit: Fit, named: Sequence[Hypothesis], motion: Motion, halves: Mask, start: Noise | None = None) -> Weighed:

@@ -8,7 +8,7 @@ import torch
 from scipy import stats
 
 from ballfg.arrays import Array
-from ballfg.diagnosis.evidence.rows import Motion
+from ballfg.diagnosis.evidence.rows import Motion, random_motion
 from ballfg.diagnosis.evidence.screen import foretold
 from ballfg.diagnosis.evidence.weighed import Weighed
 from ballfg.diagnosis.fit.fit import fit_problem
@@ -67,22 +67,23 @@ class Refit:
         return self.scored.hypothesis.name
 
 
-def score_all(model: Weighed, motion: Motion, candidates: Sequence[Hypothesis]) -> list[Scored]:
+def score_all(model: Weighed, candidates: Sequence[Hypothesis], motion: Motion | None = None) -> list[Scored]:
     """Score tests of all hypotheses, and their foretold gains.
 
     Args:
-        model: without any of them.
-        motion: random columns of its fit.
+        model: without any of them, as `weigh` gives it.
         candidates: the hypotheses; those without strengths are left out.
+        motion: random columns of the model's fit, if they are known.
     Returns: the tests, sorted by explained residual, invisible hypotheses last.
     """
     testable = [h for h in candidates if h.strengths]
     if not testable:
         return []
     columns = columns_of(model.fit, testable)
+    gains = foretold(model, random_motion(model.fit) if motion is None else motion, testable, columns)
     scores = score_tests(*hypothesis_signatures(model.fit, testable, columns))
     scored = []
-    for hypothesis, score, gain in zip(testable, scores, foretold(model, motion, testable, columns), strict=True):
+    for hypothesis, score, gain in zip(testable, scores, gains, strict=True):
         p_value = 1.0 if score is None else min(1.0, score.p_value * len(testable))
         scored.append(Scored(hypothesis, score, p_value, tested=len(testable), gain=gain))
     return sorted(scored, key=lambda s: s.explained, reverse=True)

@@ -55,7 +55,7 @@ def try_varying(
     known = ways(searched)
     listed = varying_hypotheses(problem.model, scene_of(before), catalogue, problem.free, known)
     tell(f"testing {len(listed)} ways in which tracks may differ")
-    scored = score_all(model, motion, listed)
+    scored = score_all(model, listed, motion)
     names = sorted({name for way in known for level in way.weights.values() for name in level}, key=place_of)
     refits = []
     for candidate in shortlist(scored):
@@ -86,7 +86,7 @@ def _placed(model: Weighed, motion: Motion, closer: Sequence[Varying]) -> Scored
     place is chosen, since one new table changes several coefficients; else the middle of them.
     """
     known = {deviation.level for deviation in model.fit.problem.deviations.values()}
-    scored = {id(s.hypothesis): s for s in score_all(model, motion, closer)}
+    scored = {id(s.hypothesis): s for s in score_all(model, closer, motion)}
     most = max(s.explained for s in scored.values())
     good = [scored[id(h)] for h in closer if scored[id(h)].explained >= AS_GOOD * most]
     named = [s for h, s in ((cast(Varying, s.hypothesis), s) for s in good) if known & set(h.grouping.weights)]
@@ -115,7 +115,7 @@ def try_hypotheses(
     tell(f"testing {len(candidates)} hypotheses")
     unlabelled = before.problem.stretches.labelled.mean() < LABELLED
     driven = [h for h in candidates if h.effect.multiplies_spin and unlabelled]
-    scored = score_all(weighed, motion, [h for h in candidates if h not in driven])
+    scored = score_all(weighed, [h for h in candidates if h not in driven], motion)
     leading = shortlist(scored)
     called = {candidate.hypothesis.name for candidate in leading}
     usual = {h.name: h for h in (s.hypothesis for s in scored) if h.usual and h.name not in called}

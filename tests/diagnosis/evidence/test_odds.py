@@ -9,12 +9,13 @@ import pytest
 
 from ballfg.diagnosis.evidence.odds import odds_of, tempered
 from ballfg.diagnosis.evidence.prior import THERE, WIDTHS, choice_odds, log_odds, scales
+from ballfg.diagnosis.evidence.rows import random_motion
 from ballfg.diagnosis.evidence.screen import foretold
+from ballfg.diagnosis.evidence.weighed import weigh
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.hypotheses.signatures import columns_of
 from ballfg.diagnosis.search.candidates import Scored, refit
 from ballfg.dynamics import EFFECTS
-from tests.diagnosis.evidence.weighing import weigh
 
 WIND = Hypothesis(EFFECTS["wind"], {}, ("x", "y", "z"))
 
@@ -67,9 +68,9 @@ def test_a_choice_among_shapes_is_paid_for():
 
 
 def test_what_is_foretold_is_what_a_refit_gains(windy_fit):
-    before, motion = weigh(windy_fit)
+    before, motion = weigh(windy_fit), random_motion(windy_fit)
     (gain,) = foretold(before, motion, [WIND], columns_of(windy_fit, [WIND]))
-    after, _ = weigh(refit(windy_fit, Scored(WIND, None, 0.0)).fit, [WIND])
+    after = weigh(refit(windy_fit, Scored(WIND, None, 0.0)).fit, [WIND])
     assert gain > 20.0
     assert after.evidence - before.evidence > 0.8 * gain  # with noise of its own it gains more
     strengths = after.strengths["wind"]
@@ -79,8 +80,8 @@ def test_what_is_foretold_is_what_a_refit_gains(windy_fit):
 
 
 def test_an_effect_that_is_not_there_costs_its_prior(calm_fit):
-    before, motion = weigh(calm_fit)
+    before, motion = weigh(calm_fit), random_motion(calm_fit)
     (gain,) = foretold(before, motion, [WIND], columns_of(calm_fit, [WIND]))
-    after, _ = weigh(refit(calm_fit, Scored(WIND, None, 0.0)).fit, [WIND])
+    after = weigh(refit(calm_fit, Scored(WIND, None, 0.0)).fit, [WIND])
     assert gain < 1.0
     assert after.evidence - before.evidence == pytest.approx(gain, abs=1.0)

@@ -9,6 +9,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from ballfg.diagnosis.evidence.rows import random_motion
+from ballfg.diagnosis.evidence.weighed import weigh
 from ballfg.diagnosis.fit.fit import covariance_of, fit_model
 from ballfg.diagnosis.fit.problem import Fit, Unknowns
 from ballfg.diagnosis.fit.sensitivity import predict
@@ -23,7 +25,6 @@ from ballfg.dynamics import EFFECTS, Scene
 from ballfg.dynamics.variation import Variation
 from ballfg.estimation import Settings
 from ballfg.tracks import Track
-from tests.diagnosis.evidence.weighing import weigh
 
 COUNT, CHANGE = 24, 10
 OLD, NEW = 0.93, 0.88
@@ -68,7 +69,9 @@ def before(two_balls, make_ball, make_fit) -> Fit:
 @pytest.fixture(scope="module")
 def found(before, holdout):
     catalogue = [EFFECTS[name] for name in ("drag", "restitution", "wind", "table_tilt")]
-    return try_varying(*weigh(before), catalogue, partial(groupings, holdout.tracks), lambda line: None)
+    return try_varying(
+        weigh(before), random_motion(before), catalogue, partial(groupings, holdout.tracks), lambda line: None
+    )
 
 
 def test_another_ball_is_found_with_both_values_and_the_track_from_which_on_it_flew(found):
@@ -89,7 +92,7 @@ def test_nothing_differs_where_one_ball_flew_all_the_time(make_ball, make_launch
     names = tuple(f"{2 * i:03d}" for i in range(COUNT))
     alike = replace(stretches, names=names)
     fit, ways = make_fit(make_ball(), alike), partial(groupings, holdout.tracks)
-    scored, refits = try_varying(*weigh(fit), list(EFFECTS.values()), ways, lambda line: None)
+    scored, refits = try_varying(weigh(fit), random_motion(fit), list(EFFECTS.values()), ways, lambda line: None)
     assert len(scored) > 20
     assert refits == []
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from ballfg.diagnosis.evidence.weighed import weigh
 from ballfg.diagnosis.fit.fit import values_of
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, without_effect
 from ballfg.diagnosis.search.candidates import (
@@ -22,7 +23,6 @@ from ballfg.diagnosis.search.candidates import (
 )
 from ballfg.diagnosis.search.score import Score
 from ballfg.dynamics import EFFECTS
-from tests.diagnosis.evidence.weighing import weigh
 
 WIND_TRUE = np.array([0.5, -0.3, 0.0])
 
@@ -42,7 +42,7 @@ CANDIDATES = [
 
 
 def scores(fit, candidates):
-    return score_all(*weigh(fit), candidates)
+    return score_all(weigh(fit), candidates)
 
 
 @pytest.fixture(scope="module")
