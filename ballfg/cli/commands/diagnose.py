@@ -117,7 +117,7 @@ def _typed(
 def _summary(diagnosis: Diagnosis) -> Iterator[str]:
     """The diagnosis in lines: the sentence, effects, errors on the held-out half, the rest."""
     from ballfg.diagnosis.report.headline import headline
-    from ballfg.diagnosis.report.wording import fixed, listed, probability
+    from ballfg.diagnosis.report.wording import fixed, listed, odds, probability
 
     yield headline(diagnosis)
     yield f"{diagnosis.verdict.value}: {diagnosis.sentence}"
@@ -125,7 +125,7 @@ def _summary(diagnosis: Diagnosis) -> Iterator[str]:
     for f in diagnosis.findings:
         others = ", ".join(f.indistinguishable_from) or "-"
         chance, bic = probability(f.p_value), f"{f.delta_bic:+.0f}"
-        rows.append((f.name, probability(f.probability), f.kind, chance, bic, others, listed(f.parameters)))
+        rows.append((f.name, odds(f.probability), f.kind, chance, bic, others, listed(f.parameters)))
     if diagnosis.findings:
         yield from ("", *_aligned(rows))
     before, after = diagnosis.before, diagnosis.after

@@ -14,7 +14,7 @@ from ballfg.diagnosis.report.headline import advice, answer, certainty, further,
 from ballfg.diagnosis.report.origin import Origin, packages
 from ballfg.diagnosis.report.plain_effects import in_plain_words, plain_name
 from ballfg.diagnosis.report.predictions import errors, one_shot
-from ballfg.diagnosis.report.wording import NONE, capital, fixed, joined, number, plus_minus, probability
+from ballfg.diagnosis.report.wording import NONE, capital, fixed, joined, number, odds, plus_minus, probability
 from ballfg.diagnosis.result import Diagnosis, Finding, Residuals, Value, Verdict
 from ballfg.dynamics import EFFECTS
 from ballfg.machine import date
@@ -96,7 +96,7 @@ def _finding(finding: Finding) -> Html:
     unusual = f"Stronger than usual: {finding.usual}." if finding.usual else ""
     evidence = items(
         (
-            f"Probability that it is there: {probability(finding.probability)}.",
+            f"Probability that it is there: {odds(finding.probability)}.",
             *filter(None, (unusual,)),
             tag(
                 "span",

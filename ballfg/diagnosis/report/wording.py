@@ -10,6 +10,8 @@ NONE = "–"
 """Text for a missing number."""
 MOST_DECIMALS = 6
 """Largest number of decimals; others are written with a power of ten."""
+MOST_CERTAIN = 0.999
+"""Larger probabilities of an effect depend on what no catalogue holds."""
 LEAST_PROBABILITY = 1e-99
 """Smaller probabilities depend on unknown tails of distributions."""
 
@@ -55,6 +57,13 @@ def probability(p: float) -> str:
     if p < LEAST_PROBABILITY:
         return f"less than {LEAST_PROBABILITY:.0e}"
     return f"{p:.2g}" if p >= 1e-3 else f"{p:.0e}".replace("e-0", "e-")
+
+
+def odds(p: float) -> str:
+    """The probability of an effect, for instance `97.2 %`; never as certain as 0 or 100 %."""
+    if p > MOST_CERTAIN:
+        return f"> {100 * MOST_CERTAIN:g} %"
+    return f"< {100 * (1.0 - MOST_CERTAIN):.1f} %" if p < 1.0 - MOST_CERTAIN else f"{100 * p:.1f} %"
 
 
 def change(before: float, after: float) -> str:

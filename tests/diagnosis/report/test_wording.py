@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from ballfg.diagnosis.report.wording import sentence
+from ballfg.diagnosis.report.wording import odds, sentence
 from ballfg.diagnosis.result import Unexplained, Value, Verdict
 from tests.diagnosis.made_diagnosis import found
 
@@ -30,3 +30,7 @@ def test_a_tracker_is_not_what_a_model_lacks(verdict, findings, begins, ends) ->
     said = sentence(verdict, findings, LEFT)
     assert said.startswith(begins)
     assert said.endswith(ends)
+
+
+def test_no_probability_is_certain() -> None:
+    assert [odds(p) for p in (1.0, 0.998, 0.5, 0.002, 0.0)] == ["> 99.9 %", "99.8 %", "50.0 %", "0.2 %", "< 0.1 %"]
