@@ -41,8 +41,6 @@ SIGMAS = 3.0
 """Distance from the planted change up to which a strength counts as found."""
 DRIFT = "_drift"
 """Ending of the name of an effect that changes along the recording."""
-EXACT = 1e-9
-"""Rounding of strengths that are tried as a whole and have no standard deviation."""
 
 Strength = tuple[float, float]
 """Value and standard deviation."""
@@ -80,7 +78,7 @@ class Outcome:
     def found(self) -> bool:
         """True if the effect is named and its strength changed as planted, within three standard deviations."""
         ratio = self.ratio
-        return ratio is not None and abs(ratio[0] - 1.0) <= SIGMAS * ratio[1] + EXACT
+        return ratio is not None and abs(ratio[0] - 1.0) <= SIGMAS * ratio[1]
 
 
 def planted_cases(name: str, folder: Path, seed: int, chosen: Sequence[str], most: int | None) -> Iterator[Case]:
@@ -194,7 +192,7 @@ def add_rows(results: Results, outcomes: Mapping[tuple[str, str], Outcome]) -> N
     for (name, change), outcome in outcomes.items():
         results.add(name, "named", change, "1", float(outcome.named), 1)
         results.add(name, "within 3 sigma", change, "1", float(outcome.found), 1)
-        for coefficient, should in outcome.planted.items():
+        for coefficient, should in ((c, p) for c, p in outcome.planted.items() if p):
             row, unit = f"{change}.{coefficient}", UNITS.get(change) or _listed(change)[coefficient].unit
             results.add(name, "planted", row, unit, should, 1)
             if coefficient in outcome.changes:

@@ -119,7 +119,7 @@ def _values(values: Mapping[str, Value]) -> dict[str, tuple[float, float | None]
 
 def _probabilities(diagnosis: Diagnosis) -> dict[str, float]:
     """Of findings, and of the last round's candidates; of one that is both, the finding's."""
-    listed = [*(diagnosis.rounds[-1] if diagnosis.rounds else ()), *diagnosis.findings]
+    listed: list[Candidate | Finding] = [*(diagnosis.rounds[-1] if diagnosis.rounds else ()), *diagnosis.findings]
     stated = {one.name: getattr(one, "probability", None) for one in listed}
     return {name: float(value) for name, value in stated.items() if value is not None}
 

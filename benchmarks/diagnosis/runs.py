@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,8 +21,9 @@ def run_case(case: Case, diagnose: Callable[..., Diagnosis] = diagnose) -> Recor
     """Make the data, diagnose, and fit the true model where a case asks for it."""
     digest = case_digest(case)
     with TemporaryDirectory() as folder:
+        strengths: Mapping[str, float] = {}
         if case.data is None:
-            dataset, strengths = make_dataset(case, Path(folder) / "tracks"), {}
+            dataset = make_dataset(case, Path(folder) / "tracks")
         else:
             dataset, strengths = measured_dataset(case, case.data)
         model = declared_model(case, dataset.info.ball.radius)

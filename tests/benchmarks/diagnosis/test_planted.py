@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from ballfg.benchmarks.cli import run as bench
+from ballfg.benchmarks.conclusions import conclusions
 from ballfg.benchmarks.diagnosis.cases import Case
 from ballfg.benchmarks.diagnosis.changes import CHANGES
+from ballfg.benchmarks.diagnosis.data import measured_dataset
 from ballfg.benchmarks.diagnosis.planted import TITLE, outcome_of, planted_cases, run_planted, strengths
 from ballfg.benchmarks.diagnosis.record import Found, Ranked, Record, case_digest
 from ballfg.benchmarks.diagnosis.runs import run_case
@@ -148,11 +150,21 @@ def test_a_run_makes_rows_and_a_picture(measured: Path, tmp_path: Path) -> None:
     assert results.value(TITLE, "within 3 sigma", "shots") == pytest.approx(1 / 3)
     assert results.value(TITLE, "named", "frame_tilt") == 1.0
     assert results.value("shots", "named", "wind") == 0.0
+    said = conclusions(TITLE, [row for row in results.rows if row.case == TITLE])
+    assert said == ["of 3 changes 33 % were named, 33 % also with their strength."]
     assert results.value("shots", "change", "frame_tilt.x") == 0.02
     assert {row.unit for row in results.rows if row.metric == "frame_tilt.x"} == {"rad"}
     made.clear()
     run_planted(Results("test", 0), [measured], tmp_path, chosen, None, 1, run)
     assert made == ["wind"]  # what failed is tried again, nothing else
+
+
+def test_the_same_seed_draws_the_same_errors(measured: Path) -> None:
+    def stamps(seed: int) -> list[float]:
+        case = list(planted_cases("shots", measured, seed, ("stamp_jitter",), 8))[1]
+        return [float(track.times.sum()) for track in measured_dataset(case, measured)[0]]
+
+    assert stamps(1) == stamps(1) != stamps(2)
 
 
 @pytest.mark.parametrize(
