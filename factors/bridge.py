@@ -45,8 +45,8 @@ class Bridge:
             that move all variables at once. `row` evaluates the requested row alone: for iSAM2, where the caller
             prepares the rows in advance and a miss is an unexpected row.
 
-    A row that is not finite raises, except when an optimizer that moves all variables asks for its residual alone, to
-    judge a step: an infinite residual then makes it take a shorter one.
+    A row that is not finite raises. One question is excepted: an optimizer that moves all variables judges a step by
+    residuals alone. It gets an infinite residual, and takes a shorter step.
 
     Attributes:
         calls: number of evaluations of the batch.

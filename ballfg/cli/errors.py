@@ -76,7 +76,7 @@ def _refused(error: Exception) -> int:
         return _bad_input(_in_words(MemoryError(f"torch {NO_MEMORY}")))
     if message is None:
         raise error
-    return _bad_input(message(), getattr(error, "ctx", None))
+    return _bad_input(message().replace(": Value error, ", ": "), getattr(error, "ctx", None))
 
 
 def check_words(words: Sequence[str]) -> None:

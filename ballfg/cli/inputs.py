@@ -302,7 +302,8 @@ class Outcome:
             print(f"  {number} track{'s' if number > 1 else ''}: {text}")
         print_notes(self.doubts)
         if self.doubtful > MOST_DOUBTS:
-            print_notes([f"the same doubts about {self.doubtful - MOST_DOUBTS} more tracks"])
+            more = self.doubtful - MOST_DOUBTS
+            print_notes([f"the same doubts about {more} more track{'s' if more > 1 else ''}"])
 
     def end(self) -> None:
         """Ends a command whose output is complete, with a table of the tracks that could not be estimated.

@@ -200,7 +200,7 @@ class Impact:
         return -self.velocity[..., 2:]
 
     def with_(self, **changes: Tensor) -> Impact:
-        """This impact with changes (..., 1) of some coefficients, dimensionless, or of the motion: as in `Impact`."""
+        """This impact with changes: other values (..., 1), dimensionless, or of the motion; units as in `Impact`."""
         return replace(self, **changes)
 
 

@@ -47,6 +47,8 @@ def load_model(
             outside its bounds; or if the folder does not hold a learned part of this version.
     """
     path = check_path("path", path)
+    if path.is_dir():
+        raise FileNotFoundError(f"model file must be one YAML file; {path} is a folder. Give a file in it.")
     if not path.is_file():
         raise FileNotFoundError(f"model file {path} does not exist; a model is one YAML file")
     content = read_yaml(path)

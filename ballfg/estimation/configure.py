@@ -128,8 +128,8 @@ def tracks_settings(
 
     The first parts of tracks give too large an acceleration noise. A network has learned it from whole tracks similar
     to these: the noise is the geometric mean of both, weighted with the share of flights inside of its training data.
-    Other noise moves, by the same share, from the usual values to those of the training. Outside, a correction of the
-    usual size is missing: it widens bounces.
+    The same share weights other noise between its usual values and those of the training. Outside of the training data
+    the network's correction is missing; bounces are widened by the usual size of it.
 
     Args:
         model: the ball.

@@ -38,7 +38,7 @@ def make_estimator(name: str, model: BallModel, surfaces: Surfaces | float, sett
     Raises: ValueError: if there is none of that name; the message lists those there are.
     """
     if name not in ESTIMATORS:
-        raise ValueError(f"method must be one of {', '.join(ESTIMATORS)}; got {shown(name)}")
+        raise ValueError(f"method must be one of {', '.join(ESTIMATORS)}; got {shown(name)}. Choose one.")
     check_instance("model", model, BallModel, "Load one with load_model.")
     make = partial(_estimator, ESTIMATORS[name], surfaces, settings)
     if not model.variations:

@@ -43,8 +43,8 @@ class TrackPrediction:
         name: of the track.
         times: (k,) s, the stamps after the observed part; none if the track ends before.
         positions: (k, 3) m.
-        sigmas: (k, 3) m, of a measured position: state and measurement noise. They neglect measurement effects: a
-            stretch of lengths, and a lag times the velocity's sigma.
+        sigmas: (k, 3) m, of a measured position: state and measurement noise. Measurement effects are
+            left out of them, such as a stretch of lengths, or a lag that multiplies the velocity's sigma.
         measured: (k, 3) m, the track's positions at those stamps.
         estimate: from the observed part.
         conformal: the scales of the sigmas; None for the model's own sigmas.

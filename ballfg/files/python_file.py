@@ -44,6 +44,8 @@ def load_classes(registry: Registry[T], path: str | Path) -> tuple[type[T], ...]
         ValueError: if it is no Python, does not run, defines no such class, or one that the registry refuses.
     """
     path, sort = check_path("path", path).resolve(), registry.sort
+    if path.is_dir():
+        raise FileNotFoundError(f"{sort}s file must be one Python file; {path} is a folder. Give a file in it.")
     if not path.is_file():
         raise FileNotFoundError(f"{sort}s file {path} does not exist; {sort}s of one's own are one Python file.")
     own = defined_classes(run_file(path, f"{sort}s"), registry.base)

@@ -30,7 +30,7 @@ def in_order(
     However slowly results are consumed, no more than `AHEAD` chunks per worker and `HELPED` more are begun; and no
     worker has more than `AHEAD` in its queue.
 
-    Args: function: of a chunk; gives its results.  chunks: a stream.  executor: computes them.
+    Args: function: takes a chunk and returns its results.  chunks: a stream.  executor: computes them.
     Raises: the function's exceptions.
     """
     send = executor.sender(function)

@@ -23,7 +23,7 @@ LARGEST: Final[Mapping[str, float]] = {
 }
 """Largest value of each number; a larger one is in another unit."""
 SMALLEST: Final = 1e-9
-"""Least nonzero value of each number; smaller noise leaves no digits for the motion."""
+"""Least nonzero value of each number; with smaller noise, rounding errors outweigh the motion."""
 UNITS: Final[Mapping[str, str]] = {
     "position": "m",
     "memory": "m",

@@ -178,6 +178,9 @@ class Track:
         Raises: ValueError: if no sample lies there. TypeError: a start or end that is no number.
         """
         start, end = as_float("start", start, "s"), as_float("end", end, "s")
+        for name, time in (("start", start), ("end", end)):
+            if np.isnan(time):
+                raise ValueError(f"track {shown(self.name)}: {name} must be a time in s; got nan. Correct it.")
         inside = (self.times >= start) & (self.times <= end)
         if not inside.any():
             raise ValueError(

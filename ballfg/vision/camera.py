@@ -62,7 +62,7 @@ class Camera:
         where = f"camera {shown(self.name)}"
         sides = check_array(f"{where}: size", self.size, (2,), "Give width and height in px.")
         if not ((sides > 0.0) & (sides <= MOST_PIXELS) & (sides % 1.0 == 0.0)).all():
-            raise ValueError(f"{where}: size must be width and height in pixels; got {shown(self.size)}")
+            raise ValueError(f"{where}: size must be width and height in pixels; got {shown(self.size)}. Correct it.")
         width, height = int(sides[0]), int(sides[1])
         object.__setattr__(self, "size", (width, height))
         count = np.asarray(self.distortion).size

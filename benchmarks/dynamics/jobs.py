@@ -71,7 +71,7 @@ def read(job: Job) -> dict[int, Record] | None:
 def finish(job: Job) -> dict[int, Record]:
     """Make a method's contenders, judge them, and keep the records.
 
-    Without any record where its training does not get through: the others are compared all the same.
+    If its training fails, it has no records, and the other methods are still compared.
     """
     records = {}
     for k in judged(job):

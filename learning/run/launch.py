@@ -49,7 +49,7 @@ def launch(processes: int, work: Callable[..., int], *arguments: Any) -> int:
             f"training process {error.error_index} was ended from outside ({error.signal_name or error.exit_code}). "
             "Memory may have run out: set jobs lower, and continue with --resume."
         ) from None
-    if status.value == NO_STATUS:  # torch ends a process that is interrupted while it starts without a message
+    if status.value == NO_STATUS:  # a process interrupted while torch starts it ends without a message
         raise KeyboardInterrupt
     return status.value
 

@@ -182,7 +182,7 @@ def test_bad_model_files(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFi
     ("options", "message"),
     [
         (["--method", "kalman"], "method must be one of smoother, online, ekf, sliding-window; got 'kalman'"),
-        (["--solver", "isam2"], "'isam2' is not one of 'ballfg', 'gtsam'"),
+        (["--solver", "isam2"], "'--solver': 'isam2' is not one of 'ballfg', 'gtsam'"),
         (["--solver", "gtsam", "--method", "ekf"], "settings.solver must be 'ballfg' or None for the estimator 'ekf'"),
         (["--jobs", "0"], "'--jobs'"),
         (["--model", "none.yaml"], "none.yaml does not exist"),

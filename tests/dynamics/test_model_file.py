@@ -82,7 +82,7 @@ def test_nominal_model_is_what_the_effects_say():
 def test_missing_file(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"^model file .*none\.yaml does not exist; a model is one YAML file$"):
         load_model(tmp_path / "none.yaml")
-    with pytest.raises(FileNotFoundError, match="does not exist"):
+    with pytest.raises(FileNotFoundError, match=r"must be one YAML file; .* is a folder\. Give a file in it\.$"):
         load_model(tmp_path)
 
 

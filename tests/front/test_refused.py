@@ -24,7 +24,9 @@ def test_arrays_in_place_of_a_track_are_told_how_to_be_one(shots: bf.Dataset, tr
             bf.estimate(wrong)  # type: ignore[call-overload]
     with pytest.raises(FileNotFoundError, match="nowhere"):
         bf.estimate("nowhere")
-    with pytest.raises(ValueError, match=r"method must be one of smoother, online, ekf, sliding-window.*; got 'best'"):
+    with pytest.raises(
+        ValueError, match=r"method must be one of smoother, online, ekf, sliding-window.*; got 'best'. Choose"
+    ):
         bf.estimate(track, method="best")
 
 

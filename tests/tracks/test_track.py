@@ -115,6 +115,14 @@ def test_one_observation_may_stand_without_a_tuple_and_must_name_a_sample():
         Track(T, P).observed(RadarSpeed(3, 5.0, 0.1))
 
 
+def test_an_interval_needs_times():
+    track = Track(T, P, name="a")
+    with pytest.raises(ValueError, match=r"end must be a time in s; got nan\. Correct it\.$"):
+        track.until(np.nan)
+    with pytest.raises(ValueError, match="start must be a time in s; got nan"):
+        track.between(np.nan, 1.0)
+
+
 def test_an_interval_between_numbers():
     track = Track(T, P, name="a")
     assert len(track.between(np.float32(-1), 10**400)) == 3

@@ -91,7 +91,7 @@ def test_view_ends_at_the_image() -> None:
         ({"distortion": [0.1, 0.2, 0.3]}, "distortion must have one of 0, 4, 5, 8, 12, 14 coefficients; got 3"),
         ({"rvec": [0, 0, np.nan]}, "rvec must be finite"),
         ({"tvec": "here"}, "tvec must be an array of numbers"),
-        ({"size": (0, 720)}, "size must be width and height"),
+        ({"size": (0, 720)}, "size must be width and height in pixels; got .*Correct it."),
         ({"name": " "}, "printable text"),
         ({"time_offset": np.inf}, "time_offset must be finite"),
     ],

@@ -37,7 +37,7 @@ def _weights(t, h, w, dw):
 
 @machine_code(NOTHING(FLAG, TWO, THREE, COUNTS, ONE, TWO, ONE, THREE, THREE, FOUR, FOUR, COUNT, THREE, FOUR))
 def sample(first, times, timest, rows, begun, began, step, nodes, slopes, nodest, slopest, parts, value, tangent):
-    """States of an arc's balls at those times that lie in the arc, with tangents.
+    """States of the balls of an arc, with tangents, at those of their times that lie in the arc.
 
     Args:
         first: whether the arc begins the motion, so that all times lie in it.

@@ -124,7 +124,7 @@ def _newton_step(model: BallModel, state: Tensor, height: Tensor | float, tau: T
 def fly_through(
     model: BallModel, state: Tensor, dt: Tensor, heights: tuple[Tensor | float, ...]
 ) -> tuple[Tensor, Tensor]:
-    """The state after `dt`, with one contact after another on the way, at surfaces that the caller names.
+    """The state after `dt`, with one contact on the way for each height that the caller gives.
 
     The contacts happen whether or not their times lie inside [0, dt]: a contact a little before or after the
     interval is a smooth continuation, so that an estimator can move through it. Whether it lies inside is for the

@@ -1,10 +1,10 @@
 """Scores noise by forecasts of linearised tracks, at 20 to 300 ms ahead.
 
-The scatter from sample to sample does not determine an interval 0.3 s ahead. So noise is scored by its forecasts: from
-many origins in every track a Kalman filter forecasts 20 to 300 ms ahead, and the score is the mean negative logarithm
-of the density at the later samples (A. P. Dawid, "The prequential approach", 1984), with tails that grow linearly. The
-same score of the next sample alone, the marginal likelihood, is added with a small weight: it separates parts of the
-noise that forecasts leave undetermined.
+The scatter from sample to sample does not tell how uncertain a forecast 0.3 s ahead is. So noise is scored by its
+forecasts: from many origins in every track a Kalman filter forecasts 20 to 300 ms ahead, and the score is the mean
+negative logarithm of the density at the later samples (A. P. Dawid, "The prequential approach", 1984), with tails that
+grow linearly. The same score of the next sample alone, the marginal likelihood, is added with a small weight: it
+separates parts of the noise that forecasts leave undetermined.
 """
 
 from __future__ import annotations

@@ -79,7 +79,7 @@ def _of_path(path: Path, topic: str | None) -> list[RawTable]:
     files = sorted(file for file in path.rglob("*") if file.is_file() and _is_table(file))
     if not files:
         listing = ", ".join(sorted(entry.name for entry in path.iterdir())[:8]) or "nothing"
-        raise ValueError(f"{path} must hold files of measurements, such as .csv or .json; got {listing}.")
+        raise ValueError(f"{path} must hold files of measurements, such as .csv or .json; got {listing}. Name another.")
     found: list[RawTable] = []
     for file in files:
         found += _of_file(file, topic)
@@ -111,7 +111,7 @@ def _of_file(path: Path, topic: str | None) -> list[RawTable]:
     for magic, reader in _MAGIC:
         if head.startswith(magic):
             return reader(path)
-    if zipfile.is_zipfile(path):  # numpy's archive or Excel's, under another name
+    if zipfile.is_zipfile(path):  # an npz or xlsx file whose name has another ending
         with zipfile.ZipFile(path) as archive:
             arrays = any(name.endswith(".npy") for name in archive.namelist())
         return read_npz(path) if arrays else read_excel(path)

@@ -147,8 +147,8 @@ def _least_squares(design: Array) -> Array:
 def _kinks(times: Array, values: Array, covariances: Array) -> Mask:
     """(n - 1) True for intervals with a sharp bend: one cubic does not fit three samples on either side.
 
-    A kink spoils the fits of the neighbouring intervals too; the worst of five marks it. Where the path as a whole is
-    rougher than its covariances say, its own roughness is the measure.
+    A kink spoils the fits of the neighbouring intervals too; the worst of five marks it. If the path as a whole
+    is rougher than its covariances say, a bend must stand out from this roughness.
     """
     n = len(times)
     if n < _INSIDE + 1:

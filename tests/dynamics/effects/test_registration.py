@@ -173,6 +173,8 @@ def test_what_is_refused(changes: dict[str, object], message: str) -> None:
 def test_files_that_do_not_run(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"none\.py does not exist; effects of one's own are one Python file"):
         load_effects(tmp_path / "none.py")
+    with pytest.raises(FileNotFoundError, match=r"^effects file must be one Python file; .* is a folder\. Give a file"):
+        load_effects(tmp_path)
     broken = tmp_path / "broken.py"
     broken.write_text("x = 1\ny = (\n", encoding="utf-8")
     with pytest.raises(ValueError, match=r"broken\.py must run as Python; line 2: SyntaxError: .*\. Mend it there\.$"):

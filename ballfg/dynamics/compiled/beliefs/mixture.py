@@ -30,8 +30,9 @@ from ballfg.dynamics.compiled.signatures import (
 from ballfg.dynamics.motion.limits import BEYOND, LEAST_SIGMA
 
 FAR = 4.5
-"""Standard deviations of the gap beyond which all balls are on one side of a contact. One in 300,000 is on the other
-side; with a jump of 5 m/s it adds 9 mm/s to a velocity's sigma. At 4 it would add 28 mm/s, a usual sigma."""
+"""Standard deviations of the gap beyond which all balls count as being on one side of a contact. At 4.5, one ball in
+300,000 is on the other side. With a jump of 5 m/s, 9 mm/s of a velocity's sigma are left out.
+At 4 it would be 28 mm/s, as much as a usual sigma."""
 
 
 @machine_code(REAL(FUNCTION, ONE, TWO, ONE, TWO, ONE, REAL, REAL, ONE))
