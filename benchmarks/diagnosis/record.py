@@ -56,7 +56,7 @@ class Record:
         tracks, judged: numbers of tracks in the dataset and on the judging half.
         seconds: of the diagnosis, wall clock.
         strengths: of the change that measured tracks underwent, by coefficient.
-        probabilities: stated, that an effect is there, by its name; empty where a diagnosis states none.
+        probabilities: stated, that an effect is there, by its name.
     """
 
     digest: str
@@ -102,7 +102,7 @@ def record_of(case: Case, digest: str, diagnosis: Diagnosis, true: Errors | None
         tracks=diagnosis.tracks_found_on + diagnosis.tracks_judged_on,
         judged=diagnosis.tracks_judged_on,
         seconds=seconds,
-        probabilities=_probabilities(diagnosis),
+        probabilities=dict(diagnosis.probabilities),
     )
 
 
@@ -115,13 +115,6 @@ def _found(finding: Finding) -> Found:
 def _values(values: Mapping[str, Value]) -> dict[str, tuple[float, float | None]]:
     known = {name: v for name, v in values.items() if math.isfinite(v.value)}
     return {name: (float(v.value), float(v.sigma) if math.isfinite(v.sigma) else None) for name, v in known.items()}
-
-
-def _probabilities(diagnosis: Diagnosis) -> dict[str, float]:
-    """Of findings, and of the last round's candidates; of one that is both, the finding's."""
-    listed: list[Candidate | Finding] = [*(diagnosis.rounds[-1] if diagnosis.rounds else ()), *diagnosis.findings]
-    stated = {one.name: getattr(one, "probability", None) for one in listed}
-    return {name: float(value) for name, value in stated.items() if value is not None}
 
 
 def _leading(listed: tuple[Candidate, ...], planted: tuple[str, ...]) -> tuple[Ranked, ...]:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg.checks import check_range
 from ballfg.cli.inputs import (
     CORES,
     Address,
@@ -57,6 +56,7 @@ def diagnose(
     are their own. model.yaml is then the ball's, for a room that had no part, and
     model.NAME.yaml that of each room.
     """
+    from ballfg.checks import check_range
     from ballfg.diagnosis import diagnose as find
     from ballfg.diagnosis import diagnose_jointly
     from ballfg.diagnosis.report.origin import Origin

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from ballfg.checks import did_you_mean
+from ballfg.diagnosis.evidence.weighed import weigh
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, hypotheses, scene_of
 from ballfg.diagnosis.search.candidates import score_all
@@ -65,7 +66,7 @@ def hypothesis_of(fit: Fit, text: str) -> Hypothesis:
         if not possible:
             needs = f" It needs {', '.join(effect.needs)} in the model." if effect.needs else ""
             raise ValueError(f"effect '{name}' cannot act in these tracks.{needs} Name another one.")
-        found = possible[0] if len(possible) == 1 else score_all(fit, possible)[0].hypothesis
+        found = possible[0] if len(possible) == 1 else score_all(weigh(fit), possible)[0].hypothesis
     if not strength:
         return found
     if strength not in found.strengths:

@@ -91,14 +91,15 @@ def signatures_of(fit: Fit, system: System, columns: Array) -> Signatures:
 
 
 def hypothesis_signatures(
-    fit: Fit, candidates: Sequence[Hypothesis], columns: Array
+    fit: Fit, candidates: Sequence[Hypothesis], columns: Array | None = None
 ) -> tuple[Signatures, list[list[int]]]:
     """Inner products of all columns on each track, and the numbers of the candidate columns of each hypothesis.
 
-    Args: columns: `columns_of(fit, candidates)`.
+    Args: columns: `columns_of(fit, candidates)`, if they are known.
     """
     ends = np.cumsum([len(hypothesis.strengths) for hypothesis in candidates]).tolist()
     chosen = [list(range(end - len(h.strengths), end)) for end, h in zip(ends, candidates, strict=True)]
+    columns = columns_of(fit, candidates) if columns is None else columns
     return signatures_of(fit, fit.linearised(), columns), chosen
 
 

@@ -19,8 +19,9 @@ from ballfg.diagnosis.search.label_frames import FRAMES
 from ballfg.diagnosis.search.score import Score, score_tests
 from ballfg.state import SPIN
 
-ALARM = 0.25
-"""Probability that a hypothesis passes the score tests of one round by chance, and so is refitted."""
+ALARM = 0.0025
+"""Probability that a hypothesis passes the score tests of one round by chance. A trace that passes is about one whose
+effect is named."""
 LEAST_GAIN = 0.0
 """Natural units. Least foretold gain of a candidate that is refitted: with new noise it may gain more."""
 MOST_REFITS = 6

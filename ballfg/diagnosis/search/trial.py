@@ -131,6 +131,5 @@ def try_hypotheses(
     telling = {r.name: r.scored for r in refits if r.name in usual and r.scored.p_value < ALARM}
     scored = [telling.get(s.hypothesis.name, s) for s in scored]
     scored += [r.scored for r in refits if r.name in {h.name for h in driven}]
-    refits = [r for r in refits if r.name in called or r.scored.p_value < ALARM]
     ranked = sorted(scored, key=lambda s: s.explained, reverse=True)
     return ranked, sorted(refits, key=lambda r: r.delta_bic)

@@ -72,13 +72,8 @@ def test_without_probabilities_one_line_says_why_rows_are_missing(capsys: pytest
 
 
 def test_a_record_keeps_the_probabilities_that_a_diagnosis_states() -> None:
-    diagnosis, case = found(), Case(TITLE, "one", 1.0, 0)
-    candidates = [replace(candidate) for candidate in diagnosis.rounds[-1]]
-    for one, probability in zip((*diagnosis.findings, *candidates), (0.98, 0.6, 0.2), strict=False):
-        object.__setattr__(one, "probability", probability)
-    one = replace(diagnosis, rounds=(tuple(candidates),))
-    expected = {candidates[0].name: 0.6, candidates[1].name: 0.2} | {diagnosis.findings[0].name: 0.98}
-    assert record_of(case, "", one, None, 1.0).probabilities == expected
+    diagnosis = replace(found(), probabilities={"wind": 0.98, "gust_region": 0.02})
+    assert record_of(Case(TITLE, "one", 1.0, 0), "", diagnosis, None, 1.0).probabilities == diagnosis.probabilities
 
 
 def test_sizes_are_log_uniform_and_numbers_even() -> None:
