@@ -38,7 +38,8 @@ def finding_of(
     own = next((r for r in refits if r.name == hypothesis.name), None)
     rest = model.names - {hypothesis.name}
     likely = odds.models[model.names] * ALIKE
-    alike = [n for names, p in odds.models.items() if p > likely and rest < names for n in names - model.names]
+    others = [names for names, p in odds.models.items() if p > likely and rest < names and hypothesis.name not in names]
+    alike = sorted({name for names in others for name in names - rest})
     return Finding(
         name=hypothesis.name,
         kind=hypothesis.effect.kind,
