@@ -129,7 +129,7 @@ class Likelihood:
         """First states and random motion integrated out."""
         total, logs = self.inner(noise)
         end = STATE_DIM + self.rows.motion.kinds.shape[1]
-        lower = np.linalg.cholesky(total[:, :end, :end])
+        lower = np.asarray(np.linalg.cholesky(total[:, :end, :end]), dtype=np.float64)
         solved = solve_lower(lower, total[:, :end, end:])
         gram = total[:, end:, end:] - solved.swapaxes(1, 2) @ solved
         narrow = np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)

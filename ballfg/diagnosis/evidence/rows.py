@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.arrays import Array, Index
+from ballfg.arrays import Array, Index, Mask
 from ballfg.diagnosis.fit.free_motion import ACCELERATION, CONTACT_SPIN, CONTACT_VELOCITY, free_motion
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.response import fitted_path, responses
@@ -57,8 +57,8 @@ class Rows:
     by_start: Array
     by_common: Array
     motion: Motion
-    used: Array
-    labelled: Array
+    used: Mask
+    labelled: Mask
     track: Index
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import special
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Index
 from ballfg.diagnosis.evidence.likelihood import Likelihood, Reduced, posterior
 from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, scales
 from ballfg.diagnosis.evidence.rows import Motion, roots, rows_of
@@ -36,7 +36,7 @@ def foretold(model: Weighed, motion: Motion, hypotheses: Sequence[Hypothesis], c
     return gains
 
 
-def _part(reduced: Reduced, chosen: Array) -> Reduced:
+def _part(reduced: Reduced, chosen: Index) -> Reduced:
     """All tracks with some of the common columns."""
     gram, listed = reduced.gram.sum(axis=0), np.append(chosen, reduced.gram.shape[-1] - 1)
     return Reduced(reduced.constant.sum(keepdims=True), gram[np.ix_(listed, listed)][None])

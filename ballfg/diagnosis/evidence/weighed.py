@@ -17,6 +17,8 @@ from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.state import STATE_DIM
 
 MIDDLE = WIDTHS.index(1.0)
+WIDTH_ROUNDS = 2
+"""Number of turns in which each effect gets its most probable width."""
 MOST_STEPS = 4
 """Largest number of steps from a deterministic fit to the most probable unknowns."""
 WORTH_A_STEP = 0.5
@@ -106,6 +108,21 @@ class Priors:
             found[place] = (WIDTHS[width] * size) ** -2
         return found
 
+    def widths(self, reduced: Reduced) -> tuple[list[int], float]:
+        """The most probable widths, and the logarithm of the mean evidence over all widths less the evidence at these.
+
+        Effects are taken one after the other, the others at their best width.
+        """
+        chosen, mixed = [MIDDLE] * len(self.places), 0.0
+        for _ in range(WIDTH_ROUNDS):
+            mixed = 0.0
+            for effect in range(len(chosen)):
+                every = ([*chosen[:effect], width, *chosen[effect + 1 :]] for width in range(len(WIDTHS)))
+                evidence = np.array([self.posterior(reduced, widths).evidence for widths in every])
+                chosen[effect] = int(evidence.argmax())
+                mixed += float(special.logsumexp(evidence - evidence.max()) - np.log(len(WIDTHS)))
+        return chosen, mixed
+
     def posterior(self, reduced: Reduced, widths: Sequence[int]) -> Posterior:
         """The posterior of all common unknowns."""
         return posterior(reduced, self.precision(widths), self.away)
@@ -174,19 +191,11 @@ def _weighed_at(
 ) -> tuple[Weighed, _Step]:
     """The model at the unknowns of a fit, and the step to more probable ones."""
     rows, priors = rows_of(fit, motion), Priors.of(fit, named)
-    widths = [MIDDLE] * len(priors.places)
     precision = priors.precision([len(WIDTHS) - 1] * len(priors.places))
     likelihood, noise = settled(rows, precision, priors.away, start)
     total = likelihood.reduced(noise)[0].by_track(rows.track)
     whole = total.of(np.full(len(halves), True))
-    mixed = 0.0
-    for _ in range(2 if widths else 0):
-        mixed = 0.0
-        for effect in range(len(widths)):
-            tried = [priors.posterior(whole, [*widths[:effect], w, *widths[effect + 1 :]]) for w in range(len(WIDTHS))]
-            found = np.array([one.evidence for one in tried])
-            widths[effect] = int(found.argmax())
-            mixed += float(special.logsumexp(found - found.max()) - np.log(len(WIDTHS)))
+    widths, mixed = priors.widths(whole)
     result = priors.posterior(whole, widths)
     strengths, values = {}, np.array([fit.unknowns.values[name] for name in fit.problem.free])
     for hypothesis, place in zip([h for h in named if h.strengths], priors.places, strict=True):
