@@ -5,7 +5,7 @@ finds the population's mean and spread, and puts the mean into the model. It end
 docs/train.md.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -19,6 +19,7 @@ from ballfg.estimation import Estimate, Settings, Smoother, Status, dataset_sett
 from ballfg.estimation.batch import estimate_tracks, map_tracks
 from ballfg.estimation.noise.estimate import NoiseEstimate, spread_over
 from ballfg.learning.calibration.coefficients import Chosen, choose, with_values
+from ballfg.learning.calibration.groups import Groups, GroupSpin
 from ballfg.learning.calibration.population import Evidence, evidence, fit_population
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import TrackScore, judge_track
@@ -43,6 +44,7 @@ class Problem:
     settings: Settings
     split: Split
     jobs: int
+    groups: Groups | None = None
 
     def estimator(self, values: Array, settings: Settings) -> Smoother:
         """The smoother with values (p,) of the coefficients."""
@@ -73,6 +75,8 @@ class Step(BaseModel):
     """(p,) standard deviations between tracks."""
     next_track: tuple[float, ...] = ()
     """(p,) standard deviations of a new track's coefficients about the mean."""
+    spins: tuple[GroupSpin, ...] = ()
+    """The spins of each group, in the order of `Groups.names`; none without groups."""
     moved: float | None = None
     """Largest move of a mean in this step, in standard errors."""
     fits: tuple[TrackFit, ...] = ()
@@ -91,7 +95,8 @@ def pose(dataset: Dataset, model: AnalyticModel, config: CalibrationConfig, jobs
     chosen = choose(model, config.coefficients)
     split = split_tracks(dataset, config.split, config.seed, needs_spin=chosen.needs_spin)
     surfaces, settings = dataset_surfaces(dataset), dataset_settings(dataset, model)
-    return Problem(dataset, config, model, chosen, surfaces, settings, split, jobs)
+    groups = None if config.groups is None else Groups.of(dataset, config.groups, split.fit)
+    return Problem(dataset, config, model, chosen, surfaces, settings, split, jobs, groups)
 
 
 def calibrate(problem: Problem, done: Iterable[Step] = (), *, watch: Watch = unwatched) -> Iterator[Step]:
@@ -134,9 +139,11 @@ def score(
 
 
 def population_settings(problem: Problem, step: Step) -> Settings:
-    """Settings with the population's distribution of a new track as the prior of each calibrated coefficient."""
+    """Settings with the population's distribution of a new track as the prior of each calibrated number."""
     learned = dict(zip(problem.chosen.names, step.next_track, strict=True))
-    return replace(problem.settings, coefficients={**problem.settings.coefficients, **learned})
+    settings = replace(problem.settings, coefficients={**problem.settings.coefficients, **learned})
+    groups = problem.groups
+    return settings if groups is None else groups.settings(settings, groups.population(step.spins))
 
 
 def fitted_noise(
@@ -156,32 +163,40 @@ def fitted_noise(
 
 def _advance(problem: Problem, last: Step, watch: Watch) -> Step:
     """Linearise the fitted tracks about the last mean, and fit the population."""
-    chosen, about = problem.chosen, np.array(last.mean)
-    fits, evidences, skipped = _fit_tracks(problem, about, watch)
-    population = fit_population(evidences, chosen.start, chosen.sigma, chosen.low, chosen.high)
+    chosen, groups, about = problem.chosen, problem.groups, np.array(last.mean)
+    spins = () if groups is None else last.spins or groups.start
+    fits, evidences, skipped = _fit_tracks(problem, about, spins, watch)
+    if groups is None:
+        population = fit_population(evidences, chosen.start, chosen.sigma, chosen.low, chosen.high)
+    else:
+        population = fit_population(evidences, *groups.beside(chosen), groups.numbers([f.name for f in fits], chosen))
+    size, before = len(about), np.concatenate((about, *(spin.mean for spin in spins)))
+    found = GroupSpin.rows(population.mean, population.sigma, population.spread, population.next_track, size)
     return Step(
         number=last.number + 1,
-        mean=_plain(population.mean),
-        sigma=_plain(population.sigma),
-        spread=_plain(population.spread),
-        next_track=_plain(population.next_track),
-        moved=float(np.abs((population.mean - about) / population.sigma).max()),
+        mean=_plain(population.mean[:size]),
+        sigma=_plain(population.sigma[:size]),
+        spread=_plain(population.spread[:size]),
+        next_track=_plain(population.next_track[:size]),
+        spins=found,
+        moved=float(np.abs((population.mean - before) / population.sigma).max()),
         fits=tuple(fits),
         skipped=tuple(skipped),
-        scores=score(problem, population.mean, watch),
+        scores=score(problem, population.mean[:size], watch),
     )
 
 
 def _fit_tracks(
-    problem: Problem, about: Array, watch: Watch
+    problem: Problem, about: Array, spins: Sequence[GroupSpin], watch: Watch
 ) -> tuple[list[TrackFit], list[Evidence], list[tuple[str, str]]]:
     """Posterior and likelihood of each fitted track, and the skipped tracks.
 
     Coefficients that vary from track to track stay free in each track, calibrated or not.
     """
-    chosen, names = problem.chosen, problem.split.fit
+    chosen, names, groups = problem.chosen, problem.split.fit, problem.groups
     priors = {**problem.settings.coefficients, **dict(zip(chosen.names, chosen.sigma.tolist(), strict=True))}
-    estimator = problem.estimator(about, replace(problem.settings, coefficients=priors))
+    settings = replace(problem.settings, coefficients=priors)
+    estimator = problem.estimator(about, settings if groups is None else groups.wide(settings, spins))
     estimates = estimate_tracks(estimator, tracks_of(problem.dataset, names), len(names), problem.jobs)
     fits: list[TrackFit] = []
     evidences: list[Evidence] = []
@@ -189,6 +204,8 @@ def _fit_tracks(
     for estimate in watch(estimates, len(names), "tracks fitted"):
         try:
             fit, found = _read(estimate, chosen, about)
+            if groups is not None:
+                found = groups.evidence(estimate, chosen, about, spins, problem.settings.spin_prior)
         except ValueError as error:
             skipped.append((estimate.name, str(error)))
             limit = problem.config.failure_limit

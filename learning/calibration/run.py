@@ -109,6 +109,7 @@ def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch)
     comparison = compare(steps[0].scores, last.scores, spread, shown)
     found = report(problem, last, comparison, noise)
     model.noise = None if noise is None else noise.noise
+    model.spins = population.spins
     save_model(model, folder / files.MODEL)
     files.write_json(folder / files.REPORT, found)
     draw(problem, last, comparison, folder / files.PICTURE)
@@ -154,7 +155,9 @@ def _follow(steps: Sequence[Step], problem: Problem) -> bool:
             rows += [step.sigma, step.spread, step.next_track]
             rows += [values for fit in step.fits for values in (fit.values, fit.sigmas)]
         names = {fit.name for fit in step.fits} | {name for name, _ in step.skipped}
+        groups = 0 if problem.groups is None or not number else len(problem.groups.names)
         fit = all(len(row) == size for row in rows) and names <= tracks and len(step.scores) == judged
+        fit = fit and len(step.spins) == groups
         if not fit or step.number != number or (step.moved is None) != (number == 0):
             return False
     return True
