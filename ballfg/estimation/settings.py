@@ -175,6 +175,12 @@ class Settings:
         """The settings of a track: positions computed from other observations have no tracker's errors."""
         return replace(self, memory=(0.0, 0.0, 0.0), stamp_jitter=0.0) if track.rough else self
 
+    def grouped(self, track: Track) -> Track:
+        """The track with the label of its group, if the settings name the group of tracks without one."""
+        if self.group is None or self.spins is None or self.spins.by in track.labels:
+            return track
+        return replace(track, labels={**track.labels, self.spins.by: self.group})
+
     def renamed(self, model: BallModel) -> Settings:
         """These settings with today's names of the model's coefficients."""
         earlier = [name for name in self.coefficients if todays_name(name) != name]

@@ -15,9 +15,19 @@ from pydantic import BaseModel, ConfigDict
 from ballfg.arrays import Array
 from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation import Estimate, Settings, Smoother, Status, dataset_settings, dataset_surfaces, estimate_noise
+from ballfg.estimation import (
+    Estimate,
+    Estimator,
+    Settings,
+    Smoother,
+    Status,
+    dataset_settings,
+    dataset_surfaces,
+    estimate_noise,
+)
 from ballfg.estimation.batch import estimate_tracks, map_tracks
 from ballfg.estimation.noise.estimate import NoiseEstimate, spread_over
+from ballfg.estimation.registry import make_estimator
 from ballfg.learning.calibration.coefficients import Chosen, choose, with_values
 from ballfg.learning.calibration.groups import Groups, GroupSpin
 from ballfg.learning.calibration.population import Evidence, evidence, fit_population
@@ -77,6 +87,8 @@ class Step(BaseModel):
     """(p,) standard deviations of a new track's coefficients about the mean."""
     spins: tuple[GroupSpin, ...] = ()
     """The spins of each group, in the order of `Groups.names`; none without groups."""
+    by_group: dict[str, tuple[float, ...]] = {}
+    """Means by group, in the same order, of the coefficients that differ between groups."""
     moved: float | None = None
     """Largest move of a mean in this step, in standard errors."""
     fits: tuple[TrackFit, ...] = ()
@@ -126,12 +138,22 @@ def has_ended(config: CalibrationConfig, step: Step) -> bool:
 
 
 def score(
-    problem: Problem, values: Array, watch: Watch = unwatched, settings: Settings | None = None
+    problem: Problem, values: Array | AnalyticModel, watch: Watch = unwatched, settings: Settings | None = None
 ) -> tuple[TrackScore | None, ...]:
-    """Scores of the judging tracks, in order, with values (p,) of the coefficients; settings: else the problem's."""
+    """Scores of the judging tracks, in order.
+
+    Args:
+        values: (p,) of the coefficients, or a model with them.
+        watch: called for each track.
+        settings: None: the problem's.
+    """
     config, names = problem.config, problem.split.judge
     horizon = np.inf if config.horizon is None else config.horizon
-    estimator = problem.estimator(values, settings or problem.settings)
+    estimator: Estimator
+    if isinstance(values, AnalyticModel):
+        estimator = make_estimator("smoother", values, problem.surfaces, settings or problem.settings)
+    else:
+        estimator = problem.estimator(values, settings or problem.settings)
     tracks = tracks_of(problem.dataset, names)
     judge = partial(judge_track, estimator, observed_share=config.observed_share, horizon=horizon)
     scores = map_tracks(judge, tracks, len(names), problem.jobs)
@@ -144,6 +166,14 @@ def population_settings(problem: Problem, step: Step) -> Settings:
     settings = replace(problem.settings, coefficients={**problem.settings.coefficients, **learned})
     groups = problem.groups
     return settings if groups is None else groups.settings(settings, groups.population(step.spins))
+
+
+def population_model(problem: Problem, step: Step) -> AnalyticModel:
+    """The model with the means of a step, and each group's own where coefficients differ between groups."""
+    model = with_values(problem.model, problem.chosen.names, np.array(step.mean))
+    if problem.groups is not None:
+        model.variations = {**model.variations, **problem.groups.variations(step.by_group)}
+    return model
 
 
 def fitted_noise(
@@ -166,19 +196,20 @@ def _advance(problem: Problem, last: Step, watch: Watch) -> Step:
     chosen, groups, about = problem.chosen, problem.groups, np.array(last.mean)
     spins = () if groups is None else last.spins or groups.start
     fits, evidences, skipped = _fit_tracks(problem, about, spins, watch)
+    size, before = len(about), np.concatenate((about, *(spin.mean for spin in spins)))
+    next_track, by_group, found = None, {}, ()
     if groups is None:
         population = fit_population(evidences, chosen.start, chosen.sigma, chosen.low, chosen.high)
     else:
-        population = fit_population(evidences, *groups.beside(chosen), groups.numbers([f.name for f in fits], chosen))
-    size, before = len(about), np.concatenate((about, *(spin.mean for spin in spins)))
-    found = GroupSpin.rows(population.mean, population.sigma, population.spread, population.next_track, size)
+        population, by_group, found, next_track = groups.fit(evidences, [fit.name for fit in fits], chosen)
     return Step(
         number=last.number + 1,
         mean=_plain(population.mean[:size]),
         sigma=_plain(population.sigma[:size]),
         spread=_plain(population.spread[:size]),
-        next_track=_plain(population.next_track[:size]),
+        next_track=_plain(population.next_track[:size] if next_track is None else next_track),
         spins=found,
+        by_group=by_group,
         moved=float(np.abs((population.mean - before) / population.sigma).max()),
         fits=tuple(fits),
         skipped=tuple(skipped),

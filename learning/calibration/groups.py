@@ -17,10 +17,11 @@ from pydantic import BaseModel, ConfigDict
 from ballfg.arrays import Array, Index
 from ballfg.checks import listed, shown
 from ballfg.dynamics.population import SpinGroup, SpinPopulation, launch_axes
+from ballfg.dynamics.variation import Variation
 from ballfg.estimation import Estimate, Settings
 from ballfg.factors.loss import Loss
 from ballfg.learning.calibration.coefficients import Chosen
-from ballfg.learning.calibration.population import Evidence, evidence
+from ballfg.learning.calibration.population import Evidence, Population, evidence, fit_population
 from ballfg.state import SPIN, VELOCITY
 from ballfg.tracks import Dataset
 
@@ -134,6 +135,42 @@ class Groups:
         sigma = np.full(3, LABEL_PRIOR if labelled else spin_prior)
         return evidence(mean, covariance, np.concatenate((about, before)), np.concatenate((chosen.sigma, sigma)))
 
+    def fit(
+        self, evidences: Sequence[Evidence], tracks: Sequence[str], chosen: Chosen
+    ) -> tuple[Population, dict[str, tuple[float, ...]], tuple[GroupSpin, ...], Array]:
+        """The population of all tracks, and what differs between groups.
+
+        A coefficient gets a mean and a spread for each group if that raises the log likelihood by more than half the
+        logarithm of the number of tracks for each further number (G. Schwarz, "Estimating the dimension of a model",
+        Ann. Statist. 6, 1978).
+
+        Args: evidences: of the tracks.  tracks: their names.  chosen: the coefficients.
+        Returns: the population with coefficients shared by all groups; means by group of those that differ; spins;
+            (p,) standard deviations of a new track's coefficients about the mean of its group.
+        """
+        columns, numbers, size = self.beside(chosen), self.numbers(tracks, chosen), len(chosen.names)
+        best = shared = fit_population(evidences, *columns, numbers)
+        own = np.array([self._number(name) for name in tracks])
+        apart: dict[str, int] = {}
+        for k, name in enumerate(chosen.names) if len(self.names) > 1 else ():
+            first = len(columns[0])
+            split = numbers.copy()
+            split[:, k] = first + own
+            wider = tuple(np.append(values, np.full(len(self.names), values[k])) for values in columns)
+            found = fit_population(evidences, *wider, split)
+            if found.log_likelihood - best.log_likelihood > (len(self.names) - 1) * np.log(len(tracks)):
+                best, columns, numbers, apart[name] = found, wider, split, first
+        next_track = np.sqrt((best.next_track[numbers[:, :size]] ** 2).mean(axis=0))
+        values = {name: tuple(best.mean[k : k + len(self.names)].tolist()) for name, k in apart.items()}
+        rows = (values_of[: size + 3 * len(self.names)] for values_of in _columns_of(best))
+        return shared, values, GroupSpin.rows(*rows, size), next_track
+
+    def variations(self, by_group: Mapping[str, Sequence[float]]) -> dict[str, Variation]:
+        """The entries of a model file. Args: by_group: means in the order of the names, by coefficient."""
+        return {
+            name: Variation(self.by, dict(zip(self.names, values, strict=True))) for name, values in by_group.items()
+        }
+
     def beside(self, chosen: Chosen) -> tuple[Array, Array, Array, Array]:
         """Start, sigma and both bounds of all means: (p + 3 groups,) each, the coefficients first."""
         count = 3 * len(self.names)
@@ -156,3 +193,8 @@ class Groups:
         counts = list(self.tracks.values())
         rows = zip(self.names, spins, strict=True)
         return SpinPopulation(self.by, {name: SpinGroup(*spin, counts.count(name)) for name, spin in rows})
+
+
+def _columns_of(population: Population) -> tuple[Array, Array, Array, Array]:
+    """Mean, its standard error, spread and standard deviation of a new track, of every number."""
+    return population.mean, population.sigma, population.spread, population.next_track

@@ -108,7 +108,11 @@ def _groups(problem: Problem, last: Step) -> dict[str, Any]:
     if problem.groups is None:
         return {}
     spins = {name: spin.model_dump(mode="json") for name, spin in zip(problem.groups.names, last.spins, strict=True)}
-    return {"groups": {"by": problem.groups.by, "axes": list(AXES), "spin": spins}}
+    apart = {
+        coefficient: dict(zip(problem.groups.names, values, strict=True))
+        for coefficient, values in last.by_group.items()
+    }
+    return {"groups": {"by": problem.groups.by, "axes": list(AXES), "spin": spins, "coefficients": apart}}
 
 
 def _plain(found: Summary | None) -> dict[str, Any] | None:
@@ -158,6 +162,11 @@ def table(problem: Problem, last: Step, comparison: Comparison) -> str:
         values = (problem.chosen.start[k], last.mean[k], last.sigma[k], last.spread[k])
         rows.append((name, problem.chosen.units[k], *(f"{value:.4g}" for value in values)))
     names = () if problem.groups is None else problem.groups.names
+    for coefficient, values in last.by_group.items():
+        k = problem.chosen.names.index(coefficient)
+        start, unit = f"{problem.chosen.start[k]:.4g}", problem.chosen.units[k]
+        apart = zip(names, values, strict=True)
+        rows += [(f"{coefficient} of {name}", unit, start, f"{value:.4g}", "", "") for name, value in apart]
     for name, spin in zip(names, last.spins, strict=True):
         for axis, *numbers in zip(AXES, spin.mean, spin.sigma, spin.spread, strict=True):
             rows.append((f"spin of {name}, {axis}", "rad/s", "0", *(f"{number:.4g}" for number in numbers)))
