@@ -191,8 +191,10 @@ class _Found:
         return max(able, key=lambda model: (len(model.names), odds.models[model.names]))
 
     def without(self, gone: Sequence[Hypothesis], model: Weighed | None = None) -> Weighed:
-        """A model without some of its effects."""
+        """A model without some of its effects, and without those that need them."""
         model = model or self.best
+        lost = {h.effect.name for h in gone if not has_effect(self.first.problem.model, h.effect.name)}
+        gone = [h for h in model.named if h in gone or lost & set(h.effect.needs)]
         kept = tuple(h for h in model.named if h not in gone)
         names = frozenset(h.name for h in kept)
         if names not in self.models:

@@ -171,3 +171,13 @@ def test_what_later_effects_make_superfluous_is_taken_out_again(make_ball, make_
     ).run(make_ball())
     assert {finding.name for finding in search.findings} == {"frame_tilt", "wind"}
     assert search.odds.of("table_tilt") < 0.1
+
+
+def test_an_effect_goes_with_the_one_that_it_needs(make_ball, make_launches, make_shots):
+    """Drag that grows with spin, where the declared model has no drag: both are found, and neither alone is a model."""
+    data = [shots(make_ball, make_launches, make_shots, seed, drag_spin={"gain": 0.6}) for seed in (83, 84)]
+    declared = without_effect(make_ball(), "drag")
+    catalogue = [EFFECTS["drag"], EFFECTS["drag_spin"]]
+    search = SearchLoop(holdout(*data), catalogue, predicts_well, judges_alike, unwatched).run(declared)
+    assert [finding.name for finding in search.findings] == ["drag", "drag_spin"]
+    assert frozenset(["drag_spin"]) not in search.odds.models
