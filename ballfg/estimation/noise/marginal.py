@@ -99,15 +99,19 @@ class MarginalFit:
         """Moves to the minimum of the negative log posterior.
 
         The search variables are scaled to a unit scatter of the tracks' gradients, which approximates the second
-        derivatives (Berndt, Hall, Hall and Hausman 1974).
+        derivatives (Berndt, Hall, Hall and Hausman 1974). A first step may still lead to noise so large that rounding
+        leaves no density; it counts as worse than the start, so that the line search shortens the step.
         """
         root = np.linalg.cholesky(self._scatter() + np.diag(self.precision))
         turn = np.linalg.inv(root).T
-        begin = self.logs
+        begin, worst = self.logs, self._objective(self.losses, self.gradients, self.logs)[0]
 
         def objective(way: Array) -> tuple[float, Array]:
             logs = begin + turn @ way
-            value, gradient = self._objective(*self.at(logs), logs)
+            try:
+                value, gradient = self._objective(*self.at(logs), logs)
+            except torch.linalg.LinAlgError:
+                return worst + float(way @ way), 2.0 * way
             return value, turn.T @ gradient
 
         options = {"gtol": tolerance, "ftol": 0.0, "maxfun": most, "maxcor": len(begin)}
