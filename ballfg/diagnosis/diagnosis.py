@@ -111,6 +111,7 @@ def diagnose(
         labels=labels,
         probabilities=search.odds.effects(),
         nothing_lacking=search.odds.nothing,
+        nameless=search.odds.nameless,
     )
 
 

@@ -20,6 +20,7 @@ from ballfg.diagnosis.diagnosis import in_order, strange, verdict_of, what_is_le
 from ballfg.diagnosis.fit.fit import first_guess, fit_model, fit_problem, reachable, values_of
 from ballfg.diagnosis.fit.free import LOOSE, Deviation, declared_free
 from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout, hold_out
+from ballfg.diagnosis.fit.patterns import DRIFT
 from ballfg.diagnosis.fit.problem import Fit, Noise, Problem
 from ballfg.diagnosis.fit.stretches import Stretches, joined
 from ballfg.diagnosis.hypotheses.hypothesis import effects_of, has_effect, with_effects, without_effect
@@ -29,7 +30,6 @@ from ballfg.diagnosis.report.wording import joined as listed
 from ballfg.diagnosis.report.wording import sentence
 from ballfg.diagnosis.residual_tests.generic import generic_tests
 from ballfg.diagnosis.residual_tests.label_check import judged, label_evidence, label_test
-from ballfg.diagnosis.residual_tests.patterns import DRIFT
 from ballfg.diagnosis.residual_tests.residuals import residuals_of
 from ballfg.diagnosis.result import Diagnosis, Errors, Finding
 from ballfg.diagnosis.search.evaluation import prediction_errors
@@ -151,6 +151,7 @@ def diagnose_jointly(
         labels=labels,
         probabilities=search.odds.effects(),
         nothing_lacking=search.odds.nothing,
+        nameless=search.odds.nameless,
     )
     return JointDiagnosis(whole, models)
 

@@ -284,7 +284,8 @@ class Diagnosis:
             unknown release alone; NaN if unknown.
         labels: verdicts on the spin labels; None without labels.
         probabilities: that an effect is there, by name, over all models that were compared; the most probable first.
-        nothing_lacking: probability that no effect of the catalogue is lacking.
+        nothing_lacking: probability that nothing is lacking, neither an effect of the catalogue nor something nameless.
+        nameless: probability that forces, kicks or position errors remain that no effect of the catalogue describes.
     """
 
     dataset: str
@@ -308,6 +309,7 @@ class Diagnosis:
     labels: LabelCheck | None = None
     probabilities: Mapping[str, float] = field(default_factory=dict)
     nothing_lacking: float = float("nan")
+    nameless: float = float("nan")
 
     def __repr__(self) -> str:
         effects = ", ".join(finding.name for finding in self.findings) or "none"

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import special
 
+from ballfg.diagnosis.evidence.nameless import NAMELESS
 from ballfg.diagnosis.evidence.weighed import Weighed
 
 SURELY = 2.0
@@ -19,7 +20,7 @@ class Odds:
     """Probabilities of the models that were weighed.
 
     Attributes:
-        models: probability by the names of the effects in it.
+        models: probability by the names of the effects in it, with `NAMELESS` for patterns without a name.
     """
 
     models: Mapping[frozenset[str], float] = field(default_factory=dict)
@@ -30,12 +31,17 @@ class Odds:
 
     @property
     def nothing(self) -> float:
-        """Probability that no effect is there."""
+        """Probability that nothing is there, neither an effect nor something nameless."""
         return self.models.get(frozenset(), 1.0)
+
+    @property
+    def nameless(self) -> float:
+        """Probability that something nameless is there."""
+        return self.of(NAMELESS)
 
     def effects(self) -> dict[str, float]:
         """Probability of each effect in any model, the most probable first."""
-        names = {name for model in self.models for name in model}
+        names = {name for model in self.models for name in model} - {NAMELESS}
         return dict(sorted(((name, self.of(name)) for name in names), key=lambda item: -item[1]))
 
 

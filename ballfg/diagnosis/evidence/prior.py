@@ -31,9 +31,9 @@ def scales(hypothesis: Hypothesis) -> Array:
     return np.array([abs(usual.change.get(varied(name), largest)) for name in hypothesis.strengths])
 
 
-def log_odds(hypotheses: Sequence[Hypothesis]) -> float:
-    """Logarithm of the prior odds of a model with these effects to one without any."""
-    chances = [VARIES if isinstance(h, Varying) else THERE for h in hypotheses]
+def log_odds(hypotheses: Sequence[Hypothesis], nameless: bool = False) -> float:
+    """Logarithm of the prior odds of a model with these effects to one without any; nameless: and patterns."""
+    chances = [VARIES if isinstance(h, Varying) else THERE for h in hypotheses] + [THERE] * nameless
     return float(sum(np.log(p / (1.0 - p)) for p in chances))
 
 

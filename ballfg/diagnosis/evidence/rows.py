@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -60,6 +60,10 @@ class Rows:
     used: Mask
     labelled: Mask
     track: Index
+
+    def with_common(self, by_common: Array) -> Rows:
+        """The rows with other common unknowns; by_common: (n, m, q)."""
+        return replace(self, by_common=by_common)
 
 
 def rows_of(fit: Fit, motion: Motion) -> Rows:

@@ -10,6 +10,7 @@ from scipy import special
 
 from ballfg.arrays import Array, Index, Mask
 from ballfg.diagnosis.evidence.likelihood import Noise, Posterior, Reduced, posterior, settled
+from ballfg.diagnosis.evidence.nameless import NAMELESS, USUAL, Patterns
 from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, log_odds, scales
 from ballfg.diagnosis.evidence.rows import Motion, random_motion, rows_of
 from ballfg.diagnosis.fit.problem import Fit, Unknowns
@@ -47,6 +48,7 @@ class Weighed:
         odds: logarithm of the prior odds.
         strengths: by name of the effect.
         held_out: (t,) logarithm of the density of each track, with coefficients of the other half.
+        nameless: whether it holds patterns without a name as well.
     """
 
     named: tuple[Hypothesis, ...]
@@ -58,11 +60,12 @@ class Weighed:
     odds: float
     strengths: Mapping[str, Strengths]
     held_out: Array
+    nameless: bool = False
 
     @property
     def names(self) -> frozenset[str]:
-        """Names of the effects."""
-        return frozenset(h.name for h in self.named)
+        """Names of the effects, with `NAMELESS` for patterns without a name."""
+        return frozenset(h.name for h in self.named) | frozenset([NAMELESS] * self.nameless)
 
     @property
     def score(self) -> float:
@@ -77,7 +80,7 @@ class Priors:
     Attributes:
         base: (c,) precision of the others, zero for strengths.
         away: (c,) prior mean less present value.
-        places, sizes: for each effect, where its strengths are and their usual sizes.
+        places, sizes: for each effect, then for each block of patterns, where its strengths are and their usual sizes.
     """
 
     base: Array
@@ -86,8 +89,8 @@ class Priors:
     sizes: tuple[Array, ...]
 
     @classmethod
-    def of(cls, fit: Fit, named: Sequence[Hypothesis]) -> Priors:
-        """The priors at a fit."""
+    def of(cls, fit: Fit, named: Sequence[Hypothesis], patterns: Patterns | None = None) -> Priors:
+        """The priors at a fit, beside patterns."""
         problem, listed = fit.problem, list(fit.problem.free)
         with_strengths = [h for h in named if h.strengths]
         places = tuple(np.array([listed.index(c) for c in h.columns]) for h in with_strengths)
@@ -99,7 +102,13 @@ class Priors:
         for place in places:
             base[place] = 0.0
         away = np.concatenate((centres - values, -fit.unknowns.launcher.ravel()))
-        return cls(base, away, places, tuple(scales(h) for h in with_strengths))
+        sizes = tuple(scales(h) for h in with_strengths)
+        if patterns is None:
+            return cls(base, away, places, sizes)
+        none = np.zeros(patterns.columns.shape[-1])
+        more = tuple(len(base) + block for block in patterns.blocks)
+        usual = tuple(np.full(len(block), USUAL) for block in patterns.blocks)
+        return cls(np.append(base, none), np.append(away, none), (*places, *more), (*sizes, *usual))
 
     def precision(self, widths: Sequence[int]) -> Array:
         """(c,) with one of `WIDTHS` for each effect."""
@@ -128,19 +137,27 @@ class Priors:
         return posterior(reduced, self.precision(widths), self.away)
 
 
-def weigh(fit: Fit, named: Sequence[Hypothesis] = ()) -> Weighed:
+def weigh(fit: Fit, named: Sequence[Hypothesis] = (), *, nameless: bool = False) -> Weighed:
     """The evidence of a fitted model, with the sizes of its noise.
 
     Args:
         fit: to all tracks; every second one counts as one half.
         named: effects in the fit that the declared model lacks; their strengths get the priors of effects.
+        nameless: with patterns without a name beside them.
     Returns: the model with its evidence; ratios of evidences compare models of the same stretches.
     """
     halves = np.arange(len(np.unique(fit.problem.stretches.track))) % 2 == 0
-    return weighed(fit, named, random_motion(fit), halves)
+    return weighed(fit, named, random_motion(fit), halves, nameless=nameless)
 
 
-def weighed(fit: Fit, named: Sequence[Hypothesis], motion: Motion, halves: Mask, start: Noise | None = None) -> Weighed:
+def weighed(
+    fit: Fit,
+    named: Sequence[Hypothesis],
+    motion: Motion,
+    halves: Mask,
+    start: Noise | None = None,
+    nameless: bool = False,
+) -> Weighed:
     """Weighs a model at the most probable values of its unknowns.
 
     A deterministic fit ends where the model alone comes closest to the samples; beside random motion other values are
@@ -152,24 +169,30 @@ def weighed(fit: Fit, named: Sequence[Hypothesis], motion: Motion, halves: Mask,
         motion: random columns of this or a similar model.
         halves: (t,) True for tracks of the search half, in the order of the fit's tracks.
         start: noise of a similar model.
+        nameless: with patterns without a name beside the effects.
     """
-    found, step = _weighed_at(fit, named, motion, halves, start)
-    for _ in range(MOST_STEPS):
-        if step.gain < WORTH_A_STEP:
+    question = _Question(named, motion, halves, nameless)
+    found, step = question.at(fit, start)
+    for number in range(MOST_STEPS):
+        if step.gain < WORTH_A_STEP and (number or not nameless):  # noise and widths of patterns need a second turn
             break
         moved = step.taken(found.fit)
         if not np.isfinite(moved.cost):
             break
-        again, step = _weighed_at(moved, named, motion, halves, found.noise)
-        if again.evidence < found.evidence:
+        again, after = question.at(moved, found.noise, found.widths)
+        # patterns take the place of strengths far from the fit: there the foretold gain is only believed if it comes
+        if again.evidence < found.evidence - step.gain * nameless:
             break
-        found = again
+        found, step = again, after
     return found
 
 
 @dataclass(frozen=True)
 class _Step:
-    """A step of first states (n, 9) and common unknowns (c,) with the logarithm of the density that it should gain."""
+    """A step of first states (n, 9) and common unknowns (c,) with the logarithm of the density that it should gain.
+
+    Patterns are no unknowns of the fit: at its new values they are as free as before.
+    """
 
     starts: Array
     common: Array
@@ -186,36 +209,49 @@ class _Step:
         return Fit.at(fit.problem, Unknowns(unknowns.starts + self.starts, values, launcher), fit.noise, fit.steps)
 
 
-def _weighed_at(
-    fit: Fit, named: Sequence[Hypothesis], motion: Motion, halves: Mask, start: Noise | None
-) -> tuple[Weighed, _Step]:
-    """The model at the unknowns of a fit, and the step to more probable ones."""
-    rows, priors = rows_of(fit, motion), Priors.of(fit, named)
-    precision = priors.precision([len(WIDTHS) - 1] * len(priors.places))
-    likelihood, noise = settled(rows, precision, priors.away, start)
-    total = likelihood.reduced(noise)[0].by_track(rows.track)
-    whole = total.of(np.full(len(halves), True))
-    widths, mixed = priors.widths(whole)
-    result = priors.posterior(whole, widths)
-    strengths, values = {}, np.array([fit.unknowns.values[name] for name in fit.problem.free])
-    for hypothesis, place in zip([h for h in named if h.strengths], priors.places, strict=True):
-        mean = values[place] + result.mean[place]
-        strengths[hypothesis.name] = Strengths(mean, result.covariance[np.ix_(place, place)])
-    information = whole.gram[0, :-1, :-1] + np.diag(priors.precision(widths))
-    gain = 0.5 * float(result.mean @ information @ result.mean)
-    step = _Step(likelihood.local_step(noise, result.mean)[:, :STATE_DIM], result.mean, gain)
-    found = Weighed(
-        tuple(named),
-        fit,
-        noise,
-        (likelihood.samples, likelihood.spins, likelihood.penalty),
-        tuple(widths),
-        result.evidence + mixed + choice_odds(named),
-        log_odds(named),
-        strengths,
-        held_out(priors, total, widths, halves),
-    )
-    return found, step
+@dataclass(frozen=True)
+class _Question:
+    """The arguments of `weighed` that stay the same at all values of the unknowns."""
+
+    named: Sequence[Hypothesis]
+    motion: Motion
+    halves: Mask
+    nameless: bool
+
+    def at(self, fit: Fit, start: Noise | None, widths: Sequence[int] = ()) -> tuple[Weighed, _Step]:
+        """The model at the unknowns of a fit, and the step to more probable ones.
+
+        Args: start, widths: noise, and widths of the patterns after those of the effects, of a similar model.
+        """
+        rows, patterns = rows_of(fit, self.motion), Patterns.of(fit) if self.nameless else None
+        own, effects = rows.by_common.shape[-1], [h for h in self.named if h.strengths]
+        rows, priors = rows if patterns is None else patterns.beside(rows), Priors.of(fit, self.named, patterns)
+        of_patterns = list(widths[len(effects) :]) or [0] * (len(priors.places) - len(effects))
+        first = priors.precision([len(WIDTHS) - 1] * len(effects) + of_patterns)
+        likelihood, noise = settled(rows, first, priors.away, start)
+        total = likelihood.reduced(noise)[0].by_track(rows.track)
+        whole = total.of(np.full(len(self.halves), True))
+        best, mixed = priors.widths(whole)
+        result = priors.posterior(whole, best)
+        strengths, values = {}, np.array([fit.unknowns.values[name] for name in fit.problem.free])
+        for hypothesis, place in zip(effects, priors.places, strict=False):
+            mean = values[place] + result.mean[place]
+            strengths[hypothesis.name] = Strengths(mean, result.covariance[np.ix_(place, place)])
+        away, spread = result.mean[:own], result.covariance[:own, :own]
+        gain = 0.5 * float(away @ np.linalg.solve(spread, away))
+        found = Weighed(
+            tuple(self.named),
+            fit,
+            noise,
+            (likelihood.samples, likelihood.spins, likelihood.penalty),
+            tuple(best),
+            result.evidence + mixed + choice_odds(self.named),
+            log_odds(self.named, self.nameless),
+            strengths,
+            held_out(priors, total, best, self.halves),
+            self.nameless,
+        )
+        return found, _Step(likelihood.local_step(noise, result.mean)[:, :STATE_DIM], away, gain)
 
 
 def held_out(priors: Priors, by_tracks: Reduced, widths: Sequence[int], halves: Mask) -> Array:

@@ -9,12 +9,12 @@ from typing import Final
 
 import numpy as np
 
+from ballfg.diagnosis.fit.patterns import EVERYWHERE
 from ballfg.diagnosis.generic_test import ALARM
 from ballfg.diagnosis.report.origin import Origin
 from ballfg.diagnosis.report.plain_effects import BY_GROUP, DRIFT, in_plain_words, plain_name
-from ballfg.diagnosis.report.wording import NONE, fixed, joined, number, probability, sized
+from ballfg.diagnosis.report.wording import MOST_CERTAIN, NONE, fixed, joined, number, probability, sized
 from ballfg.diagnosis.residual_tests.label_check import LABEL
-from ballfg.diagnosis.residual_tests.patterns import EVERYWHERE
 from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Finding, Outcome, Verdict
 from ballfg.dynamics import EFFECTS
 from ballfg.estimation.noise.tracker_errors import NUMBERS
@@ -129,6 +129,11 @@ def certainty(diagnosis: Diagnosis) -> Iterator[str]:
             yield f"These would have been noticed in 9 of 10 recordings like this one, from such a size on: {noticed}."
     if unseen:
         yield f"These tracks say nothing about {unseen} more effect{'s' * (unseen > 1)}, which may be there or not."
+    if diagnosis.nameless > 0.5:
+        yield (
+            "Something that no effect of the catalogue describes is there with a probability of "
+            f"{100.0 * min(diagnosis.nameless, MOST_CERTAIN):.3g} %; named effects are needed beside it."
+        )
     if diagnosis.verdict is Verdict.UNEXPLAINED and diagnosis.unexplained.tests:
         tests = diagnosis.unexplained.tests
         of_labels = [test.p_value for test in tests if test.name == LABEL and test.p_value < ALARM]

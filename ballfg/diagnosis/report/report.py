@@ -144,6 +144,7 @@ def content(diagnosis: Diagnosis) -> dict[str, Any]:
             "remarks": diagnosis.remarks,
             "probabilities": diagnosis.probabilities,
             "nothing_lacking": diagnosis.nothing_lacking,
+            "nameless": diagnosis.nameless,
             "labels": None if diagnosis.labels is None else _labels(diagnosis.labels),
         }
     )

@@ -10,11 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.fit.system import System
-from ballfg.diagnosis.generic_test import GenericTest
-from ballfg.diagnosis.hypotheses.signatures import signatures_of
-from ballfg.diagnosis.residual_tests.patterns import (
+from ballfg.diagnosis.fit.patterns import (
     DRIFT,
     EVERYWHERE,
     PLAUSIBLE,
@@ -23,6 +19,10 @@ from ballfg.diagnosis.residual_tests.patterns import (
     describe_drift,
     drift_block,
 )
+from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.fit.system import System
+from ballfg.diagnosis.generic_test import GenericTest
+from ballfg.diagnosis.hypotheses.signatures import signatures_of
 from ballfg.diagnosis.residual_tests.whiteness import whiteness
 from ballfg.diagnosis.search.score import pattern_tests
 from ballfg.tracks.noise import TrackNoise

@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 
 from ballfg.arrays import Mask
+from ballfg.diagnosis.evidence.nameless import NAMELESS
 from ballfg.diagnosis.evidence.odds import Odds, odds_of
 from ballfg.diagnosis.evidence.rows import random_motion
 from ballfg.diagnosis.evidence.weighed import Weighed, weighed
@@ -105,21 +106,24 @@ class SearchLoop:
         """The search with the named effects only, its predictions and findings."""
         stamps, odds = self.holdout.stamps, found.odds
         final = found.named_at(self.name_at)
+        whole = found.models[final.names - {NAMELESS}].fit
         self.watch("predicting the other half")
         declared = self.predictive(first)
         judged = self.judge(declared.model)
         before = self.judge(as_declared(declared.model, stamps)) if stamps.found else judged
         fit, predictive = first, declared
         if final.named:
-            problem = replace(final.fit.problem, stretches=first.problem.stretches)
-            starts = final.fit.unknowns.starts[: len(first.problem.stretches)]
-            fit = fit_problem(problem, replace(final.fit.unknowns, starts=starts), final.fit.noise)
+            problem = replace(whole.problem, stretches=first.problem.stretches)
+            starts = whole.unknowns.starts[: len(first.problem.stretches)]
+            fit = fit_problem(problem, replace(whole.unknowns, starts=starts), whole.noise)
             predictive = self.predictive(fit)
             judged = self.judge(predictive.model)
         rounds = {r.added: r for r in found.rounds}
+        rests = [found.without([h], final) for h in final.named]
+        rests = found.beside_nameless(rests) if final.nameless else rests
         findings = [
-            finding_of(h, final, found.without([h], final), odds, rounds.get(h.name, found.rounds[-1]).refits)
-            for h in final.named
+            finding_of(h, final, rest, odds, rounds.get(h.name, found.rounds[-1]).refits)
+            for h, rest in zip(final.named, rests, strict=True)
         ]
         return Search(
             first,
@@ -128,7 +132,7 @@ class SearchLoop:
             predictive,
             before,
             judged,
-            final.fit,
+            whole,
             (*stamp_hypotheses(stamps), *final.named),
             (*stamp_findings(first, stamps), *findings),
             tuple(ranking(r.scored, r.refits, r.added, odds) for r in found.rounds),
@@ -179,16 +183,34 @@ class _Found:
         return True
 
     def compare(self) -> None:
-        """Weighs the best model without each of its effects, and with its rivals in its place."""
+        """Weighs the best model without each of its effects, and what is left of it beside something nameless."""
         for hypothesis in self.best.named:
             self.without([hypothesis])
+        self.loop.watch("weighing what has no name")
+        self.beside_nameless([self.declared])
+        (best,) = self.beside_nameless([self.best])
+        while best.named:
+            shorter = self.beside_nameless([self.without([h], best) for h in best.named])
+            gone = [h for h, model in zip(best.named, shorter, strict=True) if model.score > best.score]
+            if not gone:
+                break
+            shorter += self.beside_nameless([self.without(gone, best)])
+            best = max(shorter, key=_score)
+        self.best = max(self.best, best, key=_score)
 
     def named_at(self, probability: float) -> Weighed:
         """The model with all effects that are at least so probable, or with most of them."""
         odds = self.odds
-        likely = {name for name in odds.effects() if odds.of(name) >= probability}
+        likely = {name for name in odds.effects() if odds.of(name) >= probability} | {NAMELESS}
         able = [model for model in self.models.values() if model.names <= likely]
-        return max(able, key=lambda model: (len(model.names), odds.models[model.names]))
+        return max(able, key=lambda model: (len(model.named), odds.models[model.names]))
+
+    def beside_nameless(self, models: Sequence[Weighed]) -> list[Weighed]:
+        """The same models with something nameless beside their effects."""
+        new = {m.names | {NAMELESS}: m for m in models if m.names | {NAMELESS} not in self.models}
+        tasks = [partial(weighed, m.fit, m.named, self.motion, self.halves, m.noise, True) for m in new.values()]
+        self.models |= dict(zip(new, do_all(tasks, self.loop.jobs), strict=True))
+        return [self.models[m.names | {NAMELESS}] for m in models]
 
     def without(self, gone: Sequence[Hypothesis], model: Weighed | None = None) -> Weighed:
         """A model without some of its effects, and without those that need them."""

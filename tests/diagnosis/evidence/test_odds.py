@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from ballfg.diagnosis.evidence.nameless import NAMELESS
 from ballfg.diagnosis.evidence.odds import odds_of, tempered
 from ballfg.diagnosis.evidence.prior import THERE, WIDTHS, choice_odds, log_odds, scales
 from ballfg.diagnosis.evidence.rows import random_motion
@@ -77,6 +78,33 @@ def test_what_is_foretold_is_what_a_refit_gains(windy_fit):
     sigmas = np.sqrt(np.diagonal(strengths.covariance))
     assert (np.abs(strengths.mean - [0.5, -0.3, 0.0]) < 4.0 * sigmas).all()
     assert (after.held_out - before.held_out).sum() > 0.5 * (after.evidence - before.evidence)
+
+
+def test_patterns_lose_against_an_effect_that_is_there(windy_fit, calm_fit):
+    windy = refit(windy_fit, Scored(WIND, None, 0.0)).fit
+    declared, named = weigh(windy_fit), weigh(windy, [WIND])
+    patterns, both = weigh(windy_fit, nameless=True), weigh(windy, [WIND], nameless=True)
+    assert named.score > max(patterns.score, both.score) + 2.0
+    assert weigh(calm_fit, nameless=True).score < weigh(calm_fit).score
+    assert patterns.names == {NAMELESS}
+    assert both.names == {"wind", NAMELESS}
+    odds = odds_of([declared, named, patterns, both], declared)
+    assert odds.effects() == {"wind": odds.of("wind")}
+    assert odds.of("wind") > 0.9
+    assert odds.nameless < 0.2
+
+
+def test_a_name_that_explains_a_part_is_not_believed_beside_patterns(make_ball, make_launches, make_shots, make_fit):
+    """Wind that grows with the height: an even wind explains most of it, on both halves."""
+    sheared = make_ball(wind_shear={"x": 2.0, "y": -1.0})
+    declared = make_fit(make_ball(), make_shots(sheared, make_launches(30, 5), 5).stretches)
+    windy = refit(declared, Scored(WIND, None, 0.0)).fit
+    without = [weigh(declared), weigh(windy, [WIND])]
+    assert odds_of(without, without[0]).of("wind") > 0.95
+    beside = [weigh(declared, nameless=True), weigh(windy, [WIND], nameless=True)]
+    odds = odds_of([*without, *beside], without[0])
+    assert odds.of("wind") < 0.5
+    assert odds.nameless > 0.95
 
 
 def test_an_effect_that_is_not_there_costs_its_prior(calm_fit):

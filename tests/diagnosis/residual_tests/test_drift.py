@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ballfg.diagnosis.fit.patterns import DRIFT, drift_block
 from ballfg.diagnosis.fit.stretches import joined
 from ballfg.diagnosis.generic_test import ALARM
 from ballfg.diagnosis.residual_tests.generic import generic_tests
-from ballfg.diagnosis.residual_tests.patterns import DRIFT, drift_block
 
 COUNT = 20
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from ballfg.diagnosis.fit.patterns import EVERYWHERE, PLAUSIBLE, WORLD, Block, blocks_of
 from ballfg.diagnosis.fit.response import fitted_path, responses
 from ballfg.diagnosis.generic_test import ALARM
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.hypotheses.signatures import Signatures, hypothesis_columns
 from ballfg.diagnosis.residual_tests.generic import generic_tests, where
-from ballfg.diagnosis.residual_tests.patterns import EVERYWHERE, PLAUSIBLE, WORLD, Block, blocks_of
 from ballfg.diagnosis.residual_tests.whiteness import REACHES, whiteness
 from ballfg.diagnosis.search.score import pattern_tests
 from ballfg.dynamics.effects.generic import GenericFlight

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.estimation import Smoother
+from ballfg.estimation import Settings, Smoother
 from ballfg.estimation.noise.filter_code import GATE, NEXT_TAIL
 from ballfg.estimation.noise.linear_filter import LinearFilter, Noise
 from ballfg.estimation.noise.linear_tracks import linearise
+from ballfg.estimation.noise.marginal import MarginalFit
+from ballfg.estimation.noise.parameters import parameters_of
 from ballfg.simulation import MeasurementNoise
 from tests.estimation.noise import in_torch
 
@@ -84,3 +86,21 @@ def test_a_covariance_that_is_none_is_refused(linear):
     tracks, noise = LinearFilter(linear, 10.0), noise_of(1)
     with pytest.raises(torch.linalg.LinAlgError, match="not positive definite"):
         tracks.run(noise, -tracks.measured(noise))
+
+
+def test_a_search_that_steps_too_far_comes_back(linear, monkeypatch):
+    """Rounding leaves no density where the first step leads to: the search ends where it would have ended anyway."""
+    tracks, calls = LinearFilter(linear, 10.0, biased=True), []
+    parameters = parameters_of(Settings(), linear, position_known=False)
+    free, whole = MarginalFit(tracks, Settings(), parameters, tolerance=0.01, most=80), LinearFilter.losses
+
+    def losses(self, noise):
+        calls.append(1)
+        if len(calls) == 2:
+            raise torch.linalg.LinAlgError("the covariance of an innovation is not positive definite")
+        return whole(self, noise)
+
+    monkeypatch.setattr(LinearFilter, "losses", losses)
+    again = MarginalFit(tracks, Settings(), parameters, tolerance=0.01, most=80)
+    assert len(calls) > 3
+    np.testing.assert_allclose(again.losses.sum(), free.losses.sum(), atol=0.02)

@@ -1,0 +1,46 @@
+"""Sets patterns of force, kick and position error, which no effect describes, beside the effects of a model.
+
+Under wrong physics the nearest effect explains a part, on both halves of the tracks. It is believed only if it explains
+more than smooth patterns of place, velocity, spin and time would, whose sizes are as free as its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from ballfg.arrays import Array, Index
+from ballfg.diagnosis.evidence.rows import Rows, roots
+from ballfg.diagnosis.fit.patterns import blocks_of
+from ballfg.diagnosis.fit.problem import Fit
+
+NAMELESS: Final = "something nameless"
+USUAL: Final = 0.125
+"""Usual strength of a pattern, in the unit of its column, which is large: widths of its prior reach twice that."""
+
+
+@dataclass(frozen=True)
+class Patterns:
+    """Columns of all patterns at a fit.
+
+    Attributes:
+        columns: (n, m, p) whitened responses of the samples to patterns that are large in practice.
+        blocks: where in p the columns of each block are; those of a block share the width of their prior.
+    """
+
+    columns: Array
+    blocks: tuple[Index, ...]
+
+    @classmethod
+    def of(cls, fit: Fit) -> Patterns:
+        """The patterns that a fit's flights, contacts and positions may have."""
+        blocks = blocks_of(fit)
+        ends = np.cumsum([block.columns.shape[-1] for block in blocks])
+        places = tuple(np.arange(end - b.columns.shape[-1], end) for b, end in zip(blocks, ends, strict=True))
+        return cls(np.concatenate([block.columns for block in blocks], axis=-1) / roots(fit), places)
+
+    def beside(self, rows: Rows) -> Rows:
+        """Rows with the patterns as further common unknowns, last."""
+        return rows.with_common(np.concatenate((rows.by_common, self.columns), axis=-1))
