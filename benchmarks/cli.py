@@ -5,6 +5,7 @@ Commands import what they need inside: `ballfg-bench --help` must not wait for t
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
     from ballfg.benchmarks.results import Results
     from ballfg.tracks import Dataset
 
+MEASURED = Path("../shared/data")
+"""Folder of the measured sets unless BALLFG_DATA names another."""
+
 app = typer.Typer(name="ballfg-bench", add_completion=False, pretty_exceptions_enable=False)
 
 Data = Annotated[Path | None, typer.Option("--data", help="Dataset of measured tracks; synthetic tracks by default.")]
@@ -30,6 +34,14 @@ Datasets = Annotated[
 Beside = Annotated[
     list[Path] | None,
     typer.Option("--data", help="Dataset of measured tracks in addition; may be repeated."),
+]
+Planted = Annotated[
+    list[Path] | None,
+    typer.Option("--data", help="Dataset of measured tracks; may be repeated; by default the sets in $BALLFG_DATA."),
+]
+Changes = Annotated[
+    list[str] | None,
+    typer.Option("--change", help="Name of the effect that is planted; may be repeated; all by default."),
 ]
 Timed = Annotated[
     Path | None, typer.Option("--data", help="Dataset whose tracks are timed in addition to the fixed problem.")
@@ -152,6 +164,9 @@ def dynamics(
 @app.command()
 def loop(
     data: Beside = None,
+    reliability: Annotated[
+        bool, typer.Option("--reliability", help="Test stated probabilities, on sets with effects of random size.")
+    ] = False,
     out: Out = Path("results"),
     quick: Quick = False,
     seed: Seed = 0,
@@ -164,20 +179,69 @@ def loop(
     The simulated datasets hold every catalogue effect in several sizes, pairs of effects, nothing that the model lacks,
     or physics of no catalogue; the ideal test of each effect alone stands beside them. --data adds measured tracks,
     diagnosed with the nominal model and with gravity, drag and the bounce only. Finished parts are kept in OUT/runs, so
-    that a stopped run can be continued.
+    that a stopped run can be continued. --reliability makes other sets, with up to three effects of random size, and
+    compares the stated probability of each name with the share of right names.
 
     Example: ballfg-bench loop --data data/aimy --out results/loop
     """
     from ballfg.benchmarks.diagnosis.cases import FULL, QUICK
+    from ballfg.benchmarks.diagnosis.reliability import run_reliability
     from ballfg.benchmarks.diagnosis.suite import run_loop
 
-    results = _start("loop", data or [], quick, seed)
+    if reliability and data:
+        raise typer.BadParameter("its sets are simulated. Leave out --data.", param_hint="--reliability")
+    results = _start("loop", data or [], quick, seed, ["--reliability"] if reliability else [])
     for folder in data or []:
         _open(folder)  # refuses a bad folder at once instead of hours later
     plan = QUICK if quick else FULL
     with workers(cluster, address, jobs) as processes, _folder(out) as place:
-        shared = [_shared(one, cluster) for one in data or []]
-        pictures = run_loop(results, shared, _shared(place, cluster), plan, processes)
+        shared, kept = [_shared(one, cluster) for one in data or []], _shared(place, cluster)
+        pictures: list[Path] = []
+        if reliability:
+            run_reliability(results, kept, plan.reliability, processes)
+        else:
+            pictures = run_loop(results, shared, kept, plan, processes)
+        _finish(results, out, pictures)
+
+
+@app.command()
+def planted(
+    data: Planted = None,
+    change: Changes = None,
+    out: Out = Path("results"),
+    quick: Quick = False,
+    seed: Seed = 0,
+    jobs: Jobs = CORES,
+    cluster: Cluster = None,
+    address: Address = None,
+) -> None:
+    """Test of the diagnosis on measured tracks: effects planted in them that it names and measures.
+
+    Each set is diagnosed as it was, and as another instrument, tracker or air would have made it: frame turned, clock
+    or heights off by a share, stamps that jitter, errors that last, a rig that moves, labels in another frame, frames
+    lost and counted through, wind. Counted are right names, and strengths that changed as planted. Finished diagnoses
+    are kept in OUT/runs, so that a stopped run can be continued.
+
+    Example: ballfg-bench planted --data data/ballgun --change frame_tilt --out results/planted
+    """
+    from ballfg.benchmarks.diagnosis.changes import CHANGES
+    from ballfg.benchmarks.diagnosis.planted import QUICK_CHANGES, QUICK_TRACKS, SETS, run_planted
+
+    if unknown := [name for name in change or () if name not in CHANGES]:
+        known = ", ".join(CHANGES)
+        raise typer.BadParameter(f"it is one of {known}; got {unknown[0]}. Choose one.", param_hint="--change")
+    root = Path(os.environ.get("BALLFG_DATA", MEASURED))
+    folders = data or [root / name for name in SETS if (root / name).is_dir()]
+    if not folders:
+        raise typer.BadParameter(f"there are no measured sets in {root}. Give --data.", param_hint="--data")
+    words = [word for name in change or () for word in ("--change", name)]
+    results = _start("planted", data or [], quick, seed, words)
+    for folder in folders:
+        _open(folder)  # refuses a bad folder at once instead of hours later
+    chosen = change or (QUICK_CHANGES if quick else tuple(CHANGES))
+    with workers(cluster, address, jobs) as processes, _folder(out) as place:
+        shared, most = [_shared(one, cluster) for one in folders], QUICK_TRACKS if quick else None
+        pictures = run_planted(results, shared, _shared(place, cluster), chosen, most, processes)
         _finish(results, out, pictures)
 
 

@@ -23,8 +23,9 @@ OF_CASE: Final = {
     "silence": "0",
     "unknown physics": "1",
     "repair": "1",
+    "planted in measured sets": "1",
 }
-"""Target values of all shares and ratios of a table of `ballfg-bench loop`."""
+"""Target values of all shares and ratios of a table of `ballfg-bench loop` or `planted`."""
 JUDGED: Final = ("nees", "coverage_90", "nis_median")
 """Metrics of the consistency of covariances, the sharpest first."""
 NEAR, NEAR_SHARE = 0.1, 0.03
@@ -168,7 +169,7 @@ def _covariances(case: str, methods: Mapping[str, Row]) -> Iterator[str]:
 
 
 def _of_loop(case: str, by_metric: Mapping[str, Mapping[str, Row]]) -> Iterator[str]:
-    """The line over all data of a table of `ballfg-bench loop` in words."""
+    """The line over all data of a table of `ballfg-bench loop` or `planted` in words."""
     total = by_metric.get("all", {})
     values = {name: _value(row) for name, row in total.items()}
     number = max((row.n for row in total.values()), default=0)
@@ -188,6 +189,9 @@ def _of_loop(case: str, by_metric: Mapping[str, Mapping[str, Row]]) -> Iterator[
     elif case == "pairs" and {"first", "both"} <= values.keys():
         first, both = 100 * values["first"], 100 * values["both"]
         yield f"{both:.0f} % of {number} pairs of effects were named completely; {first:.0f} % got a right first name."
+    elif case == "planted in measured sets" and {"named", "within 3 sigma"} <= values.keys():
+        named, near = 100 * values["named"], 100 * values["within 3 sigma"]
+        yield f"of {number} changes {named:.0f} % were named, {near:.0f} % also with their strength."
     elif case == "unknown physics" and {"unexplained", "reduced"} <= values.keys():
         called, reduced = 100 * values["unexplained"], 100 * values["reduced"]
         yield f"physics of no catalogue: {called:.0f} % called unexplained; errors reduced in {reduced:.0f} %."

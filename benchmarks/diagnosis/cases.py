@@ -54,6 +54,8 @@ class Case:
         sessions: undeclared effects, as texts, of each session that the dataset consists of.
         recording: settings of its tracks.
         data: folder of measured tracks, which take the place of simulated ones.
+        change: name of a change of `CHANGES` that the measured tracks undergo; empty for none.
+        most: number of measured tracks, evenly spread; None for all.
         repair: fit the true model too.  jobs: processes of the diagnosis.
     """
 
@@ -66,6 +68,8 @@ class Case:
     sessions: tuple[tuple[str, ...], ...] = ((),)
     recording: Recording = field(default_factory=Recording)
     data: Path | None = None
+    change: str = ""
+    most: int | None = None
     repair: bool = False
     jobs: int = 1
 
@@ -94,6 +98,7 @@ class Plan:
         nulls: datasets that lack nothing.
         unknown, unknown_seeds: physics outside the catalogue.
         timed: diagnoses that are timed alone.
+        reliability: sets for the test of stated probabilities, which is a run of its own.
     """
 
     effects: tuple[str, ...] = tuple(PLANTS)
@@ -109,6 +114,7 @@ class Plan:
     unknown: tuple[str, ...] = tuple(UNKNOWN)
     unknown_seeds: int = 3
     timed: int = 3
+    reliability: int = 300
 
 
 FULL: Final = Plan()
@@ -126,6 +132,7 @@ QUICK: Final = Plan(
     unknown=FULL.unknown[:2],
     unknown_seeds=1,
     timed=1,
+    reliability=4,
 )
 
 
@@ -190,12 +197,20 @@ def measured_cases(folders: Sequence[Path]) -> Iterator[Case]:
 
     Raises: ValueError: if two folders have the same name.
     """
-    names = [folder.resolve().name for folder in folders]
-    for folder, name in zip(folders, names, strict=True):
-        if names.count(name) > 1:
-            raise ValueError(f"datasets must differ in the names of their folders; got '{name}' twice. Rename one.")
+    for name, folder in by_name(folders).items():
         yield Case("measured", name, 1.0, 0, data=folder)
         yield Case("measured", f"{name}-bare", 1.0, 0, planted=BARE, left_out=BARE, data=folder)
+
+
+def by_name(folders: Sequence[Path]) -> dict[str, Path]:
+    """Folders of datasets by their names. Raises: ValueError: if two have the same name."""
+    found: dict[str, Path] = {}
+    for folder in folders:
+        name = folder.resolve().name
+        if name in found:
+            raise ValueError(f"datasets must differ in the names of their folders; got '{name}' twice. Rename one.")
+        found[name] = folder
+    return found
 
 
 def timed_cases(plan: Plan, seed: int) -> Iterator[Case]:

@@ -1,15 +1,21 @@
-"""Makes the data of a case: simulated tracks in a folder, the declared model, and the true one."""
+"""Makes the data of a case: simulated tracks in a folder, or measured ones; the declared model, and the true one."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from ballfg.benchmarks.diagnosis.cases import LABEL_NOISE, STATED_NOISE, Case
+from ballfg.benchmarks.diagnosis.changes import CHANGES
 from ballfg.diagnosis.search.hypothesis import has_effect, with_effects, without_effect
 from ballfg.dynamics import AnalyticModel, nominal_model
+from ballfg.estimation.noise.estimate import spread_over
 from ballfg.simulation import MeasurementNoise, SimulationConfig, parse_effects, simulate, table_tennis
 from ballfg.simulation.composition import true_model
 from ballfg.simulation.synthetic import dataset_info
 from ballfg.tracks import Dataset, read_dataset, write_dataset
+from ballfg.tracks.memory import dataset_in_memory
 
 
 def make_dataset(case: Case, folder: Path) -> Dataset:
@@ -22,6 +28,19 @@ def make_dataset(case: Case, folder: Path) -> Dataset:
     tracks = (replace(track, name=f"{session}-{track.name}") for session, track in simulated)
     write_dataset(folder, info, tracks, "parquet")
     return read_dataset(folder)
+
+
+def measured_dataset(case: Case, folder: Path) -> tuple[Dataset, Mapping[str, float]]:
+    """Measured tracks in a folder as a case wants them, and the strength of their change by coefficient."""
+    dataset = read_dataset(folder)
+    if not case.change and case.most is None:
+        return dataset, {}
+    tracks, strengths = spread_over(dataset, len(dataset), case.most or len(dataset)), dict[str, float]()
+    if case.change:
+        part = dataset_in_memory(dataset.info, tracks)
+        changed = CHANGES[case.change](part, tracks, np.random.default_rng(case.stream))
+        tracks, strengths = list(changed.tracks), dict(changed.strengths)
+    return dataset_in_memory(dataset.info, tracks), strengths
 
 
 def declared_model(case: Case, radius: float) -> AnalyticModel:

@@ -3,7 +3,7 @@
 import hashlib
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 from ballfg.benchmarks.diagnosis.cases import Case
 from ballfg.benchmarks.resumable import read_record as read_any
 from ballfg.benchmarks.resumable import write_record
-from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Finding
+from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Finding, Value
 
 RANKED = 8
 """Leading candidates of a round that are kept, beside those planted."""
@@ -31,13 +31,14 @@ class Found:
 
 @dataclass(frozen=True)
 class Ranked:
-    """A candidate of a round: its explained residual, its evidence, and its outcome."""
+    """A candidate of a round: its explained residual, its evidence, its outcome, coefficients with their sigmas."""
 
     name: str
     explained: float
     p_value: float
     delta_bic: float | None
     standing: str
+    estimate: Mapping[str, tuple[float, float | None]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,8 @@ class Record:
         patterns: p-values of the tests for remaining patterns, by their place.
         tracks, judged: numbers of tracks in the dataset and on the judging half.
         seconds: of the diagnosis, wall clock.
+        strengths: of the change that measured tracks underwent, by coefficient.
+        probabilities: stated, that an effect is there, by its name; empty where a diagnosis states none.
     """
 
     digest: str
@@ -65,6 +68,8 @@ class Record:
     tracks: int
     judged: int
     seconds: float
+    strengths: Mapping[str, float] = field(default_factory=dict)
+    probabilities: Mapping[str, float] = field(default_factory=dict)
 
     def save(self, path: Path) -> None:
         """Write the file whole or not at all."""
@@ -97,21 +102,33 @@ def record_of(case: Case, digest: str, diagnosis: Diagnosis, true: Errors | None
         tracks=diagnosis.tracks_found_on + diagnosis.tracks_judged_on,
         judged=diagnosis.tracks_judged_on,
         seconds=seconds,
+        probabilities=_probabilities(diagnosis),
     )
 
 
 def _found(finding: Finding) -> Found:
-    pairs = {name: (float(v.value), float(v.sigma)) for name, v in finding.parameters.items()}
-    values = {name: (value, sigma if math.isfinite(sigma) else None) for name, (value, sigma) in pairs.items()}
     alike = tuple(finding.indistinguishable_from)
+    values = _values(finding.parameters)
     return Found(finding.name, alike, float(finding.p_value), float(finding.delta_bic), values)
+
+
+def _values(values: Mapping[str, Value]) -> dict[str, tuple[float, float | None]]:
+    known = {name: v for name, v in values.items() if math.isfinite(v.value)}
+    return {name: (float(v.value), float(v.sigma) if math.isfinite(v.sigma) else None) for name, v in known.items()}
+
+
+def _probabilities(diagnosis: Diagnosis) -> dict[str, float]:
+    """Of findings, and of the last round's candidates; of one that is both, the finding's."""
+    listed: list[Candidate | Finding] = [*(diagnosis.rounds[-1] if diagnosis.rounds else ()), *diagnosis.findings]
+    stated = {one.name: getattr(one, "probability", None) for one in listed}
+    return {name: float(value) for name, value in stated.items() if value is not None}
 
 
 def _leading(listed: tuple[Candidate, ...], planted: tuple[str, ...]) -> tuple[Ranked, ...]:
     kept = [c for place, c in enumerate(listed) if place < RANKED or c.name in planted]
     bic = [None if c.delta_bic is None else float(c.delta_bic) for c in kept]
     return tuple(
-        Ranked(c.name, float(c.explained), float(c.p_value), delta, c.outcome.value)
+        Ranked(c.name, float(c.explained), float(c.p_value), delta, c.outcome.value, _values(c.estimate))
         for c, delta in zip(kept, bic, strict=True)
     )
 

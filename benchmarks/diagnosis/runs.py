@@ -2,32 +2,36 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from ballfg.benchmarks.diagnosis.cases import Case
-from ballfg.benchmarks.diagnosis.data import declared_model, make_dataset
+from ballfg.benchmarks.diagnosis.data import declared_model, make_dataset, measured_dataset
 from ballfg.benchmarks.diagnosis.ideal import Ideal, ideal_case, ideal_of, read_ideal
 from ballfg.benchmarks.diagnosis.record import Record, case_digest, read_record, record_of
 from ballfg.benchmarks.diagnosis.true_model import true_errors
 from ballfg.benchmarks.resumable import collect
 from ballfg.diagnosis import diagnose
 from ballfg.diagnosis.result import Diagnosis
-from ballfg.tracks import read_dataset
 
 
 def run_case(case: Case, diagnose: Callable[..., Diagnosis] = diagnose) -> Record:
     """Make the data, diagnose, and fit the true model where a case asks for it."""
     digest = case_digest(case)
     with TemporaryDirectory() as folder:
-        dataset = make_dataset(case, Path(folder) / "tracks") if case.data is None else read_dataset(case.data)
+        strengths: Mapping[str, float] = {}
+        if case.data is None:
+            dataset = make_dataset(case, Path(folder) / "tracks")
+        else:
+            dataset, strengths = measured_dataset(case, case.data)
         model = declared_model(case, dataset.info.ball.radius)
         start = time.perf_counter()
         diagnosis = diagnose(dataset, model, jobs=case.jobs)
         seconds = time.perf_counter() - start
         true = true_errors(case, dataset) if case.repair else None
-    return record_of(case, digest, diagnosis, true, seconds)
+    return replace(record_of(case, digest, diagnosis, true, seconds), strengths=strengths)
 
 
 def collect_records(
