@@ -99,7 +99,9 @@ def state_prior(state: int, mean: Array, sigma: Array) -> PriorFactors:
     return PriorFactors(np.array([state]), mean[None], np.diag(1.0 / sigma)[None])
 
 
-def spin_prior(states: Index, spin: Array, sigma: Array, loss: Loss | None = None) -> PriorFactors:
+def spin_prior(
+    states: Index, spin: Array, sigma: Array, loss: Loss | None = None, axes: Array | None = None
+) -> PriorFactors:
     """Priors on the spin of some states.
 
     Args:
@@ -107,9 +109,10 @@ def spin_prior(states: Index, spin: Array, sigma: Array, loss: Loss | None = Non
         spin: (m, 3) rad/s, means.
         sigma: (m, 3) rad/s, standard deviations.
         loss: on the norm of a whitened residual.
+        axes: (3, 3), one unit vector a row, along which sigma counts; None: x, y, z.
     Raises: ValueError: if a sigma is not positive and finite.
     """
-    return PriorFactors(states, *_about_spin(spin, sigma), loss)
+    return PriorFactors(states, *_about_spin(spin, sigma, axes), loss)
 
 
 def spin_label(states: Index, spin: Array, sigma: Array, loss: Loss | None = None) -> SpinLabelFactors:
@@ -121,13 +124,13 @@ def spin_label(states: Index, spin: Array, sigma: Array, loss: Loss | None = Non
     return SpinLabelFactors(states, *_about_spin(spin, sigma), loss)
 
 
-def _about_spin(spin: Array, sigma: Array) -> tuple[Array, Array]:
+def _about_spin(spin: Array, sigma: Array, axes: Array | None = None) -> tuple[Array, Array]:
     """Mean (m, 9) and root information (m, 3, 9) of priors on spins."""
     _check_sigma(sigma)
     mean = np.zeros((len(spin), STATE_DIM))
     mean[:, SPIN] = spin
     root = np.zeros((len(spin), 3, STATE_DIM))
-    root[:, :, SPIN] = np.eye(3) / sigma[:, :, None]
+    root[:, :, SPIN] = (np.eye(3) if axes is None else axes) / sigma[:, :, None]
     return mean, root
 
 

@@ -75,6 +75,14 @@ SolverName = Annotated[
     Literal["ballfg", "gtsam"] | None,
     typer.Option("--solver", help="Solver of the factor graph.", show_default="gtsam for online, else ballfg"),
 ]
+GroupName = Annotated[
+    str | None,
+    typer.Option(
+        "--group",
+        help="Group of the model, such as a launcher or a player, of tracks whose labels name none.",
+        show_default="the mixture of all groups",
+    ),
+]
 ModelFile = Annotated[
     Path | None, typer.Option("--model", help="Model file; by default the nominal model of the ball.")
 ]
@@ -119,19 +127,24 @@ class Inputs(Generic[D]):
     observed: float
     """s from the start of each track that a noise estimate may use."""
 
-    def estimator(self, method: str, solver: Solver | None = None) -> Estimator:
+    def estimator(self, method: str, solver: Solver | None = None, group: str | None = None) -> Estimator:
         """The estimator of a name, with the noise of the dataset.
 
-        Args: method: its name.  solver: of its factor graph; None: the usual one.
-        Raises: ValueError: if there is no such estimator, or the solver cannot solve it.
+        Args:
+            method: its name.
+            solver: of its factor graph; None: the usual one.
+            group: of tracks whose labels name none; None: unknown.
+        Raises: ValueError: if there is no such estimator or group, or the solver cannot solve it.
         """
         from ballfg.estimation import Settings
         from ballfg.estimation.configure import fitted_settings
         from ballfg.estimation.registry import make_estimator
 
-        make_estimator(method, self.model, self.surfaces, Settings(solver=solver))  # refuses before any long work
+        # both refuse before any long work
+        make_estimator(method, self.model, self.surfaces, Settings(solver=solver))
+        Settings(spins=self.model.spins, group=group)
         settings = fitted_settings(self.dataset, self.model, self.observed, progress)
-        return make_estimator(method, self.model, self.surfaces, replace(settings, solver=solver))
+        return make_estimator(method, self.model, self.surfaces, replace(settings, solver=solver, group=group))
 
 
 def know_effects(files: Iterable[Path] | None) -> None:

@@ -16,6 +16,7 @@ from ballfg.dynamics.motion.impact import slip_velocity
 from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, VELOCITY, VZ, Z
 
 if TYPE_CHECKING:
+    from ballfg.dynamics.population import SpinPopulation
     from ballfg.dynamics.trained import Trained
     from ballfg.dynamics.variation import Variation
     from ballfg.tracks import Track
@@ -52,6 +53,7 @@ class BallModel(nn.Module, ABC):
         trained: the noise and the launcher that were learned together with the model; None if none were.
         noise: the scatter of tracks about the model; None if unknown.
         variations: coefficients that differ between tracks, by name as in `named_parameters()`.
+        spins: the spins of groups of shots; None if unknown.
         random: True if the model draws random numbers, so that the same state has another future each time; machine
             code then uses its `in_flight`.
 
@@ -74,6 +76,7 @@ class BallModel(nn.Module, ABC):
         self.trained: Trained | None = None
         self.noise: TrackNoise | None = None
         self.variations: Mapping[str, Variation] = {}
+        self.spins: SpinPopulation | None = None
 
     def for_track(self, track: "Track") -> Self:
         """The model with the coefficients of one track; the model itself if none differ between tracks."""

@@ -12,6 +12,7 @@ from ballfg.dynamics.analytic import AnalyticModel, after_needs
 from ballfg.dynamics.effect import Effect, Kind
 from ballfg.dynamics.effects.registry import effect_class
 from ballfg.dynamics.model import THIN_SHELL, BallModel
+from ballfg.dynamics.population import SpinPopulation
 from ballfg.dynamics.variation import Variation
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.files.whole_file import write_text
@@ -20,7 +21,10 @@ from ballfg.tracks.noise import TrackNoise
 
 KINDS: Final[tuple[Kind, ...]] = ("flight", "bounce", "measurement")
 VARIATIONS: Final = "variations"
-SECTIONS = (*KINDS, VARIATIONS, "learned")
+POPULATIONS: Final = "populations"
+SPIN: Final = "spin"
+"""Entry of the section `populations`."""
+SECTIONS = (*KINDS, VARIATIONS, POPULATIONS, "learned")
 LONGEST_NAME: Final = 255
 """Characters of a folder's name."""
 NOISE: Final = "noise"
@@ -34,7 +38,8 @@ def load_model(
     """Read a model file.
 
     Args:
-        path: YAML file with the sections `flight`, `bounce`, `measurement`, `variations`, `learned` (docs/models.md).
+        path: YAML file with the sections `flight`, `bounce`, `measurement`, `variations`, `populations`, `learned`
+            (docs/models.md).
         radius: m, of the ball, usually from the dataset.
         inertia_factor: moment of inertia divided by m R^2.
         room: name of the dataset to estimate. In a room outside of its training a network that fades keeps half of its
@@ -84,7 +89,7 @@ def model_from_dict(
     """The model of a parsed model file without a learned part.
 
     Args:
-        content: the sections `flight`, `bounce`, `measurement` and `variations` (docs/models.md).
+        content: the sections `flight`, `bounce`, `measurement`, `variations` and `populations` (docs/models.md).
         radius: m, of the ball.
         inertia_factor: moment of inertia divided by m R^2.
         where: start of the error messages.
@@ -115,7 +120,20 @@ def model_from_dict(
     model = AnalyticModel(effects, radius=radius, inertia_factor=inertia_factor)
     model.noise = noise
     model.variations = _variations(content.get(VARIATIONS), model, where)
+    model.spins = _spins(content.get(POPULATIONS), where)
     return model
+
+
+def _spins(section: Any, where: str) -> SpinPopulation | None:
+    """The spins of groups of shots."""
+    if section is None:
+        return None
+    if not isinstance(section, Mapping) or set(section) != {SPIN}:
+        raise ValueError(f"{where}: section '{POPULATIONS}' must be a mapping with '{SPIN}'; got {shown(section)}")
+    try:
+        return SpinPopulation.from_mapping(section[SPIN])
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{where}: {POPULATIONS}.{SPIN}: {error}") from error
 
 
 def _variations(section: Any, model: AnalyticModel, where: str) -> dict[str, Variation]:
@@ -175,7 +193,8 @@ def model_to_dict(model: AnalyticModel) -> dict[str, Any]:
         content[kind] = {name: cast(Effect, effect).values() for name, effect in group.items()}
     if model.noise is not None:
         content["measurement"][NOISE] = model.noise.to_mapping()
-    return content | _listed(model.variations) | {"learned": None}
+    populations = {} if model.spins is None else {POPULATIONS: {SPIN: model.spins.to_mapping()}}
+    return content | _listed(model.variations) | populations | {"learned": None}
 
 
 def _listed(variations: Mapping[str, Variation]) -> dict[str, Any]:

@@ -47,7 +47,8 @@ def dataset_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Set
     gives it. The coefficients of an analytic model are estimated with each track, within their priors; a trained model
     is fixed, with its learned noise and launcher. In a room outside of the training, by the name of the dataset, the
     coefficients of the corrected model are estimated again, and the noise of motion and bounces is that of the tracks
-    about them. Other noise that the model or, second, the dataset states takes precedence.
+    about them. Other noise that the model or, second, the dataset states takes precedence. The model's groups of shots
+    give the spin of tracks without a spin label.
     """
     info, trained = dataset.info, model.trained
     if info.position_noise is not None:
@@ -74,7 +75,7 @@ def dataset_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Set
         settings = replace(settings, spin_label_noise=info.spin_noise)
     for stated in (info.noise, model.noise):
         settings = settings if stated is None else with_noise(settings, stated)
-    return settings
+    return settings if model.spins is None else replace(settings, spins=model.spins)
 
 
 def fitted_settings(

@@ -32,6 +32,7 @@ class EachItsModel(Estimator):
 
     def of(self, track: Track) -> Estimator:
         """The estimator with the coefficients of a track; tracks with equal coefficients share it."""
+        track = self.settings.grouped(track)
         values = tuple(variation.value(track) for variation in self.model.variations.values())
         if values not in self._made:
             self._made[values] = self._make(self.model.for_track(track))

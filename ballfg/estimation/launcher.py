@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ballfg.checks import check_number
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.dynamics.population import SpinPopulation, launch_axes
 from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.tracks import Track
 from ballfg.tracks.track import SPIN_LABELS
@@ -21,10 +22,29 @@ FIRST_SAMPLES = 10
 
 @dataclass(frozen=True)
 class SpinLabel:
-    """A spin known before the flight: (3,) rad/s, and its standard deviation per axis, rad/s."""
+    """A spin known before the flight, from a label or from the population of shots.
+
+    Attributes:
+        spin: (3,) rad/s.
+        sigma: rad/s, standard deviation per axis, one number or (3,).
+        axes: (3, 3), one unit vector a row, along which sigma counts.
+        measured: True if a label gives it; False if the population does.
+    """
 
     spin: NDArray[np.float64]
-    sigma: float
+    sigma: float | NDArray[np.float64]
+    axes: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
+    measured: bool = True
+
+    @property
+    def sigmas(self) -> NDArray[np.float64]:
+        """(3,) rad/s, along the axes."""
+        return np.broadcast_to(np.asarray(self.sigma, dtype=np.float64), (3,))
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """(3, 3) rad^2/s^2, in the world."""
+        return np.asarray((self.axes.T * self.sigmas**2) @ self.axes)
 
 
 @dataclass(frozen=True)
@@ -73,8 +93,7 @@ class Launcher:
         settings = self.settings(track)
         if settings is None or len(track) < 2:
             return None
-        first = slice(0, FIRST_SAMPLES)
-        velocity = window_velocities(track.seconds[first], track.positions[first]).mean(axis=0)
+        velocity = launch_velocity(track)
         with torch.no_grad():
             spin = self.embedding.spin(torch.from_numpy(settings), torch.from_numpy(velocity))
         return SpinLabel(spin.numpy(), self.sigma)
@@ -85,3 +104,20 @@ class Launcher:
         if label is None:
             return track
         return replace(track, labels={**track.labels, **dict(zip(SPIN_LABELS, label.spin.tolist(), strict=True))})
+
+
+def group_spin(spins: SpinPopulation, track: Track, group: str | None) -> SpinLabel:
+    """The spin of a new shot of a track's group.
+
+    Args: spins: of all groups.  track: its label names the group.  group: that of a track without the label.
+    """
+    mean, covariance = spins.spin(str(track.labels[spins.by]) if spins.by in track.labels else group)
+    axes = launch_axes(launch_velocity(track))
+    variances, vectors = np.linalg.eigh(covariance)
+    return SpinLabel(mean @ axes, np.sqrt(variances), vectors.T @ axes, measured=False)
+
+
+def launch_velocity(track: Track) -> NDArray[np.float64]:
+    """(3,) m/s, mean of a track's first samples."""
+    first = slice(0, FIRST_SAMPLES)
+    return window_velocities(track.seconds[first], track.positions[first]).mean(axis=0)

@@ -22,7 +22,8 @@ from ballfg.checks import (
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.earlier_names import todays_name, todays_names
 from ballfg.dynamics.model import BallModel
-from ballfg.estimation.launcher import Launcher, SpinLabel
+from ballfg.dynamics.population import SpinPopulation
+from ballfg.estimation.launcher import Launcher, SpinLabel, group_spin
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.tracks import Track
@@ -92,6 +93,12 @@ class Settings:
     launcher: Launcher | None = None
     """Gives the spin of tracks without a spin label from their launcher settings."""
 
+    spins: SpinPopulation | None = None
+    """The spins of groups of shots, in place of `spin_prior` for the first spin of tracks without a spin label."""
+
+    group: str | None = None
+    """The group of tracks whose labels name none, for `spins`; None: unknown, so that its mixture counts."""
+
     find_events: bool = True
     """Look for hits, outliers and tracker shifts. False: the track is one undisturbed flight with contacts that the
     model explains."""
@@ -129,6 +136,16 @@ class Settings:
         check_flag("find_events", self.find_events)
         if self.solver is not None:
             check_choice("solver", self.solver, SOLVERS)
+        if self.spins is not None:
+            check_instance("spins", self.spins, SpinPopulation, "Load a model that has them, and take model.spins.")
+        if self.group is not None:
+            check_instance("group", self.group, str, "Give its name, or leave it out.")
+            if self.spins is None:
+                raise ValueError(
+                    f"group must be None for a model without groups; got {shown(self.group)}. Use a model file with "
+                    "the section populations, which ballfg-train writes with kind: calibrate and groups: LABEL."
+                )
+            self.spins.check(self.group)
         if self.launcher is not None and not callable(getattr(self.launcher, "label", None)):
             got = f"{type_name(self.launcher)} {shown(self.launcher)}"
             raise TypeError(f"launcher must be a Launcher or None; got {got}. Read one from its file.")
@@ -158,6 +175,12 @@ class Settings:
         """The settings of a track: positions computed from other observations have no tracker's errors."""
         return replace(self, memory=(0.0, 0.0, 0.0), stamp_jitter=0.0) if track.rough else self
 
+    def grouped(self, track: Track) -> Track:
+        """The track with the label of its group, if the settings name the group of tracks without one."""
+        if self.group is None or self.spins is None or self.spins.by in track.labels:
+            return track
+        return replace(track, labels={**track.labels, self.spins.by: self.group})
+
     def renamed(self, model: BallModel) -> Settings:
         """These settings with today's names of the model's coefficients."""
         earlier = [name for name in self.coefficients if todays_name(name) != name]
@@ -168,10 +191,13 @@ class Settings:
         return replace(self, coefficients=dict(zip(names, self.coefficients.values(), strict=True)))
 
     def spin_label(self, track: Track) -> SpinLabel | None:
-        """The spin label of a track: its own, else that of its launcher settings, else None."""
+        """The spin known before a track: its label, else that of its launcher settings or its group, else None."""
         if track.spin_label is not None:
             return SpinLabel(track.spin_label, self.spin_label_noise)
-        return None if self.launcher is None else self.launcher.label(track)
+        label = None if self.launcher is None else self.launcher.label(track)
+        if label is None and self.spins is not None:
+            return group_spin(self.spins, track, self.group)
+        return label
 
 
 _TYPES: dict[str, type] = {
@@ -209,9 +235,9 @@ MEASURED = ProcessNoise(contact_tangential=0.2, contact_spin=10.0)
 tangential restitution as coefficients of a track would be equivalent, but their kink hinders the minimisation."""
 
 
-def spin_start(label: SpinLabel | None, settings: Settings) -> tuple[Array, float]:
-    """Mean (3,) and standard deviation per axis, rad/s, of the spin at a start, from the label or the prior."""
-    return (np.zeros(3), settings.spin_prior) if label is None else (label.spin, label.sigma)
+def spin_start(label: SpinLabel | None, settings: Settings) -> SpinLabel:
+    """The spin at a start: that of the label, else the prior about zero."""
+    return SpinLabel(np.zeros(3), settings.spin_prior, measured=False) if label is None else label
 
 
 def sample_sigmas(settings: Settings, count: int, own: Array | None) -> Array:

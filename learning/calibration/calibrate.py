@@ -5,7 +5,7 @@ finds the population's mean and spread, and puts the mean into the model. It end
 docs/train.md.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -15,10 +15,21 @@ from pydantic import BaseModel, ConfigDict
 from ballfg.arrays import Array
 from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation import Estimate, Settings, Smoother, Status, dataset_settings, dataset_surfaces, estimate_noise
+from ballfg.estimation import (
+    Estimate,
+    Estimator,
+    Settings,
+    Smoother,
+    Status,
+    dataset_settings,
+    dataset_surfaces,
+    estimate_noise,
+)
 from ballfg.estimation.batch import estimate_tracks, map_tracks
 from ballfg.estimation.noise.estimate import NoiseEstimate, spread_over
+from ballfg.estimation.registry import make_estimator
 from ballfg.learning.calibration.coefficients import Chosen, choose, with_values
+from ballfg.learning.calibration.groups import Groups, GroupSpin
 from ballfg.learning.calibration.population import Evidence, evidence, fit_population
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import TrackScore, judge_track
@@ -43,6 +54,7 @@ class Problem:
     settings: Settings
     split: Split
     jobs: int
+    groups: Groups | None = None
 
     def estimator(self, values: Array, settings: Settings) -> Smoother:
         """The smoother with values (p,) of the coefficients."""
@@ -73,6 +85,10 @@ class Step(BaseModel):
     """(p,) standard deviations between tracks."""
     next_track: tuple[float, ...] = ()
     """(p,) standard deviations of a new track's coefficients about the mean."""
+    spins: tuple[GroupSpin, ...] = ()
+    """The spins of each group, in the order of `Groups.names`; none without groups."""
+    by_group: dict[str, tuple[float, ...]] = {}
+    """Means by group, in the same order, of the coefficients that differ between groups."""
     moved: float | None = None
     """Largest move of a mean in this step, in standard errors."""
     fits: tuple[TrackFit, ...] = ()
@@ -91,7 +107,8 @@ def pose(dataset: Dataset, model: AnalyticModel, config: CalibrationConfig, jobs
     chosen = choose(model, config.coefficients)
     split = split_tracks(dataset, config.split, config.seed, needs_spin=chosen.needs_spin)
     surfaces, settings = dataset_surfaces(dataset), dataset_settings(dataset, model)
-    return Problem(dataset, config, model, chosen, surfaces, settings, split, jobs)
+    groups = None if config.groups is None else Groups.of(dataset, config.groups, split.fit)
+    return Problem(dataset, config, model, chosen, surfaces, settings, split, jobs, groups)
 
 
 def calibrate(problem: Problem, done: Iterable[Step] = (), *, watch: Watch = unwatched) -> Iterator[Step]:
@@ -121,12 +138,22 @@ def has_ended(config: CalibrationConfig, step: Step) -> bool:
 
 
 def score(
-    problem: Problem, values: Array, watch: Watch = unwatched, settings: Settings | None = None
+    problem: Problem, values: Array | AnalyticModel, watch: Watch = unwatched, settings: Settings | None = None
 ) -> tuple[TrackScore | None, ...]:
-    """Scores of the judging tracks, in order, with values (p,) of the coefficients; settings: else the problem's."""
+    """Scores of the judging tracks, in order.
+
+    Args:
+        values: (p,) of the coefficients, or a model with them.
+        watch: called for each track.
+        settings: None: the problem's.
+    """
     config, names = problem.config, problem.split.judge
     horizon = np.inf if config.horizon is None else config.horizon
-    estimator = problem.estimator(values, settings or problem.settings)
+    estimator: Estimator
+    if isinstance(values, AnalyticModel):
+        estimator = make_estimator("smoother", values, problem.surfaces, settings or problem.settings)
+    else:
+        estimator = problem.estimator(values, settings or problem.settings)
     tracks = tracks_of(problem.dataset, names)
     judge = partial(judge_track, estimator, observed_share=config.observed_share, horizon=horizon)
     scores = map_tracks(judge, tracks, len(names), problem.jobs)
@@ -134,9 +161,19 @@ def score(
 
 
 def population_settings(problem: Problem, step: Step) -> Settings:
-    """Settings with the population's distribution of a new track as the prior of each calibrated coefficient."""
+    """Settings with the population's distribution of a new track as the prior of each calibrated number."""
     learned = dict(zip(problem.chosen.names, step.next_track, strict=True))
-    return replace(problem.settings, coefficients={**problem.settings.coefficients, **learned})
+    settings = replace(problem.settings, coefficients={**problem.settings.coefficients, **learned})
+    groups = problem.groups
+    return settings if groups is None else groups.settings(settings, groups.population(step.spins))
+
+
+def population_model(problem: Problem, step: Step) -> AnalyticModel:
+    """The model with the means of a step, and each group's own where coefficients differ between groups."""
+    model = with_values(problem.model, problem.chosen.names, np.array(step.mean))
+    if problem.groups is not None:
+        model.variations = {**model.variations, **problem.groups.variations(step.by_group)}
+    return model
 
 
 def fitted_noise(
@@ -156,32 +193,41 @@ def fitted_noise(
 
 def _advance(problem: Problem, last: Step, watch: Watch) -> Step:
     """Linearise the fitted tracks about the last mean, and fit the population."""
-    chosen, about = problem.chosen, np.array(last.mean)
-    fits, evidences, skipped = _fit_tracks(problem, about, watch)
-    population = fit_population(evidences, chosen.start, chosen.sigma, chosen.low, chosen.high)
+    chosen, groups, about = problem.chosen, problem.groups, np.array(last.mean)
+    spins = () if groups is None else last.spins or groups.start
+    fits, evidences, skipped = _fit_tracks(problem, about, spins, watch)
+    size, before = len(about), np.concatenate((about, *(spin.mean for spin in spins)))
+    next_track, by_group, found = None, {}, ()
+    if groups is None:
+        population = fit_population(evidences, chosen.start, chosen.sigma, chosen.low, chosen.high)
+    else:
+        population, by_group, found, next_track = groups.fit(evidences, [fit.name for fit in fits], chosen)
     return Step(
         number=last.number + 1,
-        mean=_plain(population.mean),
-        sigma=_plain(population.sigma),
-        spread=_plain(population.spread),
-        next_track=_plain(population.next_track),
-        moved=float(np.abs((population.mean - about) / population.sigma).max()),
+        mean=_plain(population.mean[:size]),
+        sigma=_plain(population.sigma[:size]),
+        spread=_plain(population.spread[:size]),
+        next_track=_plain(population.next_track[:size] if next_track is None else next_track),
+        spins=found,
+        by_group=by_group,
+        moved=float(np.abs((population.mean - before) / population.sigma).max()),
         fits=tuple(fits),
         skipped=tuple(skipped),
-        scores=score(problem, population.mean, watch),
+        scores=score(problem, population.mean[:size], watch),
     )
 
 
 def _fit_tracks(
-    problem: Problem, about: Array, watch: Watch
+    problem: Problem, about: Array, spins: Sequence[GroupSpin], watch: Watch
 ) -> tuple[list[TrackFit], list[Evidence], list[tuple[str, str]]]:
     """Posterior and likelihood of each fitted track, and the skipped tracks.
 
     Coefficients that vary from track to track stay free in each track, calibrated or not.
     """
-    chosen, names = problem.chosen, problem.split.fit
+    chosen, names, groups = problem.chosen, problem.split.fit, problem.groups
     priors = {**problem.settings.coefficients, **dict(zip(chosen.names, chosen.sigma.tolist(), strict=True))}
-    estimator = problem.estimator(about, replace(problem.settings, coefficients=priors))
+    settings = replace(problem.settings, coefficients=priors)
+    estimator = problem.estimator(about, settings if groups is None else groups.wide(settings, spins))
     estimates = estimate_tracks(estimator, tracks_of(problem.dataset, names), len(names), problem.jobs)
     fits: list[TrackFit] = []
     evidences: list[Evidence] = []
@@ -189,6 +235,8 @@ def _fit_tracks(
     for estimate in watch(estimates, len(names), "tracks fitted"):
         try:
             fit, found = _read(estimate, chosen, about)
+            if groups is not None:
+                found = groups.evidence(estimate, chosen, about, spins, problem.settings.spin_prior)
         except ValueError as error:
             skipped.append((estimate.name, str(error)))
             limit = problem.config.failure_limit

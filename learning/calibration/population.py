@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Index
 
 MAX_STEPS = 20_000
 """Largest number of iterations: some tens are usual, thousands for a spread close to zero. A step takes 50 us."""
@@ -95,28 +95,36 @@ def evidence(mean: Array, covariance: Array, prior_mean: Array, prior_sigma: Arr
     return Evidence(information / scale, vector / prior_sigma, np.array(prior_mean))
 
 
-def fit_population(tracks: Sequence[Evidence], start: Array, sigma: Array, low: Array, high: Array) -> Population:
+def fit_population(
+    tracks: Sequence[Evidence], start: Array, sigma: Array, low: Array, high: Array, numbers: Index | None = None
+) -> Population:
     """Mean and spread of maximum marginal likelihood, the mean within its bounds.
 
     Args:
-        tracks: at least one.
+        tracks: at least one, each with k coefficients.
         start: (p,) mean of the prior of the population's mean.  sigma: (p,) its standard deviation.
         low: (p,) least mean.  high: (p,) largest mean.
+        numbers: (n, k) which of the p means each coefficient of each track is a draw about: those of its group. None:
+            the same for all tracks.
     Raises: ValueError: if there is no track.
     """
     if not tracks:
         raise ValueError("tracks must hold at least one; got none. Every estimate may have failed.")
-    scale = np.outer(sigma, sigma)
-    information = np.stack([t.information for t in tracks]) * scale
-    moved = np.stack([t.vector + t.information @ (t.about - start) for t in tracks]) * sigma
+    size = len(start)
+    numbers = np.tile(np.arange(size), (len(tracks), 1)) if numbers is None else numbers
+    scale = sigma[numbers]
+    information = np.stack([t.information for t in tracks]) * scale[:, :, None] * scale[:, None, :]
+    begun = start[numbers]
+    moved = np.stack([t.vector + t.information @ (t.about - b) for t, b in zip(tracks, begun, strict=True)]) * scale
     bounds = ((low - start) / sigma, (high - start) / sigma)
-    seen = np.einsum("ikk->k", information) > NO_INFORMATION
-    variance = np.where(seen, 1.0, 0.0)
+    about = _Means(numbers, size, bounds)
+    variance = np.where(about.summed(np.einsum("ikk->ik", information)) > NO_INFORMATION, 1.0, 0.0)
     for _ in range(MAX_STEPS):
-        mean = _mean(information, moved, variance, bounds)
+        own = variance[numbers]
+        mean = about.best(information, moved, own)
         # the pulls as large as they are, against as large as they should be
-        pulls = (_residual(information, moved, variance, mean) ** 2).sum(axis=0)
-        expected = np.einsum("ikk->k", _marginal(information, variance))
+        pulls = about.summed(_residual(information, moved, own, mean[numbers]) ** 2)
+        expected = about.summed(np.einsum("ikk->ik", _marginal(information, own)))
         growth = np.sqrt(np.divide(pulls, expected, out=np.zeros_like(pulls), where=expected > 0.0))
         updated = np.minimum(variance * growth, MOST_SPREAD)
         updated[updated < NO_SPREAD] = 0.0
@@ -125,49 +133,66 @@ def fit_population(tracks: Sequence[Evidence], start: Array, sigma: Array, low: 
         variance = updated
         if done:
             break
-    mean = _mean(information, moved, variance, bounds)
-    precision = np.eye(len(start)) + _marginal(information, variance).sum(axis=0)
+    own = variance[numbers]
+    mean = about.best(information, moved, own)
     return Population(
         mean=np.clip(start + sigma * mean, low, high),
-        covariance=np.linalg.inv(precision) * scale,
+        covariance=np.linalg.inv(about.precision(information, own)) * np.outer(sigma, sigma),
         spread=sigma * np.sqrt(variance),
-        log_likelihood=_log_likelihood(information, moved, variance, mean),
+        log_likelihood=_log_likelihood(information, moved, own, mean[numbers]) - 0.5 * float(mean @ mean),
     )
 
 
 def _mixing(information: Array, variance: Array) -> Array:
-    """(n, p, p) I + L_i D."""
-    return np.eye(len(variance)) + information * variance
+    """(n, k, k) I + L_i D_i, with the variances (n, k) of each track's group."""
+    return np.eye(variance.shape[1]) + information * variance[:, None, :]
 
 
 def _marginal(information: Array, variance: Array) -> Array:
-    """(n, p, p) information of each track on the mean, its own deviation integrated out: (I + L_i D)^-1 L_i."""
+    """(n, k, k) information of each track on the mean, its own deviation integrated out: (I + L_i D)^-1 L_i."""
     found = np.linalg.solve(_mixing(information, variance), information)
     return (found + found.swapaxes(-1, -2)) / 2.0
 
 
-def _mean(information: Array, moved: Array, variance: Array, bounds: tuple[Array, Array]) -> Array:
-    """(p,) the best mean for a given spread."""
-    mixing = _mixing(information, variance)
-    precision = np.eye(len(variance)) + _marginal(information, variance).sum(axis=0)
-    target = np.linalg.solve(mixing, moved[..., None])[..., 0].sum(axis=0)
-    free = np.linalg.solve(precision, target)
-    if ((bounds[0] <= free) & (free <= bounds[1])).all():
-        return np.asarray(free)
-    root = np.linalg.cholesky(precision).T
-    return np.asarray(lsq_linear(root, np.linalg.solve(root.T, target), bounds, method="bvls").x)
-
-
 def _residual(information: Array, moved: Array, variance: Array, mean: Array) -> Array:
-    """(n, p) each track's pull on the mean."""
-    pull = (moved - information @ mean)[..., None]
+    """(n, k) each track's pull on the means (n, k) of its group."""
+    pull = moved[..., None] - information @ mean[..., None]
     return np.asarray(np.linalg.solve(_mixing(information, variance), pull)[..., 0])
 
 
 def _log_likelihood(information: Array, moved: Array, variance: Array, mean: Array) -> float:
-    """Marginal log likelihood and log prior of the mean, without their constants."""
+    """Marginal log likelihood, without its constants, with the means (n, k) of each track's group."""
     _, log_determinant = np.linalg.slogdet(_mixing(information, variance))
-    pull = moved - information @ mean
+    pull = moved - (information @ mean[..., None])[..., 0]
     explained = (pull * variance * _residual(information, moved, variance, mean)).sum()
-    quadratic = (mean @ information @ mean).sum() - 2.0 * moved.sum(axis=0) @ mean - explained + mean @ mean
+    quadratic = np.einsum("ij,ijk,ik->", mean, information, mean) - 2.0 * (moved * mean).sum() - explained
     return float(-0.5 * (log_determinant.sum() + quadratic))
+
+
+@dataclass(frozen=True)
+class _Means:
+    """The p means; numbers (n, k) say which ones each track's coefficients are draws about; bounds of the means."""
+
+    numbers: Index
+    size: int
+    bounds: tuple[Array, Array]
+
+    def summed(self, values: Array) -> Array:
+        """(p,) sums of values (n, k) by mean."""
+        return np.bincount(self.numbers.ravel(), values.ravel(), minlength=self.size)
+
+    def precision(self, information: Array, variance: Array) -> Array:
+        """(p, p) of the means, their prior included."""
+        found = np.eye(self.size)
+        np.add.at(found, (self.numbers[:, :, None], self.numbers[:, None, :]), _marginal(information, variance))
+        return found
+
+    def best(self, information: Array, moved: Array, variance: Array) -> Array:
+        """(p,) the best means for some variances (n, k)."""
+        target = self.summed(np.linalg.solve(_mixing(information, variance), moved[..., None])[..., 0])
+        precision = self.precision(information, variance)
+        free = np.linalg.solve(precision, target)
+        if ((self.bounds[0] <= free) & (free <= self.bounds[1])).all():
+            return np.asarray(free)
+        root = np.linalg.cholesky(precision).T
+        return np.asarray(lsq_linear(root, np.linalg.solve(root.T, target), self.bounds, method="bvls").x)

@@ -10,6 +10,7 @@ from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.learning.calibration.calibrate import Problem, Step, has_converged
 from ballfg.learning.evaluation import Summary, TrackScore, summary
 
+AXES = ("forward", "across", "up")
 NEW_INFORMATION = 0.05
 """Least share by which informative data narrow the prior of a coefficient."""
 
@@ -64,6 +65,7 @@ def report(problem: Problem, last: Step, comparison: Comparison, noise: NoiseEst
         "iterations": last.number,
         "last_move": last.moved,
         "coefficients": {name: _coefficient(problem, last, k) for k, name in enumerate(problem.chosen.names)},
+        **_groups(problem, last),
         "fitted": {
             "tracks": len(last.fits),
             "names": [fit.name for fit in last.fits],
@@ -99,6 +101,18 @@ def _coefficient(problem: Problem, last: Step, k: int) -> dict[str, Any]:
         "told_by_data": sigma < (1.0 - NEW_INFORMATION) * prior,
         "at_bound": mean in (float(chosen.low[k]), float(chosen.high[k])),
     }
+
+
+def _groups(problem: Problem, last: Step) -> dict[str, Any]:
+    """The entry `groups`: spins by group, rad/s; none without groups."""
+    if problem.groups is None:
+        return {}
+    spins = {name: spin.model_dump(mode="json") for name, spin in zip(problem.groups.names, last.spins, strict=True)}
+    apart = {
+        coefficient: dict(zip(problem.groups.names, values, strict=True))
+        for coefficient, values in last.by_group.items()
+    }
+    return {"groups": {"by": problem.groups.by, "axes": list(AXES), "spin": spins, "coefficients": apart}}
 
 
 def _plain(found: Summary | None) -> dict[str, Any] | None:
@@ -147,6 +161,15 @@ def table(problem: Problem, last: Step, comparison: Comparison) -> str:
     for k, name in enumerate(problem.chosen.names):
         values = (problem.chosen.start[k], last.mean[k], last.sigma[k], last.spread[k])
         rows.append((name, problem.chosen.units[k], *(f"{value:.4g}" for value in values)))
+    names = () if problem.groups is None else problem.groups.names
+    for coefficient, values in last.by_group.items():
+        k = problem.chosen.names.index(coefficient)
+        start, unit = f"{problem.chosen.start[k]:.4g}", problem.chosen.units[k]
+        apart = zip(names, values, strict=True)
+        rows += [(f"{coefficient} of {name}", unit, start, f"{value:.4g}", "", "") for name, value in apart]
+    for name, spin in zip(names, last.spins, strict=True):
+        for axis, *numbers in zip(AXES, spin.mean, spin.sigma, spin.spread, strict=True):
+            rows.append((f"spin of {name}, {axis}", "rad/s", "0", *(f"{number:.4g}" for number in numbers)))
     errors: list[tuple[str, ...]] = [
         ("judged tracks", "unit", "before", "after", "after, spread as prior", "and noise")
     ]

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -19,11 +18,11 @@ from ballfg.learning.calibration.calibrate import (
     calibrate,
     fitted_noise,
     has_ended,
+    population_model,
     population_settings,
     pose,
     score,
 )
-from ballfg.learning.calibration.coefficients import with_values
 from ballfg.learning.calibration.picture import draw
 from ballfg.learning.calibration.report import compare, report, table
 from ballfg.learning.config.calibration import CalibrationConfig
@@ -101,14 +100,14 @@ def _line(problem: Problem, step: Step, left: float) -> str:
 def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch) -> None:
     """Judge once more with the spread as the prior and with the noise, write the results and print their paths."""
     last = steps[-1]
-    mean, population = np.array(last.mean), population_settings(problem, last)
-    model = with_values(problem.model, problem.chosen.names, mean)
+    population, model = population_settings(problem, last), population_model(problem, last)
     noise = fitted_noise(problem, model, population, watch)
-    spread = score(problem, mean, watch, population)
-    shown = spread if noise is None else score(problem, mean, watch, noise.settings)
+    spread = score(problem, model, watch, population)
+    shown = spread if noise is None else score(problem, model, watch, noise.settings)
     comparison = compare(steps[0].scores, last.scores, spread, shown)
     found = report(problem, last, comparison, noise)
     model.noise = None if noise is None else noise.noise
+    model.spins = population.spins
     save_model(model, folder / files.MODEL)
     files.write_json(folder / files.REPORT, found)
     draw(problem, last, comparison, folder / files.PICTURE)
@@ -154,7 +153,10 @@ def _follow(steps: Sequence[Step], problem: Problem) -> bool:
             rows += [step.sigma, step.spread, step.next_track]
             rows += [values for fit in step.fits for values in (fit.values, fit.sigmas)]
         names = {fit.name for fit in step.fits} | {name for name, _ in step.skipped}
+        groups = 0 if problem.groups is None or not number else len(problem.groups.names)
         fit = all(len(row) == size for row in rows) and names <= tracks and len(step.scores) == judged
+        fit = fit and len(step.spins) == groups and set(step.by_group) <= set(problem.chosen.names)
+        fit = fit and all(len(row) == groups for row in step.by_group.values())
         if not fit or step.number != number or (step.moved is None) != (number == 0):
             return False
     return True

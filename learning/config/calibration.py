@@ -45,6 +45,10 @@ class CalibrationConfig(Section):
     )
     """Calibrated parameters by name: `flight.` or `bounce.`, the effect, its coefficient."""
 
+    groups: str | None = None
+    """Label that names a track's launcher, player, ball or session, such as `group`: the spins of each group get a
+    mean and a spread, which the model file keeps. A dataset without labels is one group. null: no groups."""
+
     split: Literal["random", "label"] = "random"
     """random: half of the tracks are fitted and half judge, by the seed. label: by the label `split` of the dataset,
     `train` to fit and `test` to judge."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,12 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 
+from ballfg.dynamics import nominal_model, save_model
+from ballfg.dynamics.population import SpinGroup, SpinPopulation
 from ballfg.estimation import ConformalScales
 from ballfg.estimation.conformal import load_conformal
 from ballfg.simulation import SimulationConfig, write_simulation
-from ballfg.tracks import Dataset, read_dataset
+from ballfg.tracks import Dataset, read_dataset, write_dataset
 from tests.commands import status
 
 METHODS = ("smoother", "online", "ekf", "sliding-window")
@@ -203,3 +206,30 @@ def test_bad_calibration_tracks(
     assert lines[0].startswith("ballfg: error: ")
     assert message in lines[0]
     assert list(out.iterdir()) == []
+
+
+def test_the_group_of_all_tracks(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = nominal_model()
+    model.spins = SpinPopulation(
+        "player", {name: SpinGroup((0.0, spin, 0.0), (5.0,) * 3, 9) for name, spin in {"a": 200.0, "b": -200.0}.items()}
+    )
+    save_model(model, tmp_path / "model.yaml")
+    unlabelled = tmp_path / "shots"
+    write_dataset(unlabelled, dataset.info, (replace(track, labels={}) for track in dataset))
+
+    def table(command: str, *options: object) -> str:
+        out = tmp_path / "out.csv"
+        assert status(command, unlabelled, "--model", tmp_path / "model.yaml", *options, "--out", out) == 0
+        return out.read_text()
+
+    for command, options in (("predict", ("--observe", 0.3)), ("estimate", ())):
+        a, b, mixture = (table(command, *options, *more) for more in (("--group", "a"), ("--group", "b"), ()))
+        assert len({a, b, mixture}) == 3
+    capsys.readouterr()
+    model_file, out = tmp_path / "model.yaml", tmp_path / "none.csv"
+    options = ("predict", unlabelled, "--observe", 0.3, "--out", out)
+    assert status(*options, "--model", model_file, "--group", "c") == 2
+    assert "group must be one of the model's, a, b; got 'c'" in capsys.readouterr().err
+    assert status(*options, "--group", "a") == 2
+    assert "group must be None for a model without groups; got 'a'" in capsys.readouterr().err
+    assert not out.exists()

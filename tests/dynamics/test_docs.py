@@ -25,11 +25,13 @@ def blocks(page, language):
 
 
 def test_model_file_example_loads():
-    text, variations = blocks("models.md", "yaml")
+    text, variations, populations = blocks("models.md", "yaml")
     content = yaml.safe_load(text)
     assert model_to_dict(model_from_dict(content)) == content
     content = {**content, **yaml.safe_load(variations)}
     assert model_to_dict(model_from_dict(content))["variations"] == content["variations"]
+    content = {**content, **yaml.safe_load(populations)}
+    assert model_to_dict(model_from_dict(content))["populations"] == content["populations"]
 
 
 def test_model_code_runs(tmp_path, monkeypatch):

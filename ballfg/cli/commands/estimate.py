@@ -32,6 +32,7 @@ def estimate(
     method: inputs.MethodName = "smoother",
     solver: inputs.SolverName = None,
     model: inputs.ModelFile = None,
+    group: inputs.GroupName = None,
     ball: inputs.BallName = None,
     source: Annotated[
         inputs.Source | None,
@@ -73,7 +74,7 @@ def estimate(
         inputs.know_observations(observations_file)
         opened = open_dataset(dataset, model, effects_file, ball=ball)
         count = len(opened.dataset)
-        work = partial(_estimated, opened.model, opened.estimator(method, solver))
+        work = partial(_estimated, opened.model, opened.estimator(method, solver, group))
         results = map_tracks(work, opened.dataset, count, workers)
         for result in progress(results, count, "tracks estimated"):
             for columns in result.columns:

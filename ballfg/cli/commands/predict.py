@@ -26,6 +26,7 @@ def predict(
     method: inputs.MethodName = "smoother",
     solver: inputs.SolverName = None,
     model: inputs.ModelFile = None,
+    group: inputs.GroupName = None,
     ball: inputs.BallName = None,
     effects_file: inputs.EffectsFiles = None,
     observations_file: inputs.ObservationsFiles = None,
@@ -69,7 +70,7 @@ def predict(
         inputs.know_observations(observations_file)
         opened = inputs.open_inputs(dataset, model, effects_file, observe, ball)
         count = len(opened.dataset)
-        estimator = opened.estimator(method, solver)
+        estimator = opened.estimator(method, solver, group)
         scales = None
         if conformal is not None:
             scales = _conformal_scales(conformal, opened.dataset, estimator, method, observe, workers)

@@ -35,7 +35,7 @@ from ballfg.estimation.smoother.problem import coefficient_means, trackwise_mode
 from ballfg.factors.batch import FactorBatch
 from ballfg.factors.correlated_noise import bias_step
 from ballfg.factors.linear.definite import raised
-from ballfg.state import POSITION, STATE_DIM, VELOCITY, Z
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, Z
 from ballfg.tracks import Ball, Track
 
 if TYPE_CHECKING:
@@ -195,16 +195,19 @@ class _Run:
 
     def prior(self, i: int) -> tuple[Array, Array]:
         """The prior at sample i from that sample alone: mean (d,) and covariance (d, d)."""
-        spin, spin_sigma = spin_start(self.settings.spin_label(self.track), self.settings)
-        mean = np.concatenate((self.track.positions[i], np.zeros(3), spin, self.means, np.zeros(len(self.bias_sigmas))))
+        known = spin_start(self.settings.spin_label(self.track), self.settings)
+        mean = np.concatenate(
+            (self.track.positions[i], np.zeros(3), known.spin, self.means, np.zeros(len(self.bias_sigmas)))
+        )
         sigma = (
             self.sigma[i],
             np.full(3, self.settings.velocity_prior),
-            np.full(3, spin_sigma),
+            known.sigmas,
             np.array(list(self.settings.coefficients.values())),
             self.bias_sigmas,
         )
         covariance = np.diag(np.concatenate(sigma) ** 2)
+        covariance[SPIN, SPIN] = known.covariance
         covariance[POSITION, POSITION] = self._measurement_noise(i, self.velocities[i])
         if len(self.bias_sigmas):  # the position is the measured one less its bias
             lasting = covariance[-3:, -3:]

@@ -64,7 +64,7 @@ class SlidingWindow(Estimator):
         states = np.zeros((n, STATE_DIM))
         states[:, POSITION] = track.positions
         states[:, VELOCITY] = (track.positions - track.positions[first]) / span[:, None]
-        states[:, SPIN], _ = spin_start(self.settings.spin_label(track), self.settings)
+        states[:, SPIN] = spin_start(self.settings.spin_label(track), self.settings).spin
         bounced = may_touch(track.times, track.positions, self.surfaces, self.model.radius)
         covariances = _measurement_covariance(sigma, first, span)
         covariances[:, SPIN, SPIN] = self._spin_covariance(track, bounced)
@@ -87,10 +87,10 @@ class SlidingWindow(Estimator):
 
     def _spin_covariance(self, track: Track, bounced: NDArray[np.bool_]) -> Array:
         """(n, 3, 3): prior or label, the random walk since, and an unknown change after a possible bounce."""
-        _, start = spin_start(self.settings.spin_label(track), self.settings)
-        variance = start**2 + self.settings.process.spin**2 * (track.times - track.times[0])
-        variance = variance + self.settings.spin_prior**2 * np.logical_or.accumulate(bounced)
-        return np.asarray(variance[:, None, None] * np.eye(3))
+        start = spin_start(self.settings.spin_label(track), self.settings).covariance
+        walk = self.settings.process.spin**2 * (track.times - track.times[0])
+        bounce = self.settings.spin_prior**2 * np.logical_or.accumulate(bounced)
+        return np.asarray(start + walk[:, None, None] * np.eye(3) + bounce[:, None, None] * np.eye(3))
 
 
 def may_touch(times: Array, positions: Array, surfaces: Surfaces, radius: float) -> NDArray[np.bool_]:

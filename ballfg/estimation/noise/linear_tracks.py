@@ -51,6 +51,8 @@ class LinearTracks:
         kicks: (t, n - 1, 7, 9, 9) covariance for a unit of each number of `PROCESS_NOISE`.
         starts: (t, d) mean of the prior at the first sample, as a deviation from the estimate.
         labelled: (t,) bool, True if a label gives the spin at the first sample.
+        group_sigmas: (t, 3) rad/s, prior standard deviations of the first spin along the axes of its population; NaN
+            where none gives it. The first state's spin counts along these axes.
         coefficient_sigmas: (p,) prior standard deviations, in the coefficients' own units.
     """
 
@@ -65,6 +67,7 @@ class LinearTracks:
     kicks: Tensor
     starts: Tensor
     labelled: Tensor
+    group_sigmas: Tensor
     coefficient_sigmas: Tensor
 
     def __len__(self) -> int:
@@ -80,7 +83,8 @@ class LinearTracks:
             velocity: m/s, standard deviation per axis.
         """
         count = len(self)
-        spins = torch.where(self.labelled, label, spin).square()[:, None].expand(count, 3)
+        spins = torch.where(self.labelled, label, spin)[:, None].expand(count, 3)
+        spins = torch.where(self.group_sigmas.isnan(), spins, self.group_sigmas).square()
         fixed = torch.tensor([START_POSITION_SIGMA**2] * 3 + [velocity**2] * 3, dtype=torch.float64)
         own = (coefficients[:, None] * self.coefficient_sigmas).square()
         return torch.cat((fixed.expand(count, 6), spins, own.expand(count, -1)), dim=1)
@@ -100,6 +104,7 @@ class _Piece:
     kicks: Array
     start: Array
     labelled: bool
+    group_sigmas: Array
 
 
 def linearise(
@@ -126,7 +131,7 @@ def linearise(
 
 
 def _piece(smoother: Smoother, track: Track) -> _Piece:
-    model = smoother.model.for_track(track)
+    model = smoother.model.for_track(smoother.settings.grouped(track))
     own = smoother if model is smoother.model else Smoother(model, smoother.surfaces, smoother.settings)
     problem = own.problem(track)
     return _linearised(problem, own.settle(problem))
@@ -156,6 +161,10 @@ def _linearised(problem: TrackProblem, solution: Solution) -> _Piece:
     start[POSITION] = track.positions[first] - values.states[first, POSITION]
     start[VELOCITY] = -values.states[first, VELOCITY]
     start[SPIN] = (np.zeros(3) if label is None else label.spin) - values.states[first, SPIN]
+    group_sigmas = np.full(3, np.nan)
+    if label is not None and not label.measured:  # the first spin along the axes of its prior
+        group_sigmas, start[SPIN] = label.sigmas, label.axes @ start[SPIN]
+        transitions[first, :, SPIN] = transitions[first, :, SPIN] @ label.axes.T
     start[STATE_DIM:] = coefficient_means(problem.model, problem.settings) - values.coefficients[:width]
     samples, intervals_within = slice(first, end), slice(first, end - 1)
     return _Piece(
@@ -168,7 +177,8 @@ def _linearised(problem: TrackProblem, solution: Solution) -> _Piece:
         offsets[intervals_within],
         kicks[intervals_within],
         start,
-        label is not None,
+        label is not None and label.measured,
+        group_sigmas,
     )
 
 
@@ -206,5 +216,6 @@ def _side_by_side(pieces: Sequence[_Piece], numbers: Array, coefficient_sigmas: 
         kicks=stacked((p.kicks for p in pieces), longest - 1, "zero"),
         starts=torch.from_numpy(np.stack([p.start for p in pieces])),
         labelled=torch.tensor([p.labelled for p in pieces]),
+        group_sigmas=torch.from_numpy(np.stack([p.group_sigmas for p in pieces])),
         coefficient_sigmas=coefficient_sigmas,
     )

@@ -79,7 +79,7 @@ def parameters_of(
     if bool(tracks.labelled.any()):
         label = settings.spin_label_noise if settings.launcher is None else settings.launcher.sigma
         found.append(Parameter("spin_label", None, label, FACTOR_FOUR, 1.0, 300.0))
-    if not bool(tracks.labelled.all()):
+    if not bool((tracks.labelled | ~tracks.group_sigmas.isnan().any(dim=1)).all()):
         found.append(Parameter("spin_prior", None, settings.spin_prior, FACTOR_FOUR, 3.0, 500.0))
     if settings.coefficients:
         found.append(Parameter(COEFFICIENTS, None, 1.0, FACTOR_TWO, 0.03, 5.0))

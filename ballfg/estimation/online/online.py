@@ -25,6 +25,7 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities
+from ballfg.estimation.launcher import FIRST_SAMPLES, group_spin
 from ballfg.estimation.observations.observation import Observation
 from ballfg.estimation.online.events import EventTracker
 from ballfg.estimation.online.explanation import explain, move_contacts, tell_velocities
@@ -316,12 +317,23 @@ class Online(Estimator):
         moved = move_contacts(window, self._samples, self.events)
         if moved:
             self._append(window, *moved)
+        if self._shows_direction(window):
+            assert self.settings.spins is not None
+            times, positions = (np.array([getattr(s, name) for s in self._samples]) for name in ("time", "position"))
+            launch = Track(times, positions, name="stream", part=True)
+            self._samples[0].label = group_spin(self.settings.spins, launch, self.settings.group)
+            update = window.start_anew(self._samples)
         if len(window) > 2 * self.lag:
             if self._frozen is not None:
                 self._frozen += freeze(window, len(window) - self.lag)
             window.shorten(self.lag)
             self._samples = list(window.samples)
         return max(len(again), len(moved)), update
+
+    def _shows_direction(self, window: StreamWindow) -> bool:
+        """True once a stream shows the direction of its launch, along which the spins of a group count."""
+        begun = window.first == 0 and len(self._samples) == FIRST_SAMPLES
+        return self.settings.spins is not None and begun and self._samples[0].label is None
 
     def _append(self, window: StreamWindow, *samples: Sample) -> Update:
         update = window.append_all(samples)

@@ -201,7 +201,7 @@ def _priors(track: Track, segmentation: Segmentation, settings: Settings) -> lis
     else:
         batches += start_priors(0, track.positions[0], settings.spin_label(track), settings)
     anew = replace(settings, spin_prior=max(settings.spin_prior, LEAST_SPIN_PRIOR))
-    for interval in segmentation.restarts:
+    for interval in segmentation.restarts:  # spin after a hit is not that of the group
         batches += start_priors(int(interval) + 1, track.positions[int(interval) + 1], None, anew)
     return batches
 
@@ -215,12 +215,11 @@ def start_priors(state: int, position: Array, label: SpinLabel | None, settings:
         label: prior of the spin; None for the spin prior.
         settings: spreads and losses.
     """
-    spin, spread = spin_start(label, settings)
-    where, spreads = np.array([state]), np.full((1, 3), spread)
-    if label is None:
-        about = spin_prior(where, spin[None], spreads, settings.spin_loss)
+    known, where = spin_start(label, settings), np.array([state])
+    if known.measured:
+        about: PriorFactors = spin_label(where, known.spin[None], known.sigmas[None], settings.label_loss)
     else:
-        about = spin_label(where, spin[None], spreads, settings.label_loss)
+        about = spin_prior(where, known.spin[None], known.sigmas[None], settings.spin_loss, known.axes)
     return [_wide_prior(state, position, settings), about]
 
 

@@ -18,7 +18,7 @@ from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.batch import segment
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.segmentation.result import Segmentation
-from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
+from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, total_sigmas
 from ballfg.estimation.sides.widening import widened_near_contacts
 from ballfg.estimation.smoother.problem import Events, TrackProblem
 from ballfg.estimation.smoother.second_look.at_end import with_both_sides
@@ -177,7 +177,7 @@ class Smoother(Estimator):
                     minimum = minimise_with_restart(rough, graph, values, minimum)
                 arrangement = search.after(Solution(events, graph, minimum))
             solution = search.best
-            if earlier is None and self.settings.spin_label(problem.track) is None:
+            if earlier is None and not spin_start(self.settings.spin_label(problem.track), self.settings).measured:
                 solution = with_other_spins(solution, problem.ball, rough)
             if before is not None and leads_nowhere(solution, before):
                 break

@@ -147,3 +147,38 @@ def test_failed_estimates_are_refused(mean: Array, covariance: Array, message: s
         evidence(mean, covariance, np.zeros(1), np.ones(1))
     with pytest.raises(ValueError, match="tracks must hold at least one"):
         fit_population([], np.zeros(1), np.ones(1), *unbounded(1))
+
+
+def test_groups_share_a_coefficient_and_reach_the_maximum_of_the_dense_likelihood() -> None:
+    rng, count = np.random.default_rng(8), 24
+    start, sigma = np.array([0.2, 0.0, 0.0]), np.array([1.0, 3.0, 3.0])
+    numbers = np.array([[0, 1 + k % 2] for k in range(count)])  # each group has a second mean of its own
+    true, spread = np.array([0.5, -2.0, 1.5]), np.array([0.2, 0.5, 0.3])
+    y, covariances = [], []
+    for own in numbers:
+        root = rng.normal(size=(2, 2)) * np.array([0.3, 0.6])
+        covariances.append(root @ root.T + 0.02 * np.eye(2))
+        y.append(rng.multivariate_normal(true[own], covariances[-1] + np.diag(spread[own] ** 2)))
+    tracks = [gaussian(a, c) for a, c in zip(y, covariances, strict=True)]
+    found = fit_population(tracks, start, sigma, *unbounded(3), numbers)
+
+    def dense(mean: Array, variance: Array) -> float:
+        total = sum(
+            multivariate_normal.logpdf(a, mean[own], c + np.diag(variance[own]))
+            for a, c, own in zip(y, covariances, numbers, strict=True)
+        )
+        return float(total + multivariate_normal.logpdf(mean, start, np.diag(sigma**2)))
+
+    variance = found.spread**2
+    best = dense(found.mean, variance)
+    for k in range(3):
+        for step in (1e-3, -1e-3):
+            shift = step * np.eye(3)[k]
+            assert dense(found.mean + shift, variance) < best
+            if (variance + shift)[k] >= 0.0:
+                assert dense(found.mean, variance + shift) < best
+    other = fit_population(tracks, start, sigma, np.full(3, -np.inf), np.array([np.inf, -2.5, np.inf]), numbers)
+    np.testing.assert_allclose(
+        found.log_likelihood - other.log_likelihood, best - dense(other.mean, other.spread**2), rtol=1e-8
+    )
+    assert np.all(np.abs(found.mean - true) < 3.5 * found.sigma)

@@ -1,0 +1,200 @@
+"""Finds the spins of groups of tracks together with the coefficients: more numbers of the same population.
+
+Each track's posterior of its first spin, along its launch, stands beside that of its coefficients, with their
+correlation; the prior's information is removed from both. The spins of a group's tracks are draws about the group's
+mean, with the group's spread along each axis (`fit_population`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from ballfg.arrays import Array, Index
+from ballfg.checks import listed, shown
+from ballfg.dynamics.population import SpinGroup, SpinPopulation, launch_axes
+from ballfg.dynamics.variation import Variation
+from ballfg.estimation import Estimate, Settings
+from ballfg.factors.loss import Loss
+from ballfg.learning.calibration.coefficients import Chosen
+from ballfg.learning.calibration.population import Evidence, Population, evidence, fit_population
+from ballfg.state import SPIN, VELOCITY
+from ballfg.tracks import Dataset
+
+WIDEST: Final = 200.0
+"""rad/s, standard deviation of the prior of a group's mean spin about zero; its spread begins there."""
+LABEL_PRIOR: Final = 2000.0
+"""rad/s, the smoother's prior beside a spin label (`UNINFORMATIVE_SPIN`)."""
+OWN: Final = "group"
+"""The label without which a dataset is one group of its own name."""
+Three = tuple[float, float, float]
+
+
+class GroupSpin(BaseModel):
+    """The spins of one group, (3,) rad/s forward, across and up; all zero before the first step."""
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
+
+    mean: Three = (0.0, 0.0, 0.0)
+    sigma: Three = (0.0, 0.0, 0.0)
+    """Standard errors of the mean."""
+    spread: Three = (0.0, 0.0, 0.0)
+    """Standard deviations between tracks."""
+    next_track: Three = (0.0, 0.0, 0.0)
+    """Standard deviations of a new track's spin about the mean."""
+
+    @classmethod
+    def rows(cls, mean: Array, sigma: Array, spread: Array, next_track: Array, first: int) -> tuple[GroupSpin, ...]:
+        """Of each group. Args: mean, sigma, spread, next_track: (first + 3 groups,) the coefficients come first."""
+        parts = [values[first:].reshape(-1, 3).tolist() for values in (mean, sigma, spread, next_track)]
+        names = ("mean", "sigma", "spread", "next_track")
+        return tuple(
+            cls(**dict(zip(names, (tuple(p) for p in part), strict=True))) for part in zip(*parts, strict=True)
+        )
+
+
+@dataclass(frozen=True)
+class Groups:
+    """The groups of a calibration.
+
+    Attributes:
+        by: the label that names them.
+        names: of the fitted tracks' groups, sorted.
+        tracks: the group of each fitted track, by the track's name.
+        labelled: names of the fitted tracks with a spin label, which takes the place of the group's prior.
+        own: the group of tracks without the label.
+    """
+
+    by: str
+    names: tuple[str, ...]
+    tracks: Mapping[str, str]
+    labelled: frozenset[str]
+    own: str
+
+    @classmethod
+    def of(cls, dataset: Dataset, by: str, fit: Sequence[str]) -> Groups:
+        """The groups of a dataset's fitted tracks. Raises: ValueError: if no track has the label."""
+        if by not in dataset.label_names and by != OWN:
+            known = listed(dataset.label_names) if dataset.label_names else "none"
+            raise ValueError(
+                f"groups must be a label of {dataset.path}, which has {known}; got {shown(by)}. Add the column to "
+                f"labels.csv, or give '{OWN}' for one group of all tracks."
+            )
+        own, wanted = dataset.info.name, set(fit)
+        fitted = [track for track in dataset if track.name in wanted]
+        tracks = {track.name: str(track.labels.get(by, own)) for track in fitted}
+        labelled = frozenset(track.name for track in fitted if track.spin_label is not None)
+        return cls(by, tuple(sorted(set(tracks.values()))), tracks, labelled, own)
+
+    @property
+    def start(self) -> tuple[GroupSpin, ...]:
+        """Before the first step."""
+        return (GroupSpin(),) * len(self.names)
+
+    def population(self, spins: Sequence[GroupSpin]) -> SpinPopulation:
+        """The population for a model file. Args: spins: of each group, in the order of the names."""
+        return self._population([(spin.mean, spin.next_track) for spin in spins])
+
+    def settings(self, settings: Settings, population: SpinPopulation) -> Settings:
+        """Settings with a population, in which a track without the label is of the dataset's own group."""
+        return replace(settings, spins=population, group=self.own if self.own in population.groups else None)
+
+    def wide(self, settings: Settings, spins: Sequence[GroupSpin]) -> Settings:
+        """Settings with a wide Gaussian prior about each group's last mean, which `evidence` removes again."""
+        sigma = (settings.spin_prior,) * 3
+        about = self._population([(spin.mean, sigma) for spin in spins])
+        return replace(self.settings(settings, about), spin_loss=Loss("squared"))
+
+    def evidence(
+        self, estimate: Estimate, chosen: Chosen, about: Array, spins: Sequence[GroupSpin], spin_prior: float
+    ) -> Evidence:
+        """The likelihood of one track's coefficients and first spin, (p + 3) numbers.
+
+        Args:
+            estimate: with the settings of `wide`.
+            chosen: the coefficients.
+            about: (p,) those of its model.
+            spins: as for `wide`.
+            spin_prior: rad/s, the width of `wide`.
+        Raises: ValueError: if the covariance is not positive definite.
+        """
+        columns, size = [estimate.coefficient_names.index(name) for name in chosen.names], len(chosen.names)
+        axes = launch_axes(estimate.states[0, VELOCITY])
+        covariance = np.zeros((size + 3, size + 3))
+        covariance[:size, :size] = estimate.coefficient_covariance[np.ix_(columns, columns)]
+        covariance[size:, size:] = axes @ estimate.covariances[0][SPIN, SPIN] @ axes.T
+        covariance[size:, :size] = axes @ estimate.cross_covariances[0][SPIN][:, columns]
+        covariance[:size, size:] = covariance[size:, :size].T
+        mean = np.concatenate((estimate.coefficients[columns], axes @ estimate.states[0, SPIN]))
+        labelled = estimate.name in self.labelled
+        before = np.zeros(3) if labelled else np.array(spins[self._number(estimate.name)].mean)
+        sigma = np.full(3, LABEL_PRIOR if labelled else spin_prior)
+        return evidence(mean, covariance, np.concatenate((about, before)), np.concatenate((chosen.sigma, sigma)))
+
+    def fit(
+        self, evidences: Sequence[Evidence], tracks: Sequence[str], chosen: Chosen
+    ) -> tuple[Population, dict[str, tuple[float, ...]], tuple[GroupSpin, ...], Array]:
+        """The population of all tracks, and what differs between groups.
+
+        A coefficient gets a mean and a spread for each group if that raises the log likelihood by more than half the
+        logarithm of the number of tracks for each further number (G. Schwarz, "Estimating the dimension of a model",
+        Ann. Statist. 6, 1978).
+
+        Args: evidences: of the tracks.  tracks: their names.  chosen: the coefficients.
+        Returns: the population with coefficients shared by all groups; means by group of those that differ; spins;
+            (p,) standard deviations of a new track's coefficients about the mean of its group.
+        """
+        columns, numbers, size = self.beside(chosen), self.numbers(tracks, chosen), len(chosen.names)
+        best = shared = fit_population(evidences, *columns, numbers)
+        own = np.array([self._number(name) for name in tracks])
+        apart: dict[str, int] = {}
+        for k, name in enumerate(chosen.names) if len(self.names) > 1 else ():
+            first = len(columns[0])
+            split = numbers.copy()
+            split[:, k] = first + own
+            wider = tuple(np.append(values, np.full(len(self.names), values[k])) for values in columns)
+            found = fit_population(evidences, *wider, split)
+            if found.log_likelihood - best.log_likelihood > (len(self.names) - 1) * np.log(len(tracks)):
+                best, columns, numbers, apart[name] = found, wider, split, first
+        next_track = np.sqrt((best.next_track[numbers[:, :size]] ** 2).mean(axis=0))
+        values = {name: tuple(best.mean[k : k + len(self.names)].tolist()) for name, k in apart.items()}
+        rows = (values_of[: size + 3 * len(self.names)] for values_of in _columns_of(best))
+        return shared, values, GroupSpin.rows(*rows, size), next_track
+
+    def variations(self, by_group: Mapping[str, Sequence[float]]) -> dict[str, Variation]:
+        """The entries of a model file. Args: by_group: means in the order of the names, by coefficient."""
+        return {
+            name: Variation(self.by, dict(zip(self.names, values, strict=True))) for name, values in by_group.items()
+        }
+
+    def beside(self, chosen: Chosen) -> tuple[Array, Array, Array, Array]:
+        """Start, sigma and both bounds of all means: (p + 3 groups,) each, the coefficients first."""
+        count = 3 * len(self.names)
+        further = (np.zeros(count), np.full(count, WIDEST), np.full(count, -np.inf), np.full(count, np.inf))
+        own = (chosen.start, chosen.sigma, chosen.low, chosen.high)
+        start, sigma, low, high = (np.concatenate(pair) for pair in zip(own, further, strict=True))
+        return start, sigma, low, high
+
+    def numbers(self, tracks: Sequence[str], chosen: Chosen) -> Index:
+        """(n, p + 3) which of the means of `beside` the numbers of each track, by its name, are draws about."""
+        size = len(chosen.names)
+        firsts = size + 3 * np.array([self._number(name) for name in tracks])
+        shared = np.tile(np.arange(size), (len(tracks), 1))
+        return np.concatenate((shared, firsts[:, None] + np.arange(3)), axis=1)
+
+    def _number(self, track: str) -> int:
+        return self.names.index(self.tracks[track])
+
+    def _population(self, spins: Sequence[tuple[Three, Three]]) -> SpinPopulation:
+        counts = list(self.tracks.values())
+        rows = zip(self.names, spins, strict=True)
+        return SpinPopulation(self.by, {name: SpinGroup(*spin, counts.count(name)) for name, spin in rows})
+
+
+def _columns_of(population: Population) -> tuple[Array, Array, Array, Array]:
+    """Mean, its standard error, spread and standard deviation of a new track, of every number."""
+    return population.mean, population.sigma, population.spread, population.next_track

@@ -1,0 +1,127 @@
+"""The spins of a group of shots as the prior of a track's first spin, in every estimator."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from ballfg.dynamics import Surfaces, nominal_model
+from ballfg.dynamics.motion.paths import paths
+from ballfg.dynamics.population import SpinGroup, SpinPopulation, launch_axes
+from ballfg.estimation import Online, Settings, Smoother, predict_tracks
+from ballfg.estimation.noise.linear_tracks import linearise
+from ballfg.estimation.registry import make_estimator
+from ballfg.factors.loss import Loss
+from ballfg.state import SPIN, VELOCITY
+from ballfg.tracks import Track
+from ballfg.tracks.track import SPIN_LABELS
+
+MODEL, TABLE = nominal_model(), Surfaces.table_tennis(0.0)
+SPINS = SpinPopulation(
+    "player",
+    {
+        "ann": SpinGroup((5.0, 150.0, -20.0), (4.0, 12.0, 8.0), 10),
+        "bob": SpinGroup((0.0, -100.0, 10.0), (6.0, 9.0, 15.0), 10),
+    },
+)
+START = np.array([0.0, 0.0, 0.5, -3.0, 4.0, 1.0])
+"""First position and velocity, in no axis' direction."""
+NEAR = 0.02
+"""As the direction of a launch from ten samples."""
+
+
+def shot(group: str, samples: int = 40, **labels: str) -> Track:
+    """A track of a ball with the mean spin of a group, sampled at 100 Hz with 1 mm of noise."""
+    times = np.arange(samples) * 0.01
+    spin = np.array(SPINS.groups[group].mean) @ launch_axes(START[3:])
+    with torch.no_grad():
+        path = paths(MODEL, torch.from_numpy(np.append(START, spin))[None], torch.from_numpy(times), TABLE)
+    noise = np.random.default_rng(6).normal(0.0, 0.001, (samples, 3))
+    return Track(times, path[0, :, :3].numpy() + noise, labels=labels)
+
+
+def settings(**changes: object) -> Settings:
+    return Settings.for_measured(MODEL, **({"spins": SPINS, "position_noise": (0.001,) * 3} | changes))
+
+
+@pytest.mark.parametrize("method", ["smoother", "online", "ekf", "sliding-window"])
+@pytest.mark.parametrize(("labels", "group"), [({"player": "ann"}, None), ({}, "ann"), ({"player": "ann"}, "bob")])
+def test_a_short_track_has_the_spin_of_its_group(method: str, labels: dict[str, str], group: str | None) -> None:
+    track = shot("ann", 12, **labels)
+    estimate = make_estimator(method, MODEL, TABLE, settings(group=group)).estimate(track)
+    axes = launch_axes(START[3:])
+    spin, covariance = axes @ estimate.states[0, SPIN], axes @ estimate.covariances[0][SPIN, SPIN] @ axes.T
+    known = SPINS.groups["ann"]
+    np.testing.assert_allclose(spin, known.mean, atol=0.3 * min(known.sigma) + NEAR * 150.0)
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), known.sigma, rtol=0.1)
+
+
+def test_a_group_like_the_usual_prior_changes_nothing() -> None:
+    usual = SpinPopulation("player", {"all": SpinGroup((0.0,) * 3, (60.0,) * 3, 1)})
+    track = shot("ann")
+    one, other = (Smoother(MODEL, TABLE, settings(spins=spins)).estimate(track) for spins in (None, usual))
+    np.testing.assert_allclose(other.states, one.states, atol=1e-6)
+    np.testing.assert_allclose(other.covariances, one.covariances, rtol=1e-6, atol=1e-9)
+
+
+def test_an_unknown_group_has_the_mixture_as_prior() -> None:
+    track = shot("ann", 4)
+    vague = settings(spin_loss=Loss("squared"), position_noise=(0.02,) * 3)
+    estimate = Smoother(MODEL, TABLE, vague).estimate(track)
+    mean, covariance = SPINS.spin(None)
+    axes = launch_axes(START[3:])
+    np.testing.assert_allclose(axes @ estimate.states[0, SPIN], mean, atol=5.0)
+    np.testing.assert_allclose(axes @ estimate.covariances[0][SPIN, SPIN] @ axes.T, covariance, rtol=0.05, atol=150.0)
+
+
+def test_a_spin_label_takes_precedence() -> None:
+    spin = np.array(SPINS.groups["ann"].mean) @ launch_axes(START[3:])
+    label = dict(zip(SPIN_LABELS, spin.tolist(), strict=True))
+    track = replace(shot("ann", 12), labels={"player": "bob", **label})
+    estimate = Smoother(MODEL, TABLE, settings()).estimate(track)
+    np.testing.assert_allclose(estimate.states[0, SPIN], spin, atol=10.0)
+
+
+def test_the_group_makes_a_prediction_better() -> None:
+    track = shot("bob")
+    errors = []
+    for own in (settings(group="bob"), settings(spins=None)):
+        (found,) = predict_tracks(Smoother(MODEL, TABLE, own), [track], 1, 0.15)
+        errors.append(np.linalg.norm(found.positions - found.measured, axis=1).max())
+    assert errors[0] < 0.7 * errors[1]
+
+
+def test_a_stream_has_the_spin_of_its_group_once_its_direction_shows() -> None:
+    track = shot("ann", 14)
+    online = Online(MODEL, TABLE, settings(group="ann"))
+    states = [online.push(t, x) for t, x in zip(track.times, track.positions, strict=True)]
+    axes, known = launch_axes(START[3:]), SPINS.groups["ann"]
+    assert np.linalg.norm(axes @ states[8].state[SPIN] - known.mean) > 80.0
+    for state in states[9:]:
+        np.testing.assert_allclose(axes @ state.state[SPIN], known.mean, atol=5.0)
+    whole = Online(MODEL, TABLE, settings(group="ann")).estimate(track)
+    np.testing.assert_allclose(states[-1].state[SPIN], whole.states[-1, SPIN], atol=1.0)
+    np.testing.assert_allclose(states[-1].state[VELOCITY], whole.states[-1, VELOCITY], atol=0.01)
+
+
+def test_a_linearised_track_has_its_groups_prior() -> None:
+    track = shot("ann")
+    linear = linearise(Smoother(MODEL, TABLE, settings(group="ann")), [track])
+    assert linear is not None
+    assert not linear.labelled.any()
+    np.testing.assert_allclose(np.sort(linear.group_sigmas[0]), np.sort(SPINS.groups["ann"].sigma))
+    # whatever the axes, the first spin moves the next state in the same way
+    plain = linearise(Smoother(MODEL, TABLE, settings(spins=None)), [track])
+    assert plain is not None
+    one, other = (t.transitions[0, 0, :9, SPIN].numpy() for t in (linear, plain))
+    np.testing.assert_allclose(one @ one.T, other @ other.T, rtol=0.05, atol=1e-7)
+
+
+def test_a_group_without_populations_or_an_unknown_name_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"group must be None for a model without groups; got 'ann'.*groups: LABEL"):
+        settings(spins=None, group="ann")
+    with pytest.raises(ValueError, match="group must be one of the model's, ann, bob; got 'eve'"):
+        settings(group="eve")
