@@ -197,7 +197,9 @@ def _advance(problem: Problem, last: Step, watch: Watch) -> Step:
     spins = () if groups is None else last.spins or groups.start
     fits, evidences, skipped = _fit_tracks(problem, about, spins, watch)
     size, before = len(about), np.concatenate((about, *(spin.mean for spin in spins)))
-    next_track, by_group, found = None, {}, ()
+    next_track: Array | None = None
+    by_group: dict[str, tuple[float, ...]] = {}
+    found: tuple[GroupSpin, ...] = ()
     if groups is None:
         population = fit_population(evidences, chosen.start, chosen.sigma, chosen.low, chosen.high)
     else:

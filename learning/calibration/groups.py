@@ -156,14 +156,15 @@ class Groups:
             first = len(columns[0])
             split = numbers.copy()
             split[:, k] = first + own
-            wider = tuple(np.append(values, np.full(len(self.names), values[k])) for values in columns)
+            start, sigma, low, high = (np.append(values, np.full(len(self.names), values[k])) for values in columns)
+            wider = (start, sigma, low, high)
             found = fit_population(evidences, *wider, split)
             if found.log_likelihood - best.log_likelihood > (len(self.names) - 1) * np.log(len(tracks)):
                 best, columns, numbers, apart[name] = found, wider, split, first
         next_track = np.sqrt((best.next_track[numbers[:, :size]] ** 2).mean(axis=0))
         values = {name: tuple(best.mean[k : k + len(self.names)].tolist()) for name, k in apart.items()}
-        rows = (values_of[: size + 3 * len(self.names)] for values_of in _columns_of(best))
-        return shared, values, GroupSpin.rows(*rows, size), next_track
+        mean, sigma, spread, next_spin = (values_of[: size + 3 * len(self.names)] for values_of in _columns_of(best))
+        return shared, values, GroupSpin.rows(mean, sigma, spread, next_spin, size), next_track
 
     def variations(self, by_group: Mapping[str, Sequence[float]]) -> dict[str, Variation]:
         """The entries of a model file. Args: by_group: means in the order of the names, by coefficient."""

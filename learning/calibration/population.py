@@ -179,7 +179,7 @@ class _Means:
 
     def summed(self, values: Array) -> Array:
         """(p,) sums of values (n, k) by mean."""
-        return np.bincount(self.numbers.ravel(), values.ravel(), minlength=self.size)
+        return np.asarray(np.bincount(self.numbers.ravel(), values.ravel(), minlength=self.size), dtype=np.float64)
 
     def precision(self, information: Array, variance: Array) -> Array:
         """(p, p) of the means, their prior included."""
@@ -189,7 +189,7 @@ class _Means:
 
     def best(self, information: Array, moved: Array, variance: Array) -> Array:
         """(p,) the best means for some variances (n, k)."""
-        target = self.summed(np.linalg.solve(_mixing(information, variance), moved[..., None])[..., 0])
+        target = self.summed(np.asarray(np.linalg.solve(_mixing(information, variance), moved[..., None])[..., 0]))
         precision = self.precision(information, variance)
         free = np.linalg.solve(precision, target)
         if ((self.bounds[0] <= free) & (free <= self.bounds[1])).all():

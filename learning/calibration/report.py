@@ -162,10 +162,10 @@ def table(problem: Problem, last: Step, comparison: Comparison) -> str:
         values = (problem.chosen.start[k], last.mean[k], last.sigma[k], last.spread[k])
         rows.append((name, problem.chosen.units[k], *(f"{value:.4g}" for value in values)))
     names = () if problem.groups is None else problem.groups.names
-    for coefficient, values in last.by_group.items():
+    for coefficient, means in last.by_group.items():
         k = problem.chosen.names.index(coefficient)
         start, unit = f"{problem.chosen.start[k]:.4g}", problem.chosen.units[k]
-        apart = zip(names, values, strict=True)
+        apart = zip(names, means, strict=True)
         rows += [(f"{coefficient} of {name}", unit, start, f"{value:.4g}", "", "") for name, value in apart]
     for name, spin in zip(names, last.spins, strict=True):
         for axis, *numbers in zip(AXES, spin.mean, spin.sigma, spin.spread, strict=True):

@@ -164,6 +164,7 @@ def _lowest(optimizer: LevenbergMarquardt, graph: BallGraph, starts: Sequence[Va
 def _posterior(problem: TrackProblem, minimum: Minimum) -> LabelPosterior:
     label = problem.settings.spin_label(problem.track)
     assert label is not None
+    assert isinstance(label.sigma, float)  # of a label, not of a group
     assert minimum.step is not None
     root = minimum.step.root
     covariance = marginal_covariances(root).states[0][SPIN, SPIN]
