@@ -127,13 +127,15 @@ def low_hops(
         if number == 0:
             low &= surfaces.over_table(torch.from_numpy(track.positions)).numpy()
         for first, last in _runs(low, events):
-            law, inside = ball.law(track.positions[first], most), slice(first, last + 1)
-            if law.gravity <= 0.0 or track.times[last] - track.times[first] <= 2.0 * np.sqrt(2.0 * most / law.gravity):
+            position, inside = track.positions[first], slice(first, last + 1)
+            gravity = ball.gravity(position)
+            if gravity <= 0.0 or track.times[last] - track.times[first] <= 2.0 * np.sqrt(2.0 * most / gravity):
                 continue
+            law = ball.law(position, most, gravity)
             phases = int(np.clip(4.0 * most / np.median(sigma[inside]), LEAST_PHASES, MOST_PHASES))
             noise = np.maximum(sigma[inside], 4.0 * most / phases)
             grid = HopGrid(law, phases, tick=0.25 * float(noise.min()) / law.fastest)
-            spread = max(ball.level_sigma(track.positions[first], height), SegmentationSettings().surface_sigma)
+            spread = max(ball.level_sigma(position, height), SegmentationSettings().surface_sigma)
             known = _known(grid, track.times[inside], gap[inside], noise, spread)
             least = float(np.sqrt(2.0 * law.gravity * np.median(sigma[inside])))
             found.append(LowHops(first, height, track.positions[inside, Z] - gap[inside], least, known))
@@ -233,12 +235,16 @@ class _Ball:
             gaps = self.model.gap(self._varied(position), height).numpy()
         return float(np.linalg.norm(gaps[1:] - gaps[0]))
 
-    def law(self, position: Array, most: float) -> HopLaw:
+    def gravity(self, position: Array) -> float:
+        """m/s^2, downwards, of a ball that hangs still at a position (3,) m."""
+        with torch.no_grad():
+            return -float(self.model.rates(self._still(position[None], self.means))[0][0, Z])
+
+    def law(self, position: Array, most: float, gravity: float) -> HopLaw:
         """Parameters of hops up to a height `most` m above a surface, at a position (3,) m."""
         varied = self._varied(position)
         with torch.no_grad():
-            gravity = -float(self.model.rates(varied[:1])[0][0, Z])
-            fall = float(np.sqrt(2.0 * max(gravity, 0.0) * most))
+            fall = float(np.sqrt(2.0 * gravity * most))
             known = self._rebound(varied[:1], torch.tensor([max(fall, 2.0 * REST_SPEED)], dtype=torch.float64))[0, 0]
             speeds = HopLaw.speeds(max(fall * fall / max(float(known), 0.5 * fall), 2.0 * REST_SPEED))
             rebound = self._rebound(varied, torch.from_numpy(speeds)).numpy()
