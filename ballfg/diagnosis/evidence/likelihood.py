@@ -82,9 +82,13 @@ class Local:
 
 @dataclass(frozen=True)
 class Posterior:
-    """Evidence of a model, and mean (c,) and covariance (c, c) of its common unknowns, as steps from the fit."""
+    """Evidence of a model, and mean (c,) and covariance (c, c) of its common unknowns, as steps from the fit.
+
+    `square` is that of all rows and priors, over their variances, at the mean.
+    """
 
     evidence: float
+    square: float
     mean: Array
     covariance: Array
 
@@ -105,12 +109,19 @@ class Likelihood:
     penalty: Array
 
     @cached_property
+    def spin_columns(self) -> Array:
+        """(n, 3, d) weighted spin rows: columns start, random, common, residual."""
+        r = self.rows
+        rows = (r.by_start[:, -3:], r.motion.columns[:, -3:], r.by_common[:, -3:], r.residual[:, -3:, None])
+        return np.concatenate(rows, axis=-1) * np.sqrt(self.spins)[:, None, None]
+
+    @cached_property
     def grams(self) -> tuple[Array, Array]:
         """Two (n, d, d): of the samples, and of the spin rows; columns start, random, common, residual."""
         r = self.rows
         columns = np.concatenate((r.by_start, r.motion.columns, r.by_common, r.residual[..., None]), axis=-1)
-        root = np.sqrt(np.repeat(self.samples * r.used, 3, axis=1))[..., None]
-        positions, spins = columns[:, :-3] * root, columns[:, -3:] * np.sqrt(self.spins)[:, None, None]
+        root, spins = np.sqrt(np.repeat(self.samples * r.used, 3, axis=1))[..., None], self.spin_columns
+        positions = columns[:, :-3] * root
         return positions.swapaxes(1, 2) @ positions, spins.swapaxes(1, 2) @ spins
 
     def inner(self, noise: Noise) -> tuple[Array, Array]:
@@ -135,30 +146,33 @@ class Likelihood:
         narrow = np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)
         return Reduced(logs - narrow - self.penalty, gram), Local(lower, solved)
 
-    def slope(self, noise: Noise, local: Local, found: Posterior) -> Array:
-        """(6,) derivative of the evidence by the logarithms of the sizes: expected squares less their number."""
-        end = STATE_DIM + self.rows.motion.kinds.shape[1]
+    def slope(self, noise: Noise, local: Local, found: Posterior, precision: Array, away: Array) -> Array:
+        """(6,) derivative of the evidence by the logarithms of the sizes: expected squares less their number.
+
+        The expected squares over their variances of all rows and priors add up to the square at the mean plus one for
+        each unknown, so that those of the samples follow from the others.
+        """
+        kinds = self.rows.motion.kinds
+        end = STATE_DIM + kinds.shape[1]
         upper = inverses(local.lower).swapaxes(1, 2)
         solved = upper @ local.solved  # (n, l, c + 1), what local unknowns absorb of each column
-        step = np.append(-found.mean, 1.0)
-        mean = solved @ step
-        inverse = upper @ upper.swapaxes(1, 2)
-        root = np.linalg.cholesky(found.covariance)
-        moved = solved[..., :-1] @ root
-        squares = mean**2 + np.diagonal(inverse, axis1=1, axis2=2) + (moved**2).sum(axis=-1)
-        left = np.zeros((len(mean), end + len(step), len(step)))
-        left[:, :end, 0], left[:, end:, 0] = -mean, step
-        left[:, :end, 1:], left[:, end:-1, 1:] = -moved, root
-        slopes = []
-        for gram, log, count in zip(
-            self.grams, (noise.white, noise.spin), (3.0 * self.rows.used.sum(), 3.0 * len(mean)), strict=True
-        ):
-            square = ((gram @ left) * left).sum() + (gram[:, :end, :end] * inverse).sum()
-            slopes.append(float(square) * np.exp(-2.0 * log) - count)
-        kinds, own = self.rows.motion.kinds, squares[:, STATE_DIM:]
-        for kind, log in enumerate(noise.random):
-            slopes.append(float(own[kinds == kind].sum()) * np.exp(-2.0 * log) - int((kinds == kind).sum()))
-        return np.array(slopes)
+        step, root = np.append(-found.mean, 1.0), np.linalg.cholesky(found.covariance)
+        mean, moved = solved @ step, solved[..., :-1] @ root
+        squares = mean**2 + (upper**2).sum(axis=-1) + (moved**2).sum(axis=-1)
+        own = [squares[:, STATE_DIM:][kinds == kind] for kind in range(len(noise.random))]
+        shown = [float(o.sum()) * np.exp(-2.0 * log) for o, log in zip(own, noise.random, strict=True)]
+        spins = self.spin_columns
+        left = spins[..., end:] @ step - (spins[..., :end] @ mean[..., None])[..., 0]
+        scattered = (spins[..., end:-1] - spins[..., :end] @ solved[..., :-1]) @ root
+        square = (left**2).sum() + (scattered**2).sum() + ((spins[..., :end] @ upper) ** 2).sum()
+        spin = float(square) * np.exp(-2.0 * noise.spin)
+        prior = float(precision @ ((away - found.mean) ** 2 + np.diagonal(found.covariance)))
+        shows = sum(np.diagonal(gram, axis1=1, axis2=2)[:, :STATE_DIM] for gram in self.grams)
+        unseen = (shows == 0.0).sum() + (kinds < 0).sum()  # `inner` gives these unknowns a prior of their own
+        unknowns = mean.shape[0] * end - unseen + len(found.mean)
+        white = found.square + float(unknowns) - sum(shown) - spin - prior
+        counts = [3.0 * self.rows.used.sum(), 3.0 * len(mean), *(float(o.size) for o in own)]
+        return np.array([white, spin, *shown]) - counts
 
     def local_step(self, noise: Noise, common: Array) -> Array:
         """(n, l) first states and random motion that follow a step (c,) of the common unknowns."""
@@ -197,7 +211,7 @@ def posterior(reduced: Reduced, precision: Array, away: Array) -> Posterior:
     mean = covariance @ gradient
     square = total[-1, -1] - gradient @ mean + float((precision * away**2).sum())
     narrow = np.log(np.diagonal(lower)).sum() - 0.5 * np.log(precision).sum()
-    return Posterior(float(reduced.constant.sum() - 0.5 * square - narrow), mean, covariance)
+    return Posterior(float(reduced.constant.sum() - 0.5 * square - narrow), float(square), mean, covariance)
 
 
 def settled(rows: Rows, precision: Array, away: Array, start: Noise | None = None) -> tuple[Likelihood, Noise]:
@@ -217,7 +231,7 @@ def settled(rows: Rows, precision: Array, away: Array, start: Noise | None = Non
             noise = Noise.of(vector)
             reduced, local = likelihood.reduced(noise)
             found = posterior(reduced, precision, away)
-            return -found.evidence, -likelihood.slope(noise, local, found)
+            return -found.evidence, -likelihood.slope(noise, local, found, precision, away)
 
         found = optimize.minimize(missing, now.vector, method="L-BFGS-B", jac=True, bounds=bounds, options=options)
         now = Noise.of(found.x)

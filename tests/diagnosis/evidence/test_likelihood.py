@@ -70,7 +70,7 @@ def test_derivative_is_that_of_differences(likelihood, prior):
         return posterior(likelihood.reduced(Noise.of(vector))[0], *prior).evidence
 
     reduced, local = likelihood.reduced(NOISE)
-    slope = likelihood.slope(NOISE, local, posterior(reduced, *prior))
+    slope = likelihood.slope(NOISE, local, posterior(reduced, *prior), *prior)
     step = 1e-5
     moved = [NOISE.vector + step * sign * axis for axis in np.eye(6) for sign in (1, -1)]
     differences = np.array([value(v) for v in moved]).reshape(6, 2) @ [1, -1] / (2 * step)
