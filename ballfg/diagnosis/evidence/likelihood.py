@@ -167,8 +167,8 @@ class Likelihood:
         square = (left**2).sum() + (scattered**2).sum() + ((spins[..., :end] @ upper) ** 2).sum()
         spin = float(square) * np.exp(-2.0 * noise.spin)
         prior = float(precision @ ((away - found.mean) ** 2 + np.diagonal(found.covariance)))
-        shows = sum(np.diagonal(gram, axis1=1, axis2=2)[:, :STATE_DIM] for gram in self.grams)
-        unseen = (shows == 0.0).sum() + (kinds < 0).sum()  # `inner` gives these unknowns a prior of their own
+        of_samples, of_spins = (np.diagonal(gram, axis1=1, axis2=2)[:, :STATE_DIM] for gram in self.grams)
+        unseen = int((of_samples + of_spins == 0.0).sum()) + int((kinds < 0).sum())  # `inner` gives them a prior
         unknowns = mean.shape[0] * end - unseen + len(found.mean)
         white = found.square + float(unknowns) - sum(shown) - spin - prior
         counts = [3.0 * self.rows.used.sum(), 3.0 * len(mean), *(float(o.size) for o in own)]
