@@ -32,7 +32,7 @@ from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.batch import FactorBatch
 from ballfg.state import POSITION, STATE_DIM
 from ballfg.tracks import Track
-from ballfg.tracks.track import SPIN_LABELS
+from ballfg.tracks.track import FASTEST_SPIN, SPIN_LABELS
 
 ROUNDS: Final = 20
 """Largest number of estimates of a track; a lag of 5 ms takes four or five, an offset of 30 ms a dozen."""
@@ -40,6 +40,9 @@ FIRST_ROUNDS: Final = 8
 """Steps of the fixed point on positions alone: they undo a stretch by 10 % to 1e-8."""
 SETTLED: Final = 1e-3
 """Standard deviations of a sample: shifts that change by less have converged."""
+IMPOSSIBLE: Final = (
+    f"the model reads the spin label as more than {FASTEST_SPIN:g} rad/s, as no ball spins: the label is not used"
+)
 LOST: Final = 1e4
 """Standard deviations of a sample, tens of metres: shifts that change by more diverge."""
 
@@ -101,6 +104,7 @@ class InvertMeasurement(Estimator):
             contacts=tuple(contacts),
             world=self.world,
             status=Status.NOT_CONVERGED if lost else found.status,
+            notes=found.notes + (IMPOSSIBLE,) * (track.spin_label is not None and undone.track.spin_label is None),
         )
         return result.dated(written.times)
 
@@ -129,11 +133,13 @@ class InvertMeasurement(Estimator):
         return best
 
     def _as_timed(self, track: Track) -> Track:
-        """The track with its true stamps and spin label."""
+        """The track with its true stamps and spin label; without a label that stands for a spin of no ball."""
         labels = track.labels
         if track.spin_label is not None:
             spin = self.labels.spin(track.spin_label)
-            labels = {**labels, **dict(zip(SPIN_LABELS, spin.tolist(), strict=True))}
+            labels = {name: value for name, value in labels.items() if name not in SPIN_LABELS}
+            if np.abs(spin).max() <= FASTEST_SPIN:
+                labels |= dict(zip(SPIN_LABELS, spin.tolist(), strict=True))
         return replace(track, times=true_times(self.model, track.times), labels=labels)
 
     def _first_shift(self, track: Track) -> Array:

@@ -20,6 +20,7 @@ from ballfg.factors.noise import ProcessNoise
 from ballfg.simulation import MeasurementNoise, SimulationConfig, parse_effects, simulate
 from ballfg.simulation.measure import SimulatedTrack
 from ballfg.state import POSITION, SPIN, VELOCITY
+from ballfg.tracks.track import SPIN_LABELS
 
 CONFIG = SimulationConfig(tracks=3, rate=60.0, seed=3, noise=MeasurementNoise(position=0.002, spin=4.0))
 BALL, SURFACES = CONFIG.ball.model, CONFIG.ball.surfaces
@@ -203,3 +204,14 @@ def test_plain_models_get_the_estimator_itself(method) -> None:
 def test_an_estimator_by_itself_refuses_measurement_effects(method) -> None:
     with pytest.raises(ValueError, match=f"no measurement effects for the estimator '{method}' by itself"):
         ESTIMATORS[method](declared(EFFECTS["scale"]()), SURFACES, SETTINGS)
+
+
+def test_a_label_that_stands_for_a_spin_of_no_ball_is_not_used(plain) -> None:
+    estimator = make_estimator("smoother", declared(EFFECTS["spin_label_scale"](s=-0.9)), SURFACES, SETTINGS)
+    track = plain[0].track
+    wild = replace(track, labels={**track.labels, "spin_x": 300.0, "spin_y": 0.0, "spin_z": 0.0})  # read as 3,000 rad/s
+    bare = replace(track, labels={n: v for n, v in track.labels.items() if n not in SPIN_LABELS})
+    found, expected = estimator.estimate(wild), estimator.estimate(bare)
+    np.testing.assert_array_equal(found.states, expected.states)
+    assert [note for note in found.notes if "no ball spins" in note]
+    assert not [note for note in expected.notes if "no ball spins" in note]
