@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import combinations
 
 import numpy as np
 from scipy import special
@@ -18,6 +19,8 @@ from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.state import STATE_DIM
 
 MIDDLE = WIDTHS.index(1.0)
+HELD = 1e-5
+"""Width of the prior of strengths that are held, in usual strengths."""
 WIDTH_ROUNDS = 2
 """Number of turns in which each effect gets its most probable width."""
 MOST_STEPS = 4
@@ -49,6 +52,7 @@ class Weighed:
         strengths: by name of the effect.
         held_out: (t,) logarithm of the density of each track, with coefficients of the other half.
         nameless: whether it holds patterns without a name as well.
+        nested: score of each smaller model, by its names, the rest linearised where it is.
     """
 
     named: tuple[Hypothesis, ...]
@@ -61,6 +65,7 @@ class Weighed:
     strengths: Mapping[str, Strengths]
     held_out: Array
     nameless: bool = False
+    nested: Mapping[frozenset[str], float] = field(default_factory=dict)
 
     @property
     def names(self) -> frozenset[str]:
@@ -117,24 +122,30 @@ class Priors:
             found[place] = (WIDTHS[width] * size) ** -2
         return found
 
-    def widths(self, reduced: Reduced) -> tuple[list[int], float]:
-        """The most probable widths, and the logarithm of the mean evidence over all widths less the evidence at these.
+    def widths(self, reduced: Reduced) -> tuple[list[int], list[float]]:
+        """The most probable widths, and for each the logarithm of the mean evidence over all less that at the best.
 
         Effects are taken one after the other, the others at their best width.
         """
-        chosen, mixed = [MIDDLE] * len(self.places), 0.0
+        chosen, mixed = [MIDDLE] * len(self.places), [0.0] * len(self.places)
         for _ in range(WIDTH_ROUNDS):
-            mixed = 0.0
             for effect in range(len(chosen)):
                 every = ([*chosen[:effect], width, *chosen[effect + 1 :]] for width in range(len(WIDTHS)))
                 evidence = np.array([self.posterior(reduced, widths).evidence for widths in every])
                 chosen[effect] = int(evidence.argmax())
-                mixed += float(special.logsumexp(evidence - evidence.max()) - np.log(len(WIDTHS)))
+                mixed[effect] = float(special.logsumexp(evidence - evidence.max()) - np.log(len(WIDTHS)))
         return chosen, mixed
 
     def posterior(self, reduced: Reduced, widths: Sequence[int]) -> Posterior:
         """The posterior of all common unknowns."""
         return posterior(reduced, self.precision(widths), self.away)
+
+    def without(self, effects: Sequence[int], reduced: Reduced, widths: Sequence[int]) -> float:
+        """The evidence with the strengths of some effects held where they are absent."""
+        precision = self.precision(widths)
+        for effect in effects:
+            precision[self.places[effect]] = (HELD * self.sizes[effect]) ** -2
+        return posterior(reduced, precision, self.away).evidence
 
 
 def weigh(fit: Fit, named: Sequence[Hypothesis] = (), *, nameless: bool = False) -> Weighed:
@@ -245,13 +256,29 @@ class _Question:
             noise,
             (likelihood.samples, likelihood.spins, likelihood.penalty),
             tuple(best),
-            result.evidence + mixed + choice_odds(self.named),
+            result.evidence + sum(mixed) + choice_odds(self.named),
             log_odds(self.named, self.nameless),
             strengths,
             held_out(priors, total, best, self.halves),
             self.nameless,
+            self._nested(priors, whole, best, mixed),
         )
         return found, _Step(likelihood.local_step(noise, result.mean)[:, :STATE_DIM], away, gain)
+
+    def _nested(
+        self, priors: Priors, whole: Reduced, widths: Sequence[int], mixed: Sequence[float]
+    ) -> dict[frozenset[str], float]:
+        """The score of every model with some of the effects: strengths of the others are held where they are absent."""
+        found, effects = {}, [h for h in self.named if h.strengths]
+        for count in range(1, len(effects) + 1):
+            for gone in combinations(range(len(effects)), count):
+                rest = [h for h in self.named if h not in [effects[place] for place in gone]]
+                if any(effects[place].effect.name in h.effect.needs for place in gone for h in rest):
+                    continue
+                evidence = priors.without(gone, whole, widths) + sum(mixed) - sum(mixed[place] for place in gone)
+                names = frozenset(h.name for h in rest) | frozenset([NAMELESS] * self.nameless)
+                found[names] = evidence + choice_odds(rest) + log_odds(rest, self.nameless)
+        return found
 
 
 def held_out(priors: Priors, by_tracks: Reduced, widths: Sequence[int], halves: Mask) -> Array:

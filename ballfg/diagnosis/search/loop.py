@@ -202,6 +202,11 @@ class _Found:
         """The model with all effects that are at least so probable, or with most of them."""
         odds = self.odds
         likely = {name for name in odds.effects() if odds.of(name) >= probability} | {NAMELESS}
+        if gone := [h for h in self.best.named if h.name not in likely]:
+            rest = self.without(gone)
+            if self.best.nameless:
+                self.beside_nameless([rest])
+            odds = self.odds
         able = [model for model in self.models.values() if model.names <= likely]
         return max(able, key=lambda model: (len(model.named), odds.models[model.names]))
 

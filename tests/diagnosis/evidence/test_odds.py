@@ -24,7 +24,10 @@ WIND = Hypothesis(EFFECTS["wind"], {}, ("x", "y", "z"))
 def model(names, evidence, held_out=None):
     named = [Hypothesis(EFFECTS[name], {}, ("x",)) for name in names]
     gains = np.full(10, evidence / 10.0) if held_out is None else np.asarray(held_out)
-    return SimpleNamespace(names=frozenset(names), evidence=evidence, odds=log_odds(named), held_out=gains)
+    odds = log_odds(named)
+    return SimpleNamespace(
+        names=frozenset(names), nested={}, evidence=evidence, odds=odds, score=evidence + odds, held_out=gains
+    )
 
 
 def test_a_strength_of_five_times_the_usual_one_costs_two_nats():
@@ -62,6 +65,25 @@ def test_what_the_other_half_does_not_bear_out_is_tempered():
     assert tempered(model(["wind"], -3.0), nothing) == -3.0
 
 
+def test_an_effect_whose_strength_is_nothing_is_not_believed():
+    """Its refit without it ended in a poorer minimum: the model with it knows better."""
+    nothing, both, wind = model([], 0.0), model(["wind", "scale"], 60.0), model(["wind"], 20.0)
+    assert odds_of([nothing, both, wind], nothing).of("scale") > 0.99
+    both.nested = {frozenset(["scale"]): 5.0, frozenset(["wind"]): 61.0 + wind.odds, frozenset(): 3.0}
+    odds = odds_of([nothing, both, wind], nothing)
+    assert odds.of("scale") < 0.1
+    assert odds.of("wind") > 0.99
+
+
+def test_the_evidence_without_an_effect_is_that_of_its_columns_left_out(calm_fit, windy_fit):
+    """On a calm day that of the declared model; in wind far below that of the model with wind."""
+    windy = refit(calm_fit, Scored(WIND, None, 0.0)).fit
+    with_wind = weigh(windy, [WIND])
+    assert with_wind.nested[frozenset()] == pytest.approx(weigh(calm_fit).score, abs=1.0)
+    needed = weigh(refit(windy_fit, Scored(WIND, None, 0.0)).fit, [WIND])
+    assert needed.nested[frozenset()] < needed.score - 20.0
+
+
 def test_a_choice_among_shapes_is_paid_for():
     assert choice_odds([Hypothesis(EFFECTS["gust_region"], {}, ("x",), 18)]) == pytest.approx(-np.log(18.0))
     assert choice_odds([WIND]) == 0.0
@@ -96,7 +118,7 @@ def test_patterns_lose_against_an_effect_that_is_there(windy_fit, calm_fit):
 
 def test_a_name_that_explains_a_part_is_not_believed_beside_patterns(make_ball, make_launches, make_shots, make_fit):
     """Wind that grows with the height: an even wind explains most of it, on both halves."""
-    sheared = make_ball(wind_shear={"x": 2.0, "y": -1.0})
+    sheared = make_ball(wind_shear={"x": 5.0, "y": -3.0})
     declared = make_fit(make_ball(), make_shots(sheared, make_launches(30, 5), 5).stretches)
     windy = refit(declared, Scored(WIND, None, 0.0)).fit
     without = [weigh(declared), weigh(windy, [WIND])]
