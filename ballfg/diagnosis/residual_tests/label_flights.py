@@ -132,6 +132,8 @@ def _labelled_flight(
     else:
         inverse = InvertMeasurement(Smoother, ball, surfaces, settings)
         track, smoother = inverse.undo(track).track, inverse.smoother
+    if smoother.settings.spin_label(track) is None:
+        return None  # the model reads the label as a spin of no ball
     bare = smoother.problem(replace(track, labels={}))
     flight = smoother.settle(bare)  # with the spin that the flight alone shows best
     near, wide = (
