@@ -21,7 +21,7 @@ from ballfg.diagnosis.residual_tests.tracker_errors import look_at_tracker
 from ballfg.diagnosis.result import Diagnosis, Errors, Fallback, Unexplained, Value, Verdict
 from ballfg.diagnosis.search.evaluation import prediction_errors, prediction_floor
 from ballfg.diagnosis.search.loop import NAMED, Search, SearchLoop
-from ballfg.diagnosis.search.plausible import implausible
+from ballfg.diagnosis.search.plausible import at_bound, implausible
 from ballfg.diagnosis.search.process_noise import Predicting, calibrated_model, noise_about
 from ballfg.diagnosis.search.stamp_effects import as_declared
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel
@@ -106,7 +106,7 @@ def diagnose(
         residuals_before=residuals,
         residuals_after=residuals if search.fit is search.first else residuals_of(search.fit),
         excluded=holdout.excluded,
-        remarks=tuple(strange(calibrated, model.radius)),
+        remarks=tuple(strange(search.whole, calibrated, model.radius)),
         floor_mm=floor,
         labels=labels,
         probabilities=search.odds.effects(),
@@ -160,11 +160,16 @@ def _with_own_noise(
     return corrected, tracker.noise, search
 
 
-def strange(calibrated: Mapping[str, Value], radius: float) -> list[str]:
-    """Sentences on declared coefficients with implausible fitted values."""
-    texts = [implausible(name.partition(".")[2], value, radius) for name, value in calibrated.items()]
+def strange(fit: Fit, calibrated: Mapping[str, Value], radius: float) -> list[str]:
+    """Sentences on implausible values of declared coefficients, and on all fitted ones that end at a bound."""
     words = "Something that the model does not describe has moved it: a clock, lengths or spin labels, say"
-    return [f"The fitted {text}. {words}." for text in texts if text]
+    texts = []
+    for full, coefficient in fit.problem.free.items():
+        name = full.partition(".")[2]
+        value = calibrated.get(full, Value(fit.unknowns.values[full], 0.0, coefficient.unit))
+        known = implausible(name, value, radius) if full in calibrated else ""
+        texts += [text for text in (known, at_bound(name, value, coefficient)) if text]
+    return [f"The fitted {text}. {words}." for text in texts]
 
 
 def _errors(holdout: Holdout, jobs: int, model: BallModel) -> Errors:

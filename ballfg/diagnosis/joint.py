@@ -147,7 +147,7 @@ def diagnose_jointly(
         residuals_before=residuals_of(search.first),
         residuals_after=residuals_of(search.fit),
         excluded=tuple(f"{room.name}: {line}" for room in rooms for line in room.holdout.excluded),
-        remarks=(*remarks, *strange(calibrated, model.radius)),
+        remarks=(*remarks, *strange(search.whole, calibrated, model.radius)),
         labels=labels,
         probabilities=search.odds.effects(),
         nothing_lacking=search.odds.nothing,

@@ -1,13 +1,10 @@
-"""Compares fitted coefficients with the plausible ranges of a table-tennis ball, its table and its room.
-
-A coefficient that must lie outside of its range to explain the tracks stands for something else: it is never a name.
-"""
+"""Judges fitted coefficients by their bounds and by what is plausible for a ball, its table and its room."""
 
 from typing import Final
 
 from ballfg.diagnosis.result import Value
 from ballfg.dynamics import EFFECTS
-from ballfg.dynamics.effect import Range
+from ballfg.dynamics.effect import Coefficient, Range
 from ballfg.tracks import TABLE_TENNIS
 
 NEAR: Final = 0.15
@@ -15,8 +12,7 @@ NEAR: Final = 0.15
 MARGIN: Final = 0.1
 """Share of a range by which a fitted value may lie outside of it."""
 SIGMAS: Final = 3.0
-"""Standard deviations: least distance of coefficients from absent, largest difference between halves, and largest
-distance of a value from its range."""
+"""Largest distance of a plausible value from its range, in standard deviations of the value."""
 
 
 def range_of(name: str, radius: float) -> Range | None:
@@ -43,3 +39,14 @@ def implausible(name: str, value: Value, radius: float) -> str:
         return ""
     unit = "" if value.unit == "1" else f" {value.unit}"
     return f"{name} = {value.value:.3g}{unit} lies outside of {known.low:g} to {known.high:g}{unit} ({known.source})"
+
+
+def at_bound(name: str, value: Value, coefficient: Coefficient) -> str:
+    """The finding that tracks pull a coefficient to its bound; empty if it is inside, or held there by the model.
+
+    Args: name: of effect and coefficient.  coefficient: as declared, with its bounds.
+    """
+    if value.value not in (coefficient.low, coefficient.high) or value.value == value.declared:
+        return ""
+    unit = "" if value.unit == "1" else f" {value.unit}"
+    return f"{name} = {value.value:.3g}{unit} is the bound of that coefficient: the tracks ask for more"
