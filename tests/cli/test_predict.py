@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -225,6 +226,13 @@ def test_the_group_of_all_tracks(dataset: Dataset, tmp_path: Path, capsys: pytes
     for command, options in (("predict", ("--observe", 0.3)), ("estimate", ())):
         a, b, mixture = (table(command, *options, *more) for more in (("--group", "a"), ("--group", "b"), ()))
         assert len({a, b, mixture}) == 3
+
+    def streamed(*options: object) -> str:
+        capsys.readouterr()
+        assert status("live", *options, "--model", tmp_path / "model.yaml", "--speed", 0) == 0
+        return "".join(str(json.loads(line).get("spin")) for line in capsys.readouterr().out.splitlines())
+
+    assert len({streamed("--replay", unlabelled, *more) for more in (("--group", "a"), ("--group", "b"), ())}) == 3
     capsys.readouterr()
     model_file, out = tmp_path / "model.yaml", tmp_path / "none.csv"
     options = ("predict", unlabelled, "--observe", 0.3, "--out", out)

@@ -62,6 +62,7 @@ def live(
             help="Recording to begin or continue: JSON lines, or .mcap for ROS 2.", show_default="standard output"
         ),
     ] = None,
+    group: inputs.GroupName = None,
     viewer: Annotated[bool, typer.Option("--viewer", help="Show it live in rerun (extra: viewer).")] = False,
     effects_file: inputs.EffectsFiles = None,
     observations_file: inputs.ObservationsFiles = None,
@@ -93,7 +94,7 @@ def live(
     inputs.know_observations(observations_file)
     bag = replay is not None and _is_bag(replay)
     data = _dataset(like if bag or replay is None else replay)
-    tracker = Tracker(*_scene(data, model, ball, table, noise), lag=lag)
+    tracker = Tracker(*_scene(data, model, ball, table, noise, group), lag=lag)
     with (
         contextlib.closing(_source(replay, bag, listen, idle, speed, topic, data)) as source,
         _output(out, source) as write,
@@ -137,9 +138,14 @@ def _dataset(folder: Path | None) -> Dataset | None:
 
 
 def _scene(
-    data: Dataset | None, model: Path | None, named: str | None, table: float | None, noise: float | None
+    data: Dataset | None,
+    model: Path | None,
+    named: str | None,
+    table: float | None,
+    noise: float | None,
+    group: str | None,
 ) -> tuple[BallModel, Surfaces, Settings]:
-    """Ball, surfaces and noise: the dataset's, or the options'."""
+    """Ball, surfaces, noise and the group of shots: the dataset's, or the options'."""
     from dataclasses import replace
 
     from ballfg.checks import check_number
@@ -164,7 +170,7 @@ def _scene(
     if noise is not None:
         sigma = check_number("noise", noise, "m", above=0.0, limit=1.0, instead="mm")
         settings = replace(settings, position_noise=(sigma,) * 3)
-    return ball, surfaces, settings
+    return ball, surfaces, replace(settings, spins=ball.spins, group=group)
 
 
 def _settings(ball: BallModel) -> Settings:
