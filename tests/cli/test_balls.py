@@ -60,6 +60,6 @@ def test_a_shuttle(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_stream_without_a_dataset_is_of_the_ball_that_is_named() -> None:
-    ball, _, _ = _scene(None, None, "golf", None, None)
+    ball, _, _ = _scene(None, None, "golf", None, None, None)
     assert (ball.radius, ball.inertia_factor) == (0.021335, 0.4)
-    assert _scene(None, None, None, None, None)[0].radius == 0.02
+    assert _scene(None, None, None, None, None, None)[0].radius == 0.02
