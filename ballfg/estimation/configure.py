@@ -1,13 +1,15 @@
 """Chooses settings and surfaces for a dataset, from its statements of noise and table or else from its tracks."""
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import islice
 
 import numpy as np
 
+from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.model_file import model_to_dict
 from ballfg.dynamics.networks.fading import DOUBT
 from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.dynamics.surfaces import Surfaces
@@ -95,8 +97,7 @@ def fitted_settings(
     stated = dataset.info.noise is not None or model.noise is not None or at_home
     if stated or dataset.rough or len(dataset) < LEAST_TRACKS:
         return settings
-    values = tuple(float(p.detach()) for p in model.parameters() if p.numel() == 1)
-    key = (dataset, model, values, observed)
+    key = (dataset, _content(model), observed)
     if key not in _FITTED:
         while len(_FITTED) >= KEPT:
             del _FITTED[next(iter(_FITTED))]
@@ -105,7 +106,17 @@ def fitted_settings(
     return _FITTED[key] or settings
 
 
-_FITTED: dict[tuple[Dataset | SightedDataset, BallModel, tuple[float, ...], float], Settings | None] = {}
+_FITTED: dict[tuple[Dataset | SightedDataset, Hashable, float], Settings | None] = {}
+
+
+def _content(model: BallModel) -> Hashable:
+    """Equal for analytic models with equal content, which every call of the front door makes or loads anew."""
+    values = tuple(p.detach().numpy().tobytes() for p in model.parameters())
+    if not isinstance(model, AnalyticModel) or model.trained is not None:
+        return model, values
+    parts = tuple(type(module) for module in model.modules())
+    stated = repr((model.radius, model.inertia_factor, model_to_dict(model), model.declared_coefficients()))
+    return parts, stated, values
 
 
 def _fitted(dataset: Dataset | SightedDataset, model: BallModel, observed: float, watch: Watch) -> Settings | None:

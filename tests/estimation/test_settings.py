@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 from ballfg.dynamics import EFFECTS, AnalyticModel, nominal_model
 from ballfg.estimation import configure
@@ -64,6 +65,20 @@ def test_five_tracks_tell_the_noise_where_nobody_states_it(tracks, looked_for, m
     shots = [shot.track for shot in simulate(SimulationConfig(tracks=tracks, seed=4))]
     data = dataset_in_memory(DatasetInfo("unstated", 0.0, Ball(0.02, 0.0027)), shots)
     assert (configure.fitted_settings(data, nominal_model()) is found) == looked_for
+
+
+def test_the_noise_is_looked_for_once_for_equal_models(monkeypatch) -> None:
+    """Each call of the front door makes a model of its own."""
+    calls: list[tuple[object, ...]] = []
+    monkeypatch.setattr(configure, "_fitted", lambda *given: calls.append(given) or Settings())
+    shots = [shot.track for shot in simulate(SimulationConfig(tracks=5, seed=4))]
+    data = dataset_in_memory(DatasetInfo("unstated", 0.0, Ball(0.02, 0.0027)), shots)
+    changed = nominal_model()
+    with torch.no_grad():
+        dict(changed.named_parameters())["flight.drag.k"] += 1e-3
+    for model in (nominal_model(), nominal_model(), changed, nominal_model(Ball(0.021, 0.0027))):
+        configure.fitted_settings(data, model)
+    assert len(calls) == 3
 
 
 def test_uncertain_takes_the_coefficients_that_vary() -> None:

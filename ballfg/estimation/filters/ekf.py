@@ -117,13 +117,7 @@ class ExtendedKalmanFilter(Estimator):
         return with_contact_states(estimate, found).dated(written.times)
 
     def _result(
-        self,
-        track: Track,
-        run: _Run,
-        mean: Array,
-        covariance: Array,
-        whitened: Array,
-        status: Status | None = None,
+        self, track: Track, run: _Run, mean: Array, covariance: Array, whitened: Array, status: Status | None = None
     ) -> Estimate:
         states, own = mean[:, :STATE_DIM], slice(STATE_DIM, STATE_DIM + len(run.means))
         contacts = tuple(contact for i in sorted(run.record.contacts) for contact in run.record.contacts[i])

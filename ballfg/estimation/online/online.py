@@ -11,16 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ballfg.arrays import Array
-from ballfg.checks import (
-    as_float,
-    check_array,
-    check_choice,
-    check_count,
-    check_each,
-    check_iterable,
-    is_number,
-    shown,
-)
+from ballfg.checks import as_float, check_array, check_choice, check_count, check_each, check_iterable, is_number, shown
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
@@ -157,11 +148,7 @@ class Online(Estimator):
         gc.freeze()
 
     def push(
-        self,
-        time: float,
-        position: ArrayLike,
-        sigma: ArrayLike | None = None,
-        observations: Sequence[Observation] = (),
+        self, time: float, position: ArrayLike, sigma: ArrayLike | None = None, observations: Sequence[Observation] = ()
     ) -> OnlineState:
         """Takes in a measured position, and other measurements of that time.
 

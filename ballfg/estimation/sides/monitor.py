@@ -73,11 +73,7 @@ class ContactMonitor:
         self._hypotheses = None
 
     def step(
-        self,
-        before: tuple[Array, Array],
-        dt: float,
-        measured: SampleMeasurement,
-        bounced: Callable[[int], bool],
+        self, before: tuple[Array, Array], dt: float, measured: SampleMeasurement, bounced: Callable[[int], bool]
     ) -> ContactState | None:
         """The state to report at the next sample.
 

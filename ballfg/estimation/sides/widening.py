@@ -82,12 +82,7 @@ def widened_near_contacts(estimate: Estimate, model: BallModel) -> Estimate:
 
 
 def widening_near_contacts(
-    times: Array,
-    states: Array,
-    covariances: Array,
-    contacts: Sequence[Contact],
-    model: BallModel,
-    shared: Shared,
+    times: Array, states: Array, covariances: Array, contacts: Sequence[Contact], model: BallModel, shared: Shared
 ) -> Array:
     """The difference of covariances near contacts for the chance that a ball is on the other side.
 

@@ -83,11 +83,7 @@ class Earlier:
 
 
 def initial_states(
-    track: Track,
-    contacts: tuple[Contact, ...],
-    segmentation: Segmentation,
-    model: BallModel,
-    label: SpinLabel | None,
+    track: Track, contacts: tuple[Contact, ...], segmentation: Segmentation, model: BallModel, label: SpinLabel | None
 ) -> Array:
     """(n, 9) states from the sliding window: measured positions, mean velocities of windows without events.
 
