@@ -152,9 +152,7 @@ class ConformalScales:
     def check_fits(self, observe: float, method: str) -> None:
         """Refuses scales that were made from another observed part or by another estimator.
 
-        Args:
-            observe: s, the observed part of the tracks to predict.
-            method: name of the estimator that predicts them.
+        Args: observe: s, the observed part of the tracks to predict.  method: name of the estimator that predicts them.
         Raises: ValueError: if one of them differs.
         """
         if not isclose(observe, self.observe) or method != self.method:

@@ -28,9 +28,7 @@ def out_of_distribution(model: BallModel, states: Array | Tensor) -> Array | Non
 def out_of_distribution_share(model: BallModel, tracks: Sequence[Array]) -> float | None:
     """Share of flights that lies outside of the training data of a model.
 
-    Args:
-        model: the ball.
-        tracks: (n, 9) states of each.
+    Args: model: the ball.  tracks: (n, 9) states of each.
     Returns: from 0 to 1, the mean over tracks; None for a model without such data, or without tracks.
     """
     shares = [

@@ -32,9 +32,7 @@ def make_estimator(name: str, model: BallModel, surfaces: Surfaces | float, sett
     It undoes the model's measurement effects, if any, and gives each track its own coefficients, if they differ between
     tracks.
 
-    Args:
-        name: of a registered estimator.
-        model, surfaces, settings: as for every `Estimator`.
+    Args: name: of a registered estimator.  model, surfaces, settings: as for every `Estimator`.
     Raises: ValueError: if there is none of that name; the message lists those there are.
     """
     if name not in ESTIMATORS:

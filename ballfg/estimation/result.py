@@ -172,9 +172,7 @@ class Estimate:
     def dated(self, times: Array, origin: float | None = None) -> Estimate:
         """The estimate with the stamps of the data; estimators count stamps from a track's first.
 
-        Args:
-            times: (n,) s, the original stamps.
-            origin: s, the first stamp of the whole track, if these are a part.
+        Args: times: (n,) s, the original stamps.  origin: s, the first stamp of the whole track, if these are a part.
         """
         origin = float(times[0]) if origin is None else origin
         if origin == 0.0:

@@ -154,9 +154,7 @@ class Settings:
     def for_measured(cls, model: BallModel, **changes: Any) -> Settings:
         """Settings for measured tracks: the model's coefficients are estimated with each track within their priors.
 
-        Args:
-            model: gives the coefficients and their prior standard deviations.
-            changes: other fields.
+        Args: model: gives the coefficients and their prior standard deviations.  changes: other fields.
         """
         usual: dict[str, Any] = {"coefficients": coefficient_sigmas(model), "process": MEASURED}
         return cls(**(usual | changes))
@@ -258,10 +256,7 @@ def stamp_covariance(settings: Settings, velocity: Array) -> Array:
 def total_sigmas(settings: Settings, white: Array, velocities: Array) -> Array:
     """Standard deviations of whole position errors: the white part, the lasting part, and that of the stamps.
 
-    Args:
-        settings: with memory and jitter.
-        white: (n, 3) m, of the white part.
-        velocities: (n, 3) m/s, of the ball.
+    Args: settings: with memory and jitter.  white: (n, 3) m, of the white part.  velocities: (n, 3) m/s, of the ball.
     Returns: (n, 3) m.
     """
     if not settings.has_memory and settings.stamp_jitter == 0.0:

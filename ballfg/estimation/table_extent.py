@@ -67,10 +67,7 @@ class TableExtent:
 def find_table_extent(tracks: Iterable[Track], table_height: float, radius: float) -> TableExtent | None:
     """The ends of a table-tennis table, from balls that bounced on it and balls that fell past it.
 
-    Args:
-        tracks: of balls around one table.
-        table_height: m, z of its surface.
-        radius: m, of the ball.
+    Args: tracks: of balls around one table.  table_height: m, z of its surface.  radius: m, of the ball.
     Returns: the ends; None if no side is known: no ball fell, few bounced at this height, another ball is played with,
         or the balls contradict a table of the rules' size.
     """

@@ -89,9 +89,7 @@ def measured_positions(model: BallModel, states: Tensor, surfaces: Surfaces) -> 
 class LabelMap:
     """The affine map from spins to labels: label = matrix spin + offset.
 
-    Attributes:
-        matrix: (3, 3).
-        offset: (3,) rad/s.
+    Attributes: matrix: (3, 3).  offset: (3,) rad/s.
     """
 
     matrix: Array

@@ -51,10 +51,7 @@ LOST: Final = 1e4
 class Undone:
     """The true track: stamps, positions and label.
 
-    Attributes:
-        track: shifted, on the true clock.
-        estimate: of the smoother.
-        settled: True if the shift converged.
+    Attributes: track: shifted, on the true clock.  estimate: of the smoother.  settled: True if the shift converged.
     """
 
     track: Track

@@ -102,9 +102,7 @@ def leave_one_out(rows: Rows, covariances: Covariances) -> Array:
     C r); for a robust loss, H and r in S and in the pull are the weighted ones. The covariance of that distance is 1 +
     C.
 
-    Args:
-        rows: the factors, linearised at the minimum.
-        covariances: of the states there and of the coefficients.
+    Args: rows: the factors, linearised at the minimum.  covariances: of the states there and of the coefficients.
     """
     state, unit = rows.variables[:, 0], np.eye(rows.residual.shape[1])
     plain, (residual, jacobians) = np.concatenate(rows.jacobians, axis=-1), weighted(rows)

@@ -24,8 +24,7 @@ from ballfg.tracks import Track
 class Frozen:
     """A state at the moment when it left the window.
 
-    Attributes:
-        sample: its observation.  state: (9,).  joint: (9 + p, 9 + p) covariance with the coefficients.
+    Attributes: sample: its observation.  state: (9,).  joint: (9 + p, 9 + p) covariance with the coefficients.
     """
 
     sample: Sample

@@ -23,8 +23,7 @@ class Measurement:
 
     Args: batch: of one factor on a single state.
 
-    Attributes:
-        innovation: (dim,) whitened, against the prediction when it came in; NaN without a prediction.
+    Attributes: innovation: (dim,) whitened, against the prediction when it came in; NaN without a prediction.
     """
 
     def __init__(self, batch: FactorBatch) -> None:

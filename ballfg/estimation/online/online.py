@@ -68,8 +68,7 @@ class Online(Estimator):
         cameras: that sightings come from.
         solver: earlier name of the settings' solver, "isam2" or "chain"; deprecated.
 
-    Attributes:
-        window: the samples, states and factors that are held; None before the first observation.
+    Attributes: window: the samples, states and factors that are held; None before the first observation.
 
     Raises: ValueError: a lag below 2, time offsets in the settings, or as `Estimator`.
     """

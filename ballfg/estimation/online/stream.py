@@ -36,8 +36,7 @@ STAMPS: Final = 9
 class SightingStream:
     """Turns sightings into samples for the window.
 
-    Args:
-        cameras: of the rig.  loss: on a sighting.
+    Args: cameras: of the rig.  loss: on a sighting.
     """
 
     def __init__(self, cameras: Sequence[Camera], loss: Loss) -> None:

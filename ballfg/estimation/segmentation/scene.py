@@ -32,9 +32,7 @@ SCENE: Final[Any] = from_dtype(NUMBERS)
 class Scene:
     """Ball, surfaces and settings.
 
-    Attributes:
-        numbers: one row of `NUMBERS`.
-        rows: (s,) of `SURFACE`, one a surface, table first.
+    Attributes: numbers: one row of `NUMBERS`.  rows: (s,) of `SURFACE`, one a surface, table first.
     """
 
     physics: SegmentationPhysics

@@ -38,10 +38,7 @@ class Segmenter:
     and shifts when the best of them is surprised), weighs them, and drops the unlikely. Events `settings.lag` samples
     old become final: hypotheses that deny them are dropped, so that memory is bounded on an endless stream.
 
-    Args:
-        surfaces: table and floor.
-        physics: of the ball; see `physics_of`.
-        settings: noise model and prices.
+    Args: surfaces: table and floor.  physics: of the ball; see `physics_of`.  settings: noise model and prices.
     """
 
     def __init__(
@@ -71,10 +68,7 @@ class Segmenter:
     def push(self, time: float, position: ArrayLike, sigma: ArrayLike) -> Decision:
         """Takes in the next sample.
 
-        Args:
-            time: s, later than the last.
-            position: (3,) m.
-            sigma: (3,) m, standard deviation of each coordinate.
+        Args: time: s, later than the last.  position: (3,) m.  sigma: (3,) m, standard deviation of each coordinate.
         Returns: the events that became final, and the best explanation of the rest.
         Raises: ValueError: if the time does not increase, or something is not finite or has a wrong shape.
         """

@@ -21,10 +21,7 @@ LEAST_SPREAD = 1e-9
 class GaussianMixture:
     """Gaussians over the state of a ball, the model's coefficients and the tracker's bias, in this order.
 
-    Attributes:
-        log_weights: (n,), not normalised.
-        means: (n, d).
-        covariances: (n, d, d).
+    Attributes: log_weights: (n,), not normalised.  means: (n, d).  covariances: (n, d, d).
     """
 
     log_weights: Array

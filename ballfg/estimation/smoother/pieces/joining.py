@@ -130,10 +130,7 @@ def told_by(smoother: Smoother, state: State) -> Told:
 def joined_minimum(smoother: Smoother, track: Track, length: int | None = None) -> Joined | None:
     """The minimum of a whole track, by sections.
 
-    Args:
-        smoother: of the track.
-        track: prepared.
-        length: approximate number of samples in a piece.
+    Args: smoother: of the track.  track: prepared.  length: approximate number of samples in a piece.
     Returns: None if a piece has no finite explanation by itself.
     """
     rough = type(smoother)(

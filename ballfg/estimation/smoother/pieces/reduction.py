@@ -24,9 +24,7 @@ from ballfg.factors.linear.substitution import substitute_back
 class Point:
     """A point or a step of the ends and the coefficients of a section.
 
-    Attributes:
-        first, last: (w,) states, followed by the tracker's biases.
-        coefficients: (p,) in their own units.
+    Attributes: first, last: (w,) states, followed by the tracker's biases.  coefficients: (p,) in their own units.
     """
 
     first: Array
