@@ -11,7 +11,7 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.nominal import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.measurement.position_noise import noise_doubts
-from ballfg.estimation.observations.given import given
+from ballfg.estimation.observations.observation import given
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.settings import Settings
 from ballfg.factors.batch import FactorBatch

@@ -7,7 +7,7 @@ Estimators know this interface only. A user's own kind of measurement is a subcl
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar, Self
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ballfg.arrays import Array, Index
-from ballfg.checks import shown
+from ballfg.checks import check_each, shown
 from ballfg.dynamics.model import BallModel
 from ballfg.estimation.observations.innovation import leave_one_out
 from ballfg.estimation.settings import Settings
@@ -204,3 +204,41 @@ def refuse_unknowns(observations: Iterable[Observation], settings: Settings, est
                 f"observations of the estimator '{estimator}' must have no unknowns; '{observation.name}' has "
                 f"{', '.join(names)}. Use the smoother."
             )
+
+
+class GivenFactors(Observation):
+    """A batch of factors, each on one state of the track.
+
+    Args: factors: their first variable is the index of a sample.  number: index among the user's batches.
+    """
+
+    def __init__(self, factors: FactorBatch, number: int) -> None:
+        self.name = f"{type(factors).__name__} {number}"  # type: ignore[misc]  # one of a name in a track
+        self.factors = factors
+        self.number = number
+        self.state = factors.variables[:, 0]
+
+    def batch(self, context: Context) -> FactorBatch:
+        """The factors."""
+        return self.factors
+
+    def select(self, samples: NDArray[np.bool_]) -> GivenFactors:
+        """The factors of some samples."""
+        kept = self.factors.select(np.flatnonzero(samples[self.state]))
+        kept.variables = kept.variables.copy()
+        kept.variables[:, 0] = (np.cumsum(samples) - 1)[kept.variables[:, 0]]
+        return GivenFactors(kept, self.number)
+
+
+def given(factors: Sequence[FactorBatch]) -> list[GivenFactors]:
+    """Each batch as an observation.
+
+    Raises: ValueError: if a factor ties several states. TypeError: something else than factors.
+    """
+    for batch in check_each("factors", factors, FactorBatch, "Write one as docs/custom_factors.md shows."):
+        if (batch.variables[:, 0] < 0).any() or (batch.variables[:, 1:] >= 0).any():
+            raise ValueError(
+                f"factors must be on one state each, and on the coefficients beside it at most; {type(batch).__name__} "
+                "ties other variables. Add those to a TrackProblem (docs/custom_factors.md)."
+            )
+    return [GivenFactors(batch, number) for number, batch in enumerate(factors)]

@@ -18,12 +18,10 @@ from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities
 from ballfg.estimation.launcher import FIRST_SAMPLES, group_spin
 from ballfg.estimation.observations.observation import Observation
-from ballfg.estimation.online.events import EventTracker
-from ballfg.estimation.online.explanation import explain, move_contacts, tell_velocities
+from ballfg.estimation.online.events import EventTracker, explain, move_contacts, tell_velocities
 from ballfg.estimation.online.final import Frozen, final_estimate, freeze, unknown
 from ballfg.estimation.online.measurement import Measurement, measurements_beside
-from ballfg.estimation.online.sample import Sample, Update
-from ballfg.estimation.online.state import OnlineState
+from ballfg.estimation.online.state import OnlineState, Sample, Update
 from ballfg.estimation.online.stream import SightingStream
 from ballfg.estimation.online.warm_up import warmed_up
 from ballfg.estimation.online.windows.chain import ChainWindow

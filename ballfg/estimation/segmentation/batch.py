@@ -1,17 +1,152 @@
-"""Segments a whole track by a forward pass over all samples and a second look at its contacts."""
+"""Segments a whole track by a forward pass over all samples, and assembles the events of a chain."""
+
+from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ballfg.arrays import Array
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.segmentation.assembly import BREAKS, contacts_of, intervals_of, quality_of, rests_of
-from ballfg.estimation.segmentation.events import EventKind
+from ballfg.estimation.segmentation.events import Event, EventKind
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
-from ballfg.estimation.segmentation.result import Quality, Segmentation
-from ballfg.estimation.segmentation.second_look import hits_at_contacts
+from ballfg.estimation.segmentation.result import Contact, Quality, Rest, Segmentation
 from ballfg.estimation.segmentation.segmenter import Segmenter
 from ballfg.estimation.segmentation.settings import SegmentationSettings
+
+BREAKS = (EventKind.HIT, EventKind.RESTART)
+"""Events after which nothing is known of the past."""
+
+
+def contacts_of(events: Sequence[Event]) -> list[Contact]:
+    """The contacts, in order."""
+    return [Contact(e.index, e.time, e.height) for e in events if e.kind is EventKind.CONTACT and e.height is not None]
+
+
+def intervals_of(events: Sequence[Event], *kinds: EventKind) -> list[int]:
+    """The intervals with an event of some kinds, ascending."""
+    return sorted({e.index for e in events if e.kind in kinds})
+
+
+def rests_of(events: Sequence[Event], samples: int) -> list[Rest]:
+    """The rests: from the first whole interval on a surface to the last.
+
+    A rest begins in the interval of its event and is whole from the next one on; a ball leaves at the end of its
+    interval, but a hit may fall anywhere inside.
+    """
+    rests = []
+    start: Event | None = None
+    for event in [*events, None]:
+        if event is not None and event.kind not in (*BREAKS, EventKind.REST, EventKind.LEAVE):
+            continue
+        if start is not None and start.height is not None:
+            end = samples - 1 if event is None else event.index + (event.kind is EventKind.LEAVE)
+            if end > start.index + 1:
+                rests.append(Rest(start.index + 1, end - 1, start.height))
+        start = event if event is not None and event.kind is EventKind.REST else None
+    return rests
+
+
+def quality_of(events: Sequence[Event], samples: int, shift_level: float) -> NDArray[np.int8]:
+    """(samples,) quality; a shift counts more than a wide noise, and less than an outlier."""
+    quality = np.full(samples, Quality.GOOD, dtype=np.int8)
+    quality[intervals_of(events, EventKind.WIDE)] = Quality.WIDE
+    quality[shifted(events, samples, shift_level)] = Quality.SHIFTED
+    quality[intervals_of(events, EventKind.OUTLIER)] = Quality.OUTLIER
+    return quality
+
+
+def shifted(events: Sequence[Event], samples: int, level: float) -> NDArray[np.bool_]:
+    """(samples,) True if a sample's offset differs by more than `level` m from the most common one of its segment.
+
+    A segment does not show which of two offsets is the true one; the tracker is assumed to be right most of the time. A
+    lone shift in the interval of a contact is left out: the jump belongs to the contact as well.
+    """
+    jumps = np.zeros((samples, 3))
+    shifts = [event for event in events if event.kind is EventKind.SHIFT]
+    contacts = intervals_of(events, EventKind.CONTACT) if shifts else []
+    for event in shifts:
+        jumps[event.index + 1] += event.offset
+    marked = np.zeros(samples, dtype=bool)
+    cuts = [0, *(i + 1 for i in intervals_of(events, *BREAKS)), samples]
+    for first, stop in pairwise(cuts):
+        inside = [event.index for event in shifts if first <= event.index + 1 < stop]
+        if not inside or (len(inside) == 1 and inside[0] in contacts):
+            continue
+        offsets = np.cumsum(jumps[first:stop], axis=0)
+        offsets -= np.median(offsets, axis=0)
+        marked[first:stop] = np.linalg.norm(offsets, axis=1) > level
+    return marked
+
+
+SIDE = 8
+"""Number of samples on each side: at 180 Hz and 1.5 mm they give the velocity to 0.1 m/s."""
+LEAST_SIDE = 4
+"""Least number of samples on each side for a decision."""
+LONGEST_INTERVAL = 0.02
+"""s. Over longer intervals, drag and the unknown moment of the touch blur the jump."""
+LEEWAY = 0.3
+"""m/s, of tangential jump that noise and the Magnus force over these samples may feign."""
+
+
+def hits_at_contacts(
+    times: Array,
+    positions: Array,
+    usable: NDArray[np.bool_],
+    contacts: Sequence[Contact],
+    hits: Sequence[int],
+    physics: SegmentationPhysics,
+    settings: SegmentationSettings,
+) -> list[int]:
+    """Intervals of contacts with a tangential jump beyond Coulomb friction: mu (1 + e) v_n.
+
+    Args:
+        times: (n,) s.
+        positions: (n, 3) m.
+        usable: (n,) samples that measure the ball.
+        contacts: of the forward pass, in order.
+        hits: intervals; they bound the used samples, as neighbouring contacts do.
+        physics: of the ball.
+        settings: with the tolerated excess.
+    """
+    ends = sorted({-1, len(times) - 1, *hits, *(contact.interval for contact in contacts)})
+    found = []
+    for contact in contacts:
+        i = contact.interval
+        if i in hits or not 0 <= i < len(times) - 1 or times[i + 1] - times[i] > LONGEST_INTERVAL:
+            continue
+        place = ends.index(i)
+        before = _velocity(times, positions, usable, max(ends[place - 1] + 1, i + 1 - SIDE), i, contact.time, physics)
+        stop = min(ends[place + 1], i + SIDE) if place + 1 < len(ends) else i
+        after = _velocity(times, positions, usable, i + 1, stop, contact.time, physics)
+        if before is None or after is None:
+            continue
+        jump = np.hypot(*(after[:2] - before[:2]))
+        if jump > settings.friction_excess * physics.friction * (1.0 + physics.restitution) * abs(before[2]) + LEEWAY:
+            found.append(i)
+    return found
+
+
+def _velocity(
+    times: Array,
+    positions: Array,
+    usable: NDArray[np.bool_],
+    first: int,
+    last: int,
+    at: float,
+    physics: SegmentationPhysics,
+) -> Array | None:
+    """(3,) m/s at time `at`: least squares of flight under gravity and drag through the usable samples first..last."""
+    rows = first + np.flatnonzero(usable[first : last + 1])
+    if len(rows) < LEAST_SIDE:
+        return None
+    since = times[rows] - at
+    chord = (positions[rows[-1]] - positions[rows[0]]) / (times[rows[-1]] - times[rows[0]])
+    pull = -physics.drag * np.linalg.norm(chord) * chord - np.array([0.0, 0.0, physics.gravity])
+    straight = positions[rows] - 0.5 * pull * since[:, None] ** 2
+    centred = since - since.mean()
+    slope: Array = centred @ (straight - straight.mean(axis=0)) / (centred @ centred)
+    return slope
 
 
 def segment(

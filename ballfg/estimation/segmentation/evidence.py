@@ -12,6 +12,7 @@ from ballfg.estimation.segmentation.bank import (
     BANK,
     ONE_HYPOTHESIS,
     SAMPLE,
+    SCENE,
     USED,
     WORK,
     Record,
@@ -22,7 +23,6 @@ from ballfg.estimation.segmentation.bank import (
     pass_through,
 )  # fmt: skip
 from ballfg.estimation.segmentation.events import OUTLIER, WIDE
-from ballfg.estimation.segmentation.scene import SCENE
 
 AS_GOOD, AS_WIDE, AS_OUTLIER = range(3)
 """The components of the noise, as in a scene's `log_shares`."""

@@ -16,7 +16,9 @@ from ballfg.estimation.segmentation.bank import (
     LOG,
     LOGGED,
     NO_EVENT,
+    ONE_HYPOTHESIS,
     SAMPLE,
+    SCENE,
     SURFACES,
     USED,
     WORK,
@@ -27,12 +29,134 @@ from ballfg.estimation.segmentation.bank import (
     Work,
     add,
     pass_through,
-)  # fmt: skip
-from ballfg.estimation.segmentation.branches import MOST_ADDED, hit, leave, shift, start
-from ballfg.estimation.segmentation.events import RESTART
-from ballfg.estimation.segmentation.evidence import prune, rank, update
-from ballfg.estimation.segmentation.scene import SCENE
-from ballfg.estimation.segmentation.surface_contact import Step, advance
+)
+from ballfg.estimation.segmentation.events import HIT, LEAVE, OUTLIER, REST, RESTART, SHIFT
+from ballfg.estimation.segmentation.evidence import AS_OUTLIER, prune, rank, update
+from ballfg.estimation.segmentation.surface_contact import Step, advance, lift, put_down
+
+SHORTEST_STEP: Final = 1e-3
+"""s. Least interval for the price of an event."""
+SHIFTED_PREDICTIONS: Final = 3
+"""Number of best predictions that are tried with a shift; beside a bounce the right one may be the third."""
+MOST_ADDED: Final = 2 + 2 * SHIFTED_PREDICTIONS
+"""Largest number of hypotheses from these events, besides one for each surface."""
+
+
+@machine_code(NOTHING(WORK, COUNT, REAL, SAMPLE, SCENE, SURFACES))
+def start(work: Work, tip: int, score: float, sample: Sample, scene: Record, surfaces: Records) -> None:
+    """Hypotheses after a first sample: a flying ball, one that rests on a surface nearby, or the sample an outlier.
+
+    All expect the ball within the spread of outliers around the sample, so that their evidences are comparable.
+
+    Args:
+        work: empty; afterwards those hypotheses.
+        tip: the last event before.
+        score: nats, carried on.
+        scene, surfaces: of a `Scene`.
+    """
+    work.fill[USED] = 1
+    bank = work.bank
+    _forget(bank[0], sample.position, scene.outlier_spread**2, scene)
+    bank[0].score, bank[0].tip = score, tip
+    _rested(work, 0, sample, scene, surfaces)
+    flying = bank[:1].copy()
+    update(work, 0, sample, scene)
+    lost = bank[add(work, flying, 0)]
+    lost.score += scene.log_shares[AS_OUTLIER] - 3.0 * math.log(scene.outlier_spread)
+    pass_through(lost, work, OUTLIER, sample.number, -1, sample.time)
+
+
+@machine_code(NOTHING(WORK, BANK, SAMPLE, REAL, SCENE, SURFACES))
+def hit(work: Work, before: Records, sample: Sample, dt: float, scene: Record, surfaces: Records) -> None:
+    """Adds the best explanation of the past, its velocity forgotten: in the air, and on a surface if it is near one.
+
+    Over a short interval the ball reappears close to where it was; over a long one it may be anywhere.
+    """
+    row = add(work, before, 0)
+    h = work.bank[row]
+    at = h.mean[:, 0].copy() if dt < scene.short_gap else sample.position
+    reach = scene.hit_spread**2 + (scene.velocity_spread * min(dt, scene.short_gap)) ** 2
+    _forget(h, at, reach, scene)
+    h.score -= _rarity(scene.hit_rate, dt) + scene.hit_cost * math.exp(-dt / scene.short_gap)
+    pass_through(h, work, HIT, sample.number - 1, -1, sample.time)
+    _rested(work, row, sample, scene, surfaces)
+
+
+@machine_code(NOTHING(WORK, BANK, SAMPLE, REAL, SCENE))
+def shift(work: Work, predicted: Records, sample: Sample, dt: float, scene: Record) -> None:
+    """Adds the best predictions, with the measurements jumping by an unknown offset: off from now on, or until now.
+
+    Only the next surface shows which of the two holds.
+    """
+    n, bank, first = len(predicted), work.bank, work.fill[USED]
+    rows = np.empty(n, np.int64)
+    rank(predicted, 0, n, rows)
+    for row in rows[:SHIFTED_PREDICTIONS]:
+        h = bank[add(work, predicted, row)]
+        h.score = h.score - _rarity(scene.shift_rate, dt) - scene.shift_cost
+        h.age = 0
+        pass_through(h, work, SHIFT, sample.number - 1, -1, sample.time)
+        for axis in range(3):
+            h.cov[axis, 0, 0] += scene.shift_spread**2
+            # the shift's expectation, not the innovation: after a gap most of that is the path's own uncertainty
+            known = scene.shift_spread**2 / (h.cov[axis, 0, 0] + sample.sigma[axis] ** 2)
+            offset = (sample.position[axis] - h.mean[axis, 0]) * known
+            h.shift[axis] += offset
+            work.log[work.fill[WRITTEN] - 1].offset[axis] = offset
+    for row in range(first, work.fill[USED]):
+        right = bank[add(work, bank, row)]
+        for axis in range(3):
+            right.shift[axis] = 0.0
+
+
+@machine_code(NOTHING(WORK, BANK, SAMPLE, REAL, SCENE))
+def leave(work: Work, predicted: Records, sample: Sample, dt: float, scene: Record) -> None:
+    """Adds the best resting prediction, in the air from now on."""
+    best = -1
+    for row in range(len(predicted)):
+        if predicted[row].surface != FLYING and (best < 0 or predicted[row].score > predicted[best].score):
+            best = row
+    if best < 0:
+        return
+    h = work.bank[add(work, predicted, best)]
+    pass_through(h, work, LEAVE, sample.number - 1, h.surface, sample.time)
+    lift(h, scene)
+    h.score = h.score - _rarity(scene.hit_rate, dt) - scene.leave_cost
+    h.age = 0
+
+
+@machine_code(NOTHING(ONE_HYPOTHESIS, ONE, REAL, SCENE))
+def _forget(h: Record, position: Array, variance: float, scene: Record) -> None:
+    """Makes a hypothesis fly at a position (3,) m with a variance m^2, with all else unknown."""
+    h.surface, h.age = FLYING, 0
+    for axis in range(3):
+        h.shift[axis] = 0.0
+        for i in range(3):
+            h.mean[axis, i] = 0.0
+            for k in range(3):
+                h.cov[axis, i, k] = 0.0
+        h.mean[axis, 0] = position[axis]
+        h.cov[axis, 0, 0] = variance
+        h.cov[axis, 1, 1] = scene.velocity_spread**2
+        h.cov[axis, 2, 2] = scene.slack**2
+
+
+@machine_code(NOTHING(WORK, COUNT, SAMPLE, SCENE, SURFACES))
+def _rested(work: Work, row: int, sample: Sample, scene: Record, surfaces: Records) -> None:
+    """Adds a flying hypothesis as one that rests, for each surface that the sample is near."""
+    for surface in range(len(surfaces)):
+        if abs(sample.position[2] - surfaces[surface].centre) < scene.rest_range:
+            down = work.bank[add(work, work.bank, row)]
+            put_down(down, surface, surfaces)
+            down.score -= scene.start_at_rest_cost
+            pass_through(down, work, REST, sample.number - 1, surface, sample.time)
+
+
+@machine_code(REAL(REAL, REAL))
+def _rarity(rate: float, dt: float) -> float:
+    """nats, minus log probability of an event with a rate (1/s) in an interval."""
+    return -math.log(-math.expm1(-rate * max(dt, SHORTEST_STEP)))
+
 
 EXPLAINED: Final[Any] = types.Tuple((BANK, LOG))
 """Hypotheses, best first, and the events of all hypotheses during a sample."""

@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 
 from ballfg.dynamics import Surfaces
-from ballfg.estimation.segmentation.assembly import rests_of
-from ballfg.estimation.segmentation.bank import FLYING, HYPOTHESIS
-from ballfg.estimation.segmentation.branches import _forget
+from ballfg.estimation.segmentation.bank import FLYING, HYPOTHESIS, Scene
+from ballfg.estimation.segmentation.batch import rests_of
 from ballfg.estimation.segmentation.events import Event, EventKind
+from ballfg.estimation.segmentation.explain import _forget
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
-from ballfg.estimation.segmentation.scene import Scene
 from ballfg.estimation.segmentation.settings import SegmentationSettings
 
 HEIGHT = 0.76

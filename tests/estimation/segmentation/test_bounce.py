@@ -3,9 +3,8 @@
 import numpy as np
 
 from ballfg.dynamics import Surfaces, nominal_model
-from ballfg.estimation.segmentation.bank import HYPOTHESIS
+from ballfg.estimation.segmentation.bank import HYPOTHESIS, Scene
 from ballfg.estimation.segmentation.physics import physics_of
-from ballfg.estimation.segmentation.scene import Scene
 from ballfg.estimation.segmentation.settings import SegmentationSettings
 from ballfg.estimation.segmentation.surface_contact import _bounce
 

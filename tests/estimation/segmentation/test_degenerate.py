@@ -5,7 +5,7 @@ import pytest
 
 from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.estimation.segmentation.batch import segment
-from ballfg.estimation.segmentation.branches import _rarity
+from ballfg.estimation.segmentation.explain import _rarity
 from ballfg.estimation.segmentation.result import Quality
 
 TABLE = Surfaces(0.75)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from ballfg.dynamics import nominal_model
+from ballfg.estimation.segmentation.batch import hits_at_contacts
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.segmentation.result import Contact
-from ballfg.estimation.segmentation.second_look import hits_at_contacts
 from ballfg.estimation.segmentation.settings import SegmentationSettings
 
 AT = 20

@@ -15,9 +15,8 @@ from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.pieces import joining, long_tracks
 from ballfg.estimation.smoother.pieces.joining import joined_minimum
 from ballfg.estimation.smoother.pieces.long_tracks import PiecewiseSmoother
-from ballfg.estimation.smoother.pieces.looks import bounds_of, cut_between, look
 from ballfg.estimation.smoother.pieces.reduction import Point, Reduction
-from ballfg.estimation.smoother.pieces.section import part_of
+from ballfg.estimation.smoother.pieces.section import bounds_of, cut_between, look, part_of
 from ballfg.estimation.smoother.pieces.whole import in_pieces
 from ballfg.estimation.smoother.second_look import spin_ambiguity
 from ballfg.estimation.smoother.smoother import Smoother

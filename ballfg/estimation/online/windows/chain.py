@@ -17,7 +17,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.estimation.online.measurement import Measurement, prepare
-from ballfg.estimation.online.sample import Sample, Update
+from ballfg.estimation.online.state import Sample, Update
 from ballfg.estimation.online.windows.interval import Interval
 from ballfg.estimation.online.windows.linear import LinearFactors
 from ballfg.estimation.online.windows.stream_window import Arrival, StreamWindow

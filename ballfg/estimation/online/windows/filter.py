@@ -3,9 +3,9 @@
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.estimation.online.linear_factors import carried_with_bias
-from ballfg.estimation.online.sample import Sample
+from ballfg.estimation.online.state import Sample
 from ballfg.estimation.online.windows.interval import Interval
+from ballfg.estimation.online.windows.linear import carried_with_bias
 from ballfg.estimation.settings import Settings, stamp_covariance
 from ballfg.factors.correlated_noise import BIAS_DIM
 from ballfg.factors.linear.definite import whitened as whitened_by

@@ -17,10 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
-from ballfg.estimation.smoother.pieces.chain import Chain, Point, moved_rows, solve_chain
-from ballfg.estimation.smoother.pieces.looks import bounds_of, cut_between, joined, look, section_of
-from ballfg.estimation.smoother.pieces.reduction import Ends, Reduction, Response
-from ballfg.estimation.smoother.pieces.section import State, part_of, prior_rows
+from ballfg.estimation.smoother.pieces.reduction import Chain, Ends, Point, Reduction, Response, moved_rows, solve_chain
+from ballfg.estimation.smoother.pieces.section import (
+    State,
+    bounds_of,
+    cut_between,
+    joined,
+    look,
+    part_of,
+    prior_rows,
+    section_of,
+)
 from ballfg.estimation.smoother.settle import ROUGH
 from ballfg.factors.batch import Values
 from ballfg.factors.graph import AT_KINK, RATE_MARGIN, Convergence, objective

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +13,12 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array, Index
 from ballfg.estimation.segmentation.result import Contact, Rest, Segmentation
 from ballfg.estimation.smoother.problem import Events, TrackProblem
+from ballfg.estimation.smoother.settle import places_of, timed_contacts
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Rows, Values
 from ballfg.tracks import Track
+
+if TYPE_CHECKING:
+    from ballfg.estimation.smoother.smoother import Smoother
 
 
 @dataclass(frozen=True)
@@ -141,3 +147,123 @@ def shifted(segmentation: Segmentation, by: int) -> Segmentation:
     rests = tuple(Rest(r.first + by, r.last + by, r.height) for r in segmentation.rests)
     hits, restarts = segmentation.hits + by, segmentation.restarts + by
     return Segmentation(contacts, hits, restarts, rests, segmentation.quality)
+
+
+@dataclass(frozen=True)
+class Look:
+    """Events and states of a part of a track by itself.
+
+    Attributes:
+        begin: first sample of the part, in the track.
+        values: of its states.
+        segmentation: its events, the contacts in their estimated intervals; counted from the track's first sample.
+        moved: True if one of its contacts moved into another interval.
+        timed: the contacts with their estimated times, with the same numbering.
+        rival: (3,) rad/s, another first spin that explains the part nearly as well, or None.
+    """
+
+    begin: int
+    values: Values
+    segmentation: Segmentation
+    moved: bool
+    timed: tuple[Contact, ...]
+    rival: Array | None
+
+    @property
+    def end(self) -> int:
+        """The sample after the last."""
+        return self.begin + len(self.values.states)
+
+    def busy(self) -> Index:
+        """Intervals and samples of the track with events."""
+        s = self.segmentation
+        bounds = [edge for rest in s.rests for edge in (rest.first, rest.last)]
+        bad = self.begin + np.flatnonzero(s.quality)
+        return np.concatenate(([c.interval for c in s.contacts], s.hits, bounds, bad)).astype(np.int64)
+
+    def select(self, begin: int, end: int) -> Values:
+        """The values of the states begin to end - 1 of the track."""
+        inside = slice(begin - self.begin, end - self.begin)
+        biases = None if self.values.biases is None else self.values.biases[inside]
+        return replace(self.values, states=self.values.states[inside], biases=biases)
+
+
+def bounds_of(samples: int, length: int, overlap: int) -> list[tuple[int, int]]:
+    """First sample of each part and the one after its last; neighbours share twice `overlap` samples.
+
+    Args: samples: of the track.  length: approximate length without shared samples.  overlap: beyond each cut.
+    """
+    parts = max(1, round(samples / length))
+    cuts = np.linspace(0, samples, parts + 1).round().astype(int).tolist()
+    return [(max(0, a - overlap), min(samples, b + overlap)) for a, b in pairwise(cuts)]
+
+
+def look(smoother: Smoother, part: tuple[int, Track]) -> Look | None:
+    """The events and states of a part by itself; None without a finite explanation.
+
+    Args: smoother: may be rough.  part: its first sample's number, and its track.
+    """
+    begin, track = part
+    solution = smoother.settle(smoother.problem(track))
+    if solution.minimum.step is None:
+        return None
+    found = replace(solution.events.segmentation, contacts=solution.events.contacts)
+    timed = replace(found, contacts=timed_contacts(track.times, solution))
+    moved = places_of(found.contacts) != places_of(solution.events.segmentation.contacts)
+    events, contacts = shifted(found, begin), shifted(timed, begin).contacts
+    return Look(begin, solution.minimum.values, events, moved, contacts, solution.rival)
+
+
+def cut_between(one: Look, other: Look) -> int:
+    """The shared sample of two neighbours that is furthest from all events in either of them.
+
+    There they agree on the events, and no event is lost or counted twice. The outer quarters of the shared samples are
+    excluded: a part is uncertain of the events at its end.
+    """
+    margin = (one.end - other.begin) // 4
+    candidates = np.arange(other.begin + margin, one.end - margin)
+    busy = np.concatenate((one.busy(), other.busy()))
+    middle = 0.5 * (one.end - 1 + other.begin)
+    distance = np.abs(candidates[:, None] - 0.5 - busy).min(axis=1, initial=len(candidates))
+    return int(candidates[np.lexsort((np.abs(candidates - middle), -distance))[0]])
+
+
+def joined(looks: Sequence[Look], cuts: Sequence[int]) -> Segmentation:
+    """The events of the whole track: each interval's from its own part.
+
+    If a contact has moved, all get their estimated times, as in a track that is smoothed at once.
+
+    Args: looks: in order.  cuts: (k + 1,) first sample of each part, and the number of samples.
+    """
+    contacts, rests = list[Contact](), list[Rest]()
+    hits, restarts, quality = list[Index](), list[Index](), list[NDArray[np.int8]]()
+    moved = any(one.moved for one in looks)
+    for one, first, last in zip(looks, cuts[:-1], cuts[1:], strict=True):
+        s = one.segmentation
+        contacts += [c for c in (one.timed if moved else s.contacts) if first <= c.interval < last]
+        hits.append(s.hits[(s.hits >= first) & (s.hits < last)])
+        restarts.append(s.restarts[(s.restarts >= first) & (s.restarts < last)])
+        for rest in s.rests:
+            inside = replace(rest, first=max(rest.first, first), last=min(rest.last, last - 1))
+            if inside.first > inside.last:
+                continue
+            if rests and rests[-1].last + 1 == inside.first == first and rests[-1].height == rest.height:
+                inside = replace(inside, first=rests.pop().first)
+            rests.append(inside)
+        quality.append(s.quality[first - one.begin : last - one.begin])
+    contacts.sort(key=lambda c: c.time)
+    whole = np.concatenate
+    return Segmentation(tuple(contacts), whole(hits), whole(restarts), tuple(rests), whole(quality))
+
+
+def section_of(track: Track, events: Segmentation, first: int, last: int, margin: int) -> Section:
+    """A section of a track.
+
+    Args:
+        track, events: all of it.
+        first, last: samples; the last is the first of the next section, or the track's last.
+        margin: samples kept beyond both, for velocities.
+    """
+    begin, end = max(0, first - margin), min(len(track), last + 1 + margin)
+    part = part_of(track, begin, end)
+    return Section(part, events_of(events, begin, end), first - begin, last - begin, last == len(track) - 1)

@@ -17,9 +17,8 @@ from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.result import Contact
 from ballfg.estimation.settings import sample_sigmas
 from ballfg.estimation.sides.widening import Shared, widening_near_contacts
-from ballfg.estimation.smoother.pieces.chain import Point
 from ballfg.estimation.smoother.pieces.joining import Joined, joined_minimum, watched
-from ballfg.estimation.smoother.pieces.reduction import Reduction
+from ballfg.estimation.smoother.pieces.reduction import Point, Reduction
 from ballfg.estimation.smoother.pieces.section import State
 from ballfg.estimation.smoother.problem import TrackProblem
 from ballfg.estimation.smoother.second_look.at_end import with_both_sides
