@@ -7,11 +7,9 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import LinAlgWarning
 
 from ballfg.arrays import Array
@@ -28,7 +26,7 @@ from ballfg.estimation.plausible import plausible
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.result import Contact, Quality
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, stamp_covariance, total_sigmas
-from ballfg.estimation.sides.hypotheses import HypothesisModel, SampleMeasurement
+from ballfg.estimation.sides.hypotheses import HypothesisModel, SampleMeasurement, measured_at
 from ballfg.estimation.sides.monitor import ContactMonitor, ContactState, with_contact_states
 from ballfg.estimation.sides.widening import widened_near_contacts
 from ballfg.estimation.smoother.problem import coefficient_means, trackwise_model
@@ -103,11 +101,14 @@ class ExtendedKalmanFilter(Estimator):
         track = written.since_first()
         run = _Run(self, track)
         record = run.record
-        if not run.finite():
-            return self._failed(track, run).dated(written.times)
+        if not (np.isfinite(record.mean).all() and np.isfinite(record.covariance).all()):
+            pairs = [run.prior(i) for i in range(len(track))]
+            mean, covariance = (np.stack(part) for part in zip(*pairs, strict=True))
+            nothing = np.full((len(track), 3), np.nan)
+            return self._result(track, run, mean, covariance, nothing, Status.FAILED).dated(written.times)
         mean, covariance = rts_smooth(record) if self.smooth else (record.mean, record.covariance)
         if record.start > 0 and (self.smooth or self.initialise == "prior"):
-            fly_back(self.ball, record.start, track.times, run.flight_noise, run.fading, mean, covariance)
+            fly_back(self.ball, record.start, track.times, run.flight_noise, run.fading, (mean, covariance))
         whitened = record.innovations(run.H, mean, covariance, track.positions) if self.smooth else record.whitened
         estimate = self._result(track, run, mean, covariance, whitened)
         found = run.states_near_contacts()
@@ -120,13 +121,12 @@ class ExtendedKalmanFilter(Estimator):
         self, track: Track, run: _Run, mean: Array, covariance: Array, whitened: Array, status: Status | None = None
     ) -> Estimate:
         states, own = mean[:, :STATE_DIM], slice(STATE_DIM, STATE_DIM + len(run.means))
-        contacts = tuple(contact for i in sorted(run.record.contacts) for contact in run.record.contacts[i])
         estimate = Estimate(
             name=track.name,
             times=track.times,
             states=states,
             covariances=covariance[:, :STATE_DIM, :STATE_DIM],
-            status=status or _status(run.record.used),
+            status=status or run.status(),
             innovations={"position": whitened, **run.innovations},
             world=self.world,
             notes=self.doubts(track),
@@ -134,25 +134,11 @@ class ExtendedKalmanFilter(Estimator):
             coefficients=mean[-1, own],
             coefficient_covariance=covariance[-1, own, own],
             cross_covariances=covariance[:, :STATE_DIM, own],
-            contacts=contacts,
+            contacts=tuple(contact for i in sorted(run.record.contacts) for contact in run.record.contacts[i]),
             hits=np.array(run.record.hits, dtype=np.int64),
             quality=run.record.quality,
         )
         return plausible(estimate, track, run.sigma, self.settings)
-
-    def _failed(self, track: Track, run: _Run) -> Estimate:
-        """Measured positions and priors."""
-        pairs = [run.prior(i) for i in range(len(track))]
-        mean, covariance = (np.stack(part) for part in zip(*pairs, strict=True))
-        nothing = np.full((len(track), 3), np.nan)
-        return self._result(track, run, mean, covariance, nothing, Status.FAILED)
-
-
-def _status(used: NDArray[np.bool_]) -> Status:
-    """The status for the used samples: a filter that set most of them aside has lost the ball."""
-    if used.sum() < 2:
-        return Status.NO_VELOCITY
-    return Status.OK if used.mean() >= LEAST_USED else Status.NOT_CONVERGED
 
 
 class _Run:
@@ -175,7 +161,7 @@ class _Run:
         refuse_unknowns(beside, owner.settings, owner.name)
         self.beside = [(one, one.batch(context)) for one in beside]
         self.innovations = {one.name: np.full((len(batch), batch.dim), np.nan) for one, batch in self.beside}
-        self.record = FilterRecord.empty(len(track), self.H.shape[1])
+        self.record = FilterRecord(len(track), self.H.shape[1])
         self.record.least = self._least()
         for k in range(len(track)):
             self.record.measurement_noise[k] = self._measurement_noise(k, self.velocities[k])
@@ -183,9 +169,12 @@ class _Run:
         with calm, warnings.catch_warnings(category=LinAlgWarning, action="ignore"):  # ends in a status that failed
             self._filter()
 
-    def finite(self) -> bool:
-        """True if the whole record is finite."""
-        return bool(np.isfinite(self.record.mean).all() and np.isfinite(self.record.covariance).all())
+    def status(self) -> Status:
+        """The status of the result: a filter that set most samples aside has lost the ball."""
+        used = self.record.used
+        if used.sum() < 2:
+            return Status.NO_VELOCITY
+        return Status.OK if used.mean() >= LEAST_USED else Status.NOT_CONVERGED
 
     def prior(self, i: int) -> tuple[Array, Array]:
         """The prior at sample i from that sample alone: mean (d,) and covariance (d, d)."""
@@ -218,24 +207,17 @@ class _Run:
             if k - 1 in record.hits:
                 monitor.reset()
                 continue
-            before = record.mean[k - 1], record.covariance[k - 1]
-            held = partial(self._bounced_before, k)
-            state = monitor.step(before, float(times[k] - times[k - 1]), self._measured(k), held)
+            before, measured = (record.mean[k - 1], record.covariance[k - 1]), SampleMeasurement()
+            if record.quality[k] != Quality.OUTLIER:
+                measured = measured_at(self.track, self.sigma, dict(self.beside), k)
+
+            def bounced(count: int, k: int = k) -> bool:
+                return any(i in record.contacts for i in range(k - count, k))
+
+            state = monitor.step(before, float(times[k] - times[k - 1]), measured, bounced)
             if state is not None:
                 found[k] = state
         return found
-
-    def _bounced_before(self, k: int, count: int) -> bool:
-        """True if the filter's ball has bounced in the last `count` intervals before sample k."""
-        return any(i in self.record.contacts for i in range(k - count, k))
-
-    def _measured(self, k: int) -> SampleMeasurement:
-        """The measurements that the filter used at a sample."""
-        if self.record.quality[k] == Quality.OUTLIER:
-            return SampleMeasurement()
-        rows = [(batch, row) for one, batch in self.beside for row in one.filter_rows(k)]
-        factors = [batch.select(np.array([row])) for batch, row in rows]
-        return SampleMeasurement(self.track.positions[k], self.sigma[k], factors)
 
     def _least(self) -> Array:
         """(d,) least standard deviations, against rounding."""
@@ -275,8 +257,7 @@ class _Run:
         """The filter at its first sample, or at the window's end."""
         record, owner = self.record, self.owner
         first, second = self._first_pair(0)
-        mean, covariance = self.prior(first)
-        start = first
+        (mean, covariance), start = self.prior(first), first
         if owner.initialise == "window":
             start = min(first + WINDOW - 1, len(self.track) - 1)
             window = SlidingWindow(owner.model, owner.surfaces, self.settings).estimate(self.track)
@@ -286,9 +267,8 @@ class _Run:
             record.covariance[:, :STATE_DIM, :STATE_DIM] = window.covariances
             mean, covariance = record.mean[start].copy(), record.covariance[start].copy()
             if len(self.bias_sigmas) and start > 0:  # the window takes the errors of its two ends to be independent
-                slope = covariance[POSITION, -3:] / (
-                    self.track.times[start] - self.track.times[max(start - WINDOW + 1, 0)]
-                )
+                span = self.track.times[start] - self.track.times[max(start - WINDOW + 1, 0)]
+                slope = covariance[POSITION, -3:] / span
                 covariance[VELOCITY, -3:] = covariance[-3:, VELOCITY] = slope
         record.start = start
         record.quality[:first] = Quality.OUTLIER
@@ -368,8 +348,7 @@ class _Run:
     def _correct_beside(self, ball: BallFilter, k: int) -> None:
         """Updates with all other measurements at sample k.
 
-        At the first sample the velocity is still unknown: a speed, whose Jacobian is zero there, is skipped with an
-        innovation of NaN.
+        At the first sample a speed, whose Jacobian is zero without a velocity, is skipped with an innovation of NaN.
         """
         begins = k == self.record.start
         for observation, batch in self.beside:

@@ -6,8 +6,6 @@ Source: H. E. Rauch, F. Tung, C. T. Striebel, "Maximum likelihood estimates of l
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -23,7 +21,6 @@ from ballfg.factors.loss import Loss
 from ballfg.state import STATE_DIM
 
 
-@dataclass
 class FilterRecord:
     """A filter's belief at each of n samples, in d numbers: state, coefficients of the model, tracker's bias.
 
@@ -41,36 +38,15 @@ class FilterRecord:
         hits: intervals.
     """
 
-    prior_mean: Array
-    prior_covariance: Array
-    mean: Array
-    covariance: Array
-    transition: Array
-    noise: Array
-    measurement_noise: Array
-    whitened: Array
-    quality: NDArray[np.int8]
-    least: Array
-    start: int = 0
-    contacts: dict[int, tuple[Contact, ...]] = field(default_factory=dict)
-    hits: list[int] = field(default_factory=list)
-
-    @classmethod
-    def empty(cls, n: int, d: int) -> FilterRecord:
-        """A record of n samples without content."""
-        square = (n, d, d)
-        return cls(
-            prior_mean=np.zeros((n, d)),
-            prior_covariance=np.zeros(square),
-            mean=np.zeros((n, d)),
-            covariance=np.zeros(square),
-            transition=np.zeros(square),
-            noise=np.zeros(square),
-            measurement_noise=np.zeros((n, 3, 3)),
-            whitened=np.full((n, 3), np.nan),
-            quality=np.full(n, Quality.GOOD, dtype=np.int8),
-            least=np.zeros(d),
-        )
+    def __init__(self, n: int, d: int) -> None:
+        self.prior_mean, self.mean, self.least = np.zeros((n, d)), np.zeros((n, d)), np.zeros(d)
+        self.prior_covariance, self.covariance = np.zeros((n, d, d)), np.zeros((n, d, d))
+        self.transition, self.noise = np.zeros((n, d, d)), np.zeros((n, d, d))
+        self.measurement_noise, self.whitened = np.zeros((n, 3, 3)), np.full((n, 3), np.nan)
+        self.quality = np.full(n, Quality.GOOD, dtype=np.int8)
+        self.start = 0
+        self.contacts: dict[int, tuple[Contact, ...]] = {}
+        self.hits: list[int] = []
 
     @property
     def used(self) -> NDArray[np.bool_]:
@@ -78,12 +54,9 @@ class FilterRecord:
         return self.quality != Quality.OUTLIER
 
     def innovations(self, H: Array, mean: Array, covariance: Array, measured: Array) -> Array:
-        """(n, 3) whitened: each sample against its prediction from all others.
+        """(n, 3) whitened: each sample measured (n, 3) m against its prediction from all others.
 
-        Args:
-            H: (3, d) of a measured position.
-            mean: (n, d) and covariance: (n, d, d), given all samples.
-            measured: (n, 3) m.
+        Args: H: (3, d) of a measured position.  mean, covariance: (n, d) and (n, d, d), given all samples.
         """
         n, expected = len(mean), mean @ H.T
         used = self.used & (np.arange(n) >= self.start)
@@ -124,26 +97,17 @@ def _gain(cross: Array, covariance: Array) -> Array:
 
 
 def fly_back(
-    model: BallModel,
-    start: int,
-    times: Array,
-    noise: Array,
-    fading: tuple[Array, Array],
-    mean: Array,
-    covariance: Array,
+    model: BallModel, start: int, times: Array, noise: Array, fading: tuple[Array, Array], known: tuple[Array, Array]
 ) -> None:
     """Fills the states before sample `start`, in place, by free flight back from it.
 
     Args:
-        model: the ball, with its coefficients in the state.
-        start: the first sample with a state.
-        times: (n,) s.
+        model: the ball, with its coefficients in the state.  times: (n,) s.  known: means and covariances.
         noise: (n - 1, 9, 9), process noise of free flight over each interval.
         fading: (n - 1,) decay of the bias over each interval and (n - 1, b) m, the standard deviation of its new part,
             the same in both directions of time.
-        mean: (n, d).
-        covariance: (n, d, d).
     """
+    mean, covariance = known
     width = mean.shape[1] - fading[1].shape[1]
     for k in range(start - 1, -1, -1):
         state, dt = torch.from_numpy(mean[k + 1 : k + 2, :width]), torch.from_numpy(times[k : k + 1] - times[k + 1])

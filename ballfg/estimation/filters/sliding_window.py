@@ -127,8 +127,7 @@ def _lag_covariance(model: BallModel, states: Array, spin_covariance: Array, spa
         acceleration = model.rates(state)[0].numpy()
     by_spin = rate_jacobian(model.rates, state)[:, VELOCITY, SPIN].numpy()
     half = span[:, None, None] / 2
-    lag = acceleration[:, :, None] * half
-    by_spin = by_spin * half
+    lag, by_spin = acceleration[:, :, None] * half, by_spin * half
     return np.asarray(lag @ lag.swapaxes(-1, -2) + by_spin @ spin_covariance @ by_spin.swapaxes(-1, -2))
 
 
@@ -148,35 +147,28 @@ def _bounce_covariance(track: Track, first: NDArray[np.int64], bounced: NDArray[
 def first_pair(
     times: Array, positions: Array, sigma: Array, near: NDArray[np.bool_], first: int = 0
 ) -> tuple[int, int]:
-    """The first two good samples of a flight: with a third they lie on a parabola.
+    """The first two good samples of a flight from sample `first` on: with a third they lie on a parabola.
 
     The triple with the best parabola among those that end earliest gives them. Samples near a surface agree with all,
-    as a bounce may lie between them.
+    as a bounce may lie between them. If nothing fits, they are `first` and the next one.
 
-    Args:
-        times: (n,) s.
-        positions: (n, 3) m.
-        sigma: (n, 3) m.
-        near: (n,) bool, samples near a surface.
-        first: the first sample to look at.
-    Returns: indices of two samples; `first` and the next one if nothing fits.
+    Args: times: (n,) s.  positions, sigma: (n, 3) m.  near: (n,) bool, samples near a surface.
     """
     for last in range(first + 2, min(first + START_SEARCH, len(times))):
         pairs = list(combinations(range(first, last), 2))
-        misses = [
-            0.0 if near[[i, j, last]].any() else _parabola_miss(times, positions, sigma, i, j, last) for i, j in pairs
-        ]
+        triples = ([i, j, last] for i, j in pairs)
+        misses = [0.0 if near[t].any() else _parabola_miss(times[t], positions[t], sigma[t]) for t in triples]
         if min(misses) < START_GATE:
             return pairs[int(np.argmin(misses))]
     return first, first + 1
 
 
-def _parabola_miss(times: Array, positions: Array, sigma: Array, i: int, j: int, k: int) -> float:
-    """Squared whitened distance of sample j from a flight between samples i and k, drag and lift unknown."""
-    span = times[k] - times[i]
-    shares = np.array([(times[k] - times[j]) / span, -1.0, (times[j] - times[i]) / span])
-    bend = 0.5 * (times[j] - times[i]) * (times[k] - times[j])
-    miss = shares @ positions[[i, j, k]]
+def _parabola_miss(times: Array, positions: Array, sigma: Array) -> float:
+    """Squared whitened distance of the second of three samples from a flight between the others, drag unknown."""
+    since, until = np.diff(times)
+    span = times[2] - times[0]
+    shares, bend = np.array([until / span, -1.0, since / span]), 0.5 * since * until
+    miss = shares @ positions
     miss[Z] += bend * STANDARD_GRAVITY
-    variance = shares**2 @ sigma[[i, j, k]] ** 2 + (bend * START_ACCELERATION) ** 2
+    variance = shares**2 @ sigma**2 + (bend * START_ACCELERATION) ** 2
     return float((miss**2 / variance).sum())

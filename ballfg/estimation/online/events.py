@@ -14,15 +14,7 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.online.state import Sample
 from ballfg.estimation.online.windows.stream_window import StreamWindow
-from ballfg.estimation.segmentation.batch import (
-    BREAKS,
-    SIDE,
-    contacts_of,
-    hits_at_contacts,
-    intervals_of,
-    quality_of,
-    rests_of,
-)
+from ballfg.estimation.segmentation.batch import BREAKS, SIDE, assembled
 from ballfg.estimation.segmentation.events import Event, EventKind
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.estimation.segmentation.result import Quality, Segmentation
@@ -75,35 +67,25 @@ class EventTracker:
         self._pending = decision.pending
         after = (*self._final, *self._pending)
         changed = len(before) != len(after) or any(a is not b for a, b in zip(before, after, strict=True))
-        return changed or self._resting() or self._second_look_due()
-
-    def _resting(self) -> bool:
-        state = [e.kind for e in (*self._final, *self._pending) if e.kind in _REST_KINDS]
-        return bool(state) and state[-1] is EventKind.REST
-
-    def _second_look_due(self) -> bool:
-        """True if a contact has just enough samples after it to be distinguished from a hit."""
-        newest = self.segmenter.count - 1
-        return any(e.kind is EventKind.CONTACT and e.index + SIDE == newest for e in self._pending)
+        resting = [e.kind for e in after if e.kind in _REST_KINDS][-1:] == [EventKind.REST]
+        newest = self.segmenter.count - 1  # a contact with just enough samples after it is distinguished from a hit
+        due = any(e.kind is EventKind.CONTACT and e.index + SIDE == newest for e in self._pending)
+        return changed or resting or due
 
     def segmentation(self, first: int, times: Array, positions: Array) -> Segmentation:
         """The best explanation of the samples first, first + 1, ... of the stream, numbered from 0.
 
         Args: first: number of the window's first sample.  times: (n,) s.  positions: (n, 3) m.
         """
-        self._final = _still_needed(self._final, first)
-        events = [replace(e, index=e.index - first) for e in (*self._final, *self._pending) if _matters(e, first)]
-        n = len(times)
-        contacts, hits = contacts_of(events), intervals_of(events, *BREAKS)
-        quality = quality_of(events, n, self.settings.shift_level)
-        hits += hits_at_contacts(times, positions, quality <= Quality.WIDE, contacts, hits, self.physics, self.settings)
-        found = Segmentation(
-            contacts=tuple(contacts),
-            hits=np.array(sorted(hits), dtype=np.int64),
-            restarts=np.array(intervals_of(events, EventKind.RESTART), dtype=np.int64),
-            rests=tuple(rests_of(events, n)),
-            quality=quality,
-        )
+        old = [e for e in self._final if e.index < first and e.kind in _REST_KINDS][-1:]
+        open_rest = [e for e in old if e.kind is EventKind.REST]  # the last rest, unless the ball left it
+        self._final = open_rest + [e for e in self._final if e.index >= first]
+        events = [
+            replace(e, index=e.index - first)
+            for e in (*self._final, *self._pending)
+            if e.index >= first or e.kind is EventKind.REST
+        ]
+        found = assembled(events, times, positions, self.physics, self.settings)
         return found if self.find_events else found.only_contacts()
 
     def with_moved_contacts(self, segmentation: Segmentation, first: int) -> Segmentation:
@@ -136,25 +118,10 @@ class EventTracker:
 _REST_KINDS = (EventKind.REST, EventKind.LEAVE, *BREAKS)
 
 
-def _matters(event: Event, first: int) -> bool:
-    """True for an event inside the window, or the rest at its beginning."""
-    inside = event.index >= first - (event.kind is EventKind.REST)
-    return inside or event.kind is EventKind.REST
-
-
-def _still_needed(events: list[Event], first: int) -> list[Event]:
-    """Events in the window, and the last rest, leave or break before it."""
-    old = [e for e in events if e.index < first and e.kind in _REST_KINDS]
-    open_rest = old[-1:] if old and old[-1].kind is EventKind.REST else []
-    return open_rest + [e for e in events if e.index >= first]
-
-
 def contact_step(state: Array, rise: float, dt: float) -> int:
     """The interval of a contact relative to the present one: -1 the one before, 1 the next, 0 the same.
 
-    The ball's path over one interval is a parabola to some micrometres.
-
-    Args: state: (9,) at the interval's start.  rise: m, z of the centre at the contact.  dt: s.
+    The path over one interval is a parabola to some micrometres, from `state` (9,); the centre touches at `rise` m.
     """
     above, vz = float(state[Z]) - rise, float(state[VZ])
     root = vz * vz + 2 * STANDARD_GRAVITY * above
@@ -185,13 +152,18 @@ YOUNG = 20
 """Number of samples after a contact in which the estimate may still move it to another interval."""
 
 
+def path_of(samples: Sequence[Sample]) -> tuple[Array, Array]:
+    """Times (n,) s and positions (n, 3) m."""
+    return np.array([s.time for s in samples]), np.array([s.position for s in samples])
+
+
 def explain(window: StreamWindow, samples: list[Sample], events: EventTracker) -> list[Sample]:
     """Applies the events to the samples; samples from the first difference on are retracted and returned.
 
     Args: window: holds the first of the samples.  samples: the wanted content.  events: found in them.
     """
     held = len(window)
-    times, positions = np.array([s.time for s in samples]), np.array([s.position for s in samples])
+    times, positions = path_of(samples)
     segmentation = events.segmentation(window.first, times, positions)
     motions = motions_of(events.with_moved_contacts(segmentation, window.first), times)
     measured = np.array([s.measured for s in samples])
@@ -215,11 +187,7 @@ def explain(window: StreamWindow, samples: list[Sample], events: EventTracker) -
 
 
 def move_contacts(window: StreamWindow, samples: Sequence[Sample], events: EventTracker) -> Sequence[Sample]:
-    """Moves young contacts to their estimated places; the newest one may not have happened yet.
-
-    Args: as for `explain`.
-    Returns: the retracted samples, to be appended again.
-    """
+    """The samples retracted, as by `explain`, to move a young contact to its place; the newest may be to come."""
     n = len(window)
     for k in range(max(n - YOUNG, 1), n):
         motion = samples[k].motion
@@ -243,11 +211,9 @@ def tell_velocities(window: StreamWindow, samples: Sequence[Sample]) -> None:
     """Sets rough velocities of the coming samples, by line fits between the events, for the errors of their stamps.
 
     A start or a hit just before the window's last sample left its velocity undetermined; now there are more samples.
-
-    Args: as for `explain`.
     """
     held = len(window)
-    times, positions = np.array([s.time for s in samples]), np.array([s.position for s in samples])
+    times, positions = path_of(samples)
     breaks = [k - 1 for k, s in enumerate(samples) if k and s.motion != FLIGHT]
     velocities = window_velocities(times, positions, breaks)
     last = samples[max(held - 1, 0)].motion

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array, Index
 from ballfg.estimation.online.events import SIGMA_FACTOR
 from ballfg.estimation.online.state import Sample
-from ballfg.estimation.online.windows.linear import without_bias
+from ballfg.estimation.online.windows.filter import without_bias
 from ballfg.estimation.online.windows.stream_window import StreamWindow
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.segmentation.result import Contact, Segmentation
@@ -22,10 +22,7 @@ from ballfg.tracks import Track
 
 @dataclass(frozen=True)
 class Frozen:
-    """A state at the moment when it left the window.
-
-    Attributes: sample: its observation.  state: (9,).  joint: (9 + p, 9 + p) covariance with the coefficients.
-    """
+    """A state (9,) when it left the window: with its observation, and its covariance with the coefficients."""
 
     sample: Sample
     state: Array
@@ -52,12 +49,7 @@ def final_estimate(
 ) -> Estimate:
     """The result over a whole track.
 
-    Args:
-        smoother: with the window's model, surfaces and settings.
-        window: after the last push.
-        track: all of it.
-        found: the events among the window's samples.
-        frozen: the states that left the window, oldest first.
+    Args: smoother: with the window's settings.  found: the events in the window.  frozen: states before it.
     """
     first = window.first
     part = track.between(float(track.times[first]), float(track.times[-1]))

@@ -5,6 +5,7 @@ import gc
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Final
 
 import numpy as np
@@ -18,7 +19,7 @@ from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities
 from ballfg.estimation.launcher import FIRST_SAMPLES, group_spin
 from ballfg.estimation.observations.observation import Observation
-from ballfg.estimation.online.events import EventTracker, explain, move_contacts, tell_velocities
+from ballfg.estimation.online.events import EventTracker, explain, move_contacts, path_of, tell_velocities
 from ballfg.estimation.online.final import Frozen, final_estimate, freeze, unknown
 from ballfg.estimation.online.measurement import Measurement, measurements_beside
 from ballfg.estimation.online.state import OnlineState, Sample, Update
@@ -173,8 +174,7 @@ class Online(Estimator):
             raise ValueError(f"time must be finite and increase; got {stamp} s after {last} s. Sort the samples.")
         sample = Sample(since, point, spread)
         check_iterable("observations", observations)
-        others = tuple(observations)
-        if others:
+        if others := tuple(observations):
             moment = Track(np.array([sample.time]), point[None], spread[None], name="stream", observations=others)
             beside = measurements_beside(moment, self.model, self.settings, spread[None])
             sample.measurements += [measurement for found in beside.values() for _, measurement in found]
@@ -202,12 +202,9 @@ class Online(Estimator):
             raise ValueError("push_sighting must not follow push in one stream; call reset in between.")
         since = self._origin.elapsed(as_float("time", time, "s"))
         samples, joined = self._stream.take(since, camera, pixel, covariance)
-        if joined is not None:
-            state: OnlineState | None = self._join(joined)
-        else:
-            state = None
-            for sample in samples:
-                state = self._observe(sample)
+        state = None if joined is None else self._join(joined)
+        for sample in samples:
+            state = self._observe(sample)
         return state and replace(state, time=self.stamp_of(state.time))
 
     @np.errstate(over="ignore", invalid="ignore")  # samples that no ball flew give a status, not warnings
@@ -230,7 +227,7 @@ class Online(Estimator):
         if status is Status.OK and not newest.motion.linked:  # a long gap before it
             status = Status.NO_VELOCITY
         contact = self._near_contact(None if rebuilt else before, newest)
-        return self._state(self.window, newest, update, revised, rebuilt, status, contact)
+        return self._state(update, revised, rebuilt, status, contact)
 
     def _new_window(self, sample: Sample) -> StreamWindow:
         """A window that begins with a sample; only measured positions have a tracker's bias."""
@@ -242,10 +239,7 @@ class Online(Estimator):
         return window
 
     def _near_contact(self, before: tuple[Array, Array] | None, sample: Sample) -> ContactState | None:
-        """The state to report of a ball that may be on either side of a contact; None far from one.
-
-        Args: before: the belief at the sample before.  sample: the newest one.
-        """
+        """The state to report on either side of a contact, from the belief a sample before; None far from one."""
         assert self._monitor is not None
         motion = sample.motion
         if before is None or motion.hit or not motion.linked or motion.rest is not None:
@@ -268,8 +262,7 @@ class Online(Estimator):
         last = [*self._samples[1 - WINDOW :], sample]
         in_order = len(last) > 1 and sample.time > last[-2].time and np.isfinite(sample.position).all()
         if self.settings.stamp_jitter > 0.0 and in_order:
-            times, positions = np.array([s.time for s in last]), np.array([s.position for s in last])
-            sample.velocity = window_velocities(times, positions)[-1]
+            sample.velocity = window_velocities(*path_of(last))[-1]
         sample.whole = total_sigmas(self.settings, sample.stated, sample.velocity)
 
     @np.errstate(over="ignore", invalid="ignore")
@@ -277,18 +270,15 @@ class Online(Estimator):
         """Takes in one more sighting of the newest sample."""
         assert self.window is not None
         self._counts[:] = 0
-        status, rebuilt, sample = Status.OK, False, self._samples[-1]
-        sample.measurements.append(sighting)
+        self._samples[-1].measurements.append(sighting)
         try:
             update = self.window.attach(sighting)
         except (RuntimeError, ValueError) as error:
-            rebuilt = True
-            status, update = self._repair(error, status)
+            status, update = self._repair(error, Status.OK)
+            return self._state(update, 0, True, status, None)
         assert self._monitor is not None
-        contact = (
-            None if rebuilt else self._monitor.update(SampleMeasurement(factors=[sighting.batch]), self._has_bounced)
-        )
-        return self._state(self.window, sample, update, 0, rebuilt, status, contact)
+        contact = self._monitor.update(SampleMeasurement(factors=[sighting.batch]), self._has_bounced)
+        return self._state(update, 0, False, Status.OK, contact)
 
     def _take_in(self, window: StreamWindow, sample: Sample, changed: bool) -> tuple[int, Update]:
         """Explains, goes back to where the explanation changed, appends, moves contacts, cuts the window."""
@@ -301,11 +291,10 @@ class Online(Estimator):
         moved = move_contacts(window, self._samples, self.events)
         if moved:
             self._append(window, *moved)
-        if self._shows_direction(window):
-            assert self.settings.spins is not None
-            times, positions = (np.array([getattr(s, name) for s in self._samples]) for name in ("time", "position"))
-            launch = Track(times, positions, name="stream", part=True)
-            self._samples[0].label = group_spin(self.settings.spins, launch, self.settings.group)
+        spins, begun = self.settings.spins, window.first == 0 and len(self._samples) == FIRST_SAMPLES
+        if spins is not None and begun and self._samples[0].label is None:  # the direction of the launch shows now
+            launch = Track(*path_of(self._samples), name="stream", part=True)
+            self._samples[0].label = group_spin(spins, launch, self.settings.group)
             update = window.start_anew(self._samples)
         if len(window) > 2 * self.lag:
             if self._frozen is not None:
@@ -313,11 +302,6 @@ class Online(Estimator):
             window.shorten(self.lag)
             self._samples = list(window.samples)
         return max(len(again), len(moved)), update
-
-    def _shows_direction(self, window: StreamWindow) -> bool:
-        """True once a stream shows the direction of its launch, along which the spins of a group count."""
-        begun = window.first == 0 and len(self._samples) == FIRST_SAMPLES
-        return self.settings.spins is not None and begun and self._samples[0].label is None
 
     def _append(self, window: StreamWindow, *samples: Sample) -> Update:
         update = window.append_all(samples)
@@ -338,20 +322,16 @@ class Online(Estimator):
         self.window.first = first
         self._samples = [newest]
         try:
-            return Status.FAILED, self.window.append(newest)
+            return Status.FAILED, self.window.append_all([newest])
         except (RuntimeError, ValueError):
             raise error from None
 
     def _state(
-        self,
-        window: StreamWindow,
-        sample: Sample,
-        update: Update,
-        revised: int,
-        rebuilt: bool,
-        status: Status,
-        contact: ContactState | None,
+        self, update: Update, revised: int, rebuilt: bool, status: Status, contact: ContactState | None
     ) -> OnlineState:
+        """The state at the newest sample."""
+        assert self.window is not None
+        window, sample = self.window, self._samples[-1]
         mean, joint = window.newest_belief
         if contact is not None:
             mean, joint = contact.mean[: len(mean)], contact.widened[: len(mean), : len(mean)]
@@ -394,18 +374,17 @@ class Online(Estimator):
             for k, (t, position, spread) in enumerate(zip(track.times, track.positions, sigma, strict=True))
         ]
         beside = measurements_beside(track, self.model, self.settings, sigma)
-        for measurements in beside.values():
-            for k, measurement in measurements:
-                samples[k].measurements.append(measurement)
+        for k, measurement in chain.from_iterable(beside.values()):
+            samples[k].measurements.append(measurement)
         states = [self._observe(sample) for sample in samples]
         innovations = {} if track.rough else {"position": np.array([state.innovation for state in states])}
         for name, measurements in beside.items():
             innovations[name] = np.array([measurement.innovation for _, measurement in measurements])
         assert self.window is not None
-        smoother = Smoother(self.model, self.surfaces, self.settings)
         first = self.window.first
         found = self.events.segmentation(first, track.times[first:], track.positions[first:])
         found = self.events.with_moved_contacts(found, first)  # the window's states fit the refined contacts
+        smoother = Smoother(self.model, self.surfaces, self.settings)
         result = final_estimate(smoother, self.window, track, found, self._frozen)
         self.reset()
         lost = any(state.status is Status.FAILED for state in states)

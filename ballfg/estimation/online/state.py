@@ -57,9 +57,8 @@ class Update:
 
     Attributes:
         innovation: (dim,) whitened, of the position or of its substitute; NaN without a prediction.
-        evaluated: number of evaluated factors of the motion, including the new one.
-        calls: number of torch calls for them.
-        variables: number of states that iSAM2 eliminated again.
+        evaluated, calls: factors of the motion, including the new one, and torch calls for them.
+        variables: number of states that were eliminated again.
     """
 
     innovation: Array

@@ -75,25 +75,20 @@ class SightingStream:
         self._last = true
         ray = Rays.of(row, np.array([true]), tuple(self.cameras.values()))
         self._rays = ray if self._rays is None else self._rays.joined(ray, MOST_RAYS, self._period(true))
-        newest = self._newest
-        if newest is None or true - newest.time > SAME_MOMENT:
-            found = [self._measurement(row, 0.0)]
-            self._newest = Sample(true, np.zeros(3), np.ones(3), measured=False, measurements=found)
+        newest, where = self._newest, np.zeros(1, dtype=np.int64)
+        since = np.inf if newest is None else true - newest.time
+        delay = np.array([since if since <= SAME_MOMENT else 0.0])
+        sighting = Measurement(
+            CameraFactors(where, row.camera, row.pixels, row.covariances, self.bank, delay, loss=self.loss)
+        )
+        if newest is None or since > SAME_MOMENT:
+            self._newest = Sample(true, np.zeros(3), np.ones(3), measured=False, measurements=[sighting])
             self._held.append(self._newest)
             return self._placed(), None
-        sighting = self._measurement(row, true - newest.time)
         if not self._held:
             return [], sighting
         newest.measurements.append(sighting)
         return self._placed(), None
-
-    def _measurement(self, row: Sightings, delay: float) -> Measurement:
-        """One sighting, `delay` s later than its sample."""
-        where = np.zeros(1, dtype=np.int64)
-        factors = CameraFactors(
-            where, row.camera, row.pixels, row.covariances, self.bank, np.array([delay]), loss=self.loss
-        )
-        return Measurement(factors)
 
     def _period(self, now: float) -> float:
         """s, of the slowest camera that sees the ball."""

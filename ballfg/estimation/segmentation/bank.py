@@ -1,6 +1,6 @@
 """Defines the records of machine code for hypotheses, events, surfaces, and the constants of a scene."""
 
-from dataclasses import dataclass, field, fields
+from dataclasses import fields
 from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -134,36 +134,24 @@ NUMBERS: Final = np.dtype(
 SCENE: Final[Any] = from_dtype(NUMBERS)
 
 
-@dataclass(frozen=True)
 class Scene:
-    """Ball, surfaces and settings.
+    """Ball, surfaces and settings for machine code: `numbers`, a row of `NUMBERS`; `rows` of `SURFACE`, table first."""
 
-    Attributes: numbers: one row of `NUMBERS`.  rows: (s,) of `SURFACE`, one a surface, table first.
-    """
-
-    physics: SegmentationPhysics
-    surfaces: Surfaces
-    settings: SegmentationSettings
-    numbers: Record = field(init=False)
-    rows: Records = field(init=False)
-
-    def __post_init__(self) -> None:
-        s, drift = self.settings, np.zeros((3, 3, 3))
+    def __init__(self, physics: SegmentationPhysics, surfaces: Surfaces, settings: SegmentationSettings) -> None:
+        self.surfaces, self.settings = surfaces, settings
+        s, drift = settings, np.zeros((3, 3, 3))
         drift[2, 0, 0], drift[1, 0, 1], drift[0, 1, 1] = white_acceleration(1.0, s.velocity_drift**2)
         drift[1, 1, 0], drift[0, 2, 2] = drift[1, 0, 1], s.slack_drift**2
         shares = np.log([1.0 - s.wide_share - s.outlier_share, s.wide_share, s.outlier_share])
-        extent = np.array((-np.inf, np.inf, -np.inf, np.inf) if (known := self.surfaces.extent) is None else known)
+        extent = np.array((-np.inf, np.inf, -np.inf, np.inf) if surfaces.extent is None else surfaces.extent)
         extent += s.extent_margin * np.array((-1.0, 1.0, -1.0, 1.0))
-        own = (getattr(part, one.name) for part in (self.physics, s) for one in fields(part))
-        numbers = np.array([(*own, shares, drift, extent)], dtype=NUMBERS)
-        object.__setattr__(self, "numbers", numbers[0])
-
-        heights = np.array(self.surfaces.heights())
-        rows = np.zeros(len(heights), dtype=SURFACE)
-        rows["centre"] = heights + self.physics.surface_offset + self.physics.radius
-        rows["restitution_sigma"] = s.floor_restitution_sigma
-        rows["restitution_sigma"][0] = s.restitution_sigma
-        object.__setattr__(self, "rows", rows)
+        own = (getattr(part, one.name) for part in (physics, s) for one in fields(part))
+        self.numbers: Record = np.array([(*own, shares, drift, extent)], dtype=NUMBERS)[0]
+        heights = np.array(surfaces.heights())
+        self.rows: Records = np.zeros(len(heights), dtype=SURFACE)
+        self.rows["centre"] = heights + physics.surface_offset + physics.radius
+        self.rows["restitution_sigma"] = s.floor_restitution_sigma
+        self.rows["restitution_sigma"][0] = s.restitution_sigma
 
     def height(self, surface: int) -> float | None:
         """m, declared height of a surface; None for -1."""

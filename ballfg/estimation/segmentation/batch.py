@@ -18,11 +18,6 @@ BREAKS = (EventKind.HIT, EventKind.RESTART)
 """Events after which nothing is known of the past."""
 
 
-def contacts_of(events: Sequence[Event]) -> list[Contact]:
-    """The contacts, in order."""
-    return [Contact(e.index, e.time, e.height) for e in events if e.kind is EventKind.CONTACT and e.height is not None]
-
-
 def intervals_of(events: Sequence[Event], *kinds: EventKind) -> list[int]:
     """The intervals with an event of some kinds, ascending."""
     return sorted({e.index for e in events if e.kind in kinds})
@@ -62,14 +57,12 @@ def shifted(events: Sequence[Event], samples: int, level: float) -> NDArray[np.b
     A segment does not show which of two offsets is the true one; the tracker is assumed to be right most of the time. A
     lone shift in the interval of a contact is left out: the jump belongs to the contact as well.
     """
-    jumps = np.zeros((samples, 3))
+    jumps, marked = np.zeros((samples, 3)), np.zeros(samples, dtype=bool)
     shifts = [event for event in events if event.kind is EventKind.SHIFT]
-    contacts = intervals_of(events, EventKind.CONTACT) if shifts else []
+    contacts = intervals_of(events, EventKind.CONTACT)
     for event in shifts:
         jumps[event.index + 1] += event.offset
-    marked = np.zeros(samples, dtype=bool)
-    cuts = [0, *(i + 1 for i in intervals_of(events, *BREAKS)), samples]
-    for first, stop in pairwise(cuts):
+    for first, stop in pairwise([0, *(i + 1 for i in intervals_of(events, *BREAKS)), samples]):
         inside = [event.index for event in shifts if first <= event.index + 1 < stop]
         if not inside or (len(inside) == 1 and inside[0] in contacts):
             continue
@@ -100,14 +93,11 @@ def hits_at_contacts(
 ) -> list[int]:
     """Intervals of contacts with a tangential jump beyond Coulomb friction: mu (1 + e) v_n.
 
+    The forward pass takes a bat, a net or a frame at a contact for one whose unknown friction costs less than a hit.
+
     Args:
-        times: (n,) s.
-        positions: (n, 3) m.
-        usable: (n,) samples that measure the ball.
-        contacts: of the forward pass, in order.
-        hits: intervals; they bound the used samples, as neighbouring contacts do.
-        physics: of the ball.
-        settings: with the tolerated excess.
+        times: (n,) s.  positions: (n, 3) m.  usable: (n,) samples that measure the ball.
+        contacts: in order.  hits: intervals; they bound the used samples, as neighbouring contacts do.
     """
     ends = sorted({-1, len(times) - 1, *hits, *(contact.interval for contact in contacts)})
     found = []
@@ -116,9 +106,9 @@ def hits_at_contacts(
         if i in hits or not 0 <= i < len(times) - 1 or times[i + 1] - times[i] > LONGEST_INTERVAL:
             continue
         place = ends.index(i)
-        before = _velocity(times, positions, usable, max(ends[place - 1] + 1, i + 1 - SIDE), i, contact.time, physics)
         stop = min(ends[place + 1], i + SIDE) if place + 1 < len(ends) else i
-        after = _velocity(times, positions, usable, i + 1, stop, contact.time, physics)
+        sides = (max(ends[place - 1] + 1, i + 1 - SIDE), i), (i + 1, stop)
+        before, after = (_velocity(times, positions, usable, *side, contact.time, physics) for side in sides)
         if before is None or after is None:
             continue
         jump = np.hypot(*(after[:2] - before[:2]))
@@ -145,8 +135,7 @@ def _velocity(
     pull = -physics.drag * np.linalg.norm(chord) * chord - np.array([0.0, 0.0, physics.gravity])
     straight = positions[rows] - 0.5 * pull * since[:, None] ** 2
     centred = since - since.mean()
-    slope: Array = centred @ (straight - straight.mean(axis=0)) / (centred @ centred)
-    return slope
+    return np.asarray(centred @ (straight - straight.mean(axis=0)) / (centred @ centred))
 
 
 def segment(
@@ -174,17 +163,20 @@ def segment(
     """
     t, x, s = _checked(times, positions, sigma)
     physics, settings = physics or SegmentationPhysics(), settings or SegmentationSettings()
-    events = Segmenter(surfaces, physics, settings).push_all(t, x, s)
-    contacts, hits = contacts_of(events), intervals_of(events, *BREAKS)
-    quality = quality_of(events, len(t), settings.shift_level)
-    hits += hits_at_contacts(t, x, quality <= Quality.WIDE, contacts, hits, physics, settings)
-    return Segmentation(
-        contacts=tuple(contacts),
-        hits=np.array(sorted(hits), dtype=np.int64),
-        restarts=np.array(intervals_of(events, EventKind.RESTART), dtype=np.int64),
-        rests=tuple(rests_of(events, len(t))),
-        quality=quality,
-    )
+    return assembled(Segmenter(surfaces, physics, settings).push_all(t, x, s), t, x, physics, settings)
+
+
+def assembled(
+    events: Sequence[Event], times: Array, positions: Array, ball: SegmentationPhysics, settings: SegmentationSettings
+) -> Segmentation:
+    """The segmentation by a chain of events, with hits at contacts; times (n,) s and positions (n, 3) m."""
+    n = len(times)
+    contacts = [Contact(e.index, e.time, e.height) for e in events if e.kind is EventKind.CONTACT]
+    hits, quality = intervals_of(events, *BREAKS), quality_of(events, n, settings.shift_level)
+    hits += hits_at_contacts(times, positions, quality <= Quality.WIDE, contacts, hits, ball, settings)
+    restarts = np.array(intervals_of(events, EventKind.RESTART), dtype=np.int64)
+    hit = np.array(sorted(hits), dtype=np.int64)
+    return Segmentation(tuple(contacts), hit, restarts, tuple(rests_of(events, n)), quality)
 
 
 def _checked(times: ArrayLike, positions: ArrayLike, sigma: ArrayLike) -> tuple[Array, Array, Array]:

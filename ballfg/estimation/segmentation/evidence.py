@@ -38,7 +38,6 @@ def update(work: Work, first: int, sample: Sample, scene: Record) -> float:
     This happens where the ball's place is hardly known: at its second sample, and at the first ones after a hit or a
     gap. Explanations that are far behind already are not multiplied.
 
-    Args: work: predicted hypotheses; afterwards the updated ones.  first: row.  sample.  scene: of a `Scene`.
     Returns: squared whitened innovation, as of a good sample, of the hypothesis that is the best afterwards.
     """
     bank, n, best, surprise = work.bank, work.fill[USED], -math.inf, 0.0
@@ -79,11 +78,9 @@ def _variance(h: Record, axis: int, sigma: float, component: int, scene: Record)
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, ONE, ONE, SCENE, ONE))
 def weigh(h: Record, position: Array, sigma: Array, scene: Record, said: Array) -> None:
-    """Evidence of a sample for a hypothesis, without the common constant (3/2 log 2 pi).
+    """Writes the evidence of a sample for a predicted hypothesis, without the common constant (3/2 log 2 pi).
 
-    Args:
-        h: predicted.  position: (3,) m.  sigma: (3,) m.  scene: of a `Scene`.
-        said: (4,) written: nats, of a good sample, a wide one and an outlier; and the squared innovation.
+    Args: said: (4,) nats, of a good sample, a wide one and an outlier; and the squared innovation.
     """
     said[SURPRISE] = 0.0
     for component in range(3):

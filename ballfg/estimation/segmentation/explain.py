@@ -48,11 +48,7 @@ def start(work: Work, tip: int, score: float, sample: Sample, scene: Record, sur
 
     All expect the ball within the spread of outliers around the sample, so that their evidences are comparable.
 
-    Args:
-        work: empty; afterwards those hypotheses.
-        tip: the last event before.
-        score: nats, carried on.
-        scene, surfaces: of a `Scene`.
+    Args: work: empty; afterwards those hypotheses.  tip: the last event before.  score: nats, carried on.
     """
     work.fill[USED] = 1
     bank = work.bank
@@ -173,14 +169,11 @@ def explain(
     scene: Record,
     surfaces: Records,
 ) -> Any:
-    """The hypotheses after a sample, from those before it.
+    """The likely hypotheses after a sample, best first, and the log for their `tip`, from those before it.
 
     Args:
-        bank: (h,) best first; none before the first sample.
-        before: s, stamp of the last sample.
+        bank: (h,) best first; none before the first sample.  before: s, stamp of the last sample.
         time, position, sigma, index: of this one, as in `Sample`, with its number.
-        scene, surfaces: of a `Scene`.
-    Returns: the likely hypotheses, best first, and the log for their `tip`.
     """
     h, dt, now = len(bank), time - before, bank.copy()
     for row in range(h):

@@ -3,7 +3,7 @@
 import math
 import weakref
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -53,12 +53,10 @@ class SegmentationPhysics:
     surface_offset: float = 0.0
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not math.isfinite(value):
-                raise ValueError(f"{field.name} must be finite; got {value}. Check the model it comes from.")
         for name, (low, high) in BOUNDS.items():
             value = getattr(self, name)
+            if not math.isfinite(value):
+                raise ValueError(f"{name} must be finite; got {value}. Check the model it comes from.")
             if not low <= value <= high:
                 raise ValueError(f"{name} must lie in [{low:g}, {high:g}]; got {value:g}. Check units and model.")
 
@@ -81,8 +79,8 @@ def physics_of(model: BallModel) -> SegmentationPhysics:
     return known[2]
 
 
-_Known = tuple[Hashable, Sequence[Tensor], SegmentationPhysics]
-_known: weakref.WeakKeyDictionary[BallModel, _Known] = weakref.WeakKeyDictionary()
+_known: weakref.WeakKeyDictionary[BallModel, tuple[Hashable, Sequence[Tensor], SegmentationPhysics]]
+_known = weakref.WeakKeyDictionary()
 """For each model: the stamp of its numbers, its tables, and the result."""
 
 
@@ -91,14 +89,9 @@ def _asked(model: BallModel) -> SegmentationPhysics:
     still[:, Z] = 1.0
     with torch.no_grad():
         restitution, friction = _bounce_coefficients(model, still)
-        values = {
-            "gravity": -float(model.rates(still)[0][0, 2]),
-            "drag": _drag_coefficient(model, still),
-            "restitution": restitution,
-            "friction": friction,
-            "radius": model.radius,
-            "surface_offset": float(torch.as_tensor(model.surface_offset(still)).reshape(-1)[0]),
-        }
+        offset = float(torch.as_tensor(model.surface_offset(still)).reshape(-1)[0])
+        gravity, drag = -float(model.rates(still)[0][0, 2]), _drag_coefficient(model, still)
+    values = dict(zip(BOUNDS, (gravity, drag, restitution, friction, model.radius, offset), strict=True))
     return SegmentationPhysics(**{n: v for n, v in values.items() if BOUNDS[n][0] <= v <= BOUNDS[n][1]})
 
 

@@ -16,6 +16,8 @@ from ballfg.estimation.segmentation.explain import explain
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.estimation.segmentation.settings import SegmentationSettings
 
+USUAL = SegmentationSettings()
+
 
 @dataclass(frozen=True)
 class Decision:
@@ -41,15 +43,13 @@ class Segmenter:
     """
 
     def __init__(
-        self,
-        surfaces: Surfaces,
-        physics: SegmentationPhysics | None = None,
-        settings: SegmentationSettings | None = None,
+        self, surfaces: Surfaces, physics: SegmentationPhysics, settings: SegmentationSettings = USUAL
     ) -> None:
-        self._scene = Scene(physics or SegmentationPhysics(), surfaces, settings or SegmentationSettings())
+        self._scene = Scene(physics, surfaces, settings)
         self._bank: Records = np.empty(0, HYPOTHESIS)
         self._tips: list[Node | None] = []
-        self._count = 0
+        self.count = 0
+        """Number of samples so far."""
         self._time = -math.inf
 
     def copy(self) -> "Segmenter":
@@ -59,27 +59,22 @@ class Segmenter:
         other._tips = [copied(tip, known) for tip in self._tips]
         return other
 
-    @property
-    def count(self) -> int:
-        """Number of samples so far."""
-        return self._count
-
     def push(self, time: float, position: ArrayLike, sigma: ArrayLike) -> Decision:
         """Takes in the next sample.
 
-        Args: time: s, later than the last.  position: (3,) m.  sigma: (3,) m, standard deviation of each coordinate.
-        Returns: the events that became final, and the best explanation of the rest.
+        Args: time: s, later than the last.  position: (3,) m.  sigma: (3,) m, standard deviations.
         Raises: ValueError: if the time does not increase, or something is not finite or has a wrong shape.
         """
-        point, noise = self._checked(time, position, sigma)
+        if not math.isfinite(time) or time <= self._time:
+            raise ValueError(f"time must be finite and increase; got {time} s after {self._time} s. Sort the samples.")
+        point, noise = _triple("position", position), _triple("sigma", sigma)
         final = self._taken(time, point, np.maximum(noise, self._scene.settings.sigma_floor))
         return Decision(final, tuple(node.event for node in open_nodes(self._tips[0])))
 
     def push_all(self, times: Array, positions: Array, sigmas: Array) -> list[Event]:
-        """Takes in samples that are in order and finite, and returns the events of all samples so far.
+        """The events of all samples so far, oldest first, after samples that are in order and finite.
 
         Args: times: (n,) s.  positions, sigmas: (n, 3) m.
-        Returns: the events that became final, then the best explanation of the rest, oldest first.
         """
         events: list[Event] = []
         noise = np.array(np.maximum(sigmas, self._scene.settings.sigma_floor), order="C")
@@ -90,17 +85,14 @@ class Segmenter:
     def _taken(self, time: float, position: Array, sigma: Array) -> tuple[Event, ...]:
         """Takes in a sample; returns the events that become final."""
         last, scene = (self._bank, self._time), self._scene
-        self._bank, log = explain(*last, time, position, sigma, self._count, scene.numbers, scene.rows)
+        self._bank, log = explain(*last, time, position, sigma, self.count, scene.numbers, scene.rows)
         self._tips = self._followed(self._bank["tip"].tolist(), log)
         self._time = time
-        self._count += 1
+        self.count += 1
         return self._made_final()
 
     def _followed(self, tips: list[int], log: Records) -> list[Node | None]:
-        """The last node of each hypothesis after a sample; hypotheses with the same event share its node.
-
-        Args: tips: as in `HYPOTHESIS`.  log: the events of the sample.
-        """
+        """The last node of each hypothesis, by its `tip` in the log of a sample; equal events share a node."""
         old = self._tips
         if not len(log):
             return [old[-1 - tip] for tip in tips]
@@ -117,18 +109,13 @@ class Segmenter:
 
     def _made_final(self) -> tuple[Event, ...]:
         """Makes old events final, and drops the hypotheses that deny them."""
-        cutoff = self._count - self._scene.settings.lag
+        cutoff = self.count - self._scene.settings.lag
         old = [node for node in open_nodes(self._tips[0]) if node.event.index < cutoff]
         if not old:
             return ()
         agreeing = [row for row, tip in enumerate(self._tips) if contains(tip, old[-1])]
         self._bank, self._tips = self._bank[agreeing], [self._tips[row] for row in agreeing]
         return make_final(old)
-
-    def _checked(self, time: float, position: ArrayLike, sigma: ArrayLike) -> tuple[Array, Array]:
-        if not math.isfinite(time) or time <= self._time:
-            raise ValueError(f"time must be finite and increase; got {time} s after {self._time} s. Sort the samples.")
-        return _triple("position", position), _triple("sigma", sigma)
 
 
 def _event(log: Records, row: int, scene: Scene) -> Event:

@@ -8,7 +8,7 @@ sliding and rolling. So a bounce is computed at nine spins.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final
@@ -21,12 +21,14 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import fly_through_jacobian
 from ballfg.dynamics.motion.integrate import fly_jacobian
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.observations.observation import Observation
 from ballfg.estimation.settings import Settings, stamp_covariance
 from ballfg.estimation.sides.gaussians import GaussianMixture
 from ballfg.factors.batch import FactorBatch
 from ballfg.factors.correlated_noise import bias_step
 from ballfg.factors.dynamics import model_width
 from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, STATE_DIM, VELOCITY, VZ, Z
+from ballfg.tracks import Track
 
 FAR: Final = 4.5
 """Standard deviations of the gap beyond which a ball has certainly not touched: one in 300,000."""
@@ -62,14 +64,20 @@ class SampleMeasurement:
     factors: Sequence[FactorBatch] = ()
 
 
+def measured_at(
+    track: Track, sigma: Array, batches: Mapping[Observation, FactorBatch], sample: int
+) -> SampleMeasurement:
+    """The measurements at a sample of a track, given sigmas (n, 3) m and the factors of other observations."""
+    rows = [(batch, row) for one, batch in batches.items() for row in one.filter_rows(sample)]
+    factors = [batch.select(np.array([row])) for batch, row in rows]
+    return SampleMeasurement(track.positions[sample], sigma[sample], factors)
+
+
 @dataclass(frozen=True)
 class HypothesisModel:
     """Motion and measurement of a ball.
 
     ball: its model, with the estimated coefficients in columns after the state.
-        surfaces: table and floor.
-        surfaces: that it may bounce on.
-        settings: noise.
         biases: number of the tracker's biases after state and coefficients: 0 or 3.
     """
 

@@ -9,7 +9,7 @@ import pytest
 from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.estimation.segmentation.batch import segment
 from ballfg.estimation.segmentation.events import Event, EventKind
-from ballfg.estimation.segmentation.physics import physics_of
+from ballfg.estimation.segmentation.physics import SegmentationPhysics, physics_of
 from ballfg.estimation.segmentation.segmenter import Segmenter
 from ballfg.estimation.segmentation.settings import SegmentationSettings
 
@@ -84,7 +84,7 @@ def test_an_endless_stream_keeps_no_old_events(make_rally):
 def test_a_first_sample_is_the_ball_or_an_outlier_by_their_densities() -> None:
     """Far from all surfaces, where nothing rests. All hypotheses expect the sample within the spread of outliers."""
     settings, sigma = SegmentationSettings(), 0.01
-    segmenter = Segmenter(Surfaces(0.0), settings=settings)
+    segmenter = Segmenter(Surfaces(0.0), SegmentationPhysics(), settings)
     segmenter.push(0.0, (0.0, 0.0, 5.0), (sigma,) * 3)
     scores = np.sort(segmenter._bank["score"])
     good = np.log(1.0 - settings.wide_share - settings.outlier_share)

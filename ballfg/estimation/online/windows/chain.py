@@ -63,8 +63,7 @@ class ChainWindow(StreamWindow):
     def copy(self, samples: Sequence[Sample]) -> Self:
         """An independent window with the same states and factors."""
         other = copy.copy(self)
-        other.samples = list(samples)
-        other.intervals = [copy.copy(interval) for interval in self.intervals]
+        other.samples, other.intervals = list(samples), [copy.copy(interval) for interval in self.intervals]
         other._priors, other._rows = [list(batches) for batches in self._priors], list(self._rows)
         other._positions, other._answers = list(self._positions), list(self._answers)
         other._stale = dict(self._stale)
@@ -92,7 +91,7 @@ class ChainWindow(StreamWindow):
 
     def retract(self, count: int) -> None:
         """Removes the newest samples, with their states and factors."""
-        self._move()
+        self._relinearize(None)
         for held in (self.samples, self._priors, self._positions, self._answers, self._rows):
             del held[count:]
         del self.intervals[count - 1 :]
@@ -103,7 +102,7 @@ class ChainWindow(StreamWindow):
 
     def attach(self, measurement: Measurement) -> Update:
         """Adds one more measurement of the newest sample, which holds it already."""
-        count, calls = self._move()
+        _, count, calls = self._relinearize(None)
         measurement.corrected(self.points[-1], self.newest_covariance[: self.width, : self.width])
         beside = self.samples[-1].measurements
         prepare(beside, np.tile(self.theta[-1], (len(beside), 1)))
@@ -112,7 +111,7 @@ class ChainWindow(StreamWindow):
 
     def reweigh(self, numbers: list[int]) -> None:
         """Replaces the position factors of some samples of the window, whose noise has changed."""
-        self._move()
+        self._relinearize(None)
         for k in numbers:
             self._positions[k] = self._measured(k)
         self._renew(numbers, moved=False)
@@ -121,7 +120,7 @@ class ChainWindow(StreamWindow):
     def shorten(self, keep: int) -> None:
         """Drops all but the newest states; the triangle at the cut keeps their information."""
         leaving = len(self.samples) - keep
-        self._move()
+        self._relinearize(None)
         self._solve()
         w, p, linked = self.width, self.p, self.intervals[leaving - 1] is not None
         carries, shared, _ = self._chain
@@ -157,11 +156,6 @@ class ChainWindow(StreamWindow):
     def _first_is_known(self) -> bool:
         return self._summary is not None and bool(self._summary.blocks[0].any())
 
-    def _move(self) -> tuple[int, int]:
-        """Relinearises the states that left the thresholds; returns the evaluated factors and calls."""
-        _, count, calls = self._relinearize(None)
-        return count, calls
-
     def _relinearize(self, new: Interval | None) -> tuple[Array, int, int]:
         """As the base's; the chain's rows of all evaluated factors become stale."""
         before, shared = self.theta, self.coefficient_theta
@@ -188,7 +182,8 @@ class ChainWindow(StreamWindow):
         if moved:  # bridges are shared with copies of the window, results are not
             asked = [(m.batch, m.bridge) for m in sample.measurements]
             asked += [] if interval is None else [(interval.batch, interval.bridge)]
-            self._answers[k] = [(batch, _batched(bridge.kept(0))) for batch, bridge in asked]
+            kept = [(batch, *bridge.kept(0)) for batch, bridge in asked]
+            self._answers[k] = [(batch, (r[None], tuple([b[None] for b in blocks]))) for batch, r, blocks in kept]
         pieces = list(self._answers[k])
         for batch in (*self._positions[k], *self._priors[k]):
             pieces.append((batch, batch.compute(slice(None), (self._seen(batch, k),))))
@@ -201,7 +196,9 @@ class ChainWindow(StreamWindow):
         written = np.zeros((sum(batch.dim for batch, _ in pieces), self._columns))
         row = 0
         for batch, (residual, blocks) in pieces:
-            weight, end, place = _weight(batch, residual[0]), row + batch.dim, 0
+            weight, end, place = 1.0, row + batch.dim, 0
+            if batch.loss.name != "squared":  # as in GTSAM's noise models
+                weight = math.sqrt(float(batch.loss.weight(np.sqrt(residual[0] @ residual[0]))))
             for variable, (block,) in zip(batch.variables[0].tolist(), blocks, strict=True):
                 at = 2 * self.width if variable == COEFFICIENTS else place
                 written[row:end, at : at + block.shape[1]] = block if weight == 1.0 else weight * block
@@ -259,16 +256,3 @@ class ChainWindow(StreamWindow):
         _, shared, root = self._chain
         n, end = len(self.samples), 2 * self.width + self.p
         return Root(root[first:n], np.concatenate((shared[n, :, :end], shared[n, :, -1:]), axis=1))
-
-
-def _batched(answer: Answer) -> Answer:
-    """One factor's answer as that of a batch."""
-    residual, blocks = answer
-    return residual[None], tuple([block[None] for block in blocks])
-
-
-def _weight(batch: FactorBatch, residual: Array) -> float:
-    """The scale of one factor by its batch's loss, as in GTSAM's noise models; residual (r,)."""
-    if batch.loss.name == "squared":
-        return 1.0
-    return math.sqrt(float(batch.loss.weight(np.sqrt(residual @ residual))))

@@ -5,9 +5,8 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.estimation.online.state import Sample
 from ballfg.estimation.online.windows.interval import Interval
-from ballfg.estimation.online.windows.linear import carried_with_bias
 from ballfg.estimation.settings import Settings, stamp_covariance
-from ballfg.factors.correlated_noise import BIAS_DIM
+from ballfg.factors.correlated_noise import BIAS_DIM, bias_step
 from ballfg.factors.linear.definite import whitened as whitened_by
 from ballfg.state import POSITION, STATE_DIM, VELOCITY
 
@@ -37,13 +36,12 @@ class WindowFilter:
         interval: Interval,
         sample: Sample,
     ) -> tuple[Array, Array, Array]:
-        """Predicts over an interval and updates with the sample at its end.
+        """Mean, covariance and whitened innovation after an interval and the sample at its end.
 
         Args:
             piece: (9, 1 + 9 + p) propagation from `point` (w,) and the coefficients `shared` (p,).
             mean, covariance: (w + p,) and (w + p, w + p) of state, bias and coefficients before.
             interval: between the samples.  sample: gets the rough velocity for its stamp's error.
-        Returns: mean and covariance after the sample, and its whitened innovation.
         """
         carried, noise, w = piece, interval.covariance, self.width
         if self.biased:
@@ -82,3 +80,32 @@ class WindowFilter:
     def _measured_part(self, rows: Array) -> Array:
         """(3, ...) the sum of the position and bias rows of (w + p, ...), which a measured position depends on."""
         return rows[POSITION] + rows[STATE_DIM : STATE_DIM + BIAS_DIM] if self.biased else rows[POSITION]
+
+
+def carried_with_bias(
+    piece: Array, covariance: Array, bias: Array, dt: float, settings: Settings
+) -> tuple[Array, Array]:
+    """The propagation from a state, its bias and the coefficients to the next state with its bias, and its noise.
+
+    Args:
+        piece: (9, 1 + 9 + p) the propagated state and its Jacobian side by side.  covariance: (9, 9) of its noise.
+        bias: (3,) m, at the linearisation point.  dt: s.  settings: with a memory.
+    Returns: (12, 1 + 12 + p) and (12, 12).
+    """
+    width = STATE_DIM + BIAS_DIM
+    decay, spread = bias_step(np.array([dt]), settings.bias_sigmas, settings.memory_time)
+    carried, noise = np.zeros((width, piece.shape[1] + BIAS_DIM)), np.zeros((width, width))
+    carried[:STATE_DIM, : 1 + STATE_DIM] = piece[:, : 1 + STATE_DIM]
+    carried[:STATE_DIM, 1 + width :] = piece[:, 1 + STATE_DIM :]
+    carried[STATE_DIM:, 0] = decay * bias
+    carried[STATE_DIM:, 1 + STATE_DIM : 1 + width] = decay * np.eye(BIAS_DIM)
+    noise[:STATE_DIM, :STATE_DIM], noise[STATE_DIM:, STATE_DIM:] = covariance, np.diag(spread[0] ** 2)
+    return carried, noise
+
+
+def without_bias(joint: Array, width: int) -> Array:
+    """(9 + p, 9 + p) covariance of a state and the coefficients, from (w + p, w + p) with the bias between them."""
+    if width == STATE_DIM:
+        return joint
+    kept = np.delete(np.arange(len(joint)), np.s_[STATE_DIM:width])
+    return joint[np.ix_(kept, kept)]

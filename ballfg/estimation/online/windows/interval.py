@@ -87,13 +87,11 @@ class IntervalMaker:
 
 
 def evaluate(intervals: Sequence[Interval], start: Array, after: Array, coefficients: Array) -> tuple[list[Array], int]:
-    """Residuals and Jacobians of intervals, one torch call for all that share a motion, stored in their bridges.
+    """Residuals and Jacobians of k intervals, one torch call for all that share a motion, stored in their bridges.
 
     Args:
-        intervals: k of them.
         start: (k, 9) states at which they begin; biases may follow these and the next.
-        after: (l, 9) states at which the first l of them end; `store` completes the others.
-        coefficients: (p,).
+        after: (l, 9) states at which the first l of them end; `store` completes the others.  coefficients: (p,).
     Returns: for each interval the propagated state and its Jacobian side by side, (9, 1 + 9 + p); number of calls.
     Raises: ValueError: if a value of the model is not finite.
     """
@@ -109,32 +107,23 @@ def evaluate(intervals: Sequence[Interval], start: Array, after: Array, coeffici
         pieces = np.concatenate((moved.numpy()[:, :STATE_DIM, None], jacobian.numpy()[:, :STATE_DIM]), axis=2)
         for row, k in enumerate(members):
             result[k] = pieces[row]
-        count = sum(k < len(after) for k in members)  # the first ones: members ascend
-        if count:
-            ended = members[:count]
-            answers = _whitened(
-                batch, batch.whitening[:count], pieces[:count], start[ended], after[ended], coefficients
-            )
-            for row, k in enumerate(ended):
-                _keep(intervals[k], answers, row)
+        ended = [k for k in members if k < len(after)]  # the first ones: members ascend
+        if ended:
+            whole, count = [intervals[k] for k in ended], len(ended)
+            _keep(whole, batch.whitening[:count], pieces[:count], start[ended], after[ended], coefficients)
     return result, len(groups)
 
 
 def store(intervals: Sequence[Interval], start: Array, after: Array, coefficients: Array, pieces: Array) -> None:
     """Whitens the propagations of k intervals and stores them for iSAM2's queries; `pieces` as from `evaluate`."""
     roots = np.concatenate([interval.batch.whitening for interval in intervals])
-    answers = _whitened(intervals[0].batch, roots, pieces, start, after, coefficients)
-    for row, interval in enumerate(intervals):
-        _keep(interval, answers, row)
+    _keep(intervals, roots, pieces, start, after, coefficients)
 
 
-Answers = tuple[tuple[Array, ...], Array, tuple[Array, ...]]
-"""Inputs (k, d) of the variables, residuals (k, 9), Jacobians (k, 9, d)."""
-
-
-def _whitened(
-    batch: DynamicsFactors, root: Array, pieces: Array, start: Array, after: Array, coefficients: Array
-) -> Answers:
+def _keep(
+    intervals: Sequence[Interval], root: Array, pieces: Array, start: Array, after: Array, coefficients: Array
+) -> None:
+    """Stores the inputs (k, d), residuals (k, 9) and Jacobians (k, 9, d) of intervals."""
     start, after = start[:, :STATE_DIM], after[:, :STATE_DIM]
     residual = (root @ (after - pieces[:, :, 0])[..., None])[..., 0]
     by_start = -(root @ pieces[:, :, 1:])
@@ -143,9 +132,6 @@ def _whitened(
     if len(coefficients):
         inputs = (*inputs, np.broadcast_to(coefficients, (len(start), len(coefficients))))
         blocks = (*blocks, by_start[..., STATE_DIM:])
-    return (inputs, *checked(batch, slice(None), inputs, residual, blocks))
-
-
-def _keep(interval: Interval, answers: Answers, row: int) -> None:
-    inputs, residual, blocks = answers
-    interval.bridge.keep(0, tuple([x[row] for x in inputs]), residual[row], tuple([j[row] for j in blocks]))
+    residual, blocks = checked(intervals[0].batch, slice(None), inputs, residual, blocks)
+    for row, interval in enumerate(intervals):
+        interval.bridge.keep(0, tuple([x[row] for x in inputs]), residual[row], tuple([j[row] for j in blocks]))

@@ -20,9 +20,8 @@ from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.estimation.online.measurement import Measurement, prepare
 from ballfg.estimation.online.state import Sample, Update
-from ballfg.estimation.online.windows.filter import WindowFilter
+from ballfg.estimation.online.windows.filter import WindowFilter, without_bias
 from ballfg.estimation.online.windows.interval import Interval, IntervalMaker, evaluate, store
-from ballfg.estimation.online.windows.linear import without_bias
 from ballfg.estimation.settings import Settings, stamp_covariance
 from ballfg.estimation.smoother.problem import coefficient_means, start_priors
 from ballfg.factors.batch import FactorBatch, Values
@@ -50,10 +49,7 @@ class Arrival:
 
 
 VELOCITY_THRESHOLD = 0.3
-"""m/s. With an error this large in the linearisation point, drag is wrong by k dv^2 = 0.012 m/s^2, and by 0.04 m/s^2
-with `SPIN_THRESHOLD` as well: a third of the acceleration that the process noise allows over half a second, until the
-next state is relinearised. A third of it costs twice the evaluations and changes nothing
-(docs/derivations/online.md)."""
+"""m/s. A third of it costs twice the evaluations and changes nothing (docs/derivations/online.md)."""
 SPIN_THRESHOLD = 40.0
 """rad/s. The Magnus force is linear in the spin: only its product with a velocity error matters."""
 POSITION_THRESHOLD = 0.5
@@ -90,8 +86,6 @@ class StreamWindow(ABC):
         self._own_means = coefficient_means(model.model, settings) if self.p else np.zeros(0)  # type: ignore[arg-type]
         self._own_sigmas = np.array(list(settings.coefficients.values()))
         self.first = 0
-        self.samples: list[Sample] = []
-        self.intervals: list[Interval | None] = []
         self.threshold = np.full(self.width, POSITION_THRESHOLD * position_sigma)
         self.threshold[VELOCITY], self.threshold[SPIN] = VELOCITY_THRESHOLD, SPIN_THRESHOLD
         self._clear()
@@ -101,24 +95,15 @@ class StreamWindow(ABC):
 
     @abstractmethod
     def copy(self, samples: Sequence[Sample]) -> Self:
-        """An independent window with the same states and factors.
-
-        Args: samples: copies of the window's.
-        """
+        """An independent window with the same states and factors, and copies of its samples."""
 
     @abstractmethod
     def retract(self, count: int) -> None:
-        """Removes the newest samples, with their states and factors.
-
-        Args: count: number of samples to keep, at least 1.
-        """
+        """Removes the newest samples but `count` of them, at least one, with their states and factors."""
 
     @abstractmethod
     def attach(self, measurement: Measurement) -> Update:
-        """Adds one more measurement of the newest sample, which holds it already.
-
-        Raises: RuntimeError or ValueError: as `append`.
-        """
+        """Adds one more measurement of the newest sample, which holds it already; errors as of `append_all`."""
 
     @abstractmethod
     def reweigh(self, numbers: list[int]) -> None:
@@ -141,17 +126,16 @@ class StreamWindow(ABC):
 
     @abstractmethod
     def _insert(self, arrivals: Sequence[Arrival]) -> int:
-        """Takes in new states with their factors, one after another, and solves.
-
-        Returns: number of eliminated states.
-        """
+        """Takes in new states with their factors, one after another, and solves; number of eliminated states."""
 
     @abstractmethod
     def _first_is_known(self) -> bool:
         """True if removed states left information on the window's first state."""
 
     def _clear(self) -> None:
-        """No states."""
+        """No samples and no states."""
+        self.samples: list[Sample] = []
+        self.intervals: list[Interval | None] = []
         self.theta, self.delta = np.zeros((0, self.width)), np.zeros((0, self.width))
         self.coefficient_theta, self.coefficient_delta = self._own_means.copy(), np.zeros(self.p)
         self.newest_covariance = np.zeros((0, 0))
@@ -159,12 +143,10 @@ class StreamWindow(ABC):
     def start_anew(self, samples: list[Sample]) -> Update:
         """Drops the solution, after an error left it half-updated, and takes in all samples again, oldest first.
 
-        Returns: the last sample's update.
-        Raises: RuntimeError or ValueError: if that fails as well.
+        Returns: the last sample's update; errors as of `append_all`.
         """
         start, coefficients = self.points[:1], self.coefficients
         self._clear()
-        self.samples, self.intervals = [], []
         for sample in samples:
             sample.slots, sample.bias_slot = (), None
         update = Update(np.full(3, np.nan), 0, 0, 0)
@@ -174,7 +156,7 @@ class StreamWindow(ABC):
             self._insert([Arrival(samples[0], start[0])])
             samples = samples[1:]
         for sample in samples:
-            update = self.append(sample)
+            update = self.append_all([sample])
         return update
 
     @property
@@ -209,46 +191,31 @@ class StreamWindow(ABC):
         """(p,) the present estimate."""
         return self.coefficient_theta + self.coefficient_delta
 
-    @property
-    def times(self) -> Array:
-        """(n,) s."""
-        return np.array([sample.time for sample in self.samples])
-
-    def append(self, sample: Sample) -> Update:
-        """Takes in a sample.
-
-        Raises: RuntimeError or ValueError: from GTSAM or the model; the window must then be rebuilt.
-        """
-        return self.append_all([sample])
-
     def append_all(self, samples: Sequence[Sample]) -> Update:
         """Takes in several samples and solves once: those that were retracted when an event changed.
 
         An extended Kalman filter over them gives their linearisation points. If these are too far from the solution,
-        the next sample moves them, as after `append`.
+        the next sample moves them.
 
         Returns: the last one's update.
-        Raises: RuntimeError or ValueError: as `append`.
+        Raises: RuntimeError or ValueError: from GTSAM or the model; the window must then be rebuilt.
         """
         update, begin = Update(np.full(3, np.nan), 0, 0, 0), 0
         while begin < len(samples):
-            if not (samples[begin].motion.linked and self.samples):
-                update = self._append_start(samples[begin])
-                begin += 1
-                continue
             end = begin + 1
-            while end < len(samples) and samples[end].motion.linked:
-                end += 1
-            update = self._append_linked(samples[begin:end])
+            if samples[begin].motion.linked and self.samples:
+                while end < len(samples) and samples[end].motion.linked:
+                    end += 1
+                update = self._append_linked(samples[begin:end])
+            else:
+                update = self._append_start(samples[begin])
             begin = end
         return update
 
     def _append_linked(self, samples: Sequence[Sample]) -> Update:
         """Takes in samples that are linked to the newest one and to each other."""
         mean, covariance = np.concatenate((self.points[-1], self.coefficients)), self.newest_covariance
-        points: list[Array] = []
-        intervals: list[Interval] = []
-        pieces: list[Array] = []
+        points, intervals, pieces = list[Array](), list[Interval](), list[Array]()
         for before, sample in pairwise((self.samples[-1], *samples)):
             number = self.first + len(self.samples) + len(intervals)
             interval = self.maker.make(number - 1, sample.motion, sample.time - before.time)

@@ -25,7 +25,7 @@ WILDFIRE = 1e-7
 """m, m/s, rad/s. Back-substitution stops where the solution changes by less."""
 
 
-class IsamCore(StreamWindow):
+class IsamWindow(StreamWindow):
     """A window with its linear system in iSAM2: arguments and attributes as those of `StreamWindow`.
 
     Attributes:
@@ -89,16 +89,12 @@ class IsamCore(StreamWindow):
             factors.append(arrival.interval.bridge.factor(0))
         measurements = arrival.sample.measurements
         prepare(measurements, np.tile(arrival.state, (len(measurements), 1)))
-        factors += self._measured(arrival.sample, key - STATE_KEY)
+        factors += [self._position_factor(arrival.sample, key - STATE_KEY)] if arrival.sample.measured else []
+        factors += [measurement.factor(key - STATE_KEY) for measurement in measurements]
         factors += [Bridge(prior, "row").factor(0, [key - STATE_KEY]) for prior in arrival.priors]
         if self.biased and arrival.priors and not self.samples:
             factors.append(bias_start(key, self.settings))
         return factors
-
-    def _measured(self, sample: Sample, state: int) -> list[gtsam.NonlinearFactor]:
-        """The factors of a sample's measurements."""
-        position = [self._position_factor(sample, state)] if sample.measured else []
-        return position + [measurement.factor(state) for measurement in sample.measurements]
 
     def _position_factor(self, sample: Sample, state: int) -> gtsam.NonlinearFactor:
         """The observation's factor; linear without a robust loss."""
@@ -136,27 +132,6 @@ class IsamCore(StreamWindow):
         else:
             self.newest_covariance = self.isam.marginalCovariance(newest)
 
-
-def _parameters(threshold: Array, coefficient_threshold: Array) -> gtsam.ISAM2Params:
-    """QR, because a loose spin prior beside a tight process noise defeats Cholesky."""
-    parameters = gtsam.ISAM2Params()
-    parameters.setFactorization("QR")
-    parameters.relinearizeSkip = 1
-    parameters.findUnusedFactorSlots = True
-    thresholds = gtsam.ISAM2ThresholdMap()
-    thresholds.insert(("x", threshold))
-    if len(coefficient_threshold):
-        thresholds.insert(("c", coefficient_threshold))
-    parameters.setRelinearizeThreshold(thresholds)
-    solver = gtsam.ISAM2GaussNewtonParams()
-    solver.setWildfireThreshold(WILDFIRE)
-    parameters.setOptimizationParams(solver)
-    return parameters
-
-
-class IsamWindow(IsamCore):
-    """The window in iSAM2: arguments and attributes as those of `IsamCore`."""
-
     def copy(self, samples: Sequence[Sample]) -> Self:
         """An independent window with the same states and factors.
 
@@ -173,10 +148,8 @@ class IsamWindow(IsamCore):
 
     def retract(self, count: int) -> None:
         """Removes the newest samples, with their states and factors, from iSAM2 as well."""
-        gone = self.samples[count:]
-        slots = [slot for sample in gone for slot in sample.slots]
-        slots += [i.slot for i in self.intervals[count - 1 :] if i is not None and i.slot is not None]
-        slots += [sample.bias_slot for sample in gone if sample.bias_slot is not None]
+        gone, n = range(count, len(self.samples)), len(self.samples)
+        slots = self._slots(gone, range(count - 1, n - 1), gone)
         self._relinearize(None)
         del self.samples[count:], self.intervals[count - 1 :]
         self._update(gtsam.NonlinearFactorGraph(), gtsam.Values(), slots, {})
@@ -245,11 +218,11 @@ class IsamWindow(IsamCore):
 
     def _summary(self, leaving: int) -> list[gtsam.NonlinearFactor]:
         """The information of the oldest states, as linear factors on the first that stays and on the coefficients."""
-        point = self._point(range(leaving + 1))
+        point = self._point(leaving + 1)
         old = gtsam.GaussianFactorGraph()
         cut = leaving - (self.intervals[leaving - 1] is None)
-        factors = self._factors(range(leaving), range(leaving), range(1, cut + 1))
-        for factor in (*factors, *self.shared):
+        held, slots = self.isam.getFactorsUnsafe(), self._slots(range(leaving), range(leaving), range(1, cut + 1))
+        for factor in (*(held.at(slot) for slot in slots), *self.shared):
             old.push_back(factor.linearize(point))
         ordering = gtsam.Ordering()
         present = set(old.keyVector())
@@ -259,32 +232,30 @@ class IsamWindow(IsamCore):
         bayes_net = old.eliminateSequential(ordering, gtsam.EliminateQR)
         conditionals = [bayes_net.at(i) for i in range(bayes_net.size())]  # by branches of the forest, not in order
         gone = range(STATE_KEY + self.first, STATE_KEY + self.first + leaving)
-        rest = [_jacobian_factor(c) for c in conditionals if list(c.keys())[0] not in gone]  # noqa: RUF015
-        return [gtsam.LinearContainerFactor(factor, point) for factor in rest]
+        rest = [c for c in conditionals if list(c.keys())[0] not in gone]  # noqa: RUF015
+        return [linear_factor(list(c.keys()), [c.R(), c.S()], c.d(), point) for c in rest]
 
-    def _point(self, numbers: range) -> gtsam.Values:
-        """The linearisation points of some states of the window and of the coefficients."""
+    def _point(self, count: int) -> gtsam.Values:
+        """The linearisation points of the first states of the window and of the coefficients."""
         values = gtsam.Values()
-        for k in numbers:
+        for k in range(count):
             values.insert(STATE_KEY + self.first + k, self.theta[k])
         if self.p:
             values.insert(COEFFICIENT_KEY, self.coefficient_theta)
         return values
 
-    def _factors(self, samples: range, intervals: range, biases: range) -> list[gtsam.NonlinearFactor]:
+    def _slots(self, samples: range, intervals: range, biases: range) -> list[int]:
         """Slots in iSAM2 of factors: of some samples, of some intervals, and of those to the biases of some samples."""
-        held = self.isam.getFactorsUnsafe()
         slots = [slot for k in samples for slot in self.samples[k].slots]
         slots += [i.slot for k in intervals if (i := self.intervals[k]) is not None and i.slot is not None]
-        slots += [slot for k in biases if (slot := self.samples[k].bias_slot) is not None]
-        return [held.at(slot) for slot in slots]
+        return slots + [slot for k in biases if (slot := self.samples[k].bias_slot) is not None]
 
     def _renew(self, linked: bool) -> None:
         """A new iSAM2 from the present window; its first state may have no link to the removed ones."""
-        n = len(self.samples)
+        n, held = len(self.samples), self.isam.getFactorsUnsafe()
         graph = gtsam.NonlinearFactorGraph()
-        for factor in self._factors(range(n), range(n - 1), range(1, n)):
-            graph.push_back(factor)
+        for slot in self._slots(range(n), range(n - 1), range(1, n)):
+            graph.push_back(held.at(slot))
         self.samples[0].bias_slot = None
         if self.biased and not linked:
             graph.push_back(bias_start(STATE_KEY + self.first, self.settings))
@@ -292,7 +263,7 @@ class IsamWindow(IsamCore):
             graph.push_back(factor)
         self.isam = self._new_isam()
         last = {STATE_KEY + self.first + n - 1: 1, COEFFICIENT_KEY: 2} if self.p else {}
-        slots = iter(self._update(graph, self._point(range(n)), [], last))
+        slots = iter(self._update(graph, self._point(n), [], last))
         for sample in self.samples:
             sample.slots = tuple(next(slots) for _ in sample.slots)
         for interval in self.intervals:
@@ -306,10 +277,18 @@ class IsamWindow(IsamCore):
         self._read_back()
 
 
-def _jacobian_factor(conditional: gtsam.GaussianConditional) -> gtsam.JacobianFactor:
-    """A conditional R x + S y = d as a factor."""
-    keys, unit = list(conditional.keys()), gtsam.noiseModel.Unit.Create(len(conditional.d()))
-    if len(keys) == 1:
-        return gtsam.JacobianFactor(keys[0], conditional.R(), conditional.d(), unit)
-    first, second = keys
-    return gtsam.JacobianFactor(first, conditional.R(), second, conditional.S(), conditional.d(), unit)
+def _parameters(threshold: Array, coefficient_threshold: Array) -> gtsam.ISAM2Params:
+    """QR, because a loose spin prior beside a tight process noise defeats Cholesky."""
+    parameters = gtsam.ISAM2Params()
+    parameters.setFactorization("QR")
+    parameters.relinearizeSkip = 1
+    parameters.findUnusedFactorSlots = True
+    thresholds = gtsam.ISAM2ThresholdMap()
+    thresholds.insert(("x", threshold))
+    if len(coefficient_threshold):
+        thresholds.insert(("c", coefficient_threshold))
+    parameters.setRelinearizeThreshold(thresholds)
+    solver = gtsam.ISAM2GaussNewtonParams()
+    solver.setWildfireThreshold(WILDFIRE)
+    parameters.setOptimizationParams(solver)
+    return parameters

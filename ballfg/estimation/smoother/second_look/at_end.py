@@ -8,7 +8,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.estimation.result import Estimate
-from ballfg.estimation.sides.hypotheses import HypothesisModel, SampleMeasurement
+from ballfg.estimation.sides.hypotheses import HypothesisModel, measured_at
 from ballfg.estimation.sides.monitor import ContactMonitor, with_contact_states
 from ballfg.estimation.smoother.problem import TrackProblem
 from ballfg.factors.linear.definite import definite
@@ -31,8 +31,6 @@ def with_both_sides(smoother: Smoother, problem: TrackProblem, estimate: Estimat
 
     The samples before the contact are estimated by themselves; from there on both hypotheses are followed
     (`ballfg.estimation.sides`).
-
-    Args: smoother: of the track.  problem: of the track.  estimate: without the other side.
     """
     track, n = problem.track, len(problem.track)
     disturbed = np.concatenate((estimate.hits, problem.segmentation.restarts))
@@ -44,7 +42,9 @@ def with_both_sides(smoother: Smoother, problem: TrackProblem, estimate: Estimat
         return estimate
     biases = len(before[0]) - STATE_DIM - problem.width
     model = HypothesisModel(problem.ball, smoother.surfaces, problem.settings, biases)
-    steps = [(float(track.times[k] - track.times[k - 1]), _measured(problem, k)) for k in range(first + 1, n)]
+    beside = {one: problem.observed[one.name] for one in problem.observations if not one.locates}
+    measured = (measured_at(track, problem.sigma, beside, k) for k in range(first + 1, n))
+    steps = list(zip(np.diff(track.times[first:]).tolist(), measured, strict=True))
     latest = max((contact.interval for contact in estimate.contacts), default=-1)
     state = ContactMonitor(model).run(before, steps, lambda count: latest >= n - 1 - count)
     return estimate if state is None else with_contact_states(estimate, {n - 1: state})
@@ -76,11 +76,3 @@ def _filtered(smoother: Smoother, track: Track) -> tuple[Array, Array] | None:
     width = STATE_DIM + len(biases)
     order = np.r_[:STATE_DIM, width : width + p, STATE_DIM:width]
     return mean, definite(known.joint(-1)[np.ix_(order, order)])
-
-
-def _measured(problem: TrackProblem, sample: int) -> SampleMeasurement:
-    """The measurements at a sample of a track; rough positions stand for pixels."""
-    beside = [one for one in problem.observations if not one.locates]
-    rows = [(problem.observed[one.name], row) for one in beside for row in one.filter_rows(sample)]
-    factors = [batch.select(np.array([row])) for batch, row in rows]
-    return SampleMeasurement(problem.track.positions[sample], problem.sigma[sample], factors)
