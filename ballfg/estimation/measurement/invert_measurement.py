@@ -10,7 +10,6 @@ from typing import Final
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from ballfg.arrays import Array
 from ballfg.dynamics.augmented import AugmentedModel
@@ -49,10 +48,7 @@ LOST: Final = 1e4
 
 @dataclass(frozen=True)
 class Undone:
-    """The true track: stamps, positions and label.
-
-    Attributes: track: shifted, on the true clock.  estimate: of the smoother.  settled: True if the shift converged.
-    """
+    """The true track: shifted, on the true clock; the estimate of the smoother; True if the shift converged."""
 
     track: Track
     estimate: Estimate
@@ -157,14 +153,9 @@ class InvertMeasurement(Estimator):
             augmented = AugmentedModel(model, estimate.coefficient_names)
             states, model = augmented.append(states, torch.from_numpy(estimate.coefficients)), augmented
         if len(states) > 1 and len(states) - 2 not in estimate.hits:
-            states = torch.cat((states[:-1], self._last(model, states[-2:-1], estimate.times)))
+            # no later sample tells on which side of a bounce the last one is: shifted as if before it, a sample after
+            # it would still look like one before, so that the motion must decide
+            with torch.no_grad():
+                dt = torch.from_numpy(np.diff(estimate.times[-2:]))
+                states = torch.cat((states[:-1], advance(model, states[-2:-1], dt, self.surfaces)))
         return (measured_positions(model, states, self.surfaces) - states[:, POSITION]).numpy()
-
-    def _last(self, model: BallModel, before: Tensor, times: Array) -> Tensor:
-        """(1, 9 + p) the last state, as it follows from the previous one.
-
-        No later sample tells on which side of a bounce the last one is. Shifted as if before the bounce, a sample after
-        it would still look like one before: the motion must decide.
-        """
-        with torch.no_grad():
-            return advance(model, before, torch.from_numpy(np.diff(times[-2:])), self.surfaces)

@@ -51,12 +51,10 @@ def estimate_position_noise(tracks: Iterable[Track]) -> Array:
     Args: tracks: read until there are enough windows.
     Returns: (3,) m, at least `FLOOR`; `FALLBACK` if every track is shorter than a window.
     """
-    blocks: list[Array] = []
-    count = 0
+    blocks, count = list[Array](), 0
     for track in tracks:
-        block = _window_residuals(track.seconds, track.positions)
-        blocks.append(block)
-        count += len(block)
+        blocks.append(_window_residuals(track.seconds, track.positions))
+        count += len(blocks[-1])
         if count >= ENOUGH:
             break
     if count == 0:
@@ -107,8 +105,7 @@ def _window_residuals(times: Array, positions: Array) -> Array:
     leverage = np.einsum("wij,wij->wi", basis, basis)
     residuals = values - basis @ (basis.transpose(0, 2, 1) @ values)
     left = np.sqrt((1.0 - leverage).clip(min=LEAST_LEFT))  # rounding may take it below zero
-    scaled_residuals: Array = residuals / left[..., None]
-    return scaled_residuals
+    return np.asarray(residuals / left[..., None])
 
 
 def _robust_sigma(residuals: Array) -> Array:

@@ -34,15 +34,9 @@ class ReadingTables:
 
     def attached(self, track: Track) -> Track:
         """The track with its readings; readings before its first and after its last sample are left out."""
-        found = []
-        for sort, tables in self.rows.items():
-            table = tables.get(track.name)
-            if table is None:
-                continue
-            inside = table[(table[:, 0] >= track.times[0]) & (table[:, 0] <= track.times[-1])]
-            if len(inside):
-                found.append(sort.from_table(track, inside))
-        return track.observed(*found)
+        own = {sort: tables[track.name] for sort, tables in self.rows.items() if track.name in tables}
+        inside = {s: t[(t[:, 0] >= track.times[0]) & (t[:, 0] <= track.times[-1])] for s, t in own.items()}
+        return track.observed(*(sort.from_table(track, table) for sort, table in inside.items() if len(table)))
 
 
 def read_readings(folder: str | PathLike[str], trajectories: Collection[str]) -> ReadingTables:
@@ -126,16 +120,15 @@ def _read(path: Path, sort: type[Observation], known: set[str], notes: list[str]
                 "Names are compared as text, zeros included."
             )
         for place in places:
-            if not csv_files.is_number(cells[place]) or (header[place] == "sigma" and not float(cells[place]) > 0.0):
-                rule = "a positive number" if header[place] == "sigma" else "a number"
+            name, cell, rule = header[place], cells[place], ""
+            if not csv_files.is_number(cell) or (name == "sigma" and not float(cell) > 0.0):
+                rule = "a positive number" if name == "sigma" else "a number"
+            elif name in sort.columns and abs(float(cell)) > sort.largest:
+                rule = f"within {sort.largest:g}, as of every ball"
+            if rule:
                 raise ValueError(
-                    f"{path}, line {line}, column {shown(header[place])}: must be {rule}; got {shown(cells[place])}. "
+                    f"{path}, line {line}, column {shown(name)}: must be {rule}; got {shown(cell)}. "
                     "Correct it, or delete the line."
-                )
-            if header[place] in sort.columns and abs(float(cells[place])) > sort.largest:
-                raise ValueError(
-                    f"{path}, line {line}, column {shown(header[place])}: must be within {sort.largest:g}, as of every "
-                    f"ball; got {shown(cells[place])}. Correct it, or delete the line."
                 )
         rows[cells[key]].append([float(cells[place]) for place in places])
     return {name: np.array(numbers) for name, numbers in rows.items()}

@@ -35,13 +35,11 @@ class FilterInnovation:
 
     @classmethod
     def of(cls, factor: FactorBatch, mean: Array, covariance: Array, biases: int = 0) -> "FilterInnovation":
-        """The innovation of a batch of one factor.
+        """The innovation of a batch of one factor on the state, and perhaps on the coefficients behind it.
 
         Args:
-            factor: on the state, and perhaps on the coefficients behind it in the filter's state.
             mean: (d,) m, m/s, rad/s, then the coefficients in their own units, then the tracker's biases in m.
-            covariance: (d, d) in the squares of these units.
-            biases: number of biases at the end of the mean, which the factor does not see.
+            covariance: (d, d) in the squares of these units.  biases: their number; the factor does not see them.
         """
         own = slice(STATE_DIM, len(mean) - biases)
         inputs = (mean[None, :STATE_DIM], mean[None, own])[: factor.variables.shape[1]]

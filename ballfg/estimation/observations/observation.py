@@ -207,10 +207,7 @@ def refuse_unknowns(observations: Iterable[Observation], settings: Settings, est
 
 
 class GivenFactors(Observation):
-    """A batch of factors, each on one state of the track.
-
-    Args: factors: their first variable is the index of a sample.  number: index among the user's batches.
-    """
+    """A batch of factors, each on one state of the track; the first variable is the index of a sample."""
 
     def __init__(self, factors: FactorBatch, number: int) -> None:
         self.name = f"{type(factors).__name__} {number}"  # type: ignore[misc]  # one of a name in a track

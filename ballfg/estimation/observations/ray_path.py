@@ -10,7 +10,7 @@ fit, those at the camera best.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
@@ -35,6 +35,8 @@ SPEED: Final = 30.0
 """m/s, prior standard deviation of the velocity: bounds the direction that a single camera leaves undetermined."""
 SPREAD: Final = 100.0
 """m, prior standard deviation of the position about the cameras."""
+NEAREST: Final = 0.05
+"""m, least depth that a ball may have while its window is solved."""
 
 
 @dataclass(frozen=True)
@@ -52,11 +54,7 @@ class Path:
 
     def joined(self, other: Path) -> Path:
         """This path, then another."""
-        return Path(
-            np.concatenate((self.positions, other.positions)),
-            np.concatenate((self.velocities, other.velocities)),
-            np.concatenate((self.sigmas, other.sigmas)),
-        )
+        return Path(*(np.concatenate((getattr(self, f.name), getattr(other, f.name))) for f in fields(self)))
 
 
 @dataclass(frozen=True)
@@ -100,19 +98,9 @@ class Rays:
 
     def joined(self, later: Rays, most: int, period: float) -> Rays:
         """These rays and later ones, the newest `most` of them, with a new period, s."""
-
-        def newest(mine: Array, others: Array) -> Array:
-            return np.concatenate((mine, others))[-most:]
-
-        return Rays(
-            newest(self.times, later.times),
-            np.concatenate((self.camera, later.camera))[-most:],
-            newest(self.matrix, later.matrix),
-            newest(self.target, later.target),
-            newest(self.root, later.root),
-            newest(self.depth_row, later.depth_row),
-            period,
-        )
+        arrays = (f.name for f in fields(self) if f.name != "period")
+        both = (np.concatenate((getattr(self, name), getattr(later, name)))[-most:] for name in arrays)
+        return Rays(*both, period=period)
 
 
 def rough_path(rays: Rays, moments: Array, windows: Sequence[tuple[float, float]] = AROUND) -> Path:
@@ -173,7 +161,3 @@ def _robust(
         depth = np.maximum((depth_row[..., :3] * point).sum(axis=-1) + depth_row[..., 3], NEAREST)
     loss = ROBUST**2 * (np.log1p(square / ROBUST**2) * inside).sum(axis=1)
     return np.asarray(unknown[..., 0]), np.asarray(np.linalg.inv(information)), np.asarray(loss)
-
-
-NEAREST: Final = 0.05
-"""m, least depth that a ball may have while its window is solved."""

@@ -27,6 +27,8 @@ from ballfg.tracks.track import FASTEST_BALL, FASTEST_SPIN
 
 FARTHEST: Final = 0.05
 """s. A reading farther from every sample is refused: the ball may bounce in so long a time."""
+LEAST_SPEED: Final = 1e-6
+"""m/s. Below it the derivative of the velocity's length is set to zero."""
 
 
 class Reading(Observation):
@@ -153,10 +155,7 @@ class Reading(Observation):
 
 
 def _checked_index(name: str, state: ArrayLike) -> Index:
-    """The indices of samples as whole numbers.
-
-    Raises: ValueError: a negative or fractional number, such as a time in place of an index.
-    """
+    """The indices of samples as whole numbers. Raises: ValueError: for a time in place of an index."""
     given = check_array(f"state of '{name}'", state)
     if not np.isfinite(given).all() or (given < 0.0).any() or (given % 1.0).any():
         raise ValueError(
@@ -181,10 +180,6 @@ class RadarSpeed(Reading):
     def turned(self, rotation: Tensor, shift: Tensor) -> RadarSpeed:
         """A speed is the same in every frame."""
         return self
-
-
-LEAST_SPEED: Final = 1e-6
-"""m/s. Below it the derivative of the velocity's length is set to zero."""
 
 
 class SpinReading(Reading):
@@ -234,17 +229,16 @@ class ReadingFactors(FactorBatch):
 
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         """Whitened residuals (k, dim) and Jacobians (k, dim, 9)."""
-        numbers = (torch.from_numpy(a[rows]) for a in (self.values, self.sigma, self.delay))
-        function = partial(self._whitened, *numbers)
+        function = partial(self._whitened, rows)
         residual, jacobian = batch_jacobian(function, torch.from_numpy(inputs[0]), outputs=self.dim)
         return residual.numpy(), (jacobian.numpy(),)
 
     def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
         """(m, dim) whitened residuals in torch."""
-        values, sigma, delay = (torch.from_numpy(a) for a in (self.values, self.sigma, self.delay))
-        return self._whitened(values, sigma, delay, inputs[0])
+        return self._whitened(slice(None), inputs[0])
 
-    def _whitened(self, values: Tensor, sigma: Tensor, delay: Tensor, state: Tensor) -> Tensor:
+    def _whitened(self, rows: Index | slice, state: Tensor) -> Tensor:
+        values, sigma, delay = (torch.from_numpy(a[rows]) for a in (self.values, self.sigma, self.delay))
         if bool(delay.any()):
             state = rk4_step(self.model.rates, state, delay.unsqueeze(-1))
         return (self.predicted(state) - values) / sigma

@@ -45,10 +45,7 @@ class SightedDataset(TrackFolder):
         labels: LabelTable,
         notes: list[str],
     ) -> None:
-        self.path = path
-        self.info = info
-        self.cameras = cameras
-        self.notes = notes
+        self.path, self.info, self.cameras, self.notes = path, info, cameras, notes
         self._tracks = {}
         for name, sightings in balls.items():
             try:
@@ -107,9 +104,8 @@ def read_sighted(folder: str | PathLike[str]) -> SightedDataset:
     info, notes = read_info(path / INFO_FILE)
     cameras = tuple(read_cameras(path / CAMERAS_FILE))
     balls, more = read_sightings(path / DETECTIONS_FILE, {camera.name: camera.time_offset for camera in cameras})
-    labels = LabelTable({}, {})
-    if (path / LABELS_FILE).is_file():
-        labels = read_labels(path / LABELS_FILE, list(balls))
+    labels_file = path / LABELS_FILE
+    labels = read_labels(labels_file, list(balls)) if labels_file.is_file() else LabelTable({}, {})
     dataset = SightedDataset(path, info, cameras, balls, labels, notes + more)
     if not len(dataset):
         raise ValueError(

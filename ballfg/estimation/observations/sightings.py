@@ -75,11 +75,6 @@ class CameraSightings(Observation):
         self.moved = moved
 
     @property
-    def bank(self) -> CameraBank:
-        """The cameras in torch; one object for all tracks of a rig."""
-        return _bank(self.cameras)
-
-    @property
     def time_offsets(self) -> Array:
         """(c,) s, of the cameras, as the stamps include them."""
         return np.array([camera.time_offset for camera in self.cameras])
@@ -88,16 +83,9 @@ class CameraSightings(Observation):
         """Camera factors; with time offsets among the coefficients where they are unknown."""
         names = [TIME_OFFSET + name for name in self.sightings.cameras]
         columns = np.array([context.columns.get(name, FIXED) for name in names])
-        return CameraFactors(
-            self.state,
-            self.sightings.camera,
-            self.sightings.pixels,
-            self.sightings.covariances,
-            self.bank,
-            self.delay,
-            columns if (columns != FIXED).any() else None,
-            context.settings.sighting_loss,
-        )
+        seen, unknown = self.sightings, columns if (columns != FIXED).any() else None
+        measured, loss = (seen.camera, seen.pixels, seen.covariances), context.settings.sighting_loss
+        return CameraFactors(self.state, *measured, _bank(self.cameras), self.delay, unknown, loss)
 
     def unknowns(self, settings: Settings) -> Unknowns:
         """The time offsets that the settings name, s, each counted from that of its camera.
@@ -143,11 +131,9 @@ class CameraSightings(Observation):
 
     def select(self, samples: NDArray[np.bool_]) -> CameraSightings:
         """The sightings of some samples."""
-        rows = samples[self.state]
-        number = np.cumsum(samples) - 1
-        return CameraSightings(
-            self.sightings.select(rows), self.cameras, number[self.state[rows]], self.delay[rows], self.moved
-        )
+        rows, number = samples[self.state], np.cumsum(samples) - 1
+        sightings, state = self.sightings.select(rows), number[self.state[rows]]
+        return CameraSightings(sightings, self.cameras, state, self.delay[rows], self.moved)
 
 
 def sightings_of(track: Track) -> CameraSightings:
@@ -190,7 +176,10 @@ def sighted_track(
             f"{shown(sightings.cameras[sightings.camera[row]])}, is earlier than the one before. "
             "Sort them with `in_order`."
         )
-    first = _firsts(times)
+    first, begun = np.ones(len(times), dtype=bool), times[0]  # those that begin a state of their own
+    for row in range(1, len(times)):
+        first[row] = times[row] - begun > SAME_MOMENT
+        begun = times[row] if first[row] else begun
     moments = times[first]
     state = np.cumsum(first) - 1
     path = filled(moments, rough_path(Rays.of(sightings, times, rig), moments), name)
@@ -225,17 +214,8 @@ def in_order(sightings: Sightings, cameras: Sequence[Camera]) -> Sightings:
 
 @lru_cache(maxsize=64)
 def _bank(cameras: tuple[Camera, ...]) -> CameraBank:
+    """The cameras in torch; one object for all tracks of a rig."""
     return CameraBank(cameras)
-
-
-def _firsts(times: Array) -> NDArray[np.bool_]:
-    """(m,) True if a sighting begins a state of its own."""
-    first = np.ones(len(times), dtype=bool)
-    begun = times[0]
-    for row in range(1, len(times)):
-        first[row] = times[row] - begun > SAME_MOMENT
-        begun = times[row] if first[row] else begun
-    return first
 
 
 def filled(moments: Array, path: Path, name: str) -> Path:

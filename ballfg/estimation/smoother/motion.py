@@ -40,10 +40,6 @@ class Motion:
         mine = (self.heights, self.rest, self.hit, self.linked)
         return mine == (other.heights, other.rest, other.hit, other.linked)
 
-    def kick_times(self, dt: float) -> tuple[float, ...]:
-        """`times` for the process noise over dt s: rounded to `KICK_PARTS`."""
-        return tuple(round(time / dt * KICK_PARTS) * dt / KICK_PARTS for time in self.times)
-
     def covariance(self, dt: Array, noise: ProcessNoise) -> Array:
         """(1, 9, 9) process noise over dt (1,) s: flight, each contact's noise, a hit at an unknown time."""
         return noise.flight(dt) + noise.kicks(dt, kicks_of([self], dt))
@@ -56,25 +52,22 @@ depend on the rounding of a segmentation, which knows the axes of the frame: wit
 
 
 def kicks_of(motions: Sequence[Motion], dt: Array) -> Kicks:
-    """The contacts and hits of m motions with equal numbers of contacts, over dt (m,) s."""
-    times = [motion.kick_times(duration) for motion, duration in zip(motions, dt.tolist(), strict=True)]
+    """The contacts and hits of m motions with equal numbers of contacts, over dt (m,) s; times are rounded."""
+    times = [
+        [round(time / duration * KICK_PARTS) * duration / KICK_PARTS for time in motion.times]
+        for motion, duration in zip(motions, dt.tolist(), strict=True)
+    ]
     return Kicks(np.array(times), np.array([motion.hit for motion in motions]))
 
 
 def motions_of(segmentation: Segmentation, times: Array) -> list[Motion]:
-    """The motion of every interval of a track or window.
-
-    Args: segmentation: of n samples.  times: (n,) s.
-    """
+    """The motion of every interval of a track or window of samples at times (n,) s."""
     found = eventful_motions(segmentation, times)
     return [found.get(i, FLIGHT) for i in range(len(times) - 1)]
 
 
 def eventful_motions(segmentation: Segmentation, times: Array) -> dict[int, Motion]:
-    """The motion of every interval with an event, in their order.
-
-    Args: segmentation: of n samples.  times: (n,) s.
-    """
+    """The motion of every interval with an event, in their order, of samples at times (n,) s."""
     count = len(times) - 1
     met = contacts_by_interval(segmentation.contacts)
     rests: dict[int, float] = {}
@@ -123,24 +116,17 @@ class TrackDynamics:
         return found
 
     def factors(self, events: Segmentation) -> list[DynamicsFactors]:
-        """One factor per linked interval, in batches that share a motion and a number of integration steps.
-
-        Args: events: with contacts in the wanted intervals.
-        """
+        """One factor per linked interval, in batches that share a motion and a number of integration steps."""
         motions = eventful_motions(events, self.times)
         flying = np.ones(len(self.dt), dtype=bool)
-        groups: defaultdict[tuple[str, int], list[int]] = defaultdict(list)
+        groups: defaultdict[int, list[int]] = defaultdict(list)  # by the number of contacts; 0 for rests
         for i, motion in motions.items():
-            if motion.linked and motion.heights:
-                groups["contact", len(motion.heights)].append(i)
-            elif motion.linked and motion.rest is not None:
-                groups["rest", 0].append(i)
             flying[i] = motion.linked and not motion.heights and motion.rest is None
+            if motion.linked and not flying[i]:
+                groups[len(motion.heights)].append(i)
         hit = np.array([i for i, motion in motions.items() if motion.hit], dtype=np.int64)
         found: list[DynamicsFactors] = [self._flown(steps, flying, hit) for steps in self._flights]
-        for (sort, _), rows in groups.items():
-            made = self._contacts if sort == "contact" else self._rests
-            found.append(made(np.array(rows), [motions[i] for i in rows]))
+        found += [self._touching(np.array(rows), [motions[i] for i in rows]) for rows in groups.values()]
         return sorted((batch for batch in found if len(batch)), key=lambda batch: int(batch.variables[0, 0]))
 
     def _flown(self, steps: int, flying: Array, hit: Index) -> FlightFactors:
@@ -152,16 +138,11 @@ class TrackDynamics:
         struck = np.flatnonzero(np.isin(flights.variables[:, 0], hit))
         return flights.with_hits(struck, self.noise) if len(struck) else flights
 
-    def _contacts(self, rows: Index, motions: list[Motion]) -> ContactFactors:
-        heights, kicks, covariance = np.array([m.heights for m in motions]), *self._kicked(rows, motions)
-        return ContactFactors(self.model, rows, self.dt[rows], covariance, heights, kicks)
-
-    def _rests(self, rows: Index, motions: list[Motion]) -> RestFactors:
-        heights, kicks, covariance = np.array([m.rest for m in motions]), *self._kicked(rows, motions)
-        return RestFactors(self.model, rows, self.dt[rows], covariance, heights, kicks)
-
-    def _kicked(self, rows: Index, motions: list[Motion]) -> tuple[Kicks, Array]:
-        """Contacts and hits of intervals with equal numbers of contacts, and their process noise."""
-        dt = self.dt[rows]
-        kicks = kicks_of(motions, dt)
-        return kicks, self.noise.flight(dt) + self.noise.kicks(dt, kicks)
+    def _touching(self, rows: Index, motions: list[Motion]) -> DynamicsFactors:
+        """Contacts in intervals with equal numbers of them, or rests."""
+        dt, kicks = self.dt[rows], kicks_of(motions, self.dt[rows])
+        covariance = self.noise.flight(dt) + self.noise.kicks(dt, kicks)
+        if motions[0].heights:
+            heights = np.array([m.heights for m in motions])
+            return ContactFactors(self.model, rows, dt, covariance, heights, kicks)
+        return RestFactors(self.model, rows, dt, covariance, np.array([m.rest for m in motions]), kicks)

@@ -22,7 +22,7 @@ from ballfg.estimation.smoother.motion import TrackDynamics
 from ballfg.estimation.smoother.second_look.low_hops import LowHops
 from ballfg.factors.batch import FactorBatch, Values
 from ballfg.factors.correlated_noise import BIAS_DIM, BiasFactors, BiasStartFactors
-from ballfg.factors.dynamics import ContactFactors, model_width
+from ballfg.factors.dynamics import model_width
 from ballfg.factors.graph import BallGraph
 from ballfg.factors.launcher import LauncherSpinFactors
 from ballfg.factors.linear.covariance import Covariances
@@ -39,6 +39,8 @@ from ballfg.tracks import Track
 
 LEAST_SPIN_PRIOR = 60.0
 """rad/s, of a ball after a hit, however well a launcher repeats its spin."""
+UNINFORMATIVE_SPIN = 2000.0
+"""rad/s, prior about zero beside the label or the spin prior, in case their robust loss rejects them."""
 START_POSITION_SIGMA = 5.0
 """m, prior of the first position about its measurement: wide enough to carry no information."""
 QUALITY_SIGMA = {Quality.WIDE: 4.0, Quality.SHIFTED: 20.0, Quality.OUTLIER: 200.0}
@@ -132,7 +134,9 @@ class TrackProblem:
         batches += self._dynamics.factors(replace(events.segmentation, contacts=events.contacts))
         batches += _priors(self.track, events.segmentation, self.settings)
         if self.biased:
-            batches += _biases(self.track.times, self.settings)
+            sigma, dt = self.settings.bias_sigmas, np.diff(self.track.times)
+            batches.append(BiasStartFactors(np.array([0]), sigma))
+            batches.append(BiasFactors(np.arange(len(dt)), dt, sigma, self.settings.memory_time))
         own, others = self.coefficient_sigmas[: self.width], len(self.unknowns.names)
         if isinstance(self.ball, AugmentedModel):
             batches.append(CoefficientPriorFactors(self.ball, own, others))
@@ -170,20 +174,7 @@ def bridged_positions(track: Track, segmentation: Segmentation) -> Array:
     trusted = segmentation.quality <= Quality.WIDE
     if trusted.all() or not trusted.any():
         return track.positions.copy()
-    columns = [np.interp(track.times, track.times[trusted], axis[trusted]) for axis in track.positions.T]
-    return np.stack(columns, axis=-1)
-
-
-def _biases(times: Array, settings: Settings) -> list[FactorBatch]:
-    """Factors of the tracker's lasting errors: about zero at the start, decaying from sample to sample."""
-    sigma, before = settings.bias_sigmas, np.arange(len(times) - 1)
-    fading = BiasFactors(before, np.diff(times), sigma, settings.memory_time)
-    return [BiasStartFactors(np.array([0]), sigma), fading]
-
-
-def contact_batches(graph: BallGraph) -> list[ContactFactors]:
-    """The graph's contact factors."""
-    return [batch for batch in graph.batches if isinstance(batch, ContactFactors)]
+    return np.stack([np.interp(track.times, track.times[trusted], p[trusted]) for p in track.positions.T], axis=-1)
 
 
 def _priors(track: Track, segmentation: Segmentation, settings: Settings) -> list[FactorBatch]:
@@ -192,11 +183,11 @@ def _priors(track: Track, segmentation: Segmentation, settings: Settings) -> lis
     The first piece's spin is the label's, if any, or that of the launcher's settings; else the spin prior.
     """
     batches: list[FactorBatch] = []
-    launch = None if settings.launcher is None else settings.launcher.settings(track)
-    if settings.launcher is not None and launch is not None:
-        spread = np.full((1, 3), settings.launcher.sigma)
-        embedding, loss = settings.launcher.embedding, settings.label_loss
-        batches.append(LauncherSpinFactors(np.array([0]), launch[None], embedding, spread, loss))
+    launcher = settings.launcher
+    launch = None if launcher is None else launcher.settings(track)
+    if launcher is not None and launch is not None:
+        spread, loss = np.full((1, 3), launcher.sigma), settings.label_loss
+        batches.append(LauncherSpinFactors(np.array([0]), launch[None], launcher.embedding, spread, loss))
         batches.append(_wide_prior(0, track.positions[0], settings))
     else:
         batches += start_priors(0, track.positions[0], settings.spin_label(track), settings)
@@ -207,14 +198,7 @@ def _priors(track: Track, segmentation: Segmentation, settings: Settings) -> lis
 
 
 def start_priors(state: int, position: Array, label: SpinLabel | None, settings: Settings) -> list[FactorBatch]:
-    """Priors on a state without a link to a previous one.
-
-    Args:
-        state: its index.
-        position: (3,) m, as measured.
-        label: prior of the spin; None for the spin prior.
-        settings: spreads and losses.
-    """
+    """Priors on a state without a link to a previous one, at a measured position (3,) m, with a label of its spin."""
     known, where = spin_start(label, settings), np.array([state])
     if known.measured:
         about: PriorFactors = spin_label(where, known.spin[None], known.sigmas[None], settings.label_loss)
@@ -228,7 +212,3 @@ def _wide_prior(state: int, position: Array, settings: Settings) -> PriorFactors
     mean[POSITION] = position
     sigma[POSITION], sigma[VELOCITY], sigma[SPIN] = START_POSITION_SIGMA, settings.velocity_prior, UNINFORMATIVE_SPIN
     return state_prior(state, mean, sigma)
-
-
-UNINFORMATIVE_SPIN = 2000.0
-"""rad/s, prior about zero beside the label or the spin prior, in case their robust loss rejects them."""

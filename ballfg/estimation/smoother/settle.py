@@ -24,10 +24,10 @@ from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.launcher import SpinLabel
 from ballfg.estimation.segmentation.result import Contact, Segmentation
 from ballfg.estimation.smoother.motion import contacts_by_interval
-from ballfg.estimation.smoother.problem import Events, TrackProblem, bridged_positions, contact_batches
+from ballfg.estimation.smoother.problem import Events, TrackProblem, bridged_positions
 from ballfg.factors.batch import FactorBatch, Values
 from ballfg.factors.correlated_noise import BiasStartFactors
-from ballfg.factors.dynamics import DynamicsFactors, model_width
+from ballfg.factors.dynamics import ContactFactors, DynamicsFactors, model_width
 from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Minimum
 from ballfg.factors.launcher import LauncherSpinFactors
 from ballfg.factors.prior import PriorFactors, SpinLabelFactors
@@ -65,11 +65,9 @@ class Solution:
 
 @dataclass(frozen=True)
 class Earlier:
-    """The information from samples before those of a problem.
+    """The information from samples before those of a problem: initial values, and factors of removed states.
 
-    Attributes:
-        start: initial values of the minimisation.
-        summaries: factors with the information of removed states; they replace priors on the same variables.
+    The factors replace priors on the same variables.
     """
 
     start: Values
@@ -82,9 +80,7 @@ class Earlier:
         return BallGraph((*kept, *self.summaries))
 
 
-def initial_states(
-    track: Track, contacts: tuple[Contact, ...], segmentation: Segmentation, model: BallModel, label: SpinLabel | None
-) -> Array:
+def initial_states(track: Track, segmentation: Segmentation, model: BallModel, label: SpinLabel | None) -> Array:
     """(n, 9) states from the sliding window: measured positions, mean velocities of windows without events.
 
     The spin is the label's, or zero, up to the first contact; each contact changes it by the model. A resting ball is
@@ -96,30 +92,19 @@ def initial_states(
     states[:, VELOCITY] = window_velocities(track.times, states[:, POSITION], breaks.astype(np.int64))
     if label is not None:
         states[:, SPIN] = label.spin
-    for contact in sorted(contacts, key=lambda c: c.time):
-        _start_contact(states, contact, model)
-    for rest in segmentation.rests:
-        _start_rest(states[rest.first : rest.last + 2], rest.height, model)
+    for contact in sorted(contacts, key=lambda c: c.time):  # the state before it can reach it
+        before = torch.from_numpy(states[contact.interval].copy())
+        with torch.no_grad():
+            states[contact.interval, Z] -= min(0.0, float(model.gap(before, contact.height)))
+            states[contact.interval, VZ] = before[VZ] = min(float(before[VZ]), -LEAST_FALL)
+            states[contact.interval + 1 :, SPIN] = model.after_bounce(before)[SPIN].numpy()
+    for rest in segmentation.rests:  # rolling: saturated friction does not determine the direction of the spin
+        down = states[rest.first : rest.last + 2]
+        down[:, Z] -= model.gap(torch.from_numpy(down), rest.height).detach().numpy()
+        down[:, VZ] = 0.0
+        down[:, SPIN.start] = -down[:, VELOCITY.start + 1] / model.radius
+        down[:, SPIN.start + 1] = down[:, VELOCITY.start] / model.radius
     return states
-
-
-def _start_contact(states: Array, contact: Contact, model: BallModel) -> None:
-    """Moves the state before a contact to where it can reach the contact, and gives later states the spin after it."""
-    before = torch.from_numpy(states[contact.interval].copy())
-    with torch.no_grad():
-        gap = float(model.gap(before, contact.height))
-        if gap < 0.0:
-            states[contact.interval, Z] -= gap
-        states[contact.interval, VZ] = before[VZ] = min(float(before[VZ]), -LEAST_FALL)
-        states[contact.interval + 1 :, SPIN] = model.after_bounce(before)[SPIN].numpy()
-
-
-def _start_rest(states: Array, height: float, model: BallModel) -> None:
-    """Puts states on a surface, rolling: saturated friction does not determine the direction of the spin."""
-    states[:, Z] -= model.gap(torch.from_numpy(states), height).detach().numpy()
-    states[:, VZ] = 0.0
-    states[:, SPIN.start] = -states[:, VELOCITY.start + 1] / model.radius
-    states[:, SPIN.start + 1] = states[:, VELOCITY.start] / model.radius
 
 
 class ContactSearch:
@@ -140,10 +125,7 @@ class ContactSearch:
         return min(self._seen.values(), key=lambda s: s.minimum.error) if self._best is None else self._best
 
     def after(self, solution: Solution) -> tuple[Events, Values] | None:
-        """The next arrangement with initial values; None at the end of the search.
-
-        Args: solution: for the previous arrangement.
-        """
+        """The next arrangement with initial values, after a solution for the previous one; None at the end."""
         times, ball = self.problem.track.times, self.problem.ball
         places = places_of(solution.events.contacts)
         self._seen[places] = solution
@@ -205,11 +187,7 @@ def move_contacts(
 ) -> Values:
     """Values for a continued search after contacts moved: a state after its contact is now before it, or vice versa.
 
-    Args:
-        values: the states for the old contacts.
-        times: (n,) s.
-        old: interval and height of each contact so far.  new: the same of the next contacts.
-        model: gives the state at the end of the first interval that gained or lost a contact, from that at its start.
+    Args: values: for the old contacts.  times: (n,) s.  old, new: interval and height of each contact.
     """
     states = values.states.copy()
     changed = sorted({i for i, _ in set(old) ^ set(new)})
@@ -238,10 +216,9 @@ def timed_contacts(times: Array, solution: Solution) -> tuple[Contact, ...]:
     """The contacts with their estimated times; unchanged without an estimate."""
     grouped = contacts_by_interval(solution.events.contacts)
     timed: list[Contact] = []
-    for batch in contact_batches(solution.graph):
-        for interval, elapsed in zip(
-            batch.variables[:, 0].tolist(), batch.contact_times(solution.minimum.values), strict=True
-        ):
+    for batch in (batch for batch in solution.graph.batches if isinstance(batch, ContactFactors)):
+        elapsed_of = batch.contact_times(solution.minimum.values)
+        for interval, elapsed in zip(batch.variables[:, 0].tolist(), elapsed_of, strict=True):
             for contact, tau in zip(grouped[interval], elapsed.tolist(), strict=True):
                 time = float(times[interval] + tau) if np.isfinite(tau) else contact.time
                 timed.append(Contact(interval, time, contact.height))
@@ -256,14 +233,10 @@ def label_let_go(graph: BallGraph, values: Values) -> bool:
 
 def minimise_with_restart(optimizer: LevenbergMarquardt, graph: BallGraph, start: Values, found: Minimum) -> Minimum:
     """The lower of a given minimum and of the one reached by convex losses on labels."""
-    held = optimizer.minimize(_convex(graph), start)
+    convex = (b.with_loss(b.loss.convex) if isinstance(b, LABELS) else b for b in graph.batches)
+    held = optimizer.minimize(BallGraph(tuple(convex)), start)
     again = optimizer.minimize(graph, held.values)
     return again if again.error < found.error else found
-
-
-def _convex(graph: BallGraph) -> BallGraph:
-    """The graph with convex losses on labels."""
-    return BallGraph(tuple(b.with_loss(b.loss.convex) if isinstance(b, LABELS) else b for b in graph.batches))
 
 
 def worst_break(solution: Solution) -> int | None:

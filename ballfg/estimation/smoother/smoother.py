@@ -37,7 +37,7 @@ from ballfg.estimation.smoother.settle import (
     worst_break,
 )
 from ballfg.factors.batch import FactorBatch, Values
-from ballfg.factors.graph import Convergence, LevenbergMarquardt, Minimum
+from ballfg.factors.graph import Convergence, LevenbergMarquardt
 from ballfg.factors.gtsam_solver import GtsamLevenbergMarquardt
 from ballfg.factors.linear.covariance import Covariances
 from ballfg.state import STATE_DIM
@@ -45,6 +45,7 @@ from ballfg.tracks import Ball, Track
 
 MAX_UNSEEN_HITS = 8
 """Largest number of hits that the estimate adds to the segmentation's; measured logs needed three at most."""
+AT_MINIMUM = (Convergence.CONVERGED, Convergence.AT_KINK)
 OFFSET_ROUNDS = 6
 """Largest number of corrections of stamps by estimated time offsets; 4 ms need three."""
 FIRST_STEPS = 15
@@ -167,7 +168,13 @@ class Smoother(Estimator):
         segmentation, before = problem.segmentation, None
         for left in range(MAX_UNSEEN_HITS if self.settings.find_events else 0, -1, -1):
             search = ContactSearch(problem, self.surfaces, segmentation)
-            arrangement: tuple[Events, Values] | None = self._begin(problem, segmentation, earlier)
+            if earlier is None:
+                label = self.settings.spin_label(problem.track)
+                states = initial_states(problem.track, segmentation.contacts, segmentation, self.model, label)
+                start = problem.start(states)
+            else:
+                start = earlier.start
+            arrangement: tuple[Events, Values] | None = Events(segmentation.contacts, segmentation), start
             while arrangement is not None:
                 events, values = arrangement
                 graph = problem.graph(events)
@@ -190,16 +197,6 @@ class Smoother(Estimator):
             found = self.optimizer.minimize(solution.graph, found)
         return replace(solution, minimum=found.bare())
 
-    def _begin(
-        self, problem: TrackProblem, segmentation: Segmentation, earlier: Earlier | None
-    ) -> tuple[Events, Values]:
-        """The segmentation's events, and initial values."""
-        if earlier is not None:
-            return Events(segmentation.contacts, segmentation), earlier.start
-        label = self.settings.spin_label(problem.track)
-        states = initial_states(problem.track, segmentation.contacts, segmentation, self.model, label)
-        return Events(segmentation.contacts, segmentation), problem.start(states)
-
     def result(self, problem: TrackProblem, solution: Solution) -> Estimate:
         """The estimate of a track from a solution."""
         known = self.optimizer.covariances(solution.graph, solution.minimum)
@@ -217,16 +214,25 @@ class Smoother(Estimator):
         """
         minimum, segmentation = solution.minimum, solution.events.segmentation
         track, values = problem.track, solution.minimum.values
-        n, p = len(track), len(values.coefficients)
-        contacts = timed_contacts(track.times, solution)
-        covariances = prior_covariances(problem) if known is None else known
+        n, p, covariances = len(track), len(values.coefficients), known
+        if covariances is None:  # each state by itself
+            sigmas, (_, states) = (
+                problem.coefficient_sigmas,
+                measured_only(track.positions, problem.sigma, self.settings),
+            )
+            covariances = Covariances(states, np.diag(sigmas**2), np.zeros((n, STATE_DIM, p)))
+        status = Status.OK if minimum.convergence in AT_MINIMUM else Status.NOT_CONVERGED
+        if minimum.convergence is Convergence.NOT_FINITE or minimum.step is None:
+            status = Status.FAILED
+        elif n - 1 <= len(np.unique(segmentation.restarts)):
+            status = Status.NO_VELOCITY
         own, rest = slice(0, problem.width), slice(problem.width, p)
         estimate = Estimate(
             name=track.name,
             times=track.times,
             states=values.states,
             covariances=covariances.states[:, :STATE_DIM, :STATE_DIM],
-            status=status_of(minimum, n - 1 - len(np.unique(segmentation.restarts))),
+            status=status,
             innovations=problem.innovations(values, known),
             coefficient_names=tuple(self.settings.coefficients),
             coefficients=values.coefficients[own],
@@ -235,7 +241,7 @@ class Smoother(Estimator):
             unknown_names=problem.unknowns.names,
             unknowns=problem.unknowns.origins + values.coefficients[rest],
             unknown_covariance=covariances.coefficients[rest, rest],
-            contacts=contacts,
+            contacts=timed_contacts(track.times, solution),
             hits=segmentation.hits,
             quality=segmentation.quality,
             error=minimum.error,
@@ -246,23 +252,3 @@ class Smoother(Estimator):
         estimate = plausible(estimate, track, problem.sigma, self.settings)
         estimate = replace(estimate, notes=estimate.notes + rival_note(solution, estimate.covariances[0]))
         return widened_near_contacts(estimate, problem.ball)
-
-
-def status_of(minimum: Minimum, linked: int) -> Status:
-    """The status of a track's estimate.
-
-    Args: linked: intervals between samples over which the motion of the ball is followed.
-    """
-    if minimum.convergence is Convergence.NOT_FINITE or minimum.step is None:
-        return Status.FAILED
-    if linked < 1:
-        return Status.NO_VELOCITY
-    at_minimum = minimum.convergence in (Convergence.CONVERGED, Convergence.AT_KINK)
-    return Status.OK if at_minimum else Status.NOT_CONVERGED
-
-
-def prior_covariances(problem: TrackProblem) -> Covariances:
-    """Covariance of each state by itself, for a graph that could not be solved."""
-    coefficients = problem.coefficient_sigmas
-    _, states = measured_only(problem.track.positions, problem.sigma, problem.settings)
-    return Covariances(states, np.diag(coefficients**2), np.zeros((len(states), STATE_DIM, len(coefficients))))

@@ -12,7 +12,7 @@ from ballfg.dynamics import Surfaces
 from ballfg.dynamics.motion.contact import contact_time
 from ballfg.estimation.result import Status
 from ballfg.estimation.segmentation.result import Contact
-from ballfg.estimation.smoother.motion import Motion
+from ballfg.estimation.smoother.motion import Motion, kicks_of
 from ballfg.estimation.smoother.settle import initial_states, move_contacts
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.tracks import Track
@@ -138,6 +138,6 @@ def test_surfaces(case, settings) -> None:
 
 def test_the_process_noise_knows_when_a_contact_was_to_a_64th_of_its_interval() -> None:
     dt, times = 0.008, (0.0013, 0.0071)
-    kicks = Motion(heights=(0.0, 0.0), times=times).kick_times(dt)
+    (kicks,) = kicks_of([Motion(heights=(0.0, 0.0), times=times)], np.array([dt])).times
     np.testing.assert_allclose(kicks, times, rtol=0, atol=0.5 * dt / 64)
-    np.testing.assert_allclose(np.array(kicks) / dt * 64, np.round(np.array(kicks) / dt * 64), atol=1e-9)
+    np.testing.assert_allclose(kicks / dt * 64, np.round(kicks / dt * 64), atol=1e-9)
