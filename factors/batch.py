@@ -59,6 +59,11 @@ class Values:
             return np.concatenate((self.states[variables], self.biases[variables]), axis=1)
         return self.states[variables]
 
+    def select(self, begin: int, end: int) -> Values:
+        """The values of the states begin to end - 1, with the same coefficients."""
+        biases = None if self.biases is None else self.biases[begin:end]
+        return Values(self.states[begin:end], self.coefficients, biases)
+
     def retract(self, states: Array, coefficients: Array) -> Values:
         """These values plus a step.
 

@@ -12,7 +12,7 @@ from tests.test_layout import MODULES
 
 STARTS = (
     "ballfg.front",
-    "ballfg.estimation.smoother.pieces.long_tracks",
+    "ballfg.estimation.smoother.smoother",
     *(f"ballfg.dynamics.effects.{kind}" for kind in ("flight", "bounce", "measurement")),
 )
 """The door, and what is imported by its name: the default estimator, the effects."""

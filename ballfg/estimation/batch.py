@@ -50,36 +50,23 @@ def map_tracks(function: Callable[[Track], R], tracks: Iterable[Track], count: i
     Worker processes are started only if they save more time than they take to start. A cluster gets all tracks.
 
     Args:
-        function: copied to every process, so it must pickle.
-        tracks: a stream; it is never held as a whole.
-        count: approximate number of tracks.
-        jobs: processes; 1 stays in this one.
+        function: copied to every process, so it must pickle.  tracks: a stream; it is never held as a whole.
+        count: approximate number of tracks.  jobs: processes; 1 stays in this one.
     """
-    return _mapped(partial(each, function), tracks, count, jobs, None)
+    return map_blocks(partial(each, function), tracks, count, jobs, None)
 
 
 def map_blocks(
-    function: Callable[[Sequence[Track]], Iterable[R]], tracks: Iterable[Track], count: int, jobs: int, block: int
-) -> Iterator[R]:
-    """`map_tracks` for a function of several tracks, whose results may depend on the grouping.
-
-    Args:
-        function: of `block` tracks, fewer at the end; copied to every process, so it must pickle.
-        tracks: a stream; it is never held as a whole.
-        count: approximate number of tracks.
-        jobs: processes; 1 stays in this one.
-        block: number of tracks in a group, whatever the number of processes.
-    """
-    return _mapped(function, tracks, count, jobs, block)
-
-
-def _mapped(
     function: Callable[[Sequence[Track]], Iterable[R]],
     tracks: Iterable[Track],
     count: int,
     jobs: int,
     block: int | None,
 ) -> Iterator[R]:
+    """`map_tracks` for a function of `block` tracks, fewer at the end, whose results may depend on the grouping.
+
+    The number of processes does not change the blocks. Without a number the function takes any number of tracks.
+    """
     stream, others = iter(tracks), executor(jobs)
     here = partial(with_jobs, jobs, partial(on_one_thread, function))
     if isinstance(others, Processes):

@@ -21,7 +21,7 @@ from ballfg.estimation.noise.parameters import with_noise
 from ballfg.estimation.observations.sighted_dataset import SightedDataset
 from ballfg.estimation.out_of_distribution import out_of_distribution_share
 from ballfg.estimation.settings import MEASURED, Settings
-from ballfg.estimation.smoother.pieces.long_tracks import PiecewiseSmoother
+from ballfg.estimation.smoother.smoother import PiecewiseSmoother
 from ballfg.estimation.table_extent import TableExtent, find_table_extent
 from ballfg.factors.noise import PROCESS_NOISE, ProcessNoise
 from ballfg.progress import Watch, doing, unwatched
@@ -88,8 +88,7 @@ def fitted_settings(
     Args:
         dataset: `estimate_noise` sees a few of its tracks. The settings are those of `dataset_settings` with fewer than
             `LEAST_TRACKS` tracks, with sightings of cameras, or with a trained model in its own rooms.
-        model: the ball.
-        observed: s, the part of each track that the estimate may use.
+        model: the ball.  observed: s, the part of each track that the estimate may use.
         watch: called for each track and each step of the search.
     """
     settings = dataset_settings(dataset, model)
@@ -121,20 +120,15 @@ def _content(model: BallModel) -> Hashable:
 
 def _fitted(dataset: Dataset | SightedDataset, model: BallModel, observed: float, watch: Watch) -> Settings | None:
     """The settings with the noise estimated from the tracks; None if the tracks do not determine it."""
-    tracks = spread_over(dataset, min(len(dataset), TRACKS_FOR_TABLE), QUICK_TRACKS)
-    parts = [track.opening(observed) for track in tracks]
+    chosen = spread_over(dataset, min(len(dataset), TRACKS_FOR_TABLE), QUICK_TRACKS)
+    parts = [track.opening(observed) for track in chosen]
     surfaces, before = dataset_surfaces(dataset), dataset_settings(dataset, model)
     known = dataset.info.position_noise is not None
     return tracks_settings(model, surfaces, before, parts, known, watch)
 
 
 def tracks_settings(
-    model: BallModel,
-    surfaces: Surfaces,
-    settings: Settings,
-    parts: Sequence[Track],
-    position_known: bool,
-    watch: Watch = unwatched,
+    model: BallModel, surfaces: Surfaces, settings: Settings, parts: Sequence[Track], position_known: bool, watch: Watch
 ) -> Settings | None:
     """The settings with the noise estimated from parts of tracks; None if they do not determine it.
 
@@ -144,12 +138,8 @@ def tracks_settings(
     the network's correction is missing; bounces are widened by the usual size of it.
 
     Args:
-        model: the ball.
-        surfaces: table and floor.
         settings: prior ones; for a trained model, with the noise of its training.
-        parts: of tracks.
-        position_known: True if the white noise of positions is stated.
-        watch: called for each track and each step of the search.
+        position_known: True if the white noise of positions is stated.  watch: as for `fitted_settings`.
     """
     doubts = {name: sigma for name, sigma in settings.coefficients.items() if name.startswith(DOUBT)}
     plain = replace(settings, coefficients={n: s for n, s in settings.coefficients.items() if n not in doubts})
@@ -177,15 +167,10 @@ def with_usual_noise(settings: Settings, model: BallModel, share: float) -> Sett
     """Settings whose noise, except for positions, moves to a model's usual one by a share from 0 to 1."""
     usual = Settings.for_measured(model)
     spreads = {name: _between(s, usual.coefficients.get(name, s), share) for name, s in settings.coefficients.items()}
-    process = {
-        name: _between(getattr(settings.process, name), getattr(MEASURED, name), share) for name in PROCESS_NOISE
-    }
-    return replace(
-        settings,
-        process=replace(settings.process, **process),
-        spin_prior=_between(settings.spin_prior, usual.spin_prior, share),
-        coefficients=spreads,
-    )
+    own = settings.process
+    noise = {name: _between(getattr(own, name), getattr(MEASURED, name), share) for name in PROCESS_NOISE}
+    spin = _between(settings.spin_prior, usual.spin_prior, share)
+    return replace(settings, process=replace(own, **noise), spin_prior=spin, coefficients=spreads)
 
 
 def _between(one: float, other: float, share: float) -> float:

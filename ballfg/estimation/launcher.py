@@ -25,8 +25,7 @@ class SpinLabel:
     """A spin known before the flight, from a label or from the population of shots.
 
     Attributes:
-        spin: (3,) rad/s.
-        sigma: rad/s, standard deviation per axis, one number or (3,).
+        spin: (3,) rad/s.  sigma: rad/s, standard deviation per axis, one number or (3,).
         axes: (3, 3), one unit vector a row, along which sigma counts.
         measured: True if a label gives it; False if the population does.
     """
@@ -52,8 +51,7 @@ class Launcher:
     """Spin from the labels of a track.
 
     Attributes:
-        embedding: from the settings to a spin.
-        sigma: rad/s, standard deviation per axis of that spin.
+        embedding: from the settings to a spin.  sigma: rad/s, standard deviation per axis of that spin.
         defaults: labels for tracks that lack them, for instance `group` for a dataset that is one group.
 
     Raises: ValueError: a sigma that is not positive and finite.

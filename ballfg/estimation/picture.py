@@ -47,29 +47,24 @@ def predicted(prediction: TrackPrediction) -> Figure:
 
     Args: prediction: of one track.
     """
+    estimate, times, marks = prediction.estimate, prediction.estimate.times, []
+    events = [("contact", contact.time) for contact in estimate.contacts]
+    events += [("hit", float(0.5 * (times[interval] + times[interval + 1]))) for interval in estimate.hits]
+    for kind, time in events:
+        x, y, z = (float(np.interp(time, times, path)) for path in estimate.states[:, :3].T)
+        marks.append(Mark(kind, time, (x, y, z)))
     return by_axis(
         ShownShot(
             prediction.name,
             prediction.times,
             prediction.measured,
             np.full(prediction.measured.shape, np.nan),
-            prediction.estimate.times,
-            prediction.estimate.states,
-            prediction.estimate.sigmas,
+            times,
+            estimate.states,
+            estimate.sigmas,
             prediction.times,
             prediction.positions,
             prediction.sigmas,
-            _marks(prediction.estimate),
+            tuple(marks),
         )
     )
-
-
-def _marks(estimate: Estimate) -> tuple[Mark, ...]:
-    times = estimate.times
-    events = [("contact", contact.time) for contact in estimate.contacts]
-    events += [("hit", float(0.5 * (times[interval] + times[interval + 1]))) for interval in estimate.hits]
-    found = []
-    for kind, time in events:
-        x, y, z = (float(np.interp(time, times, path)) for path in estimate.states[:, :3].T)
-        found.append(Mark(kind, time, (x, y, z)))
-    return tuple(found)

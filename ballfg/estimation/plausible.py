@@ -24,15 +24,15 @@ def plausible(estimate: Estimate, track: Track, sigma: Array, settings: Settings
     """The estimate with positive definite covariances, its impossible states replaced by the measurements.
 
     Args:
-        estimate: of the track.
-        track: gives the positions.
-        sigma: (n, 3) m, of the positions.
+        estimate: of the track.  track: gives the positions.  sigma: (n, 3) m, of the positions.
         settings: give the priors.
     Returns: the same estimate if nothing is wrong with it, else one whose status says so.
     """
     wrong = ~(possible(estimate.states) & variances_positive(estimate.covariances))
-    lost = not _known(estimate)
+    finite = np.isfinite(estimate.coefficients).all() and np.isfinite(estimate.cross_covariances).all()
+    lost = not (finite and variances_positive(estimate.coefficient_covariance).all())
     covariances = estimate.covariances
+    status = Status.FAILED if estimate.status is Status.FAILED else Status.IMPLAUSIBLE
     if wrong.any():
         states, priors = measured_only(track.positions, sigma, settings)
         covariances = np.where(wrong[:, None, None], priors, covariances)
@@ -40,7 +40,7 @@ def plausible(estimate: Estimate, track: Track, sigma: Array, settings: Settings
             estimate,
             states=np.where(wrong[:, None], states, estimate.states),
             other_sides=np.where(wrong[: len(estimate.other_sides), None, None], 0.0, estimate.other_sides),
-            status=Status.FAILED if estimate.status is Status.FAILED else Status.IMPLAUSIBLE,
+            status=status,
         )
     if lost:
         coefficients = np.array(list(settings.coefficients.values()))
@@ -48,7 +48,7 @@ def plausible(estimate: Estimate, track: Track, sigma: Array, settings: Settings
             estimate,
             coefficients=np.where(np.isfinite(estimate.coefficients), estimate.coefficients, 0.0),
             coefficient_covariance=np.diag(coefficients**2),
-            status=Status.FAILED if estimate.status is Status.FAILED else Status.IMPLAUSIBLE,
+            status=status,
         )
     covariances, shared = definite(covariances), estimate.coefficient_covariance
     shared = definite(shared) if shared.size else shared
@@ -83,13 +83,3 @@ def measured_only(positions: Array, sigma: Array, settings: Settings) -> tuple[A
     spread[:, POSITION] = np.maximum(sigma, LEAST_POSITION_SIGMA)
     spread[:, VELOCITY], spread[:, SPIN] = settings.velocity_prior, settings.spin_prior
     return states, spread[..., None] ** 2 * np.eye(STATE_DIM)
-
-
-def _known(estimate: Estimate) -> bool:
-    """True if the coefficients are numbers with a covariance."""
-    own = estimate.coefficient_covariance
-    return bool(
-        np.isfinite(estimate.coefficients).all()
-        and variances_positive(own).all()
-        and np.isfinite(estimate.cross_covariances).all()
-    )

@@ -16,12 +16,7 @@ from ballfg.tracks import Track
 
 
 class EachItsModel(Estimator):
-    """An estimator for each set of coefficients, created when the first track with it comes.
-
-    Args:
-        make: the estimator of a model that is the same for all tracks.
-        model: with `variations`.  surfaces: what the ball may bounce on.  settings: noise and priors.
-    """
+    """An estimator for each set of coefficients that differ between tracks, made for the first track with it."""
 
     name = "each-its-model"
     undoes_measurement = True
@@ -53,7 +48,7 @@ ESTIMATORS: Final[Registry[Estimator]] = Registry(
     base=Estimator,
     remedy="docs/estimators.md has an example.",
     own={
-        "smoother": "ballfg.estimation.smoother.pieces.long_tracks:PiecewiseSmoother",
+        "smoother": "ballfg.estimation.smoother.smoother:PiecewiseSmoother",
         "online": "ballfg.estimation.online.online:Online",
         "ekf": "ballfg.estimation.filters.ekf:ExtendedKalmanFilter",
         "sliding-window": "ballfg.estimation.filters.sliding_window:SlidingWindow",

@@ -42,8 +42,7 @@ class TableExtent:
 
     Attributes:
         sides: (x_low, x_high, y_low, y_high) m; infinite if no ball fell beyond the side.
-        sigmas: m, of each side; 0 where it is infinite.
-        bounces: number of bounces on the table.
+        sigmas: m, of each side; 0 where it is infinite.  bounces: number of bounces on the table.
         falls: number of balls that fell past it.
     """
 

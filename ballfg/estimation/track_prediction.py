@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ballfg.arrays import Array
 from ballfg.checks import as_float
@@ -101,8 +100,7 @@ def predict_tracks(
     horizon = as_float("horizon", horizon, "s")
     if not horizon > 0.0:
         raise ValueError(f"horizon must be a positive number of seconds; got {horizon:g}. Leave it out for all stamps.")
-    seconds = observe if callable(observe) else lambda track: observe
-    return _predictions(estimator, tracks, count, seconds, horizon, jobs)
+    return _predictions(estimator, tracks, count, observe, horizon, jobs)
 
 
 def check_observe(observe: float) -> None:
@@ -122,7 +120,7 @@ def _predictions(
     estimator: Estimator,
     tracks: Iterable[Track],
     count: int,
-    observe: Callable[[Track], float],
+    observe: float | Callable[[Track], float],
     horizon: float,
     jobs: int,
 ) -> Iterator[TrackPrediction]:
@@ -136,7 +134,7 @@ def _predictions(
 def _block(
     estimator: Estimator,
     propagator: Propagator,
-    observe: Callable[[Track], float],
+    observe: float | Callable[[Track], float],
     horizon: float,
     tracks: Sequence[Track],
 ) -> list[TrackPrediction]:
@@ -144,23 +142,17 @@ def _block(
     for track in tracks:
         estimator.prepared(track)  # checks the whole track for metres and seconds
     counted = [track.since_first() for track in tracks]
-    parts = [track.opening(observe(track)) for track in counted]
+    parts = [track.opening(observe(track) if callable(observe) else observe) for track in counted]
     estimates = [estimator.estimate(part) for part in parts]
     made = _predict_block(estimator, propagator, estimates, counted, horizon)
-    found = [_dated(one, track.times) for one, track in zip(made, tracks, strict=True)]
-    if estimator.model.variations:  # the world of each estimate is that of its track
-        return found
-    return [replace(one, estimate=replace(one.estimate, world=None)) for one in found]
-
-
-def _dated(prediction: TrackPrediction, times: Array) -> TrackPrediction:
-    """A prediction with the stamps of the data.
-
-    Args: times: (n,) s, the original stamps of the whole track.
-    """
-    observed = len(prediction.estimate.times)
-    estimate = prediction.estimate.dated(times[:observed])
-    return replace(prediction, times=times[observed : observed + len(prediction.times)], estimate=estimate)
+    found = []
+    for one, track in zip(made, tracks, strict=True):  # with the stamps of the data
+        seen = len(one.estimate.times)
+        estimate, times = one.estimate.dated(track.times[:seen]), track.times[seen : seen + len(one.times)]
+        if not estimator.model.variations:  # else the world of each estimate is that of its track
+            estimate = replace(estimate, world=None)
+        found.append(replace(one, times=times, estimate=estimate))
+    return found
 
 
 def _predict_block(
@@ -179,7 +171,11 @@ def _predict_block(
 def _predict_alike(
     estimator: Estimator, propagator: Propagator, estimates: list[Estimate], tracks: list[Track], horizon: float
 ) -> Iterator[TrackPrediction]:
-    later = [_later(t, float(e.times[-1]), horizon) for t, e in zip(tracks, estimates, strict=True)]
+    begun = [float(e.times[-1]) for e in estimates]
+    later = [
+        (t.times > begin) & (t.times <= begin + horizon + STAMP_TOLERANCE)
+        for t, begin in zip(tracks, begun, strict=True)
+    ]
     clocks = [true_times(estimator.model, t.times) for t in tracks]
     ends = [float(clock[len(e.times) - 1]) for clock, e in zip(clocks, estimates, strict=True)]
     times = _padded([clock[mask] for clock, mask in zip(clocks, later, strict=True)], ends)
@@ -198,16 +194,10 @@ def _predict_alike(
     for i, (track, result, mask) in enumerate(zip(tracks, estimates, later, strict=True)):
         k = int(mask.sum())
         white = sample_sigmas(estimator.settings, len(track), track.sigmas)[mask]
-        noise = total_sigmas(estimator.settings, white, velocities[i, :k])
-        sigmas = np.sqrt(variances[i, :k] + noise**2)
+        sigmas = np.sqrt(variances[i, :k] + total_sigmas(estimator.settings, white, velocities[i, :k]) ** 2)
         left = None if outside is None else outside[i, :k]
         ahead = track.times[mask], positions[i, :k], sigmas, track.positions[mask]
         yield TrackPrediction(track.name, *ahead, result, outside=left)
-
-
-def _later(track: Track, end: float, horizon: float) -> NDArray[np.bool_]:
-    """(n,) bool: the stamps to predict."""
-    return (track.times > end) & (track.times <= end + horizon + STAMP_TOLERANCE)
 
 
 def _padded(times: list[Array], ends: list[float]) -> Array:

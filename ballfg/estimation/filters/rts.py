@@ -25,17 +25,14 @@ class FilterRecord:
     """A filter's belief at each of n samples, in d numbers: state, coefficients of the model, tracker's bias.
 
     Attributes:
-        start: first sample with a belief.
-        prior_mean: (n, d) and prior_covariance: (n, d, d), before the sample.
+        start: first sample with a belief.  prior_mean: (n, d) and prior_covariance: (n, d, d), before the sample.
         mean: (n, d) and covariance: (n, d, d), after it.
         transition: (n, d, d), Jacobian of the motion from the sample before.
         noise: (n, d, d), process noise gathered since the sample before.
         measurement_noise: (n, 3, 3) m^2, covariance of the sample's white error and of that of its stamp.
         whitened: (n, 3), innovations divided by their standard deviations; NaN where a sample has none.
-        quality: (n,) `Quality`.
-        least: (d,) least standard deviations, against rounding.
-        contacts: for each interval with any.
-        hits: intervals.
+        quality: (n,) `Quality`.  least: (d,) least standard deviations, against rounding.
+        contacts: for each interval with any.  hits: intervals.
     """
 
     def __init__(self, n: int, d: int) -> None:

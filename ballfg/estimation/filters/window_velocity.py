@@ -19,8 +19,7 @@ def window_velocities(times: Array, positions: Array, breaks: ArrayLike = ()) ->
     than five samples. A sample alone between breaks gets the mean slope to its neighbours.
 
     Args:
-        times: (n,) s, increasing.
-        positions: (n, 3) m.
+        times: (n,) s, increasing.  positions: (n, 3) m.
         breaks: intervals (between samples i and i+1) in which a contact or a hit broke the motion.
     Returns: (n, 3) m/s, always finite, at most `FASTEST_BALL`; zero for a track of one sample.
     """

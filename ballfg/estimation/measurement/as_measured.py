@@ -72,8 +72,7 @@ def measured_positions(model: BallModel, states: Tensor, surfaces: Surfaces) -> 
     """(n, 3) m, expected measured positions of balls, before noise.
 
     Args:
-        model: may be augmented.
-        states: (n, 9 + p), true.
+        model: may be augmented.  states: (n, 9 + p), true.
         surfaces: those that a ball may bounce on between the moments of one sample.
     """
     if model.measures_plainly:

@@ -26,8 +26,7 @@ from ballfg.estimation.measurement.as_measured import (
 )
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.settings import Settings, sample_sigmas
-from ballfg.estimation.smoother.pieces.long_tracks import PiecewiseSmoother
-from ballfg.estimation.smoother.smoother import Smoother
+from ballfg.estimation.smoother.smoother import PiecewiseSmoother, Smoother
 from ballfg.factors.batch import FactorBatch
 from ballfg.state import POSITION, STATE_DIM
 from ballfg.tracks import Track

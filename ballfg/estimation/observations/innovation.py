@@ -20,8 +20,7 @@ class FilterInnovation:
     """One factor on a filter's predicted state, linearised there, as the input of its update.
 
     Attributes:
-        residual: (r,) whitened.
-        H: (r, d) whitened, per unit of the filter's state.
+        residual: (r,) whitened.  H: (r, d) whitened, per unit of the filter's state.
         R: (r, r) noise of the whitened residual: one, divided by the weight that a robust loss gives the innovation.
         spread: (r, r) H P H^T, the covariance that the prediction adds to it.
         whitened: (r,) the innovation divided by the root of its covariance before the loss, H P H^T + 1.
@@ -64,8 +63,7 @@ def leave_position_out(states: Array, covariances: Array, measured: Array, noise
 
     Args:
         states: (n, 3) m, the positions x that measurements should show, or (n, 9), beginning with them.
-        covariances: (n, 3, 3) or (n, 9, 9) of the states.
-        measured: (n, 3) m.
+        covariances: (n, 3, 3) or (n, 9, 9) of the states.  measured: (n, 3) m.
         noise: (n, 3, 3) m^2, covariances R of the measurements.
         samples: the position factors, linearised at the states.
     """

@@ -50,9 +50,7 @@ class Context:
     """The inputs that an observation needs to make its factors.
 
     Attributes:
-        track: of the observation.
-        model: the ball.
-        settings: noise, losses and priors.
+        track: of the observation.  model: the ball.  settings: noise, losses and priors.
         sigma: (n, 3) m, standard deviation of the white error of each position of the track, including samples of bad
             quality.
         velocities: (n, 3) m/s, rough, of the ball; None if stamps are exact.

@@ -62,11 +62,8 @@ class Rays:
     """Sightings as linear equations A X = b of the ball's position, in units of x/z and y/z times depth.
 
     Attributes:
-        times: (m,) s, true, ascending.
-        camera: (m,) number of the camera.
-        matrix: (m, 2, 3).  target: (m, 2).
-        root: (m, 2, 2) whitens a residual divided by the depth.
-        depth_row: (m, 4): depth = row[:3] X + row[3].
+        times: (m,) s, true, ascending.  camera: (m,) number of the camera.  matrix: (m, 2, 3).  target: (m, 2).
+        root: (m, 2, 2) whitens a residual divided by the depth.  depth_row: (m, 4): depth = row[:3] X + row[3].
         period: s, of the slowest camera.
     """
 
@@ -107,8 +104,7 @@ def rough_path(rays: Rays, moments: Array, windows: Sequence[tuple[float, float]
     """The ball's positions at moments (n,) s, by the best of several windows around each.
 
     Args:
-        rays: of all sightings that may be used.
-        moments: s.
+        rays: of all sightings that may be used.  moments: s.
         windows: begin and end of each about the moment, in periods of the slowest camera.
     """
     sides = np.array(windows) * rays.period

@@ -22,9 +22,7 @@ class SightedDataset(TrackFolder):
     """The tracks of a folder from its sightings; made by `read_sighted`. The folder needs no table of tracks.
 
     Attributes:
-        path: the folder.
-        info: what `dataset.yaml` states.
-        cameras: of the rig.
+        path: the folder.  info: what `dataset.yaml` states.  cameras: of the rig.
         notes: ignored rows and balls, one sentence each.
 
     Raises: ValueError: cameras with numbers that no lens has.

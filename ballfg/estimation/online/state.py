@@ -19,13 +19,11 @@ class Sample:
     """One observation and its explanation.
 
     Attributes:
-        time: s.  position: (3,) m.
-        stated: (3,) m, standard deviation of its white error as stated.
+        time: s.  position: (3,) m.  stated: (3,) m, standard deviation of its white error as stated.
         whole: (3,) m, standard deviation of its whole error, with a lasting part and the error of the stamp.
         velocity: (3,) m/s, rough; the stamp's error displaces the sample along it.
         factor: multiple of the whole error for a sample that is not good; 1 for a good one.
-        motion: how the ball got here from the sample before.
-        label: prior of the spin, on the first sample of a track.
+        motion: how the ball got here from the sample before.  label: prior of the spin, on the first sample of a track.
         slots: places in iSAM2 of the sample's own factors: its position's first, if it was measured.
         bias_slot: place of the factor from the previous sample's bias to this one's; None without.
         measured: True if the position was measured; else it was computed from the measurements to find events.

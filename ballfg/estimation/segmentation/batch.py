@@ -150,8 +150,7 @@ def segment(
     """Finds contacts, hits, rests and bad samples of one track.
 
     Args:
-        times: (n,) s, strictly increasing.
-        positions: (n, 3) m, world frame, z up.
+        times: (n,) s, strictly increasing.  positions: (n, 3) m, world frame, z up.
         sigma: (3,) or (n, 3) m, standard deviation of each coordinate. Half the true noise makes false shifts.
             `estimate_position_noise` estimates it from the data.
         surfaces: table and floor; the ball's centre bounces a radius and the physics' offset above them.

@@ -44,11 +44,9 @@ class Event:
     """One event of an explanation.
 
     Attributes:
-        kind: what happened.
-        index: the interval of the event (-1: before the first sample), or the sample.
+        kind: what happened.  index: the interval of the event (-1: before the first sample), or the sample.
         time: s, on the track's clock: of a contact itself; for other events the stamp of the first sample after it.
-        height: m, declared height of the surface, if any.
-        offset: (3,) m, jump of the measurements, for a shift.
+        height: m, declared height of the surface, if any.  offset: (3,) m, jump of the measurements, for a shift.
     """
 
     kind: EventKind

@@ -35,11 +35,8 @@ class SegmentationPhysics:
     """A ball without spin, in six numbers; the slack of the segmentation covers the rest.
 
     Attributes:
-        gravity: m/s^2, downwards.
-        drag: 1/m, k in a = -k |v| v.
-        restitution: of the normal velocity.
-        friction: Coulomb coefficient of a bounce.
-        radius: m.
+        gravity: m/s^2, downwards.  drag: 1/m, k in a = -k |v| v.  restitution: of the normal velocity.
+        friction: Coulomb coefficient of a bounce.  radius: m.
         surface_offset: m by which surfaces lie above their declared heights.
 
     Raises: ValueError: if a number is not finite or out of range.

@@ -52,10 +52,9 @@ class GaussianMixture:
         return GaussianMixture(self.log_weights[rows], self.means[rows], self.covariances[rows])
 
     def updated_by_position(self, position: Array, noise: Array, H: Array) -> tuple[GaussianMixture, Array]:
-        """The Kalman update with a measured position; weights gain its likelihood.
+        """The Kalman update with a position, and squared whitened innovations (n,); weights gain its likelihood.
 
         Args: position: (3,) m.  noise: (n, 3, 3) m^2, for each Gaussian.  H: (3, d) of a measured position.
-        Returns: the mixture, and the squared whitened innovations (n,).
         """
         innovation = position - self.means @ H.T
         rows = H @ self.covariances

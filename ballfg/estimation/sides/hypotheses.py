@@ -54,8 +54,7 @@ class SampleMeasurement:
     """The measurements at one stamp.
 
     Attributes:
-        position: (3,) m; None if it was not measured or was rejected.
-        sigma: (3,) m, of its white error.
+        position: (3,) m; None if it was not measured or was rejected.  sigma: (3,) m, of its white error.
         factors: all other measurements, batches of one factor each.
     """
 
@@ -189,9 +188,7 @@ class ContactHypotheses:
     """Two hypotheses of a ball: not yet bounced, and bounced.
 
     Attributes:
-        model: of the ball.
-        flying: one Gaussian, without the surface.
-        bounced: Gaussians; none before the first step.
+        model: of the ball.  flying: one Gaussian, without the surface.  bounced: Gaussians; none before the first step.
         level: m, height of the surface.
         nearest: squared whitened innovation of the last position under its best hypothesis.
     """

@@ -33,10 +33,8 @@ class ContactState:
     """The state to report near a contact: the more probable side's, widened by the other one.
 
     Attributes:
-        mean: (d,) state, coefficients and bias on the more probable side.
-        covariance: (d, d) on that side alone.
-        other: (9, 9) to be added to the state's covariance.
-        bounced: True if that side has bounced.
+        mean: (d,) state, coefficients and bias on the more probable side.  covariance: (d, d) on that side alone.
+        other: (9, 9) to be added to the state's covariance.  bounced: True if that side has bounced.
     """
 
     mean: Array
@@ -75,14 +73,11 @@ class ContactMonitor:
     def step(
         self, before: tuple[Array, Array], dt: float, measured: SampleMeasurement, bounced: Callable[[int], bool]
     ) -> ContactState | None:
-        """The state to report at the next sample.
+        """The state to report at the next sample; None far from a contact, where the estimator's own is valid.
 
         Args:
-            before: the estimator's mean (d,) and covariance (d, d) of state, coefficients and bias a sample ago.
-            dt: s since then.
-            measured: at the sample.
+            before: the estimator's mean (d,) and covariance (d, d) of state, coefficients and bias a sample ago, dt s.
             bounced: True if, by the estimator, the ball has bounced within that number of last intervals.
-        Returns: None far from a contact, where the estimator's own state is valid.
         """
         if self._hypotheses is None:
             if not self.model.may_touch(*before, dt):
@@ -96,9 +91,9 @@ class ContactMonitor:
         steps: Sequence[tuple[float, SampleMeasurement]],
         bounced: Callable[[int], bool],
     ) -> ContactState | None:
-        """The state to report at the last of several samples.
+        """The state to report at the last of several samples; arguments as of `step`.
 
-        Args: before, bounced: as of `step`.  steps: time in s to each sample, and its measurements.
+        Args: steps: time in s to each sample, and its measurements.
         """
         self._start(*before)
         state = None
@@ -155,10 +150,7 @@ class ContactMonitor:
 
 
 def with_contact_states(estimate: Estimate, found: Mapping[int, ContactState]) -> Estimate:
-    """The estimate with other states at some samples; its coefficients keep their values.
-
-    Args: estimate: of a track.  found: states by sample.
-    """
+    """The estimate with other states at some samples; its coefficients keep their values."""
     others = estimate.other_sides
     others = others.copy() if len(others) else np.zeros_like(estimate.covariances)
     if not found or estimate.status.failed:

@@ -40,27 +40,17 @@ def widening(near: Array, far: Array, jump: Array, chance: float) -> Array:
         chance: of the far side, at most a half.
     """
     share, whole = max(chance, min(MORE * chance, ENOUGH)), min(chance / SPREAD, 1.0)
-    return np.asarray(whole * _excess(far, near) + share * np.outer(jump, jump))
-
-
-def _excess(far: Array, near: Array) -> Array:
-    """(9, 9) far - near, restricted to the directions in which it is positive."""
-    root = np.linalg.cholesky(near)
+    root = np.linalg.cholesky(near)  # far - near, in the directions in which it is positive
     half = np.linalg.solve(root, far - near)
     values, axes = np.linalg.eigh(np.linalg.solve(root, half.T))
     more = root @ axes[:, values > 0.0]
-    return np.asarray((more * values[values > 0.0]) @ more.T)
+    excess = (more * values[values > 0.0]) @ more.T
+    return np.asarray(whole * excess + share * np.outer(jump, jump))
 
 
 @dataclass(frozen=True)
 class Shared:
-    """Coefficients of the model that were estimated with n states.
-
-    Attributes:
-        mean: (p,) in their own units.
-        covariance: (p, p).
-        cross: (n, 9, p) covariances of the states with them.
-    """
+    """Coefficients (p,) estimated with n states, their covariance (p, p), and that with the states (n, 9, p)."""
 
     mean: Array
     covariance: Array
@@ -68,36 +58,26 @@ class Shared:
 
 
 def widened_near_contacts(estimate: Estimate, model: BallModel) -> Estimate:
-    """The estimate with its covariances widened for the chance of the other side of a near contact.
-
-    Args: estimate: without it.  model: the ball, its coefficients in columns after the state.
-    """
+    """The estimate with covariances widened for the chance of the other side of a near contact."""
     if estimate.status.failed:  # its states have no contacts
         return replace(estimate, other_sides=np.zeros_like(estimate.covariances))
     shared = Shared(estimate.coefficients, estimate.coefficient_covariance, estimate.cross_covariances)
-    others = widening_near_contacts(
-        estimate.times, estimate.states, estimate.covariances, estimate.contacts, model, shared
-    )
+    known = (estimate.times, estimate.states, estimate.covariances, estimate.contacts)
+    others = widening_near_contacts(*known, model, shared)
     return replace(estimate, covariances=estimate.covariances + others, other_sides=others)
 
 
 def widening_near_contacts(
     times: Array, states: Array, covariances: Array, contacts: Sequence[Contact], model: BallModel, shared: Shared
 ) -> Array:
-    """The difference of covariances near contacts for the chance that a ball is on the other side.
+    """(n, 9, 9) to be added near contacts for the chance that a ball is on the other side; zero far from them.
 
     The estimate fixes the order of contact and stamp. The gap between ball and surface at a stamp is known to a sigma,
     including that of the surface's height, and the contact's time to sigma / |v_z|: often 0.1 ms, so that few stamps
     are concerned.
 
-    Args:
-        times: (n,) s.
-        states: (n, 9).
-        covariances: (n, 9, 9).
-        contacts: with their estimated times.
+    Args: times, states, covariances: (n,) s, (n, 9), (n, 9, 9).  contacts: with their estimated times.
         model: the ball, its coefficients in columns after the state.
-        shared: the coefficients.
-    Returns: (n, 9, 9), to be added; zero far from contacts.
     """
     lacking = np.zeros_like(covariances)
     sides = [(k, c.interval + (k == c.interval), c) for c in contacts for k in (c.interval, c.interval + 1)]

@@ -80,7 +80,9 @@ class Earlier:
         return BallGraph((*kept, *self.summaries))
 
 
-def initial_states(track: Track, segmentation: Segmentation, model: BallModel, label: SpinLabel | None) -> Array:
+def initial_states(
+    track: Track, contacts: tuple[Contact, ...], segmentation: Segmentation, model: BallModel, label: SpinLabel | None
+) -> Array:
     """(n, 9) states from the sliding window: measured positions, mean velocities of windows without events.
 
     The spin is the label's, or zero, up to the first contact; each contact changes it by the model. A resting ball is

@@ -12,14 +12,14 @@ import pytest
 from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.settings import Settings
-from ballfg.estimation.smoother.pieces import joining, long_tracks
+from ballfg.estimation.smoother import smoother as smoother_module
+from ballfg.estimation.smoother.pieces import joining
 from ballfg.estimation.smoother.pieces.joining import joined_minimum
-from ballfg.estimation.smoother.pieces.long_tracks import PiecewiseSmoother
 from ballfg.estimation.smoother.pieces.reduction import Point, Reduction
 from ballfg.estimation.smoother.pieces.section import bounds_of, cut_between, look, part_of
 from ballfg.estimation.smoother.pieces.whole import in_pieces
 from ballfg.estimation.smoother.second_look import spin_ambiguity
-from ballfg.estimation.smoother.smoother import Smoother
+from ballfg.estimation.smoother.smoother import PiecewiseSmoother, Smoother
 from ballfg.factors.graph import LevenbergMarquardt
 from ballfg.factors.linear.step import solve
 from ballfg.parallel.parts import with_jobs
@@ -144,7 +144,7 @@ def test_a_ball_that_lies_still_across_many_pieces():
 
 
 def test_results_do_not_depend_on_the_number_of_processes(monkeypatch):
-    monkeypatch.setattr(long_tracks, "LONG", 1000)
+    monkeypatch.setattr(smoother_module, "LONG", 1000)
     smoother, track = PiecewiseSmoother(MODEL, TABLE, Settings.for_measured(MODEL)), rally(6500, seed=2)
     one, two = (with_jobs(jobs, smoother.estimate, track) for jobs in (1, 2))
     assert one.states.tobytes() == two.states.tobytes()
@@ -152,7 +152,7 @@ def test_results_do_not_depend_on_the_number_of_processes(monkeypatch):
 
 
 def test_sections_follow_one_another_and_are_the_whole(monkeypatch):
-    monkeypatch.setattr(long_tracks, "LONG", 1000)
+    monkeypatch.setattr(smoother_module, "LONG", 1000)
     smoother, track = PiecewiseSmoother(MODEL, TABLE, Settings.for_measured(MODEL)), rally(4500, seed=4)
     parts, whole = list(smoother.in_sections(track)), smoother.estimate(track)
     assert len(parts) == 2

@@ -23,8 +23,7 @@ class Interval:
     """One linked interval: its factor, and the last result of its torch batch.
 
     Args:
-        batch: one row, between states i and i + 1 of the stream.
-        motion: events in the interval.
+        batch: one row, between states i and i + 1 of the stream.  motion: events in the interval.
         covariance: (9, 9) of the process noise.
 
     Attributes:

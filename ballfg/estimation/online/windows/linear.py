@@ -55,10 +55,8 @@ class LinearFactors(FactorBatch):
     """One linear factor r = sum A_i (v_i - v_i*) - b, with the information of removed states.
 
     Args:
-        numbers: of its variables v_i.
-        points: (1, d) each, v_i* in the variable's own units.
-        blocks: (r, d) each, A_i whitened, per unit of the variable.
-        b: (r,) whitened.
+        numbers: of its variables v_i.  points: (1, d) each, v_i* in the variable's own units.
+        blocks: (r, d) each, A_i whitened, per unit of the variable.  b: (r,) whitened.
         sees_biases: True if biases follow the states.
     """
 

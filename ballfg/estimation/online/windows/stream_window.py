@@ -36,10 +36,8 @@ class Arrival:
     """A new sample of a window.
 
     Attributes:
-        sample: the sample.
-        state: (w,) its linearisation point.
-        interval: the one from the sample before; None without a link.
-        priors: factors of its own, numbered 0.
+        sample: the sample.  state: (w,) its linearisation point.
+        interval: the one from the sample before; None without a link.  priors: factors of its own, numbered 0.
     """
 
     sample: Sample

@@ -7,6 +7,7 @@ and gets their steps back. Memory holds some numbers a sample, and the matrices 
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,7 +15,6 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Final, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ballfg.arrays import Array
 from ballfg.estimation.smoother.pieces.reduction import Chain, Ends, Point, Reduction, Response, moved_rows, solve_chain
@@ -61,11 +61,9 @@ class Told:
     """The information of a section, linearised at a point.
 
     Attributes:
-        values: the point.
-        error: of the section's factors.
+        values: the point.  error: of the section's factors.
         inner: predicted decrease of the error by the inner states alone.
-        ends: information on the ends and the coefficients.
-        response: dependence of its states on these.
+        ends: information on the ends and the coefficients.  response: dependence of its states on these.
     """
 
     values: Values
@@ -89,16 +87,19 @@ class Told:
 
 
 @dataclass(frozen=True)
-class Found:
-    """The result of the search for the minimum of the whole track.
+class Joined:
+    """All sections at the minimum of the whole track.
 
     Attributes:
-        states: the sections, one step before the minimum.
-        chain: that step, with the covariances.
-        error: the objective after it.
+        segmentation: of the whole track.  cuts: (k + 1,) first samples of the sections, and the track's last.
+        rival: another first spin, or None.  states: the sections, one step before the minimum.
+        chain: that step, with the covariances.  error: the objective after it.
         convergence, rounds: reason for the end of the search, and number of its linear solutions.
     """
 
+    segmentation: Segmentation
+    cuts: Sequence[int]
+    rival: Array | None
     states: Sequence[State]
     chain: Chain
     error: float
@@ -106,28 +107,8 @@ class Found:
     rounds: int
 
 
-@dataclass(frozen=True)
-class Joined:
-    """All sections at the minimum of the whole track.
-
-    Attributes:
-        found: the sections and the last step.
-        segmentation: of the whole track.
-        cuts: (k + 1,) first samples of the sections, and the track's last.
-        rival: another first spin, or None.
-    """
-
-    found: Found
-    segmentation: Segmentation
-    cuts: Sequence[int]
-    rival: Array | None
-
-
 def told_by(smoother: Smoother, state: State) -> Told:
-    """The information of a section at its present values.
-
-    Args: smoother: of the track.  state: the section and its values.
-    """
+    """The information of a section at its present values."""
     own = state.section.own(smoother.problem(state.section.track, state.section.segmentation))
     rows = state.section.linearized(own, state.values)
     found = Reduction(rows, state.values)
@@ -135,15 +116,12 @@ def told_by(smoother: Smoother, state: State) -> Told:
 
 
 def joined_minimum(smoother: Smoother, track: Track, length: int | None = None) -> Joined | None:
-    """The minimum of a whole track, by sections.
+    """The minimum of a prepared track, by sections of about `length` samples.
 
-    Args: smoother: of the track.  track: prepared.  length: approximate number of samples in a piece.
     Returns: None if a piece has no finite explanation by itself.
     """
-    rough = type(smoother)(
-        smoother.model, smoother.surfaces, smoother.settings,
-        replace(smoother.optimizer, tolerance=max(ROUGH, smoother.optimizer.tolerance)),
-    )  # fmt: skip
+    rough = copy.copy(smoother)
+    rough.optimizer = replace(smoother.optimizer, tolerance=max(ROUGH, smoother.optimizer.tolerance))
     bounds = bounds_of(len(track), length or PIECE, OVERLAP)
     parts = [(begin, part_of(track, begin, end)) for begin, end in bounds]
     looks = [one for one in watched(partial(look, rough), parts, "looked at") if one is not None]
@@ -157,28 +135,30 @@ def joined_minimum(smoother: Smoother, track: Track, length: int | None = None) 
         for one, first, last in zip(looks, cuts[:-1], cuts[1:], strict=True)
     ]
     found = _search(smoother, states)
-    return None if found is None else Joined(found, events, cuts, looks[0].rival)
+    return None if found is None else Joined(events, cuts, looks[0].rival, *found)
 
 
-def _search(smoother: Smoother, states: list[State]) -> Found | None:
+def _search(smoother: Smoother, states: list[State]) -> tuple[Sequence[State], Chain, float, Convergence, int] | None:
     """Gauss-Newton steps of the whole track until those of all sections are shorter than the optimizer's tolerance.
 
     Lengths are distances to the minimum in posterior standard deviations, as in
     `ballfg.factors.graph.LevenbergMarquardt`. A section that is near enough keeps its linearisation point.
     """
+    tolerance = smoother.optimizer.tolerance
     told = list(watched(partial(told_by, smoother), states, "joined, round 1"))
     problem = smoother.problem(states[0].section.track, states[0].section.segmentation)
     priors, anchor = prior_rows(problem, states[0].section, told[0].values), told[0].values.coefficients
     last, share = np.full(len(states), np.inf), np.ones(len(states))
     for number in range(1, ROUNDS + 1):
         points = [Point.of(one.values) for one in told]
-        solved = solve_chain([one.ends for one in told], points, priors, anchor)
-        if solved is None:
+        chain = solve_chain([one.ends for one in told], points, priors, anchor)
+        if chain is None:
             return None
-        chain = solved
         steps = [chain.target(k).since(point) for k, point in enumerate(points)]
         length = np.array([one.length(step) for one, step in zip(told, steps, strict=True)])
-        near = _is_near(length, last, smoother.optimizer.tolerance)
+        # near enough are sections that need no step, or none after this one if lengths fall at the same rate
+        rate = np.divide(length, last, out=np.full_like(length, np.inf), where=np.isfinite(last))
+        near = (length < tolerance) | (RATE_MARGIN * length * rate < tolerance)
         if near.all() or number == ROUNDS:
             break
         share = np.where(length > last, 0.5 * share, 1.0)
@@ -191,20 +171,8 @@ def _search(smoother: Smoother, states: list[State]) -> Found | None:
     error = sum(one.promised(step) for one, step in zip(told, steps, strict=True))
     error += objective([moved_rows(rows, chain.coefficients - anchor) for rows in priors])
     there = [State(state.section, one.values) for state, one in zip(states, told, strict=True)]
-    return Found(there, chain, error, _ended(near, length), number)
-
-
-def _ended(near: NDArray[np.bool_], length: Array) -> Convergence:
-    """The reason for the end of the search, by the remaining distance of each section."""
-    if near.all():
-        return Convergence.CONVERGED
-    return Convergence.AT_KINK if (near | (length < AT_KINK)).all() else Convergence.TOO_MANY_ITERATIONS
-
-
-def _is_near(length: Array, last: Array, tolerance: float) -> NDArray[np.bool_]:
-    """True for sections that need no step, or none after this one if lengths fall at the same rate."""
-    rate = np.divide(length, last, out=np.full_like(length, np.inf), where=np.isfinite(last))
-    return np.asarray((length < tolerance) | (RATE_MARGIN * length * rate < tolerance))
+    at_kink = Convergence.AT_KINK if (near | (length < AT_KINK)).all() else Convergence.TOO_MANY_ITERATIONS
+    return there, chain, error, Convergence.CONVERGED if near.all() else at_kink, number
 
 
 def watched(function: Callable[[T], R], parts: Sequence[T], what: str) -> Iterator[R]:

@@ -55,8 +55,7 @@ class Ends:
 
     Attributes:
         by_first, by_last: (w + w + p, w) or less rows, whitened, per unit of the state.
-        by_coefficients: (.., p) whitened, per unit of each coefficient.
-        y: (..,) whitened.
+        by_coefficients: (.., p) whitened, per unit of each coefficient.  y: (..,) whitened.
     """
 
     by_first: Array
@@ -108,7 +107,11 @@ class Reduction:
         self.width, self.coefficients = values.width, len(values.coefficients)
         w, p, m = self.width, self.coefficients + self.width, len(values.states) - 1
         point = Values(values.states[1:], np.zeros(p), None if values.biases is None else values.biases[1:])
-        system, start, _ = damped_rows([_first_behind(rows) for rows in linearized], point, 0.0, held=w)
+        behind = []  # state 0 behind the coefficients, and the others counted from state 1
+        for rows in linearized:
+            waiting = np.where(rows.variables == COEFFICIENTS, COEFFICIENTS, WAITING)
+            behind.append(replace(rows, variables=np.where(rows.variables > 0, rows.variables - 1, waiting)))
+        system, start, _ = damped_rows(behind, point, 0.0, held=w)
         self.root = Root.empty(m, w, p)
         eliminate(system, start, w, w, self.root)
         self.inner = 0.5 * float((self.root.states[:-1, :, -1] ** 2).sum())
@@ -148,21 +151,16 @@ class Reduction:
 
         Args: ends: (w + p + w, w + p + w) of the last state, the coefficients, the first state.
         """
-        p = self.coefficients
-        found = marginal_covariances(self._known(_triangle(ends)))
+        w, p, triangle = self.width, self.coefficients, _triangle(ends)
+        known, below = self.root.states.copy(), np.zeros_like(self.root.coefficients)
+        known[-1] = 0.0
+        known[-1, :, :w], known[-1, :, 2 * w : -1] = triangle[:w, :w], triangle[:w, w:]
+        below[:, 2 * w : -1] = triangle[w:, w:]
+        found = marginal_covariances(Root(known, below))
         shared = found.coefficients
         states = np.concatenate((shared[None, p:, p:], found.states))
         cross = np.concatenate((shared[None, p:, :p], found.cross[:, :, :p]))
         return Covariances(states, shared[:p, :p], cross)
-
-    def _known(self, triangle: Array) -> Root:
-        """The root with another triangle of the last state, the coefficients and the first state."""
-        w, states = self.width, self.root.states.copy()
-        shared = np.zeros_like(self.root.coefficients)
-        states[-1] = 0.0
-        states[-1, :, :w], states[-1, :, 2 * w : -1] = triangle[:w, :w], triangle[:w, w:]
-        shared[:, 2 * w : -1] = triangle[w:, w:]
-        return Root(states, shared)
 
 
 def _solved(rows: Array, right: Array) -> Array:
@@ -187,20 +185,12 @@ def _triangle(covariance: Array) -> Array:
     return np.asarray(np.linalg.inv(lower[::-1, ::-1]) / scale)
 
 
-def _first_behind(rows: Rows) -> Rows:
-    """The same factors with state 0 behind the coefficients, and the others counted from state 1."""
-    states = rows.variables
-    later = np.where(states > 0, states - 1, np.where(states == COEFFICIENTS, COEFFICIENTS, WAITING))
-    return replace(rows, variables=later)
-
-
 @dataclass(frozen=True)
 class Chain:
     """The solution for all ends.
 
     Attributes:
-        states: (k + 1, w) target states at the ends of k sections.
-        coefficients: (p,) target of the coefficients.
+        states: (k + 1, w) target states at the ends of k sections.  coefficients: (p,) target of the coefficients.
         root: of the linear problem.
     """
 
@@ -223,46 +213,37 @@ class Chain:
 
     def covariances(self) -> list[Array]:
         """For each section the joint covariance of its last end, the coefficients, its first end."""
-        found = self._known
-        return [_joint(found, section) for section in range(len(self.states) - 1)]
+        found, w, joints = self._known, self.states.shape[-1], []
+        for section in range(len(self.states) - 1):
+            first, last = found.states[section : section + 2]
+            across, behind = np.split(found.cross[section], [w], axis=1)
+            shared = found.cross[section + 1][:, w:]
+            rows = [[last, shared, across.T], [shared.T, found.coefficients, behind.T], [across, behind, first]]
+            joints.append(np.block(rows))
+        return joints
 
 
 def solve_chain(ends: Sequence[Ends], points: Sequence[Point], priors: Sequence[Rows], anchor: Array) -> Chain | None:
-    """The step of all ends and coefficients to the minimum of the linearised objective.
-
-    The sections may have different linearisation points.
+    """The step of all ends and coefficients to the minimum of the linearised objective; None if it is singular.
 
     Args:
-        ends: of each section.  points: linearisation point of each.
-        priors: factors on the coefficients alone.
+        ends, points: of each section, and its linearisation point.  priors: factors on the coefficients alone.
         anchor: (p,) linearisation point of the coefficients, in their own units; the solution is a step from there.
-    Returns: None if the system is singular.
     """
     states = np.stack([*(point.first for point in points), points[-1].last])
-    rows = [_moved(*each, anchor) for each in zip(ends, points, states[1:], strict=True)]
+    right = [  # relative to the common linearisation point
+        one.y - one.by_last @ (last - point.last) - one.by_coefficients @ (anchor - point.coefficients)
+        for one, point, last in zip(ends, points, states[1:], strict=True)
+    ]
     k, w = len(ends), states.shape[1]
-    blocks = [np.stack(column) for column in zip(*rows, strict=True)]
+    blocks = [np.stack([getattr(one, name) for one in ends]) for name in ("by_first", "by_last", "by_coefficients")]
     columns = [np.arange(k), np.arange(1, k + 1)] + ([np.full(k, COEFFICIENTS)] if len(anchor) else [])
-    chain = Rows(np.stack(columns, axis=1), -blocks[0], tuple(blocks[1 : 1 + len(columns)]), Loss())
+    chain = Rows(np.stack(columns, axis=1), -np.stack(right), tuple(blocks[: len(columns)]), Loss())
     biases = states[:, STATE_DIM:] if w > STATE_DIM else None
     step = solve([chain, *priors], Values(states[:, :STATE_DIM], anchor, biases))
     if step is None:
         return None
     return Chain(states + step.states, anchor + step.coefficients, step.root)
-
-
-def _moved(ends: Ends, point: Point, last: Array, coefficients: Array) -> tuple[Array, Array, Array, Array]:
-    """Right side and blocks of a section's rows, relative to the common linearisation point."""
-    y = ends.y - ends.by_last @ (last - point.last) - ends.by_coefficients @ (coefficients - point.coefficients)
-    return y, ends.by_first, ends.by_last, ends.by_coefficients
-
-
-def _joint(found: NeighbourCovariances, section: int) -> Array:
-    """(2 w + p, 2 w + p) of a section's last end, the coefficients, its first end."""
-    (first, last), w = found.states[section : section + 2], found.states.shape[-1]
-    across, behind = np.split(found.cross[section], [w], axis=1)
-    shared = found.cross[section + 1][:, w:]
-    return np.block([[last, shared, across.T], [shared.T, found.coefficients, behind.T], [across, behind, first]])
 
 
 def moved_rows(rows: Rows, step: Array) -> Rows:

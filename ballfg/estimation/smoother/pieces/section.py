@@ -30,8 +30,7 @@ class Section:
 
     Attributes:
         track: the part, with margins on both sides; labels only at the beginning of the track.
-        segmentation: the events in the part, with refined contacts.
-        first, last: index in the part.
+        segmentation: the events in the part, with refined contacts.  first, last: index in the part.
         ends: True if the track ends with the section.
     """
 
@@ -41,22 +40,14 @@ class Section:
     last: int
     ends: bool
 
-    def __len__(self) -> int:
-        """States from the first to the last."""
-        return self.last - self.first + 1
-
     @property
     def events(self) -> Events:
         """The events in the part."""
         return Events(self.segmentation.contacts, self.segmentation)
 
-    def inside(self, array: Array) -> Array:
-        """The entries of the section's states, from one per sample of the part."""
-        return array[self.first : self.last + 1]
-
     def padded(self, array: Array) -> Array:
         """One entry per sample of the part from one per state; the margins repeat those at the ends."""
-        index = np.clip(np.arange(len(self.track)) - self.first, 0, len(self) - 1)
+        index = np.clip(np.arange(len(self.track)) - self.first, 0, self.last - self.first)
         return np.asarray(array[index])
 
     def padded_values(self, values: Values) -> Values:
@@ -69,21 +60,20 @@ class Section:
         return (states >= self.first) & (states < self.last + self.ends)
 
     def linearized(self, own: Sequence[FactorBatch], values: Values) -> list[Rows]:
-        """The section's factors at a point, their states counted from its first.
-
-        Args: own: its factors.  values: of the section's states.
-        """
-        padded = self.padded_values(values)
-        found = [batch.linearize(padded) for batch in own]
-        return [
-            replace(rows, variables=np.where(rows.variables < 0, rows.variables, rows.variables - self.first))
-            for rows in found
-        ]
+        """The section's own factors at values of its states, which are counted from its first."""
+        found = [batch.linearize(self.padded_values(values)) for batch in own]
+        counted = (np.where(rows.variables < 0, rows.variables, rows.variables - self.first) for rows in found)
+        return [replace(rows, variables=variables) for rows, variables in zip(found, counted, strict=True)]
 
     def own(self, problem: TrackProblem) -> list[FactorBatch]:
         """The section's factors, states counted as in the part. Args: problem: of the part."""
-        batches = ((batch, self.owns(first_states(batch))) for batch in problem.graph(self.events).batches)
-        return [batch.select(np.flatnonzero(own)) for batch, own in batches if own.any()]
+        none, found = np.iinfo(np.int64).max, []
+        for batch in problem.graph(self.events).batches:
+            states = np.where(batch.variables == COEFFICIENTS, none, batch.variables)
+            own = self.owns(states.min(axis=1, initial=none))  # none: of coefficients alone
+            if own.any():
+                found.append(batch.select(np.flatnonzero(own)))
+        return found
 
 
 @dataclass(frozen=True)
@@ -92,13 +82,6 @@ class State:
 
     section: Section
     values: Values
-
-
-def first_states(batch: FactorBatch) -> Index:
-    """(m,) index of the first state of each factor; -1 for factors of coefficients alone."""
-    states = batch.variables
-    least = np.where(states == COEFFICIENTS, np.iinfo(np.int64).max, states).min(axis=1, initial=np.iinfo(np.int64).max)
-    return np.where(least == np.iinfo(np.int64).max, -1, least)
 
 
 def prior_rows(problem: TrackProblem, section: Section, values: Values) -> list[Rows]:
@@ -154,8 +137,7 @@ class Look:
     """Events and states of a part of a track by itself.
 
     Attributes:
-        begin: first sample of the part, in the track.
-        values: of its states.
+        begin: first sample of the part, in the track.  values: of its states.
         segmentation: its events, the contacts in their estimated intervals; counted from the track's first sample.
         moved: True if one of its contacts moved into another interval.
         timed: the contacts with their estimated times, with the same numbering.
@@ -183,15 +165,13 @@ class Look:
 
     def select(self, begin: int, end: int) -> Values:
         """The values of the states begin to end - 1 of the track."""
-        inside = slice(begin - self.begin, end - self.begin)
-        biases = None if self.values.biases is None else self.values.biases[inside]
-        return replace(self.values, states=self.values.states[inside], biases=biases)
+        return self.values.select(begin - self.begin, end - self.begin)
 
 
 def bounds_of(samples: int, length: int, overlap: int) -> list[tuple[int, int]]:
     """First sample of each part and the one after its last; neighbours share twice `overlap` samples.
 
-    Args: samples: of the track.  length: approximate length without shared samples.  overlap: beyond each cut.
+    Args: samples: of the track.  length: approximate length without shared samples.
     """
     parts = max(1, round(samples / length))
     cuts = np.linspace(0, samples, parts + 1).round().astype(int).tolist()
@@ -199,10 +179,7 @@ def bounds_of(samples: int, length: int, overlap: int) -> list[tuple[int, int]]:
 
 
 def look(smoother: Smoother, part: tuple[int, Track]) -> Look | None:
-    """The events and states of a part by itself; None without a finite explanation.
-
-    Args: smoother: may be rough.  part: its first sample's number, and its track.
-    """
+    """The events and states of a part, given with its first sample's number; None without a finite explanation."""
     begin, track = part
     solution = smoother.settle(smoother.problem(track))
     if solution.minimum.step is None:
@@ -257,13 +234,7 @@ def joined(looks: Sequence[Look], cuts: Sequence[int]) -> Segmentation:
 
 
 def section_of(track: Track, events: Segmentation, first: int, last: int, margin: int) -> Section:
-    """A section of a track.
-
-    Args:
-        track, events: all of it.
-        first, last: samples; the last is the first of the next section, or the track's last.
-        margin: samples kept beyond both, for velocities.
-    """
+    """A section from sample `first` to `last`, the first of the next one or the track's last, with margins."""
     begin, end = max(0, first - margin), min(len(track), last + 1 + margin)
     part = part_of(track, begin, end)
     return Section(part, events_of(events, begin, end), first - begin, last - begin, last == len(track) - 1)

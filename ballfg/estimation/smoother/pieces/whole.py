@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array, Index
+from ballfg.estimation.observations.observation import Unknowns
 from ballfg.estimation.plausible import plausible
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.result import Contact
@@ -19,7 +20,7 @@ from ballfg.estimation.settings import sample_sigmas
 from ballfg.estimation.sides.widening import Shared, widening_near_contacts
 from ballfg.estimation.smoother.pieces.joining import Joined, joined_minimum, watched
 from ballfg.estimation.smoother.pieces.reduction import Point, Reduction
-from ballfg.estimation.smoother.pieces.section import State
+from ballfg.estimation.smoother.pieces.section import Section, State
 from ballfg.estimation.smoother.problem import TrackProblem
 from ballfg.estimation.smoother.second_look.at_end import with_both_sides
 from ballfg.estimation.smoother.second_look.low_hops import uncounted_note, with_low_hops
@@ -40,8 +41,7 @@ class Smoothed:
     """A section of the estimate, with the section's n states.
 
     Attributes:
-        values: at the minimum.
-        covariances: (n, 9, 9), and
+        values: at the minimum.  covariances: (n, 9, 9), and
         cross: (n, 9, p) with the coefficients, as in an `Estimate`.
         others: by the index of a state near a contact (9, 9), as `Estimate.other_sides`.
         innovations: of the section's measurements, by name of the observation.
@@ -57,11 +57,7 @@ class Smoothed:
 
 
 def in_pieces(smoother: Smoother, track: Track, length: int | None = None) -> Estimate | None:
-    """The estimate of a long track.
-
-    Args: smoother: of the track.  track: prepared.  length: approximate number of samples in a piece.
-    Returns: None if pieces cannot be joined, because one of them has no finite explanation.
-    """
+    """The estimate of a long, prepared track; None if pieces cannot be joined: one has no finite explanation."""
     parts = sections(smoother, track, length)
     return None if parts is None else _assembled(track, parts)
 
@@ -69,7 +65,6 @@ def in_pieces(smoother: Smoother, track: Track, length: int | None = None) -> Es
 def sections(smoother: Smoother, track: Track, length: int | None = None) -> Iterator[Estimate] | None:
     """The estimate of a long track, section by section, so that the caller need not hold all covariances.
 
-    Args: smoother, track, length: as for `in_pieces`.
     Returns: consecutive estimates, with the status and the coefficients of the whole; None as for `in_pieces`.
     """
     found = joined_minimum(smoother, track, length)
@@ -77,12 +72,7 @@ def sections(smoother: Smoother, track: Track, length: int | None = None) -> Ite
 
 
 def smoothed(smoother: Smoother, task: tuple[State, Array, Point]) -> Smoothed:
-    """A section of the estimate.
-
-    Args:
-        smoother: of the track.
-        task: the section, the joint covariance of its ends and the coefficients, and their target.
-    """
+    """A section of the estimate, from the joint covariance of its ends and the coefficients, and their target."""
     state, joint, target = task
     section, values = state.section, state.values
     problem = smoother.problem(section.track, section.segmentation)
@@ -91,44 +81,36 @@ def smoothed(smoother: Smoother, task: tuple[State, Array, Point]) -> Smoothed:
     values = values.retract(reduction.steps(step), step.coefficients)
     known = reduction.covariances(joint)
     covariances = np.ascontiguousarray(known.states[:, :STATE_DIM, :STATE_DIM])
-    contacts = _contacts(problem, state, values)
-    times = section.inside(section.track.times)
+    contacts = _contacts(problem, section, values)
+    times = section.track.times[section.first : section.last + 1]
     own = slice(problem.width)
     cross = np.ascontiguousarray(known.cross[:, :STATE_DIM, own])
     shared = Shared(values.coefficients[own], known.coefficients[own, own], cross)
     sides = widening_near_contacts(times, values.states, covariances, contacts, problem.ball, shared)
     near = np.flatnonzero(sides.any(axis=(1, 2)))
-    innovations = _innovations(problem, state, values, known)
+    # the covariance of its ends stands for the samples beyond them
+    around = Covariances(section.padded(known.states), known.coefficients, section.padded(known.cross))
+    found = problem.innovations(section.padded_values(values), around)
+    innovations = {one.name: found[one.name][section.owns(np.asarray(one.state))] for one in problem.observations}
     return Smoothed(values, covariances, cross, {int(k): sides[k] for k in near}, innovations, contacts)
 
 
-def _contacts(problem: TrackProblem, state: State, values: Values) -> tuple[Contact, ...]:
+def _contacts(problem: TrackProblem, section: Section, values: Values) -> tuple[Contact, ...]:
     """The section's contacts with their estimated times."""
-    section = state.section
     graph = BallGraph(tuple(section.own(problem)))
     minimum = Minimum(section.padded_values(values), 0.0, None, Convergence.CONVERGED, 0)
     found = timed_contacts(section.track.times, Solution(section.events, graph, minimum))
     return tuple(replace(contact, interval=contact.interval - section.first) for contact in found)
 
 
-def _innovations(problem: TrackProblem, state: State, values: Values, known: Covariances) -> dict[str, Array]:
-    """Innovations of the section's own measurements. The covariance of its ends stands for the samples beyond them."""
-    section = state.section
-    around = Covariances(section.padded(known.states), known.coefficients, section.padded(known.cross))
-    found = problem.innovations(section.padded_values(values), around)
-    return {one.name: found[one.name][section.owns(np.asarray(one.state))] for one in problem.observations}
-
-
 def _sections(smoother: Smoother, track: Track, found: Joined) -> Iterator[Estimate]:
     """The estimates of the sections, in order. The last state of each is the first of the next one."""
-    end, hops = found.found, smoother.low_hops(track, found.segmentation)
+    hops = smoother.low_hops(track, found.segmentation)
     doubts = (*smoother.doubts(track), *uncounted_note(hops, track.times))
-    beginning = end.states[0].section
-    problem = smoother.problem(beginning.track, beginning.segmentation)  # its unknowns are those of all sections
-    tasks = [
-        (state, joint, end.chain.target(k))
-        for k, (state, joint) in enumerate(zip(end.states, end.chain.covariances(), strict=True))
-    ]
+    beginning = found.states[0].section
+    unknowns = smoother.problem(beginning.track, beginning.segmentation).unknowns  # those of all sections
+    targets = (found.chain.target(k) for k in range(len(found.states)))
+    tasks = list(zip(found.states, found.chain.covariances(), targets, strict=True))
     before = np.zeros((STATE_DIM, STATE_DIM))
     bounds = zip(found.cuts[:-1], found.cuts[1:], strict=True)
     for (first, last), part in zip(bounds, watched(partial(smoothed, smoother), tasks, "smoothed"), strict=True):
@@ -138,8 +120,12 @@ def _sections(smoother: Smoother, track: Track, found: Joined) -> Iterator[Estim
         for k in (k for k in part.others if k < count):
             others[k] += part.others[k]
         before = part.others.get(count, np.zeros((STATE_DIM, STATE_DIM)))
-        notes = (*doubts, *_rival_note(found, part)) if first == 0 else ()
-        section = _section(smoother, track, problem, found, part, others, first, notes)
+        notes: tuple[str, ...] = ()
+        if first == 0:
+            minimum = Minimum(part.values, found.error, None, found.convergence, found.rounds)
+            solution = Solution(beginning.events, BallGraph(()), minimum, found.rival)
+            notes = (*doubts, *rival_note(solution, part.covariances[0]))
+        section = replace(_section(smoother, track, unknowns, found, part, others, first), notes=notes)
         if last == len(track) - 1:
             ending = track.between(float(track.times[first]), float(track.times[last]))
             section = with_both_sides(smoother, smoother.problem(ending), section)
@@ -147,19 +133,14 @@ def _sections(smoother: Smoother, track: Track, found: Joined) -> Iterator[Estim
 
 
 def _section(
-    smoother: Smoother,
-    track: Track,
-    problem: TrackProblem,
-    found: Joined,
-    part: Smoothed,
-    others: Array,
-    first: int,
-    notes: tuple[str, ...],
+    smoother: Smoother, track: Track, unknowns: Unknowns, found: Joined, part: Smoothed, others: Array, first: int
 ) -> Estimate:
-    end, events, count = found.found, found.segmentation, len(others)
-    coefficients, known = part.values.coefficients, end.chain.coefficient_covariance
-    own, rest = slice(0, problem.width), slice(problem.width, len(coefficients))
-    at_minimum = end.convergence in (Convergence.CONVERGED, Convergence.AT_KINK)
+    """The estimate of the section from sample `first` on, without notes."""
+    events, count = found.segmentation, len(others)
+    coefficients, known = part.values.coefficients, found.chain.coefficient_covariance
+    width = len(coefficients) - len(unknowns.names)
+    own, rest = slice(0, width), slice(width, len(coefficients))
+    at_minimum = found.convergence in (Convergence.CONVERGED, Convergence.AT_KINK)
     inside = slice(first, first + count)
     stated = None if track.sigmas is None else track.sigmas[inside]
     measured = Track(track.times[inside], track.positions[inside], stated)
@@ -174,27 +155,19 @@ def _section(
         coefficients=coefficients[own],
         coefficient_covariance=known[own, own],
         cross_covariances=part.cross[:count],
-        unknown_names=problem.unknowns.names,
-        unknowns=problem.unknowns.origins + coefficients[rest],
+        unknown_names=unknowns.names,
+        unknowns=unknowns.origins + coefficients[rest],
         unknown_covariance=known[rest, rest],
         contacts=part.contacts,
         hits=events.hits[(events.hits >= first) & (events.hits < first + count)] - first,
         quality=events.quality[inside],
-        error=end.error,
-        iterations=end.rounds,
+        error=found.error,
+        iterations=found.rounds,
         world=smoother.world,
-        notes=notes,
     )
     sigma = sample_sigmas(smoother.settings, count, stated)
     estimate = plausible(estimate, measured, sigma, smoother.settings)
     return replace(estimate, covariances=estimate.covariances + others, other_sides=others)
-
-
-def _rival_note(found: Joined, first: Smoothed) -> tuple[str, ...]:
-    """A note if another spin at the start explains the track nearly as well."""
-    minimum = Minimum(first.values, found.found.error, None, found.found.convergence, found.found.rounds)
-    solution = Solution(found.found.states[0].section.events, BallGraph(()), minimum, found.rival)
-    return rival_note(solution, first.covariances[0])
 
 
 def _assembled(track: Track, parts: Iterator[Estimate]) -> Estimate:

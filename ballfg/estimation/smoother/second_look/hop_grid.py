@@ -43,8 +43,7 @@ class HopLaw:
     """The parameters of a hop.
 
     Attributes:
-        gravity: m/s^2.
-        fastest: m/s, take-off speed of the highest hop.
+        gravity: m/s^2.  fastest: m/s, take-off speed of the highest hop.
         rebound: (`SPEEDS`,) m/s, speed after an impact for each speed of the grid.
         scatter: (`SPEEDS`,) m/s, standard deviation of that.
         acceleration: m/s^2/sqrt(Hz), density of the unmodelled acceleration.
@@ -70,8 +69,7 @@ class HopMoments:
         mean: (n, 2) m and m/s, height above the surface and vertical velocity.
         second: (n, 2, 2) their second moments about zero.
         higher: (n, 2) third and fourth moment of the vertical velocity about zero.
-        speed: (n,) m/s, take-off speed of the ball's present hop.
-        resting: (n,) probability that it lies still.
+        speed: (n,) m/s, take-off speed of the ball's present hop.  resting: (n,) probability that it lies still.
         bounces: (n - 1,) expected number of bounces in each interval.
     """
 
@@ -93,23 +91,15 @@ class HopMoments:
 
     def select(self, inside: slice) -> HopMoments:
         """The moments of some of the samples."""
-        between = slice(inside.start, inside.stop - 1)
-        return HopMoments(
-            self.mean[inside],
-            self.second[inside],
-            self.higher[inside],
-            self.speed[inside],
-            self.resting[inside],
-            self.bounces[between],
-        )
+        at_samples = (self.mean, self.second, self.higher, self.speed, self.resting)
+        return HopMoments(*(part[inside] for part in at_samples), self.bounces[inside.start : inside.stop - 1])
 
 
 class HopGrid:
     """A hidden Markov model of hops.
 
     Args:
-        law: of the hops.
-        phases: number of cells for the duration of each hop.
+        law: of the hops.  phases: number of cells for the duration of each hop.
         tick: s, to which stamps are rounded, so that few transition matrices are needed.
     """
 
@@ -124,6 +114,9 @@ class HopGrid:
         self.rise = self.speed - law.gravity * since
         z, v, rests = self.height, self.rise, self.speed == 0.0
         self._features = np.stack((z, v, z * z, z * v, v * v, v**3, v**4, self.speed, rests), axis=1)
+        self._first = np.full(len(self.speed), (1.0 - RESTS) / (len(self.speed) - 1))
+        """(k,) probabilities of the cells before the first sample."""
+        self._first[-1] = RESTS
         self._steps: dict[int, tuple[csr_array, csr_array]] = {}
 
     def ticks(self, times: Array) -> Index:
@@ -136,7 +129,7 @@ class HopGrid:
         Args: times, heights, sigma: as for `moments`.  levels: (k,) m.
         """
         found, alive = np.full(len(levels), -np.inf), np.arange(len(levels))
-        said, before = np.zeros(len(levels)), np.tile(self._first(), (len(levels), 1))
+        said, before = np.zeros(len(levels)), np.tile(self._first, (len(levels), 1))
         for k, ticks in enumerate([*self.ticks(times).tolist(), None]):
             now = before * self._likelihood(heights[k] - levels[alive], sigma[k])
             total = now.sum(axis=1)
@@ -146,10 +139,9 @@ class HopGrid:
             if ticks is None or (now[:, -1] > 1.0 - MILLIONTH).all():
                 break
             before = now @ self._step(ticks)[0]
-        left = [
-            np.log(self._likelihood(heights[j] - levels[alive], sigma[j])[:, -1]) for j in range(k + 1, len(heights))
-        ]
-        found[alive] = said + np.sum(left, axis=0)  # while the ball lies still
+        rest = zip(heights[k + 1 :], sigma[k + 1 :], strict=True)  # while the ball lies still
+        left = [np.log(self._likelihood(height - levels[alive], noise)[:, -1]) for height, noise in rest]
+        found[alive] = said + np.sum(left, axis=0)
         return found
 
     def moments(self, times: Array, heights: Array, sigma: Array) -> HopMoments:
@@ -181,15 +173,9 @@ class HopGrid:
         good = (1.0 - STRAY_SHARE) * np.exp(-0.5 * off**2) / sigma
         return np.asarray(good + STRAY_SHARE / STRAY_SPREAD)
 
-    def _first(self) -> Array:
-        """(k,) probabilities of the cells before the first sample."""
-        shares = np.full(len(self.speed), (1.0 - RESTS) / (len(self.speed) - 1))
-        shares[-1] = RESTS
-        return shares
-
     def _filtered(self, steps: Index, heights: Array, sigma: Array) -> list[Array]:
         """(k,) probabilities of the cells after each sample, until the ball surely lies still."""
-        before, found = self._first(), list[Array]()
+        before, found = self._first, list[Array]()
         for k in range(len(heights)):
             now = before * self._likelihood(heights[k], sigma[k])
             found.append(now / now.sum())
@@ -204,10 +190,8 @@ class HopGrid:
         The velocity is disturbed at the start of the step, and the first bounce scatters.
         """
         if ticks not in self._steps:
-            parts = [
-                self._moved(ticks * self.tick, push, kick, a * b)
-                for (push, a), (kick, b) in itertools.product(POINTS, POINTS)
-            ]
+            pairs = itertools.product(POINTS, POINTS)
+            parts = [self._moved(ticks * self.tick, push, kick, a * b) for (push, a), (kick, b) in pairs]
             target, weight, bounces = (np.concatenate(column) for column in zip(*parts, strict=True))
             shape = (len(self.speed), len(self.speed))
             source = np.tile(np.arange(len(self.speed)), len(target) // len(self.speed))
@@ -243,13 +227,7 @@ class HopGrid:
 
 
 def averaged(known: Sequence[HopMoments], levels: Array, weights: Array) -> HopMoments:
-    """The moments averaged over an uncertain height of the surface.
-
-    Args:
-        known: moments for each height.
-        levels: (k,) m, the heights, above the reference height of the result.
-        weights: (k,) their probabilities.
-    """
+    """The moments averaged over (k,) m heights of the surface above a reference, with (k,) probabilities."""
     shift = np.zeros((len(levels), 1, 2))
     shift[:, 0, 0] = levels
     mean = np.stack([one.mean for one in known])

@@ -53,8 +53,7 @@ class LowHops:
     """A stretch of low hops.
 
     Attributes:
-        first: sample with which it begins.
-        height: m, declared height of the surface.
+        first: sample with which it begins.  height: m, declared height of the surface.
         level: m, height of the ball's centre at contact, by the model.
         least: m/s, take-off speed of a hop as high as the noise; bounces of lower ones are not counted.
         known: moments of the ball's motion, with heights above `level`.
@@ -96,11 +95,6 @@ class LowHops:
             contacts.append(Contact(interval, 0.5 * float(times[interval] + times[interval + 1]), self.height))
         return contacts, [Rest(down, self.last - 1, self.height)] if down < self.last else []
 
-    def first_unclear(self) -> int | None:
-        """The first sample at which the ball may hop with uncounted bounces."""
-        unclear = np.flatnonzero((self.known.speed < self.least) & (self.known.resting < SURE))
-        return self.first + int(unclear[0]) if len(unclear) else None
-
 
 def low_hops(
     track: Track, events: Segmentation, model: BallModel, surfaces: Surfaces, settings: Settings
@@ -108,14 +102,7 @@ def low_hops(
     """The stretches of a track in which the ball hops low.
 
     A ball in flight stays below a height no longer than a hop of that height takes: if samples stay there longer, it
-    hops or lies still.
-
-    Args:
-        track: the samples.
-        events: hits, gaps and the ends of rests, which end stretches.
-        model: the ball, without the estimated coefficients.
-        surfaces: table and floor.
-        settings: noise and priors.
+    hops or lies still. Hits, gaps and the ends of rests end stretches.
     """
     if len(track) < 2:
         return ()
@@ -143,21 +130,13 @@ def low_hops(
 
 
 def counted(events: Segmentation, hops: Sequence[LowHops], times: Array) -> Segmentation:
-    """The events of a track; within stretches of low hops, those expected over all arrangements of bounces.
-
-    Args: events: from the segmentation.  hops: of the track.  times: (n,) s.
-    """
+    """The events of a track; within stretches of low hops, those expected over all arrangements of bounces."""
     for one in hops:
         contacts, rests = one.events(times)
         contacts += [c for c in events.contacts if not one.first <= c.interval < one.last]
-        for rest in events.rests:
-            if rest.last < one.first or rest.first >= one.last:
-                rests.append(rest)
-        events = replace(
-            events,
-            contacts=tuple(sorted(contacts, key=lambda c: c.time)),
-            rests=tuple(sorted(rests, key=lambda r: r.first)),
-        )
+        rests += [rest for rest in events.rests if rest.last < one.first or rest.first >= one.last]
+        met, lying = sorted(contacts, key=lambda c: c.time), sorted(rests, key=lambda r: r.first)
+        events = replace(events, contacts=tuple(met), rests=tuple(lying))
     return events
 
 
@@ -169,8 +148,6 @@ def with_low_hops(estimate: Estimate, hops: Sequence[LowHops], model: BallModel)
     is on the other side of a bounce would else be ten standard deviations away once in 100 times. Where the vertical
     velocity may differ because a bounce came earlier or later, the other velocities and the spin may differ by the
     effect of friction at that bounce.
-
-    Args: estimate: of the track.  hops: of the track.  model: the ball.
     """
     if estimate.status.failed or not hops:
         return estimate
@@ -183,8 +160,7 @@ def with_low_hops(estimate: Estimate, hops: Sequence[LowHops], model: BallModel)
         more, jump = _beyond(spread, own), _jumps(estimate, one, model)
         jump[:, VERTICAL] = 0.0
         added = more[:, 1, 1, None, None] * jump[:, :, None] * jump[:, None, :]
-        rows, columns = np.ix_(VERTICAL, VERTICAL)
-        added[:, rows, columns] = more
+        added[:, *np.ix_(VERTICAL, VERTICAL)] = more
         covariances[inside] += added
     return replace(estimate, covariances=covariances)
 
@@ -211,7 +187,8 @@ def _jumps(estimate: Estimate, hops: LowHops, model: BallModel) -> Array:
 
 def uncounted_note(hops: Sequence[LowHops], times: Array) -> tuple[str, ...]:
     """A note on when bounces become too low to count. Args: hops: of the track.  times: (n,) s."""
-    unclear = [sample for one in hops if (sample := one.first_unclear()) is not None]
+    lower = ((one.first, (one.known.speed < one.least) & (one.known.resting < SURE)) for one in hops)
+    unclear = [first + int(np.argmax(low)) for first, low in lower if low.any()]
     return (UNCOUNTED.format(float(times[min(unclear)] - times[0])),) if unclear else ()
 
 
@@ -289,10 +266,7 @@ def _runs(low: NDArray[np.bool_], events: Segmentation) -> list[tuple[int, int]]
 
 
 def _known(grid: HopGrid, times: Array, gap: Array, sigma: Array, spread: float) -> HopMoments:
-    """Moments of the ball's motion, averaged over the possible heights of the surface.
-
-    Args: times: (n,) s.  gap: (n,) m.  sigma: (n,) m.  spread: m, standard deviation of the surface's height.
-    """
+    """Moments of the ball's motion, averaged over the heights of the surface, which has a `spread` in m."""
     count = int(np.ceil(WIDEST * spread / (0.5 * float(np.median(sigma)))))
     levels = np.linspace(-WIDEST * spread, WIDEST * spread, 2 * count + 1)
     said = grid.evidence(times, gap, sigma, levels) - 0.5 * (levels / spread) ** 2

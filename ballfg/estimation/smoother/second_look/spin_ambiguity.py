@@ -50,10 +50,7 @@ SPIN_SPREAD = 60.0
 
 
 def with_other_spins(solution: Solution, model: BallModel, optimizer: LevenbergMarquardt) -> Solution:
-    """The lowest of a solution and those where bounces grip instead of slide, or slide instead of grip.
-
-    Args: solution: so far.  model: the ball, with the estimated coefficients.  optimizer: for the other minima.
-    """
+    """The lowest of a solution and those where bounces grip instead of slide, or slide instead of grip."""
     least, bounces = optimizer.tolerance, bounces_of(solution)
     sides = other_sides(solution.minimum.values, bounces, model)
     for number, bounce in enumerate(bounces):
@@ -75,7 +72,7 @@ def with_other_spins(solution: Solution, model: BallModel, optimizer: LevenbergM
 def rival_note(solution: Solution, covariance: Array) -> tuple[str, ...]:
     """A note on another spin that explains the track nearly as well, if the covariance does not include it.
 
-    Args: solution: of the track.  covariance: (9, 9), of its first state.
+    Args: covariance: (9, 9), of the track's first state.
     """
     if solution.rival is None:
         return ()
@@ -116,14 +113,9 @@ def bounces_of(solution: Solution) -> list[Bounce]:
 
 @dataclass(frozen=True)
 class OtherSide:
-    """Initial values of a search on the other side of the slip at which a ball begins to slide.
+    """Initial values of a search on the other side of the slip `edge`, m/s, at which a ball begins to slide.
 
-    Attributes:
-        values: to start from.
-        interval: of the bounce.
-        edge: m/s, the slip at which this side ends.
-        slides: True if the ball slides on this side.
-        radius: m, of the ball.
+    `slides` is True if the ball slides on this side.
     """
 
     values: Values
@@ -141,10 +133,6 @@ class OtherSide:
 def other_sides(values: Values, bounces: Sequence[Bounce], model: BallModel) -> Iterator[OtherSide | None]:
     """Starts with another spin at each of some bounces: rolling in place of sliding, sliding in place of gripping.
 
-    Args:
-        values: of a minimum.
-        bounces: their spin changes, from the first to the last state of each; one at a time.
-        model: the ball, with the estimated coefficients.
     Yields: one for each bounce; None for bounces without slip, or at which the ball never slides.
     """
     at = np.array([bounce.interval for bounce in bounces], dtype=np.int64)
@@ -161,7 +149,10 @@ def other_sides(values: Values, bounces: Sequence[Bounce], model: BallModel) -> 
     ends = speed * np.where(slides, NEXT, edge)
     for k, bounce in enumerate(bounces):
         if there[k]:
-            start = _turned(values, bounce, first[k], later[k])
+            states = values.states.copy()
+            states[bounce.first : bounce.interval + 1, SPIN] += first[k]
+            states[bounce.interval + 1 : bounce.last + 1, SPIN] += later[k]
+            start = replace(values, states=states)
             yield OtherSide(start, bounce.interval, float(ends[k]), bool(slides[k]), model.radius)
         else:
             yield None
@@ -170,34 +161,19 @@ def other_sides(values: Values, bounces: Sequence[Bounce], model: BallModel) -> 
 def worth_a_search(
     solution: Solution, bounce: Bounce, side: OtherSide, optimizer: LevenbergMarquardt, margin: float
 ) -> bool:
-    """True if the minimum on the other side of a bounce is, nearby, another one and higher by less than a margin.
-
-    Args:
-        solution: of the whole chain.
-        bounce: in it.
-        side: start of a search on the other side.
-        optimizer: for both minima.
-        margin: of the objective, a log likelihood.
-    """
+    """True if the minimum on the other side of a bounce is, nearby, another one and higher by less than a margin."""
     count = len(solution.minimum.values.states)
     if count < LONG_CHAIN or solution.minimum.step is None:
         return True
     first, last = max(0, bounce.first - REACH), min(count - 1, bounce.last + REACH)
-    graph, begin = _around(solution, first, last), _taken(side.values, first, last)
+    graph, begin = _around(solution, first, last), side.values.select(first, last + 1)
     holds = replace(side, interval=side.interval - first).holds
     there = optimizer.minimize(graph, begin, holds)
     if there.convergence is not Convergence.CONVERGED:
         return False
-    here = optimizer.minimize(graph, _taken(solution.minimum.values, first, last))
+    here = optimizer.minimize(graph, solution.minimum.values.select(first, last + 1))
     higher = there.error - here.error
     return higher < margin and abs(higher) > optimizer.tolerance
-
-
-def _taken(values: Values, first: int, last: int) -> Values:
-    inside = slice(first, last + 1)
-    return replace(
-        values, states=values.states[inside], biases=None if values.biases is None else values.biases[inside]
-    )
 
 
 def _around(solution: Solution, first: int, last: int) -> BallGraph:
@@ -221,14 +197,6 @@ def _around(solution: Solution, first: int, last: int) -> BallGraph:
         spread = np.full((1, 3), SPIN_SPREAD)
         batches.append(spin_prior(np.zeros(1, dtype=np.int64), values.states[first : first + 1, SPIN], spread))
     return BallGraph(tuple(batches))
-
-
-def _turned(values: Values, bounce: Bounce, before: Array, after: Array) -> Values:
-    """Values with another spin on both sides of a bounce."""
-    states = values.states.copy()
-    states[bounce.first : bounce.interval + 1, SPIN] += before
-    states[bounce.interval + 1 : bounce.last + 1, SPIN] += after
-    return replace(values, states=states)
 
 
 def _slopes(before: Array, slip: Array, model: BallModel) -> Array:
