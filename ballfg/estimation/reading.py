@@ -6,7 +6,7 @@ from pathlib import Path
 from ballfg.checks import check_path
 from ballfg.dynamics import nominal_model
 from ballfg.dynamics.model_file import model_to_dict
-from ballfg.estimation.observations.files import read_readings
+from ballfg.estimation.observations.registry import read_readings
 from ballfg.estimation.observations.sighted_dataset import SightedDataset, read_sighted
 from ballfg.files.strict_yaml import read_mapping
 from ballfg.files.whole_folder import of_one_state

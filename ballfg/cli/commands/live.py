@@ -128,7 +128,7 @@ def _dataset(folder: Path | None) -> Dataset | None:
     """The dataset of a replay, or the one named as similar to the stream."""
     if folder is None:
         return None
-    from ballfg.estimation.observations.files import tables_of_readings
+    from ballfg.estimation.observations.registry import tables_of_readings
     from ballfg.tracks import read_dataset
 
     data = read_dataset(folder)

@@ -27,8 +27,7 @@ from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.result import Contact, Quality
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, stamp_covariance, total_sigmas
 from ballfg.estimation.sides.hypotheses import HypothesisModel, SampleMeasurement, measured_at
-from ballfg.estimation.sides.monitor import ContactMonitor, ContactState, with_contact_states
-from ballfg.estimation.sides.widening import widened_near_contacts
+from ballfg.estimation.sides.monitor import ContactMonitor, ContactState, widened_near_contacts, with_contact_states
 from ballfg.estimation.smoother.problem import coefficient_means, trackwise_model
 from ballfg.factors.batch import FactorBatch
 from ballfg.factors.correlated_noise import bias_step

@@ -15,9 +15,8 @@ from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.online.state import Sample
 from ballfg.estimation.online.windows.stream_window import StreamWindow
 from ballfg.estimation.segmentation.batch import BREAKS, SIDE, assembled
-from ballfg.estimation.segmentation.events import Event, EventKind
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
-from ballfg.estimation.segmentation.result import Quality, Segmentation
+from ballfg.estimation.segmentation.result import Event, EventKind, Quality, Segmentation
 from ballfg.estimation.segmentation.segmenter import Segmenter
 from ballfg.estimation.segmentation.settings import SegmentationSettings
 from ballfg.estimation.smoother.motion import FLIGHT, Motion, motions_of

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array, Index
 from ballfg.estimation.online.events import SIGMA_FACTOR
 from ballfg.estimation.online.state import Sample
-from ballfg.estimation.online.windows.filter import without_bias
+from ballfg.estimation.online.windows.interval import without_bias
 from ballfg.estimation.online.windows.stream_window import StreamWindow
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.segmentation.result import Contact, Segmentation

@@ -21,8 +21,7 @@ from ballfg.estimation.launcher import FIRST_SAMPLES, group_spin
 from ballfg.estimation.observations.observation import Observation
 from ballfg.estimation.online.events import EventTracker, explain, move_contacts, path_of, tell_velocities
 from ballfg.estimation.online.final import Frozen, final_estimate, freeze, unknown
-from ballfg.estimation.online.measurement import Measurement, measurements_beside
-from ballfg.estimation.online.state import OnlineState, Sample, Update
+from ballfg.estimation.online.state import Measurement, OnlineState, Sample, Update, measurements_beside
 from ballfg.estimation.online.stream import SightingStream
 from ballfg.estimation.online.warm_up import warmed_up
 from ballfg.estimation.online.windows.chain import ChainWindow

@@ -15,8 +15,7 @@ from numpy.typing import ArrayLike
 from ballfg.checks import check_array, check_choice, shown
 from ballfg.estimation.observations.ray_path import AROUND, BEFORE, Path, Rays, rough_path
 from ballfg.estimation.observations.sightings import LOOSE, SAME_MOMENT, filled
-from ballfg.estimation.online.measurement import Measurement
-from ballfg.estimation.online.state import Sample
+from ballfg.estimation.online.state import Measurement, Sample
 from ballfg.factors.camera import CameraFactors
 from ballfg.factors.loss import Loss
 from ballfg.tracks.sightings import Sightings

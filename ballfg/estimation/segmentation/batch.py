@@ -8,9 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ballfg.arrays import Array
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.segmentation.events import Event, EventKind
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
-from ballfg.estimation.segmentation.result import Contact, Quality, Rest, Segmentation
+from ballfg.estimation.segmentation.result import Contact, Event, EventKind, Quality, Rest, Segmentation
 from ballfg.estimation.segmentation.segmenter import Segmenter
 from ballfg.estimation.segmentation.settings import SegmentationSettings
 

@@ -10,6 +10,7 @@ from ballfg.arrays import Array
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNT, NOTHING, ONE, REAL
 from ballfg.estimation.segmentation.bank import (
+    AS_OUTLIER,
     BANK,
     FLYING,
     HYPOTHESIS,
@@ -29,9 +30,11 @@ from ballfg.estimation.segmentation.bank import (
     Work,
     add,
     pass_through,
+    prune,
+    rank,
+    update,
 )
-from ballfg.estimation.segmentation.events import HIT, LEAVE, OUTLIER, REST, RESTART, SHIFT
-from ballfg.estimation.segmentation.evidence import AS_OUTLIER, prune, rank, update
+from ballfg.estimation.segmentation.result import HIT, LEAVE, OUTLIER, REST, RESTART, SHIFT
 from ballfg.estimation.segmentation.surface_contact import Step, advance, lift, put_down
 
 SHORTEST_STEP: Final = 1e-3

@@ -1,9 +1,10 @@
-"""A segmentation holds the contacts, hits, rests and sample qualities of a track."""
+"""Events form chains that hypotheses share; a segmentation holds the contacts, hits, rests and qualities of a track."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from enum import IntEnum
+from enum import Enum, IntEnum, auto
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,3 +91,109 @@ class Segmentation:
     def usable(self) -> NDArray[np.bool_]:
         """(n,) True for samples that measure the ball: good or wide ones."""
         return self.quality <= Quality.WIDE
+
+
+class EventKind(Enum):
+    """Kinds of events in an interval or at a sample."""
+
+    CONTACT = auto()
+    """Between two samples: the ball meets a surface."""
+    HIT = auto()
+    """Between two samples: the velocity is forgotten."""
+    RESTART = auto()
+    """Between two samples: a gap too long to bridge; everything is forgotten."""
+    SHIFT = auto()
+    """Between two samples: the measurements jump, the velocity stays."""
+    REST = auto()
+    """Between two samples: the ball stays down on a surface."""
+    LEAVE = auto()
+    """Between two samples: a resting ball gets into the air, for instance over an edge."""
+    WIDE = auto()
+    """At a sample: its noise is larger than stated."""
+    OUTLIER = auto()
+    """At a sample: it carries no information on the ball."""
+
+
+CONTACT, HIT, RESTART, SHIFT, REST, LEAVE, WIDE, OUTLIER = (kind.value for kind in EventKind)
+"""The values of `EventKind`, for machine code."""
+
+
+@dataclass(frozen=True, eq=False)
+class Event:
+    """One event of an explanation.
+
+    Attributes:
+        kind: what happened.  index: the interval of the event (-1: before the first sample), or the sample.
+        time: s, on the track's clock: of a contact itself; for other events the stamp of the first sample after it.
+        height: m, declared height of the surface, if any.  offset: (3,) m, jump of the measurements, for a shift.
+    """
+
+    kind: EventKind
+    index: int
+    time: float
+    height: float | None = None
+    offset: NDArray[np.float64] | None = None
+
+
+class Node:
+    """An event and the previous one; `final` once every living hypothesis contains it.
+
+    The event object is made on demand: most hypotheses are dropped before.
+    """
+
+    __slots__ = ("_event", "final", "parent")
+
+    def __init__(self, event: Event | Callable[[], Event], parent: Node | None) -> None:
+        self._event = event
+        self.parent = parent
+        self.final = False
+
+    @property
+    def event(self) -> Event:
+        """The event of the node."""
+        if not isinstance(self._event, Event):
+            self._event = self._event()
+        return self._event
+
+
+def copied(node: Node | None, known: dict[int, Node]) -> Node | None:
+    """An independent chain with the same events: making one chain final leaves the other unchanged.
+
+    Args: known: copies so far, by the identity of their original; chains that share nodes still share their copies.
+    """
+    if node is None:
+        return None
+    chain = [node]
+    while (parent := chain[-1].parent) is not None and id(chain[-1]) not in known:
+        chain.append(parent)
+    last: Node | None = None
+    for old in reversed(chain):
+        if id(old) not in known:
+            known[id(old)] = Node(old.event, last)
+            known[id(old)].final = old.final
+        last = known[id(old)]
+    return last
+
+
+def open_nodes(node: Node | None) -> list[Node]:
+    """The nodes of a chain that are not final, oldest first."""
+    chain: list[Node] = []
+    while node is not None and not node.final:
+        chain.append(node)
+        node = node.parent
+    return chain[::-1]
+
+
+def contains(tip: Node | None, node: Node) -> bool:
+    """True if the chain that ends in `tip` goes through `node`."""
+    while tip is not None and tip is not node:
+        tip = tip.parent
+    return tip is node
+
+
+def make_final(nodes: list[Node]) -> tuple[Event, ...]:
+    """Marks the oldest nodes of a chain as final and cuts the chain there, so that memory does not grow."""
+    for node in nodes:
+        node.final = True
+        node.parent = None
+    return tuple(node.event for node in nodes)

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from ballfg.arrays import Array
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.segmentation.bank import HYPOTHESIS, NO_EVENT, Records, Scene
-from ballfg.estimation.segmentation.events import Event, EventKind, Node, contains, copied, make_final, open_nodes
 from ballfg.estimation.segmentation.explain import explain
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
+from ballfg.estimation.segmentation.result import Event, EventKind, Node, contains, copied, make_final, open_nodes
 from ballfg.estimation.segmentation.settings import SegmentationSettings
 
 USUAL = SegmentationSettings()

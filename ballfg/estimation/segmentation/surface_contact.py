@@ -24,7 +24,7 @@ from ballfg.estimation.segmentation.bank import (
     add,
     pass_through,
 )
-from ballfg.estimation.segmentation.events import CONTACT, REST
+from ballfg.estimation.segmentation.result import CONTACT, REST
 
 STRONGEST_DRAG: Final = 0.5
 """Largest share of its velocity that a ball may lose to drag in one step: bounds absurd velocities, such as those from

@@ -20,7 +20,7 @@ from ballfg.estimation.segmentation.batch import segment
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.segmentation.result import Segmentation
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, total_sigmas
-from ballfg.estimation.sides.widening import widened_near_contacts
+from ballfg.estimation.sides.monitor import widened_near_contacts
 from ballfg.estimation.smoother.problem import Events, TrackProblem
 from ballfg.estimation.smoother.second_look.at_end import with_both_sides
 from ballfg.estimation.smoother.second_look.low_hops import LowHops, counted, low_hops, uncounted_note, with_low_hops

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ballfg.estimation import RadarSpeed, SpinReading, read
-from ballfg.estimation.observations.files import read_readings, write_readings
+from ballfg.estimation.observations.registry import read_readings, write_readings
 from ballfg.simulation import MeasurementNoise, SimulationConfig, write_simulation
 from ballfg.tracks import Dataset, Track, read_dataset
 

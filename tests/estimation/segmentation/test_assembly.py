@@ -6,9 +6,9 @@ import pytest
 from ballfg.dynamics import Surfaces
 from ballfg.estimation.segmentation.bank import FLYING, HYPOTHESIS, Scene
 from ballfg.estimation.segmentation.batch import rests_of
-from ballfg.estimation.segmentation.events import Event, EventKind
 from ballfg.estimation.segmentation.explain import _forget
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
+from ballfg.estimation.segmentation.result import Event, EventKind
 from ballfg.estimation.segmentation.settings import SegmentationSettings
 
 HEIGHT = 0.76

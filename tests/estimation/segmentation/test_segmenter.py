@@ -8,8 +8,8 @@ import pytest
 
 from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.estimation.segmentation.batch import segment
-from ballfg.estimation.segmentation.events import Event, EventKind
 from ballfg.estimation.segmentation.physics import SegmentationPhysics, physics_of
+from ballfg.estimation.segmentation.result import Event, EventKind
 from ballfg.estimation.segmentation.segmenter import Segmenter
 from ballfg.estimation.segmentation.settings import SegmentationSettings
 

@@ -10,7 +10,7 @@ from scipy.stats import norm
 from ballfg.dynamics import EFFECTS, AnalyticModel
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.estimation.segmentation.result import Contact
-from ballfg.estimation.sides.widening import ENOUGH, MORE, SPREAD, Shared, widening, widening_near_contacts
+from ballfg.estimation.sides.monitor import ENOUGH, MORE, SPREAD, Shared, widening, widening_near_contacts
 
 G, E = 9.81, 0.9
 MODEL = AnalyticModel([EFFECTS["gravity"](g=G), EFFECTS["restitution"](e=E), EFFECTS["table_height"](offset=0.0)])

@@ -16,8 +16,7 @@ from typing import Self
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.estimation.online.measurement import Measurement, prepare
-from ballfg.estimation.online.state import Sample, Update
+from ballfg.estimation.online.state import Measurement, Sample, Update, prepare
 from ballfg.estimation.online.windows.interval import Interval
 from ballfg.estimation.online.windows.linear import LinearFactors
 from ballfg.estimation.online.windows.stream_window import Arrival, StreamWindow

@@ -13,8 +13,7 @@ import gtsam
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.estimation.online.measurement import Measurement, prepare
-from ballfg.estimation.online.state import Sample, Update
+from ballfg.estimation.online.state import Measurement, Sample, Update, prepare
 from ballfg.estimation.online.windows.linear import LinearFactors, bias_link, bias_start, linear_factor
 from ballfg.estimation.online.windows.stream_window import COEFFICIENT_THRESHOLD, Arrival, StreamWindow
 from ballfg.factors.batch import FactorBatch

@@ -17,7 +17,7 @@ from ballfg.estimation.plausible import plausible
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.result import Contact
 from ballfg.estimation.settings import sample_sigmas
-from ballfg.estimation.sides.widening import Shared, widening_near_contacts
+from ballfg.estimation.sides.monitor import Shared, widening_near_contacts
 from ballfg.estimation.smoother.pieces.joining import Joined, joined_minimum, watched
 from ballfg.estimation.smoother.pieces.reduction import Point, Reduction
 from ballfg.estimation.smoother.pieces.section import Section, State
