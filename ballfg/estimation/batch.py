@@ -28,10 +28,7 @@ HAND_OVER = 0.3
 
 
 def estimate_tracks(estimator: Estimator, tracks: Iterable[Track], count: int, jobs: int) -> Iterator[Estimate]:
-    """Estimates in the order of the tracks.
-
-    Args: tracks, count, jobs: as for `map_tracks`.
-    """
+    """Estimates in the order of the tracks; arguments as for `map_tracks`."""
     if estimator.model.variations:  # the world of an estimate depends on its track
         yield from map_tracks(estimator.estimate, tracks, count, jobs)
         return
@@ -93,12 +90,7 @@ def _chunks(stream: Iterator[T], size: int) -> Iterator[list[T]]:
 
 
 def do_all(tasks: Sequence[Callable[[], R]], jobs: int) -> list[R]:
-    """The results of tasks that take seconds each, in their order.
-
-    Args:
-        tasks: functions without arguments (`functools.partial`), which must pickle.
-        jobs: processes; with fewer than two jobs or tasks, everything runs in this process.
-    """
+    """The results of tasks that take seconds each, in their order; with less than two jobs or tasks in this process."""
     others = executor(jobs)
     if others is None or len(tasks) < 2:
         return [task() for task in tasks]

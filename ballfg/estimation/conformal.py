@@ -226,10 +226,7 @@ def check_calibration_tracks(calibration: Dataset | SightedDataset, dataset: Dat
 
 @dataclass(frozen=True)
 class _Bin:
-    """The scores of all calibration tracks in a bin of the horizon.
-
-    Attributes: scores: (m, 3).  track: (m,) number of the track of each, from 0.
-    """
+    """The scores (m, 3) of all calibration tracks in a bin of the horizon, and (m,) the number of the track of each."""
 
     scores: Array
     track: Index

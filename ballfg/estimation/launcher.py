@@ -105,10 +105,7 @@ class Launcher:
 
 
 def group_spin(spins: SpinPopulation, track: Track, group: str | None) -> SpinLabel:
-    """The spin of a new shot of a track's group.
-
-    Args: spins: of all groups.  track: its label names the group.  group: that of a track without the label.
-    """
+    """The spin of a new shot of the group that the track's label names, else of `group`."""
     mean, covariance = spins.spin(str(track.labels[spins.by]) if spins.by in track.labels else group)
     axes = launch_axes(launch_velocity(track))
     variances, vectors = np.linalg.eigh(covariance)

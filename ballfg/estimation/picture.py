@@ -17,10 +17,7 @@ COLOURS: Final = ("#c44e52", "#55a868", "#4c72b0")
 
 
 def picture(estimate: Estimate) -> Figure:
-    """Three panels, one for each part of the state; contacts are dashed lines, hits are dotted ones.
-
-    Args: estimate: of one track.
-    """
+    """Three panels, one for each part of the state; contacts are dashed lines, hits are dotted ones."""
     figure = Figure(figsize=(8.0, 7.0), layout="constrained")
     panels = figure.subplots(3, 1, sharex=True)
     times, sigmas = estimate.times, estimate.sigmas
@@ -43,10 +40,7 @@ def picture(estimate: Estimate) -> Figure:
 
 
 def predicted(prediction: TrackPrediction) -> Figure:
-    """Three panels, one for each axis; contacts of the observed part are dashed lines, hits are dotted ones.
-
-    Args: prediction: of one track.
-    """
+    """Three panels, one for each axis; contacts of the observed part are dashed lines, hits are dotted ones."""
     estimate, times, marks = prediction.estimate, prediction.estimate.times, []
     events = [("contact", contact.time) for contact in estimate.contacts]
     events += [("hit", float(0.5 * (times[interval] + times[interval + 1]))) for interval in estimate.hits]

@@ -74,10 +74,7 @@ def possible(states: Array) -> NDArray[np.bool_]:
 
 
 def measured_only(positions: Array, sigma: Array, settings: Settings) -> tuple[Array, Array]:
-    """States (n, 9) from positions alone, without velocity, with covariances (n, 9, 9).
-
-    Args: positions: (n, 3) m.  sigma: (n, 3) m, of theirs.  settings: give the spreads of velocity and spin.
-    """
+    """States (n, 9) from positions (n, 3) m with sigmas (n, 3) m, without velocity, and their (n, 9, 9)."""
     states, spread = np.zeros((len(positions), STATE_DIM)), np.empty((len(positions), STATE_DIM))
     states[:, POSITION] = positions
     spread[:, POSITION] = np.maximum(sigma, LEAST_POSITION_SIGMA)

@@ -41,10 +41,7 @@ def with_readings(dataset: Dataset) -> Dataset:
 
 
 def unused_model(folder: str | PathLike[str], ball: Ball) -> tuple[str, ...]:
-    """A note on a model file beside the tracks that differs from the ball's nominal model; None otherwise.
-
-    Args: folder: of the dataset.  ball: of the dataset.
-    """
+    """A note on a model file beside the tracks that differs from the ball's nominal model, if any."""
     path = Path(folder) / MODEL_FILE
     if not path.is_file():
         return ()

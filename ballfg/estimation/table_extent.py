@@ -138,10 +138,7 @@ def _reach(times: Array) -> int:
 def _arcs(
     times: Array, positions: Array, samples: tuple[NDArray[np.intp], ...], at: NDArray[np.intp]
 ) -> tuple[Array, Array, Array]:
-    """Free falls through three samples each, evaluated at the stamps of the samples `at` (m,).
-
-    Returns: (m, 3) m, (m, 3) m/s, and (m,) m, the largest distance of a sample from the fall along z.
-    """
+    """Free falls through three samples each at stamps `at`: (m, 3) m, (m, 3) m/s, largest misfit (m,) m along z."""
     rows = np.stack(samples)
     t = (times[rows] - times[at])[..., None]
     straight = positions[rows] + t**2 / 2 * _UPWARD_GRAVITY
@@ -177,10 +174,7 @@ def _grid(bounces: Array, size: float) -> Array:
 
 
 def _contradicting(bounces: Array, falls: Array, x: Array, y: Array, size: tuple[float, float]) -> Array:
-    """(x, y) number of balls that contradict a table of a size (m) with its centre there.
-
-    A ball that is on the wrong side of an edge counts in part, up to the tolerance.
-    """
+    """(x, y) number of balls that contradict a table of a size (m) with its centre there; in part near an edge."""
 
     def inside(places: Array, margin: float) -> list[Array]:
         """For each axis, 1 where a place lies within the table made larger by a margin, less within the tolerance."""

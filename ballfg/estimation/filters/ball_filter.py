@@ -90,10 +90,7 @@ class BallFilter(FilterpyEKF):
         self.update(measured, lambda _: self.H, lambda x: self.H @ x)
 
     def correct_by(self, factor: FactorBatch, gated: bool) -> Array:
-        """(dim,) whitened innovation of a factor on the present state; the update of filterpy with its residual.
-
-        The factor's loss weights the noise; with a gate, a measurement beyond it is not used.
-        """
+        """(dim,) whitened innovation of a factor, by which the filter is updated if it passes the gate, if any."""
         found = FilterInnovation.of(factor, self.x, self.P, biases=len(self.x) - self.width)
         if not gated or self.passes(found.whitened):
             self.update(np.zeros(factor.dim), lambda _: found.H, lambda _: found.residual, R=found.R)

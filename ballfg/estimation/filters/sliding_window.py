@@ -94,10 +94,7 @@ class SlidingWindow(Estimator):
 
 
 def may_touch(times: Array, positions: Array, surfaces: Surfaces, radius: float) -> NDArray[np.bool_]:
-    """(n,) bool: True if the ball may have touched a surface since the sample before.
-
-    This holds if one of the two samples lies closer to a surface than the ball moves in one interval.
-    """
+    """(n,) True if one of the last two samples is nearer to a surface than the ball moves in one interval."""
     n = len(times)
     gap = np.abs(positions[:, Z, None] - radius - np.array(surfaces.heights())).min(axis=-1)
     travel = np.abs(np.diff(positions[:, Z]))

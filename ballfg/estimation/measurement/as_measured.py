@@ -51,10 +51,7 @@ def _without_effects(model: BallModel) -> BallModel:
 
 
 def true_times(model: BallModel, times: Array) -> Array:
-    """(n,) s, true times of a track's samples; the first stamp is right. Without effects they stay to the bit.
-
-    Args: times: (n,) s, all stamps of the track from its first on.
-    """
+    """(n,) s, true times of samples, from all stamps (n,) s of a track; without effects they stay to the bit."""
     if model.measures_plainly:
         return times
     with torch.no_grad():
@@ -69,12 +66,7 @@ def written_time(model: BallModel, first: float, time: float) -> float:
 
 @torch.no_grad()
 def measured_positions(model: BallModel, states: Tensor, surfaces: Surfaces) -> Tensor:
-    """(n, 3) m, expected measured positions of balls, before noise.
-
-    Args:
-        model: may be augmented.  states: (n, 9 + p), true.
-        surfaces: those that a ball may bounce on between the moments of one sample.
-    """
+    """(n, 3) m, expected measured positions of balls in true states (n, 9 + p), before noise."""
     if model.measures_plainly:
         return states[:, POSITION]
 
@@ -86,10 +78,7 @@ def measured_positions(model: BallModel, states: Tensor, surfaces: Surfaces) -> 
 
 @dataclass(frozen=True)
 class LabelMap:
-    """The affine map from spins to labels: label = matrix spin + offset.
-
-    Attributes: matrix: (3, 3).  offset: (3,) rad/s.
-    """
+    """The affine map from spins to labels: label = matrix (3, 3) spin + offset (3,) rad/s."""
 
     matrix: Array
     offset: Array

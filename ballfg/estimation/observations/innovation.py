@@ -81,10 +81,7 @@ def leave_position_out(states: Array, covariances: Array, measured: Array, noise
 
 
 def _inverse_of_rest(information: Array) -> Array:
-    """(n, r, r) inverse of the remaining information near one, after a share was subtracted.
-
-    It cannot be negative; if nearly all is subtracted, rounding may make it so.
-    """
+    """(n, r, r) inverse of the remaining information near one; rounding may make it negative."""
     values, vectors = np.linalg.eigh(0.5 * (information + information.swapaxes(-1, -2)))
     inverse = 1.0 / (np.maximum(values, 0.0) + LEAST_INFORMATION)
     return np.asarray((vectors * inverse[..., None, :]) @ vectors.swapaxes(-1, -2))

@@ -20,10 +20,7 @@ from ballfg.tracks import Track
 
 
 class Positions(Observation):
-    """The measured positions of a track, one at each sample.
-
-    Args: positions: (n, 3) m.
-    """
+    """The measured positions (n, 3) m of a track, one at each sample."""
 
     name: ClassVar[str] = "position"
     locates: ClassVar[bool] = True

@@ -41,12 +41,7 @@ NEAREST: Final = 0.05
 
 @dataclass(frozen=True)
 class Path:
-    """Positions at some moments.
-
-    Attributes:
-        positions: (n, 3) m.  velocities: (n, 3) m/s.
-        sigmas: (n, 3) m, standard deviations; larger where residuals are larger than the noise of the pixels.
-    """
+    """Positions (n, 3) m at some moments, velocities (n, 3) m/s, and sigmas (n, 3) m, with misfits in them."""
 
     positions: Array
     velocities: Array

@@ -206,12 +206,7 @@ class SpinReading(Reading):
 
 
 class ReadingFactors(FactorBatch):
-    """r = (h(x_i carried over the delay) - z_i) / sigma_i.
-
-    Args:
-        reading: gives h, z, sigma, the delays and the loss.
-        model: carries states in free flight; used only for delays other than zero.
-    """
+    """r = (h(x_i carried over the delay, in free flight) - z_i) / sigma_i."""
 
     row_arrays: ClassVar[tuple[str, ...]] = ("variables", "values", "sigma", "delay")
 

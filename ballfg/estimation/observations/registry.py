@@ -47,12 +47,7 @@ LONGEST_HEADER: Final = 4096
 
 @dataclass
 class ReadingTables:
-    """The readings of all trajectories of a folder.
-
-    Attributes:
-        rows: of each sort of reading, by trajectory: (m, 2 + dim) t (s), the values and sigma, in their own units.
-        notes: ignored rows and files, one sentence each.
-    """
+    """The readings of a folder: rows (m, 2 + dim) t (s), values, sigma by sort and trajectory; notes on ignored."""
 
     rows: dict[type[Observation], dict[str, Array]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)

@@ -219,9 +219,8 @@ def _bank(cameras: tuple[Camera, ...]) -> CameraBank:
 
 
 def filled(moments: Array, path: Path, name: str) -> Path:
-    """The path, with undetermined positions interpolated in time and extrapolated at its ends.
+    """The path at moments (n,) s, with undetermined positions interpolated in time and extrapolated at its ends.
 
-    Args: moments: (n,) s, of the path.  path: from `rough_path`.  name: of the track, for the message.
     Raises: NeverSeenByTwoError: if rays determine no position at all.
     """
     firm = path.sigmas.max(axis=1) <= LOOSE

@@ -72,10 +72,7 @@ class EventTracker:
         return changed or resting or due
 
     def segmentation(self, first: int, times: Array, positions: Array) -> Segmentation:
-        """The best explanation of the samples first, first + 1, ... of the stream, numbered from 0.
-
-        Args: first: number of the window's first sample.  times: (n,) s.  positions: (n, 3) m.
-        """
+        """The best explanation of samples first, first + 1, ... at (n,) s and (n, 3) m, numbered from 0."""
         old = [e for e in self._final if e.index < first and e.kind in _REST_KINDS][-1:]
         open_rest = [e for e in old if e.kind is EventKind.REST]  # the last rest, unless the ball left it
         self._final = open_rest + [e for e in self._final if e.index >= first]
@@ -118,10 +115,7 @@ _REST_KINDS = (EventKind.REST, EventKind.LEAVE, *BREAKS)
 
 
 def contact_step(state: Array, rise: float, dt: float) -> int:
-    """The interval of a contact relative to the present one: -1 the one before, 1 the next, 0 the same.
-
-    The path over one interval is a parabola to some micrometres, from `state` (9,); the centre touches at `rise` m.
-    """
+    """The interval of a contact relative to that of `state` (9,): -1, 0 or 1; the centre touches at `rise` m."""
     above, vz = float(state[Z]) - rise, float(state[VZ])
     root = vz * vz + 2 * STANDARD_GRAVITY * above
     if root < 0.0:
@@ -133,10 +127,7 @@ def contact_step(state: Array, rise: float, dt: float) -> int:
 
 
 def first_difference(samples: Sequence[Sample], motions: Sequence[Motion], factors: Array) -> int | None:
-    """The first sample whose motion or usability differs from the present explanation.
-
-    None if only noise levels differ: those change without going back.
-    """
+    """The first sample whose motion or usability differs; None if only noise levels do: they do not go back."""
     for k, sample in enumerate(samples):
         if k and not sample.motion.same(motions[k - 1]):
             return k
@@ -157,10 +148,7 @@ def path_of(samples: Sequence[Sample]) -> tuple[Array, Array]:
 
 
 def explain(window: StreamWindow, samples: list[Sample], events: EventTracker) -> list[Sample]:
-    """Applies the events to the samples; samples from the first difference on are retracted and returned.
-
-    Args: window: holds the first of the samples.  samples: the wanted content.  events: found in them.
-    """
+    """Applies the events to the samples; those from the first difference on are retracted and returned."""
     held = len(window)
     times, positions = path_of(samples)
     segmentation = events.segmentation(window.first, times, positions)

@@ -47,10 +47,7 @@ def unknown(sample: Sample, settings: Settings, p: int) -> Frozen:
 def final_estimate(
     smoother: Smoother, window: StreamWindow, track: Track, found: Segmentation, frozen: Sequence[Frozen]
 ) -> Estimate:
-    """The result over a whole track.
-
-    Args: smoother: with the window's settings.  found: the events in the window.  frozen: states before it.
-    """
+    """The result over a whole track, from the events in the window and the states before it."""
     first = window.first
     part = track.between(float(track.times[first]), float(track.times[-1]))
     problem = smoother.problem(part, found)

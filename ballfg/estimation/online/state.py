@@ -26,12 +26,7 @@ from ballfg.tracks import Track
 
 
 class Measurement:
-    """One measurement of a state.
-
-    Args: batch: of one factor on a single state.
-
-    Attributes: innovation: (dim,) whitened, against the prediction when it came in; NaN without a prediction.
-    """
+    """One measurement of a state: a batch of one factor; `innovation` (dim,) whitened, NaN without a prediction."""
 
     def __init__(self, batch: FactorBatch) -> None:
         self.batch = batch
@@ -76,9 +71,8 @@ def prepare(measurements: Sequence[Measurement], states: Array) -> None:
 def measurements_beside(
     track: Track, model: BallModel, settings: Settings, sigma: Array
 ) -> dict[str, list[tuple[int, Measurement]]]:
-    """All measurements other than positions, by name of the observation: each with the number of its sample.
+    """All measurements but positions, each with its sample's number, by the observation's name.
 
-    Args: sigma: (n, 3) m, of the positions.
     Raises: ValueError: an observation of several states, or settings that give it unknowns.
     """
     refuse_unknowns(track.observations, settings, "online")

@@ -33,10 +33,7 @@ STAMPS: Final = 9
 
 
 class SightingStream:
-    """Turns sightings into samples for the window.
-
-    Args: cameras: of the rig.  loss: on a sighting.
-    """
+    """Turns sightings of a rig's cameras into samples for the window."""
 
     def __init__(self, cameras: Sequence[Camera], loss: Loss) -> None:
         self.cameras = {camera.name: camera for camera in cameras}

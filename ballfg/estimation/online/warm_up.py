@@ -26,11 +26,7 @@ HORIZON = 0.5
 
 
 def warmed_up(online: Online) -> list[OnlineState]:
-    """Estimates a ball that falls onto the table and bounces, by a copy of an estimator, and makes all predictions.
-
-    Args: online: not changed.
-    Returns: its state before the bounce, and the last.
-    """
+    """The states before the bounce and at the end of a falling ball, estimated by a copy of an estimator."""
     trial, states = online.copy(), []
     trial.reset()
     for k, (time, position) in enumerate(zip(*falling_ball(online), strict=True)):

@@ -214,10 +214,7 @@ def _variance(h: Record, axis: int, sigma: float, component: int, scene: Record)
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, ONE, ONE, SCENE, ONE))
 def weigh(h: Record, position: Array, sigma: Array, scene: Record, said: Array) -> None:
-    """Writes the evidence of a sample for a predicted hypothesis, without the common constant (3/2 log 2 pi).
-
-    Args: said: (4,) nats, of a good sample, a wide one and an outlier; and the squared innovation.
-    """
+    """Writes a sample's evidence: (4,) nats, less 3/2 log 2 pi, if good, wide, outlier; and the squared innovation."""
     said[SURPRISE] = 0.0
     for component in range(3):
         said[component] = scene.log_shares[component]

@@ -25,8 +25,7 @@ def intervals_of(events: Sequence[Event], *kinds: EventKind) -> list[int]:
 def rests_of(events: Sequence[Event], samples: int) -> list[Rest]:
     """The rests: from the first whole interval on a surface to the last.
 
-    A rest begins in the interval of its event and is whole from the next one on; a ball leaves at the end of its
-    interval, but a hit may fall anywhere inside.
+    A rest begins in the interval of its event; a ball leaves at an interval's end, but a hit falls anywhere inside.
     """
     rests = []
     start: Event | None = None

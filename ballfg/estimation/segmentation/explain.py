@@ -67,10 +67,7 @@ def start(work: Work, tip: int, score: float, sample: Sample, scene: Record, sur
 
 @machine_code(NOTHING(WORK, BANK, SAMPLE, REAL, SCENE, SURFACES))
 def hit(work: Work, before: Records, sample: Sample, dt: float, scene: Record, surfaces: Records) -> None:
-    """Adds the best explanation of the past, its velocity forgotten: in the air, and on a surface if it is near one.
-
-    Over a short interval the ball reappears close to where it was; over a long one it may be anywhere.
-    """
+    """Adds the best past, its velocity forgotten: in the air, and on a surface if near one; anywhere after a gap."""
     row = add(work, before, 0)
     h = work.bank[row]
     at = h.mean[:, 0].copy() if dt < scene.short_gap else sample.position
@@ -83,10 +80,7 @@ def hit(work: Work, before: Records, sample: Sample, dt: float, scene: Record, s
 
 @machine_code(NOTHING(WORK, BANK, SAMPLE, REAL, SCENE))
 def shift(work: Work, predicted: Records, sample: Sample, dt: float, scene: Record) -> None:
-    """Adds the best predictions, with the measurements jumping by an unknown offset: off from now on, or until now.
-
-    Only the next surface shows which of the two holds.
-    """
+    """Adds the best predictions, with the measurements jumping by an unknown offset: from now on, or until now."""
     n, bank, first = len(predicted), work.bank, work.fill[USED]
     rows = np.empty(n, np.int64)
     rank(predicted, 0, n, rows)

@@ -136,10 +136,7 @@ class Event:
 
 
 class Node:
-    """An event and the previous one; `final` once every living hypothesis contains it.
-
-    The event object is made on demand: most hypotheses are dropped before.
-    """
+    """An event, made on demand, and the previous one; `final` once every living hypothesis contains it."""
 
     __slots__ = ("_event", "final", "parent")
 
@@ -157,10 +154,7 @@ class Node:
 
 
 def copied(node: Node | None, known: dict[int, Node]) -> Node | None:
-    """An independent chain with the same events: making one chain final leaves the other unchanged.
-
-    Args: known: copies so far, by the identity of their original; chains that share nodes still share their copies.
-    """
+    """An independent chain with the same events, except for nodes `known` by the identity of their original."""
     if node is None:
         return None
     chain = [node]

@@ -21,12 +21,7 @@ USUAL = SegmentationSettings()
 
 @dataclass(frozen=True)
 class Decision:
-    """The explanation after a sample.
-
-    Attributes:
-        final: events that became final with this sample, oldest first; each event is reported once.
-        pending: the best explanation of all later samples, oldest first. It may change with the next sample.
-    """
+    """The events that became final with a sample, reported once, and the best explanation of all later ones."""
 
     final: tuple[Event, ...]
     pending: tuple[Event, ...]
@@ -72,10 +67,7 @@ class Segmenter:
         return Decision(final, tuple(node.event for node in open_nodes(self._tips[0])))
 
     def push_all(self, times: Array, positions: Array, sigmas: Array) -> list[Event]:
-        """The events of all samples so far, oldest first, after samples that are in order and finite.
-
-        Args: times: (n,) s.  positions, sigmas: (n, 3) m.
-        """
+        """The events of all samples so far, oldest first, after finite samples in order."""
         events: list[Event] = []
         noise = np.array(np.maximum(sigmas, self._scene.settings.sigma_floor), order="C")
         for sample in zip(times.tolist(), np.array(positions, order="C"), noise, strict=True):

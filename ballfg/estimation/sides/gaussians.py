@@ -68,10 +68,7 @@ class GaussianMixture:
         return GaussianMixture(log_weights, means, covariances), squares
 
     def updated_by_factor(self, factor: FactorBatch, biases: int) -> GaussianMixture:
-        """The same update with another measurement, a batch of one factor; its robust loss bounds outliers.
-
-        Args: biases: number of biases at the end of the state, which the factor does not see.
-        """
+        """The same update with a batch of one factor, which does not see the `biases` at the state's end."""
         log_weights, means, covariances = self.log_weights.copy(), self.means.copy(), self.covariances.copy()
         for i, (mean, covariance) in enumerate(zip(self.means, self.covariances, strict=True)):
             found = FilterInnovation.of(factor, mean, covariance, biases)
@@ -85,10 +82,7 @@ class GaussianMixture:
         return GaussianMixture(log_weights, means, covariances)
 
     def truncated(self, gaps: Array, gradients: Array) -> GaussianMixture:
-        """The part above a surface: each Gaussian is cut where the gap is zero, and weighted by its remaining share.
-
-        Args: gaps: (n,) m, between ball and surface at the means.  gradients: (n, d) of the gap.
-        """
+        """The part above a surface, from gaps (n,) m and gradients (n, d); weighted by the remaining shares."""
         along = (self.covariances @ gradients[..., None])[..., 0]
         sigma = np.sqrt(np.maximum((gradients * along).sum(axis=1), LEAST_SPREAD**2))
         along, cut = along / sigma[:, None], -gaps / sigma

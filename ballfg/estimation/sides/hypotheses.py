@@ -74,11 +74,7 @@ def measured_at(
 
 @dataclass(frozen=True)
 class HypothesisModel:
-    """Motion and measurement of a ball.
-
-    ball: its model, with the estimated coefficients in columns after the state.
-        biases: number of the tracker's biases after state and coefficients: 0 or 3.
-    """
+    """Motion and measurement of a ball: state, estimated coefficients, and 0 or 3 biases of the tracker."""
 
     ball: BallModel
     surfaces: Surfaces
@@ -105,10 +101,7 @@ class HypothesisModel:
         return gaps.detach().numpy(), gradients
 
     def may_touch(self, mean: Array, covariance: Array, dt: float) -> bool:
-        """True if a ball may come down to a surface within dt s.
-
-        Most samples are far from a surface: a coarse bound avoids the gap's gradient.
-        """
+        """True if a ball may come down to a surface within dt s; most are far: a coarse bound is first."""
         way = mean[VZ] * dt - 0.5 * STEEPEST_FALL * dt**2
         reach = MOST_OFFSET + FAR * (np.sqrt(covariance[Z, Z]) + dt * np.sqrt(covariance[VZ, VZ]))
         lowest = mean[Z] - self.ball.radius + way - reach

@@ -155,10 +155,7 @@ class ContactState:
 
 
 class ContactMonitor:
-    """Runs beside an estimator and follows both hypotheses of a ball near a contact.
-
-    Args: model: of the ball.
-    """
+    """Runs beside an estimator and follows both hypotheses of a ball near a contact."""
 
     def __init__(self, model: HypothesisModel) -> None:
         self.model = model
@@ -195,10 +192,7 @@ class ContactMonitor:
         steps: Sequence[tuple[float, SampleMeasurement]],
         bounced: Callable[[int], bool],
     ) -> ContactState | None:
-        """The state to report at the last of several samples; arguments as of `step`.
-
-        Args: steps: time in s to each sample, and its measurements.
-        """
+        """The state to report at the last of several samples, by times in s to each and measurements, as of `step`."""
         self._start(*before)
         state = None
         for dt, measured in steps:

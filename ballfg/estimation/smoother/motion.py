@@ -96,10 +96,7 @@ def contacts_by_interval(contacts: tuple[Contact, ...]) -> dict[int, list[Contac
 
 
 class TrackDynamics:
-    """Makes the dynamics factors of one track. Those of free flight are made once, for all arrangements.
-
-    Args: times: (n,) s.  model: the ball, with the estimated coefficients.  noise: of its motion.
-    """
+    """Makes the dynamics factors of one track at (n,) s; those of free flight once, for all arrangements."""
 
     def __init__(self, times: Array, model: BallModel, noise: ProcessNoise) -> None:
         self.times, self.model, self.noise = times, model, noise

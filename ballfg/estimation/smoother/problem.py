@@ -178,10 +178,7 @@ def bridged_positions(track: Track, segmentation: Segmentation) -> Array:
 
 
 def _priors(track: Track, segmentation: Segmentation, settings: Settings) -> list[FactorBatch]:
-    """Wide priors on the first state of each piece, with a prior of its spin.
-
-    The first piece's spin is the label's, if any, or that of the launcher's settings; else the spin prior.
-    """
+    """Wide priors on each piece's first state, and on its spin by the label, the launcher or the settings."""
     batches: list[FactorBatch] = []
     launcher = settings.launcher
     launch = None if launcher is None else launcher.settings(track)

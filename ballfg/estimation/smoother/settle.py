@@ -65,10 +65,7 @@ class Solution:
 
 @dataclass(frozen=True)
 class Earlier:
-    """The information from samples before those of a problem: initial values, and factors of removed states.
-
-    The factors replace priors on the same variables.
-    """
+    """The information from samples before a problem's: initial values, and factors in place of some priors."""
 
     start: Values
     summaries: Sequence[FactorBatch] = ()
@@ -110,10 +107,7 @@ def initial_states(
 
 
 class ContactSearch:
-    """The arrangements of a track's contacts, beginning with its segmentation.
-
-    Args: problem: of the track.  surfaces: table and floor.  segmentation: its events.
-    """
+    """The arrangements of a track's contacts, beginning with its segmentation."""
 
     def __init__(self, problem: TrackProblem, surfaces: Surfaces, segmentation: Segmentation) -> None:
         self.problem, self.surfaces, self.segmentation = problem, surfaces, segmentation

@@ -260,10 +260,7 @@ LONG: Final = 10_000
 
 
 class PiecewiseSmoother(Smoother):
-    """The smoother, with pieces around it for long tracks.
-
-    Args: as for `Smoother`.
-    """
+    """The smoother, with pieces around it for long tracks; arguments as for `Smoother`."""
 
     def is_long(self, track: Track) -> bool:
         """True if a track is smoothed in pieces; with changing stamps or GTSAM's solver it is smoothed at once."""

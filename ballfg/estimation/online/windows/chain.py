@@ -173,10 +173,7 @@ class ChainWindow(StreamWindow):
                 self._stale[k - 1] = True
 
     def _rows_of(self, k: int, moved: bool) -> Array:
-        """(r, columns) of all factors whose first state is k; the right side last.
-
-        Args: moved: True if the factors of the model or a camera have been evaluated anew.
-        """
+        """(r, columns) of all factors whose first state is k; `moved` if some have been evaluated anew."""
         sample, interval = self.samples[k], self.intervals[k] if k < len(self.intervals) else None
         if moved:  # bridges are shared with copies of the window, results are not
             asked = [(m.batch, m.bridge) for m in sample.measurements]
@@ -225,9 +222,8 @@ class ChainWindow(StreamWindow):
         return self.theta[k : k + 1] if batch.sees_biases else self.theta[k : k + 1, :STATE_DIM]
 
     def _solve(self) -> int:
-        """Eliminates from the first state whose rows have changed; writes solutions and the newest covariance.
+        """Eliminates from the first state whose rows have changed; returns the number of eliminated states.
 
-        Returns: number of eliminated states.
         Raises: RuntimeError: if the system is singular.
         """
         n = len(self.samples)

@@ -47,10 +47,7 @@ class Interval:
 
 
 class IntervalMaker:
-    """Makes intervals for one model and noise; the usual ones, free flights, quickly.
-
-    The correlation of the noise in flight does not depend on dt, so its root is computed once and scaled.
-    """
+    """Makes intervals; the root of the noise in flight, whose correlation does not depend on dt, is only scaled."""
 
     def __init__(self, model: BallModel, noise: ProcessNoise) -> None:
         self.model = model

@@ -69,10 +69,7 @@ class LinearFactors(FactorBatch):
 
     @classmethod
     def of_gtsam(cls, factor: gtsam.NonlinearFactor, values: Values, first: int) -> Self:
-        """A linear factor of iSAM2.
-
-        Args: values: v*, of the window.  first: number of the window's first state.
-        """
+        """A linear factor of iSAM2 at the values of the window, whose first state has the number `first`."""
         keys = list(factor.keys())
         numbers = [COEFFICIENTS if k == COEFFICIENT_KEY else k - STATE_KEY - first for k in keys]
         points = [np.array(values.gather(np.array([n]), with_biases=True)) for n in numbers]

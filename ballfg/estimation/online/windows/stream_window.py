@@ -38,12 +38,7 @@ from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 
 @dataclass(frozen=True)
 class Arrival:
-    """A new sample of a window.
-
-    Attributes:
-        sample: the sample.  state: (w,) its linearisation point.
-        interval: the one from the sample before; None without a link.  priors: factors of its own, numbered 0.
-    """
+    """A new sample, its linearisation point (w,), the linked interval before it, if any, and its own priors."""
 
     sample: Sample
     state: Array
@@ -144,10 +139,7 @@ class StreamWindow(ABC):
         self.newest_covariance = np.zeros((0, 0))
 
     def start_anew(self, samples: list[Sample]) -> Update:
-        """Drops the solution, after an error left it half-updated, and takes in all samples again, oldest first.
-
-        Returns: the last sample's update; errors as of `append_all`.
-        """
+        """Drops a half-updated solution and takes in all samples again; update and errors as of `append_all`."""
         start, coefficients = self.points[:1], self.coefficients
         self._clear()
         for sample in samples:

@@ -116,10 +116,7 @@ def told_by(smoother: Smoother, state: State) -> Told:
 
 
 def joined_minimum(smoother: Smoother, track: Track, length: int | None = None) -> Joined | None:
-    """The minimum of a prepared track, by sections of about `length` samples.
-
-    Returns: None if a piece has no finite explanation by itself.
-    """
+    """The minimum of a prepared track, by sections of about `length` samples; None if a piece has none."""
     rough = copy.copy(smoother)
     rough.optimizer = replace(smoother.optimizer, tolerance=max(ROUGH, smoother.optimizer.tolerance))
     bounds = bounds_of(len(track), length or PIECE, OVERLAP)

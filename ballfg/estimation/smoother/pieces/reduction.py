@@ -25,10 +25,7 @@ from ballfg.state import STATE_DIM
 
 @dataclass(frozen=True)
 class Point:
-    """A point or a step of the ends and the coefficients of a section.
-
-    Attributes: first, last: (w,) states, followed by the tracker's biases.  coefficients: (p,) in their own units.
-    """
+    """A point or step: ends of a section (w,), which biases follow, and coefficients (p,) in their own units."""
 
     first: Array
     last: Array
@@ -147,10 +144,7 @@ class Reduction:
         )
 
     def covariances(self, ends: Array) -> Covariances:
-        """Covariances of all states and the coefficients, from the joint covariance of the ends and the coefficients.
-
-        Args: ends: (w + p + w, w + p + w) of the last state, the coefficients, the first state.
-        """
+        """Covariances of all states, from (w + p + w, w + p + w) of the last, the coefficients, the first."""
         w, p, triangle = self.width, self.coefficients, _triangle(ends)
         known, below = self.root.states.copy(), np.zeros_like(self.root.coefficients)
         known[-1] = 0.0
@@ -164,10 +158,7 @@ class Reduction:
 
 
 def _solved(rows: Array, right: Array) -> Array:
-    """Solves the rows of R (m, w, ..) for some states, with the state after them fixed.
-
-    Args: right: (m, w) or (m, w, k), the right side or k of them.
-    """
+    """Solves the rows of R (m, w, ..) for some states, with the one after them fixed; right (m, w) or (m, w, k)."""
     root, found = Root(rows, np.empty((0, rows.shape[2]))), np.empty_like(right)
     for k in np.ndindex(right.shape[2:]):
         states = right[..., *k].copy()

@@ -169,10 +169,7 @@ class Look:
 
 
 def bounds_of(samples: int, length: int, overlap: int) -> list[tuple[int, int]]:
-    """First sample of each part and the one after its last; neighbours share twice `overlap` samples.
-
-    Args: samples: of the track.  length: approximate length without shared samples.
-    """
+    """First sample of each part of some length and the one after its last; neighbours share 2 `overlap` samples."""
     parts = max(1, round(samples / length))
     cuts = np.linspace(0, samples, parts + 1).round().astype(int).tolist()
     return [(max(0, a - overlap), min(samples, b + overlap)) for a, b in pairwise(cuts)]

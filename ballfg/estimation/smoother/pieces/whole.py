@@ -63,10 +63,7 @@ def in_pieces(smoother: Smoother, track: Track, length: int | None = None) -> Es
 
 
 def sections(smoother: Smoother, track: Track, length: int | None = None) -> Iterator[Estimate] | None:
-    """The estimate of a long track, section by section, so that the caller need not hold all covariances.
-
-    Returns: consecutive estimates, with the status and the coefficients of the whole; None as for `in_pieces`.
-    """
+    """The estimate of a long track, section by section, with the whole's status; None as for `in_pieces`."""
     found = joined_minimum(smoother, track, length)
     return None if found is None else _sections(smoother, track, found)
 
@@ -171,10 +168,7 @@ def _section(
 
 
 def _assembled(track: Track, parts: Iterator[Estimate]) -> Estimate:
-    """One estimate from those of all sections, which it takes in one by one.
-
-    `np.zeros` takes memory for what is written only: `other_sides` is all but empty.
-    """
+    """One estimate from those of all sections; `np.zeros` of `other_sides` takes memory for few of them."""
     n, first = len(track), next(parts)
     p = first.cross_covariances.shape[2]
     states, covariances = np.empty((n, STATE_DIM)), np.empty((n, STATE_DIM, STATE_DIM))

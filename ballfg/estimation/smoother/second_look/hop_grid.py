@@ -124,10 +124,7 @@ class HopGrid:
         return np.diff(np.round((times - times[0]) / self.tick)).astype(np.int64)
 
     def evidence(self, times: Array, heights: Array, sigma: Array, levels: Array) -> Array:
-        """(k,) log likelihoods of samples if the surface is higher by each of k levels; -inf where it falls far behind.
-
-        Args: times, heights, sigma: as for `moments`.  levels: (k,) m.
-        """
+        """(k,) log likelihoods for levels (k,) m of the surface, -inf if far behind; arguments as of `moments`."""
         found, alive = np.full(len(levels), -np.inf), np.arange(len(levels))
         said, before = np.zeros(len(levels)), np.tile(self._first, (len(levels), 1))
         for k, ticks in enumerate([*self.ticks(times).tolist(), None]):
@@ -145,10 +142,7 @@ class HopGrid:
         return found
 
     def moments(self, times: Array, heights: Array, sigma: Array) -> HopMoments:
-        """Moments of the ball's motion from samples, by the forward-backward algorithm.
-
-        Args: times: (n,) s.  heights: (n,) m, measured above the surface.  sigma: (n,) m, their noise.
-        """
+        """Moments of the motion from (n,) s, heights (n,) m and sigma (n,) m, by the forward-backward algorithm."""
         steps = self.ticks(times)
         filtered = self._filtered(steps, heights, sigma)
         known, bounces = np.zeros((len(times), self._features.shape[1])), np.zeros(len(times) - 1)
@@ -185,10 +179,7 @@ class HopGrid:
         return found
 
     def _step(self, ticks: int) -> tuple[csr_array, csr_array]:
-        """(k, k) transition probabilities of the cells over some ticks; and these times the number of bounces.
-
-        The velocity is disturbed at the start of the step, and the first bounce scatters.
-        """
+        """(k, k) probabilities of the cells over some ticks, and these times the number of bounces on the way."""
         if ticks not in self._steps:
             pairs = itertools.product(POINTS, POINTS)
             parts = [self._moved(ticks * self.tick, push, kick, a * b) for (push, a), (kick, b) in pairs]
@@ -200,10 +191,7 @@ class HopGrid:
         return self._steps[ticks]
 
     def _moved(self, dt: float, push: float, kick: float, share: float) -> tuple[Index, Array, Array]:
-        """Target cells of all cells over dt s, four each, their probabilities and the bounces on the way.
-
-        Args: push, kick: standard deviations of the velocity and of the first bounce.  share: of both.
-        """
+        """Four target cells of all cells over dt s, their probabilities and bounces; push, kick: disturbances."""
         law, rests = self.law, self.speed == 0.0
         rise = self.rise + push * law.acceleration * np.sqrt(dt)
         speed = np.sqrt(rise**2 + 2.0 * law.gravity * self.height)

@@ -166,10 +166,7 @@ def with_low_hops(estimate: Estimate, hops: Sequence[LowHops], model: BallModel)
 
 
 def _jumps(estimate: Estimate, hops: LowHops, model: BallModel) -> Array:
-    """(n, 9) change of a state per m/s of vertical velocity, for a bounce that came earlier or later.
-
-    It is the jump of the nearest bounce in the estimate; for a resting ball, that of one more bounce.
-    """
+    """(n, 9) change per m/s of vertical velocity, for a bounce, the nearest one, that came earlier or later."""
     states = estimate.states[hops.first : hops.last + 1]
     before = states.copy()
     before[:, VZ] = -np.maximum(hops.known.speed, REST_SPEED)

@@ -70,10 +70,7 @@ def with_other_spins(solution: Solution, model: BallModel, optimizer: LevenbergM
 
 
 def rival_note(solution: Solution, covariance: Array) -> tuple[str, ...]:
-    """A note on another spin that explains the track nearly as well, if the covariance does not include it.
-
-    Args: covariance: (9, 9), of the track's first state.
-    """
+    """A note on another spin that explains the track nearly as well, unless the first covariance includes it."""
     if solution.rival is None:
         return ()
     spin = solution.minimum.values.states[0, SPIN]
@@ -113,10 +110,7 @@ def bounces_of(solution: Solution) -> list[Bounce]:
 
 @dataclass(frozen=True)
 class OtherSide:
-    """Initial values of a search on the other side of the slip `edge`, m/s, at which a ball begins to slide.
-
-    `slides` is True if the ball slides on this side.
-    """
+    """Start of a search beyond `edge`, m/s, the slip at which a ball begins to slide; it does so if `slides`."""
 
     values: Values
     interval: int
@@ -131,10 +125,7 @@ class OtherSide:
 
 
 def other_sides(values: Values, bounces: Sequence[Bounce], model: BallModel) -> Iterator[OtherSide | None]:
-    """Starts with another spin at each of some bounces: rolling in place of sliding, sliding in place of gripping.
-
-    Yields: one for each bounce; None for bounces without slip, or at which the ball never slides.
-    """
+    """Starts at each bounce with another spin: rolling for sliding, or the reverse; None without slip or slide."""
     at = np.array([bounce.interval for bounce in bounces], dtype=np.int64)
     known = np.tile(values.coefficients[: model_width(model)], (len(at), 1))
     before = np.concatenate((values.states[at], known), axis=1)
