@@ -90,8 +90,7 @@ class ConformalScales:
             method: name of the estimator.
         Raises: ValueError: if fewer than 9 tracks go on after the observed part.
         """
-        statuses: Counter[str] = Counter()
-        longer: list[tuple[Index, Array]] = []
+        statuses, longer = Counter[str](), list[tuple[Index, Array]]()
         for prediction in predictions:
             statuses[prediction.status.value] += 1
             if len(prediction.times):
@@ -187,15 +186,12 @@ def load_conformal(path: str | Path) -> ConformalScales:
         observe = float(content["observe"])
         statuses = {str(text): int(number) for text, number in content["statuses"].items()}
     except (TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise ValueError(
-            f"{path}: must be as it was written; {short_text(one_line(error))}. Calibrate again."
-        ) from error
+        got = short_text(one_line(error))
+        raise ValueError(f"{path}: must be as it was written; {got}. Calibrate again.") from error
     for key, table in tables.items():
         if tracks.ndim != 1 or table.shape != (len(tracks), 3):
-            raise ValueError(
-                f"{path}: {key} must have three numbers for each of the {tracks.size} bins; got {table.shape}. "
-                "Calibrate again."
-            )
+            rule = f"must have three numbers for each of the {tracks.size} bins"
+            raise ValueError(f"{path}: {key} {rule}; got {table.shape}. Calibrate again.")
     if not (tables["scales"] > 0.0).all():
         raise ValueError(f"{path}: scales must be positive; got {tables['scales'].min():g}. Calibrate again.")
     return ConformalScales(str(content["source"]), observe, str(content["method"]), tracks, **tables, statuses=statuses)
@@ -212,16 +208,14 @@ def check_calibration_tracks(calibration: Dataset | SightedDataset, dataset: Dat
             f"conformal must hold other tracks than those that are predicted; got {calibration.path} for both. "
             "Write one part of the tracks to a folder of its own."
         )
+    rule = ""
     if calibration.ball != dataset.ball:
-        raise ValueError(
-            f"conformal must hold tracks of the same ball, {dataset.ball}; got {calibration.ball} in "
-            f"{calibration.path}. Give calibration tracks of the same kind."
-        )
-    if not isclose(calibration.table, dataset.table, rel_tol=0.0, abs_tol=TABLE_TOLERANCE):
-        raise ValueError(
-            f"conformal must hold tracks above the same table, at {dataset.table:g} m; got {calibration.table:g} m in "
-            f"{calibration.path}. Give calibration tracks of the same kind."
-        )
+        rule = f"of the same ball, {dataset.ball}; got {calibration.ball}"
+    elif not isclose(calibration.table, dataset.table, rel_tol=0.0, abs_tol=TABLE_TOLERANCE):
+        rule = f"above the same table, at {dataset.table:g} m; got {calibration.table:g} m"
+    if rule:
+        remedy = "Give calibration tracks of the same kind."
+        raise ValueError(f"conformal must hold tracks {rule} in {calibration.path}. {remedy}")
 
 
 @dataclass(frozen=True)
@@ -233,6 +227,7 @@ class _Bin:
 
     @property
     def count(self) -> int:
+        """Number of tracks."""
         return int(self.track[-1]) + 1 if len(self.track) else 0
 
     @property

@@ -73,18 +73,14 @@ def find_table_extent(tracks: Iterable[Track], table_height: float, radius: floa
     if abs(radius / TABLE_TENNIS.radius - 1.0) > RADIUS_TOLERANCE:
         return None
     paths = [(track.seconds, track.positions) for track in tracks]
-    bounces = _gathered(_bounces(times, positions, table_height + radius, radius) for times, positions in paths)
+    bounces = np.concatenate([np.empty((0, 3)), *(_bounces(*path, table_height + radius, radius) for path in paths)])
     if len(bounces) < LEAST_BOUNCES:
         return None
     contact = float(np.median(bounces[:, Z]))
     scatter = 1.4826 * float(np.median(np.abs(bounces[:, Z] - contact)))
     depth = max(radius, 4.0 * scatter)
-    falls = _gathered(_falls(times, positions, contact, depth) for times, positions in paths)
+    falls = np.concatenate([_falls(*path, contact, depth) for path in paths])
     return _fit(bounces, falls) if len(falls) else None
-
-
-def _gathered(places: Iterable[Array]) -> Array:
-    return np.concatenate([np.empty((0, 3)), *places])
 
 
 def _bounces(times: Array, positions: Array, contact: float, radius: float) -> Array:
@@ -152,7 +148,9 @@ def _arcs(
 def _fit(bounces: Array, falls: Array) -> TableExtent | None:
     """The ends of the table that best divides bounces (b, 2+) m from falls (f, 2+) m."""
     sizes = ((TABLE_LENGTH, TABLE_WIDTH), (TABLE_WIDTH, TABLE_LENGTH))
-    middles = [(_grid(bounces[:, 0], size[0]), _grid(bounces[:, 1], size[1])) for size in sizes]
+    grids = [[np.arange(-side / 2, side / 2, GRID_STEP) for side in size] for size in sizes]
+    centre = np.median(bounces, axis=0)  # the median bounce lies on the table
+    middles = [(float(centre[0]) + along, float(centre[1]) + across) for along, across in grids]
     costs = [_contradicting(bounces, falls, *place, size) for place, size in zip(middles, sizes, strict=True)]
     least = min(float(cost.min()) for cost in costs)
     if least > MOST_CONTRADICTING * (len(bounces) + len(falls)):
@@ -168,11 +166,6 @@ def _fit(bounces: Array, falls: Array) -> TableExtent | None:
     return None if all(map(math.isinf, sides)) else TableExtent(sides, sigmas, len(bounces), len(falls))
 
 
-def _grid(bounces: Array, size: float) -> Array:
-    """Places m of the table's centre along an axis, such that the median bounce lies on it."""
-    return float(np.median(bounces)) + np.arange(-size / 2, size / 2, GRID_STEP)
-
-
 def _contradicting(bounces: Array, falls: Array, x: Array, y: Array, size: tuple[float, float]) -> Array:
     """(x, y) number of balls that contradict a table of a size (m) with its centre there; in part near an edge."""
 
@@ -184,8 +177,7 @@ def _contradicting(bounces: Array, falls: Array, x: Array, y: Array, size: tuple
         ]
 
     (on_x, on_y), (past_x, past_y) = inside(bounces, EDGE_TOLERANCE), inside(falls, 0.0)
-    counted: Array = len(bounces) - on_x @ on_y.T + past_x @ past_y.T
-    return counted
+    return np.asarray(len(bounces) - on_x @ on_y.T + past_x @ past_y.T)
 
 
 def _side(places: Array, weight: Array, falls: Array, sign: float) -> tuple[float, float]:

@@ -151,6 +151,7 @@ class _Run:
         self.velocities = window_velocities(track.times, track.positions)
         self.flight_noise = owner.settings.process.flight(np.diff(track.times))
         self.means = coefficient_means(owner.model, owner.settings)
+        self.own_sigmas = np.array(list(owner.settings.coefficients.values()))
         self.bias_sigmas = self.settings.bias_sigmas[: 3 * self.settings.has_memory]
         self.fading = bias_step(np.diff(track.times), self.bias_sigmas, self.settings.memory_time)
         self.H = np.concatenate((np.eye(3, STATE_DIM + len(self.means)), np.eye(3, len(self.bias_sigmas))), axis=1)
@@ -158,10 +159,12 @@ class _Run:
         context = Context(track, owner.model, owner.settings, self.sigma)
         beside = [one for one in track.observations if not one.locates]
         refuse_unknowns(beside, owner.settings, owner.name)
-        self.beside = [(one, one.batch(context)) for one in beside]
-        self.innovations = {one.name: np.full((len(batch), batch.dim), np.nan) for one, batch in self.beside}
+        self.beside = {one: one.batch(context) for one in beside}
+        self.innovations = {one.name: np.full((len(batch), batch.dim), np.nan) for one, batch in self.beside.items()}
         self.record = FilterRecord(len(track), self.H.shape[1])
-        self.record.least = self._least()
+        position = LEAST_SHARE * float(self.sigma.min()) / np.sqrt(len(track))
+        shares = LEAST_SHARE * np.append(self.own_sigmas, self.bias_sigmas)
+        self.record.least = np.concatenate((np.full(3, position), np.full(6, LEAST_MOTION), shares))
         for k in range(len(track)):
             self.record.measurement_noise[k] = self._measurement_noise(k, self.velocities[k])
         calm = np.errstate(over="ignore", invalid="ignore", divide="ignore")
@@ -178,16 +181,9 @@ class _Run:
     def prior(self, i: int) -> tuple[Array, Array]:
         """The prior at sample i from that sample alone: mean (d,) and covariance (d, d)."""
         known = spin_start(self.settings.spin_label(self.track), self.settings)
-        mean = np.concatenate(
-            (self.track.positions[i], np.zeros(3), known.spin, self.means, np.zeros(len(self.bias_sigmas)))
-        )
-        sigma = (
-            self.sigma[i],
-            np.full(3, self.settings.velocity_prior),
-            known.sigmas,
-            np.array(list(self.settings.coefficients.values())),
-            self.bias_sigmas,
-        )
+        none, speed = np.zeros(len(self.bias_sigmas)), np.full(3, self.settings.velocity_prior)
+        mean = np.concatenate((self.track.positions[i], np.zeros(3), known.spin, self.means, none))
+        sigma = (self.sigma[i], speed, known.sigmas, self.own_sigmas, self.bias_sigmas)
         covariance = np.diag(np.concatenate(sigma) ** 2)
         covariance[SPIN, SPIN] = known.covariance
         covariance[POSITION, POSITION] = self._measurement_noise(i, self.velocities[i])
@@ -208,7 +204,7 @@ class _Run:
                 continue
             before, measured = (record.mean[k - 1], record.covariance[k - 1]), SampleMeasurement()
             if record.quality[k] != Quality.OUTLIER:
-                measured = measured_at(self.track, self.sigma, dict(self.beside), k)
+                measured = measured_at(self.track, self.sigma, self.beside, k)
 
             def bounced(count: int, k: int = k) -> bool:
                 return any(i in record.contacts for i in range(k - count, k))
@@ -218,13 +214,6 @@ class _Run:
                 found[k] = state
         return found
 
-    def _least(self) -> Array:
-        """(d,) least standard deviations, against rounding."""
-        position = LEAST_SHARE * float(self.sigma.min()) / np.sqrt(len(self.track))
-        coefficients = LEAST_SHARE * np.array(list(self.settings.coefficients.values()))
-        own = np.concatenate((np.full(3, position), np.full(6, LEAST_MOTION), coefficients))
-        return np.concatenate((own, LEAST_SHARE * self.bias_sigmas))
-
     def _measurement_noise(self, k: int, velocity: Array) -> Array:
         """(3, 3) m^2, of a sample's white error and of its stamp's error at a velocity (3,) m/s."""
         return np.diag(self.sigma[k] ** 2) + stamp_covariance(self.settings, velocity)
@@ -232,9 +221,8 @@ class _Run:
     def _filter(self) -> None:
         """Filters all samples in turn; after four rejected ones it goes back to before the first, with a hit there."""
         n, record = len(self.track), self.record
-        ball = self._begin()
+        ball, rejected = self._begin(), list[int]()
         k = record.start + 1
-        rejected: list[int] = []
         while k < n:
             self._predict(ball, k)
             if not (np.isfinite(ball.x).all() and np.isfinite(ball.P).all()):
@@ -246,11 +234,15 @@ class _Run:
                 rejected = []
             else:
                 rejected.append(k)
-            if len(rejected) == REJECTED_FOR_HIT:
-                k, rejected = rejected[0], []
-                self._hit(ball, k)
-            else:
+            if len(rejected) < REJECTED_FOR_HIT:
                 k += 1
+                continue
+            k, rejected = rejected[0], []  # the flight restarts at the first good sample from there on
+            first, second = self._first_pair(k)
+            self.skipped.update(range(k, first), range(first + 1, second))
+            record.hits.append(first - 1)
+            self.velocities = window_velocities(self.track.times, self.track.positions, record.hits)
+            ball.x, ball.P = record.mean[k - 1].copy(), record.covariance[k - 1].copy()
 
     def _begin(self) -> BallFilter:
         """The filter at its first sample, or at the window's end."""
@@ -278,16 +270,6 @@ class _Run:
         self._correct_beside(ball, start)
         self._store(ball, start, used=True)
         return ball
-
-    def _hit(self, ball: BallFilter, since: int) -> None:
-        """Goes back to before sample `since` with a hit; the flight restarts at the first good sample from there on."""
-        first, second = self._first_pair(since)
-        self.skipped.update(range(since, first))
-        self.skipped.update(range(first + 1, second))
-        self.record.hits.append(first - 1)
-        self.velocities = window_velocities(self.track.times, self.track.positions, self.record.hits)
-        ball.x = self.record.mean[since - 1].copy()
-        ball.P = self.record.covariance[since - 1].copy()
 
     def _first_pair(self, first: int) -> tuple[int, int]:
         """The first two good samples of a flight from sample `first` on; the filter uses them without a gate."""
@@ -350,7 +332,7 @@ class _Run:
         At the first sample a speed, whose Jacobian is zero without a velocity, is skipped with an innovation of NaN.
         """
         begins = k == self.record.start
-        for observation, batch in self.beside:
+        for observation, batch in self.beside.items():
             for row in observation.filter_rows(k):
                 one = batch.select(np.array([row]))
                 whitened = ball.correct_by(one, self.settings.find_events or begins)
