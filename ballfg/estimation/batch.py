@@ -1,5 +1,6 @@
 """Runs a function over a stream of tracks or a few long tasks, in one process, several, or on a cluster."""
 
+import operator
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -95,9 +96,5 @@ def do_all(tasks: Sequence[Callable[[], R]], jobs: int) -> list[R]:
     if others is None or len(tasks) < 2:
         return [task() for task in tasks]
     if others.helped:
-        return shared(_done, tasks, others)
-    return [result for _, result in sorted(finished(_done, tasks, others), key=lambda pair: pair[0])]
-
-
-def _done(task: Callable[[], R]) -> R:
-    return task()
+        return shared(operator.call, tasks, others)
+    return [result for _, result in sorted(finished(operator.call, tasks, others), key=lambda pair: pair[0])]

@@ -144,28 +144,21 @@ def _block(
     counted = [track.since_first() for track in tracks]
     parts = [track.opening(observe(track) if callable(observe) else observe) for track in counted]
     estimates = [estimator.estimate(part) for part in parts]
-    made = _predict_block(estimator, propagator, estimates, counted, horizon)
+    made: dict[int, TrackPrediction] = {}
+    owners = [estimator.of(track) for track in counted]
+    for owner in dict.fromkeys(owners):  # tracks with the same coefficients are predicted together
+        rows = [i for i, own in enumerate(owners) if own is owner]
+        alike = _predict_alike(owner, propagator, [estimates[i] for i in rows], [counted[i] for i in rows], horizon)
+        made.update(zip(rows, alike, strict=True))
     found = []
-    for one, track in zip(made, tracks, strict=True):  # with the stamps of the data
+    for number, track in enumerate(tracks):  # with the stamps of the data
+        one = made[number]
         seen = len(one.estimate.times)
         estimate, times = one.estimate.dated(track.times[:seen]), track.times[seen : seen + len(one.times)]
         if not estimator.model.variations:  # else the world of each estimate is that of its track
             estimate = replace(estimate, world=None)
         found.append(replace(one, times=times, estimate=estimate))
     return found
-
-
-def _predict_block(
-    estimator: Estimator, propagator: Propagator, estimates: list[Estimate], tracks: list[Track], horizon: float
-) -> Iterator[TrackPrediction]:
-    """Predictions in the order of the tracks; tracks with the same coefficients are predicted together."""
-    owners = [estimator.of(track) for track in tracks]
-    found: dict[int, TrackPrediction] = {}
-    for owner in dict.fromkeys(owners):
-        rows = [i for i, own in enumerate(owners) if own is owner]
-        alike = _predict_alike(owner, propagator, [estimates[i] for i in rows], [tracks[i] for i in rows], horizon)
-        found.update(zip(rows, alike, strict=True))
-    yield from (found[i] for i in range(len(tracks)))
 
 
 def _predict_alike(

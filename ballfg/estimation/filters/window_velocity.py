@@ -1,7 +1,7 @@
 """Fits velocities to windows of a few samples, as a start for estimates and for the direction of a launch."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ballfg.arrays import Array
 from ballfg.state import STANDARD_GRAVITY, Z
@@ -26,8 +26,10 @@ def window_velocities(times: Array, positions: Array, breaks: ArrayLike = ()) ->
     n = len(times)
     if n == 1:
         return np.zeros((1, 3))
-    begin, end = _segment_bounds(n, np.asarray(breaks, dtype=np.int64))
-    at = np.arange(n)
+    at, cuts = np.arange(n), np.asarray(breaks, dtype=np.int64) + 1
+    first, stop = np.zeros(n + 1, dtype=np.int64), np.full(n + 1, n)
+    first[cuts] = stop[cuts] = cuts
+    begin, end = np.maximum.accumulate(first[:-1]), np.minimum.accumulate(stop[:0:-1])[::-1]
     low = np.maximum(np.minimum(at - WINDOW // 2, end - WINDOW), begin)
     window = low[:, None] + np.arange(WINDOW)
     weight = (window < end[:, None]).astype(np.float64)  # (n, 5)
@@ -41,24 +43,8 @@ def window_velocities(times: Array, positions: Array, breaks: ArrayLike = ()) ->
     alone = count[:, 0] == 1
     velocities = np.einsum("nk,nkd->nd", centred, p) / np.where(alone, 1.0, scatter)[:, None]
     if alone.any():
-        velocities[alone] = _neighbour_slopes(times, positions)[alone]
+        slopes = np.diff(positions, axis=0) / np.diff(times)[:, None]
+        padded = np.concatenate((slopes[:1], slopes, slopes[-1:]))
+        velocities[alone] = ((padded[1:] + padded[:-1]) / 2)[alone]
     speed = np.linalg.norm(velocities, axis=1, keepdims=True)
     return np.asarray(velocities * (FASTEST_BALL / np.maximum(speed, FASTEST_BALL)))
-
-
-def _segment_bounds(n: int, breaks: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """(n,) first sample of each sample's segment, and (n,) the one after its last."""
-    edges = np.zeros(n + 1, dtype=np.int64)
-    edges[breaks + 1] = breaks + 1
-    begin = np.maximum.accumulate(edges[:-1])
-    edges = np.full(n + 1, n)
-    edges[breaks + 1] = breaks + 1
-    end = np.minimum.accumulate(edges[:0:-1])[::-1]
-    return begin, end
-
-
-def _neighbour_slopes(times: Array, positions: Array) -> Array:
-    """(n, 3) mean of the slopes to the samples before and after; at the ends the single slope."""
-    slopes = np.diff(positions, axis=0) / np.diff(times)[:, None]
-    padded = np.concatenate((slopes[:1], slopes, slopes[-1:]))
-    return np.asarray((padded[1:] + padded[:-1]) / 2)

@@ -59,7 +59,13 @@ class Reading(Observation):
 
     def __init__(self, state: ArrayLike, values: ArrayLike, sigma: ArrayLike, delay: ArrayLike | None = None) -> None:
         m, dim = np.size(state), len(self.columns)
-        self.state: Index = _checked_index(self.name, state).reshape(m)
+        index = check_array(f"state of '{self.name}'", state)
+        if not np.isfinite(index).all() or (index < 0.0).any() or (index % 1.0).any():
+            raise ValueError(
+                f"state of '{self.name}' must be indices of samples, whole numbers from 0 on; got "
+                f"{shown(index.tolist())}. Make readings with times of their own by the class's method at."
+            )
+        self.state: Index = index.astype(np.int64).reshape(m)
         given = check_array(f"values of '{self.name}'", values)
         given = given[None] if given.ndim == 0 and np.ndim(state) == 0 else given  # one reading, as a plain number
         if given.shape not in ((m, dim), (m,) if dim == 1 else (m, dim)):
@@ -152,17 +158,6 @@ class Reading(Observation):
             raise ValueError(f"sigma of '{self.name}' must be one number a reading in a table; got several.")
         values = dict(zip(self.columns, self.values.T, strict=True))
         return {"t": track.times[self.state] + self.delay, **values, "sigma": self.sigma[:, 0]}
-
-
-def _checked_index(name: str, state: ArrayLike) -> Index:
-    """The indices of samples as whole numbers. Raises: ValueError: for a time in place of an index."""
-    given = check_array(f"state of '{name}'", state)
-    if not np.isfinite(given).all() or (given < 0.0).any() or (given % 1.0).any():
-        raise ValueError(
-            f"state of '{name}' must be indices of samples, whole numbers from 0 on; got {shown(given.tolist())}. Make "
-            "readings with times of their own by the class's method at."
-        )
-    return given.astype(np.int64)
 
 
 class RadarSpeed(Reading):

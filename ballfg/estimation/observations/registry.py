@@ -82,19 +82,17 @@ def tables_of_readings(folder: str | PathLike[str]) -> dict[str, type[Observatio
     sorts = {sort.file: sort for sort in OBSERVATIONS.values() if sort.file is not None}
     found = {name: sort for name, sort in sorts.items() if (Path(folder) / name).is_file()}
     for path in sorted(Path(folder).glob("*.csv")):
-        if path.name not in found and path.is_file() and _has_readings(path):
+        if path.name in found or not path.is_file():
+            continue
+        with path.open("rb") as file:
+            header = file.readline(LONGEST_HEADER).removeprefix(b"\xef\xbb\xbf")
+        if {KEY.encode(), b"t", b"sigma"} <= {cell.strip().strip(b'"') for cell in header.split(b",")}:
             raise ValueError(
                 f"{path} must belong to an observation; none that is known reads it: "
                 f"{', '.join(f'{file} ({sort.name})' for file, sort in sorts.items())}. "
                 "Name the file of its class with --observations-file, register the class, or move the table away."
             )
     return found
-
-
-def _has_readings(path: Path) -> bool:
-    with path.open("rb") as file:
-        header = file.readline(LONGEST_HEADER).removeprefix(b"\xef\xbb\xbf")
-    return {KEY.encode(), b"t", b"sigma"} <= {cell.strip().strip(b'"') for cell in header.split(b",")}
 
 
 def write_readings(folder: str | PathLike[str], tracks: Iterable[Track]) -> list[Path]:

@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ballfg.arrays import Array, Index
+from ballfg.arrays import Array
 from ballfg.estimation.online.events import SIGMA_FACTOR
 from ballfg.estimation.online.state import Sample
 from ballfg.estimation.online.windows.interval import without_bias
@@ -55,7 +55,14 @@ def final_estimate(
     if not frozen:
         return late
     joints = np.array([f.joint for f in frozen])
-    contacts, hits, quality = _events_of(frozen)
+    contacts, hits = list[Contact](), list[int]()
+    for k, (before, state) in enumerate(pairwise(frozen)):
+        motion, start = state.sample.motion, before.sample.time
+        if motion.linked:
+            contacts += [Contact(k, start + t, h) for t, h in zip(motion.times, motion.heights, strict=True)]
+        if motion.hit or not motion.linked:
+            hits.append(k)
+    quality = np.array([int(np.argmin(np.abs(SIGMA_FACTOR - f.sample.factor))) for f in frozen], dtype=np.int8)
     return replace(
         late,
         times=track.times,
@@ -64,20 +71,6 @@ def final_estimate(
         other_sides=np.concatenate((np.zeros((len(frozen), STATE_DIM, STATE_DIM)), late.other_sides)),
         cross_covariances=np.concatenate((joints[:, :STATE_DIM, STATE_DIM:], late.cross_covariances)),
         contacts=(*contacts, *(replace(c, interval=c.interval + first) for c in late.contacts)),
-        hits=np.concatenate((hits, late.hits + first)),
+        hits=np.concatenate((np.array(hits, dtype=np.int64), late.hits + first)),
         quality=np.concatenate((quality, late.quality)),
     )
-
-
-def _events_of(frozen: Sequence[Frozen]) -> tuple[list[Contact], Index, NDArray[np.int8]]:
-    """Contacts, hits and qualities of the samples that left the window."""
-    contacts, hits = [], []
-    for k, state in enumerate(frozen):
-        motion = state.sample.motion
-        if k and motion.linked:
-            start = frozen[k - 1].sample.time
-            contacts += [Contact(k - 1, start + t, h) for t, h in zip(motion.times, motion.heights, strict=True)]
-        if k and (motion.hit or not motion.linked):
-            hits.append(k - 1)
-    quality = np.array([int(np.argmin(np.abs(SIGMA_FACTOR - f.sample.factor))) for f in frozen], dtype=np.int8)
-    return contacts, np.array(hits, dtype=np.int64), quality

@@ -70,7 +70,9 @@ class SightingStream:
         stamps.append(true)
         self._last = true
         ray = Rays.of(row, np.array([true]), tuple(self.cameras.values()))
-        self._rays = ray if self._rays is None else self._rays.joined(ray, MOST_RAYS, self._period(true))
+        seen = [s for s in self._stamps.values() if len(s) > 1 and true - s[-1] < FORGET]
+        period = max((float(np.median(np.diff(s))) for s in seen), default=0.0)  # of the slowest that sees the ball
+        self._rays = ray if self._rays is None else self._rays.joined(ray, MOST_RAYS, period)
         newest, where = self._newest, np.zeros(1, dtype=np.int64)
         since = np.inf if newest is None else true - newest.time
         delay = np.array([since if since <= SAME_MOMENT else 0.0])
@@ -85,11 +87,6 @@ class SightingStream:
             return [], sighting
         newest.measurements.append(sighting)
         return self._placed(), None
-
-    def _period(self, now: float) -> float:
-        """s, of the slowest camera that sees the ball."""
-        seen = [s for s in self._stamps.values() if len(s) > 1 and now - s[-1] < FORGET]
-        return max((float(np.median(np.diff(s))) for s in seen), default=0.0)
 
     def _placed(self) -> list[Sample]:
         """The samples that were held back, with positions, once the newest one's is determined."""

@@ -187,8 +187,12 @@ class ChainWindow(StreamWindow):
             dt = np.array([self.samples[k + 1].time - sample.time])
             link = BiasFactors(np.array([k]), dt, self.settings.bias_sigmas, self.settings.memory_time)
             pieces.append((link, link.compute(slice(None), (self._seen(link, k), self._seen(link, k + 1)))))
-        if k == 0:
-            pieces += self._of_the_beginning()
+        if k == 0 and self._summary is not None:
+            points = (self.theta[:1], self.coefficient_theta[None])
+            pieces.append((self._summary, self._summary.compute(slice(None), points)))
+        elif k == 0 and self.p:
+            prior = coefficient_prior(self._own_means, self._own_sigmas)
+            pieces.append((prior, prior.compute(slice(None), (self.coefficient_theta[None],))))
         written = np.zeros((sum(batch.dim for batch, _ in pieces), self._columns))
         row = 0
         for batch, (residual, blocks) in pieces:
@@ -206,16 +210,6 @@ class ChainWindow(StreamWindow):
     def _measured(self, k: int) -> list[FactorBatch]:
         """The factor of a state's position, if it was measured."""
         return [self._position_batch(self.samples[k], k)] if self.samples[k].measured else []
-
-    def _of_the_beginning(self) -> list[tuple[FactorBatch, Answer]]:
-        """The prior information on the first state and the coefficients."""
-        if self._summary is not None:
-            points = (self.theta[:1], self.coefficient_theta[None])
-            return [(self._summary, self._summary.compute(slice(None), points))]
-        if not self.p:
-            return []
-        prior = coefficient_prior(self._own_means, self._own_sigmas)
-        return [(prior, prior.compute(slice(None), (self.coefficient_theta[None],)))]
 
     def _seen(self, batch: FactorBatch, k: int) -> Array:
         """(1, d) the inputs of a batch at state k."""
