@@ -182,11 +182,9 @@ class Observation(ABC):
 def unknowns_of(observations: tuple[Observation, ...], settings: Settings) -> Unknowns:
     """The unknowns of several observations, one after the other."""
     found = [observation.unknowns(settings) for observation in observations]
+    parts = ([getattr(one, name) for one in found] for name in ("means", "sigmas", "origins"))
     return Unknowns(
-        tuple(name for one in found for name in one.names),
-        np.concatenate([np.zeros(0), *(one.means for one in found)]),
-        np.concatenate([np.zeros(0), *(one.sigmas for one in found)]),
-        np.concatenate([np.zeros(0), *(one.origins for one in found)]),
+        tuple(name for one in found for name in one.names), *(np.concatenate([np.zeros(0), *part]) for part in parts)
     )
 
 

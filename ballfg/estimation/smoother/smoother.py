@@ -217,10 +217,8 @@ class Smoother(Estimator):
         track, values = problem.track, solution.minimum.values
         n, p, covariances = len(track), len(values.coefficients), known
         if covariances is None:  # each state by itself
-            sigmas, (_, states) = (
-                problem.coefficient_sigmas,
-                measured_only(track.positions, problem.sigma, self.settings),
-            )
+            sigmas = problem.coefficient_sigmas
+            _, states = measured_only(track.positions, problem.sigma, problem.settings)
             covariances = Covariances(states, np.diag(sigmas**2), np.zeros((n, STATE_DIM, p)))
         status = Status.OK if minimum.convergence in AT_MINIMUM else Status.NOT_CONVERGED
         if minimum.convergence is Convergence.NOT_FINITE or minimum.step is None:
