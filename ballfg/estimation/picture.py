@@ -47,18 +47,8 @@ def predicted(prediction: TrackPrediction) -> Figure:
     for kind, time in events:
         x, y, z = (float(np.interp(time, times, path)) for path in estimate.states[:, :3].T)
         marks.append(Mark(kind, time, (x, y, z)))
-    return by_axis(
-        ShownShot(
-            prediction.name,
-            prediction.times,
-            prediction.measured,
-            np.full(prediction.measured.shape, np.nan),
-            times,
-            estimate.states,
-            estimate.sigmas,
-            prediction.times,
-            prediction.positions,
-            prediction.sigmas,
-            tuple(marks),
-        )
-    )
+    unknown = np.full(prediction.measured.shape, np.nan)
+    seen = (times, estimate.states, estimate.sigmas)
+    ahead = (prediction.times, prediction.positions, prediction.sigmas)
+    measured = (prediction.times, prediction.measured, unknown)
+    return by_axis(ShownShot(prediction.name, *measured, *seen, *ahead, tuple(marks)))
