@@ -10,7 +10,7 @@ fit, those at the camera best.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Final
 
 import numpy as np
@@ -90,9 +90,9 @@ class Rays:
 
     def joined(self, later: Rays, most: int, period: float) -> Rays:
         """These rays and later ones, the newest `most` of them, with a new period, s."""
-        arrays = (f.name for f in fields(self) if f.name != "period")
-        both = (np.concatenate((getattr(self, name), getattr(later, name)))[-most:] for name in arrays)
-        return Rays(*both, period=period)
+        arrays = [f.name for f in fields(self) if f.name != "period"]
+        both = {name: np.concatenate((getattr(self, name), getattr(later, name)))[-most:] for name in arrays}
+        return replace(self, **both, period=period)
 
 
 def rough_path(rays: Rays, moments: Array, windows: Sequence[tuple[float, float]] = AROUND) -> Path:
