@@ -168,7 +168,8 @@ def assembled(
 ) -> Segmentation:
     """The segmentation by a chain of events, with hits at contacts; times (n,) s and positions (n, 3) m."""
     n = len(times)
-    contacts = [Contact(e.index, e.time, e.height) for e in events if e.kind is EventKind.CONTACT]
+    met = (e for e in events if e.kind is EventKind.CONTACT)
+    contacts = [Contact(e.index, e.time, e.height) for e in met if e.height is not None]
     hits, quality = intervals_of(events, *BREAKS), quality_of(events, n, settings.shift_level)
     hits += hits_at_contacts(times, positions, quality <= Quality.WIDE, contacts, hits, ball, settings)
     restarts = np.array(intervals_of(events, EventKind.RESTART), dtype=np.int64)

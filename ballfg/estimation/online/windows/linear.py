@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Self
+from typing import Any, Self
 
 import gtsam
 import numpy as np
@@ -23,7 +23,7 @@ def linear_factor(
 
     Args: blocks: (r, w) each, A_k whitened.  right: (r,) b, whitened.  point: p_k of all states; None: zero.
     """
-    pairs = [part for pair in zip(keys, blocks, strict=False) for part in pair]
+    pairs: list[Any] = [part for pair in zip(keys, blocks, strict=False) for part in pair]
     factor = gtsam.JacobianFactor(*pairs, right, gtsam.noiseModel.Unit.Create(len(right)))
     if point is None:
         point = gtsam.Values()

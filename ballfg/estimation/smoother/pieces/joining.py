@@ -148,9 +148,10 @@ def _search(smoother: Smoother, states: list[State]) -> tuple[Sequence[State], C
     last, share = np.full(len(states), np.inf), np.ones(len(states))
     for number in range(1, ROUNDS + 1):
         points = [Point.of(one.values) for one in told]
-        chain = solve_chain([one.ends for one in told], points, priors, anchor)
-        if chain is None:
+        solved = solve_chain([one.ends for one in told], points, priors, anchor)
+        if solved is None:
             return None
+        chain = solved
         steps = [chain.target(k).since(point) for k, point in enumerate(points)]
         length = np.array([one.length(step) for one, step in zip(told, steps, strict=True)])
         # near enough are sections that need no step, or none after this one if lengths fall at the same rate

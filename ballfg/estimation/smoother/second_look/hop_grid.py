@@ -91,8 +91,9 @@ class HopMoments:
 
     def select(self, inside: slice) -> HopMoments:
         """The moments of some of the samples."""
-        at_samples = (self.mean, self.second, self.higher, self.speed, self.resting)
-        return HopMoments(*(part[inside] for part in at_samples), self.bounces[inside.start : inside.stop - 1])
+        whole = (self.mean, self.second, self.higher, self.speed, self.resting)
+        mean, second, higher, speed, resting = (part[inside] for part in whole)
+        return HopMoments(mean, second, higher, speed, resting, self.bounces[inside.start : inside.stop - 1])
 
 
 class HopGrid:

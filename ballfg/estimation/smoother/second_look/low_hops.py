@@ -160,7 +160,8 @@ def with_low_hops(estimate: Estimate, hops: Sequence[LowHops], model: BallModel)
         more, jump = _beyond(spread, own), _jumps(estimate, one, model)
         jump[:, VERTICAL] = 0.0
         added = more[:, 1, 1, None, None] * jump[:, :, None] * jump[:, None, :]
-        added[:, *np.ix_(VERTICAL, VERTICAL)] = more
+        rows, columns = np.ix_(VERTICAL, VERTICAL)
+        added[:, rows, columns] = more
         covariances[inside] += added
     return replace(estimate, covariances=covariances)
 
