@@ -19,12 +19,9 @@ from typing import Any, Final
 
 from ballfg.files.own_folder import PRIVATE, state_folder
 
-MARK: Final = ".ballfg-"
-"""Prefix of the names of hidden folders."""
-NEW, OLD = "new", "old"
-"""Entries of a hidden folder: the new folder, and the one that it replaces."""
-PATIENCE: Final = 0.3
-"""s after which a lock counts as that of a writer."""
+MARK: Final = ".ballfg-"  # prefix of the names of hidden folders
+NEW, OLD = "new", "old"  # entries of a hidden folder: the new folder, and the one that it replaces
+PATIENCE: Final = 0.3  # s after which a lock counts as that of a writer
 _DISK: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
 _records: ContextVar[dict[Path, Path | None]] = ContextVar("records")
 """Results and hidden folders that this line of work holds: the files of the locks, None for a result that could not be

@@ -13,13 +13,10 @@ import yaml
 from ballfg.checks import shown, type_name
 
 MAX_BYTES: Final = 16_000_000
-MAX_NODES: Final = 250_000
-"""Largest number of values and keys with all aliases expanded; they take 2 s."""
+MAX_NODES: Final = 250_000  # largest number of values and keys with all aliases expanded; they take 2 s
 MAX_DEPTH: Final = 40
-MAX_DIGITS: Final = 100
-"""Largest number of characters in a number."""
-MAX_KEY: Final = 1000
-"""Largest number of characters in a key, which messages quote in full."""
+MAX_DIGITS: Final = 100  # largest number of characters in a number
+MAX_KEY: Final = 1000  # largest number of characters in a key, which messages quote in full
 _TAG: Final = "tag:yaml.org,2002:"
 _NUMBERS: Final = (f"{_TAG}int", f"{_TAG}float")
 _PARSER: Final = getattr(yaml, "CSafeLoader", yaml.SafeLoader)

@@ -17,8 +17,7 @@ from ballfg.files.whole_file import check_parent, flush
 P = ParamSpec("P")
 T = TypeVar("T")
 
-DEEPEST: Final = 100
-"""Largest depth of folders in a result."""
+DEEPEST: Final = 100  # largest depth of folders in a result
 
 
 @contextmanager

@@ -10,10 +10,8 @@ from ballfg.tracks import TABLE_TENNIS, Ball, Track
 from ballfg.tracks.info import TENNIS
 
 BALLS: Final = {"table-tennis": TABLE_TENNIS, "tennis": TENNIS}
-_TENNIS_DRAG: Final = 0.045
-"""1/m; halfway, in ratio, between the drags of the two balls."""
-_SURE_WINDOWS: Final = 30
-"""Number of flight parts from which their drag distinguishes the balls."""
+_TENNIS_DRAG: Final = 0.045  # 1/m; halfway, in ratio, between the drags of the two balls
+_SURE_WINDOWS: Final = 30  # number of flight parts from which their drag distinguishes the balls
 
 
 def ball_of(choices: Choices, frame: Frame) -> tuple[Ball, Guess]:

@@ -9,10 +9,8 @@ from ballfg.importing.fall import AXES, LENGTHS, TIMES
 
 ROLES: Final = ("t", "frame", "trajectory", "x", "y", "z", "sigma_x", "sigma_y", "sigma_z")
 """Possible roles of a column."""
-MAX_WHAT: Final = 900
-"""Largest number of characters of an open question in a message."""
-MAX_CHOICE: Final = 240
-"""Largest number of characters of a choice in it, for three column names of usual length."""
+MAX_WHAT: Final = 900  # largest number of characters of an open question in a message
+MAX_CHOICE: Final = 240  # largest number of characters of a choice in it, for three column names of usual length
 
 
 class UndecidedError(ValueError):

@@ -15,11 +15,9 @@ from ballfg.importing.stamps import as_stamps
 RATES: Final = ("rate", "fps", "frame_rate", "framerate", "hz", "sampling_rate", "frequency")
 """Names of a constant that is the number of frames per second."""
 UNITS: Final = ("unit", "units", "length_unit", "position_unit")
-_REGULAR: Final = 0.3
-"""Largest median deviation of the steps of a time column, in median steps; coordinates vary more."""
+_REGULAR: Final = 0.3  # largest median deviation of the steps of a time column, in median steps; coordinates vary more
 _FORWARD: Final = 0.9
-_PIECES: Final = 0.2
-"""Largest number of changes, per row, of a column with the names of trajectories."""
+_PIECES: Final = 0.2  # largest number of changes, per row, of a column with the names of trajectories
 
 
 @dataclass(frozen=True)

@@ -10,16 +10,12 @@ from ballfg.arrays import Array
 from ballfg.importing.choices import Choices, Guess, UndecidedError
 from ballfg.importing.fall import AXES, LENGTHS, TIMES, Scale, odds, scales
 
-_LIKELY: Final = 2.0
-"""Least odds of the best reading against the next."""
+_LIKELY: Final = 2.0  # least odds of the best reading against the next
 _SURE: Final = 4.0
-_AGAINST: Final = 4.0
-"""Odds against a stated unit from which it is doubted."""
-_LEAST_SCORE: Final = 0.12
-"""Least score of a falling ball."""
+_AGAINST: Final = 4.0  # odds against a stated unit from which it is doubted
+_LEAST_SCORE: Final = 0.12  # least score of a falling ball
 RATES: Final = (24, 25, 30, 50, 60, 90, 100, 120, 125, 150, 180, 200, 240, 250, 300, 360, 400, 480, 500, 600, 960, 1000)
 """Hz, of usual cameras."""
-
 _DECIMAL: Final = ("m", "cm", "mm")
 
 TURNS: Final = {

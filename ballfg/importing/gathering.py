@@ -17,8 +17,7 @@ from ballfg.importing.frame import Frame, likely_rate
 from ballfg.importing.shots import GAP, GAP_STEPS, Counts, SourceShot, cut, split_at_gaps
 from ballfg.tracks.track import Label
 
-MOST_SHOTS: Final = 60
-"""Number of shots for the determination of units, evenly over the source."""
+MOST_SHOTS: Final = 60  # number of shots for the determination of units, evenly over the source
 _INTERRUPTED: Final = 0.5
 """Share of files or recordings with gaps, above which a gap ends a shot instead of hiding a ball."""
 
@@ -67,9 +66,7 @@ def understood(tables: Sequence[RawTable], choices: Choices) -> tuple[list[RawTa
 def shots_of(tables: Sequence[RawTable], roles: Roles, choices: Choices, counts: Counts) -> list[SourceShot]:
     """The shots of all tables, in the source's units, with unique names.
 
-    Raises:
-        UndecidedError: no times and no rate; the message has a fitting rate.
-        ValueError: no shot with two samples.
+    Raises: UndecidedError: no times and no rate; the message has a fitting rate. ValueError: no shot with two samples.
     """
     try:
         parts = [(table, cut(table, roles, choices, counts)) for table in tables]

@@ -16,16 +16,12 @@ from ballfg.importing.formats.raw import Column, RawTable, is_number, numbers
 from ballfg.importing.stamps import Stamps, as_stamps, is_date, joined, missing
 from ballfg.tracks.track import Label
 
-_DISORDER: Final = 3.0
-"""Median steps: an earlier stamp within this came late; beyond it a new shot begins."""
-_LARGEST: Final = 1e15
-"""In the source's units; a larger number is not a position in any unit, and counts as missing."""
+_DISORDER: Final = 3.0  # median steps: an earlier stamp within this came late; beyond it a new shot begins
+_LARGEST: Final = 1e15  # in the source's units; a larger number is not a position in any unit, and counts as missing
 _ALONE: Final = 5.0
 """A row of zeros is a missing sample if its distance from its neighbours is this multiple of the median."""
-GAP: Final = 0.5
-"""s without samples after which a new shot begins."""
-GAP_STEPS: Final = 20.0
-"""Least number of median steps in such a gap."""
+GAP: Final = 0.5  # s without samples after which a new shot begins
+GAP_STEPS: Final = 20.0  # least number of median steps in such a gap
 
 
 @dataclass(frozen=True)
@@ -121,10 +117,7 @@ def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list
 
 
 def split_at_gaps(shots: Iterable[SourceShot], unit: float, gap: float) -> list[SourceShot]:
-    """The shots, cut at gaps of `gap` s.
-
-    Args: unit: s in the unit of the stamps.  gap: s.
-    """
+    """The shots, cut at gaps of `gap` s. Args: unit: s in the unit of the stamps.  gap: s."""
     found: list[SourceShot] = []
     for shot in shots:
         steps = np.diff(shot.stamps).astype(np.float64) * unit

@@ -11,18 +11,13 @@ from ballfg.arrays import Array
 from ballfg.importing.formats.raw import MISSING, Column
 from ballfg.tracks.stamps import elapsed
 
-Stamps = NDArray[Any]
-"""(n,) int64 or float64, in an unknown unit."""
-
-NO_STAMP: Final = np.iinfo(np.int64).min
-"""Marks a missing stamp among whole numbers."""
+Stamps = NDArray[Any]  # (n,) int64 or float64, in an unknown unit
+NO_STAMP: Final = np.iinfo(np.int64).min  # marks a missing stamp among whole numbers
 _CLOCK: Final = re.compile(r"^(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d+)?)$")
 _FINE: Final = re.compile(r"^(.*:\d{2})[.,](\d+)(.*)$")
 _DIVISORS: Final = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
-_LATEST: Final = 1e19
-"""Largest stamp: 300 years in ns."""
-_FAR: Final = 1e6
-"""s: larger stamps are counted from the first one, so that a float keeps their microseconds."""
+_LATEST: Final = 1e19  # largest stamp: 300 years in ns
+_FAR: Final = 1e6  # s: larger stamps are counted from the first one, so that a float keeps their microseconds
 
 
 def as_stamps(column: Column) -> Stamps | None:

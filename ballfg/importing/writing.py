@@ -16,10 +16,8 @@ from ballfg.tracks.info import INFO_FILE
 from ballfg.tracks.writing import DATASET_FILES, TRUTH_FILE, TRUTH_FILES
 
 PAGE: Final = "import.html"
-_MOST_SHOTS: Final = 40
-"""Number of drawn shots, evenly over the dataset."""
-_MOST_POINTS: Final = 300
-"""Largest number of drawn samples of a shot."""
+_MOST_SHOTS: Final = 40  # number of drawn shots, evenly over the dataset
+_MOST_POINTS: Final = 300  # largest number of drawn samples of a shot
 
 
 def write_import(folder: Path, proposal: Proposal, file_format: Literal["csv", "parquet"], force: bool) -> None:

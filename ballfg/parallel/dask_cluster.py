@@ -17,21 +17,17 @@ from ballfg.checks import one_line
 from ballfg.parallel.same_versions import HERE, differences, own_versions
 from ballfg.parallel.work import Work, compute, packed
 
-CONNECT: Final = 10.0
-"""s, timeout for the scheduler, and for its first worker."""
-NOBODY: Final = 60.0
-"""s without any worker after which the work ends."""
-LOOK: Final = 5.0
-"""s between two checks of the cluster while a chunk is computed."""
+CONNECT: Final = 10.0  # s, timeout for the scheduler, and for its first worker
+NOBODY: Final = 60.0  # s without any worker after which the work ends
+LOOK: Final = 5.0  # s between two checks of the cluster while a chunk is computed
 
 
 class DaskCluster:
     """All workers of a scheduler.
 
     Args: address: of the scheduler, such as tcp://10.0.0.1:8786.
-    Raises:
-        ValueError: no address, `distributed` is not installed, or workers with other versions.
-        ConnectionError: no scheduler or no worker is there.
+    Raises: ValueError: no address, `distributed` is not installed, or workers with other versions. ConnectionError: no
+        scheduler or no worker is there.
     """
 
     batch, helped = 16, False

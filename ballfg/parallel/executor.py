@@ -11,9 +11,7 @@ from ballfg.checks import check_count, shown
 from ballfg.machine import MOST_JOBS
 from ballfg.parallel.work import is_inside
 
-CLUSTERS = ("dask", "ray")
-"""Kinds of clusters, by ballfg's extra for their library."""
-
+CLUSTERS = ("dask", "ray")  # kinds of clusters, by ballfg's extra for their library
 _CLUSTER: ContextVar[Executor | None] = ContextVar("cluster", default=None)
 
 
@@ -38,7 +36,6 @@ class Executor(Protocol):
 
     batch: int
     """Number of tracks in a chunk."""
-
     helped: bool
     """True if the calling process is one of them: it then computes chunks itself instead of waiting."""
 

@@ -8,8 +8,7 @@ from ballfg.checks import one_line
 from ballfg.parallel.same_versions import HERE, differences, own_versions
 from ballfg.parallel.work import Work, compute, packed
 
-MOST_DEATHS: Final = 3
-"""Largest number of workers that a chunk may lose."""
+MOST_DEATHS: Final = 3  # largest number of workers that a chunk may lose
 
 
 class RayCluster:

@@ -7,10 +7,8 @@ from pathlib import Path
 
 from ballfg.machine import versions
 
-PACKAGES = ("ballfg", "torch", "numpy", "scipy", "numba", "gtsam")
-"""Packages whose version may change a result."""
-SOURCE = "source of ballfg"
-"""Name of the digest of ballfg's own files: a checkout may change without its version."""
+PACKAGES = ("ballfg", "torch", "numpy", "scipy", "numba", "gtsam")  # packages whose version may change a result
+SOURCE = "source of ballfg"  # name of the digest of ballfg's own files: a checkout may change without its version
 HERE = (
     "dict(__import__('ballfg.parallel.same_versions', fromlist=['own_versions']).own_versions()) "
     "if (find := __import__('importlib.util').util.find_spec)('ballfg') and find('ballfg.parallel') else {}"

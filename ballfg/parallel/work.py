@@ -16,9 +16,7 @@ from ballfg.parallel.same_versions import differences
 T = TypeVar("T")
 R = TypeVar("R")
 
-KEPT = 4
-"""Number of functions that a worker keeps. Their models and machine code then serve all of their chunks."""
-
+KEPT = 4  # Number of functions that a worker keeps. Their models and machine code then serve all of their chunks.
 _INSIDE: ContextVar[bool] = ContextVar("inside", default=False)
 _functions: OrderedDict[str, Callable[..., Any]] = OrderedDict()
 _one_at_a_time = Lock()

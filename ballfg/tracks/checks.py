@@ -20,40 +20,21 @@ from ballfg.state import STANDARD_GRAVITY, Z
 if TYPE_CHECKING:
     from ballfg.tracks.grouping import RowGroup
 
-MERGE_DISTANCE = 0.1
-"""m: two rows at one stamp farther apart are refused; one frame of a ball at 15 m/s and 150 Hz."""
-
-MAX_COORDINATE = 1000.0
-"""m: positions farther from the origin are refused."""
-
-MAX_EXTENT = 250.0
-"""m: a longer track is refused; no struck ball flies farther."""
-
-MAX_SPEED = 343.0
-"""m/s: a track whose median speed is above that of sound is refused."""
-
-MAX_MEDIAN_SIGMA = 1.0
-"""m: a track with a larger median sigma is refused."""
-
-MAX_STEP = 1.0
-"""s: a track whose median time step is longer is refused; no bounce could be seen in it."""
-
-MIN_STEP = 1e-6
-"""s: a track whose median time step is shorter is refused; no camera is that fast."""
-
-MAX_RATE_RATIO = 100.0
-"""A median time step that differs from the declared rate by more than this factor is refused."""
-
+MERGE_DISTANCE = 0.1  # m: two rows at one stamp farther apart are refused; one frame of a ball at 15 m/s and 150 Hz
+MAX_COORDINATE = 1000.0  # m: positions farther from the origin are refused
+MAX_EXTENT = 250.0  # m: a longer track is refused; no struck ball flies farther
+MAX_SPEED = 343.0  # m/s: a track whose median speed is above that of sound is refused
+MAX_MEDIAN_SIGMA = 1.0  # m: a track with a larger median sigma is refused
+MAX_STEP = 1.0  # s: a track whose median time step is longer is refused; no bounce could be seen in it
+MIN_STEP = 1e-6  # s: a track whose median time step is shorter is refused; no camera is that fast
+MAX_RATE_RATIO = 100.0  # a median time step that differs from the declared rate by more than this factor is refused
 BASELINE: Final = 0.05
 """s to each side for an acceleration: with 3 mm of noise its error is 3 m/s^2, that of a track's median 0.5."""
-LEAST_FALLING: Final = 0.2
-"""Least share of a track that falls along -z as a ball does, for undoubted axes."""
-MOSTLY: Final = 0.5
-"""Share of a track that falls along +z, above which z seems to point down."""
+LEAST_FALLING: Final = 0.2  # least share of a track that falls along -z as a ball does, for undoubted axes
+MOSTLY: Final = 0.5  # share of a track that falls along +z, above which z seems to point down
 FALLS: Final = (0.4, 1.9)
 """Multiples of gravity between which a flying ball's vertical acceleration lies; strong topspin doubles it."""
-LEAST_REVERSAL: Final = 0.8
-"""m/s. A ball that falls and then rises at least so fast within a few samples has bounced."""
+LEAST_REVERSAL: Final = 0.8  # m/s. A ball that falls and then rises at least so fast within a few samples has bounced.
 NEAR_SURFACE: Final = 0.08
 """m. Distance from every declared surface beyond which a bounce is doubtful; a fast ball falls so far in one step."""
 AXES: Final = ("x", "y", "z")
@@ -133,8 +114,7 @@ def fuse(values: Array) -> Array:
     With sigmas it is weighted by 1 / sigma^2, and its sigma is that of the weighted mean, times a factor >= 1 if the
     measurements disagree by more than their sigmas allow.
 
-    Args:
-        values: (k, 4) or (k, 7), k >= 2, one stamp.
+    Args: values: (k, 4) or (k, 7), k >= 2, one stamp.
     Returns: (4,) or (7,).
     Source: Particle Data Group, Review of Particle Physics, Introduction, unconstrained averaging (scale factor S).
     """

@@ -19,8 +19,7 @@ from ballfg.files.spreadsheet import bare
 
 _NUMBER = re.compile(r"\s*[+-]?(\d++\.?\d*+|\.\d++)([eE][+-]?\d+)?\s*", re.ASCII)
 _NOT_FINITE = re.compile(r"\s*[+-]?(nan|inf|infinity)\s*", re.IGNORECASE)
-MAX_HEADER = 1 << 16
-"""Largest number of bytes in the line of column names."""
+MAX_HEADER = 1 << 16  # largest number of bytes in the line of column names
 
 
 def is_number(cell: str) -> bool:

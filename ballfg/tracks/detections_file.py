@@ -22,9 +22,7 @@ from ballfg.tracks.sightings import Sightings
 from ballfg.tracks.table import TableWriter
 
 Texts = NDArray[np.str_]
-Rule = tuple[str, Callable[[Array], NDArray[np.bool_]]]
-"""The rule for the numbers of a column, in words and as a test."""
-
+Rule = tuple[str, Callable[[Array], NDArray[np.bool_]]]  # the rule for the numbers of a column, in words and as a test
 CAMERA: Final = "camera"
 PLACE: Final = ("t", "u", "v")
 NOISE: Final = ("sigma_u", "sigma_v", "rho_uv")
@@ -34,8 +32,7 @@ UNSTATED: Final = {"sigma_u": 0.5, "sigma_v": 0.5, "rho_uv": 0.0}
 """px. Half a pixel, as reached by a detector of patch centres."""
 LEAST_SIGMA: Final = 1e-4
 """px. Best resolution of a camera; a graph with far surer pixels cannot be solved in double precision."""
-MOST_PIXELS: Final = 1e6
-"""px. Largest width of an image; larger numbers overflow when squared."""
+MOST_PIXELS: Final = 1e6  # px. Largest width of an image; larger numbers overflow when squared.
 _SIGMA: Final[Rule] = (
     f"{LEAST_SIGMA:g} to {MOST_PIXELS:.0f} px",
     lambda x: (x >= LEAST_SIGMA) & (x <= MOST_PIXELS),
@@ -77,10 +74,8 @@ def read_sightings(
         time_offsets: s, by camera of the rig: rows are sorted by t less the offset.
     Returns: sightings by trajectory, in the order in which the trajectories first appear; ignored entries, one sentence
         each.
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: a missing or repeated column, a cell out of its range, an unknown camera, or several candidates of
-            one ball with equal scores; the message names file, line and column.
+    Raises: FileNotFoundError: there is no such file. ValueError: a missing or repeated column, a cell out of its range,
+        an unknown camera, or several candidates of one ball with equal scores; the message names file, line and column.
     """
     path = Path(path)
     header, table, nameless = _read(path, list(time_offsets))

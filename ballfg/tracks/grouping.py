@@ -32,7 +32,6 @@ class RowGroup:
 
     rows: NDArray[np.int64]
     """(n,) number of each row in the file, from 0."""
-
     values: Array
     """(n, 4) or (n, 7), as in Block."""
 
@@ -43,13 +42,10 @@ class Index:
 
     names: list[str]
     """The trajectories in the order in which they first appear."""
-
     counts: NDArray[np.int64]
     """(number of trajectories,) rows of each."""
-
     contiguous: bool
     """True if the rows of each trajectory are contiguous."""
-
     stamp: tuple[int, int]
     """Size (bytes) and modification time (ns) of the scanned file."""
 

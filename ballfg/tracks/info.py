@@ -46,7 +46,6 @@ class Ball:
 
     radius: float
     """m"""
-
     mass: float
     """kg"""
 
@@ -60,7 +59,6 @@ class Ball:
 
 TABLE_TENNIS = Ball(radius=0.02, mass=0.0027)
 """ITTF, The Laws of Table Tennis, 2.3: diameter 40 mm, 2.7 g."""
-
 TENNIS = Ball(radius=0.0335, mass=0.0577)
 """ITF Rules of Tennis, Appendix I, type 2: diameter 65.4-68.6 mm, 56.0-59.4 g; the middle of both."""
 
@@ -74,34 +72,24 @@ class DatasetInfo:
 
     name: str
     """One line of text."""
-
     table_height: float
     """z of the table's surface, m."""
-
     ball: Ball
     """Radius (m) and mass (kg)."""
-
     rate: float | None = None
     """Nominal sampling rate, Hz. Computations use the stamps of the tracks."""
-
     position_noise: float | None = None
     """Standard deviation of one measured coordinate, m."""
-
     spin_noise: float | None = None
     """Standard deviation of one component of the spin labels, rad/s."""
-
     source: str | None = None
     """Origin of the data."""
-
     licence: str | None = None
     """Terms of use."""
-
     table_extent: tuple[float, float, float, float] | None = None
     """(x_low, x_high, y_low, y_high) m, the table's ends; None if unknown."""
-
     noise: TrackNoise | None = None
     """All known noise of the tracks, as from `ballfg noise`; it takes precedence over the two numbers above."""
-
     imported: Mapping[str, Any] | None = None
     """Origin and conversion of the tracks, as `ballfg import` records them in the section `import`; for people."""
 

@@ -33,22 +33,16 @@ class Block:
 
     start: int
     """Number of the first row, counted from 0 at the first row of data."""
-
     names: list[str | None]
     """The distinct trajectory names of the block; None for an empty cell of a Parquet file."""
-
     codes: NDArray[np.int32]
     """(n,) index into `names` for each row."""
-
     values: Array
     """(n, 4) t, x, y, z in s and m, or (n, 7) with the sigmas in m."""
 
 
 class RowSource(ABC):
-    """A track table that can be read repeatedly, in blocks.
-
-    Raises: ValueError: a missing or repeated column.
-    """
+    """A track table that can be read repeatedly, in blocks. Raises: ValueError: a missing or repeated column."""
 
     def __init__(self, path: Path, header: Sequence[str]) -> None:
         csv_files.check_header(path, header, (KEY, *VALUES), (KEY, *VALUES, *SIGMAS))

@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from ballfg.arrays import Array
 from ballfg.checks import check_array, check_iterable, check_name, shown
 
-ROUNDING = 1e-6
-"""Relative to the trace: tolerance for the symmetry of a covariance from single precision."""
+ROUNDING = 1e-6  # relative to the trace: tolerance for the symmetry of a covariance from single precision
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,16 +26,12 @@ class Sightings:
 
     cameras: tuple[str, ...]
     """Names of the rig's cameras, including those without a sighting."""
-
     camera: NDArray[np.int64]
     """(m,) number of each sighting's camera: an index into `cameras`."""
-
     times: Array
     """(m,) s, stamps as recorded by the camera."""
-
     pixels: Array
     """(m, 2) px, place of the ball's centre in the middle of the exposure."""
-
     covariances: Array
     """(m, 2, 2) px^2."""
 

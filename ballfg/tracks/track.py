@@ -26,11 +26,8 @@ from ballfg.tracks.stamps import STAMP_TOLERANCE, elapsed
 
 SPIN_LABELS = ("spin_x", "spin_y", "spin_z")
 
-FASTEST_BALL = 200.0
-"""m/s. Largest speed of a ball; the record of all sports is a shuttlecock's, 157 m/s."""
-FASTEST_SPIN = 2000.0
-"""rad/s. Largest spin of a ball; a golf ball off a wedge reaches 1,200."""
-
+FASTEST_BALL = 200.0  # m/s. Largest speed of a ball; the record of all sports is a shuttlecock's, 157 m/s.
+FASTEST_SPIN = 2000.0  # rad/s. Largest spin of a ball; a golf ball off a wedge reaches 1,200.
 Label = float | str
 
 
@@ -61,28 +58,20 @@ class Track:
 
     times: Array
     """(n,) s, n >= 1, strictly increasing. The origin is the data's own."""
-
     positions: Array
     """(n, 3) m, world frame, z up."""
-
     sigmas: Array | None = None
     """(n, 3) m, standard deviation of each coordinate, positive; None if the data do not state it."""
-
     labels: Mapping[str, Label] = field(default_factory=dict)
     """Labels of the shot: spin_x, spin_y, spin_z (rad/s, at the first sample), group, launcher settings."""
-
     name: str = "track"
     """The trajectory's name, as in the column `trajectory`: "000" stays "000"."""
-
     observations: tuple[Any, ...] = ()
     """Measurements other than positions: `ballfg.estimation.Observation`s, one of a name."""
-
     rough: bool = False
     """True if the positions were computed from the observations: they then serve to find events only."""
-
     part: bool = False
     """True for a part of a longer track. Its scale was checked with the whole; a few samples do not show it."""
-
     dataset: Any = None
     """The dataset of the track, with its ball, table and noise. Processes do not get it."""
 

@@ -11,13 +11,11 @@ from numpy.typing import ArrayLike
 from ballfg.arrays import Array, Mask
 from ballfg.checks import check_array, check_name, check_number, shown
 
-MOST_PIXELS: Final = 1_000_000
-"""Largest number of px of one side of an image."""
+MOST_PIXELS: Final = 1_000_000  # largest number of px of one side of an image
 DISTORTIONS: Final = (0, 4, 5, 8, 12, 14)
 """Lengths of distortion vectors in OpenCV: none; k1 k2 p1 p2; k3; k4 k5 k6; thin prism s1-s4; tilt tau_x tau_y."""
 _PRECISELY: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-12)
 """OpenCV undoes distortion by five steps of a fixed point by default: 0.1 pixel off in a wide lens."""
-
 WIDEST_ASKED: Final = 6.0
 """Tangent of the widest angle from the axis at which a lens is tested for turning back: 80 degrees."""
 WIDEST_STEPS: Final = 6001
@@ -38,22 +36,16 @@ class Camera:
 
     name: str
     """Unique among the cameras of a rig."""
-
     size: tuple[int, int]
     """Width and height of the image, pixels."""
-
     matrix: Array
     """(3, 3) focal lengths and principal point, pixels: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]."""
-
     distortion: Array
     """(k,) dimensionless coefficients in OpenCV's order; k one of `DISTORTIONS`."""
-
     rvec: Array
     """(3,) rad, rotation vector from the world to the camera."""
-
     tvec: Array
     """(3,) m, the world's origin in the camera's frame."""
-
     time_offset: float = 0.0
     """s, delay of the camera's stamps: an event stamped t happened at t - time_offset."""
 

@@ -17,13 +17,11 @@ from ballfg.files.strict_yaml import mapping, read_mapping
 from ballfg.files.whole_file import whole_file, write_text
 from ballfg.vision.camera import Camera
 
-CAMERAS_FILE: Final = "cameras.yaml"
-"""Its name in the folder of a dataset or a scene."""
+CAMERAS_FILE: Final = "cameras.yaml"  # its name in the folder of a dataset or a scene
 LENS: Final = ("size", "matrix", "distortion")
 POSE: Final = ("rvec", "tvec")
 FIELDS: Final = (*LENS, *POSE, "time_offset")
 """Fields of a camera in the file, in order; docs/calibrate.md explains them."""
-
 _MATRIX: Final = "camera_matrix"
 _NODES: Final = {
     "matrix": (_MATRIX,),

@@ -16,8 +16,7 @@ ENDINGS: Final = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".p
 """Endings of images in a folder; other files are ignored."""
 FORMATS: Final = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "PPM", "MPO")
 """Of Pillow's, which reads the headers alone. MPO: a JPEG with further pictures behind it, as telephones write."""
-_TILES: Final = (322, 323)
-"""Tags of TIFF: width and height of the pieces in which the pixels are kept."""
+_TILES: Final = (322, 323)  # tags of TIFF: width and height of the pieces in which the pixels are kept
 
 
 def read_image(path: Path, flags: int) -> Image:

@@ -15,8 +15,7 @@ from ballfg.importing.formats.nested import nested_tables
 from ballfg.importing.formats.raw import RawTable, table_of
 from ballfg.importing.formats.text_files import text_table
 
-MAX_DEPTH: Final = 40
-"""Largest depth of nested groups."""
+MAX_DEPTH: Final = 40  # largest depth of nested groups
 MAX_MEMBERS: Final = 20_000
 """Largest number of files in an archive, or of datasets and groups in an HDF5 file: four for each of 5,000 shots."""
 EXCEL_FREE: Final = 1_000_000

@@ -13,10 +13,8 @@ from ballfg.importing.formats.containers import read_hdf5
 from ballfg.importing.formats.nested import nested_tables
 from ballfg.importing.formats.raw import RawTable
 
-_HEADER: Final = 128
-"""Bytes before the first variable; the last two give the byte order."""
-_COMPRESSED: Final = 15
-"""The kind of a compressed variable."""
+_HEADER: Final = 128  # Bytes before the first variable; the last two give the byte order
+_COMPRESSED: Final = 15  # the kind of a compressed variable
 _BLOCK: Final = 1 << 20
 
 

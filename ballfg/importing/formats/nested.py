@@ -8,12 +8,9 @@ import numpy as np
 
 from ballfg.importing.formats.raw import RawTable, table_of
 
-_LEAST: Final = 3
-"""Least number of rows of a list as a table; shorter lists are points or settings."""
-_POINT: Final = 4
-"""Largest number of coordinates of a point in one row."""
-MAX_PARTS: Final = 100_000
-"""Largest number of searched lists and mappings; each shot is one or a few."""
+_LEAST: Final = 3  # least number of rows of a list as a table; shorter lists are points or settings
+_POINT: Final = 4  # largest number of coordinates of a point in one row
+MAX_PARTS: Final = 100_000  # largest number of searched lists and mappings; each shot is one or a few
 
 
 def nested_tables(content: Any, name: str, source: str) -> list[RawTable]:

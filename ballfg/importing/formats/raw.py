@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 from ballfg.checks import MAX_TEXT, shown
 from ballfg.files.damaged import MAX_COLUMNS
 
-Column = NDArray[Any]
-"""(n,) int64, float64 or object (text)."""
-
+Column = NDArray[Any]  # (n,) int64, float64 or object (text)
 MISSING: Final = (
     "",
     "-",
@@ -34,8 +32,7 @@ MISSING: Final = (
 """Marks of a missing number in files, in lower case."""
 WITH_UNIT: Final = re.compile(r"^\s*([-+]?(?:\d++\.?\d*+|\.\d++)(?:[eE][-+]?\d++)?)\s*([^\W\d_]{1,3})\s*$")
 """A number with its unit, such as 12.5 mm."""
-_MOSTLY: Final = 0.5
-"""Least share of numbers among the cells of a numeric column."""
+_MOSTLY: Final = 0.5  # least share of numbers among the cells of a numeric column
 
 
 @dataclass

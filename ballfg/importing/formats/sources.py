@@ -26,15 +26,13 @@ READERS: Final = {
 _MAGIC: Final = (
     (b"PAR1", read_parquet), (b"\x89HDF", read_hdf5), (b"\x93NUMPY", read_npz), (b"MATLAB 5.0", read_matlab),
 )  # fmt: skip
-_OWN: Final = ("import.html", "truth.csv", "truth.parquet")
-"""Files in a dataset's folder that hold no measurements."""
+_OWN: Final = ("import.html", "truth.csv", "truth.parquet")  # files in a dataset's folder that hold no measurements
 
 
 def tables_of(data: Any, topic: str | None = None, key: str | None = None) -> list[RawTable]:
     """All tables of a source.
 
-    Args:
-        data: a path or several, of files and folders; a DataFrame, a dict of arrays, an array, or a list of these.
+    Args: data: a path or several, of files and folders; a DataFrame, a dict of arrays, an array, or a list of these.
         topic: of a ROS bag.  key: part of the names of the wanted tables.
     Raises: FileNotFoundError: no such path. ValueError: unreadable, or no table of that key.
     """

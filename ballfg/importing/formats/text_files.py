@@ -18,12 +18,9 @@ SEPARATORS: Final = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars"
 _COMMENTS: Final = ("#", "%", "//")
 _NUMBER: Final = re.compile(r"^[-+]?(\d++\.?\d*+|\.\d++)([eE][-+]?\d++)?$")
 _DECIMAL_COMMA: Final = re.compile(r"^[-+]?\d*,\d+([eE][-+]?\d++)?$")
-_LOOK: Final = 200
-"""Number of lines for finding the separator."""
-_HEAD: Final = 4096
-"""Number of bytes at the beginning for recognising text."""
-_CONTROL: Final = 0.02
-"""Share of control characters from which a file is not text."""
+_LOOK: Final = 200  # number of lines for finding the separator
+_HEAD: Final = 4096  # number of bytes at the beginning for recognising text
+_CONTROL: Final = 0.02  # share of control characters from which a file is not text
 
 
 def read_text_table(path: Path) -> list[RawTable]:

@@ -22,25 +22,18 @@ from ballfg.vision.camera import Camera
 
 LEAST_MISFIT: Final = 3.0
 """Largest squared error of agreeing cameras, relative to noise: half a pixel for centres good to 0.3."""
-LEAST_EXPLAINED: Final = 0.8
-"""Least share of the error beyond noise that a culprit must explain."""
+LEAST_EXPLAINED: Final = 0.8  # least share of the error beyond noise that a culprit must explain
 CLEARLY: Final = 4.0
 """Least ratio of the unexplained error of another camera: correcting the wrong one of three cameras may halve the
 disagreement, but never ends it."""
-CLEARLY_WORSE: Final = 1.5
-"""Least ratio of the squared errors, noise included."""
-LEAST_POINTS: Final = 20
-"""Fewest points, each seen by three cameras or more: six numbers are fitted to them."""
-MOST_POINTS: Final = 600
-"""Most points that are used, evenly spread: more do not change the answer."""
-_LOOSE: Final = 20.0
-"""px, noise for points from views that may be wrong."""
+CLEARLY_WORSE: Final = 1.5  # least ratio of the squared errors, noise included
+LEAST_POINTS: Final = 20  # fewest points, each seen by three cameras or more: six numbers are fitted to them
+MOST_POINTS: Final = 600  # most points that are used, evenly spread: more do not change the answer
+_LOOSE: Final = 20.0  # px, noise for points from views that may be wrong
 _UNSEEN: Final = 1e4
 """px, error of a sighting whose point lies behind the camera or beyond its lens: more than any image's width."""
-_FAR: Final = 9.0
-"""Median squared errors at which a point counts half."""
-_STEPS: Final = 8
-"""Gauss-Newton steps; a camera turned by five degrees is right after six."""
+_FAR: Final = 9.0  # median squared errors at which a point counts half
+_STEPS: Final = 8  # Gauss-Newton steps; a camera turned by five degrees is right after six
 _PRIOR: Final = np.diag([0.1**-2] * 3 + [0.3**-2] * 3)
 """Information about a nudge, 0.1 rad of turn and 0.3 m of shift: keeps the fit in place where points are too few."""
 
@@ -51,16 +44,12 @@ class CameraAgreement:
 
     residual: float
     """px, median distance of its sightings from the points of the others; NaN if fewer than two others saw them."""
-
     explained: float
     """Share of the disagreement beyond noise that a correction of this camera removes; NaN without disagreement."""
-
     rotation: float
     """Degrees, turn of that correction."""
-
     shift: float
     """m, shift of its centre in that correction."""
-
     corrected: float
     """px, the median distance with the corrected camera; NaN where `residual` is."""
 
@@ -71,13 +60,10 @@ class Agreement:
 
     culprit: str | None
     """The one camera whose correction explains the disagreement; None if they agree or if no single one does."""
-
     by_camera: Mapping[str, CameraAgreement]
     """By name, in the rig's order; empty where too little was seen by three cameras."""
-
     misfit: float
     """Median squared reprojection error over that of the noise: about 1 where cameras agree; NaN if not known."""
-
     sentence: str
     """A summary for readers."""
 

@@ -36,7 +36,6 @@ class AssociationSettings:
 
     least_score: float = 0.3
     """In [0, 1]; candidates with a lower score are not used."""
-
     least_points: int = 6
     """Points of the shortest track that is kept; at least 3."""
 

@@ -9,16 +9,11 @@ from ballfg.arrays import Array, Index, Mask
 from ballfg.vision.association.gathering import Footage, Gathered, gather
 from ballfg.vision.camera import Camera
 
-_GATE: Final = 16.0
-"""Largest squared distance from the prediction, whitened: 4 sigma."""
-_WIDEST: Final = 20.0
-"""px, largest sigma of a prediction that is used."""
-_AHEAD: Final = 2.5
-"""Frames by which a track is continued past its ends in one round."""
-_ROUNDS: Final = 4
-"""Most rounds; each reaches a little farther at the ends."""
-_STEP: Final = 1e-3
-"""m, step of the numerical derivative of the projection."""
+_GATE: Final = 16.0  # largest squared distance from the prediction, whitened: 4 sigma
+_WIDEST: Final = 20.0  # px, largest sigma of a prediction that is used
+_AHEAD: Final = 2.5  # frames by which a track is continued past its ends in one round
+_ROUNDS: Final = 4  # most rounds; each reaches a little farther at the ends
+_STEP: Final = 1e-3  # m, step of the numerical derivative of the projection
 _SYSTEMATIC: Final = 1.0
 """px, added to a prediction's sigma for the calibration of the other cameras, from which it comes."""
 

@@ -14,8 +14,7 @@ from ballfg.vision.association.triangulate import triangulate
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections
 
-SAME_SHUTTER: Final = 2e-4
-"""s, largest difference between stamps of one shutter: at 15 m/s the ball moves 3 mm."""
+SAME_SHUTTER: Final = 2e-4  # s, largest difference between stamps of one shutter: at 15 m/s the ball moves 3 mm
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,16 +63,12 @@ class SeenBall:
 
     times: Array
     """(n,) s, true time."""
-
     points: Array
     """(n, 3) m, world."""
-
     covariances: Array
     """(n, 3, 3) m^2, of each point by itself; interpolated points share samples and so a little of their error."""
-
     sightings: Sightings
     """The sightings behind the points, each at its own camera's stamp."""
-
     views: Index
     """(n,) number of cameras that made each point."""
 

@@ -16,28 +16,18 @@ from ballfg.arrays import Array, Index
 from ballfg.vision.association.paths import Path
 from ballfg.vision.camera import Camera
 
-WORST_OFFSET: Final = 5.0
-"""px, prior standard deviation of a calibration's error."""
-LEAST_OFFSET: Final = 0.3
-"""px, least error of a calibration in the matching."""
-_SIGNIFICANT: Final = 0.5
-"""Least excess of the miss of right pairs' rays, as a share of the noise's variance."""
-_MEDIAN_SQUARE: Final = 0.4549
-"""Median of the square of a standard normal number."""
+WORST_OFFSET: Final = 5.0  # px, prior standard deviation of a calibration's error
+LEAST_OFFSET: Final = 0.3  # px, least error of a calibration in the matching
+_SIGNIFICANT: Final = 0.5  # least excess of the miss of right pairs' rays, as a share of the noise's variance
+_MEDIAN_SQUARE: Final = 0.4549  # median of the square of a standard normal number
 _GATE: Final = 9.0
 """Squared deviations at which two pieces do not belong together: 3 sigma of calibration and noise together."""
-_LEAST_COMMON: Final = 2
-"""Times at which both pieces must be known; a track that ends just after a bounce has no more."""
-_LEAST_SUPPORT: Final = 1.5
-"""Common times that must speak for a pair, less what speaks against it."""
-_LONG: Final = 8
-"""Common times from which a pair of pieces says something about the calibration."""
-_SPEEDING: Final = 2.0
-"""Largest excess of a speed between two pieces over those of both: at a bounce or a hit."""
-_NEARBY: Final = 15.0
-"""px, how far apart two successive pieces of one camera may be at least, however slow they are."""
-_NEAREST: Final = 0.1
-"""m, least distance from either camera at which two rays may meet."""
+_LEAST_COMMON: Final = 2  # times at which both pieces must be known; a track that ends just after a bounce has no more
+_LEAST_SUPPORT: Final = 1.5  # common times that must speak for a pair, less what speaks against it
+_LONG: Final = 8  # common times from which a pair of pieces says something about the calibration
+_SPEEDING: Final = 2.0  # largest excess of a speed between two pieces over those of both: at a bounce or a hit
+_NEARBY: Final = 15.0  # px, how far apart two successive pieces of one camera may be at least, however slow they are
+_NEAREST: Final = 0.1  # m, least distance from either camera at which two rays may meet
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +36,8 @@ class Piece:
 
     camera: int
     """Number of the camera."""
-
     rows: Index
     """(k,) its candidates."""
-
     path: Path
     """Its place in the image, over true time."""
 
@@ -86,7 +74,6 @@ class Matching:
 
     groups: list[list[int]]
     """Numbers of pieces of the same object, in the order of the first; unmatched pieces are left out."""
-
     offset: float
     """px, excess miss of rays of one object beyond noise, in the worst pair of cameras; 0 without any."""
 

@@ -14,21 +14,15 @@ from scipy.stats import chi2
 
 from ballfg.arrays import Array, Index, Mask
 
-MAX_GAP: Final = 0.06
-"""s, longest bridged gap between two samples of a smooth part: three frames lost at 60 Hz."""
+MAX_GAP: Final = 0.06  # s, longest bridged gap between two samples of a smooth part: three frames lost at 60 Hz
 RATE_OF_CHANGE: Final = 5.0
 """1/s, how fast an acceleration changes by its own size, in an image or in space: 15 m/s seen from 3 m away. What a
 polynomial leaves out is taken to be the acceleration times a power of this."""
-KINK_CHANCE: Final = 1e-5
-"""Probability with which noise alone passes for a kink."""
-_SAME: Final = 1e-6
-"""s, a time this close to a sample is the sample's."""
-_INSIDE: Final = 4
-"""Samples of the cubic between two samples."""
-_ASIDE: Final = 5
-"""Samples of the quadratic that continues a part towards a kink: one would do with three, but noisily."""
-_WING: Final = 3
-"""Samples on either side of an interval in the test for a kink."""
+KINK_CHANCE: Final = 1e-5  # probability with which noise alone passes for a kink
+_SAME: Final = 1e-6  # s, a time this close to a sample is the sample's
+_INSIDE: Final = 4  # samples of the cubic between two samples
+_ASIDE: Final = 5  # samples of the quadratic that continues a part towards a kink: one would do with three, but noisily
+_WING: Final = 3  # samples on either side of an interval in the test for a kink
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,13 +31,10 @@ class Path:
 
     times: Array
     """(n,) s, strictly increasing."""
-
     values: Array
     """(n, d)"""
-
     covariances: Array
     """(n, d, d)"""
-
     parts: Index
     """(n,) number of the smooth part that a sample belongs to, from 0, rising by at most one."""
 

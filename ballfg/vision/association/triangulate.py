@@ -37,13 +37,10 @@ class Triangulated:
 
     points: Array
     """(n, 3) m, world."""
-
     covariances: Array
     """(n, 3, 3) m^2."""
-
     used: Mask
     """(n, c) True for views that took part; wrong ones do not."""
-
     residuals: Array
     """(n, c, 2) px, seen minus projected, including views that did not take part; NaN without a sighting."""
 

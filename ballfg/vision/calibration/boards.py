@@ -16,8 +16,7 @@ from ballfg.checks import shown
 from ballfg.vision.arrays import Image
 from ballfg.vision.image_file import ENDINGS, read_image
 
-MIN_CORNERS: Final = 8
-"""Least number of corners in a view: a homography needs 4, and twice as many reveal a wrong one."""
+MIN_CORNERS: Final = 8  # least number of corners in a view: a homography needs 4, and twice as many reveal a wrong one
 DICTIONARIES: Final = tuple(sorted(n.removeprefix("DICT_") for n in dir(cv2.aruco) if n.startswith("DICT_")))
 """Names of ArUco's dictionaries, without `DICT_`."""
 _SEARCH: Final = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
@@ -40,13 +39,10 @@ class _Squares:
 
     least: ClassVar[int]
     """Fewest squares in a row and in a column."""
-
     columns: int
     """Squares in a row, the outermost ones too: one more than there are inner corners."""
-
     rows: int
     """Rows of squares."""
-
     square: float
     """m, side of a square."""
 
@@ -92,10 +88,8 @@ class Charuco(_Squares):
 
     marker: float
     """m, side of a marker."""
-
     dictionary: str = "4X4_100"
     """One of `DICTIONARIES`."""
-
     legacy: bool = False
     """Printed by OpenCV before 4.6, which began boards with an even number of rows with a marker."""
 
@@ -145,13 +139,10 @@ class View:
 
     name: str
     """Name of the image's file."""
-
     size: tuple[int, int]
     """px, width and height of the image."""
-
     pixels: Array
     """(n, 2) px, corners in the image; n is 0 where no board was found."""
-
     points: Array
     """(n, 3) m, the same corners on the board, z = 0."""
 

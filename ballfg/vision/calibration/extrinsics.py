@@ -12,14 +12,10 @@ from ballfg.vision.calibration.lens_covariance import POSE, slopes_of
 from ballfg.vision.calibration.table_points import Marked
 from ballfg.vision.camera import Camera
 
-MIN_POINTS: Final = 4
-"""Three points have up to four poses."""
-FLAT: Final = 0.01
-"""Share of the points' extent: points closer to a line or plane count as lying in it."""
-MAX_RMS: Final = 4.0
-"""Multiple of the pixels' sigma: with larger residuals a point has a wrong name or place."""
-CLEARLY: Final = 9.0
-"""Least excess of the second best pose, in sums of squared whitened residuals: three sigmas."""
+MIN_POINTS: Final = 4  # three points have up to four poses
+FLAT: Final = 0.01  # share of the points' extent: points closer to a line or plane count as lying in it
+MAX_RMS: Final = 4.0  # multiple of the pixels' sigma: with larger residuals a point has a wrong name or place
+CLEARLY: Final = 9.0  # least excess of the second best pose, in sums of squared whitened residuals: three sigmas
 _REFINE: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 
 
@@ -31,7 +27,6 @@ class Extrinsics:
 
     marked: Marked
     """The points of its calibration."""
-
     covariance: Array
     """(6, 6) of a small turn of the camera about the world's axes (rad) and of its centre (m), for an exact lens."""
 
@@ -62,9 +57,7 @@ def calibrate_extrinsics(lens: Camera, marked: Marked) -> Extrinsics:
     Every pose that could be meant is refined: a flat target has two. One from which the points would be seen from
     below is not meant.
 
-    Args:
-        lens: a camera; its pose has no part.
-        marked: at least four points, not in one line.
+    Args: lens: a camera; its pose has no part.  marked: at least four points, not in one line.
     Raises: ValueError: too few points or all in a line, none in the image, no pose that explains them, or two that
         do; the message names the camera.
     Source: T. Collins, A. Bartoli, "Infinitesimal plane-based pose estimation", IJCV 109, 2014 (OpenCV's IPPE);

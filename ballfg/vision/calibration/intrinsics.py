@@ -19,22 +19,17 @@ MIN_VIEWS: Final = 8
 MIN_TURN: Final = np.radians(10.0)
 """rad that some two boards must be turned against each other. Parallel boards cannot tell a long lens from a near
 board: OpenCV then reports tiny deviations of a focal length that is wrong by half."""
-MAX_FOCAL_SIGMA: Final = 0.02
-"""Relative standard deviation of the focal length: 2 % are 6 cm at a distance of 3 m."""
+MAX_FOCAL_SIGMA: Final = 0.02  # relative standard deviation of the focal length: 2 % are 6 cm at a distance of 3 m
 MIN_COVERAGE: Final = 0.4
 """Least share of the image's cells with corners: outside of them, the distortion is extrapolated."""
-CELLS: Final = (8, 5)
-"""Number of such cells across and down."""
+CELLS: Final = (8, 5)  # number of such cells across and down
 OUTLYING: Final = 3.0
 """Times the median of the views' errors: a view beyond it has a wrong corner or moved while it was exposed."""
-MIN_OUTLYING: Final = 0.15
-"""px. A view with a smaller error is kept, however good the others are."""
+MIN_OUTLYING: Final = 0.15  # px. A view with a smaller error is kept, however good the others are.
 MAX_LEFT_OUT: Final = 1 / 3
 """Largest share of views that are left out: if more disagree with the rest, the rest may be wrong."""
-MAX_RAY_SIGMA: Final = 1.0
-"""px, largest standard deviation of a projected ray: 3 mm at a distance of 3 m."""
-RAYS: Final = 0.95
-"""Share of the image to which that applies: the outermost corners of a wide lens rarely see a board."""
+MAX_RAY_SIGMA: Final = 1.0  # px, largest standard deviation of a projected ray: 3 mm at a distance of 3 m
+RAYS: Final = 0.95  # share of the image to which that applies: the outermost corners of a wide lens rarely see a board
 MAX_FOLD: Final = 0.05
 """px. Distortion undone and done again must lead back to each pixel, or the model folds the image there."""
 _CRITERIA: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
@@ -57,10 +52,8 @@ class FittedView:
 
     rvec: Array
     """(3,) rad, rotation from the board to the camera."""
-
     tvec: Array
     """(3,) m, the board's origin in the camera's frame."""
-
     residuals: Array
     """(n, 2) px, corners as seen minus as projected."""
 
@@ -81,19 +74,14 @@ class Intrinsics:
 
     camera: Camera
     """The camera at the world's origin, unturned: its pose is unknown."""
-
     covariance: Array
     """(4 + k, 4 + k) of fx, fy, cx, cy (px) and the k coefficients of the distortion."""
-
     views: tuple[FittedView, ...]
     """The views of the calibration."""
-
     left_out: tuple[FittedView, ...]
     """The views that disagree with it, in the order of their removal."""
-
     missed: tuple[str, ...]
     """Names of the images in which no board was found."""
-
     coverage: float
     """Share of the image's cells that hold corners."""
 
@@ -117,12 +105,10 @@ class Intrinsics:
 def calibrate_intrinsics(name: str, views: Sequence[View], distortion: int = 5) -> Intrinsics:
     """Matrix and distortion of a camera.
 
-    Args:
-        views: of one board that lay at different places, turned differently; those without corners are counted only.
+    Args: views: of one board that lay at different places, turned differently; those without corners are counted only.
         distortion: how many coefficients: 0, 4, 5, 8, 12 or 14.
-    Raises:
-        ValueError: too few views, images of several sizes, views that cannot tell the focal length, corners in a
-            small part of the image only, or too many views that disagree; the message names the camera.
+    Raises: ValueError: too few views, images of several sizes, views that cannot tell the focal length, corners in a
+        small part of the image only, or too many views that disagree; the message names the camera.
     Source: Z. Zhang, "A flexible new technique for camera calibration", IEEE PAMI 22 (11), 2000; OpenCV's
         `calibrateCamera`.
     """

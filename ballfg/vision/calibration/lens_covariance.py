@@ -11,11 +11,8 @@ from ballfg.vision.camera import Camera
 
 PosedBoard: TypeAlias = tuple[Array, Array, Array, Array]
 """Points (n, 3) m of a board, its rvec (3,) and tvec (3,), and the residuals (n, 2) px of its corners."""
-
-GRID_STEP: Final = 16
-"""px between the pixels of `pixel_grid`: a lens bends no faster."""
-POSE: Final = 6
-"""Numbers of a board's pose; in OpenCV's Jacobian they stand before those of the lens."""
+GRID_STEP: Final = 16  # px between the pixels of `pixel_grid`: a lens bends no faster
+POSE: Final = 6  # numbers of a board's pose; in OpenCV's Jacobian they stand before those of the lens
 
 
 def covariance_of_lens(camera: Camera, boards: Sequence[PosedBoard]) -> Array:

@@ -19,17 +19,12 @@ from ballfg.vision.camera import Camera
 COEFFICIENTS: Final = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 """Names of OpenCV's distortion coefficients, in their order."""
 BLUE, VERMILION, GREY = "#0072b2", "#d55e00", "#8c8c8c"
-OUTLINED: Final = withStroke(linewidth=1.5, foreground="white")
-"""For letters that must be read over any image."""
-ARROW: Final = 0.05
-"""Length of a residual of three times the median in the drawing, as a share of the image's width."""
-PARTS: Final = 40
-"""Number of parts of a drawn line, which the lens bends."""
-PANEL: Final = (5.0, 3.4)
-"""Inches, width and height of a panel."""
+OUTLINED: Final = withStroke(linewidth=1.5, foreground="white")  # for letters that must be read over any image
+ARROW: Final = 0.05  # length of a residual of three times the median in the drawing, as a share of the image's width
+PARTS: Final = 40  # number of parts of a drawn line, which the lens bends
+PANEL: Final = (5.0, 3.4)  # inches, width and height of a panel
 DPI: Final = 120
-IN_A_LINE: Final = 6
-"""Views that a line of the summary names."""
+IN_A_LINE: Final = 6  # views that a line of the summary names
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +35,6 @@ class Calibration:
 
     lens: Intrinsics | None
     """None if the lens was known before."""
-
     place: Extrinsics | None
     """None if the camera's pose was not calibrated."""
 

@@ -16,10 +16,8 @@ from ballfg.tracks.info import MAX_HEIGHT
 
 TABLE_LENGTH: Final = 2.74
 TABLE_WIDTH: Final = 1.525
-TABLE_HEIGHT: Final = 0.76
-"""m, ITTF Laws of Table Tennis 2.1.1 and 2.1.2."""
-CLICK_SIGMA: Final = 0.5
-"""px, standard deviation of a coordinate that was read off an image with care."""
+TABLE_HEIGHT: Final = 0.76  # m, ITTF Laws of Table Tennis 2.1.1 and 2.1.2
+CLICK_SIGMA: Final = 0.5  # px, standard deviation of a coordinate that was read off an image with care
 _FIELDS: Final = ("table_height", "sigma", "points", "cameras")
 
 
@@ -31,10 +29,8 @@ class Marked:
 
     points: Array
     """(n, 3) m."""
-
     pixels: Array
     """(n, 2) px."""
-
     sigma: float = CLICK_SIGMA
     """px, standard deviation of each coordinate of the pixels."""
 
@@ -66,7 +62,6 @@ class TableFile:
 
     table_height: float
     """m, z of the table's surface."""
-
     cameras: Mapping[str, Marked]
     """The marked points of each camera, by name."""
 

@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array
 from ballfg.vision.arrays import Array32, Image
 
-SHRINK: Final = 4
-"""Pixels of the image per pixel of the small picture for the search."""
+SHRINK: Final = 4  # pixels of the image per pixel of the small picture for the search
 GRID: Final = (16, 9)
 """Blocks, across and down, whose brightness tells how bright the light is; their median is no moving thing."""
-BRIGHT: Final = (8.0, 245.0)
-"""Grey levels of the blocks that count: darker ones are noise, brighter ones are clipped."""
+BRIGHT: Final = (8.0, 245.0)  # grey levels of the blocks that count: darker ones are noise, brighter ones are clipped
 STRIPS: Final = 32
 """A frame refreshes one of so many strips of the background: all of it would cost more than the search."""
 WEIGHT: Final = 0.08
@@ -23,14 +21,12 @@ WEIGHT: Final = 0.08
 COVERED_WEIGHT: Final = 0.008
 """The same where something was found: a passing ball leaves 0.5 of 60 grey levels, a moved chair is gone in 4000
 frames."""
-SIGMAS: Final = 5.0
-"""Noise sigmas of the small picture, at that place, that a change must exceed to be looked at."""
+SIGMAS: Final = 5.0  # noise sigmas of the small picture, at that place, that a change must exceed to be looked at
 LEAST_CHANGE: Final = 5.0
 """Grey levels that it must exceed besides: compression and rounding make errors that the frames learned from lack."""
 ROUNDING: Final = 1.0 / 12.0
 """Grey levels^2, variance of rounding to whole ones. It keeps a noise-free video's covariance regular."""
-FEWEST: Final = 3
-"""Images that a background is learned from at least."""
+FEWEST: Final = 3  # images that a background is learned from at least
 
 
 class Background:

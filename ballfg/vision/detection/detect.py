@@ -23,15 +23,10 @@ from ballfg.vision.detection.video import Video, open_video
 
 T = TypeVar("T")
 
-Maker = Callable[[Video], Detector]
-"""Makes the detector of a camera from its video."""
-
-SAMPLE: Final = 15
-"""Number of frames for a background: objects at the same place in eight of them are background."""
-LOOKS: Final = 0.05
-"""s without a message after which the processes are checked."""
-TELLS: Final = 20
-"""Number of frames between progress messages of a process."""
+Maker = Callable[[Video], Detector]  # makes the detector of a camera from its video
+SAMPLE: Final = 15  # number of frames for a background: objects at the same place in eight of them are background
+LOOKS: Final = 0.05  # s without a message after which the processes are checked
+TELLS: Final = 20  # number of frames between progress messages of a process
 SEARCHED: Final = "frames searched"
 
 
@@ -57,9 +52,8 @@ def load_detector(text: str) -> Maker:
     Args: text: `FILE.py:NAME`; the file is one that you trust: all of its code runs.
     Returns: what makes the detector of a camera, fit to be sent to other processes: the function as it is, or an
         instance of the class, made without arguments.
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: a text of another form, a file that does not run, or a name that is no callable of it.
+    Raises: FileNotFoundError: there is no such file. ValueError: a text of another form, a file that does not run, or a
+        name that is no callable of it.
     """
     file, colon, name = text.rpartition(":")
     if not (colon and file and name.isidentifier()):

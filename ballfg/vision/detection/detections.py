@@ -28,13 +28,10 @@ class Candidates:
 
     pixels: Array
     """(k, 2) px, the ball's centre in mid exposure; (0, 0) is the centre of the top left pixel."""
-
     covariances: Array
     """(k, 2, 2) px^2."""
-
     scores: Array
     """(k,) dimensionless, in [0, 1], similarity to a ball."""
-
     streaks: Array
     """(k, 2, 2) px, centre at the shutter's opening and closing, in unknown order; NaN where not blurred."""
 
@@ -76,22 +73,16 @@ class Detections:
 
     camera: str
     """Name of the camera."""
-
     frames: Array
     """(f,) s, recorded stamps of all frames, strictly increasing."""
-
     frame: Index
     """(n,) number of each candidate's frame, not decreasing."""
-
     pixels: Array
     """(n, 2) px, the ball's centre in mid exposure; (0, 0) is the centre of the top left pixel."""
-
     covariances: Array
     """(n, 2, 2) px^2."""
-
     scores: Array
     """(n,) dimensionless, in [0, 1], similarity to a ball."""
-
     streaks: Array
     """(n, 2, 2) px, centre at the shutter's opening and closing, in unknown order; NaN where not blurred."""
 

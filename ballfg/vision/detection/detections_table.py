@@ -15,10 +15,8 @@ from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections
 
 REQUIRED: Final = ("t", detections_file.CAMERA, "u", "v")
-UNUSED: Final = (KEY,)
-"""Columns that may be there and are not needed: which ball a row belongs to is found anew."""
-SURE: Final = 1.0
-"""Score of all rows of a table without one: somebody has chosen them."""
+UNUSED: Final = (KEY,)  # columns that may be there and are not needed: which ball a row belongs to is found anew
+SURE: Final = 1.0  # score of all rows of a table without one: somebody has chosen them
 _UNSTATED: Final = detections_file.UNSTATED | {detections_file.SCORE: SURE}
 _RULES: Final = {**detections_file.RULES, detections_file.SCORE: ("0 to 1", lambda x: (x >= 0.0) & (x <= 1.0))}
 
@@ -36,10 +34,8 @@ def read_detections(
             and `score`.
         ignored: names of cameras whose rows are passed over.
     Returns: detections in the order of the cameras, and what was ignored, one sentence each.
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: a column that is missing, a cell out of its range, an unknown camera, a camera without rows; the
-            message names file, line and column.
+    Raises: FileNotFoundError: there is no such file. ValueError: a column that is missing, a cell out of its range, an
+        unknown camera, a camera without rows; the message names file, line and column.
     """
     header, texts, values = detections_file.read_columns(path, REQUIRED)
     names = texts[detections_file.CAMERA]

@@ -23,10 +23,8 @@ Colour = Literal["white", "orange"]
 MODEL_ERROR: Final = 0.02
 """px per px of blotches, sigma that every centre has besides the noise's: the disc's edge is not quite the lens's, and
 compression, which makes the blotches, moves edges."""
-LEARNS: Final = 0.8
-"""Score from which a candidate teaches what edge and shading to expect."""
-FORGETS: Final = 0.98
-"""Factor on earlier information per teaching candidate: the light on the ball changes as it flies."""
+LEARNS: Final = 0.8  # score from which a candidate teaches what edge and shading to expect
+FORGETS: Final = 0.98  # factor on earlier information per teaching candidate: the light on the ball changes as it flies
 SUREST: Final = (0.15, 0.08, 0.08)
 """Least sigmas of the expected edge (px) and shading: they change along a flight, and may be learned wrong."""
 VISIBLE_STREAK: Final = 3.0
@@ -42,13 +40,10 @@ class DetectorSettings:
 
     diameter: tuple[float, float] = (4.0, 40.0)
     """px, least and greatest diameter."""
-
     longest_streak: float = 60.0
     """px, largest motion of a ball during an exposure."""
-
     colour: Colour | None = None
     """Colour of the ball; None: any colour that differs from the background's."""
-
     most: int = 6
     """Largest number of closely examined candidates per frame."""
 

@@ -13,18 +13,14 @@ sleeves: 0.1 and more."""
 ODD: Final = 2.0
 """Sigmas from the `Look` first expected, root mean square of its three, beyond which the mark for looks falls by half
 per sigma. Sleeves, with the light on their upper side, pass for half a ball in deep shade."""
-STRENGTH: Final = 15.0
-"""Ratio of signal to noise, over the whole candidate, at which the mark for contrast is 1 - 1/e."""
-SIZE: Final = 0.2
-"""Relative error of the diameter, beyond the limits, at which the mark for size is 1/e."""
-UNSETTLED: Final = 0.5
-"""Mark of a fit that did not converge."""
+STRENGTH: Final = 15.0  # ratio of signal to noise, over the whole candidate, at which the mark for contrast is 1 - 1/e
+SIZE: Final = 0.2  # relative error of the diameter, beyond the limits, at which the mark for size is 1/e
+UNSETTLED: Final = 0.5  # mark of a fit that did not converge
 WHITE: Final = (0.25, 0.2)
 """Saturation (greatest less least channel, over the greatest) up to which a ball is white, and the scale beyond."""
 ORANGE: Final = (8.0, 48.0, 12.0)
 """Degrees of hue between which a ball is orange, yellow ones included, and the scale beyond that."""
-PALE: Final = (0.35, 0.15)
-"""Saturation from which a ball is orange, and the scale below that."""
+PALE: Final = (0.35, 0.15)  # saturation from which a ball is orange, and the scale below that
 
 
 def score(
@@ -37,8 +33,7 @@ def score(
 ) -> float:
     """Mark of a candidate, 0 to 1.
 
-    Args:
-        change, behind: (m, 3) grey levels, difference to the background and background of these pixels.
+    Args: change, behind: (m, 3) grey levels, difference to the background and background of these pixels.
         diameter: px, least and greatest.
     """
     shape = np.exp(-((fit.unexplained / UNEXPLAINED) ** 2)) * (1.0 if fit.settled else UNSETTLED)

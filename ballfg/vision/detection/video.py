@@ -78,10 +78,7 @@ class Video(ABC):
 
     @abstractmethod
     def sample(self, count: int) -> list[Image]:
-        """Images spread over the recording.
-
-        Returns: images (h, w, 3) uint8, at most `count`.
-        """
+        """Images spread over the recording. Returns: images (h, w, 3) uint8, at most `count`."""
 
     @abstractmethod
     def _decoded(self) -> Iterator[tuple[float, Image]]:

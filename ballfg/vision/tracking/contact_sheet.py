@@ -15,22 +15,14 @@ from ballfg.vision.tracking.view_painter import hexadecimal
 
 Extent = tuple[float, float, float, float]
 
-MOST_TRACKS: Final = 12
-"""Rows of the sheet; of more tracks as many, spread evenly, are shown."""
-MOST_VIEWS: Final = 4
-"""Cameras in a row: the first ones of the rig."""
-INCH: Final = 3.1
-"""Width of a view."""
-WIDER: Final = 1.2
-"""Width of a plot, in views."""
-TITLE: Final = 0.3
-"""Inches for a line of text and the space round it."""
-PROPORTION: Final = 1.45
-"""Width of a plot over its height, at least."""
-DPI: Final = 100
-"""Pixels an inch: a view then is drawn a third smaller than it was put together."""
-AROUND: Final = 0.15
-"""m shown round the points."""
+MOST_TRACKS: Final = 12  # rows of the sheet; of more tracks as many, spread evenly, are shown
+MOST_VIEWS: Final = 4  # cameras in a row: the first ones of the rig
+INCH: Final = 3.1  # width of a view
+WIDER: Final = 1.2  # width of a plot, in views
+TITLE: Final = 0.3  # inches for a line of text and the space round it
+PROPORTION: Final = 1.45  # width of a plot over its height, at least
+DPI: Final = 100  # pixels an inch: a view then is drawn a third smaller than it was put together
+AROUND: Final = 0.15  # m shown round the points
 TABLE: Final = "#2a7f4f"
 """Colour of the table."""
 

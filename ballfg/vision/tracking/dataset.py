@@ -22,12 +22,10 @@ from ballfg.vision.tracking.strobe import tapped
 
 Streams = Sequence[Callable[[], Iterator[tuple[float, Image]]]]
 """For each camera a function that opens its video and gives stamps (s) and images."""
-
 TRACKS: Final = "tracks.csv"
 OVERLAY: Final = "overlay.mp4"
 SHEET: Final = "contact_sheet.png"
-FILES: Final = (INFO_FILE, TRACKS, DETECTIONS_FILE, CAMERAS_FILE, OVERLAY, SHEET)
-"""All written files."""
+FILES: Final = (INFO_FILE, TRACKS, DETECTIONS_FILE, CAMERAS_FILE, OVERLAY, SHEET)  # all written files
 
 
 def check_result_folder(folder: Path, inputs: Sequence[Path], *, force: bool) -> None:

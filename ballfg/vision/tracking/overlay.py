@@ -21,25 +21,17 @@ from ballfg.vision.detection.detections import Detections
 from ballfg.vision.tracking.pipeline import Tracking
 from ballfg.vision.tracking.view_painter import ViewPainter, bgr, write
 
-VIEW_WIDTH: Final = 640
-"""px of one view: three side by side make 1920, the width of a screen."""
-IN_A_ROW: Final = 3
-"""Views side by side; more go below."""
-PLAYED_AT: Final = 30.0
-"""Hz at which every frame is shown: slow motion for a camera of 120 Hz, smooth on any screen."""
-STRIP: Final = 30
-"""px, height of the line of time."""
-BAR: Final = 6
-"""px, height of a track's bar."""
-BARS: Final = 2 * BAR + 3
-"""px from the upper lane of bars to the bottom."""
+VIEW_WIDTH: Final = 640  # px of one view: three side by side make 1920, the width of a screen
+IN_A_ROW: Final = 3  # views side by side; more go below
+PLAYED_AT: Final = 30.0  # Hz at which every frame is shown: slow motion for a camera of 120 Hz, smooth on any screen
+STRIP: Final = 30  # px, height of the line of time
+BAR: Final = 6  # px, height of a track's bar
+BARS: Final = 2 * BAR + 3  # px from the upper lane of bars to the bottom
 HELD: Final = 0.1
 """s that a camera's frame stays on show where its next ones are missing: long enough to bridge dropped frames, short
 enough that a picture never shows a ball that has long gone."""
-MARGIN: Final = 12
-"""px left and right of it."""
-PAPER, INK = (40, 40, 40), (235, 235, 235)
-"""Colours of the line of time and of its cursor and text."""
+MARGIN: Final = 12  # px left and right of it
+PAPER, INK = (40, 40, 40), (235, 235, 235)  # colours of the line of time and of its cursor and text
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +40,6 @@ class Schedule:
 
     times: Array
     """(k,) s, true time of each moment, increasing."""
-
     frames: Index
     """(k, c) number of the frame of each camera; -1 where it has none within `HELD`."""
 
@@ -58,9 +49,7 @@ def write_overlay(
 ) -> int:
     """Writes the overlay video (mp4).
 
-    Args:
-        path: a new file; its folder exists.
-        streams: the frames of each camera once more, from the first on.
+    Args: path: a new file; its folder exists.  streams: the frames of each camera once more, from the first on.
         watch: sees the frames that are drawn.
     Returns: the number of its frames.
     Raises: OSError: the video cannot be written.

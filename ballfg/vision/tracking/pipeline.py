@@ -20,10 +20,8 @@ from ballfg.vision.detection.detections import Detections, Detector
 from ballfg.vision.detection.video import Video, open_video
 from ballfg.vision.tracking.recordings import check_sizes
 
-FEWEST: Final = 2
-"""Least number of cameras: a single one does not see the distance of a ball."""
-DIGITS: Final = 3
-"""Least number of digits in a track's name: names then sort as their tracks do."""
+FEWEST: Final = 2  # least number of cameras: a single one does not see the distance of a ball
+DIGITS: Final = 3  # least number of digits in a track's name: names then sort as their tracks do
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +30,6 @@ class Seen:
 
     frames: Index
     """(m,) numbers of the camera's frames, increasing."""
-
     pixels: Array
     """(m, 2) px."""
 
@@ -43,13 +40,10 @@ class Tracking:
 
     cameras: tuple[Camera, ...]
     """The rig."""
-
     detections: tuple[Detections, ...]
     """All candidates of each camera, in the order of `cameras`."""
-
     balls: tuple[SeenBall, ...]
     """In the order of their first points."""
-
     agreement: Agreement | None
     """The agreement of the cameras; None without a ball."""
 

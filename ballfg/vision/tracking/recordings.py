@@ -74,10 +74,7 @@ def stamp_files(given: Sequence[str], cameras: Sequence[Camera]) -> dict[str, Pa
 
 
 def without(cameras: Sequence[Camera], names: Sequence[str]) -> list[Camera]:
-    """The remaining cameras.
-
-    Raises: ValueError: a name of no camera.
-    """
+    """The remaining cameras. Raises: ValueError: a name of no camera."""
     known = [camera.name for camera in cameras]
     for name in names:
         if name not in known:

@@ -11,30 +11,18 @@ from ballfg.vision.arrays import Image
 from ballfg.vision.tracking.pipeline import Tracking
 from ballfg.vision.tracking.view_painter import bgr, by_score, polyline, ring, uncover, write
 
-WIDTH: Final = 480
-"""px of the picture."""
-HEIGHT: Final = 270
-"""px of the picture without the row of close-ups."""
-ZOOMS: Final = 5
-"""Close-ups below the picture."""
-ZOOM: Final = WIDTH // ZOOMS
-"""px, side of a close-up."""
-EXPOSURES: Final = 2 * ZOOMS - 1
-"""Balls in the picture; every second one is a close-up too."""
-AROUND: Final = 60.0
-"""px left free around the flight in the frame, so that one sees where it was."""
-LEAST_WIDTH: Final = 320.0
-"""px of the frame that are shown at least: less is blurred by the enlargement."""
-CUT: Final = 2.5
-"""Radii of the ball, of the disc that is cut out: room for the streak of a moving ball."""
-CLOSE: Final = 3.5
-"""Radii of the ball, half the side of a close-up."""
-LEAST_RADIUS: Final = 3.0
-"""px; the cut discs of a smaller, distant ball are those of this one."""
-MOST_RINGS: Final = 500
-"""Candidates that the picture of a recording without a ball shows: the best ones."""
-BLANK: Final = 60
-"""Grey of areas that were not filmed."""
+WIDTH: Final = 480  # px of the picture
+HEIGHT: Final = 270  # px of the picture without the row of close-ups
+ZOOMS: Final = 5  # close-ups below the picture
+ZOOM: Final = WIDTH // ZOOMS  # px, side of a close-up
+EXPOSURES: Final = 2 * ZOOMS - 1  # balls in the picture; every second one is a close-up too
+AROUND: Final = 60.0  # px left free around the flight in the frame, so that one sees where it was
+LEAST_WIDTH: Final = 320.0  # px of the frame that are shown at least: less is blurred by the enlargement
+CUT: Final = 2.5  # radii of the ball, of the disc that is cut out: room for the streak of a moving ball
+CLOSE: Final = 3.5  # radii of the ball, half the side of a close-up
+LEAST_RADIUS: Final = 3.0  # px; the cut discs of a smaller, distant ball are those of this one
+MOST_RINGS: Final = 500  # candidates that the picture of a recording without a ball shows: the best ones
+BLANK: Final = 60  # grey of areas that were not filmed
 
 
 class Picture(Protocol):

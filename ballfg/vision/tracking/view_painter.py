@@ -15,24 +15,16 @@ Colour = tuple[int, int, int]
 TRACKS: Final = ("#e69f00", "#56b4e9", "#f0e442", "#cc79a7", "#00c08b", "#ff7f50")
 """Light colours that differ for every kind of colour vision (after Okabe and Ito) and stand out on green, blue and grey
 images."""
-TRAIL: Final = 0.4
-"""s of a ball's past that its trail shows: over a metre of flight, without filling the view."""
-LINGER: Final = 0.3
-"""s that the trail stays after the ball's last point, so that the end of a track can be seen."""
+TRAIL: Final = 0.4  # s of a ball's past that its trail shows: over a metre of flight, without filling the view
+LINGER: Final = 0.3  # s that the trail stays after the ball's last point, so that the end of a track can be seen
 RING: Final = 9.0
 """px, radius of the ring round an associated ball on the scaled view: leaves the ball, some 6 px wide, visible."""
-BESIDE: Final = (12.0, -8.0)
-"""px from the ball to its name."""
-CANDIDATE: Final = 4.5
-"""px, radius of the ring round a candidate."""
-UNLIKELY, LIKELY = (130, 130, 130), (255, 255, 255)
-"""Colours of candidates of score 0 and 1; those between are mixed."""
-DIMMED: Final = 0.4
-"""Share of the view's brightness that remains behind text."""
-CAPTION: Final = 22
-"""px, height of the line of text at the top."""
-_SHIFT: Final = 4
-"""Binary digits after the point that OpenCV draws with: a 16th of a pixel."""
+BESIDE: Final = (12.0, -8.0)  # px from the ball to its name
+CANDIDATE: Final = 4.5  # px, radius of the ring round a candidate
+UNLIKELY, LIKELY = (130, 130, 130), (255, 255, 255)  # colours of candidates of score 0 and 1; those between are mixed
+DIMMED: Final = 0.4  # share of the view's brightness that remains behind text
+CAPTION: Final = 22  # px, height of the line of text at the top
+_SHIFT: Final = 4  # binary digits after the point that OpenCV draws with: a 16th of a pixel
 
 
 class ViewPainter:
