@@ -18,7 +18,6 @@ from ballfg.vision.camera_file import CAMERAS_FILE, write_cameras
 from ballfg.vision.tracking.contact_sheet import ContactSheet, Extent
 from ballfg.vision.tracking.overlay import write_overlay
 from ballfg.vision.tracking.pipeline import Tracking
-from ballfg.vision.tracking.strobe import tapped
 
 Streams = Sequence[Callable[[], Iterator[tuple[float, Image]]]]
 """For each camera a function that opens its video and gives stamps (s) and images."""
@@ -67,25 +66,15 @@ def write_tracking(
     """
     with whole_folder(folder, earlier=FILES) as stage:
         _write_tables(stage, tracking, info)
-        sheet = ContactSheet(tracking, info.ball.radius, info.table_height, table)
-        if streams is not None:
-            _run_videos(stage, tracking, sheet, streams, overlay, watch)
+        sheet = ContactSheet(tracking, info.table_height, table)
+        passing = [sheet.passing(camera, opened()) for camera, opened in enumerate(streams or ())]
+        if passing and overlay:
+            write_overlay(stage / OVERLAY, tracking, passing, watch)
+        for camera, frames in enumerate(passing if not overlay else ()):
+            for _ in itertools.islice(frames, sheet.last(camera) + 1):
+                pass
         sheet.write(stage / SHEET)
         return [name for name in FILES if (stage / name).is_file()]
-
-
-def _run_videos(
-    stage: Path, tracking: Tracking, sheet: ContactSheet, streams: Streams, overlay: bool, watch: Watch
-) -> None:
-    """Runs through the videos once more, for both kinds of pictures."""
-    pictures = [sheet.pictures_of(i) for i in range(len(streams))]
-    taps = [tapped(opened(), wanted) for opened, wanted in zip(streams, pictures, strict=True)]
-    if overlay:
-        write_overlay(stage / OVERLAY, tracking, taps, watch)
-    for tap, wanted in zip(taps, pictures, strict=True):
-        last = max((frame for picture in wanted for frame in picture.frames), default=-1)
-        for _ in itertools.islice(tap, 0 if overlay else last + 1):
-            pass
 
 
 def _write_tables(stage: Path, tracking: Tracking, info: DatasetInfo) -> None:

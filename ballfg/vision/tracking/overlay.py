@@ -1,9 +1,8 @@
-"""Draws the overlay video: all views side by side with candidates, balls, trails, names and a line of time.
+"""Draws the overlay video: all views side by side with candidates, balls, trails and names.
 
 The cameras are played back on one clock: each shows its frame that is nearest to the time.
 """
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,19 +18,14 @@ from ballfg.vision.association.gathering import nearest
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections
 from ballfg.vision.tracking.pipeline import Tracking
-from ballfg.vision.tracking.view_painter import ViewPainter, bgr, write
+from ballfg.vision.tracking.view_painter import ViewPainter
 
 VIEW_WIDTH: Final = 640  # px of one view: three side by side make 1920, the width of a screen
 IN_A_ROW: Final = 3  # views side by side; more go below
 PLAYED_AT: Final = 30.0  # Hz at which every frame is shown: slow motion for a camera of 120 Hz, smooth on any screen
-STRIP: Final = 30  # px, height of the line of time
-BAR: Final = 6  # px, height of a track's bar
-BARS: Final = 2 * BAR + 3  # px from the upper lane of bars to the bottom
 HELD: Final = 0.1
 """s that a camera's frame stays on show where its next ones are missing: long enough to bridge dropped frames, short
 enough that a picture never shows a ball that has long gone."""
-MARGIN: Final = 12  # px left and right of it
-PAPER, INK = (40, 40, 40), (235, 235, 235)  # colours of the line of time and of its cursor and text
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +54,7 @@ def write_overlay(
     if not video.isOpened():
         raise OSError(f"{path}: OpenCV cannot write this video. Check the disk, or go without the overlay.")
     try:
-        frames = painter.paint_all(moments, streams)
-        for frame in watch(frames, len(moments.times), "overlay frames drawn"):
+        for frame in watch(painter.paint_all(moments, streams), len(moments.times), "overlay frames drawn"):
             video.write(frame)
     finally:
         video.release()
@@ -72,45 +65,20 @@ class OverlayPainter:
     """Lays the views out and draws them. Attributes: size: width and height of the overlay, px."""
 
     def __init__(self, tracking: Tracking) -> None:
-        self._tracking = tracking
         self._views = [ViewPainter(tracking, i, VIEW_WIDTH) for i in range(len(tracking.cameras))]
-        columns = min(IN_A_ROW, len(self._views))
-        self._height = max(view.size[1] for view in self._views)
-        rows = math.ceil(len(self._views) / columns)
-        self._corners = [(i // columns * self._height, i % columns * VIEW_WIDTH) for i in range(len(self._views))]
-        height = rows * self._height + STRIP
-        self.size = (columns * VIEW_WIDTH, height + height % 2)  # the codec wants even sides
+        columns, height = min(IN_A_ROW, len(self._views)), max(view.size[1] for view in self._views)
+        self._corners = [(i // columns * height, i % columns * VIEW_WIDTH) for i in range(len(self._views))]
+        whole = self._corners[-1][0] + height
+        self.size = (columns * VIEW_WIDTH, whole + whole % 2)  # the codec wants even sides
 
     def paint_all(self, moments: Schedule, streams: Sequence[Iterator[tuple[float, Image]]]) -> Iterator[Image]:
         """One picture a moment."""
-        if len(moments.times) == 0:
-            return
-        first, last = float(moments.times[0]), float(moments.times[-1])
-        line = self._line_of_time(first, last)
         for time, frames, images in zip(moments.times, moments.frames, play(moments, streams), strict=True):
             page = np.zeros((self.size[1], self.size[0], 3), np.uint8)
             for view, (top, left), frame, image in zip(self._views, self._corners, frames, images, strict=True):
                 painted = view.paint(image, int(frame), float(time))
                 page[top : top + len(painted), left : left + VIEW_WIDTH] = painted
-            page[-STRIP:] = line
-            x = self._place(float(time), first, last)
-            cv2.line(page, (x, self.size[1] - STRIP), (x, self.size[1] - 1), INK, 1)
-            write(page, f"{time:.3f} s", (min(x + 5, self.size[0] - 75), self.size[1] - STRIP + 12), INK, 0.4)
             yield page
-
-    def _line_of_time(self, first: float, last: float) -> Image:
-        """The strip at the bottom: each track a bar in its colour, from its first point to its last."""
-        line = np.full((STRIP, self.size[0], 3), PAPER, np.uint8)
-        for track, ball in enumerate(self._tracking.balls):
-            start, end = (self._place(float(ball.times[i]), first, last) for i in (0, -1))
-            top = STRIP - BARS + track % 2 * (BAR + 1)  # two lanes: the next track may begin before one ends
-            cv2.rectangle(line, (start, top), (max(end, start + 1), top + BAR - 1), bgr(track), cv2.FILLED)
-        return line
-
-    def _place(self, time: float, first: float, last: float) -> int:
-        """Place of a time, px from the left."""
-        share = (time - first) / (last - first) if last > first else 0.0
-        return round(MARGIN + share * (self.size[0] - 1 - 2 * MARGIN))
 
 
 def schedule(detections: Sequence[Detections], cameras: Sequence[Camera]) -> Schedule:

@@ -17,11 +17,10 @@ TRACKS: Final = ("#e69f00", "#56b4e9", "#f0e442", "#cc79a7", "#00c08b", "#ff7f50
 images."""
 TRAIL: Final = 0.4  # s of a ball's past that its trail shows: over a metre of flight, without filling the view
 LINGER: Final = 0.3  # s that the trail stays after the ball's last point, so that the end of a track can be seen
-RING: Final = 9.0
-"""px, radius of the ring round an associated ball on the scaled view: leaves the ball, some 6 px wide, visible."""
+RING: Final = 9.0  # px, radius of the ring round an associated ball on the scaled view: leaves the ball visible
 BESIDE: Final = (12.0, -8.0)  # px from the ball to its name
 CANDIDATE: Final = 4.5  # px, radius of the ring round a candidate
-UNLIKELY, LIKELY = (130, 130, 130), (255, 255, 255)  # colours of candidates of score 0 and 1; those between are mixed
+UNLIKELY, LIKELY = (130, 130, 130), (255, 255, 255)  # colours of candidates of score 0 and 1, mixed between
 DIMMED: Final = 0.4  # share of the view's brightness that remains behind text
 CAPTION: Final = 22  # px, height of the line of text at the top
 _SHIFT: Final = 4  # binary digits after the point that OpenCV draws with: a 16th of a pixel
@@ -31,10 +30,8 @@ class ViewPainter:
     """Draws the frames of one camera, by its number, at a width in px; the height follows."""
 
     def __init__(self, tracking: Tracking, camera: int, width: int) -> None:
-        self._camera = tracking.cameras[camera]
-        self._detections = tracking.detections[camera]
-        self._names = tracking.names
-        self._balls = tracking.balls
+        self._camera, self._detections = tracking.cameras[camera], tracking.detections[camera]
+        self._names, self._balls = tracking.names, tracking.balls
         self._scale = width / self._camera.size[0]
         self.size = (width, max(1, round(self._camera.size[1] * self._scale)))
         self._trails = [self._camera.project(ball.points) for ball in tracking.balls]
@@ -55,29 +52,21 @@ class ViewPainter:
             return view
         view = np.asarray(cv2.resize(image, self.size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         used = self._used.get(frame, ())
-        clean = view.copy() if used else view
-        self._paint_trails(view, time)
-        self._paint_candidates(view, frame)
+        clean = view.copy()
+        for track, (ball, pixels) in enumerate(zip(self._balls, self._trails, strict=True)):
+            if ball.times[0] <= time <= ball.times[-1] + LINGER:
+                recent = (ball.times > time - TRAIL) & (ball.times <= time)
+                polyline(view, self._scaled(pixels[recent]), bgr(track))
+        candidates = self._detections.in_frame(frame)
+        for pixel, score in zip(candidates.pixels, candidates.scores, strict=True):
+            if not any(np.array_equal(pixel, ball) for _, ball in used):
+                ring(view, self._scaled(pixel), CANDIDATE, by_score(score))
         for track, pixel in used:
             uncover(view, clean, self._scaled(pixel), RING)
             ring(view, self._scaled(pixel), RING, bgr(track), 2)
             write(view, self._names[track], self._scaled(pixel) + np.array(BESIDE), bgr(track))
         caption(view, f"{self._camera.name}   frame {frame}   stamp {self._detections.frames[frame]:.4f} s")
         return view
-
-    def _paint_trails(self, view: Image, time: float) -> None:
-        for track, (ball, pixels) in enumerate(zip(self._balls, self._trails, strict=True)):
-            if not ball.times[0] <= time <= ball.times[-1] + LINGER:
-                continue
-            recent = pixels[(ball.times > time - TRAIL) & (ball.times <= time)]
-            polyline(view, self._scaled(recent), bgr(track), 1)
-
-    def _paint_candidates(self, view: Image, frame: int) -> None:
-        candidates = self._detections.in_frame(frame)
-        balls = [pixel for _, pixel in self._used.get(frame, ())]
-        for pixel, score in zip(candidates.pixels, candidates.scores, strict=True):
-            if not any(np.array_equal(pixel, ball) for ball in balls):
-                ring(view, self._scaled(pixel), CANDIDATE, by_score(score))
 
     def _scaled(self, pixels: Array) -> Array:
         """Places on the drawn view of places in the image: both count from the centre of the top left pixel."""
@@ -89,10 +78,9 @@ def hexadecimal(track: int) -> str:
     return TRACKS[track % len(TRACKS)]
 
 
-def bgr(track: int) -> tuple[int, int, int]:
+def bgr(track: int) -> Colour:
     """The same as blue, green, red, each 0 .. 255."""
-    text = hexadecimal(track)
-    red, green, blue = (int(text[i : i + 2], 16) for i in (1, 3, 5))
+    red, green, blue = bytes.fromhex(hexadecimal(track)[1:])
     return blue, green, red
 
 
@@ -104,10 +92,9 @@ def by_score(score: float) -> Colour:
 
 def ring(view: Image, centre: Array, radius: float, colour: Colour, thickness: int = 1) -> None:
     """A circle at a place (2,) px between pixels; none far outside the view."""
-    if not (np.abs(centre) < 4 * max(view.shape)).all():
-        return
-    u, v = (round(float(x) * 2**_SHIFT) for x in centre)
-    cv2.circle(view, (u, v), round(radius * 2**_SHIFT), colour, thickness, cv2.LINE_AA, _SHIFT)
+    if (np.abs(centre) < 4 * max(view.shape)).all():
+        u, v = (round(float(x) * 2**_SHIFT) for x in centre)
+        cv2.circle(view, (u, v), round(radius * 2**_SHIFT), colour, thickness, cv2.LINE_AA, _SHIFT)
 
 
 def uncover(view: Image, clean: Image, centre: Array, radius: float) -> None:
@@ -117,25 +104,24 @@ def uncover(view: Image, clean: Image, centre: Array, radius: float) -> None:
     cv2.copyTo(clean, disc, view)
 
 
-def polyline(view: Image, places: Array, colour: Colour, thickness: int) -> None:
+def polyline(view: Image, places: Array, colour: Colour) -> None:
     """Lines through places (n, 2) px; broken where they are NaN or far outside the view."""
-    limit = 4 * max(view.shape)
-    fine = np.isfinite(places).all(axis=1) & (np.abs(np.nan_to_num(places)) < limit).all(axis=1)
+    fine = (np.abs(np.nan_to_num(places, nan=np.inf)) < 4 * max(view.shape)).all(axis=1)
     for piece in np.split(np.arange(len(places)), np.flatnonzero(~fine)):
         inside = piece[fine[piece]]
         if len(inside) > 1:
             points = np.round(places[inside] * 2**_SHIFT).astype(np.int32)
-            cv2.polylines(view, [points], False, colour, thickness, cv2.LINE_AA, _SHIFT)
+            cv2.polylines(view, [points], False, colour, 1, cv2.LINE_AA, _SHIFT)
 
 
-def write(view: Image, text: str, at: Sequence[float] | Array, colour: Colour, scale: float = 0.45) -> None:
+def write(view: Image, text: str, at: Sequence[float] | Array, colour: Colour) -> None:
     """Text at its lower left corner, on a dark plate; a letter that the font may lack is a question mark."""
     plain = text.encode("ascii", "replace").decode()
     left, bottom = (round(float(x)) for x in at)
-    (width, height), below = cv2.getTextSize(plain, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
+    (width, height), below = cv2.getTextSize(plain, cv2.FONT_HERSHEY_SIMPLEX, 0.45, 1)
     plate = view[max(0, bottom - height - 2) : max(0, bottom + below), max(0, left - 2) : max(0, left + width + 2)]
     plate[:] = (plate * DIMMED).astype(np.uint8)
-    cv2.putText(view, plain, (left, bottom), cv2.FONT_HERSHEY_SIMPLEX, scale, colour, 1, cv2.LINE_AA)
+    cv2.putText(view, plain, (left, bottom), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
 
 
 def caption(view: Image, text: str) -> None:
