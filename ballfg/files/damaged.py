@@ -12,15 +12,12 @@ from typing import Final
 from ballfg.checks import one_line, short_text
 
 FREE: Final = 32_000_000  # number of bytes that any file may unpack to
-RATIO: Final = 20
-"""Multiple of its own size that a file may unpack to beyond that. Measurements shrink to a half or third, whole rows of
-zeros to a tenth."""
+RATIO: Final = 20  # multiple of its own size that it may unpack to beyond that; measurements shrink to a third
 NUMBER: Final = 8  # number of bytes of a number in memory, whatever its size in a file
 MAX_TEXT: Final = 250_000_000  # largest number of bytes of a text file that is held whole
 MAX_LINE: Final = 1 << 18  # Largest number of characters in a line of a table. Lines of results have some 400.
 MAX_COLUMNS: Final = 10_000  # Largest number of columns of a table. Marker systems write a few hundred.
-MAX_PIXELS: Final = 64_000_000
-"""Largest number of pixels of an image or a frame: 192 MB of three colours. A frame in 4K has 8 million."""
+MAX_PIXELS: Final = 64_000_000  # of an image or a frame: 192 MB of three colours; a frame in 4K has 8 million
 _SAID: Final = 160  # largest number of characters of a library's own words
 
 

@@ -18,8 +18,7 @@ from ballfg.files.strict_yaml import MAX_DEPTH, YamlError, parse_yaml
 Tree: TypeAlias = str | list["Tree"] | dict[str, "Tree"] | None  # a scalar as written, a sequence, or a map
 MAX_BYTES: Final = 1_000_000  # largest size of a file: each camera takes a few thousand
 ENDINGS: Final = (".xml", ".json", ".yml", ".yaml")
-_SHAPES: Final = (("rows", "cols"), ("sizes",))
-"""Nodes with the size of a matrix: one of two dimensions, one of any number."""
+_SHAPES: Final = (("rows", "cols"), ("sizes",))  # nodes with a matrix's size: of two dimensions, of any number
 _TYPE: Final = re.compile(r"([1-9]?)[ucwsifdh]")  # type of a matrix: count and kind of the numbers in each place
 _MAX_SIDE: Final = 1_000_000
 _TOKEN: Final = re.compile(r'"(?:[^"\\]|\\.)*"|\S+', re.DOTALL)

@@ -12,8 +12,7 @@ import pyarrow.parquet as pq
 from ballfg.checks import MAX_TEXT
 from ballfg.files.damaged import MAX_COLUMNS, NUMBER, check_parts, check_unpacked, library_reads
 
-MAX_FOOTER: Final = 16_000_000
-"""Largest number of bytes of the metadata at a file's end: some 100,000 pieces of columns."""
+MAX_FOOTER: Final = 16_000_000  # bytes of the metadata at a file's end: some 100,000 pieces of columns
 MAX_PIECES: Final = 100_000  # largest number of columns times groups of rows
 _BUFFER: Final = 1 << 20
 _REMEDY: Final = "Write it again."

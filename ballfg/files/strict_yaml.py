@@ -19,8 +19,7 @@ MAX_DIGITS: Final = 100  # largest number of characters in a number
 MAX_KEY: Final = 1000  # largest number of characters in a key, which messages quote in full
 _TAG: Final = "tag:yaml.org,2002:"
 _NUMBERS: Final = (f"{_TAG}int", f"{_TAG}float")
-_PARSER: Final = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-"""libyaml's parser, ten times as fast, if PyYAML was built with it."""
+_PARSER: Final = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml's is ten times as fast
 _TEXT_LOADER: Final = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 
 

@@ -8,8 +8,7 @@ from torch import Tensor
 
 from ballfg.files.damaged import library_reads
 
-MAX_HEADER: Final = 1_000_000
-"""Largest number of bytes of the names and shapes in a file; the header of this package's networks has some 2,000."""
+MAX_HEADER: Final = 1_000_000  # bytes of names and shapes in a file; those of this package's networks take some 2,000
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:

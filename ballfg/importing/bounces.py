@@ -12,11 +12,9 @@ _ARM: Final = 0.06  # s of flight for the fit on each side of a bounce
 _LEAST_SAMPLES: Final = 3
 _LEAST_SPEED: Final = 0.7
 """m/s, least speed of the fall before and of the rise after a bounce; slower ones are rolling balls and noise."""
-_MOST_RESIDUAL: Final = 0.02
-"""m, largest root mean square about the two flights; a larger one means a hit, an outlier, or two balls."""
+_MOST_RESIDUAL: Final = 0.02  # m, root mean square about the two flights; more means a hit, an outlier, or two balls
 _SAME: Final = 0.04  # m: bounces within this distance of each other are on one surface
-_SHARE: Final = 0.3
-"""Share of the most frequent surface's bounces from which a higher surface is the table: balls bounce on below it."""
+_SHARE: Final = 0.3  # of the most frequent surface's bounces that make a higher one the table: balls bounce on below it
 _GRAVITY: Final = 10.0  # m/s^2, of the fitted arcs: gravity and a little topspin. An error of 5 moves a bounce by 2 mm.
 
 

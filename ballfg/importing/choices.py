@@ -7,8 +7,7 @@ from typing import Final
 from ballfg.checks import check_choice, check_instance, check_number, check_text, short_text, shown
 from ballfg.importing.fall import AXES, LENGTHS, TIMES
 
-ROLES: Final = ("t", "frame", "trajectory", "x", "y", "z", "sigma_x", "sigma_y", "sigma_z")
-"""Possible roles of a column."""
+ROLES: Final = ("t", "frame", "trajectory", "x", "y", "z", "sigma_x", "sigma_y", "sigma_z")  # of a column
 MAX_WHAT: Final = 900  # largest number of characters of an open question in a message
 MAX_CHOICE: Final = 240  # largest number of characters of a choice in it, for three column names of usual length
 

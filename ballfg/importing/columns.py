@@ -12,8 +12,7 @@ from ballfg.importing.formats.raw import RawTable, is_number, numbers
 from ballfg.importing.names import Meaning, meanings
 from ballfg.importing.stamps import as_stamps
 
-RATES: Final = ("rate", "fps", "frame_rate", "framerate", "hz", "sampling_rate", "frequency")
-"""Names of a constant that is the number of frames per second."""
+RATES: Final = ("rate", "fps", "frame_rate", "framerate", "hz", "sampling_rate", "frequency")  # frames per second
 UNITS: Final = ("unit", "units", "length_unit", "position_unit")
 _REGULAR: Final = 0.3  # largest median deviation of the steps of a time column, in median steps; coordinates vary more
 _FORWARD: Final = 0.9

@@ -18,8 +18,7 @@ from ballfg.importing.shots import GAP, GAP_STEPS, Counts, SourceShot, cut, spli
 from ballfg.tracks.track import Label
 
 MOST_SHOTS: Final = 60  # number of shots for the determination of units, evenly over the source
-_INTERRUPTED: Final = 0.5
-"""Share of files or recordings with gaps, above which a gap ends a shot instead of hiding a ball."""
+_INTERRUPTED: Final = 0.5  # share of files with gaps, above which a gap ends a shot instead of hiding a ball
 
 
 def understood(tables: Sequence[RawTable], choices: Choices) -> tuple[list[RawTable], Roles, list[RawTable]]:

@@ -18,8 +18,7 @@ from ballfg.tracks.track import Label
 
 _DISORDER: Final = 3.0  # median steps: an earlier stamp within this came late; beyond it a new shot begins
 _LARGEST: Final = 1e15  # in the source's units; a larger number is not a position in any unit, and counts as missing
-_ALONE: Final = 5.0
-"""A row of zeros is a missing sample if its distance from its neighbours is this multiple of the median."""
+_ALONE: Final = 5.0  # median steps from its neighbours at which a row of zeros is a missing sample
 GAP: Final = 0.5  # s without samples after which a new shot begins
 GAP_STEPS: Final = 20.0  # least number of median steps in such a gap
 

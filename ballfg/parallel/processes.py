@@ -24,8 +24,7 @@ from ballfg.parallel.work import Work, packed
 
 ONE_THREAD: Final = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 MOST_DEATHS: Final = 3  # largest number of processes that a chunk may lose: it is then the probable cause
-BEGIN: Final = "import sys; exec(sys.stdin.readline())"
-"""Code of a new process; the line that it reads lets it find the modules of this one."""
+BEGIN: Final = "import sys; exec(sys.stdin.readline())"  # code of a process; the line that it reads finds our modules
 Told = Callable[[Any], object]
 
 

@@ -28,15 +28,13 @@ MAX_MEDIAN_SIGMA = 1.0  # m: a track with a larger median sigma is refused
 MAX_STEP = 1.0  # s: a track whose median time step is longer is refused; no bounce could be seen in it
 MIN_STEP = 1e-6  # s: a track whose median time step is shorter is refused; no camera is that fast
 MAX_RATE_RATIO = 100.0  # a median time step that differs from the declared rate by more than this factor is refused
-BASELINE: Final = 0.05
-"""s to each side for an acceleration: with 3 mm of noise its error is 3 m/s^2, that of a track's median 0.5."""
+BASELINE: Final = 0.05  # s to each side for an acceleration: 3 mm of noise leave 3 m/s^2, in a track's median 0.5
 LEAST_FALLING: Final = 0.2  # least share of a track that falls along -z as a ball does, for undoubted axes
 MOSTLY: Final = 0.5  # share of a track that falls along +z, above which z seems to point down
 FALLS: Final = (0.4, 1.9)
 """Multiples of gravity between which a flying ball's vertical acceleration lies; strong topspin doubles it."""
 LEAST_REVERSAL: Final = 0.8  # m/s. A ball that falls and then rises at least so fast within a few samples has bounced.
-NEAR_SURFACE: Final = 0.08
-"""m. Distance from every declared surface beyond which a bounce is doubtful; a fast ball falls so far in one step."""
+NEAR_SURFACE: Final = 0.08  # m from every declared surface beyond which a bounce is doubtful; one step of a fast ball
 AXES: Final = ("x", "y", "z")
 
 _NAMED = 3  # number of trajectories that a note names

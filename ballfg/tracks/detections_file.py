@@ -28,10 +28,8 @@ PLACE: Final = ("t", "u", "v")
 NOISE: Final = ("sigma_u", "sigma_v", "rho_uv")
 SCORE: Final = "score"
 OPTIONAL: Final = (*NOISE, SCORE)
-UNSTATED: Final = {"sigma_u": 0.5, "sigma_v": 0.5, "rho_uv": 0.0}
-"""px. Half a pixel, as reached by a detector of patch centres."""
-LEAST_SIGMA: Final = 1e-4
-"""px. Best resolution of a camera; a graph with far surer pixels cannot be solved in double precision."""
+UNSTATED: Final = {"sigma_u": 0.5, "sigma_v": 0.5, "rho_uv": 0.0}  # px; half a pixel, as of patch centres
+LEAST_SIGMA: Final = 1e-4  # px, best resolution of a camera; far surer pixels cannot be solved in double precision
 MOST_PIXELS: Final = 1e6  # px. Largest width of an image; larger numbers overflow when squared.
 _SIGMA: Final[Rule] = (
     f"{LEAST_SIGMA:g} to {MOST_PIXELS:.0f} px",

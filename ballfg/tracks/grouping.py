@@ -20,8 +20,7 @@ from ballfg.checks import LARGEST, NAME_RULE, is_name, shown
 from ballfg.tracks.csv_files import no_rows
 from ballfg.tracks.rows import Block, RowSource
 
-MIN_SIGMA, MAX_SIGMA = 1e-9, 1e6
-"""m: allowed standard deviations of a sample; a large one marks a sample with little weight."""
+MIN_SIGMA, MAX_SIGMA = 1e-9, 1e6  # m, of a sample; a large one marks a sample with little weight
 
 
 @dataclass(frozen=True)

@@ -59,8 +59,7 @@ class Ball:
 
 TABLE_TENNIS = Ball(radius=0.02, mass=0.0027)
 """ITTF, The Laws of Table Tennis, 2.3: diameter 40 mm, 2.7 g."""
-TENNIS = Ball(radius=0.0335, mass=0.0577)
-"""ITF Rules of Tennis, Appendix I, type 2: diameter 65.4-68.6 mm, 56.0-59.4 g; the middle of both."""
+TENNIS = Ball(radius=0.0335, mass=0.0577)  # ITF Rules of Tennis, Appendix I, type 2: middle of the limits
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,7 @@ from ballfg.tracks.table import TableWriter
 from ballfg.tracks.track import Track
 
 DATASET_FILES = (INFO_FILE, *TRACK_FILES, LABELS_FILE)  # all possible names of a dataset's files
-TRUTH_FILE: Final = "truth.yaml"
-"""Settings of a simulation; in its folder, the files below belong to the simulated tracks alone."""
+TRUTH_FILE: Final = "truth.yaml"  # settings of a simulation; in its folder, the files below belong to it alone
 TRUTH_FILES: Final = (TRUTH_FILE, "truth.csv", "truth.parquet", "model.yaml", "model.learned-*")
 """All names, or patterns of names, of a simulation's further files."""
 _SPOOL = "labels.jsonl"

@@ -20,8 +20,7 @@ from ballfg.vision.camera import Camera
 CAMERAS_FILE: Final = "cameras.yaml"  # its name in the folder of a dataset or a scene
 LENS: Final = ("size", "matrix", "distortion")
 POSE: Final = ("rvec", "tvec")
-FIELDS: Final = (*LENS, *POSE, "time_offset")
-"""Fields of a camera in the file, in order; docs/calibrate.md explains them."""
+FIELDS: Final = (*LENS, *POSE, "time_offset")  # in the file's order; docs/calibrate.md explains them
 _MATRIX: Final = "camera_matrix"
 _NODES: Final = {
     "matrix": (_MATRIX,),

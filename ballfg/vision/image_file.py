@@ -12,10 +12,8 @@ from ballfg.checks import one_line
 from ballfg.files.damaged import check_pixels, whole_content
 from ballfg.vision.arrays import Image
 
-ENDINGS: Final = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
-"""Endings of images in a folder; other files are ignored."""
-FORMATS: Final = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "PPM", "MPO")
-"""Of Pillow's, which reads the headers alone. MPO: a JPEG with further pictures behind it, as telephones write."""
+ENDINGS: Final = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")  # others are ignored
+FORMATS: Final = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "PPM", "MPO")  # Pillow's; MPO: telephones' JPEG
 _TILES: Final = (322, 323)  # tags of TIFF: width and height of the pieces in which the pixels are kept
 
 

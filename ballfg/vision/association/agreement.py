@@ -20,18 +20,14 @@ from ballfg.vision.association.triangulate import triangulate
 from ballfg.vision.calibration.lens_covariance import POSE, slopes_of
 from ballfg.vision.camera import Camera
 
-LEAST_MISFIT: Final = 3.0
-"""Largest squared error of agreeing cameras, relative to noise: half a pixel for centres good to 0.3."""
+LEAST_MISFIT: Final = 3.0  # squared error of agreeing cameras over the noise's: half a pixel for centres good to 0.3
 LEAST_EXPLAINED: Final = 0.8  # least share of the error beyond noise that a culprit must explain
-CLEARLY: Final = 4.0
-"""Least ratio of the unexplained error of another camera: correcting the wrong one of three cameras may halve the
-disagreement, but never ends it."""
+CLEARLY: Final = 4.0  # least ratio of another camera's unexplained error: correcting a wrong one of three may halve it
 CLEARLY_WORSE: Final = 1.5  # least ratio of the squared errors, noise included
 LEAST_POINTS: Final = 20  # fewest points, each seen by three cameras or more: six numbers are fitted to them
 MOST_POINTS: Final = 600  # most points that are used, evenly spread: more do not change the answer
 _LOOSE: Final = 20.0  # px, noise for points from views that may be wrong
-_UNSEEN: Final = 1e4
-"""px, error of a sighting whose point lies behind the camera or beyond its lens: more than any image's width."""
+_UNSEEN: Final = 1e4  # px, error of a sighting whose point lies behind the camera or beyond its lens
 _FAR: Final = 9.0  # median squared errors at which a point counts half
 _STEPS: Final = 8  # Gauss-Newton steps; a camera turned by five degrees is right after six
 _PRIOR: Final = np.diag([0.1**-2] * 3 + [0.3**-2] * 3)

@@ -23,8 +23,7 @@ from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections
 
 _NONE: Final = np.zeros(0, dtype=np.int64)
-_DISPUTED: Final = 2
-"""Most frames in which two parts of one flight both have a candidate: one of the two candidates is wrong then."""
+_DISPUTED: Final = 2  # most frames in which two parts of one flight both have a candidate, one of them wrong
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ _WIDEST: Final = 20.0  # px, largest sigma of a prediction that is used
 _AHEAD: Final = 2.5  # frames by which a track is continued past its ends in one round
 _ROUNDS: Final = 4  # most rounds; each reaches a little farther at the ends
 _STEP: Final = 1e-3  # m, step of the numerical derivative of the projection
-_SYSTEMATIC: Final = 1.0
-"""px, added to a prediction's sigma for the calibration of the other cameras, from which it comes."""
+_SYSTEMATIC: Final = 1.0  # px, added to a prediction's sigma for the calibration of the cameras that it comes from
 
 
 def complete(footage: Footage, balls: Sequence[Gathered]) -> list[Gathered]:

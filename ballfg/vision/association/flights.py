@@ -15,33 +15,25 @@ from ballfg.state import STANDARD_GRAVITY
 from ballfg.vision.association.paths import Path
 
 LONGEST_GAP: Final = 0.3  # s. A ball that reappears after a longer gap is a new one.
-LONGEST_HIT_GAP: Final = 0.1
-"""s. A ball may have been hit in a gap up to this long, and may leave it with any velocity; in a longer one it may only
-have bounced."""
+LONGEST_HIT_GAP: Final = 0.1  # s; in a gap so long a ball may have been hit, in a longer one it may only have bounced
 FASTEST: Final = 80.0  # m/s, no ball that is struck by hand is faster: the fastest served tennis balls have 73
 LEAST_WAY: Final = 0.05  # m, least extent of a ball's track
 GRAVITY: Final = np.array([0.0, 0.0, -STANDARD_GRAVITY])  # m/s^2
-_SLACK: Final = 3.0
-"""m/s^2, tolerance of a slow ball's acceleration about gravity: error of the calibration, lift of a fast spin."""
+_SLACK: Final = 3.0  # m/s^2 about gravity for a slow ball: error of the calibration, lift of a fast spin
 _AIR: Final = 0.25  # 1/m, growth of that tolerance with the square of the speed: drag of 0.13 and as much lift
-_WINDOWS: Final = (0.15, 0.3, 0.6)
-"""s, windows in which an acceleration is measured: short against a flight; the longer ones serve noisy tracks."""
+_WINDOWS: Final = (0.15, 0.3, 0.6)  # s, for an acceleration: short against a flight; the longer ones serve noisy tracks
 _LEAST_IN_WINDOW: Final = 5  # points of such a window: three make the parabola
-_TELLING: Final = 2.0
-"""m/s^2, largest standard deviation of an acceleration that is compared with gravity: with a larger one a hovering
-object would pass."""
+_TELLING: Final = 2.0  # m/s^2, largest standard deviation of an acceleration; with more, a hovering object would pass
 _SIGMAS: Final = 3.0  # tolerance in standard deviations of a measured acceleration
 _FALLING: Final = 0.5
 """Least share of the informative windows in which a ball falls; it may be held, hit or at rest in the others."""
 _END: Final = 0.08  # s, length of a track's end that is extrapolated
 _STEADY: Final = 10.0  # m/s^2, standard deviation for drag and lift, which the extrapolation leaves out
 _FLOOR: Final = 0.01  # m, standard deviation of an extrapolated position apart from noise
-_FARTHEST: Final = 0.15
-"""m, greatest distance between the ends of one flight, whatever their covariance: two balls may be that close."""
+_FARTHEST: Final = 0.15  # m, greatest distance between the ends of one flight, whatever their covariance
 _GATE: Final = 16.0  # largest squared distance of two continuations, whitened: 4 sigma
 _FRICTION: Final = 0.5  # largest relative change of the horizontal velocity in a bounce
-_LEAST_CHANGE: Final = 1.0
-"""m/s, change of the horizontal velocity that is always allowed: spin accelerates a ball that drops."""
+_LEAST_CHANGE: Final = 1.0  # m/s, always allowed change of the horizontal velocity: spin accelerates a dropped ball
 _STEPS: Final = 25  # number of times in a gap at which continuations are compared
 
 

@@ -20,8 +20,7 @@ WORST_OFFSET: Final = 5.0  # px, prior standard deviation of a calibration's err
 LEAST_OFFSET: Final = 0.3  # px, least error of a calibration in the matching
 _SIGNIFICANT: Final = 0.5  # least excess of the miss of right pairs' rays, as a share of the noise's variance
 _MEDIAN_SQUARE: Final = 0.4549  # median of the square of a standard normal number
-_GATE: Final = 9.0
-"""Squared deviations at which two pieces do not belong together: 3 sigma of calibration and noise together."""
+_GATE: Final = 9.0  # squared deviations at which two pieces part: 3 sigma of calibration and noise together
 _LEAST_COMMON: Final = 2  # times at which both pieces must be known; a track that ends just after a bounce has no more
 _LEAST_SUPPORT: Final = 1.5  # common times that must speak for a pair, less what speaks against it
 _LONG: Final = 8  # common times from which a pair of pieces says something about the calibration

@@ -15,20 +15,14 @@ from ballfg.arrays import Array, Mask
 from ballfg.checks import check_array, check_each
 from ballfg.vision.camera import Camera
 
-MISSED: Final = 1e-6
-"""Share of right candidates that the tests may refuse: a wrong one that close to the truth does no harm."""
+MISSED: Final = 1e-6  # share of right candidates that the tests may refuse
 MAX_SIGMA: Final = 0.5
 """m, standard deviation along the least certain direction from which rays count as parallel: then there is no point."""
-_GATES: Final = tuple(float(chi2.isf(MISSED, degrees)) for degrees in (1, 2))
-"""Bounds of squared whitened residuals: of two rays that miss each other (1), of a further view (2)."""
-_STEPS: Final = 3
-"""Gauss-Newton steps; from the point halfway between two rays the second already moves it by less than a micrometre."""
-_HOPELESS: Final = 1e-6
-"""Information, in units of 1 / `MAX_SIGMA`^2, below which a normal matrix is singular up to rounding."""
-_TINY_ANGLE: Final = 1e-12
-"""Squared sine below which two rays are parallel to the precision of float64: halfway between them is then nowhere."""
-_AROUND: Final = 0.5 * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-"""px, steps of the central differences, a pixel wide, that say how far a pixel reaches in the undistorted image."""
+_GATES: Final = tuple(float(chi2.isf(MISSED, degrees)) for degrees in (1, 2))  # of two rays, of a further view
+_STEPS: Final = 3  # Gauss-Newton steps; from halfway between two rays the second moves less than a micrometre
+_HOPELESS: Final = 1e-6  # information in 1 / `MAX_SIGMA`^2 below which a normal matrix is singular up to rounding
+_TINY_ANGLE: Final = 1e-12  # squared sine below which two rays are parallel in float64: halfway between them is nowhere
+_AROUND: Final = 0.5 * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])  # px, steps of differences
 
 
 @dataclass(frozen=True, eq=False)

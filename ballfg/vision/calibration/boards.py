@@ -21,16 +21,11 @@ DICTIONARIES: Final = tuple(sorted(n.removeprefix("DICT_") for n in dir(cv2.aruc
 """Names of ArUco's dictionaries, without `DICT_`."""
 _SEARCH: Final = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
 _REFINE: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-3)
-_WINDOW: Final = 0.25
-"""Half the window of the refinement, as a share of the distance to the next corner, which it must not contain."""
-_WINDOW_LIMITS: Final = (2, 8)
-"""px, least and largest half window: smaller sees no edges, larger sees the lens bend them."""
-_IN_SQUARE: Final = 0.3
-"""Distance from a corner at which the four squares around it are sampled, as a share of a square's side."""
-_UNLIKE: Final = 0.5
-"""Two squares that touch at a corner only may differ by this share of the contrast; more, and it is no such corner."""
-_TRIED: Final = 3
-"""Images in which other numbers of squares are tried where nothing was found: each costs up to a second."""
+_WINDOW: Final = 0.25  # half the refinement's window, as a share of the distance to the next corner
+_WINDOW_LIMITS: Final = (2, 8)  # px: a smaller half window sees no edges, a larger one sees the lens bend them
+_IN_SQUARE: Final = 0.3  # distance from a corner at which its four squares are sampled, as a share of a side
+_UNLIKE: Final = 0.5  # share of the contrast by which two squares that touch at a corner only may differ
+_TRIED: Final = 3  # images without a board in which other numbers of squares are tried: each costs up to a second
 
 
 @dataclass(frozen=True)

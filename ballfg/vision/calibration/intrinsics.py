@@ -14,24 +14,19 @@ from ballfg.vision.calibration.boards import View
 from ballfg.vision.calibration.lens_covariance import covariance_of_lens, pixel_grid, sigma_of_rays
 from ballfg.vision.camera import DISTORTIONS, Camera
 
-MIN_VIEWS: Final = 8
-"""A view tells two numbers about the lens (Zhang 2000, section 2.3); eight are enough to tell errors from the lens."""
+MIN_VIEWS: Final = 8  # a view tells two numbers about the lens (Zhang 2000, section 2.3)
 MIN_TURN: Final = np.radians(10.0)
 """rad that some two boards must be turned against each other. Parallel boards cannot tell a long lens from a near
 board: OpenCV then reports tiny deviations of a focal length that is wrong by half."""
 MAX_FOCAL_SIGMA: Final = 0.02  # relative standard deviation of the focal length: 2 % are 6 cm at a distance of 3 m
-MIN_COVERAGE: Final = 0.4
-"""Least share of the image's cells with corners: outside of them, the distortion is extrapolated."""
+MIN_COVERAGE: Final = 0.4  # of the image's cells with corners: outside of them, the distortion is extrapolated
 CELLS: Final = (8, 5)  # number of such cells across and down
-OUTLYING: Final = 3.0
-"""Times the median of the views' errors: a view beyond it has a wrong corner or moved while it was exposed."""
+OUTLYING: Final = 3.0  # medians of the views' errors: a view beyond has a wrong corner or moved while it was exposed
 MIN_OUTLYING: Final = 0.15  # px. A view with a smaller error is kept, however good the others are.
-MAX_LEFT_OUT: Final = 1 / 3
-"""Largest share of views that are left out: if more disagree with the rest, the rest may be wrong."""
+MAX_LEFT_OUT: Final = 1 / 3  # share of views that are left out: if more disagree, the rest may be wrong
 MAX_RAY_SIGMA: Final = 1.0  # px, largest standard deviation of a projected ray: 3 mm at a distance of 3 m
 RAYS: Final = 0.95  # share of the image to which that applies: the outermost corners of a wide lens rarely see a board
-MAX_FOLD: Final = 0.05
-"""px. Distortion undone and done again must lead back to each pixel, or the model folds the image there."""
+MAX_FOLD: Final = 0.05  # px: distortion undone and done again leads back to each pixel, or the model folds the image
 _CRITERIA: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 _FIX_RADIAL: Final = cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
 _FLAGS: Final = {

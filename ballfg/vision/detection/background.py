@@ -11,21 +11,16 @@ from ballfg.arrays import Array
 from ballfg.vision.arrays import Array32, Image
 
 SHRINK: Final = 4  # pixels of the image per pixel of the small picture for the search
-GRID: Final = (16, 9)
-"""Blocks, across and down, whose brightness tells how bright the light is; their median is no moving thing."""
+GRID: Final = (16, 9)  # blocks, across and down, for the brightness of the light; their median is no moving thing
 BRIGHT: Final = (8.0, 245.0)  # grey levels of the blocks that count: darker ones are noise, brighter ones are clipped
-STRIPS: Final = 32
-"""A frame refreshes one of so many strips of the background: all of it would cost more than the search."""
-WEIGHT: Final = 0.08
-"""Weight of a frame in the strip that it refreshes; a still object fades in over STRIPS / WEIGHT = 400 frames."""
+STRIPS: Final = 32  # a frame refreshes one strip of the background: all of it would cost more than the search
+WEIGHT: Final = 0.08  # of a frame in its strip; a still object fades in over STRIPS / WEIGHT = 400 frames
 COVERED_WEIGHT: Final = 0.008
 """The same where something was found: a passing ball leaves 0.5 of 60 grey levels, a moved chair is gone in 4000
 frames."""
 SIGMAS: Final = 5.0  # noise sigmas of the small picture, at that place, that a change must exceed to be looked at
-LEAST_CHANGE: Final = 5.0
-"""Grey levels that it must exceed besides: compression and rounding make errors that the frames learned from lack."""
-ROUNDING: Final = 1.0 / 12.0
-"""Grey levels^2, variance of rounding to whole ones. It keeps a noise-free video's covariance regular."""
+LEAST_CHANGE: Final = 5.0  # grey levels that it must exceed besides: errors of compression and rounding
+ROUNDING: Final = 1.0 / 12.0  # grey levels^2, variance of rounding; a noise-free video's covariance stays regular
 FEWEST: Final = 3  # images that a background is learned from at least
 
 

@@ -14,8 +14,7 @@ from ballfg.checks import check_array, shown
 from ballfg.tracks.sightings import are_covariances
 from ballfg.vision.arrays import Image
 
-_SHAPES: Final = {"pixels": (2,), "covariances": (2, 2), "scores": (), "streaks": (2, 2)}
-"""Fields of each candidate with their shapes, for a frame and a recording alike."""
+_SHAPES: Final = {"pixels": (2,), "covariances": (2, 2), "scores": (), "streaks": (2, 2)}  # of each
 
 
 @dataclass(frozen=True, eq=False)

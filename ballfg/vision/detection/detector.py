@@ -25,10 +25,8 @@ MODEL_ERROR: Final = 0.02
 compression, which makes the blotches, moves edges."""
 LEARNS: Final = 0.8  # score from which a candidate teaches what edge and shading to expect
 FORGETS: Final = 0.98  # factor on earlier information per teaching candidate: the light on the ball changes as it flies
-SUREST: Final = (0.15, 0.08, 0.08)
-"""Least sigmas of the expected edge (px) and shading: they change along a flight, and may be learned wrong."""
-VISIBLE_STREAK: Final = 3.0
-"""px, and sigmas of its length: a shorter streak is given as not blurred, since its direction is chance."""
+SUREST: Final = (0.15, 0.08, 0.08)  # least sigmas of the expected edge (px) and shading: they change along a flight
+VISIBLE_STREAK: Final = 3.0  # px, and sigmas of its length: a shorter streak's direction is chance
 
 
 @dataclass(frozen=True)

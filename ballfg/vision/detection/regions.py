@@ -12,8 +12,7 @@ from ballfg.arrays import Mask
 from ballfg.vision.arrays import Image
 from ballfg.vision.detection.background import SHRINK, Background, shrunk
 
-MARGIN: Final = 6
-"""px of background kept around a region: the mask misses up to a small pixel of the rim, and the fit needs some."""
+MARGIN: Final = 6  # px of background around a region: the mask misses up to a small pixel of the rim
 LEAST_MASS: Final = 12.0  # Grey levels x small pixels: a ball of 4 px and 15 grey levels. Less is noise or lost to it.
 
 

@@ -16,10 +16,8 @@ per sigma. Sleeves, with the light on their upper side, pass for half a ball in 
 STRENGTH: Final = 15.0  # ratio of signal to noise, over the whole candidate, at which the mark for contrast is 1 - 1/e
 SIZE: Final = 0.2  # relative error of the diameter, beyond the limits, at which the mark for size is 1/e
 UNSETTLED: Final = 0.5  # mark of a fit that did not converge
-WHITE: Final = (0.25, 0.2)
-"""Saturation (greatest less least channel, over the greatest) up to which a ball is white, and the scale beyond."""
-ORANGE: Final = (8.0, 48.0, 12.0)
-"""Degrees of hue between which a ball is orange, yellow ones included, and the scale beyond that."""
+WHITE: Final = (0.25, 0.2)  # saturation up to which a ball is white, and the scale beyond
+ORANGE: Final = (8.0, 48.0, 12.0)  # degrees of hue of an orange or yellow ball, and the scale beyond
 PALE: Final = (0.35, 0.15)  # saturation from which a ball is orange, and the scale below that
 
 

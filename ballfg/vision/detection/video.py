@@ -18,8 +18,7 @@ from ballfg.tracks.checks import check_step
 from ballfg.vision.arrays import Image
 from ballfg.vision.image_file import ENDINGS, read_image
 
-SHORT: Final = (3, 0.02)
-"""Frames, and share of them, that may be missing at the end of what the container announces: it often estimates."""
+SHORT: Final = (3, 0.02)  # frames, and share, that may be missing at the end of what the container announces
 
 
 class Video(ABC):

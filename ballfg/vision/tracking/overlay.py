@@ -23,9 +23,7 @@ from ballfg.vision.tracking.view_painter import ViewPainter
 VIEW_WIDTH: Final = 640  # px of one view: three side by side make 1920, the width of a screen
 IN_A_ROW: Final = 3  # views side by side; more go below
 PLAYED_AT: Final = 30.0  # Hz at which every frame is shown: slow motion for a camera of 120 Hz, smooth on any screen
-HELD: Final = 0.1
-"""s that a camera's frame stays on show where its next ones are missing: long enough to bridge dropped frames, short
-enough that a picture never shows a ball that has long gone."""
+HELD: Final = 0.1  # s that a frame stays on show: bridges dropped frames, and shows no ball that has long gone
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,8 +7,7 @@ from typing import Final
 from ballfg.checks import did_you_mean, listed, shown
 from ballfg.vision.camera import Camera
 
-SAME_SHAPE: Final = 0.01
-"""Largest relative difference between the proportions of a video and of its camera, for a scaled picture."""
+SAME_SHAPE: Final = 0.01  # largest relative difference between the proportions of a scaled video and its camera's
 
 
 def match_videos(given: Sequence[str], cameras: Sequence[Camera], ignored: Sequence[str] = ()) -> dict[str, Path]:

@@ -12,9 +12,7 @@ from ballfg.vision.tracking.pipeline import Tracking
 
 Colour = tuple[int, int, int]
 
-TRACKS: Final = ("#e69f00", "#56b4e9", "#f0e442", "#cc79a7", "#00c08b", "#ff7f50")
-"""Light colours that differ for every kind of colour vision (after Okabe and Ito) and stand out on green, blue and grey
-images."""
+TRACKS: Final = ("#e69f00", "#56b4e9", "#f0e442", "#cc79a7", "#00c08b", "#ff7f50")  # after Okabe and Ito
 TRAIL: Final = 0.4  # s of a ball's past that its trail shows: over a metre of flight, without filling the view
 LINGER: Final = 0.3  # s that the trail stays after the ball's last point, so that the end of a track can be seen
 RING: Final = 9.0  # px, radius of the ring round an associated ball on the scaled view: leaves the ball visible
