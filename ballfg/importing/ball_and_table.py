@@ -21,22 +21,16 @@ def ball_of(choices: Choices, frame: Frame) -> tuple[Ball, Guess]:
     Raises: FileNotFoundError, ValueError: an unknown chosen ball, or a file that cannot be read.
     """
     if choices.ball is not None:
-        if choices.ball in BALLS:
-            ball = BALLS[choices.ball]
-        else:
-            from ballfg.simulation.balls import ball_kind
+        from ballfg.simulation.balls import ball_kind
 
-            ball = ball_kind(choices.ball).ball
+        ball = BALLS[choices.ball] if choices.ball in BALLS else ball_kind(choices.ball).ball
         return ball, Guess("ball", choices.ball, "as given", "stated", f"--ball {choices.ball}")
-    if frame.drag is None or frame.windows < _SURE_WINDOWS:
-        return TABLE_TENNIS, Guess(
-            "ball", "table-tennis", "too little flight to show the drag", "unsure", "--ball tennis"
-        )
-    if frame.drag < _TENNIS_DRAG:
+    why, sure = "too little flight to show the drag", "unsure"
+    if frame.drag is not None and frame.windows >= _SURE_WINDOWS:
         why = f"the drag is only {frame.drag:.2f} 1/m (a tennis ball has 0.02): if it is another ball, name it"
-        return TABLE_TENNIS, Guess("ball", "table-tennis", why, "unsure", "--ball tennis")
-    why = f"drag {frame.drag:.2f} 1/m; a table-tennis ball has 0.13, a tennis ball 0.02"
-    return TABLE_TENNIS, Guess("ball", "table-tennis", why, "likely", "--ball tennis")
+        if frame.drag >= _TENNIS_DRAG:
+            why, sure = f"drag {frame.drag:.2f} 1/m; a table-tennis ball has 0.13, a tennis ball 0.02", "likely"
+    return TABLE_TENNIS, Guess("ball", "table-tennis", why, sure, "--ball tennis")
 
 
 def table_of(tracks: Sequence[Track], ball: Ball, choices: Choices) -> tuple[float, Guess]:
@@ -51,12 +45,8 @@ def table_of(tracks: Sequence[Track], ball: Ball, choices: Choices) -> tuple[flo
     found = surface((track.seconds, track.positions) for track in tracks)
     if found is None:
         lowest = min(float(track.positions[:, 2].min()) for track in tracks)
-        raise UndecidedError(
-            f"no bounce shows the height of the table (m, along the up axis); the lowest sample is at {lowest:.2f} m",
-            "table-height",
-            (),
-            f"{lowest - ball.radius:.2f}" if lowest > 0.5 else "0.76",
-        )
+        what = f"no bounce shows the height of the table (m, along the up axis); the lowest sample is at {lowest:.2f} m"
+        raise UndecidedError(what, "table-height", (), f"{lowest - ball.radius:.2f}" if lowest > 0.5 else "0.76")
     height = round(found.centre - ball.radius, 4)
     others = "".join(f"; also at {other - ball.radius:.2f} m" for other in found.others)
     one = "1 bounce" if found.bounces == 1 else f"{found.bounces} bounces"

@@ -41,10 +41,9 @@ def surface(shots: Iterable[tuple[Array, Array]]) -> Surface | None:
     groups: list[Array] = []
     while len(heights):
         near = np.searchsorted(heights, heights + _SAME, side="right") - np.searchsorted(heights, heights - _SAME)
-        middle = heights[int(np.argmax(near))]
-        inside = np.abs(heights - middle) <= _SAME
-        groups.append(heights[inside])
-        heights = heights[np.abs(heights - middle) > 2.0 * _SAME]
+        apart = np.abs(heights - heights[int(np.argmax(near))])
+        groups.append(heights[apart <= _SAME])
+        heights = heights[apart > 2.0 * _SAME]
     if not groups:
         return None
     often = [group for group in groups if len(group) >= max(_SHARE * len(groups[0]), 1.0)]
@@ -60,8 +59,7 @@ def bounce_heights(times: Array, heights: Array) -> list[float]:
     Args: times: (n,) s.  heights: (n,) m.
     """
     found: list[tuple[float, float, float]] = []
-    n = len(times)
-    for i in range(1, n - 2):
+    for i in range(1, len(times) - 2):
         # the bounce lies between samples i and i + 1, or one of them is the lowest of its neighbours
         if min(heights[i], heights[i + 1]) > min(heights[i - 1], heights[i + 2]):
             continue
@@ -74,17 +72,20 @@ def bounce_heights(times: Array, heights: Array) -> list[float]:
         when = (before[0] - after[0]) / (after[1] - before[1])
         step = times[i + 1] - times[i]
         if -0.1 * step <= when <= 1.1 * step:
-            found.append(
-                (before[2] + after[2], times[i] + when, before[0] + before[1] * when - 0.5 * _GRAVITY * when**2)
-            )
-    return [height for _, _, height in _distinct(found)]
+            height = before[0] + before[1] * when - 0.5 * _GRAVITY * when**2
+            found.append((before[2] + after[2], times[i] + when, height))
+    kept: list[tuple[float, float, float]] = []
+    for bounce in sorted(found):  # the best-fitting of bounces less than the length of an arm apart
+        if all(abs(bounce[1] - other[1]) > _ARM for other in kept):
+            kept.append(bounce)
+    return [height for _, _, height in kept]
 
 
 def _arms(times: Array, i: int) -> Sequence[slice] | None:
     """The samples of the flight before, up to i, and after, from i + 1."""
-    first = max(int(np.searchsorted(times, times[i] - _ARM)), 0)
+    first = min(int(np.searchsorted(times, times[i] - _ARM)), max(i - _LEAST_SAMPLES + 1, 0))
     last = int(np.searchsorted(times, times[i + 1] + _ARM, side="right"))
-    first, last = min(first, max(i - _LEAST_SAMPLES + 1, 0)), max(last, min(i + 1 + _LEAST_SAMPLES, len(times)))
+    last = max(last, min(i + 1 + _LEAST_SAMPLES, len(times)))
     if i + 1 - first < _LEAST_SAMPLES or last - i - 1 < _LEAST_SAMPLES:
         return None
     return slice(first, i + 1), slice(i + 1, last)
@@ -98,12 +99,3 @@ def _arc(times: Array, heights: Array, origin: float) -> tuple[float, float, flo
     (height, speed), *_ = np.linalg.lstsq(design, lifted, rcond=None)
     residual = lifted - design @ (height, speed)
     return float(height), float(speed), float(np.sqrt(np.mean(residual**2)))
-
-
-def _distinct(found: list[tuple[float, float, float]]) -> list[tuple[float, float, float]]:
-    """The best-fitting of bounces less than the length of an arm apart."""
-    kept: list[tuple[float, float, float]] = []
-    for bounce in sorted(found):
-        if all(abs(bounce[1] - other[1]) > _ARM for other in kept):
-            kept.append(bounce)
-    return kept

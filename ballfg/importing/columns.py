@@ -65,12 +65,8 @@ def roles_of(table: RawTable, choices: Choices) -> Roles | None:
         if len(found) < 3:
             return None
         if len(found) > 3:
-            raise UndecidedError(
-                f"{table.where}: x, y and z must be three columns; {listed(found[:8])} may be meant",
-                "columns",
-                (),
-                "x={},y={},z={}".format(*found[:3]),
-            )
+            what = f"{table.where}: x, y and z must be three columns; {listed(found[:8])} may be meant"
+            raise UndecidedError(what, "columns", (), "x={},y={},z={}".format(*found[:3]))
         places = (found[0], found[1], found[2])
         counters = frames
     frame = given.get("frame") or next((n for n, ms in read.items() for m in ms if m.role == "frame"), None)
@@ -130,11 +126,8 @@ def _places(
     found_units = {meaning.unit for _, meaning in best[0].values()}
     if len(found_units) > 1:
         units = sorted(short_text(str(unit)) for unit in found_units)
-        raise UndecidedError(
-            f"{table.where}: x, y and z must have one unit; their names state {', '.join(units)}",
-            "length",
-            [unit for unit in units if unit != "None"],
-        )
+        what = f"{table.where}: x, y and z must have one unit; their names state {', '.join(units)}"
+        raise UndecidedError(what, "length", [unit for unit in units if unit != "None"])
     return (chosen["x"], chosen["y"], chosen["z"]), found_units.pop()
 
 
@@ -174,9 +167,8 @@ def _named_time(
     best = [name for rank, name in candidates if rank == least]
     moving = [name for name in best if len(set(table.columns[name][:1000].tolist())) > 1] or best
     if len(moving) > 1 and not _one_clock(table, moving):
-        raise UndecidedError(
-            f"{table.where}: {' and '.join(moving)} may both be the time", "columns", [f"t={name}" for name in moving]
-        )
+        what = f"{table.where}: {' and '.join(moving)} may both be the time"
+        raise UndecidedError(what, "columns", [f"t={name}" for name in moving])
     return (moving[0],)
 
 

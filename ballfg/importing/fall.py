@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from ballfg.state import STANDARD_GRAVITY
 
 LENGTHS: Final = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}  # units of length in m
 TIMES: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # units of time in s
+Shot: TypeAlias = tuple[Array, Array]  # stamps (n,) and positions (n, 3)
 AXES: Final = ("x", "-x", "y", "-y", "z", "-z")  # possible directions of up
 _WINDOW: Final = 0.12  # s, fit of an acceleration: 3 mm of noise at 100 Hz leave 2 m/s^2; most flights are longer
 _STEPS: Final = (1e-4, 0.34)  # s between two samples: no camera is faster, and slower ones do not show the fall
@@ -37,7 +38,7 @@ class Scale:
 
 
 def scales(
-    shots: Sequence[tuple[Array, Array]],
+    shots: Sequence[Shot],
     lengths: Collection[str] = tuple(LENGTHS),
     times: Collection[str] = tuple(TIMES),
     ups: Collection[str] = AXES,
@@ -76,7 +77,7 @@ def odds(best: float, other: float) -> float:
     return (best + _COINCIDENCE) / (other + _COINCIDENCE)
 
 
-def _windows(shots: Sequence[tuple[Array, Array]], unit: float) -> tuple[Array, Array]:
+def _windows(shots: Sequence[Shot], unit: float) -> tuple[Array, Array]:
     """Velocities and accelerations (k, 3) in lengths per s and s^2, of windows that overlap by half."""
     steps = [float(np.median(np.diff(t))) * unit for t, _ in shots if len(t) >= _LEAST_SAMPLES]
     if not steps or not _STEPS[0] <= np.median(steps) <= _STEPS[1]:

@@ -1,7 +1,7 @@
 """Gathers the shots of a source's tables, with their names, ends and labels."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -47,13 +47,8 @@ def understood(tables: Sequence[RawTable], choices: Choices) -> tuple[list[RawTa
         raise questions[0]
     if not read:
         largest = max(tables, key=len)
-        columns = listed(largest.columns)
-        raise UndecidedError(
-            f"{largest.where}: no columns look like x, y and z; there are {columns}",
-            "columns",
-            (),
-            "t=NAME,x=NAME,y=NAME,z=NAME",
-        )
+        what = f"{largest.where}: no columns look like x, y and z; there are {listed(largest.columns)}"
+        raise UndecidedError(what, "columns", (), "t=NAME,x=NAME,y=NAME,z=NAME")
     signatures = {(one.places, one.time, one.trajectory) for _, one in read}
     if len(signatures) > 1 and len(read) > 1:
         names = [same[0].name or same[0].source for same, _ in read]
@@ -77,12 +72,8 @@ def shots_of(tables: Sequence[RawTable], roles: Roles, choices: Choices, counts:
         rate = likely_rate([relative(shot) for shot in frames[:MOST_SHOTS]], roles.length_unit)
         if rate is None:
             raise
-        raise UndecidedError(
-            f"{tables[0].where} has no times in s: the number of frames per second is needed; the fall of the ball "
-            f"fits about {rate} Hz",
-            "rate",
-            (str(rate),),
-        ) from None
+        what = f"{tables[0].where} has no times in s: the number of frames per second is needed"
+        raise UndecidedError(f"{what}; the fall of the ball fits about {rate} Hz", "rate", (str(rate),)) from None
     if not any(shots for _, shots in parts):
         raise ValueError(f"{tables[0].where} must hold two samples of a shot or more; each has less. Check the export.")
     named = Counter(shot.name for _, shots in parts for shot in shots)
@@ -121,15 +112,10 @@ def split(shots: list[SourceShot], roles: Roles, frame: Frame, choices: Choices)
     """
     unit = TIMES[frame.time]
     count = len(shots)
-    if choices.split_gap is not None:
-        done = _unique(split_at_gaps(shots, unit, choices.split_gap))
-        return done, Guess(
-            "shots",
-            str(len(done)),
-            f"cut at gaps of {choices.split_gap:g} s, as given",
-            "stated",
-            f"--split-gap {choices.split_gap:g}",
-        )
+    if (given := choices.split_gap) is not None:
+        done = _unique(split_at_gaps(shots, unit, given))
+        why = f"cut at gaps of {given:g} s, as given"
+        return done, Guess("shots", str(len(done)), why, "stated", f"--split-gap {given:g}")
     if roles.trajectory is not None:
         why = f"one for each value of {shown(roles.trajectory)}"
         return shots, Guess("shots", str(count), why, "sure", f"--columns trajectory={roles.trajectory}")
@@ -160,22 +146,13 @@ def with_labels(shots: list[SourceShot], beside: Sequence[RawTable]) -> list[Sou
             keys = [str(value) for value in column.tolist()]
             if not set(keys) & names or len(set(keys)) < len(keys):
                 continue
-            rows = {one: i for i, one in enumerate(keys)}
-            others = {name: values.tolist() for name, values in table.columns.items() if name != key}
-            shots = [
-                replace(shot, labels={**shot.labels, **_row(others, rows[shot.name])}) if shot.name in rows else shot
-                for shot in shots
-            ]
+            labels: dict[str, dict[str, Label]] = {one: {} for one in keys}
+            for name, values in table.columns.items():
+                for one, value in zip(keys, values.tolist() if name != key else (), strict=False):
+                    if isinstance(value, str) and value:
+                        labels[one][name] = value
+                    elif isinstance(value, int | float) and np.isfinite(value):
+                        labels[one][name] = float(value)
+            shots = [replace(shot, labels={**shot.labels, **labels.get(shot.name, {})}) for shot in shots]
             break
     return shots
-
-
-def _row(columns: Mapping[str, list[Any]], row: int) -> dict[str, Label]:
-    found: dict[str, Label] = {}
-    for name, values in columns.items():
-        value = values[row]
-        if isinstance(value, str) and value:
-            found[name] = value
-        elif isinstance(value, int | float) and np.isfinite(value):
-            found[name] = float(value)
-    return found

@@ -1,7 +1,7 @@
 """Cuts rows into shots: by a column, by file, where time restarts, and at gaps."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Final
 
@@ -70,7 +70,9 @@ def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list
 
     Raises: UndecidedError: no time and no rate. ValueError: text for a time, or no row with a position.
     """
-    lacking = [name for name in _needed(roles) if name not in table.columns]
+    alone = (name for name in (roles.frame, roles.trajectory) if name is not None)
+    needed = (*roles.time, *roles.places, *alone, *(roles.sigmas or ()))
+    lacking = [name for name in needed if name not in table.columns]
     if lacking:
         raise ValueError(f"{table.where} must have the columns of the other tables; {listed(lacking)} missing. Add it.")
     stamps = _stamps(table, roles, choices, counts)
@@ -83,13 +85,8 @@ def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list
     counts.missing += int((~held).sum())
     rows = np.flatnonzero(held)
     if not len(rows):
-        columns = ", ".join((*roles.time, *roles.places))
-        raise UndecidedError(
-            f"{table.where}: no row has a time and a position in {columns}",
-            "columns",
-            (),
-            "t=NAME,x=NAME,y=NAME,z=NAME",
-        )
+        what = f"{table.where}: no row has a time and a position in {', '.join((*roles.time, *roles.places))}"
+        raise UndecidedError(what, "columns", (), "t=NAME,x=NAME,y=NAME,z=NAME")
     if roles.trajectory is None:
         parts = _at_restarts(stamps, rows, counts)
         names = [f"{i:03d}" for i in range(len(parts))]
@@ -127,16 +124,9 @@ def split_at_gaps(shots: Iterable[SourceShot], unit: float, gap: float) -> list[
         cuts = [0, *places.tolist(), len(shot.stamps)]
         pieces = [slice(a, b) for a, b in pairwise(cuts) if b - a >= 2]
         for i, part in enumerate(pieces):
-            found.append(
-                replace(
-                    shot,
-                    name=f"{shot.name}-{i:03d}",
-                    stamps=shot.stamps[part],
-                    positions=shot.positions[part],
-                    sigmas=None if shot.sigmas is None else shot.sigmas[part],
-                    rows=shot.rows[part],
-                )
-            )
+            sigmas = None if shot.sigmas is None else shot.sigmas[part]
+            name, stamps, positions = f"{shot.name}-{i:03d}", shot.stamps[part], shot.positions[part]
+            found.append(SourceShot(name, stamps, positions, sigmas, shot.labels, shot.rows[part], shot.table))
     return found
 
 
@@ -148,22 +138,15 @@ def _stamps(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> 
         frames = None if roles.frame is None else numbers(table.columns[roles.frame])
         if rate is None:
             seen = (
-                "has frames but no time"
-                if frames is not None
-                else f"has no column of times, but {listed(table.columns)}"
+                f"has no column of times, but {listed(table.columns)}" if frames is None else "has frames but no time"
             )
             raise UndecidedError(f"{table.where} {seen}: the number of frames per second is needed", "rate", (), "120")
         return (np.arange(len(table), dtype=np.float64) if frames is None else frames) / rate
     column = table.columns[roles.time[0]]
     stamps = as_stamps(column)
     if stamps is None:
-        raise UndecidedError(
-            f"{table.where}: the column of times, {shown(roles.time[0])}, must hold numbers or dates; it holds "
-            f"{shown(str(column[0])[:30])}",
-            "columns",
-            (),
-            "t=NAME",
-        )
+        what = f"{table.where}: the column of times, {shown(roles.time[0])}, must hold numbers or dates"
+        raise UndecidedError(f"{what}; it holds {shown(str(column[0])[:30])}", "columns", (), "t=NAME")
     counts.dates |= is_date(column)
     return stamps
 
@@ -229,12 +212,6 @@ def _labels(
         elif not is_number(column) or np.isfinite(numbers(column)).any():
             counts.ignored.add(name)
     return found
-
-
-def _needed(roles: Roles) -> tuple[str, ...]:
-    """The columns that every table of a source must have."""
-    alone = (name for name in (roles.frame, roles.trajectory) if name is not None)
-    return (*roles.time, *roles.places, *alone, *(roles.sigmas or ()))
 
 
 def _label(column: Column, row: int) -> Label | None:

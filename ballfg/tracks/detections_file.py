@@ -31,10 +31,7 @@ OPTIONAL: Final = (*NOISE, SCORE)
 UNSTATED: Final = {"sigma_u": 0.5, "sigma_v": 0.5, "rho_uv": 0.0}  # px; half a pixel, as of patch centres
 LEAST_SIGMA: Final = 1e-4  # px, best resolution of a camera; far surer pixels cannot be solved in double precision
 MOST_PIXELS: Final = 1e6  # px. Largest width of an image; larger numbers overflow when squared.
-_SIGMA: Final[Rule] = (
-    f"{LEAST_SIGMA:g} to {MOST_PIXELS:.0f} px",
-    lambda x: (x >= LEAST_SIGMA) & (x <= MOST_PIXELS),
-)
+_SIGMA: Final[Rule] = (f"{LEAST_SIGMA:g} to {MOST_PIXELS:.0f} px", lambda x: (x >= LEAST_SIGMA) & (x <= MOST_PIXELS))
 _PIXEL: Final[Rule] = (f"finite, at most {MOST_PIXELS:.0f} px", lambda x: np.abs(x) <= MOST_PIXELS)
 RULES: Final[Mapping[str, Rule]] = {
     "u": _PIXEL,

@@ -59,29 +59,22 @@ class Camera:
         count = np.asarray(self.distortion).size
         if count not in DISTORTIONS:
             lengths = ", ".join(map(str, DISTORTIONS))
-            raise ValueError(
-                f"camera {shown(self.name)}: distortion must have one of {lengths} coefficients; got {count}. "
-                "Give them in OpenCV's order k1, k2, p1, p2, k3, ..."
-            )
+            what = f"{where}: distortion must have one of {lengths} coefficients; got {count}"
+            raise ValueError(f"{what}. Give them in OpenCV's order k1, k2, p1, p2, k3, ...")
         for field, shape in {"matrix": (3, 3), "rvec": (3,), "tvec": (3,), "distortion": (count,)}.items():
-            object.__setattr__(self, field, self._checked(field, getattr(self, field), shape))
+            array = check_array(f"{where}: {field}", getattr(self, field), remedy=f"Give {shape} numbers.")
+            if array.size != np.prod(shape, dtype=int):
+                raise ValueError(f"{where}: {field} must have shape {shape}; got {array.shape}")
+            if not np.isfinite(array).all():
+                raise ValueError(f"{where}: {field} must be finite; got {array.tolist()}")
+            array = array.reshape(shape)
+            array.setflags(write=False)
+            object.__setattr__(self, field, array)
         k = self.matrix
         if not (k[0, 0] > 0 and k[1, 1] > 0 and k[1, 0] == 0 and (k[2] == (0, 0, 1)).all() and k[0, 1] == 0):
-            raise ValueError(
-                f"camera {shown(self.name)}: matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0; "
-                f"got {k.tolist()}"
-            )
+            rule = "matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0"
+            raise ValueError(f"{where}: {rule}; got {k.tolist()}")
         object.__setattr__(self, "time_offset", check_number(f"{where}: time_offset", self.time_offset, "s"))
-
-    def _checked(self, field: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-        array = check_array(f"camera {shown(self.name)}: {field}", value, remedy=f"Give {shape} numbers.")
-        if array.size != np.prod(shape, dtype=int):
-            raise ValueError(f"camera {shown(self.name)}: {field} must have shape {shape}; got {array.shape}")
-        if not np.isfinite(array).all():
-            raise ValueError(f"camera {shown(self.name)}: {field} must be finite; got {array.tolist()}")
-        array = array.reshape(shape)
-        array.setflags(write=False)
-        return array
 
     @cached_property
     def rotation(self) -> Array:

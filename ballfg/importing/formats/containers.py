@@ -3,7 +3,8 @@
 import math
 import sys
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -33,7 +34,6 @@ def read_parquet(path: Path) -> list[RawTable]:
         table = file.read(use_threads=False).flatten()
         check_unpacked(path, sum(_copied(chunk) for column in table.columns for chunk in column.chunks))
         columns = _columns(pa, table)
-    rows: list[dict[str, Any]] = []
     if any(isinstance(values, list) and values and isinstance(values[0], list) for values in columns.values()):
         rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
         return nested_tables(rows, path.stem, str(path))
@@ -74,15 +74,10 @@ def _copied(array: Any, inside: bool = False) -> int:
 
 def read_excel(path: Path) -> list[RawTable]:
     """The tables of an Excel file, one per sheet. Raises: ValueError: no openpyxl, or not an Excel file."""
-    try:
-        import openpyxl
-    except ImportError:
-        raise ValueError(
-            f"{path} must be read by the package openpyxl; it is not there. Install it: pip install 'ballfg[excel]'."
-        ) from None
     import csv
     import io
 
+    openpyxl = _imported("openpyxl", "excel", path)
     if not zipfile.is_zipfile(path):
         raise ValueError(f"{path} must be an Excel file (.xlsx); it is none. Save it again as .xlsx or CSV.")
     with library_reads(path, "Excel"), zipfile.ZipFile(path) as archive:
@@ -120,23 +115,9 @@ def _rows(path: Path, sheet: Any, most: int) -> Iterator[list[str]]:
     for row in sheet.iter_rows(values_only=True):
         count += len(row)
         check_parts(path, "cells", count, most)
-        cells = _cells(row)
+        cells = ["" if cell is None else cell.isoformat() if hasattr(cell, "isoformat") else str(cell) for cell in row]
         if any(cells):
             yield cells
-
-
-def _cells(row: Iterable[Any]) -> list[str]:
-    """The cells of a row as text."""
-    return [
-        ""
-        if cell is None
-        else cell.isoformat()
-        if hasattr(cell, "isoformat")
-        else repr(cell)
-        if isinstance(cell, float)
-        else str(cell)
-        for cell in row
-    ]
 
 
 def read_npz(path: Path) -> list[RawTable]:
@@ -160,7 +141,7 @@ def read_hdf5(path: Path) -> list[RawTable]:
 
     Raises: ValueError: no h5py, or not an HDF5 file.
     """
-    h5py = _h5py(path)
+    h5py = _imported("h5py", "hdf5", path)
     with library_reads(path, "HDF5"), h5py.File(path, "r") as file:
         content = _Group(h5py, path).content(file, 0)
     return nested_tables(content, path.stem, str(path))
@@ -187,14 +168,12 @@ def read_bag(path: Path, topic: str | None) -> list[RawTable]:
     return [table_of(path.stem, columns, str(path))]
 
 
-def _h5py(path: Path) -> Any:
+def _imported(package: str, extra: str, path: Path) -> Any:
     try:
-        import h5py
+        return import_module(package)
     except ImportError:
-        raise ValueError(
-            f"{path} must be read by the package h5py; it is not installed. Install it: pip install 'ballfg[hdf5]'."
-        ) from None
-    return h5py
+        what = f"{path} must be read by the package {package}; it is not installed"
+        raise ValueError(f"{what}. Install it: pip install 'ballfg[{extra}]'.") from None
 
 
 class _Group:
@@ -208,9 +187,8 @@ class _Group:
     def content(self, group: Any, depth: int) -> dict[str, Any]:
         """Arrays and numbers of a group, by name."""
         content: dict[str, Any] = {}
-        for key, value in group.attrs.items():
-            if isinstance(value, str | int | float | np.integer | np.floating):
-                content[key] = value
+        plain = (str, int, float, np.integer, np.floating)
+        content |= {key: value for key, value in group.attrs.items() if isinstance(value, plain)}
         if depth > MAX_DEPTH:
             raise ValueError(f"{self._path}: groups must be nested at most {MAX_DEPTH} deep. Write it flatter.")
         check_parts(self._path, "groups and datasets", len(self._seen) + len(group), MAX_MEMBERS)
@@ -269,17 +247,15 @@ def _array_bytes(path: Path) -> int:
     if not zipfile.is_zipfile(path):
         with path.open("rb") as file:
             return _header_bytes(file)
-    size = 0
     with zipfile.ZipFile(path) as archive:
         members = archive.infolist()
         check_parts(path, "arrays", len(members), MAX_MEMBERS)
+        size = 0
         for member in members:
-            within = member.file_size
-            if member.filename.endswith(".npy"):
-                with archive.open(member) as file:
-                    within = max(within, _header_bytes(file))
-            size += within
-    return size
+            with archive.open(member) as file:
+                within = _header_bytes(file) if member.filename.endswith(".npy") else 0
+            size += max(member.file_size, within)
+        return size
 
 
 def _header_bytes(file: IO[bytes]) -> int:

@@ -2,12 +2,12 @@
 
 import json
 import zipfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final
 
-from ballfg.checks import check_path, shown
+from ballfg.checks import check_path, listed, shown
 from ballfg.files.json_file import TOO_MANY, has_too_many, parse_json
 from ballfg.importing.formats.containers import read_bag, read_excel, read_hdf5, read_npz, read_parquet
 from ballfg.importing.formats.matlab import read_matlab
@@ -54,13 +54,9 @@ def tables_of(data: Any, topic: str | None = None, key: str | None = None) -> li
         table for table in found if key in f"{table.source}/{table.name}"
     ]
     if not chosen:
-        raise ValueError(f"--key must name a table of the source; got {shown(key)}, there are {_listed(found)}.")
+        names = listed(dict.fromkeys(table.name or table.source for table in found))
+        raise ValueError(f"--key must name a table of the source; got {shown(key)}, there are {names}.")
     return chosen
-
-
-def _listed(tables: Iterable[RawTable]) -> str:
-    names = list(dict.fromkeys(table.name or table.source for table in tables))
-    return ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
 
 
 def _of_path(path: Path, topic: str | None) -> list[RawTable]:
@@ -69,19 +65,14 @@ def _of_path(path: Path, topic: str | None) -> list[RawTable]:
     if path.is_file():
         return _of_file(path, topic)
     if not path.is_dir():
-        raise ValueError(
-            f"source must be a file or a folder; {path} is a pipe or a device. Write what comes to a file."
-        )
+        raise ValueError(f"source must be a file or folder; {path} is a pipe or a device. Write what comes to a file.")
     if (path / "metadata.yaml").is_file() or any(path.glob("*.db3")):
         return read_bag(path, topic)
     files = sorted(file for file in path.rglob("*") if file.is_file() and _is_table(file))
     if not files:
-        listing = ", ".join(sorted(entry.name for entry in path.iterdir())[:8]) or "nothing"
+        listing = listed(sorted(entry.name for entry in path.iterdir()))
         raise ValueError(f"{path} must hold files of measurements, such as .csv or .json; got {listing}. Name another.")
-    found: list[RawTable] = []
-    for file in files:
-        found += _of_file(file, topic)
-    return found
+    return [table for file in files for table in _of_file(file, topic)]
 
 
 def _is_table(file: Path) -> bool:
@@ -125,7 +116,9 @@ def _json(path: Path, text: str) -> list[RawTable]:
         content = parse_json(text)
     except json.JSONDecodeError as error:
         lines = [line for line in text.splitlines() if line.strip()]
-        if not _whole_line(lines[0]):
+        try:
+            parse_json(lines[0])
+        except json.JSONDecodeError:
             raise ValueError(
                 f"{path}, line {error.lineno}: must be valid JSON; {error.msg} at column {error.colno}, as in a file "
                 "that was cut off. Write it again, whole."
@@ -134,14 +127,6 @@ def _json(path: Path, text: str) -> list[RawTable]:
     if isinstance(content, dict) and not any(isinstance(value, list | dict) for value in content.values()):
         content = [content]
     return nested_tables(content, path.stem, str(path))
-
-
-def _whole_line(line: str) -> bool:
-    try:
-        parse_json(line)
-    except json.JSONDecodeError:
-        return False
-    return True
 
 
 def _json_lines(path: Path, lines: Sequence[str]) -> list[Any]:

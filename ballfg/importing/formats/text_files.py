@@ -61,21 +61,18 @@ def text_table(text: str, name: str, source: str) -> RawTable:
     try:
         return _text_table(text, name, source)
     except csv.Error as error:  # more than 131,072 characters without a separator
-        raise ValueError(
-            f"{source} must hold rows of numbers: a time and x, y, z; {one_line(error)}. Export the table as CSV."
-        ) from None
+        what = f"{source} must hold rows of numbers: a time and x, y, z; {one_line(error)}"
+        raise ValueError(f"{what}. Export the table as CSV.") from None
 
 
 def _text_table(text: str, name: str, source: str) -> RawTable:
     lines = [line for line in text.splitlines() if line.strip()]
     longest = max(map(len, lines), default=0)
     if longest > MAX_LINE:
-        raise ValueError(
-            f"{source} must have lines of at most {MAX_LINE} characters; one has {longest}. Export the table as CSV, "
-            "one row a line."
-        )
-    comments = [line for line in lines if line.lstrip().startswith(_COMMENTS)]
+        what = f"{source} must have lines of at most {MAX_LINE} characters; one has {longest}"
+        raise ValueError(f"{what}. Export the table as CSV, one row a line.")
     rows_of_text = [line for line in lines if not line.lstrip().startswith(_COMMENTS)]
+    comments = [line for line in lines if line.lstrip().startswith(_COMMENTS)]
     separator = _separator(rows_of_text)
     rows = _cells(rows_of_text, separator)
     comma = separator != "," or any(_DECIMAL_COMMA.match(cell) for row in rows[-5:] for cell in row)
@@ -159,11 +156,9 @@ def _joined(header: Sequence[Sequence[str]], width: int) -> list[str]:
     names: list[list[str]] = [[] for _ in range(width)]
     units = [""] * width
     for row in header:
-        if (
-            sum(unit_of_text(cell) is not None for cell in row) >= 2
-            and all(unit_of_text(cell) is not None or cell in ("", "-", "1") for cell in row)
-            and any(names)
-        ):
+        known = [unit_of_text(cell) is not None for cell in row]
+        others = [cell for cell, is_unit in zip(row, known, strict=True) if not is_unit]
+        if any(names) and sum(known) >= 2 and set(others) <= {"", "-", "1"}:
             units = list(row)
             continue
         for i, cell in enumerate(row):

@@ -83,9 +83,9 @@ def check_agreement(balls: Sequence[SeenBall], cameras: Sequence[Camera]) -> Agr
     cameras = list(cameras)
     pixels, covariances = _views(balls, cameras)
     scene = _scene(cameras, pixels, covariances)
-    if len(scene.points) < LEAST_POINTS:
-        few = f"{len(scene.points)} points were seen by three cameras or more; {LEAST_POINTS} are needed to check them."
-        return Agreement(None, {}, float("nan"), f"Whether the cameras agree is not known: {few}")
+    if (few := len(scene.points)) < LEAST_POINTS:
+        why = f"{few} points were seen by three cameras or more; {LEAST_POINTS} are needed to check them."
+        return Agreement(None, {}, float("nan"), f"Whether the cameras agree is not known: {why}")
     before = _misfit(scene, cameras, _refined(scene, cameras, scene.points, None)[0])
     by_camera = {}
     for k, camera in enumerate(cameras):
@@ -106,19 +106,17 @@ def check_agreement(balls: Sequence[SeenBall], cameras: Sequence[Camera]) -> Agr
 
 def _views(balls: Sequence[SeenBall], cameras: list[Camera]) -> tuple[Array, Array]:
     """Pixels (n, c, 2) of the balls in every camera at their points' times, covariances; NaN where not seen."""
-    pixels, covariances = [np.zeros((0, len(cameras), 2))], [np.zeros((0, len(cameras), 2, 2))]
-    for ball in balls:
+    ends = np.cumsum([0, *map(len, balls)])
+    pixels = np.full((ends[-1], len(cameras), 2), np.nan)
+    covariances = np.full((ends[-1], len(cameras), 2, 2), np.nan)
+    for ball, start, end in zip(balls, ends[:-1], ends[1:], strict=True):
         seen = ball.sightings
-        places = np.full((len(ball), len(cameras), 2), np.nan)
-        spreads = np.full((len(ball), len(cameras), 2, 2), np.nan)
         for k, camera in enumerate(cameras):
             rows = seen.camera == seen.cameras.index(camera.name)
             if rows.any():
                 line = path(seen.times[rows] - camera.time_offset, seen.pixels[rows], seen.covariances[rows])
-                places[:, k], spreads[:, k] = line.at(ball.times)
-        pixels.append(places)
-        covariances.append(spreads)
-    return np.concatenate(pixels), np.concatenate(covariances)
+                pixels[start:end, k], covariances[start:end, k] = line.at(ball.times)
+    return pixels, covariances
 
 
 def _scene(cameras: list[Camera], pixels: Array, covariances: Array) -> _Scene:
@@ -141,18 +139,16 @@ def _errors(scene: _Scene, cameras: list[Camera], points: Array) -> Array:
     return np.where(np.isnan(scene.pixels), 0.0, np.nan_to_num(scene.pixels - projected, nan=_UNSEEN))
 
 
-def _squares(scene: _Scene, errors: Array) -> Array:
-    return np.asarray(np.einsum("nci,ncij,ncj->n", errors, scene.weights, errors))
-
-
 def _misfit(scene: _Scene, cameras: list[Camera], points: Array) -> float:
-    return float(np.median(_squares(scene, _errors(scene, cameras, points)) / scene.expected))
+    errors = _errors(scene, cameras, points)
+    return float(np.median(np.einsum("nci,ncij,ncj->n", errors, scene.weights, errors) / scene.expected))
 
 
 def _refined(scene: _Scene, cameras: list[Camera], points: Array, nudged: int | None) -> tuple[Array, list[Camera]]:
     """Gauss-Newton on all points and, if one is named, on a camera's pose: the points and the cameras then."""
     cameras = list(cameras)
-    start = None if nudged is None else np.concatenate((cameras[nudged].rvec, cameras[nudged].tvec))
+    first = cameras[nudged or 0]
+    start = np.concatenate((first.rvec, first.tvec))
     for _ in range(_STEPS):
         errors = _errors(scene, cameras, points)
         slopes = [slopes_of(c, points, c.rvec, c.tvec)[:, :POSE].reshape(-1, 2, POSE) for c in cameras]
@@ -161,11 +157,12 @@ def _refined(scene: _Scene, cameras: list[Camera], points: Array, nudged: int | 
         information = np.einsum("ncij,ncik->njk", by_point, weighted)
         gradient = np.einsum("ncij,nci->nj", weighted, errors)
         points = points + np.linalg.solve(information, gradient[..., None])[..., 0]
-        if nudged is not None and start is not None:
+        if nudged is not None:
             by_pose, mine = slopes[nudged], scene.weights[:, nudged] @ slopes[nudged]
             mixed = np.einsum("nij,nik->njk", weighted[:, nudged], by_pose)
             removed = np.linalg.solve(information, mixed)
-            squares = _squares(scene, errors)  # Cauchy weights: points far worse than the median count less
+            # Cauchy weights: points far worse than the median count less
+            squares = np.einsum("nci,ncij,ncj->n", errors, scene.weights, errors)
             trust = 1.0 / (1.0 + squares / (_FAR * (np.median(squares) + 1.0)))
             # The points are eliminated from the normal equations (Schur complement).
             schur = np.einsum("n,nij,nik->jk", trust, mine, by_pose) - np.einsum("n,nji,njk->ik", trust, mixed, removed)
@@ -198,13 +195,12 @@ def _culprit(by_camera: Mapping[str, CameraAgreement], misfit: float) -> str | N
 
 def _sentence(culprit: str | None, by_camera: Mapping[str, CameraAgreement], misfit: float) -> str:
     distances = ", ".join(f"{name} {seen.residual:.2f} px" for name, seen in by_camera.items())
+    each = f"each from the points of the others by {distances}"
     if misfit <= LEAST_MISFIT:
-        return f"The cameras agree: each from the points of the others by {distances}."
+        return f"The cameras agree: {each}."
     if culprit is None:
-        return (
-            f"The cameras disagree, and no single one explains it (each from the points of the others by {distances}). "
-            "Calibrate them again, and check their time offsets."
-        )
+        why = f"The cameras disagree, and no single one explains it ({each})."
+        return f"{why} Calibrate them again, and check their time offsets."
     seen = by_camera[culprit]
     return (
         f"Camera {culprit} has moved since its calibration: it is off by {seen.residual:.1f} px from the points of the "

@@ -25,7 +25,6 @@ def complete(footage: Footage, balls: Sequence[Gathered]) -> list[Gathered]:
         for camera, rows in enumerate(ball.rows):
             taken[camera][rows] = True
     for _ in range(_ROUNDS):
-        changed = False
         wanted = [_wanted(footage, ball, taken) for ball in done]
         for camera, free in enumerate(taken):
             claims = np.zeros(len(free), dtype=int)
@@ -34,11 +33,10 @@ def complete(footage: Footage, balls: Sequence[Gathered]) -> list[Gathered]:
             for want in wanted:
                 want[camera] = want[camera][claims[want[camera]] == 1]
                 free[want[camera]] = True
-        for number, want in enumerate(wanted):
-            if any(len(rows) for rows in want):
-                both = zip(done[number].rows, want, strict=True)
-                done[number] = gather(footage, [np.union1d(old, new) for old, new in both])
-                changed = True
+        changed = [number for number, want in enumerate(wanted) if any(len(rows) for rows in want)]
+        for number in changed:
+            both = zip(done[number].rows, wanted[number], strict=True)
+            done[number] = gather(footage, [np.union1d(old, new) for old, new in both])
         if not changed:
             break
     return done

@@ -5,6 +5,7 @@ continuation of the first meets that of the second in the gap, with a kink where
 """
 
 from collections.abc import Sequence
+from itertools import permutations
 from typing import Final
 
 import numpy as np
@@ -41,11 +42,9 @@ def is_ball(track: Path) -> bool:
     """True for a track in space (d = 3) of a ball: long enough, not too fast, and falling."""
     if np.ptp(track.values, axis=0).max() < LEAST_WAY:
         return False
-    for length in _WINDOWS:
-        falling = _falling(track, length)
-        if falling:
-            return float(np.mean(falling)) >= _FALLING
-    return False
+    found = (_falling(track, length) for length in _WINDOWS)
+    first = next((falling for falling in found if falling), [False])
+    return float(np.mean(first)) >= _FALLING
 
 
 def _falling(track: Path, length: float) -> list[bool]:
@@ -56,9 +55,8 @@ def _falling(track: Path, length: float) -> list[bool]:
         for start in np.arange(track.times[rows[0]], track.times[rows[-1]] + 0.5 * length, 0.5 * length):
             window = rows[(track.times[rows] >= start) & (track.times[rows] <= start + length)]
             if len(window) >= _LEAST_IN_WINDOW:
-                falls = _falls(track, window)
-                found += [falls] if falls is not None else []
-    return found
+                found.append(_falls(track, window))
+    return [falls for falls in found if falls is not None]
 
 
 def _falls(track: Path, window: NDArray[np.intp]) -> bool | None:
@@ -120,14 +118,9 @@ def _continued(track: Path, times: Array, last: bool) -> tuple[Array, Array, Arr
 
 def successions(tracks: Sequence[Path]) -> list[tuple[int, int]]:
     """Pairs (earlier, later) of tracks of one flight, best first; no track is twice on the same side."""
-    found = []
-    for i, earlier in enumerate(tracks):
-        for j, later in enumerate(tracks):
-            cost = meeting(earlier, later) if i != j else None
-            if cost is not None:
-                found.append((cost, i, j))
+    costs = {(i, j): meeting(tracks[i], tracks[j]) for i, j in permutations(range(len(tracks)), 2)}
     pairs: list[tuple[int, int]] = []
-    for _, i, j in sorted(found):
+    for _, (i, j) in sorted((cost, pair) for pair, cost in costs.items() if cost is not None):
         if all(i != earlier and j != later for earlier, later in pairs):
             pairs.append((i, j))
     return pairs

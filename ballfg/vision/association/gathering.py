@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Final
 
 import numpy as np
@@ -81,7 +82,11 @@ def gather(footage: Footage, rows: Sequence[Index]) -> Gathered:
 
     Args: rows: for each camera the numbers of its candidates, one a frame at most, ascending.
     """
-    times = _stamps(footage, rows)
+    # stamps of the shared shutter, or of the camera that saw most
+    stamps = footage.frames(int(np.argmax(list(map(len, rows))))) if footage.shared is None else footage.shared
+    seen = [footage.frames(c)[footage.detections[c].frame[mine[[0, -1]]]] for c, mine in enumerate(rows) if len(mine)]
+    first, last = (np.min(seen), np.max(seen)) if seen else (np.inf, -np.inf)
+    times = np.asarray(stamps[(stamps >= first - SAME_SHUTTER) & (stamps <= last + SAME_SHUTTER)])
     pixels = np.full((len(times), len(rows), 2), np.nan)
     covariances = np.full((len(times), len(rows), 2, 2), np.nan)
     for camera, mine in enumerate(rows):
@@ -94,17 +99,6 @@ def gather(footage: Footage, rows: Sequence[Index]) -> Gathered:
     share = np.mean(noise / (noise + footage.offset**2), axis=1, where=used)
     track = path(times[found], made.points[found], made.covariances[found] * share[:, None, None])
     return Gathered(tuple(rows), track, made.covariances[found], used.sum(axis=1).astype(np.int64))
-
-
-def _stamps(footage: Footage, rows: Sequence[Index]) -> Array:
-    """(k,) s, true times of the points: stamps of the shared shutter or of the camera that saw most."""
-    most = int(np.argmax([len(mine) for mine in rows]))
-    stamps = footage.shared if footage.shared is not None else footage.frames(most)
-    seen = [footage.frames(c)[footage.detections[c].frame[mine[[0, -1]]]] for c, mine in enumerate(rows) if len(mine)]
-    if not seen:
-        return np.zeros(0)
-    first, last = np.min(seen), np.max(seen)
-    return np.asarray(stamps[(stamps >= first - SAME_SHUTTER) & (stamps <= last + SAME_SHUTTER)])
 
 
 def nearest(stamps: Array, times: Array) -> NDArray[np.intp]:
@@ -124,12 +118,9 @@ def shared_stamps(frames: Sequence[Array], within: float) -> Array | None:
     Args: frames: (f,) s of each camera, ascending, on one clock.
     Returns: (k,) s, or None.
     """
-    for one in frames:
-        for other in frames:
-            if len(one) <= len(other) and len(one):
-                apart = np.abs(other[nearest(other, one)] - one)
-                if np.median(apart) > within:
-                    return None
+    for one, other in product(frames, frames):
+        if 0 < len(one) <= len(other) and np.median(np.abs(other[nearest(other, one)] - one)) > within:
+            return None
     stamps = np.sort(np.concatenate(frames))
     if not len(stamps):
         return None

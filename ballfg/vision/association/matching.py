@@ -96,21 +96,17 @@ def _pairs(pieces: Sequence[Piece], cameras: Sequence[Camera]) -> list[_Pair]:
     """All pairs of pieces of different cameras that overlap, compared in one call for each pair of cameras."""
     pairs = []
     for one, other in combinations(range(len(cameras)), 2):
-        meeting: list[tuple[int, int]] = []
-        seen: list[tuple[Array, Array, Array, Array]] = []
-        for i, j in _overlapping(pieces, one, other):
-            common = _common(pieces[i], pieces[j])
-            if len(common[0]) >= _LEAST_COMMON:
-                meeting.append((i, j))
-                seen.append(common)
+        common = {(i, j): _common(pieces[i], pieces[j]) for i, j in _overlapping(pieces, one, other)}
+        meeting = [ij for ij, arrays in common.items() if len(arrays[0]) >= _LEAST_COMMON]
         if not meeting:
             continue
+        seen = [common[ij] for ij in meeting]
         pixels, spread, others, other_spread = (np.concatenate(arrays) for arrays in zip(*seen, strict=True))
         misses, slopes = epipolar_miss(cameras[one], cameras[other], pixels, others)
         variances = _along(slopes[:, :2], spread) + _along(slopes[:, 2:], other_spread)
-        ends = np.cumsum([len(common[0]) for common in seen])[:-1]
+        ends = np.cumsum([len(arrays[0]) for arrays in seen])[:-1]
         cut = zip(meeting, np.split(misses, ends), np.split(variances, ends), strict=True)
-        pairs += [_Pair(i, j, miss, variance) for (i, j), miss, variance in cut]
+        pairs += [_Pair(*ij, miss, variance) for ij, miss, variance in cut]
     return pairs
 
 
@@ -152,13 +148,11 @@ def _offsets(pieces: Sequence[Piece], pairs: Sequence[_Pair], count: int) -> dic
                 best[piece, camera] = (support, pair)
     offsets = {}
     for one, other in combinations(range(count), 2):
-        squares, variances = [np.zeros(0)], [np.zeros(0)]
-        for (piece, camera), (_, pair) in best.items():
-            mutual = best.get((pair.second, one), (0.0, None))[1] is pair
-            if pieces[piece].camera == one and camera == other and mutual and len(pair.misses) >= _LONG:
-                squares.append(pair.misses**2)
-                variances.append(pair.variances)
-        square, variance = np.concatenate(squares), np.concatenate(variances)
+        chosen = [pair for (piece, to), (_, pair) in best.items() if pieces[piece].camera == one and to == other]
+        mutual = [pair for pair in chosen if best.get((pair.second, one), (0.0, None))[1] is pair]
+        long = [pair for pair in mutual if len(pair.misses) >= _LONG]
+        square = np.concatenate([np.zeros(0), *(pair.misses**2 for pair in long)])
+        variance = np.concatenate([np.zeros(0), *(pair.variances for pair in long)])
         known = np.isfinite(square)
         if known.any():
             beyond = float(np.median(square[known] / variance[known])) / _MEDIAN_SQUARE - 1.0

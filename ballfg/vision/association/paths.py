@@ -40,8 +40,8 @@ class Path:
 
     def at(self, times: Array) -> tuple[Array, Array]:
         """Values (k, d) at times (k,) and their covariances (k, d, d), interpolation error included; NaN if unknown."""
-        values = np.full((len(times), self.values.shape[1]), np.nan)
-        covariances = np.full((len(times), self.values.shape[1], self.values.shape[1]), np.nan)
+        d = self.values.shape[1]
+        values, covariances = np.full((len(times), d), np.nan), np.full((len(times), d, d), np.nan)
         if len(self.times) < 2:
             return values, covariances
         right = np.clip(np.searchsorted(self.times, times), 1, len(self.times) - 1)
@@ -115,9 +115,8 @@ class Path:
         bend = np.linalg.norm(derivative, axis=1) * (2.0 if known == 2 else RATE_OF_CHANGE)
         remainder = bend * near * RATE_OF_CHANGE ** max(degree - 1, 0)
         spread = (remainder / (2.0, 2.0, 6.0, 24.0)[degree]) ** 2
-        return values, covariances / scale[:, None, None] ** (2 * order) + spread[:, None, None] * np.eye(
-            values.shape[1]
-        )
+        eye = np.eye(values.shape[1])
+        return values, covariances / scale[:, None, None] ** (2 * order) + spread[:, None, None] * eye
 
 
 def path(times: Array, values: Array, covariances: Array) -> Path:

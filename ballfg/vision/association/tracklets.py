@@ -59,9 +59,8 @@ def find_tracklets(detections: Detections, focal: float) -> list[Index]:
         recent = [*recent, candidates][-4:]
         if not candidates:
             continue
-        lost = [piece for piece in open_pieces if number - piece.seen[-1].frame > MAX_MISSED + 1]
-        done += lost
-        open_pieces = [piece for piece in open_pieces if piece not in lost]
+        done += [piece for piece in open_pieces if number - piece.seen[-1].frame > MAX_MISSED + 1]
+        open_pieces = [piece for piece in open_pieces if number - piece.seen[-1].frame <= MAX_MISSED + 1]
         _offer(open_pieces, candidates, focal)
         _accept(open_pieces, done)
         open_pieces += _start(recent, focal)

@@ -171,7 +171,9 @@ def _proposal(views: _Views, i: int, j: int) -> tuple[Array, Mask, Array]:
 
 def _halfway(views: _Views, i: int, j: int) -> Array:
     """(n, 3) the middle of the shortest line between the rays of two views; NaN where they are parallel."""
-    first, second = (_directions(views, c) for c in (i, j))
+    local = np.concatenate((views.planes, np.ones((*views.seen.shape, 1))), axis=2)
+    sizes = np.linalg.norm(local, axis=2, keepdims=True)
+    first, second = (local[:, c] @ views.rotations[c] / sizes[:, c] for c in (i, j))
     centres = [-views.rotations[c].T @ views.translations[c] for c in (i, j)]
     between = centres[1] - centres[0]
     cosine = np.einsum("ni,ni->n", first, second)
@@ -181,11 +183,6 @@ def _halfway(views: _Views, i: int, j: int) -> Array:
     near = (along_first - cosine * along_second) / sine2
     far = (cosine * along_first - along_second) / sine2
     return np.asarray(0.5 * (centres[0] + near[:, None] * first + centres[1] + far[:, None] * second))
-
-
-def _directions(views: _Views, c: int) -> Array:
-    local = np.concatenate((views.planes[:, c], np.ones((len(views.planes), 1))), axis=1)
-    return np.asarray(local @ views.rotations[c] / np.linalg.norm(local, axis=1, keepdims=True))
 
 
 def _refined(views: _Views, points: Array, used: Mask) -> tuple[Array, Array]:

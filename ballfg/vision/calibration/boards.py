@@ -96,9 +96,8 @@ class Charuco(_Squares):
                 "Measure both on the print."
             )
         if self.dictionary not in DICTIONARIES:
-            raise ValueError(
-                f"dictionary must be one of {', '.join(DICTIONARIES)}; got {shown(self.dictionary)}. Choose one."
-            )
+            known = ", ".join(DICTIONARIES)
+            raise ValueError(f"dictionary must be one of {known}; got {shown(self.dictionary)}. Choose one.")
         needed, there = self.columns * self.rows // 2, len(_dictionary(self.dictionary).bytesList)
         if there < needed:
             raise ValueError(
@@ -109,8 +108,8 @@ class Charuco(_Squares):
     @cached_property
     def board(self) -> cv2.aruco.CharucoBoard:
         """OpenCV's board."""
-        size = (self.columns, self.rows)
-        board = cv2.aruco.CharucoBoard(size, self.square, self.marker, _dictionary(self.dictionary))
+        sides, words = (self.columns, self.rows), _dictionary(self.dictionary)
+        board = cv2.aruco.CharucoBoard(sides, self.square, self.marker, words)
         board.setLegacyPattern(self.legacy)
         return board
 
@@ -153,10 +152,8 @@ def image_files(places: Iterable[str]) -> list[Path]:
         found = sorted(path.iterdir()) if path.is_dir() else sorted(map(Path, glob.glob(place))) or [path]
         images = [file for file in found if file.is_file() and file.suffix.lower() in ENDINGS]
         if not images:
-            endings = ", ".join(ENDINGS)
-            raise FileNotFoundError(
-                f"{place}: must be a folder, a pattern or a file of images ({endings}). Correct it."
-            )
+            what = f"{place}: must be a folder, a pattern or a file of images ({', '.join(ENDINGS)})"
+            raise FileNotFoundError(f"{what}. Correct it.")
         files += images
     return files
 
@@ -184,10 +181,8 @@ def suggested(files: Sequence[Path], board: Board) -> str:
             continue
         other = replace(board, columns=board.columns + more, rows=board.rows + more)
         if any(len(view.pixels) for view in find_views(files[:_TRIED], other)):
-            return (
-                f" The images show {other.columns}x{other.rows} squares: "
-                "squares are counted with the outermost ones, not the corners between them."
-            )
+            squares = f" The images show {other.columns}x{other.rows} squares"
+            return f"{squares}: squares are counted with the outermost ones, not the corners between them."
     return ""
 
 

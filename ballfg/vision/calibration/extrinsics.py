@@ -74,7 +74,8 @@ def calibrate_extrinsics(lens: Camera, marked: Marked) -> Extrinsics:
         )
     best = Extrinsics(above[0], marked, np.zeros((6, 6)))
     _check_fit(best)
-    if len(above) > 1 and _squares(above[1], marked) - _squares(above[0], marked) < CLEARLY and _apart(*above[:2]):
+    alike = [camera for camera in above[1:2] if _squares(camera, marked) - _squares(above[0], marked) < CLEARLY]
+    if any(np.linalg.norm(above[0].centre - c.centre) > FLAT * np.linalg.norm(above[0].tvec) for c in alike):
         raise ValueError(
             f"camera {shown(lens.name)}: points must tell one pose; two explain them alike. "
             "Mark more points, farther apart or at other heights."
@@ -146,37 +147,25 @@ def _is_above(camera: Camera, points: Array) -> bool:
     return bool((camera.centre - centre) @ normal * normal[2] >= 0.0)
 
 
-def _apart(one: Camera, other: Camera) -> bool:
-    """True if two poses differ."""
-    return bool(np.linalg.norm(one.centre - other.centre) > FLAT * np.linalg.norm(one.tvec))
-
-
 def _rms(residuals: Array) -> float:
     return float(np.sqrt((residuals**2).sum(axis=1).mean()))
 
 
 def _check_fit(found: Extrinsics) -> None:
-    if found.rms <= MAX_RMS * found.marked.sigma:
-        return
-    culprit = _culprit(found)
-    raise ValueError(
-        f"camera {shown(found.camera.name)}: points must be explained within {MAX_RMS * found.marked.sigma:g} px; "
-        f"got {found.rms:.1f}. {culprit}Check names and pixels, and that the lens is this camera's."
-    )
+    most = MAX_RMS * found.marked.sigma
+    if found.rms > most:
+        raise ValueError(
+            f"camera {shown(found.camera.name)}: points must be explained within {most:g} px; got {found.rms:.1f}. "
+            f"{_culprit(found)}Check names and pixels, and that the lens is this camera's."
+        )
 
 
 def _culprit(found: Extrinsics) -> str:
     """A sentence with the one point whose removal resolves the error, if there is one."""
     marked = found.marked
-    for i in range(len(marked.names)):
-        rest = Marked(
-            (*marked.names[:i], *marked.names[i + 1 :]),
-            np.delete(marked.points, i, axis=0),
-            np.delete(marked.pixels, i, axis=0),
-            marked.sigma,
-        )
-        if len(rest.names) <= MIN_POINTS:
-            return ""
+    for i in range(len(marked.names) if len(marked.names) > MIN_POINTS + 1 else 0):
+        names = (*marked.names[:i], *marked.names[i + 1 :])
+        rest = Marked(names, *(np.delete(a, i, axis=0) for a in (marked.points, marked.pixels)), marked.sigma)
         cameras = _poses(found.camera, rest, _check_points(found.camera, rest))
         if min(_rms(camera.project(rest.points) - rest.pixels) for camera in cameras) <= MAX_RMS / 3 * marked.sigma:
             return f"Without {shown(marked.names[i])} the others agree. "

@@ -125,8 +125,10 @@ def calibrate_intrinsics(name: str, views: Sequence[View], distortion: int = 5) 
             )
         fitted = _fit(name, used, distortion)
     _check_fit(name, fitted)
-    outside = tuple(_pose(fitted.camera, view) for view in left_out)
-    return replace(fitted, left_out=outside, missed=missed)
+    given = [(view.points, view.pixels, fitted.camera.matrix, fitted.camera.distortion) for view in left_out]
+    poses = [cv2.solvePnP(*one)[1:] for one in given]
+    outside = [_fitted(fitted.camera, view, *map(np.ravel, pose)) for view, pose in zip(left_out, poses, strict=True)]
+    return replace(fitted, left_out=tuple(outside), missed=missed)
 
 
 def turn(normals: Array) -> float:
@@ -195,12 +197,6 @@ def _one_thread() -> Iterator[None]:
 def _fitted(camera: Camera, view: View, rvec: Array, tvec: Array) -> FittedView:
     projected, _ = cv2.projectPoints(view.points, rvec, tvec, camera.matrix, camera.distortion)
     return FittedView(view, rvec, tvec, view.pixels - np.asarray(projected, dtype=np.float64).reshape(-1, 2))
-
-
-def _pose(camera: Camera, view: View) -> FittedView:
-    """A view that had no part in the calibration, with the pose that suits it best."""
-    _, rvec, tvec = cv2.solvePnP(view.points, view.pixels, camera.matrix, camera.distortion)
-    return _fitted(camera, view, np.ravel(rvec), np.ravel(tvec))
 
 
 def _outlying(fitted: Intrinsics) -> int | None:

@@ -55,11 +55,8 @@ def _lens_lines(lens: Intrinsics) -> Iterator[str]:
     usual, worst = lens.ray_sigma
     yield f"    rays known to {usual:.2f} px in {RAYS:.0%} of the image, {worst:.2f} px where worst"
     values, sigmas = _lens_numbers(lens)
-    yield (
-        "    "
-        + ", ".join(f"{name} {values[name]:.1f} ± {sigmas[name]:.1f}" for name in ("fx", "fy", "cx", "cy"))
-        + " px"
-    )
+    pinhole = ", ".join(f"{name} {values[name]:.1f} ± {sigmas[name]:.1f}" for name in ("fx", "fy", "cx", "cy"))
+    yield f"    {pinhole} px"
     bent = [name for name in values if name in COEFFICIENTS]
     if bent:
         yield "    " + ", ".join(f"{name} {values[name]:.4f} ± {sigmas[name]:.4f}" for name in bent)
