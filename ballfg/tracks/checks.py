@@ -55,16 +55,14 @@ class Findings:
         """One sentence for each kind of repair."""
         notes = []
         if self.repeats:
-            notes.append(f"{_count(self.repeats, 'exact repeat')} dropped")
-        if self.sorted_tracks:
-            count = _count(len(self.sorted_tracks), "trajectory", "trajectories")
+            notes.append(f"{self.repeats} exact repeat{'s' * (self.repeats != 1)} dropped")
+        if late := len(self.sorted_tracks):
+            count = f"{late} trajector{'y' if late == 1 else 'ies'}"
             notes.append(f"rows of {count} were not in time order: sorted ({_some(self.sorted_tracks)})")
-        if self.merged:
-            count = _count(len(self.merged), "stamp")
-            notes.append(
-                f"{count} with different rows, up to {self.merged_distance * 100:.1f} cm apart: "
-                f"averaged ({_some(self.merged)})"
-            )
+        if merged := len(self.merged):
+            what = f"{merged} stamp{'s' * (merged != 1)} with different rows"
+            most = f"up to {self.merged_distance * 100:.1f} cm apart"
+            notes.append(f"{what}, {most}: averaged ({_some(self.merged)})")
         return notes
 
 
@@ -90,13 +88,11 @@ def tidy(group: RowGroup, where: Where, findings: Findings | None = None) -> Arr
     """
     findings = Findings() if findings is None else findings
     values, rows = group.values, group.rows
-    steps = np.diff(values[:, 0])
-    if (steps < 0).any():
+    if (np.diff(values[:, 0]) < 0).any():
         findings.sorted_tracks.append(repr(group.name))
         order = np.argsort(values[:, 0], kind="stable")
         values, rows = values[order], rows[order]
-        steps = np.diff(values[:, 0])
-    if (steps == 0).any():
+    if (np.diff(values[:, 0]) == 0).any():
         values = _one_per_stamp(replace(group, rows=rows, values=values), where, findings)
     if len(values) < 2:
         raise ValueError(
@@ -215,10 +211,6 @@ def _time_remedy(step: float, rate: float | None) -> str:
     return f"The unit is probably {unit}: divide by {units[unit]:g}."
 
 
-def _count(number: int, one: str, many: str | None = None) -> str:
-    return f"{number} {one if number == 1 else many or one + 's'}"
-
-
 def _some(names: list[str]) -> str:
     more = len(names) - _NAMED
     return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
@@ -236,10 +228,8 @@ def _other_axis(times: Array, positions: Array, reach: int) -> tuple[str, ...]:
         return ()
     if rises.mean() >= MOSTLY:
         return ("the ball rises faster and faster along z: z seems to point down. Turn the sign of z.",)
-    if abs(acceleration[Z]) >= low / 2:
-        return ()
     other = int(np.abs(acceleration[:2]).argmax())
-    if not low <= abs(acceleration[other]) <= high:
+    if abs(acceleration[Z]) >= low / 2 or not low <= abs(acceleration[other]) <= high:
         return ()
     return (f"the ball falls along {AXES[other]}, not along z: exchange the axes so that z points up.",)
 
@@ -253,10 +243,8 @@ def _other_surface(
     rise = (z[inner + reach] - z[inner]) / (times[inner + reach] - times[inner])
     lowest = z[inner] == sliding_window_view(z, 2 * reach + 1).min(axis=1)
     bounces = z[inner[lowest & (fall < -LEAST_REVERSAL) & (rise > LEAST_REVERSAL)]] - radius
-    if not len(bounces) or not len(surfaces):
-        return ()
-    gaps = np.abs(bounces[:, None] - np.array(surfaces)).min(axis=1)
-    if np.median(gaps) <= NEAR_SURFACE:
+    gaps = np.abs(bounces[:, None] - np.array(surfaces)).min(axis=1, initial=np.inf)
+    if not len(bounces) or not len(surfaces) or np.median(gaps) <= NEAR_SURFACE:
         return ()
     heights = " and ".join(f"{height:g}" for height in surfaces)
     return (

@@ -73,9 +73,17 @@ def read_sightings(
         an unknown camera, or several candidates of one ball with equal scores; the message names file, line and column.
     """
     path = Path(path)
-    header, table, nameless = _read(path, list(time_offsets))
+    header, texts, numbers = read_columns(path, REQUIRED)
+    (lines,) = np.nonzero(np.char.strip(texts[KEY]) != "")
+    values = {name: column[lines] for name, column in numbers.items()}
+    check_values(path, values, lines)
+    check_cameras(path, texts[CAMERA][lines], lines, list(time_offsets))
+    values |= {name: np.full(len(lines), value) for name, value in UNSTATED.items() if name not in values}
+    number_of = {name: number for number, name in enumerate(time_offsets)}
+    seen_by = np.array([number_of[name] for name in texts[CAMERA][lines].tolist()], dtype=np.int64)
+    table = _Table(path, lines, texts[KEY][lines], seen_by, values)
     notes = [f"{path.name}: column {shown(name)} ignored" for name in header if name not in (*REQUIRED, *OPTIONAL)]
-    if nameless:
+    if nameless := len(texts[KEY]) - len(lines):
         notes.append(f"{path.name}: {nameless} rows without a trajectory left out")
     rows, doubles = _chosen(table)
     if doubles:
@@ -87,9 +95,9 @@ def read_sightings(
     found = {}
     for name in dict.fromkeys(table.names.tolist()):
         mine = rows[table.names[rows] == name]
-        values = {column: numbers[mine] for column, numbers in table.values.items()}
-        pixels = np.column_stack((values["u"], values["v"]))
-        found[name] = Sightings(tuple(time_offsets), table.camera[mine], values["t"], pixels, covariances(values))
+        own = {column: numbers[mine] for column, numbers in table.values.items()}
+        pixels = np.column_stack((own["u"], own["v"]))
+        found[name] = Sightings(tuple(time_offsets), table.camera[mine], own["t"], pixels, covariances(own))
     return found, notes
 
 
@@ -103,20 +111,6 @@ def write_sightings(path: str | os.PathLike[str], balls: Iterable[tuple[str, Sig
         for name, seen in balls:
             camera = np.array(seen.cameras, dtype=object)[seen.camera]
             table.write({KEY: name} | seen_columns(seen.times, camera, seen.pixels, seen.covariances))
-
-
-def _read(path: Path, cameras: list[str]) -> tuple[list[str], _Table, int]:
-    """The header, the checked rows with a ball's name, and the number of other rows."""
-    header, texts, numbers = read_columns(path, REQUIRED)
-    (lines,) = np.nonzero(np.char.strip(texts[KEY]) != "")
-    names, seen_by = texts[KEY][lines], texts[CAMERA][lines]
-    values = {name: column[lines] for name, column in numbers.items()}
-    check_values(path, values, lines)
-    check_cameras(path, seen_by, lines, cameras)
-    values |= {name: np.full(len(lines), value) for name, value in UNSTATED.items() if name not in values}
-    number_of = {name: number for number, name in enumerate(cameras)}
-    camera = np.array([number_of[name] for name in seen_by.tolist()], dtype=np.int64)
-    return header, _Table(path, lines, names, camera, values), len(texts[KEY]) - len(lines)
 
 
 def _chosen(table: _Table) -> tuple[NDArray[np.int64], int]:
@@ -222,15 +216,8 @@ def covariances(values: Mapping[str, Array]) -> Array:
 def seen_columns(times: Array, camera: ArrayLike, pixels: Array, spread: Array) -> dict[str, ArrayLike]:
     """The columns of a table from stamps (n,) s, cameras, pixels (n, 2) and covariances (n, 2, 2) px^2."""
     sigma_u, sigma_v = (np.sqrt(spread[:, i, i]) for i in (0, 1))
-    return {
-        "t": times,
-        CAMERA: camera,
-        "u": pixels[:, 0],
-        "v": pixels[:, 1],
-        "sigma_u": sigma_u,
-        "sigma_v": sigma_v,
-        "rho_uv": spread[:, 0, 1] / (sigma_u * sigma_v),
-    }
+    noise = {"sigma_u": sigma_u, "sigma_v": sigma_v, "rho_uv": spread[:, 0, 1] / (sigma_u * sigma_v)}
+    return {"t": times, CAMERA: camera, "u": pixels[:, 0], "v": pixels[:, 1], **noise}
 
 
 def _place(path: Path, lines: NDArray[np.int64], column: str) -> str:

@@ -128,12 +128,8 @@ def _stream(source: RowSource) -> Iterator[RowGroup]:
         for start, end in _runs(block.codes)
     )
     for name, run in groupby(pieces, key=lambda piece: piece.name):
-        yield _joined(name, list(run))
-
-
-def _joined(name: str, pieces: list[RowGroup]) -> RowGroup:
-    rows = np.concatenate([piece.rows for piece in pieces])
-    return RowGroup(name, rows, np.concatenate([piece.values for piece in pieces]))
+        rows, values = zip(*((piece.rows, piece.values) for piece in run), strict=True)
+        yield RowGroup(name, np.concatenate(rows), np.concatenate(values))
 
 
 def _regroup(source: RowSource, index: Index) -> Iterator[RowGroup]:

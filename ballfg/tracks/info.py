@@ -1,7 +1,7 @@
 """Reads, checks and writes `dataset.yaml`, the description of a dataset."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -50,11 +50,10 @@ class Ball:
     """kg"""
 
     def __post_init__(self) -> None:
-        for key, unit, (least, limit), instead in (("radius", "m", _RADII, "mm"), ("mass", "kg", _MASSES, "g")):
-            value = check_number(
-                f"ball.{key}", getattr(self, key), unit, above=0.0, least=least, limit=limit, instead=instead
-            )
-            object.__setattr__(self, key, value)
+        for key, unit, (least, limit), other in (("radius", "m", _RADII, "mm"), ("mass", "kg", _MASSES, "g")):
+            value, label = getattr(self, key), f"ball.{key}"
+            checked = check_number(label, value, unit, above=0.0, least=least, limit=limit, instead=other)
+            object.__setattr__(self, key, checked)
 
 
 TABLE_TENNIS = Ball(radius=0.02, mass=0.0027)
@@ -148,11 +147,7 @@ class DatasetInfo:
         frame: dict[str, Any] = {"up": "z", "table_height": self.table_height}
         if self.table_extent is not None:
             frame["table"] = {"x": list(self.table_extent[:2]), "y": list(self.table_extent[2:])}
-        content: dict[str, Any] = {
-            "name": self.name,
-            "frame": frame,
-            "ball": {field.name: getattr(self.ball, field.name) for field in fields(Ball)},
-        }
+        content: dict[str, Any] = {"name": self.name, "frame": frame, "ball": asdict(self.ball)}
         optional = {key: getattr(self, key) for key in _OPTIONAL}
         content |= {key: value for key, value in optional.items() if value is not None}
         if self.noise is not None:
@@ -208,8 +203,7 @@ def read_info(path: Path) -> tuple[DatasetInfo, list[str]]:
 
 def write_info(path: Path, info: DatasetInfo) -> None:
     """Writes a `dataset.yaml`; floats read back bit for bit."""
-    text = yaml.safe_dump(info.to_mapping(), sort_keys=False, allow_unicode=True)
-    path.write_text(text, encoding="utf-8")
+    path.write_text(yaml.safe_dump(info.to_mapping(), sort_keys=False, allow_unicode=True), encoding="utf-8")
 
 
 def _section(content: Mapping[str, Any], key: str, fields: Mapping[str, str], prefix: str = "") -> dict[str, Any]:
@@ -233,11 +227,8 @@ def _stated_extent(frame: Mapping[str, Any]) -> tuple[Any, ...] | None:
     table = _section(frame, "table", {"x": "[0.0, 2.74]", "y": "[-0.76, 0.76]"}, "frame.")
     for axis in "xy":
         if not isinstance(table[axis], list) or len(table[axis]) != 2:
-            raise ValueError(
-                f"frame.table.{axis} must be two numbers in m, the table's ends along {axis}; got "
-                f"{shown(table[axis])}. "
-                f"Write {axis}: [low, high]."
-            )
+            what = f"frame.table.{axis} must be two numbers in m, the table's ends along {axis}"
+            raise ValueError(f"{what}; got {shown(table[axis])}. Write {axis}: [low, high].")
     return (*table["x"], *table["y"])
 
 
@@ -262,8 +253,7 @@ def _checked_extent(extent: Any) -> tuple[float, ...]:
 
 
 def _need(content: Mapping[str, Any], key: str, prefix: str) -> None:
-    if content.get(key) is not None:
-        return
-    found = nearest(key, (str(name) for name in content if name not in _KNOWN))
-    remedy = f"Add it, or rename {shown(found)}." if found else "Add it."
-    raise ValueError(f"{prefix}{key} is required; got {listed(content)}. {remedy}")
+    if content.get(key) is None:
+        found = nearest(key, (str(name) for name in content if name not in _KNOWN))
+        remedy = f"Add it, or rename {shown(found)}." if found else "Add it."
+        raise ValueError(f"{prefix}{key} is required; got {listed(content)}. {remedy}")

@@ -109,10 +109,8 @@ class ParquetRows(RowSource):
         for name in self.columns:
             kind = schema.field(name).type
             if not (pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_decimal(kind)):
-                raise ValueError(
-                    f"{path}, column {shown(name)}: must hold numbers; got type {kind}. "
-                    "Convert it to float64 (SI units)."
-                )
+                what = f"{path}, column {shown(name)}: must hold numbers; got type {kind}"
+                raise ValueError(f"{what}. Convert it to float64 (SI units).")
 
     def blocks(self) -> Iterator[Block]:
         """Reads the file from its start; see RowSource."""
@@ -124,9 +122,8 @@ class ParquetRows(RowSource):
                     yield _block(batch.select(names), start)
                     start += batch.num_rows
         except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-            raise ValueError(
-                f"{self.path}: cannot be read as a table of tracks; {one_line(error)}. Write it again."
-            ) from None
+            what = f"{self.path}: cannot be read as a table of tracks; {one_line(error)}"
+            raise ValueError(f"{what}. Write it again.") from None
 
     def where(self, *rows: int) -> str:
         """The file and the numbers of these rows, counted from 1; see RowSource."""

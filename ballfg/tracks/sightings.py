@@ -55,7 +55,11 @@ class Sightings:
             )
         object.__setattr__(self, "camera", camera.astype(np.int64))
         for field, shape in {"times": (m,), "pixels": (m, 2), "covariances": (m, 2, 2)}.items():
-            object.__setattr__(self, field, _floats(field, getattr(self, field), shape))
+            array = check_array(field, getattr(self, field), shape, "Pass one row per sighting.")
+            if not np.isfinite(array).all():
+                row = int(np.argwhere(~np.isfinite(array))[0][0])
+                raise ValueError(f"{field} must be finite; {field}[{row}]={array[row].tolist()}. Drop that sighting.")
+            object.__setattr__(self, field, array)
         self._check_stamps()
         good = are_covariances(self.covariances)
         if not good.all():
@@ -87,14 +91,6 @@ class Sightings:
         """
         kept = np.asarray(rows)
         return Sightings(self.cameras, self.camera[kept], self.times[kept], self.pixels[kept], self.covariances[kept])
-
-
-def _floats(field: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    array = check_array(field, value, shape, "Pass one row per sighting.")
-    if not np.isfinite(array).all():
-        row = int(np.argwhere(~np.isfinite(array))[0][0])
-        raise ValueError(f"{field} must be finite; {field}[{row}]={array[row].tolist()}. Drop that sighting.")
-    return array
 
 
 def are_covariances(matrices: Array) -> NDArray[np.bool_]:

@@ -47,10 +47,9 @@ class TableWriter:
         check_file(self.path, "path")
         self._file: BinaryIO | None = None
         self._parquet: pq.ParquetWriter | None = None
-        self._has_header = False
         self._schema: pa.Schema | None = None
         self._pending: list[pa.RecordBatch] = []
-        self._pending_rows = 0
+        self._has_header, self._pending_rows = False, 0
 
     def __enter__(self) -> "TableWriter":
         self._context = self._opened()
@@ -87,8 +86,7 @@ class TableWriter:
         if self._file is None:
             raise RuntimeError("write must be called inside `with TableWriter(path) as table:`; it was not.")
         batch = _batch(columns)
-        if self._schema is None:
-            self._schema = batch.schema
+        self._schema = self._schema or batch.schema
         self._pending.append(_conformed(batch, self._schema))
         self._pending_rows += batch.num_rows
         if self._pending_rows >= _BLOCK_ROWS:
@@ -126,16 +124,13 @@ def _batch(columns: Mapping[str, ArrayLike]) -> pa.RecordBatch:
     arrays = {name: np.asarray(values) for name, values in columns.items()}
     for name, array in arrays.items():
         if array.ndim > 1:
-            raise ValueError(
-                f"columns[{shown(name)}] must have shape (n,); got {array.shape}. Pass one column at a time."
-            )
+            what = f"columns[{shown(name)}] must have shape (n,); got {array.shape}"
+            raise ValueError(f"{what}. Pass one column at a time.")
     lengths = {name: len(array) for name, array in arrays.items() if array.ndim == 1}
     if len(set(lengths.values())) > 1:
         raise ValueError(f"columns must have one length; got {lengths}. Pass one value per row.")
     count = next(iter(lengths.values()), 1)
-    return pa.RecordBatch.from_arrays(
-        [_arrow(name, array, count) for name, array in arrays.items()], names=list(arrays)
-    )
+    return pa.RecordBatch.from_pydict({name: _arrow(name, array, count) for name, array in arrays.items()})
 
 
 def _arrow(name: str, array: np.ndarray, count: int) -> pa.Array:

@@ -43,10 +43,8 @@ class Background:
     """
 
     def __init__(self, images: Sequence[Image]) -> None:
-        if len(images) < FEWEST:
-            raise ValueError(
-                f"images must be at least three to learn a background; got {len(images)}. Pass more frames."
-            )
+        if (few := len(images)) < FEWEST:
+            raise ValueError(f"images must be at least three to learn a background; got {few}. Pass more frames.")
         shapes = {image.shape for image in images}
         if len(shapes) > 1 or len(images[0].shape) != 3 or images[0].shape[2] != 3:
             raise ValueError(f"images must have one shape (h, w, 3); got {sorted(shapes)}. Pass frames of one camera.")
@@ -59,7 +57,11 @@ class Background:
         self.full = _mean_near(level, middle, 3.0 * float(np.sqrt(self.noise.max())))
         self.small = np.asarray(shrunk(self.full), dtype=np.float32)
         self.blotches = _blotches(level, self.full, self.noise)
-        self.threshold = self._thresholds([shrunk(image) for image in level])
+        # larger at noise, at edges under compression, and at moving leaves
+        spread = _median([cv2.absdiff(shrunk(image), self.small.astype(np.uint8)) for image in level])
+        restless = cv2.dilate(spread.max(axis=2), np.ones((3, 3), dtype=np.uint8))
+        sigma = np.hypot(1.4826 * restless, np.sqrt(self.noise.max()) / SHRINK)
+        self.threshold = np.minimum(LEAST_CHANGE + SIGMAS * sigma, 255.0).astype(np.uint8)
         self.gains: Array = np.ones(3)
         self._strip = 0
 
@@ -67,13 +69,6 @@ class Background:
     def shape(self) -> tuple[int, int]:
         """Height and width, px."""
         return (self.full.shape[0], self.full.shape[1])
-
-    def _thresholds(self, smalls: list[Image]) -> Image:
-        """Thresholds of a change: larger at noise, at edges under compression, and at moving leaves."""
-        spread = _median([cv2.absdiff(small, self.small.astype(np.uint8)) for small in smalls])
-        restless = cv2.dilate(spread.max(axis=2), np.ones((3, 3), dtype=np.uint8))
-        sigma = np.hypot(1.4826 * restless, np.sqrt(self.noise.max()) / SHRINK)
-        return np.minimum(LEAST_CHANGE + SIGMAS * sigma, 255.0).astype(np.uint8)
 
     def follow(self, small: Image) -> Image:
         """The change (h/4, w/4) uint8 grey levels in a frame's small picture, of the channel that differs most."""
@@ -145,8 +140,7 @@ def _median(images: Sequence[NDArray]) -> Image:
 
 def _mean_near(images: Sequence[NDArray], middle: Image, near: float) -> Array32:
     """(h, w, 3) mean of what lies within `near` of the median: its noise is a quarter of the median's rounding."""
-    total = np.zeros(middle.shape, dtype=np.float32)
-    count = np.zeros(middle.shape, dtype=np.float32)
+    total, count = np.zeros(middle.shape, dtype=np.float32), np.zeros(middle.shape, dtype=np.float32)
     for image in images:
         close = (cv2.absdiff(image, middle) <= max(near, 1.0)).astype(np.float32)
         count += close

@@ -69,7 +69,6 @@ class BallDetector:
 
         Args: images: at least three, (h, w, 3) grey levels, spread over the recording; see `Background`.
             settings: assumptions on the ball; None: the default ones.
-        Returns: the detector of that camera.
         Raises: ValueError: too few images, or of several sizes.
         """
         return cls(Background(images), settings)
@@ -131,13 +130,8 @@ def patch_of(change: np.ndarray, behind: np.ndarray, region: Region, noise: Arra
     direction /= length
     along = direction.astype(np.float32)
     shade = behind @ along
-    return Patch(
-        *region.places(),
-        change @ along,
-        shade - shade.mean(),
-        float(shade.mean()),
-        float(np.sqrt(direction @ noise @ direction)),
-    )
+    sigma = float(np.sqrt(direction @ noise @ direction))
+    return Patch(*region.places(), change @ along, shade - shade.mean(), float(shade.mean()), sigma)
 
 
 def learned(look: Look, fit: StreakFit, blotches: float) -> Look:
@@ -163,9 +157,5 @@ def _candidates(rated: Sequence[tuple[StreakFit, float]], floor: float) -> Candi
     lengths = 2.0 * np.hypot(halves[:, 0], halves[:, 1])
     spread = 2.0 * np.sqrt(np.trace(covariances[:, 2:4, 2:4], axis1=1, axis2=2))
     halves[(lengths < VISIBLE_STREAK) | (lengths < VISIBLE_STREAK * spread)] = np.nan
-    return Candidates(
-        centres,
-        covariances[:, :2, :2] + floor**2 * np.eye(2),
-        np.array([rating for _, rating in rated]),
-        np.stack((centres - halves, centres + halves), axis=1),
-    )
+    spread_of_centres, scores = covariances[:, :2, :2] + floor**2 * np.eye(2), np.array([mark for _, mark in rated])
+    return Candidates(centres, spread_of_centres, scores, np.stack((centres - halves, centres + halves), axis=1))

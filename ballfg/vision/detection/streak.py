@@ -164,18 +164,10 @@ def swept(x: Array32, y: Array32, values: Array) -> tuple[Array32, Array32]:
     by_x, by_y = along * dx, along * dy
     disc = (disc + 1) * (1 / (2 * radius))
     moments = weights * nodes
-    rows = (
-        (weights, by_x),
-        (weights, by_y),
-        (moments, by_x),
-        (moments, by_y),
-        (weights, slope),
-        (-weights, slope * inward),
-        (weights, disc * dx),
-        (weights, disc * dy),
-    )
-    parts = np.empty((len(rows), x.size), dtype=np.float32)
-    for row, (moment, array) in zip(parts, rows, strict=True):
+    moment_of = (weights, weights, moments, moments, weights, -weights, weights, weights)
+    arrays = (by_x, by_y, by_x, by_y, slope, slope * inward, disc * dx, disc * dy)
+    parts = np.empty((len(arrays), x.size), dtype=np.float32)
+    for row, moment, array in zip(parts, moment_of, arrays, strict=True):
         np.matmul(moment, array, out=row)
     return (weights @ disc) * radius, parts
 

@@ -46,8 +46,7 @@ class Video(ABC):
         Raises: ValueError: stamps that do not increase, an image of another size, frames that are fewer or more than
             the stamps or, by over 2 %, fewer than announced.
         """
-        last = -np.inf
-        number = -1
+        last, number = -np.inf, -1
         for number, (stamp, image) in enumerate(self._decoded()):
             if self._stamps is not None:
                 if number >= len(self._stamps):
@@ -142,9 +141,8 @@ class ImageFolder(Video):
         image = read_image(file, cv2.IMREAD_COLOR)
         size = (image.shape[1], image.shape[0])
         if size != self.size:
-            raise ValueError(
-                f"images of {self.path} must have one size; {file.name} has {size}, the first {self.size}."
-            )
+            what = f"images of {self.path} must have one size"
+            raise ValueError(f"{what}; {file.name} has {size}, the first {self.size}.")
         return image
 
 

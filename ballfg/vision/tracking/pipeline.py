@@ -70,21 +70,13 @@ class Tracking:
         return float(f"{1.0 / step:.6g}")
 
     def seen(self, ball: SeenBall, camera: int) -> Seen:
-        """The frames in which a camera saw a ball, and its pixels.
-
-        Args: ball: one of `balls`.  camera: number of the camera.
-        Returns: numbers of the frames, and pixels.
-        """
+        """The frames in which a camera, by its number, saw one of `balls`, and its pixels."""
         rows = ball.sightings.camera == camera
         frames = np.searchsorted(self.detections[camera].frames, ball.sightings.times[rows])
         return Seen(frames.astype(np.int64), ball.sightings.pixels[rows])
 
     def rows(self, ball: SeenBall, camera: int) -> Index:
-        """The candidates of a camera that are sightings of a ball.
-
-        Args: ball: one of `balls`.  camera: number of the camera.
-        Returns: (m,) numbers of the candidates.
-        """
+        """(m,) numbers of the candidates of a camera, by its number, that are sightings of one of `balls`."""
         detections, seen = self.detections[camera], self.seen(ball, camera)
         first, end = (np.searchsorted(detections.frame, seen.frames, side) for side in ("left", "right"))
         found = [

@@ -30,16 +30,14 @@ def match_videos(given: Sequence[str], cameras: Sequence[Camera], ignored: Seque
                 f"NAME={path}.{did_you_mean(name, names)}"
             )
         if name in found:
-            raise ValueError(
-                f"camera {shown(name)} must have one video; got {found[name]} and {path}. Drop one of them."
-            )
+            both = f"{found[name]} and {path}"
+            raise ValueError(f"camera {shown(name)} must have one video; got {both}. Drop one of them.")
         found[name] = path
     missing = [name for name in names if name not in found]
     if missing:
         raise ValueError(
             f"every camera must have a video; got none for {' and '.join(map(shown, missing))}. "
-            f"Give it as {missing[0]}=FILE, "
-            f"or leave the camera out with --without {missing[0]}."
+            f"Give it as {missing[0]}=FILE, or leave the camera out with --without {missing[0]}."
         )
     return {name: found[name] for name in names}
 
@@ -89,20 +87,17 @@ def check_sizes(sizes: Mapping[str, tuple[int, int]], cameras: Sequence[Camera])
     Raises: ValueError: naming the camera, both sizes and what to do.
     """
     for camera in cameras:
-        size = sizes[camera.name]
-        if size != camera.size:
-            calibrated, filmed = (f"{width}x{height}" for width, height in (camera.size, size))
-            raise ValueError(
-                f"camera {shown(camera.name)} must be calibrated at the size of its video; got {calibrated} in the "
-                f"cameras' file and a video of {filmed}. {_remedy(camera.size, size)}"
-            )
-
-
-def _remedy(calibrated: tuple[int, int], filmed: tuple[int, int]) -> str:
-    across, down = (new / old for new, old in zip(filmed, calibrated, strict=True))
-    if abs(across / down - 1.0) > SAME_SHAPE:
-        return "Calibrate it again at that size: the pictures have different proportions."
-    return (
-        f"If the whole picture was scaled, set size to [{filmed[0]}, {filmed[1]}] and multiply fx, fy by {across:.6g}; "
-        f"cx, cy become {across:.6g} (c + 0.5) - 0.5. If it was cropped, calibrate again."
-    )
+        (width, height), (old_width, old_height) = sizes[camera.name], camera.size
+        if (width, height) == camera.size:
+            continue
+        across = width / old_width
+        remedy = (
+            f"If the whole picture was scaled, set size to [{width}, {height}] and multiply fx, fy by {across:.6g}; "
+            f"cx, cy become {across:.6g} (c + 0.5) - 0.5. If it was cropped, calibrate again."
+        )
+        if abs(across / (height / old_height) - 1.0) > SAME_SHAPE:
+            remedy = "Calibrate it again at that size: the pictures have different proportions."
+        raise ValueError(
+            f"camera {shown(camera.name)} must be calibrated at the size of its video; got {old_width}x{old_height} in "
+            f"the cameras' file and a video of {width}x{height}. {remedy}"
+        )
