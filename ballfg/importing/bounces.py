@@ -22,13 +22,10 @@ _GRAVITY: Final = 10.0  # m/s^2, of the fitted arcs: gravity and a little topspi
 class Surface:
     """A height at which balls bounce."""
 
-    centre: float
-    """m, of the ball's centre at contact, the median of the bounces."""
-    spread: float
-    """m, standard deviation of one bounce."""
+    centre: float  # m, of the ball's centre at contact, the median of the bounces
+    spread: float  # m, standard deviation of one bounce
     bounces: int
-    others: tuple[float, ...] = ()
-    """m, centres at further surfaces."""
+    others: tuple[float, ...] = ()  # m, centres at further surfaces
 
 
 def surface(shots: Iterable[tuple[Array, Array]]) -> Surface | None:

@@ -76,10 +76,8 @@ class Guess:
     what: str
     value: str
     why: str
-    sure: str
-    """stated, sure, likely or unsure."""
-    option: str
-    """The option that changes it, as typed; empty if it cannot be changed."""
+    sure: str  # stated, sure, likely or unsure
+    option: str  # the option that changes it, as typed; empty if it cannot be changed
 
 
 def parse_columns(text: str) -> dict[str, str]:

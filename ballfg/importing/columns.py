@@ -24,8 +24,7 @@ class Roles:
     """The columns of one table by role."""
 
     places: tuple[str, str, str]
-    time: tuple[str, ...]
-    """One column of stamps, two of s and ns, or none."""
+    time: tuple[str, ...]  # one column of stamps, two of s and ns, or none
     frame: str | None = None
     trajectory: str | None = None
     sigmas: tuple[str, str, str] | None = None

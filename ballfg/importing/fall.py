@@ -30,11 +30,9 @@ class Scale:
     length: str
     time: str
     up: str
-    score: float
-    """Weighted share of the windows with the acceleration of a falling ball, 0 to 1."""
+    score: float  # weighted share of the windows with the acceleration of a falling ball, 0 to 1
     windows: int
-    drag: float
-    """1/m, the quadratic drag that fits the windows best."""
+    drag: float  # 1/m, the quadratic drag that fits the windows best
 
 
 def scales(

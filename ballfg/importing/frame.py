@@ -38,8 +38,7 @@ class Frame:
     time: str
     up: str
     flip: str | None
-    drag: float | None
-    """1/m, from the falls."""
+    drag: float | None  # 1/m, from the falls
     windows: int = 0
 
     def metres(self, positions: Array) -> Array:

@@ -54,12 +54,9 @@ class Meaning:
 
     role: str
     """t, frame, trajectory, x, y, z, sigma_x, sigma_y, sigma_z, seconds or nanoseconds (of a stamp in two parts)."""
-    rank: int
-    """0 for an unambiguous name; larger for vaguer ones."""
-    unit: str | None = None
-    """As in the name, normalised; unknown text in brackets stays as it is."""
-    group: str = ""
-    """The other words of the name: x, y and z with the same ones belong together."""
+    rank: int  # 0 for an unambiguous name; larger for vaguer ones
+    unit: str | None = None  # as in the name, normalised; unknown text in brackets stays as it is
+    group: str = ""  # the other words of the name: x, y and z with the same ones belong together
 
 
 def unit_of_text(text: str) -> str | None:

@@ -29,8 +29,7 @@ class Proposal:
     info: DatasetInfo
     tracks: list[Track]
     guesses: list[Guess]
-    notes: list[str]
-    """Omitted or reordered rows, one sentence each."""
+    notes: list[str]  # omitted or reordered rows, one sentence each
 
 
 def propose(data: Any, choices: Choices) -> Proposal:

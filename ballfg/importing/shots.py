@@ -28,15 +28,11 @@ class SourceShot:
     """The samples of one shot in the units of their source."""
 
     name: str
-    stamps: Stamps
-    """(n,) non-decreasing."""
-    positions: Array
-    """(n, 3)"""
-    sigmas: Array | None
-    """(n, 3)"""
+    stamps: Stamps  # (n,) non-decreasing
+    positions: Array  # (n, 3)
+    sigmas: Array | None  # (n, 3)
     labels: Mapping[str, Label]
-    rows: NDArray[np.intp]
-    """(n,) index into the source's table."""
+    rows: NDArray[np.intp]  # (n,) index into the source's table
     table: RawTable
 
 

@@ -34,10 +34,8 @@ class Pending(Protocol):
 class Executor(Protocol):
     """Processes that compute chunks, of this machine or of a cluster."""
 
-    batch: int
-    """Number of tracks in a chunk."""
-    helped: bool
-    """True if the calling process is one of them: it then computes chunks itself instead of waiting."""
+    batch: int  # number of tracks in a chunk
+    helped: bool  # True if the calling process is one of them: it then computes chunks itself instead of waiting
 
     @property
     def slots(self) -> int:

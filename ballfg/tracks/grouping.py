@@ -29,24 +29,18 @@ class RowGroup:
 
     name: str
 
-    rows: NDArray[np.int64]
-    """(n,) number of each row in the file, from 0."""
-    values: Array
-    """(n, 4) or (n, 7), as in Block."""
+    rows: NDArray[np.int64]  # (n,) number of each row in the file, from 0
+    values: Array  # (n, 4) or (n, 7), as in Block
 
 
 @dataclass(frozen=True)
 class Index:
     """The result of one scan of the file."""
 
-    names: list[str]
-    """The trajectories in the order in which they first appear."""
-    counts: NDArray[np.int64]
-    """(number of trajectories,) rows of each."""
-    contiguous: bool
-    """True if the rows of each trajectory are contiguous."""
-    stamp: tuple[int, int]
-    """Size (bytes) and modification time (ns) of the scanned file."""
+    names: list[str]  # the trajectories in the order in which they first appear
+    counts: NDArray[np.int64]  # (number of trajectories,) rows of each
+    contiguous: bool  # True if the rows of each trajectory are contiguous
+    stamp: tuple[int, int]  # size (bytes) and modification time (ns) of the scanned file
 
 
 def scan(source: RowSource) -> Index:

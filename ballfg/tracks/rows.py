@@ -31,14 +31,10 @@ _PARQUET_BLOCK = 1 << 14  # rows a block
 class Block:
     """Consecutive rows of the file."""
 
-    start: int
-    """Number of the first row, counted from 0 at the first row of data."""
-    names: list[str | None]
-    """The distinct trajectory names of the block; None for an empty cell of a Parquet file."""
-    codes: NDArray[np.int32]
-    """(n,) index into `names` for each row."""
-    values: Array
-    """(n, 4) t, x, y, z in s and m, or (n, 7) with the sigmas in m."""
+    start: int  # number of the first row, counted from 0 at the first row of data
+    names: list[str | None]  # the distinct trajectory names of the block; None for an empty cell of a Parquet file
+    codes: NDArray[np.int32]  # (n,) index into `names` for each row
+    values: Array  # (n, 4) t, x, y, z in s and m, or (n, 7) with the sigmas in m
 
 
 class RowSource(ABC):

@@ -25,18 +25,12 @@ _MOSTLY: Final = 0.5  # least share of numbers among the cells of a numeric colu
 class RawTable:
     """One table of a source."""
 
-    name: str
-    """Name of the table in its file; the file's own name for a single table."""
-    columns: dict[str, Column]
-    """By name, in the order of the file."""
-    source: str = ""
-    """Name of the file, for messages."""
-    named: bool = True
-    """True if the columns have names of their own."""
-    notes: list[str] = field(default_factory=list)
-    """Omissions during reading."""
-    texts: dict[str, Column] = field(default_factory=dict)
-    """Columns of numbers with some other cells, as written."""
+    name: str  # name of the table in its file; the file's own name for a single table
+    columns: dict[str, Column]  # by name, in the order of the file
+    source: str = ""  # name of the file, for messages
+    named: bool = True  # True if the columns have names of their own
+    notes: list[str] = field(default_factory=list)  # omissions during reading
+    texts: dict[str, Column] = field(default_factory=dict)  # columns of numbers with some other cells, as written
 
     @property
     def doubts(self) -> dict[str, str]:

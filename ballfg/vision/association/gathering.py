@@ -23,16 +23,11 @@ class Footage:
     """A recording of all cameras, on one clock that begins with the first frame of all."""
 
     cameras: Sequence[Camera]
-    detections: Sequence[Detections]
-    """One for each camera, in the cameras' order."""
-    shared: Array | None
-    """(k,) s, true time of the stamps if the cameras share a shutter."""
-    origin: float = 0.0
-    """s, stamp of the first frame of all; the detections' stamps are counted from it."""
-    stamps: Sequence[Array] = ()
-    """For each camera (f,) s, the recorded stamps of its frames."""
-    offset: float = 0.0
-    """px, error of the calibration, added to every pixel's noise."""
+    detections: Sequence[Detections]  # one for each camera, in the cameras' order
+    shared: Array | None  # (k,) s, true time of the stamps if the cameras share a shutter
+    origin: float = 0.0  # s, stamp of the first frame of all; the detections' stamps are counted from it
+    stamps: Sequence[Array] = ()  # for each camera (f,) s, the recorded stamps of its frames
+    offset: float = 0.0  # px, error of the calibration, added to every pixel's noise
 
     def frames(self, camera: int) -> Array:
         """(f,) s, true times of a camera's frames."""
@@ -48,14 +43,10 @@ class Footage:
 class Gathered:
     """A ball during the association."""
 
-    rows: tuple[Index, ...]
-    """For each camera the numbers of its candidates, ascending; never two of one frame."""
-    track: Path
-    """Its points in space over true time, with the covariances that noise gives them."""
-    covariances: Array
-    """(n, 3, 3) m^2, including the calibration's error."""
-    views: Index
-    """(n,) cameras that made each point."""
+    rows: tuple[Index, ...]  # for each camera the numbers of its candidates, ascending; never two of one frame
+    track: Path  # its points in space over true time, with the covariances that noise gives them
+    covariances: Array  # (n, 3, 3) m^2, including the calibration's error
+    views: Index  # (n,) cameras that made each point
 
 
 @dataclass(frozen=True, eq=False)

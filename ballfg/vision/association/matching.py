@@ -33,12 +33,9 @@ _NEAREST: Final = 0.1  # m, least distance from either camera at which two rays 
 class Piece:
     """A smoothly moving object in one camera."""
 
-    camera: int
-    """Number of the camera."""
-    rows: Index
-    """(k,) its candidates."""
-    path: Path
-    """Its place in the image, over true time."""
+    camera: int  # number of the camera
+    rows: Index  # (k,) its candidates
+    path: Path  # its place in the image, over true time
 
     @property
     def start(self) -> float:
@@ -73,8 +70,7 @@ class Matching:
 
     groups: list[list[int]]
     """Numbers of pieces of the same object, in the order of the first; unmatched pieces are left out."""
-    offset: float
-    """px, excess miss of rays of one object beyond noise, in the worst pair of cameras; 0 without any."""
+    offset: float  # px, excess miss of rays of one object beyond noise, in the worst pair of cameras; 0 without any
 
 
 def match(pieces: Sequence[Piece], cameras: Sequence[Camera]) -> Matching:

@@ -29,14 +29,10 @@ _WING: Final = 3  # samples on either side of an interval in the test for a kink
 class Path:
     """Samples in order of time; values of any dimension d (2: an image, 3: space)."""
 
-    times: Array
-    """(n,) s, strictly increasing."""
-    values: Array
-    """(n, d)"""
-    covariances: Array
-    """(n, d, d)"""
-    parts: Index
-    """(n,) number of the smooth part that a sample belongs to, from 0, rising by at most one."""
+    times: Array  # (n,) s, strictly increasing
+    values: Array  # (n, d)
+    covariances: Array  # (n, d, d)
+    parts: Index  # (n,) number of the smooth part that a sample belongs to, from 0, rising by at most one
 
     def at(self, times: Array) -> tuple[Array, Array]:
         """Values (k, d) at times (k,) and their covariances (k, d, d), interpolation error included; NaN if unknown."""

@@ -32,14 +32,10 @@ _TRIED: Final = 3  # images without a board in which other numbers of squares ar
 class _Squares:
     """Squares of a board."""
 
-    least: ClassVar[int]
-    """Fewest squares in a row and in a column."""
-    columns: int
-    """Squares in a row, the outermost ones too: one more than there are inner corners."""
-    rows: int
-    """Rows of squares."""
-    square: float
-    """m, side of a square."""
+    least: ClassVar[int]  # fewest squares in a row and in a column
+    columns: int  # squares in a row, the outermost ones too: one more than there are inner corners
+    rows: int  # rows of squares
+    square: float  # m, side of a square
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < self.least:
@@ -81,12 +77,9 @@ class Charuco(_Squares):
 
     least: ClassVar[int] = 3
 
-    marker: float
-    """m, side of a marker."""
-    dictionary: str = "4X4_100"
-    """One of `DICTIONARIES`."""
-    legacy: bool = False
-    """Printed by OpenCV before 4.6, which began boards with an even number of rows with a marker."""
+    marker: float  # m, side of a marker
+    dictionary: str = "4X4_100"  # one of `DICTIONARIES`
+    legacy: bool = False  # printed by OpenCV before 4.6, which began boards with an even number of rows with a marker
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -131,14 +124,10 @@ Board: TypeAlias = Chessboard | Charuco
 class View:
     """The corners of a board in one image."""
 
-    name: str
-    """Name of the image's file."""
-    size: tuple[int, int]
-    """px, width and height of the image."""
-    pixels: Array
-    """(n, 2) px, corners in the image; n is 0 where no board was found."""
-    points: Array
-    """(n, 3) m, the same corners on the board, z = 0."""
+    name: str  # name of the image's file
+    size: tuple[int, int]  # px, width and height of the image
+    pixels: Array  # (n, 2) px, corners in the image; n is 0 where no board was found
+    points: Array  # (n, 3) m, the same corners on the board, z = 0
 
 
 def image_files(places: Iterable[str]) -> list[Path]:

@@ -25,8 +25,7 @@ class Extrinsics:
 
     camera: Camera
 
-    marked: Marked
-    """The points of its calibration."""
+    marked: Marked  # the points of its calibration
     covariance: Array
     """(6, 6) of a small turn of the camera about the world's axes (rad) and of its centre (m), for an exact lens."""
 

@@ -45,12 +45,9 @@ class FittedView:
 
     view: View
 
-    rvec: Array
-    """(3,) rad, rotation from the board to the camera."""
-    tvec: Array
-    """(3,) m, the board's origin in the camera's frame."""
-    residuals: Array
-    """(n, 2) px, corners as seen minus as projected."""
+    rvec: Array  # (3,) rad, rotation from the board to the camera
+    tvec: Array  # (3,) m, the board's origin in the camera's frame
+    residuals: Array  # (n, 2) px, corners as seen minus as projected
 
     @property
     def normal(self) -> Array:
@@ -67,18 +64,12 @@ class FittedView:
 class Intrinsics:
     """A calibrated lens."""
 
-    camera: Camera
-    """The camera at the world's origin, unturned: its pose is unknown."""
-    covariance: Array
-    """(4 + k, 4 + k) of fx, fy, cx, cy (px) and the k coefficients of the distortion."""
-    views: tuple[FittedView, ...]
-    """The views of the calibration."""
-    left_out: tuple[FittedView, ...]
-    """The views that disagree with it, in the order of their removal."""
-    missed: tuple[str, ...]
-    """Names of the images in which no board was found."""
-    coverage: float
-    """Share of the image's cells that hold corners."""
+    camera: Camera  # the camera at the world's origin, unturned: its pose is unknown
+    covariance: Array  # (4 + k, 4 + k) of fx, fy, cx, cy (px) and the k coefficients of the distortion
+    views: tuple[FittedView, ...]  # the views of the calibration
+    left_out: tuple[FittedView, ...]  # the views that disagree with it, in the order of their removal
+    missed: tuple[str, ...]  # names of the images in which no board was found
+    coverage: float  # share of the image's cells that hold corners
 
     @property
     def sigmas(self) -> Array:

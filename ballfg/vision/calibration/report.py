@@ -33,10 +33,8 @@ class Calibration:
 
     camera: Camera
 
-    lens: Intrinsics | None
-    """None if the lens was known before."""
-    place: Extrinsics | None
-    """None if the camera's pose was not calibrated."""
+    lens: Intrinsics | None  # None if the lens was known before
+    place: Extrinsics | None  # None if the camera's pose was not calibrated
 
 
 def summary(found: Calibration) -> Iterator[str]:

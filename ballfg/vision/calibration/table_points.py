@@ -27,12 +27,9 @@ class Marked:
 
     names: tuple[str, ...]
 
-    points: Array
-    """(n, 3) m."""
-    pixels: Array
-    """(n, 2) px."""
-    sigma: float = CLICK_SIGMA
-    """px, standard deviation of each coordinate of the pixels."""
+    points: Array  # (n, 3) m
+    pixels: Array  # (n, 2) px
+    sigma: float = CLICK_SIGMA  # px, standard deviation of each coordinate of the pixels
 
 
 def table_points(height: float = TABLE_HEIGHT) -> dict[str, Array]:
@@ -60,10 +57,8 @@ def table_outline(height: float = TABLE_HEIGHT) -> list[Array]:
 class TableFile:
     """The content of a table file."""
 
-    table_height: float
-    """m, z of the table's surface."""
-    cameras: Mapping[str, Marked]
-    """The marked points of each camera, by name."""
+    table_height: float  # m, z of the table's surface
+    cameras: Mapping[str, Marked]  # the marked points of each camera, by name
 
 
 def read_table(path: str | PathLike[str]) -> TableFile:

@@ -30,10 +30,8 @@ HELD: Final = 0.1  # s that a frame stays on show: bridges dropped frames, and s
 class Schedule:
     """The frames on show at each time."""
 
-    times: Array
-    """(k,) s, true time of each moment, increasing."""
-    frames: Index
-    """(k, c) number of the frame of each camera; -1 where it has none within `HELD`."""
+    times: Array  # (k,) s, true time of each moment, increasing
+    frames: Index  # (k, c) number of the frame of each camera; -1 where it has none within `HELD`
 
 
 def write_overlay(

@@ -28,10 +28,8 @@ DIGITS: Final = 3  # least number of digits in a track's name: names then sort a
 class Seen:
     """One ball in one camera."""
 
-    frames: Index
-    """(m,) numbers of the camera's frames, increasing."""
-    pixels: Array
-    """(m, 2) px."""
+    frames: Index  # (m,) numbers of the camera's frames, increasing
+    pixels: Array  # (m, 2) px
 
 
 @dataclass(frozen=True, eq=False)
