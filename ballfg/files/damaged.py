@@ -64,10 +64,7 @@ def check_parts(path: Path, what: str, count: int, most: int) -> None:
 
 
 def check_pixels(path: Path, width: int, height: int) -> None:
-    """Refuses an image or video with an impossible size, px; call it before decoding.
-
-    Raises: ValueError: more than `MAX_PIXELS`, or zero.
-    """
+    """Refuses an image of 0 or over `MAX_PIXELS` px, before it is decoded. Raises: ValueError."""
     if not 0 < width * height <= MAX_PIXELS:
         raise ValueError(
             f"{path} must have at most {MAX_PIXELS / 1e6:g} million pixels; it says {width} x {height}. Scale it down."

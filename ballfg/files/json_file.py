@@ -12,10 +12,7 @@ TOO_MANY: Final = f"it must hold at most {MAX_VALUES} values, a name counted as 
 
 
 def read_json(path: Path) -> Any:
-    """The content of a file.
-
-    Raises: ValueError: not JSON in UTF-8, or too large; the caller names the file. OSError.
-    """
+    """The content of a file. Raises: ValueError: no JSON, or too large; the caller names the file. OSError."""
     try:
         return parse_json(whole_content(path).decode("utf-8"))
     except UnicodeDecodeError:

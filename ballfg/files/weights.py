@@ -12,10 +12,7 @@ MAX_HEADER: Final = 1_000_000  # bytes of names and shapes in a file; those of t
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
-    """The tensors of a file by name.
-
-    Raises: ValueError: a damaged file, with its name. FileNotFoundError: no such file.
-    """
+    """The tensors of a file by name. Raises: ValueError: a damaged file. FileNotFoundError: no such file."""
     if not path.is_file():
         raise FileNotFoundError(f"{path} must be a file of weights; there is none. Copy it again.")
     with library_reads(path, "safetensors"):

@@ -29,11 +29,7 @@ class Surface:
 
 
 def surface(shots: Iterable[tuple[Array, Array]]) -> Surface | None:
-    """The surface of most bounces, or a higher one with nearly as many.
-
-    Args: shots: times (n,) s and positions (n, 3) m, z up.
-    Returns: None without a bounce.
-    """
+    """The surface of most bounces, or a higher one with nearly as many; of times (n,) s and positions (n, 3) m."""
     heights = np.sort([height for t, p in shots for height in bounce_heights(t, p[:, 2])])
     groups: list[Array] = []
     while len(heights):
@@ -51,10 +47,7 @@ def surface(shots: Iterable[tuple[Array, Array]]) -> Surface | None:
 
 
 def bounce_heights(times: Array, heights: Array) -> list[float]:
-    """The heights (m) of one ball's bounces: where the arc before meets the arc after.
-
-    Args: times: (n,) s.  heights: (n,) m.
-    """
+    """Heights (m) of a ball's bounces, where arcs before and after meet; of times (n,) s and heights (n,) m."""
     found: list[tuple[float, float, float]] = []
     for i in range(1, len(times) - 2):
         # the bounce lies between samples i and i + 1, or one of them is the lowest of its neighbours

@@ -81,11 +81,7 @@ class Guess:
 
 
 def parse_columns(text: str) -> dict[str, str]:
-    """Roles and columns from text such as "t=stamp,x=X".
-
-    Returns: role -> name of the column.
-    Raises: ValueError: another form.
-    """
+    """Role -> column from text such as "t=stamp,x=X". Raises: ValueError: another form."""
     found: dict[str, str] = {}
     for part in text.split(","):
         role, sign, column = part.partition("=")

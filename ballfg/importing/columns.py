@@ -36,10 +36,7 @@ class Roles:
 
 
 def roles_of(table: RawTable, choices: Choices) -> Roles | None:
-    """The roles of a table's columns; None if it holds no positions.
-
-    Raises: UndecidedError: several readings. ValueError: only positions in an image, or an unknown column.
-    """
+    """The roles of a table's columns; None without positions. Raises: UndecidedError. ValueError: an unknown column."""
     given = {role: _existing(table, name) for role, name in choices.columns.items()}
     read = {name: meanings(name) for name in table.columns} if table.named else {}
     places, units = _places(table, read, given)

@@ -106,10 +106,7 @@ def relative(shot: SourceShot) -> tuple[Array, Array]:
 
 
 def split(shots: list[SourceShot], roles: Roles, frame: Frame, choices: Choices) -> tuple[list[SourceShot], Guess]:
-    """The shots, cut at gaps in time that end a shot, and the guess for that.
-
-    Args: shots: in the source's units.  roles: of their columns.  frame: its units.  choices: of the user.
-    """
+    """The shots in the source's units, cut at gaps in time that end a shot, and the guess for that."""
     unit = TIMES[frame.time]
     count = len(shots)
     if (given := choices.split_gap) is not None:

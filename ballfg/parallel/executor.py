@@ -98,20 +98,18 @@ def on_cluster(kind: str | None, address: str | None = None) -> Iterator[int | N
         return
     if kind not in CLUSTERS:
         raise ValueError(f"cluster must be {' or '.join(CLUSTERS)}; got {shown(kind)}. Choose one of them.")
-    opened = _open(kind, address)
+    opened: Any
+    if kind == "dask":
+        from ballfg.parallel.dask_cluster import DaskCluster
+
+        opened = DaskCluster(address)
+    else:
+        from ballfg.parallel.ray_cluster import RayCluster
+
+        opened = RayCluster(address)
     token = _CLUSTER.set(opened)
     try:
         yield opened.slots
     finally:
         _CLUSTER.reset(token)
         opened.close()
-
-
-def _open(kind: str, address: str | None) -> Any:
-    if kind == "dask":
-        from ballfg.parallel.dask_cluster import DaskCluster
-
-        return DaskCluster(address)
-    from ballfg.parallel.ray_cluster import RayCluster
-
-    return RayCluster(address)

@@ -51,11 +51,8 @@ class RayCluster:
         work = Work.of(function)
         content = self._ray.put(work.content)
 
-        def send(chunk: Sequence[Any]) -> _Chunk:
-            sent = self._task.remote(work.name, content, packed(chunk), own_versions())
-            return _Chunk(self._ray, sent, chunk)
-
-        return send
+        submit = self._task.remote
+        return lambda chunk: _Chunk(self._ray, submit(work.name, content, packed(chunk), own_versions()), chunk)
 
     def stop(self) -> None:
         """Does nothing: chunks are cancelled one by one, and the cluster continues without them."""
@@ -75,8 +72,7 @@ class RayCluster:
             if node["Alive"] and node["Resources"].get("CPU"):
                 there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
                 theirs = self._ray.get(self._ray.remote(asked).options(scheduling_strategy=there).remote(HERE))
-                different = differences(theirs, f"the node {node['NodeManagerAddress']}")
-                if different:
+                if different := differences(theirs, f"the node {node['NodeManagerAddress']}"):
                     raise ValueError(different)
 
 

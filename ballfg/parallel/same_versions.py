@@ -25,10 +25,7 @@ def own_versions() -> dict[str, str]:
 
 
 def differences(theirs: dict[str, str], whose: str = "a worker") -> str | None:
-    """A message on versions that differ from those of this process; None if there are none.
-
-    Args: theirs: versions of the other process.  whose: name of its worker.
-    """
+    """A message on versions of a process, `whose`, that differ from those of this one; None without any."""
     own = own_versions()
     if theirs == own:
         return None

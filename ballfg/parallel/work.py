@@ -49,11 +49,14 @@ def compute(name: str, content: bytes, chunk: bytes, versions: dict[str, str]) -
     Args: name, content: of the `Work`.  chunk: pickled.  versions: of the calling process.
     Raises: ValueError: the versions differ from those of this process; and the function's exceptions.
     """
-    different = differences(versions)
-    if different:
+    if different := differences(versions):
         raise ValueError(different)
     with _one_at_a_time:
-        return packed(alone(_function(name, content), pickle.loads(chunk)))
+        function = _functions.pop(name) if name in _functions else pickle.loads(content)
+        _functions[name] = function  # the last one used stands last
+        while len(_functions) > KEPT:
+            _functions.popitem(last=False)
+        return packed(alone(function, pickle.loads(chunk)))
 
 
 def each(function: Callable[[Any], R], chunk: Sequence[Any]) -> list[R]:
@@ -85,12 +88,3 @@ def alone(function: Callable[[T], R], argument: T) -> R:
 def is_inside() -> bool:
     """True if this code runs as part of a chunk."""
     return _INSIDE.get()
-
-
-def _function(name: str, content: bytes) -> Callable[..., Any]:
-    if name not in _functions:
-        _functions[name] = pickle.loads(content)
-        while len(_functions) > KEPT:
-            _functions.popitem(last=False)
-    _functions.move_to_end(name)
-    return _functions[name]

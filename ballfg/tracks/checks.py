@@ -74,10 +74,8 @@ def check_step(label: str, stamps: Array) -> None:
     """
     step = float(np.median(np.diff(stamps))) if len(stamps) > 2 else MIN_STEP
     if not MIN_STEP <= step <= MAX_STEP:
-        raise ValueError(
-            f"{label}: t must be in s, with a median step of {MIN_STEP:g} to {MAX_STEP:g} s; got {step:.4g} s. "
-            "The unit is probably ms or us: convert it."
-        )
+        problem = f"{label}: t must be in s, with a median step of {MIN_STEP:g} to {MAX_STEP:g} s; got {step:.4g} s"
+        raise ValueError(f"{problem}. The unit is probably ms or us: convert it.")
 
 
 def tidy(group: RowGroup, where: Where, findings: Findings | None = None) -> Array:
@@ -135,10 +133,8 @@ def check_scale(label: str, times: Array, positions: Array, sigmas: Array | None
     farthest = float(max(high.max(), -low.min()))
     extent = float(np.hypot.reduce(high - low))
     if extent > MAX_EXTENT:
-        raise ValueError(
-            f"{label}: x, y, z must be in m, and a track at most {MAX_EXTENT:g} m long; got {extent:.4g}. "
-            "The unit is probably mm: divide by 1000."
-        )
+        problem = f"{label}: x, y, z must be in m, and a track at most {MAX_EXTENT:g} m long; got {extent:.4g}"
+        raise ValueError(f"{problem}. The unit is probably mm: divide by 1000.")
     if farthest > MAX_COORDINATE:
         raise ValueError(
             f"{label}: x, y, z must be in m and within {MAX_COORDINATE:g} m of the origin; got {farthest:.4g}. "
@@ -146,10 +142,8 @@ def check_scale(label: str, times: Array, positions: Array, sigmas: Array | None
         )
     if step > MAX_STEP or step < MIN_STEP or misses_rate:
         expected = f"{MIN_STEP:g} to {MAX_STEP:g} s apart" + (f", near 1/{rate:g} s (rate)" if rate else "")
-        raise ValueError(
-            f"{label}: t must be in s, its stamps {expected}; got a median step of {step:.4g}. "
-            f"{_time_remedy(step, rate)}"
-        )
+        problem = f"{label}: t must be in s, its stamps {expected}; got a median step of {step:.4g}"
+        raise ValueError(f"{problem}. {_time_remedy(step, rate)}")
     with np.errstate(over="ignore"):  # a single step may be almost zero
         speed = float(np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1) / steps))
     if speed > MAX_SPEED:

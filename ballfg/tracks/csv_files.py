@@ -29,19 +29,14 @@ def is_number(cell: str) -> bool:
 
 
 def read_header(path: Path) -> list[str]:
-    """The column names of a CSV file.
-
-    Raises: ValueError: an empty file, one that is not UTF-8 text, or a first line of more than `MAX_HEADER` bytes.
-    """
+    """The column names of a CSV file. Raises: ValueError: empty, not UTF-8, or a line beyond `MAX_HEADER` bytes."""
     with path.open("rb") as file:
         first = re.split(rb"[\r\n]", file.read(MAX_HEADER + 1), maxsplit=1)[0]
     if not first.strip():
         raise ValueError(f"{path}: must begin with a line of column names; got an empty file or line. Add the header.")
     if len(first) > MAX_HEADER:
-        raise ValueError(
-            f"{path}, line 1: the line of column names must have at most {MAX_HEADER} bytes; it has more. "
-            "Leave columns out, or put each row on a line of its own."
-        )
+        problem = f"{path}, line 1: the line of column names must have at most {MAX_HEADER} bytes; it has more"
+        raise ValueError(f"{problem}. Leave columns out, or put each row on a line of its own.")
     text = first.decode("utf-8-sig", errors="surrogateescape")
     if "\0" in text or _has_surrogate(text):
         raise _not_utf8(path, 1)

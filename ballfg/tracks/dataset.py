@@ -151,10 +151,8 @@ def _open_source(folder: Path) -> RowSource:
     if len(present) > 1:
         raise ValueError(f"{folder} must hold one table of tracks; got {' and '.join(present)}. Delete one of them.")
     if not present:
-        raise FileNotFoundError(
-            f"{folder} must hold {' or '.join(TRACK_FILES)}; got {_listing(folder)}. "
-            "Add it: trajectory,t,x,y,z (docs/tracks.md)."
-        )
+        problem = f"{folder} must hold {' or '.join(TRACK_FILES)}; got {_listing(folder)}"
+        raise FileNotFoundError(f"{problem}. Add it: trajectory,t,x,y,z (docs/tracks.md).")
     source = CsvRows if present[0].endswith(".csv") else ParquetRows
     return source(folder / present[0])
 

@@ -114,10 +114,7 @@ def write_sightings(path: str | os.PathLike[str], balls: Iterable[tuple[str, Sig
 
 
 def _chosen(table: _Table) -> tuple[NDArray[np.int64], int]:
-    """One row for each ball, camera and stamp, the best scored, ascending; and the number of the others.
-
-    Raises: ValueError: two rows of the same score.
-    """
+    """The best scored row for each ball, camera and stamp; the number of others. Raises: ValueError: equal scores."""
     score = table.values.get(SCORE, np.zeros(len(table.lines)))
     order = np.lexsort((-score, table.values["t"], table.camera, table.names))
     same = np.ones(max(len(order) - 1, 0), dtype=bool)
@@ -183,10 +180,8 @@ def check_values(
         rule, holds = rules.get(name, (f"finite, at most {LARGEST:g} in size", np.isfinite))
         wrong = ~((np.abs(column) <= LARGEST) & holds(column))
         if wrong.any():
-            raise ValueError(
-                f"{_place(path, lines[wrong], name)} must be {rule}; got {column[wrong][0]:g}. "
-                "Correct it or delete the line."
-            )
+            problem = f"{_place(path, lines[wrong], name)} must be {rule}; got {column[wrong][0]:g}"
+            raise ValueError(f"{problem}. Correct it or delete the line.")
 
 
 def check_cameras(

@@ -44,10 +44,7 @@ class Index:
 
 
 def scan(source: RowSource) -> Index:
-    """Reads the file once, checks every cell and counts the rows of each trajectory.
-
-    Raises: ValueError: no rows, a nameless trajectory, a value that is not finite, an invalid sigma.
-    """
+    """Reads the file once, checks every cell, counts rows of trajectories. Raises: ValueError: no rows, a bad cell."""
     stamp = source.stamp()
     codes_of: dict[str, int] = {}
     counts: list[int] = []
@@ -70,10 +67,7 @@ def scan(source: RowSource) -> Index:
 
 
 def groups(source: RowSource, index: Index) -> Iterator[RowGroup]:
-    """Yields the trajectories in the order of their first rows.
-
-    Raises: ValueError: if the file has changed since the scan.
-    """
+    """The trajectories in the order of their first rows. Raises: ValueError: the file has changed since the scan."""
     if source.stamp() != index.stamp:
         raise ValueError(f"{source.path}: must not change while it is in use; it did. Call read_dataset again.")
     return _stream(source) if index.contiguous else _regroup(source, index)
@@ -84,10 +78,8 @@ def check_cells(source: RowSource, block: Block) -> None:
     for code, name in enumerate(block.names):
         if not name or not is_name(name):
             row = block.start + int(np.argmax(block.codes == code))
-            raise ValueError(
-                f"{source.where(row)}, column 'trajectory': must be {NAME_RULE}; got {shown(name or '')}. "
-                "Fill in a name."
-            )
+            problem = f"{source.where(row)}, column 'trajectory': must be {NAME_RULE}; got {shown(name or '')}"
+            raise ValueError(f"{problem}. Fill in a name.")
     bad = ~(np.abs(block.values) <= LARGEST)
     sigmas = block.values[:, 4:]
     bad[:, 4:] |= (sigmas < MIN_SIGMA) | (sigmas > MAX_SIGMA)

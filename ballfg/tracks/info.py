@@ -127,10 +127,8 @@ class DatasetInfo:
         frame = _section(content, "frame", {"up": "...", "table_height": "..."})
         ball = _section(content, "ball", {"radius": "...", "mass": "..."})
         if frame["up"] != "z":
-            raise ValueError(
-                f"frame.up must be 'z', the only up axis that is supported; got {shown(frame['up'])}. "
-                "Rotate the positions so that z points up."
-            )
+            problem = f"frame.up must be 'z', the only up axis that is supported; got {shown(frame['up'])}"
+            raise ValueError(f"{problem}. Rotate the positions so that z points up.")
         _need(content, "name", "")
         return cls(
             name=content["name"],
@@ -172,21 +170,15 @@ class TrackFolder:
 
 
 def read_info(path: Path) -> tuple[DatasetInfo, list[str]]:
-    """Reads a `dataset.yaml`.
-
-    Returns: the info, and a note for each unknown key.
-    Raises: ValueError: not readable as YAML, or a bad field; the message names file and field.
-    """
+    """The info in a `dataset.yaml`, and notes on unknown keys. Raises: ValueError: no YAML, or a bad field."""
     try:
         content = read_yaml(path)
     except YamlError as error:
         place = "" if error.line is None else f", line {error.line}"
         raise ValueError(f"{path}{place}: must be valid YAML; {error.problem}. Correct it.") from None
     if not isinstance(content, dict):
-        raise ValueError(
-            f"{path}: must hold fields such as 'name: my_shots'; got {type_name(content)}. "
-            f"Give at least {', '.join(_REQUIRED)}."
-        )
+        problem = f"{path}: must hold fields such as 'name: my_shots'; got {type_name(content)}"
+        raise ValueError(f"{problem}. Give at least {', '.join(_REQUIRED)}.")
     content = {str(key): value for key, value in content.items()}
     try:
         info = DatasetInfo.from_mapping(content)

@@ -42,11 +42,7 @@ class LabelTable:
 
 
 def read_labels(path: Path, trajectories: Collection[str]) -> LabelTable:
-    """Reads a `labels.csv`.
-
-    Raises: ValueError: a missing or repeated column, a ragged line, a row without a track, a second row for a track, or
-        text in place of a number; the message names line and column.
-    """
+    """Reads a `labels.csv`. Raises: ValueError: a bad column or row; the message names line and column."""
     header = csv_files.read_header(path)
     csv_files.check_header(path, header, (KEY,), (KEY,))
     for name in header:

@@ -45,10 +45,8 @@ class RowSource(ABC):
         present = [name for name in SIGMAS if name in header]
         if present and len(present) < len(SIGMAS):
             absent = ", ".join(name for name in SIGMAS if name not in present)
-            raise ValueError(
-                f"{path}: sigma columns must be all three or none; {absent} missing, got {', '.join(present)}. "
-                "Add the missing ones or drop the others."
-            )
+            problem = f"{path}: sigma columns must be all three or none; {absent} missing, got {', '.join(present)}"
+            raise ValueError(f"{problem}. Add the missing ones or drop the others.")
         self.path = path
         self.columns = [*VALUES, *present]
         self.ignored = [name for name in header if name not in (KEY, *self.columns)]

@@ -49,10 +49,8 @@ class Sightings:
         m = len(times)
         camera = np.asarray(self.camera)
         if camera.shape != (m,) or camera.dtype.kind not in "iu" or not ((camera >= 0) & (camera < len(names))).all():
-            raise ValueError(
-                f"camera must be ({m},) whole numbers from 0 to {len(names) - 1}; got {shown(camera.tolist())}. "
-                "Number the cameras in the order of their names."
-            )
+            problem = f"camera must be ({m},) whole numbers from 0 to {len(names) - 1}; got {shown(camera.tolist())}"
+            raise ValueError(f"{problem}. Number the cameras in the order of their names.")
         object.__setattr__(self, "camera", camera.astype(np.int64))
         for field, shape in {"times": (m,), "pixels": (m, 2), "covariances": (m, 2, 2)}.items():
             array = check_array(field, getattr(self, field), shape, "Pass one row per sighting.")
@@ -84,11 +82,7 @@ class Sightings:
         return len(self.times)
 
     def select(self, rows: ArrayLike) -> Sightings:
-        """A part of the rows.
-
-        Args: rows: (k,) their numbers, ascending, or (m,) bool.
-        Raises: ValueError: if none remains.
-        """
+        """The rows of the numbers (k,), ascending, or of the mask (m,) bool. Raises: ValueError: if none remains."""
         kept = np.asarray(rows)
         return Sightings(self.cameras, self.camera[kept], self.times[kept], self.pixels[kept], self.covariances[kept])
 

@@ -160,14 +160,10 @@ def _guarded(column: pa.ChunkedArray) -> pa.ChunkedArray:
 def _conformed(batch: pa.RecordBatch, schema: pa.Schema) -> pa.RecordBatch:
     """The block with the first block's types; whole numbers may be in a column of floats."""
     if batch.schema.names != schema.names:
-        raise ValueError(
-            f"columns must be those of the first block, {schema.names}; got {batch.schema.names}. "
-            "Write the same columns in each block."
-        )
+        problem = f"columns must be those of the first block, {schema.names}; got {batch.schema.names}"
+        raise ValueError(f"{problem}. Write the same columns in each block.")
     for name, got, want in zip(schema.names, batch.schema.types, schema.types, strict=True):
         if got != want and not (pa.types.is_integer(got) and pa.types.is_floating(want)):
-            raise ValueError(
-                f"columns[{shown(name)}] must be {want} as in the first block; got {got}. Convert it, or write floats "
-                "from the start."
-            )
+            problem = f"columns[{shown(name)}] must be {want} as in the first block; got {got}"
+            raise ValueError(f"{problem}. Convert it, or write floats from the start.")
     return batch if batch.schema == schema else batch.cast(schema)

@@ -7,7 +7,6 @@ from os import PathLike
 from pathlib import Path
 from typing import Final, Literal, TextIO
 
-from ballfg.arrays import Array
 from ballfg.checks import check_choice, check_each, check_instance, check_path, shown
 from ballfg.files.spreadsheet import guarded
 from ballfg.files.whole_folder import whole_folder
@@ -70,7 +69,10 @@ def _write_tracks(path: Path, info: DatasetInfo, tracks: Iterable[Track], spool:
             has_sigmas = track.sigmas is not None if has_sigmas is None else has_sigmas
             _check_track(track, names, info, has_sigmas)
             names.add(track.name)
-            table.write(_columns(track))
+            columns = dict(zip(VALUES[1:], track.positions.T, strict=True))
+            if track.sigmas is not None:
+                columns |= dict(zip(SIGMAS, track.sigmas.T, strict=True))
+            table.write({KEY: track.name, VALUES[0]: track.times, **columns})
             if track.labels:
                 label_names.update(dict.fromkeys(track.labels))
                 spool.write(json.dumps({KEY: track.name, **track.labels}) + "\n")
@@ -85,24 +87,14 @@ def _check_track(track: Track, names: set[str], info: DatasetInfo, has_sigmas: b
     if len(track) < 2:
         raise ValueError(f"track {shown(track.name)} must have at least two samples; got one. Leave it out.")
     if (track.sigmas is not None) != has_sigmas:
-        raise ValueError(
-            f"tracks must have sigmas all or none; {shown(track.name)} differs from the first. "
-            "Set sigmas=None in all of them, or give them all."
-        )
+        what = f"tracks must have sigmas all or none; {shown(track.name)} differs from the first"
+        raise ValueError(f"{what}. Set sigmas=None in all of them, or give them all.")
     if track.sigmas is not None and not (MIN_SIGMA <= track.sigmas.min() <= track.sigmas.max() <= MAX_SIGMA):
         raise ValueError(
             f"track {shown(track.name)}: sigmas must be {MIN_SIGMA:g} to {MAX_SIGMA:g} m; "
             f"got {track.sigmas.min():g} to {track.sigmas.max():g}. Correct them or set sigmas=None."
         )
     check_scale(f"track {shown(track.name)}", track.times, track.positions, track.sigmas, info.rate)
-
-
-def _columns(track: Track) -> dict[str, Array | str]:
-    columns: dict[str, Array | str] = {KEY: track.name, VALUES[0]: track.times}
-    columns |= {name: track.positions[:, axis] for axis, name in enumerate(VALUES[1:])}
-    if track.sigmas is not None:
-        columns |= {name: track.sigmas[:, axis] for axis, name in enumerate(SIGMAS)}
-    return columns
 
 
 def _write_labels(path: Path, spool: Path, label_names: list[str]) -> None:

@@ -18,11 +18,7 @@ _TILES: Final = (322, 323)  # tags of TIFF: width and height of the pieces in wh
 
 
 def read_image(path: Path, flags: int) -> Image:
-    """An image as OpenCV decodes it, (h, w) or (h, w, 3) uint8, BGR.
-
-    Args: path: of the file.  flags: of `cv2.imdecode`.
-    Raises: ValueError: not an image, or one of more than 64 million pixels; the message names the file. OSError.
-    """
+    """An image by `cv2.imdecode`, (h, w) or (h, w, 3) uint8, BGR. Raises: ValueError: none, or too large. OSError."""
     _check_size(path)
     image = cv2.imdecode(np.frombuffer(whole_content(path), dtype=np.uint8), flags)
     if image is None:

@@ -137,10 +137,7 @@ def read_npz(path: Path) -> list[RawTable]:
 
 
 def read_hdf5(path: Path) -> list[RawTable]:
-    """The tables of an HDF5 file: compound or 2-D datasets, and groups of columns.
-
-    Raises: ValueError: no h5py, or not an HDF5 file.
-    """
+    """The tables of an HDF5 file: datasets and groups of columns. Raises: ValueError: no h5py, or no HDF5 file."""
     h5py = _imported("h5py", "hdf5", path)
     with library_reads(path, "HDF5"), h5py.File(path, "r") as file:
         content = _Group(h5py, path).content(file, 0)
@@ -148,10 +145,7 @@ def read_hdf5(path: Path) -> list[RawTable]:
 
 
 def read_bag(path: Path, topic: str | None) -> list[RawTable]:
-    """The positions of one topic of a ROS 2 bag, stamped in s from its first message.
-
-    Raises: ValueError: no rosbags, no such topic, several topics, or several balls in one message.
-    """
+    """The positions of one topic of a ROS 2 bag, in s from its first message. Raises: ValueError: none, or several."""
     from ballfg.live.sources.bag import bag_samples
 
     samples = list(bag_samples(path, topic))
@@ -204,10 +198,7 @@ class _Group:
         return content
 
     def _is_known(self, group: Any, key: str) -> bool:
-        """True if another link has led there: two links in each of 40 groups would be 2^40 ways.
-
-        Raises: ValueError: a link to another file.
-        """
+        """True if another link has led there: else 40 groups had 2^40 ways. Raises: ValueError: a link to a file."""
         link = group.id.links.get_info(key.encode("utf-8", "surrogateescape"))
         if link.type not in (self._h5py.h5l.TYPE_HARD, self._h5py.h5l.TYPE_SOFT):
             raise ValueError(f"{self._path} must hold its data itself; {shown(key)} is a link to another file.")

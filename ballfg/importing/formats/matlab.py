@@ -31,10 +31,7 @@ def read_matlab(path: Path) -> list[RawTable]:
 
 
 def _check_packed(path: Path) -> None:
-    """Counts the unpacked bytes of a version 5 file's variables, which its structures do not state.
-
-    Source: MathWorks, MAT-File Format, level 5. Raises: ValueError: more than the file may.
-    """
+    """Counts the unpacked bytes of a version 5 file (MathWorks, MAT-File Format, level 5). Raises: ValueError."""
     with path.open("rb") as file:
         order = {b"IM": "<II", b"MI": ">II"}.get(file.read(_HEADER)[-2:])
         size = 0

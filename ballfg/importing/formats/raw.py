@@ -51,10 +51,7 @@ class RawTable:
 
 
 def table_of(name: str, columns: Mapping[str, Any], source: str = "", named: bool = True) -> RawTable:
-    """A table from columns that are arrays or lists (n,) of anything; text that is numbers becomes numbers.
-
-    Raises: ValueError: more than `MAX_COLUMNS`.
-    """
+    """A table from columns (n,) of anything; text that is numbers becomes numbers. Raises: ValueError: too many."""
     if len(columns) > MAX_COLUMNS:
         raise ValueError(f"{source} must have at most {MAX_COLUMNS} columns; got {len(columns)}. Leave some out.")
     read = [_column(label, values) for label, values in columns.items()]

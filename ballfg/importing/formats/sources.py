@@ -44,10 +44,8 @@ def tables_of(data: Any, topic: str | None = None, key: str | None = None) -> li
     else:
         found, name = nested_tables(data, "", "data"), "data"
     if not found:
-        raise ValueError(
-            f"{name} must hold a table with a time and x, y, z; none was found. Give (n, 4) numbers t, x, y, z, or "
-            "columns of these names."
-        )
+        problem = f"{name} must hold a table with a time and x, y, z; none was found"
+        raise ValueError(f"{problem}. Give (n, 4) numbers t, x, y, z, or columns of these names.")
     if key is None:
         return found
     chosen = [table for table in found if table.name == key or Path(table.source).name == key] or [
@@ -135,8 +133,6 @@ def _json_lines(path: Path, lines: Sequence[str]) -> list[Any]:
         try:
             values.append(parse_json(line))
         except json.JSONDecodeError as error:
-            raise ValueError(
-                f"{path}, line {number}: must be valid JSON; {error.msg} at column {error.colno}. Correct or delete "
-                "the line."
-            ) from None
+            problem = f"{path}, line {number}: must be valid JSON; {error.msg} at column {error.colno}"
+            raise ValueError(f"{problem}. Correct or delete the line.") from None
     return values

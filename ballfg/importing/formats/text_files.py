@@ -24,10 +24,7 @@ _CONTROL: Final = 0.02  # share of control characters from which a file is not t
 
 
 def read_text_table(path: Path) -> list[RawTable]:
-    """The one table of a text file.
-
-    Raises: ValueError: not text, empty, or without rows of numbers; the message describes the content.
-    """
+    """The one table of a text file. Raises: ValueError: not text, empty, or without rows of numbers."""
     return [text_table(decoded(path), path.stem, str(path))]
 
 

@@ -77,10 +77,7 @@ def _falls(track: Path, window: NDArray[np.intp]) -> bool | None:
 
 
 def meeting(earlier: Path, later: Path) -> float | None:
-    """Squared distance, whitened, of the continuations of two tracks in the gap between them.
-
-    None where the tracks are not of one flight: the gap is too long, or the continuations miss each other.
-    """
+    """Squared whitened distance of two tracks' continuations in the gap between them; None if not of one flight."""
     start, end = float(earlier.times[-1]), float(later.times[0])
     if end < start or end - start > LONGEST_GAP or min(len(earlier.times), len(later.times)) < 2:
         return None

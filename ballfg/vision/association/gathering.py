@@ -69,10 +69,7 @@ class SeenBall:
 
 
 def gather(footage: Footage, rows: Sequence[Index]) -> Gathered:
-    """The points of candidates of several cameras; none if fewer than two agree.
-
-    Args: rows: for each camera the numbers of its candidates, one a frame at most, ascending.
-    """
+    """The points of the cameras' candidates, one a frame at most, ascending; none if fewer than two agree."""
     # stamps of the shared shutter, or of the camera that saw most
     stamps = footage.frames(int(np.argmax(list(map(len, rows))))) if footage.shared is None else footage.shared
     seen = [footage.frames(c)[footage.detections[c].frame[mine[[0, -1]]]] for c, mine in enumerate(rows) if len(mine)]

@@ -39,10 +39,8 @@ class _Squares:
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < self.least:
-            raise ValueError(
-                f"squares must be at least {self.least} a row and column; got {self.columns}x{self.rows}. "
-                "Count all squares, the outermost ones too."
-            )
+            problem = f"squares must be at least {self.least} a row and column; got {self.columns}x{self.rows}"
+            raise ValueError(f"{problem}. Count all squares, the outermost ones too.")
         if not 0.0 < self.square < np.inf:
             raise ValueError(f"square must be the side of a square in m, above 0; got {self.square:g}. Measure it.")
 
@@ -84,10 +82,8 @@ class Charuco(_Squares):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0.0 < self.marker < self.square:
-            raise ValueError(
-                f"marker must be above 0 and smaller than a square of {self.square:g} m; got {self.marker:g}. "
-                "Measure both on the print."
-            )
+            problem = f"marker must be above 0 and smaller than a square of {self.square:g} m; got {self.marker:g}"
+            raise ValueError(f"{problem}. Measure both on the print.")
         if self.dictionary not in DICTIONARIES:
             known = ", ".join(DICTIONARIES)
             raise ValueError(f"dictionary must be one of {known}; got {shown(self.dictionary)}. Choose one.")
@@ -131,10 +127,7 @@ class View:
 
 
 def image_files(places: Iterable[str]) -> list[Path]:
-    """The images in folders, of patterns such as `calib/left_*.png`, or given one by one; sorted within each place.
-
-    Raises: FileNotFoundError: a place where there is no image; the message names it.
-    """
+    """The images in folders, of patterns such as `left_*.png`, or single ones. Raises: FileNotFoundError: none."""
     files: list[Path] = []
     for place in places:
         path = Path(place)
@@ -148,10 +141,7 @@ def image_files(places: Iterable[str]) -> list[Path]:
 
 
 def read_grey(path: Path) -> Image:
-    """A grey image (h, w) as the sensor saw it: a camera's note that it was held upright is left aside.
-
-    Raises: ValueError: not an image; the message names the file.
-    """
+    """A grey image (h, w) as the sensor saw it, whatever its orientation note. Raises: ValueError: not an image."""
     return read_image(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
 
 

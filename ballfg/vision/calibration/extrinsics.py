@@ -75,10 +75,8 @@ def calibrate_extrinsics(lens: Camera, marked: Marked) -> Extrinsics:
     _check_fit(best)
     alike = [camera for camera in above[1:2] if _squares(camera, marked) - _squares(above[0], marked) < CLEARLY]
     if any(np.linalg.norm(above[0].centre - c.centre) > FLAT * np.linalg.norm(above[0].tvec) for c in alike):
-        raise ValueError(
-            f"camera {shown(lens.name)}: points must tell one pose; two explain them alike. "
-            "Mark more points, farther apart or at other heights."
-        )
+        problem = f"camera {shown(lens.name)}: points must tell one pose; two explain them alike"
+        raise ValueError(f"{problem}. Mark more points, farther apart or at other heights.")
     return replace(best, covariance=_covariance(best))
 
 
@@ -99,10 +97,8 @@ def _check_points(lens: Camera, marked: Marked) -> bool:
     extent = np.linalg.svd(marked.points - marked.points.mean(axis=0), compute_uv=False)
     seen = np.linalg.svd(marked.pixels - marked.pixels.mean(axis=0), compute_uv=False)
     if extent[1] < FLAT * extent[0] or seen[1] < FLAT * seen[0]:
-        raise ValueError(
-            f"camera {shown(lens.name)}: points must not lie in one line; {listed(marked.names)} do. "
-            "Mark points on both sides of the table."
-        )
+        problem = f"camera {shown(lens.name)}: points must not lie in one line; {listed(marked.names)} do"
+        raise ValueError(f"{problem}. Mark points on both sides of the table.")
     return bool(extent[2] < FLAT * extent[1])
 
 
@@ -153,10 +149,8 @@ def _rms(residuals: Array) -> float:
 def _check_fit(found: Extrinsics) -> None:
     most = MAX_RMS * found.marked.sigma
     if found.rms > most:
-        raise ValueError(
-            f"camera {shown(found.camera.name)}: points must be explained within {most:g} px; got {found.rms:.1f}. "
-            f"{_culprit(found)}Check names and pixels, and that the lens is this camera's."
-        )
+        problem = f"camera {shown(found.camera.name)}: points must be explained within {most:g} px; got {found.rms:.1f}"
+        raise ValueError(f"{problem}. {_culprit(found)}Check names and pixels, and that the lens is this camera's.")
 
 
 def _culprit(found: Extrinsics) -> str:

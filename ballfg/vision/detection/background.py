@@ -82,10 +82,7 @@ class Background:
         return np.asarray(self.full[rows, columns] * self.gains.astype(np.float32), dtype=np.float32)
 
     def absorb(self, image: Image, small: Image, found: Image) -> None:
-        """Takes a frame's light and clouds into the background.
-
-        Args: image: the frame.  small: it, shrunk.  found: (h/4, w/4) uint8, 255 where something is in front.
-        """
+        """Takes light and clouds of a frame into the background; found: (h/4, w/4) uint8, 255 where covered."""
         height, width = self.shape
         rows = slice(self._strip * height // STRIPS, (self._strip + 1) * height // STRIPS)
         self._strip = (self._strip + 1) % STRIPS

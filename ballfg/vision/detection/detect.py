@@ -158,10 +158,8 @@ def _run(video: Video, detector: Detector, seen: list[tuple[float, Candidates]])
     for number, (stamp, image) in enumerate(video.frames()):
         candidates = detector(image)
         if not isinstance(candidates, Candidates):
-            raise TypeError(
-                f"a detector must return Candidates; got {type(candidates).__name__} for frame {number}. "
-                "Make them with Candidates.at(pixels, sigma)."
-            )
+            problem = f"a detector must return Candidates; got {type(candidates).__name__} for frame {number}"
+            raise TypeError(f"{problem}. Make them with Candidates.at(pixels, sigma).")
         seen.append((stamp, candidates))
         yield number
 

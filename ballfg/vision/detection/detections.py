@@ -94,10 +94,8 @@ class Detections:
         wrong = np.flatnonzero(~(np.diff(stamps) > 0.0))
         if len(wrong):
             i = int(wrong[0]) + 1
-            raise ValueError(
-                f"{what}: frames must be strictly increasing; frames[{i}]={stamps[i]} after {stamps[i - 1]}. "
-                "Sort the frames or correct the stamps."
-            )
+            problem = f"{what}: frames must be strictly increasing; frames[{i}]={stamps[i]} after {stamps[i - 1]}"
+            raise ValueError(f"{problem}. Sort the frames or correct the stamps.")
         if not np.isfinite(stamps).all():
             raise ValueError(f"{what}: frames must be finite; got {stamps[~np.isfinite(stamps)][0]}.")
         _check_fields(self, what)

@@ -44,10 +44,8 @@ def read_detections(
     detections_file.check_cameras(path, names, rows, [camera.name for camera in cameras], ignored)
     blind = [camera.name for camera in cameras if not (names == camera.name).any()]
     if blind:
-        raise ValueError(
-            f"{path}: every camera must have rows; got none of {' and '.join(map(repr, blind))}. "
-            f"Add them, or leave the camera out with --without {blind[0]}."
-        )
+        problem = f"{path}: every camera must have rows; got none of {' and '.join(map(repr, blind))}"
+        raise ValueError(f"{problem}. Add them, or leave the camera out with --without {blind[0]}.")
     values |= {name: np.full(len(names), value) for name, value in _UNSTATED.items() if name not in values}
     known = (*REQUIRED, *detections_file.OPTIONAL, *UNUSED)
     notes = [f"{path.name}: column {shown(name)} ignored" for name in header if name not in known]

@@ -74,16 +74,10 @@ class BallDetector:
         return cls(Background(images), settings)
 
     def __call__(self, image: Image) -> Candidates:
-        """The candidates of the next frame.
-
-        Args: image: (h, w, 3) grey levels, BGR.
-        Raises: ValueError: an image of another size than the background's.
-        """
+        """The candidates of the next frame (h, w, 3), BGR. Raises: ValueError: another size than the background's."""
         if image.shape != self.background.full.shape:
-            raise ValueError(
-                f"image must have the background's shape {self.background.full.shape}; got {image.shape}. "
-                "Learn a detector for each camera."
-            )
+            problem = f"image must have the background's shape {self.background.full.shape}; got {image.shape}"
+            raise ValueError(f"{problem}. Learn a detector for each camera.")
         known = self.settings
         regions = find_regions(self.background, image, known.diameter[1], known.longest_streak, known.most)
         rated = [found for region in regions if (found := self._fitted(image, region)) is not None]

@@ -53,10 +53,8 @@ class Video(ABC):
                     raise ValueError(self._mismatch("more"))
                 stamp = float(self._stamps[number])
             if not stamp > last:
-                raise ValueError(
-                    f"stamps of {self.path} must increase; frame {number} has {stamp:.6f} s after {last:.6f} s. "
-                    "Give a CSV file with the stamps of the frames."
-                )
+                problem = f"stamps of {self.path} must increase; frame {number} has {stamp:.6f} s after {last:.6f} s"
+                raise ValueError(f"{problem}. Give a CSV file with the stamps of the frames.")
             last = stamp
             yield stamp, image
         self._check_count(number + 1)
@@ -65,10 +63,8 @@ class Video(ABC):
         if self._stamps is not None and read < len(self._stamps):
             raise ValueError(self._mismatch(f"only {read}"))
         if self._stamps is None and self.count - read > max(SHORT[0], SHORT[1] * self.count):
-            raise ValueError(
-                f"video {self.path} must be whole; it announces {self.count} frames and ends after {read}. "
-                "Copy it again, or give a CSV file with stamps for those that are there."
-            )
+            problem = f"video {self.path} must be whole; it announces {self.count} frames and ends after {read}"
+            raise ValueError(f"{problem}. Copy it again, or give a CSV file with stamps for those that are there.")
 
     def _mismatch(self, found: str) -> str:
         rows = 0 if self._stamps is None else len(self._stamps)
@@ -190,10 +186,8 @@ def read_stamps(path: Path) -> Array:
             raise ValueError(f"{where}: t must be a finite number of seconds; got {shown(row.get('t'))}. Correct it.")
         stamps.append(float(row["t"]))
         if len(stamps) > 1 and not stamps[-1] > stamps[-2]:
-            raise ValueError(
-                f"{where}: t must increase; frame {len(stamps) - 1} has {stamps[-1]!r} s after {stamps[-2]!r} s. "
-                "Sort the rows or correct the stamps."
-            )
+            problem = f"{where}: t must increase; frame {len(stamps) - 1} has {stamps[-1]!r} s after {stamps[-2]!r} s"
+            raise ValueError(f"{problem}. Sort the rows or correct the stamps.")
     if not stamps:
         raise ValueError(f"{path} must have one row a frame; got none.")
     check_step(str(path), np.array(stamps))

@@ -78,10 +78,7 @@ class OverlayPainter:
 
 
 def schedule(detections: Sequence[Detections], cameras: Sequence[Camera]) -> Schedule:
-    """The times of a shown recording: the frames of the camera with most, and in its gaps the others'.
-
-    Only the stamps of the detections' frames and the cameras' time offsets are used.
-    """
+    """The times of a shown recording: the frames of the camera with most, and beyond them the others'."""
     clocks = [seen.frames - camera.time_offset for seen, camera in zip(detections, cameras, strict=True)]
     times = np.zeros(0)
     for clock in sorted(clocks, key=len, reverse=True):
@@ -101,10 +98,7 @@ def shown(clock: Array, times: Array) -> Index:
 
 
 def play(moments: Schedule, streams: Sequence[Iterator[tuple[float, Image]]]) -> Iterator[list[Image | None]]:
-    """The images of each moment, one of each camera; None where it has none.
-
-    Args: streams: of each camera, from its first frame on; each is run through once.
-    """
+    """Each moment's images, None without one; the streams begin with the cameras' first frames and run once."""
     at = [-1] * len(streams)
     images: list[Image | None] = [None] * len(streams)
     for frames in moments.frames:

@@ -139,10 +139,7 @@ def check_rig(cameras: Sequence[Camera]) -> None:
 
 
 def check_overlap(detections: Sequence[Detections], cameras: Sequence[Camera]) -> None:
-    """Refuses a camera that recorded while no other did: its clock or file is another recording's.
-
-    Raises: ValueError: naming the camera and when each one filmed.
-    """
+    """Refuses a camera that recorded while no other did. Raises: ValueError: naming it and the times of all."""
     spans: dict[str, tuple[float, float]] = {}
     for seen, camera in zip(detections, cameras, strict=True):
         if len(seen.frames):
@@ -151,7 +148,5 @@ def check_overlap(detections: Sequence[Detections], cameras: Sequence[Camera]) -
         others = [span for other, span in spans.items() if other != name]
         if others and not any(start <= last and first <= end for first, last in others):
             when = "; ".join(f"{shown(other)} {first:g} to {last:g} s" for other, (first, last) in spans.items())
-            raise ValueError(
-                f"videos must overlap in time; camera {shown(name)} overlaps with no other: {when} (true time). "
-                "Check stamps and time_offset, or that the files are of one recording."
-            )
+            problem = f"videos must overlap in time; camera {shown(name)} overlaps with no other: {when} (true time)"
+            raise ValueError(f"{problem}. Check stamps and time_offset, or that the files are of one recording.")

@@ -25,10 +25,8 @@ def match_videos(given: Sequence[str], cameras: Sequence[Camera], ignored: Seque
         if name in ignored:
             continue
         if name not in names:
-            raise ValueError(
-                f"video {shown(text)} must be of a camera: {listed(names)}; got {shown(name)}. Rename it, or write "
-                f"NAME={path}.{did_you_mean(name, names)}"
-            )
+            problem = f"video {shown(text)} must be of a camera: {listed(names)}; got {shown(name)}"
+            raise ValueError(f"{problem}. Rename it, or write NAME={path}.{did_you_mean(name, names)}")
         if name in found:
             both = f"{found[name]} and {path}"
             raise ValueError(f"camera {shown(name)} must have one video; got {both}. Drop one of them.")
@@ -52,11 +50,7 @@ def named_path(text: str, names: Sequence[str]) -> tuple[str, Path]:
 
 
 def stamp_files(given: Sequence[str], cameras: Sequence[Camera]) -> dict[str, Path]:
-    """The files of stamps of some cameras.
-
-    Args: given: `name=path`.
-    Raises: ValueError: a word without a name, a name of no camera, or one that comes twice.
-    """
+    """The files of stamps of cameras, given as `name=path`. Raises: ValueError: no name, no camera's, or twice."""
     names = [camera.name for camera in cameras]
     found: dict[str, Path] = {}
     for text in given:
@@ -81,11 +75,7 @@ def without(cameras: Sequence[Camera], names: Sequence[str]) -> list[Camera]:
 
 
 def check_sizes(sizes: Mapping[str, tuple[int, int]], cameras: Sequence[Camera]) -> None:
-    """Refuses a calibration of another resolution than the video's.
-
-    Args: sizes: camera -> width and height of its video, px.
-    Raises: ValueError: naming the camera, both sizes and what to do.
-    """
+    """Refuses a calibration of another resolution than the videos' (px). Raises: ValueError: with both sizes."""
     for camera in cameras:
         (width, height), (old_width, old_height) = sizes[camera.name], camera.size
         if (width, height) == camera.size:
