@@ -59,7 +59,11 @@ def held(target: Path, argument: str = "out") -> Iterator[None]:
             yield
         return
     try:
-        _clear_after(record, target)
+        for place in _left(record):  # the remains of a killed process; a folder that it had moved gets its name back
+            with suppress(OSError):
+                if (place / OLD).is_dir() and not os.path.lexists(target):
+                    os.rename(place / OLD, target)
+            _remove(place)
         _write(record, os.getpid(), "w")
         with _holding(target, record):
             yield
@@ -121,15 +125,6 @@ def _left(record: Path) -> list[Path]:
     places = [Path(line) for line in _read(record) if isinstance(line, str) and os.path.lexists(line)]
     found = ((place, place.lstat()) for place in places)
     return [place for place, one in found if stat.S_ISDIR(one.st_mode) and one.st_uid == os.geteuid()]
-
-
-def _clear_after(record: Path, target: Path) -> None:
-    """Removes the remains of a killed process; a folder that it had moved away gets its name back."""
-    for place in _left(record):
-        with suppress(OSError):
-            if (place / OLD).is_dir() and not os.path.lexists(target):
-                os.rename(place / OLD, target)
-        _remove(place)
 
 
 def _remove(place: Path) -> None:

@@ -1,6 +1,6 @@
 """Finds the height of the table from the bounces of the balls."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
@@ -53,9 +53,12 @@ def bounce_heights(times: Array, heights: Array) -> list[float]:
         # the bounce lies between samples i and i + 1, or one of them is the lowest of its neighbours
         if min(heights[i], heights[i + 1]) > min(heights[i - 1], heights[i + 2]):
             continue
-        arms = _arms(times, i)
-        if arms is None:
+        first = min(int(np.searchsorted(times, times[i] - _ARM)), max(i - _LEAST_SAMPLES + 1, 0))
+        last = int(np.searchsorted(times, times[i + 1] + _ARM, side="right"))
+        last = max(last, min(i + 1 + _LEAST_SAMPLES, len(times)))
+        if i + 1 - first < _LEAST_SAMPLES or last - i - 1 < _LEAST_SAMPLES:
             continue
+        arms = (slice(first, i + 1), slice(i + 1, last))  # the flight before, up to i, and after
         before, after = (_arc(times[part], heights[part], times[i]) for part in arms)
         if before[1] > -_LEAST_SPEED or after[1] < _LEAST_SPEED or max(before[2], after[2]) > _MOST_RESIDUAL:
             continue
@@ -69,16 +72,6 @@ def bounce_heights(times: Array, heights: Array) -> list[float]:
         if all(abs(bounce[1] - other[1]) > _ARM for other in kept):
             kept.append(bounce)
     return [height for _, _, height in kept]
-
-
-def _arms(times: Array, i: int) -> Sequence[slice] | None:
-    """The samples of the flight before, up to i, and after, from i + 1."""
-    first = min(int(np.searchsorted(times, times[i] - _ARM)), max(i - _LEAST_SAMPLES + 1, 0))
-    last = int(np.searchsorted(times, times[i + 1] + _ARM, side="right"))
-    last = max(last, min(i + 1 + _LEAST_SAMPLES, len(times)))
-    if i + 1 - first < _LEAST_SAMPLES or last - i - 1 < _LEAST_SAMPLES:
-        return None
-    return slice(first, i + 1), slice(i + 1, last)
 
 
 def _arc(times: Array, heights: Array, origin: float) -> tuple[float, float, float]:

@@ -53,7 +53,11 @@ def roles_of(table: RawTable, choices: Choices) -> Roles | None:
             frames += [counter] if counter else []
         if table.named and not time and not frames:
             return None
-        trajectory = trajectory or _pieces(table, {*time, *frames})
+        for name, column in table.columns.items() if trajectory is None else ():
+            changes = int((column[1:] != column[:-1]).sum()) if column.dtype.kind != "f" else 0
+            if name not in (*time, *frames) and 0 < changes <= _PIECES * len(column):
+                trajectory = name
+                break
         found = _numeric_rest(table, {*time, *frames, *([trajectory] if trajectory else [])})
         left = [n for n, c in table.columns.items() if is_number(c) and n not in (*time, *frames, trajectory)]
         if len(found) < 3 and len(left) == 3:  # a coordinate may be constant
@@ -70,6 +74,9 @@ def roles_of(table: RawTable, choices: Choices) -> Roles | None:
     if not time and frame is None:
         time, frame = _time_by_numbers(table, {*places, *([trajectory] if trajectory else [])})
     sigmas, unit, rate = _sigmas(read, given), _constant(table, UNITS), _constant(table, RATES)
+    time_unit = "ns" if len(time) == 2 else None
+    if len(time) == 1:
+        time_unit = next((m.unit for m in read.get(time[0], []) if m.role in ("t", "seconds") and m.unit), None)
     used = {*places, *time, *(sigmas or ())} | {one for one in (frame, trajectory) if one}
     return Roles(
         places,
@@ -78,7 +85,7 @@ def roles_of(table: RawTable, choices: Choices) -> Roles | None:
         trajectory,
         sigmas,
         units or (unit.strip().lower() if isinstance(unit, str) else None),
-        _time_unit(read, time),
+        time_unit,
         float(rate) if isinstance(rate, int | float) and rate > 0 else None,
         by_name,
         tuple(name for name in table.columns if name not in used and name.lower() not in (*RATES, *UNITS)),
@@ -177,9 +184,9 @@ def _one_clock(table: RawTable, names: list[str]) -> bool:
         a, b = (np.asarray(one - one[0], dtype=np.float64) for one in (first, other))
         slope = float(a @ b) / max(float(a @ a), 1e-300)
         power = np.log10(abs(slope)) if slope else np.inf
-        if not np.isfinite(power):
+        if not np.isfinite(power) or abs(power - round(power)) > 1e-3:
             return False
-        if abs(power - round(power)) > 1e-3 or np.abs(b - slope * a).max() > 1e-3 * max(np.abs(b).max(), 1e-300):
+        if np.abs(b - slope * a).max() > 1e-3 * max(np.abs(b).max(), 1e-300):
             return False
     return True
 
@@ -189,13 +196,10 @@ def _trajectory(
 ) -> str | None:
     if "trajectory" in given:
         return given["trajectory"]
-    candidates = sorted(
-        (m.rank, name) for name, found in read.items() for m in found if m.role == "trajectory" and name not in used
-    )
-    for _, name in candidates:
+    ranked = [(m.rank, name) for name, found in read.items() for m in found if m.role == "trajectory"]
+    for _, name in sorted(ranked):
         column = table.texts.get(name, table.columns[name])
-        distinct = len(set(column.tolist()))
-        if distinct <= max(1, len(column) // 3):
+        if name not in used and len(set(column.tolist())) <= max(1, len(column) // 3):
             return name
     return None
 
@@ -206,9 +210,9 @@ def _numeric_rest(table: RawTable, used: set[str]) -> list[str]:
     for name, column in table.columns.items():
         values = numbers(column)
         held = values[np.isfinite(values)]
-        counts = column.dtype.kind == "i" and len(held) > 2 and bool((np.abs(np.diff(held)) <= 1).mean() > _FORWARD)
-        if name not in used and len(held) > 2 and np.ptp(held) > 0 and not counts:
-            found.append(name)
+        if name not in used and len(held) > 2 and np.ptp(held) > 0:
+            counts = column.dtype.kind == "i" and (np.abs(np.diff(held)) <= 1).mean() > _FORWARD
+            found += [] if counts else [name]
     return found
 
 
@@ -233,27 +237,10 @@ def _time_by_numbers(table: RawTable, used: set[str]) -> tuple[tuple[str, ...], 
     return ((), name) if counter else ((name,), None)
 
 
-def _pieces(table: RawTable, used: set[str]) -> str | None:
-    for name, column in table.columns.items():
-        if name in used or column.dtype.kind == "f":
-            continue
-        changes = int((column[1:] != column[:-1]).sum())
-        if 0 < changes <= _PIECES * len(column):
-            return name
-    return None
-
-
 def _sigmas(read: Mapping[str, list[Meaning]], given: Mapping[str, str]) -> tuple[str, str, str] | None:
     found = {m.role: name for name, ms in read.items() for m in ms if m.role.startswith("sigma")} | dict(given)
-    if all(f"sigma_{axis}" in found for axis in "xyz"):
-        return found["sigma_x"], found["sigma_y"], found["sigma_z"]
-    return None
-
-
-def _time_unit(read: Mapping[str, list[Meaning]], time: tuple[str, ...]) -> str | None:
-    if len(time) != 1:
-        return "ns" if time else None
-    return next((m.unit for m in read.get(time[0], []) if m.role in ("t", "seconds") and m.unit), None)
+    x, y, z = (found.get(f"sigma_{axis}") for axis in "xyz")
+    return (x, y, z) if x and y and z else None
 
 
 def _constant(table: RawTable, names: tuple[str, ...]) -> object:

@@ -92,8 +92,7 @@ def shots_of(tables: Sequence[RawTable], roles: Roles, choices: Choices, counts:
 
 
 def _unique(shots: Iterable[SourceShot]) -> list[SourceShot]:
-    seen: Counter[str] = Counter()
-    found = []
+    seen, found = Counter[str](), []
     for shot in shots:
         seen[shot.name] += 1
         found.append(shot if seen[shot.name] == 1 else replace(shot, name=f"{shot.name}#{seen[shot.name]}"))

@@ -49,16 +49,14 @@ class Counts:
 
     def notes(self) -> list[str]:
         """One sentence for each kind."""
-        said = [
-            (self.missing, "rows without a time or a position left out"),
-            (self.zeros, "rows with x = y = z = 0 far from their neighbours left out as missing samples"),
-            (self.late, "rows put in the order of their times"),
-            (self.short, "shots of fewer than two samples left out"),
-        ]
-        found = [f"{count} {words}" for count, words in said if count]
-        if self.ignored:
-            found.append(f"columns left out: {', '.join(sorted(self.ignored))}")
-        return found
+        said = {
+            f"{self.missing} rows without a time or a position left out": self.missing,
+            f"{self.zeros} rows with x = y = z = 0 far from their neighbours left out as missing samples": self.zeros,
+            f"{self.late} rows put in the order of their times": self.late,
+            f"{self.short} shots of fewer than two samples left out": self.short,
+            f"columns left out: {', '.join(sorted(self.ignored))}": self.ignored,
+        }
+        return [sentence for sentence, count in said.items() if count]
 
 
 def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list[SourceShot]:
@@ -72,8 +70,7 @@ def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list
     if lacking:
         raise ValueError(f"{table.where} must have the columns of the other tables; {listed(lacking)} missing. Add it.")
     stamps = _stamps(table, roles, choices, counts)
-    positions = np.stack([numbers(table.columns[name]) for name in roles.places], axis=1)
-    sigmas = None
+    positions, sigmas = np.stack([numbers(table.columns[name]) for name in roles.places], axis=1), None
     held = ~missing(stamps) & (np.abs(positions) <= _LARGEST).all(axis=1)
     if roles.sigmas is not None:
         sigmas = np.stack([numbers(table.columns[name]) for name in roles.sigmas], axis=1)
@@ -161,10 +158,8 @@ def _at_restarts(stamps: Stamps, rows: NDArray[np.intp], counts: Counts) -> list
 
 def _ordered(part: NDArray[np.intp], stamps: Stamps, counts: Counts) -> NDArray[np.intp]:
     late = int((np.diff(stamps[part]) < 0).sum())
-    if not late:
-        return part
     counts.late += late
-    return part[np.argsort(stamps[part], kind="stable")]
+    return part[np.argsort(stamps[part], kind="stable")] if late else part
 
 
 def _by_name(
@@ -174,12 +169,12 @@ def _by_name(
     codes = np.array([codes_of.setdefault(str(value), len(codes_of)) for value in column[rows].tolist()])
     order = np.argsort(codes, kind="stable")
     parts = np.split(rows[order], np.flatnonzero(np.diff(codes[order])) + 1)
-    return [_ordered(part, stamps, counts) for part in parts], [_text(column[part[0]]) for part in parts]
-
-
-def _text(value: object) -> str:
-    number = float(value) if isinstance(value, float | np.floating) else None
-    return f"{number:.0f}" if number is not None and number.is_integer() else str(value) or "unnamed"
+    values = [column[part[0]] for part in parts]
+    whole = [isinstance(value, float | np.floating) and float(value).is_integer() for value in values]
+    names = [
+        f"{value:.0f}" if is_whole else str(value) or "unnamed" for value, is_whole in zip(values, whole, strict=True)
+    ]
+    return [_ordered(part, stamps, counts) for part in parts], names
 
 
 def _lone_zeros(positions: Array, counts: Counts) -> NDArray[np.bool_]:
@@ -204,14 +199,11 @@ def _labels(
         if column is None:  # in the first table, but not in this one
             counts.ignored.add(name)
         elif all((column[part] == column[part[0]]).all() for part in parts) and is_name(name) and name != "trajectory":
-            found[name] = [_label(column, int(part[0])) for part in parts]
+            cells = [column[part[0]] for part in parts]
+            if is_number(column):
+                found[name] = [float(cell) if np.isfinite(cell) else None for cell in cells]
+            else:
+                found[name] = [short_text(" ".join(str(cell).split()), MAX_TEXT) or None for cell in cells]
         elif not is_number(column) or np.isfinite(numbers(column)).any():
             counts.ignored.add(name)
     return found
-
-
-def _label(column: Column, row: int) -> Label | None:
-    if is_number(column):
-        value = float(column[row])
-        return value if np.isfinite(value) else None
-    return short_text(" ".join(str(column[row]).split()), MAX_TEXT) or None

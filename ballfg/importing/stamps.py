@@ -25,9 +25,8 @@ def as_stamps(column: Column) -> Stamps | None:
     if column.dtype.kind in "if":
         return column
     parsed = [_parsed(str(cell)) for cell in column]
-    present = sum(1 for one in parsed if one is not None)
-    empty = sum(1 for cell in column if str(cell).lower() in MISSING)
-    if not present or present + empty < len(column):
+    present = sum(one is not None for one in parsed)
+    if not present or present + sum(str(cell).lower() in MISSING for cell in column) < len(column):
         return None
     return np.array([NO_STAMP if one is None else one for one in parsed], dtype=np.int64)
 

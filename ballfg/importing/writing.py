@@ -60,7 +60,8 @@ def _drawing(tracks: Sequence[Track], height: float) -> Html:
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    across = _across(tracks)
+    # the horizontal axis of the longer flights
+    across = int(np.argmax(np.median([np.ptp(track.positions[:, :2], axis=0) for track in tracks], axis=0)))
     with mpl.rc_context({"svg.hashsalt": "ballfg", "svg.fonttype": "none", "font.size": 9}):
         figure = Figure(figsize=(9.0, 6.5), layout="constrained")
         side, above = figure.subplots(2, 1)
@@ -78,9 +79,3 @@ def _drawing(tracks: Sequence[Track], height: float) -> Html:
         metadata: dict[str, Any] = {"Date": None, "Creator": None}
         figure.savefig(text, format="svg", metadata=metadata)
     return Html(text.getvalue()[text.getvalue().index("<svg") :])
-
-
-def _across(tracks: Sequence[Track]) -> int:
-    """The horizontal axis of the longer flights."""
-    extents = np.median([np.ptp(track.positions[:, :2], axis=0) for track in tracks], axis=0)
-    return int(np.argmax(extents))

@@ -10,7 +10,6 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import groupby, pairwise
-from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,27 +119,20 @@ def _stream(source: RowSource) -> Iterator[RowGroup]:
 
 def _regroup(source: RowSource, index: Index) -> Iterator[RowGroup]:
     width = 1 + len(source.columns)
+    codes_of = {name: code for code, name in enumerate(index.names)}
+    position = (np.cumsum(index.counts) - index.counts).tolist()
     with tempfile.TemporaryFile(prefix="ballfg-") as file:
-        _write_ordered(file, source, index, width)
+        for block in source.blocks():  # each row, its number and values, goes to its trajectory's place
+            codes = _global_codes(block, codes_of)
+            order = np.argsort(codes, kind="stable")
+            table = np.column_stack([(block.start + order).astype(np.float64), block.values[order]])
+            for start, end in _runs(codes[order]):
+                code = int(codes[order[start]])
+                file.seek(position[code] * width * 8)
+                file.write(table[start:end].tobytes())
+                position[code] += end - start
         file.seek(0)
         for name, count in zip(index.names, index.counts, strict=True):
             table = np.frombuffer(file.read(int(count) * width * 8), dtype=np.float64).reshape(-1, width)
             # A row number is exact in float64 up to 2**53.
             yield RowGroup(name, table[:, 0].astype(np.int64), table[:, 1:])
-
-
-def _write_ordered(file: IO[bytes], source: RowSource, index: Index, width: int) -> None:
-    """Writes each row (its number, its values) to its trajectory's place in the file."""
-    codes_of = {name: code for code, name in enumerate(index.names)}
-    ends = np.cumsum(index.counts)
-    position = (ends - index.counts).tolist()
-    for block in source.blocks():
-        codes = _global_codes(block, codes_of)
-        order = np.argsort(codes, kind="stable")
-        codes = codes[order]
-        table = np.column_stack([(block.start + order).astype(np.float64), block.values[order]])
-        for start, end in _runs(codes):
-            code = int(codes[start])
-            file.seek(position[code] * width * 8)
-            file.write(table[start:end].tobytes())
-            position[code] += end - start

@@ -58,16 +58,6 @@ class Sightings:
                 row = int(np.argwhere(~np.isfinite(array))[0][0])
                 raise ValueError(f"{field} must be finite; {field}[{row}]={array[row].tolist()}. Drop that sighting.")
             object.__setattr__(self, field, array)
-        self._check_stamps()
-        good = are_covariances(self.covariances)
-        if not good.all():
-            row = int(np.argmin(good))
-            raise ValueError(
-                f"covariances must be symmetric and positive definite; covariances[{row}]="
-                f"{self.covariances[row].tolist()}. Give the variance of u and v in px^2."
-            )
-
-    def _check_stamps(self) -> None:
         for number, name in enumerate(self.cameras):
             rows = np.flatnonzero(self.camera == number)
             wrong = np.flatnonzero(np.diff(self.times[rows]) <= 0.0)
@@ -77,6 +67,13 @@ class Sightings:
                     f"times of camera {shown(name)} must increase; times[{second}]={self.times[second]} <= "
                     f"times[{first}]={self.times[first]}. Sort the rows, and keep one sighting a frame."
                 )
+        good = are_covariances(self.covariances)
+        if not good.all():
+            row = int(np.argmin(good))
+            raise ValueError(
+                f"covariances must be symmetric and positive definite; covariances[{row}]="
+                f"{self.covariances[row].tolist()}. Give the variance of u and v in px^2."
+            )
 
     def __len__(self) -> int:
         return len(self.times)

@@ -105,10 +105,14 @@ class TableWriter:
                 self._has_header = True
             for place, field in enumerate(table.schema):
                 if pa.types.is_string(field.type):
-                    table = table.set_column(place, field, _guarded(table.column(place)))
+                    text = table.column(place)  # formulas get quoted; see `ballfg.files.spreadsheet`
+                    formula = pc.match_substring_regex(text, QUOTED)
+                    risky = pc.and_(formula, pc.invert(pc.match_substring_regex(text, NUMBER)))
+                    quoted = pc.binary_join_element_wise("'", text, "")
+                    table = table.set_column(place, field, pc.if_else(risky, quoted, text))
             texts = [column for column in table.columns if pa.types.is_string(column.type)]
-            quoted = any(pc.any(pc.match_substring_regex(column, '[,;"\t\r\n]')).as_py() for column in texts)
-            style = pa_csv.WriteOptions(include_header=False, quoting_style="needed" if quoted else "none")
+            quotes = any(pc.any(pc.match_substring_regex(column, '[,;"\t\r\n]')).as_py() for column in texts)
+            style = pa_csv.WriteOptions(include_header=False, quoting_style="needed" if quotes else "none")
             pa_csv.write_csv(table, self._file, style)
         else:
             if self._parquet is None:
@@ -149,12 +153,6 @@ def _arrow(name: str, array: np.ndarray, count: int) -> pa.Array:
     if array.ndim == 0:
         return pa.repeat(pa.scalar(array.item(), type=kind or pa.from_numpy_dtype(array.dtype)), count)
     return pa.array(array, type=kind)
-
-
-def _guarded(column: pa.ChunkedArray) -> pa.ChunkedArray:
-    """The texts of a column, with formulas quoted; see `ballfg.files.spreadsheet`."""
-    risky = pc.and_(pc.match_substring_regex(column, QUOTED), pc.invert(pc.match_substring_regex(column, NUMBER)))
-    return pc.if_else(risky, pc.binary_join_element_wise("'", column, ""), column)
 
 
 def _conformed(batch: pa.RecordBatch, schema: pa.Schema) -> pa.RecordBatch:

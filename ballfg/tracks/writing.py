@@ -55,7 +55,13 @@ def write_dataset(
         with (stage / _SPOOL).open("x", encoding="utf-8") as spool:
             label_names = _write_tracks(stage / f"tracks.{file_format}", info, tracks, spool)
         if label_names:
-            _write_labels(stage / LABELS_FILE, stage / _SPOOL, label_names)
+            with (stage / LABELS_FILE).open("x", encoding="utf-8", newline="") as file:
+                writer = csv.writer(file, lineterminator="\n")
+                writer.writerow(map(guarded, (KEY, *label_names)))
+                with (stage / _SPOOL).open(encoding="utf-8") as lines:
+                    for cells in map(json.loads, lines):
+                        row = (cells.get(name, "") for name in (KEY, *label_names))
+                        writer.writerow(guarded(cell) if isinstance(cell, str) else cell for cell in row)
         (stage / _SPOOL).unlink()
 
 
@@ -95,13 +101,3 @@ def _check_track(track: Track, names: set[str], info: DatasetInfo, has_sigmas: b
             f"got {track.sigmas.min():g} to {track.sigmas.max():g}. Correct them or set sigmas=None."
         )
     check_scale(f"track {shown(track.name)}", track.times, track.positions, track.sigmas, info.rate)
-
-
-def _write_labels(path: Path, spool: Path, label_names: list[str]) -> None:
-    with path.open("x", encoding="utf-8", newline="") as file, spool.open(encoding="utf-8") as lines:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(map(guarded, (KEY, *label_names)))
-        for line in lines:
-            cells = json.loads(line)
-            row = (cells.get(name, "") for name in (KEY, *label_names))
-            writer.writerow(guarded(cell) if isinstance(cell, str) else cell for cell in row)

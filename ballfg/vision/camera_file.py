@@ -164,17 +164,6 @@ def _camera(name: str, content: Any, posed: bool) -> Camera:
 
 
 def _fields(node: Mapping[str, Tree], where: str) -> dict[str, Any]:
-    fields: dict[str, Any] = {"size": _size(node, where)}
-    for field, names in _NODES.items():
-        present = [name for name in names if name in node]
-        if present:
-            fields[field] = numbers(node[present[0]], f"{where}: node {present[0]!r}")
-    if "time_offset" in node:
-        fields["time_offset"] = number(node["time_offset"], f"{where}: node 'time_offset'")
-    return fields
-
-
-def _size(node: Mapping[str, Tree], where: str) -> list[int]:
     if "image_size" in node:
         sides = np.ravel(numbers(node["image_size"], f"{where}: node 'image_size'"))
     elif "image_width" in node and "image_height" in node:
@@ -184,4 +173,11 @@ def _size(node: Mapping[str, Tree], where: str) -> list[int]:
     if len(sides) != 2 or not np.isfinite(sides).all() or (sides != np.trunc(sides)).any():
         got = shown(sides.tolist())
         raise ValueError(f"{where}: the image's size must be two whole numbers; got {got}. Correct it.")
-    return [int(side) for side in sides]
+    fields: dict[str, Any] = {"size": [int(side) for side in sides]}
+    for field, names in _NODES.items():
+        present = [name for name in names if name in node]
+        if present:
+            fields[field] = numbers(node[present[0]], f"{where}: node {present[0]!r}")
+    if "time_offset" in node:
+        fields["time_offset"] = number(node["time_offset"], f"{where}: node 'time_offset'")
+    return fields

@@ -19,14 +19,6 @@ _TILES: Final = (322, 323)  # tags of TIFF: width and height of the pieces in wh
 
 def read_image(path: Path, flags: int) -> Image:
     """An image by `cv2.imdecode`, (h, w) or (h, w, 3) uint8, BGR. Raises: ValueError: none, or too large. OSError."""
-    _check_size(path)
-    image = cv2.imdecode(np.frombuffer(whole_content(path), dtype=np.uint8), flags)
-    if image is None:
-        raise ValueError(f"image {path} must be readable; OpenCV cannot decode it. Write it again or remove it.")
-    return np.asarray(image, dtype=np.uint8)
-
-
-def _check_size(path: Path) -> None:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Header.DecompressionBombWarning)  # our own bound is lower
@@ -42,3 +34,7 @@ def _check_size(path: Path) -> None:
         raise ValueError(f"image {path} must be readable; {why}. Write it again or remove it.") from None
     for width, height in sizes:
         check_pixels(path, width, height)
+    image = cv2.imdecode(np.frombuffer(whole_content(path), dtype=np.uint8), flags)
+    if image is None:
+        raise ValueError(f"image {path} must be readable; OpenCV cannot decode it. Write it again or remove it.")
+    return np.asarray(image, dtype=np.uint8)

@@ -2,7 +2,6 @@
 
 import json
 import zipfile
-from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final
@@ -66,16 +65,14 @@ def _of_path(path: Path, topic: str | None) -> list[RawTable]:
         raise ValueError(f"source must be a file or folder; {path} is a pipe or a device. Write what comes to a file.")
     if (path / "metadata.yaml").is_file() or any(path.glob("*.db3")):
         return read_bag(path, topic)
-    files = sorted(file for file in path.rglob("*") if file.is_file() and _is_table(file))
+    known = (*TEXT[:-1], *JSON, *BAGS, *READERS, *_added())
+    files = [file for file in sorted(path.rglob("*")) if file.is_file() and file.suffix.lower() in known]
+    files = [file for file in files if not file.name.startswith(".") and file.name not in _OWN]
+    files = [file for file in files if "readme" not in file.name.lower()]
     if not files:
         listing = listed(sorted(entry.name for entry in path.iterdir()))
         raise ValueError(f"{path} must hold files of measurements, such as .csv or .json; got {listing}. Name another.")
     return [table for file in files for table in _of_file(file, topic)]
-
-
-def _is_table(file: Path) -> bool:
-    known = file.suffix.lower() in (*TEXT[:-1], *JSON, *BAGS, *READERS, *_added())
-    return known and not file.name.startswith(".") and file.name not in _OWN and "readme" not in file.name.lower()
 
 
 def _added() -> dict[str, type[Format]]:
@@ -121,18 +118,13 @@ def _json(path: Path, text: str) -> list[RawTable]:
                 f"{path}, line {error.lineno}: must be valid JSON; {error.msg} at column {error.colno}, as in a file "
                 "that was cut off. Write it again, whole."
             ) from None
-        content = _json_lines(path, lines)
+        content = []
+        for number, line in enumerate(lines, 1):
+            try:
+                content.append(parse_json(line))
+            except json.JSONDecodeError as wrong:
+                problem = f"{path}, line {number}: must be valid JSON; {wrong.msg} at column {wrong.colno}"
+                raise ValueError(f"{problem}. Correct or delete the line.") from None
     if isinstance(content, dict) and not any(isinstance(value, list | dict) for value in content.values()):
         content = [content]
     return nested_tables(content, path.stem, str(path))
-
-
-def _json_lines(path: Path, lines: Sequence[str]) -> list[Any]:
-    values: list[Any] = []
-    for number, line in enumerate(lines, 1):
-        try:
-            values.append(parse_json(line))
-        except json.JSONDecodeError as error:
-            problem = f"{path}, line {number}: must be valid JSON; {error.msg} at column {error.colno}"
-            raise ValueError(f"{problem}. Correct or delete the line.") from None
-    return values

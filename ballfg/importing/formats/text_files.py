@@ -97,15 +97,15 @@ def _text_table(text: str, name: str, source: str) -> RawTable:
 
 def _separator(lines: Sequence[str]) -> str:
     """The separator that gives most lines the same number of cells, most of them numbers."""
-    best, most = ",", (0.0, -math.inf)
+    best, most = ",", (-math.inf, 0.0)
     for separator in SEPARATORS:
         rows = _cells(lines[-_LOOK:], separator)
         widths = Counter(len(row) for row in rows)
         if not widths:
             continue
         width, count = widths.most_common(1)[0]
-        score = (count / sum(widths.values()) if width > 1 else 0.0, _numbers(rows))
-        if score[1] > most[1] or (score[1] == most[1] and score[0] > most[0]):
+        score = (_numbers(rows), count / sum(widths.values()) if width > 1 else 0.0)
+        if score > most:
             best, most = separator, score
     return best
 
@@ -163,8 +163,7 @@ def _joined(header: Sequence[Sequence[str]], width: int) -> list[str]:
                 names[i].append(cell)
     joined = [".".join(parts) or str(i) for i, parts in enumerate(names)]
     full = [f"{name} [{unit.strip('[]()')}]" if unit else name for name, unit in zip(joined, units, strict=True)]
-    counts: Counter[str] = Counter()
-    unique = []
+    counts, unique = Counter[str](), []
     for name in full:
         counts[name] += 1
         unique.append(name if counts[name] == 1 else f"{name}#{counts[name]}")

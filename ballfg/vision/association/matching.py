@@ -91,8 +91,13 @@ def match(pieces: Sequence[Piece], cameras: Sequence[Camera]) -> Matching:
 def _pairs(pieces: Sequence[Piece], cameras: Sequence[Camera]) -> list[_Pair]:
     """All pairs of pieces of different cameras that overlap, compared in one call for each pair of cameras."""
     pairs = []
+    camera = np.array([piece.camera for piece in pieces])
+    starts, ends = (np.array([piece.path.times[place] for piece in pieces]) for place in (0, -1))
     for one, other in combinations(range(len(cameras)), 2):
-        common = {(i, j): _common(pieces[i], pieces[j]) for i, j in _overlapping(pieces, one, other)}
+        common: dict[tuple[int, int], tuple[Array, Array, Array, Array]] = {}
+        for i in np.flatnonzero(camera == one).tolist():
+            for j in np.flatnonzero((camera == other) & (starts < ends[i]) & (ends > starts[i])).tolist():
+                common[i, j] = _common(pieces[i], pieces[j])
         meeting = [ij for ij, arrays in common.items() if len(arrays[0]) >= _LEAST_COMMON]
         if not meeting:
             continue
@@ -100,22 +105,10 @@ def _pairs(pieces: Sequence[Piece], cameras: Sequence[Camera]) -> list[_Pair]:
         pixels, spread, others, other_spread = (np.concatenate(arrays) for arrays in zip(*seen, strict=True))
         misses, slopes = epipolar_miss(cameras[one], cameras[other], pixels, others)
         variances = _along(slopes[:, :2], spread) + _along(slopes[:, 2:], other_spread)
-        ends = np.cumsum([len(arrays[0]) for arrays in seen])[:-1]
-        cut = zip(meeting, np.split(misses, ends), np.split(variances, ends), strict=True)
+        cuts = np.cumsum([len(arrays[0]) for arrays in seen])[:-1]
+        cut = zip(meeting, np.split(misses, cuts), np.split(variances, cuts), strict=True)
         pairs += [_Pair(*ij, miss, variance) for ij, miss, variance in cut]
     return pairs
-
-
-def _overlapping(pieces: Sequence[Piece], one: int, other: int) -> list[tuple[int, int]]:
-    """Pieces of one camera with those of another that were there at the same time."""
-    theirs = np.array([j for j, piece in enumerate(pieces) if piece.camera == other], dtype=int)
-    starts, ends = np.array([pieces[j].start for j in theirs]), np.array([pieces[j].end for j in theirs])
-    return [
-        (i, int(j))
-        for i, piece in enumerate(pieces)
-        if piece.camera == one
-        for j in theirs[(starts < piece.end) & (ends > piece.start)]
-    ]
 
 
 def _common(first: Piece, second: Piece) -> tuple[Array, Array, Array, Array]:
@@ -213,17 +206,13 @@ def epipolar_miss(first: Camera, second: Camera, pixels: Array, others: Array) -
     by_second = other_normal @ second.rotation[:2].T / second.matrix[[0, 1], [0, 1]]
     slopes = np.concatenate((by_first, by_second), axis=1)
     size = np.linalg.norm(slopes, axis=1)
-    meets = (_distances(rays, towards, between) > _NEAREST).all(axis=1) & (size > 0.0)
+    a, b, c = (rays**2).sum(axis=1), (rays * towards).sum(axis=1), (towards**2).sum(axis=1)
+    d, e = rays @ between, towards @ between
+    determinant = a * c - b**2
+    determinant[determinant <= 0.0] = np.nan  # parallel
+    along = np.stack(((c * d - b * e) / determinant, (b * d - a * e) / determinant))  # m, where they are closest
+    meets = (along > _NEAREST).all(axis=0) & (size > 0.0)
     size[~meets] = np.nan
     miss[known] = (rays * normal).sum(axis=1) / size
     gradient[known] = slopes / size[:, None]
     return miss, gradient
-
-
-def _distances(rays: Array, towards: Array, between: Array) -> Array:
-    """(n, 2) m, how far along the two rays they are closest; NaN where parallel."""
-    a, b, c = (rays**2).sum(axis=1), (rays * towards).sum(axis=1), (towards**2).sum(axis=1)
-    d, e = rays @ between, towards @ between
-    determinant = a * c - b**2
-    determinant[determinant <= 0.0] = np.nan
-    return np.stack(((c * d - b * e) / determinant, (b * d - a * e) / determinant), axis=1)

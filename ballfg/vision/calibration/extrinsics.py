@@ -72,7 +72,9 @@ def calibrate_extrinsics(lens: Camera, marked: Marked) -> Extrinsics:
             "Swap left and right, or correct the points."
         )
     best = Extrinsics(above[0], marked, np.zeros((6, 6)))
-    _check_fit(best)
+    if best.rms > (most := MAX_RMS * marked.sigma):
+        problem = f"camera {shown(lens.name)}: points must be explained within {most:g} px; got {best.rms:.1f}"
+        raise ValueError(f"{problem}. {_culprit(best)}Check names and pixels, and that the lens is this camera's.")
     alike = [camera for camera in above[1:2] if _squares(camera, marked) - _squares(above[0], marked) < CLEARLY]
     if any(np.linalg.norm(above[0].centre - c.centre) > FLAT * np.linalg.norm(above[0].tvec) for c in alike):
         problem = f"camera {shown(lens.name)}: points must tell one pose; two explain them alike"
@@ -146,13 +148,6 @@ def _rms(residuals: Array) -> float:
     return float(np.sqrt((residuals**2).sum(axis=1).mean()))
 
 
-def _check_fit(found: Extrinsics) -> None:
-    most = MAX_RMS * found.marked.sigma
-    if found.rms > most:
-        problem = f"camera {shown(found.camera.name)}: points must be explained within {most:g} px; got {found.rms:.1f}"
-        raise ValueError(f"{problem}. {_culprit(found)}Check names and pixels, and that the lens is this camera's.")
-
-
 def _culprit(found: Extrinsics) -> str:
     """A sentence with the one point whose removal resolves the error, if there is one."""
     marked = found.marked
@@ -171,15 +166,12 @@ def _covariance(found: Extrinsics) -> Array:
     by_pose = slopes_of(camera, marked.points, camera.rvec, camera.tvec)[:, :POSE]
     rotation, slope = cv2.Rodrigues(camera.rvec)
     slopes = np.asarray(slope, dtype=np.float64).reshape(3, 3, 3)  # of the rotation, by the three of rvec
-    turns = np.stack([_axis(rotation.T @ by_r) for by_r in slopes], axis=1)
+    skews = [rotation.T @ by_r for by_r in slopes]
+    axes = [np.array([skew[2, 1] - skew[1, 2], skew[0, 2] - skew[2, 0], skew[1, 0] - skew[0, 1]]) for skew in skews]
+    turns = np.stack(axes, axis=1) / 2.0
     centres = np.stack([-by_r.T @ camera.tvec for by_r in slopes], axis=1)
     moved = np.block([[turns, np.zeros((3, 3))], [centres, -rotation.T]])
     freedom = 2 * len(marked.points) - 6
     shown = found.rms * np.sqrt(len(marked.points) / freedom)  # rms is of distances: two numbers a point
     sigma = max(marked.sigma, shown)
     return np.asarray(sigma**2 * moved @ np.linalg.inv(by_pose.T @ by_pose) @ moved.T)
-
-
-def _axis(skew: Array) -> Array:
-    """(3,) vector whose cross product is the skew matrix (3, 3)."""
-    return np.array([skew[2, 1] - skew[1, 2], skew[0, 2] - skew[2, 0], skew[1, 0] - skew[0, 1]]) / 2.0

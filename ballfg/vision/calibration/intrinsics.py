@@ -1,7 +1,6 @@
 """Calibrates a lens from views of a board, and checks whether the views determine it."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -153,11 +152,12 @@ def _fit(name: str, views: Sequence[View], distortion: int) -> Intrinsics:
     points = [np.ascontiguousarray(view.points, dtype=np.float32) for view in views]
     pixels = [np.ascontiguousarray(view.pixels, dtype=np.float32) for view in views]
     size = views[0].size
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # on several it adds in another order each time, and the last digits differ
     try:
-        with _one_thread():
-            _, matrix, coefficients, rvecs, tvecs = cv2.calibrateCamera(
-                points, pixels, size, np.eye(3), np.zeros(0), flags=_FLAGS[distortion], criteria=_CRITERIA
-            )
+        _, matrix, coefficients, rvecs, tvecs = cv2.calibrateCamera(
+            points, pixels, size, np.eye(3), np.zeros(0), flags=_FLAGS[distortion], criteria=_CRITERIA
+        )
         bent = np.array(np.ravel(coefficients)[:distortion], dtype=np.float64)
         camera = Camera(name, size, np.array(matrix, dtype=np.float64), bent, np.zeros(3), np.zeros(3))
     except (cv2.error, ValueError):
@@ -165,24 +165,13 @@ def _fit(name: str, views: Sequence[View], distortion: int) -> Intrinsics:
             f"camera {shown(name)}: views must tell the lens; no lens explains them. "
             "Turn the board to different sides, up to 45 degrees, and check that it is flat."
         ) from None
-    fitted = tuple(
-        _fitted(camera, view, np.ravel(rvec), np.ravel(tvec))
-        for view, rvec, tvec in zip(views, rvecs, tvecs, strict=True)
-    )
+    finally:
+        cv2.setNumThreads(threads)
+    posed = zip(views, rvecs, tvecs, strict=True)
+    fitted = tuple(_fitted(camera, view, np.ravel(rvec), np.ravel(tvec)) for view, rvec, tvec in posed)
     share = coverage(size, np.concatenate([view.pixels for view in views]))
     covariance = covariance_of_lens(camera, [(v.view.points, v.rvec, v.tvec, v.residuals) for v in fitted])
     return Intrinsics(camera, covariance, fitted, (), (), share)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """OpenCV on one thread: on several it adds in another order each time, and the last digits differ."""
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(threads)
 
 
 def _fitted(camera: Camera, view: View, rvec: Array, tvec: Array) -> FittedView:
@@ -222,12 +211,7 @@ def _check_fit(name: str, fitted: Intrinsics) -> None:
             f"got {sigma:.1f} px. Take images with the board in its corners, or fewer coefficients than "
             f"{len(fitted.camera.distortion)}."
         )
-    _check_fold(fitted.camera)
-
-
-def _check_fold(camera: Camera) -> None:
-    """Refuses a distortion that cannot be undone somewhere in the image."""
-    pixels = pixel_grid(camera)
+    camera, pixels = fitted.camera, pixel_grid(fitted.camera)
     plane = camera.normalized(pixels)
     again = camera.project(np.column_stack((plane, np.ones(len(plane)))))
     apart = float(np.linalg.norm(again - pixels, axis=1).max())

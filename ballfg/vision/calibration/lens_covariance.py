@@ -34,9 +34,8 @@ def covariance_of_lens(camera: Camera, boards: Sequence[PosedBoard]) -> Array:
         squares += float((residuals**2).sum())
         freedom += residuals.size - POSE
     scale = np.sqrt(np.diag(information))
-    if freedom <= 0 or not (scale > 0.0).all():
-        return np.diag(np.full(unknowns, np.inf))
-    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    known = freedom > 0 and (scale > 0.0).all()
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale)) if known else (np.zeros(1), scale)
     if values[0] <= np.finfo(np.float64).eps * unknowns:
         return np.diag(np.full(unknowns, np.inf))
     return np.asarray(squares / freedom * (vectors / values) @ vectors.T / np.outer(scale, scale))

@@ -6,7 +6,6 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.arrays import Array, Mask
 from ballfg.checks import shown
 from ballfg.tracks import detections_file
 from ballfg.tracks.checks import check_step
@@ -54,17 +53,13 @@ def read_detections(
     if len(kept) < len(names):
         notes.append(f"{path.name}: {len(names) - len(kept)} exact repeats of rows dropped")
     names, values = names[kept], {name: column[kept] for name, column in values.items()}
-    found = [_of_camera(camera.name, names == camera.name, values) for camera in cameras]
-    for seen in found:
-        check_step(f"{path}, camera {shown(seen.camera)}", seen.frames)
+    found = []
+    for camera in cameras:
+        mine = {column: numbers[names == camera.name] for column, numbers in values.items()}
+        frames, frame = np.unique(mine["t"], return_inverse=True)
+        order = np.argsort(frame, kind="stable")
+        pixels, streaks = np.column_stack((mine["u"], mine["v"])), np.full((len(order), 2, 2), np.nan)
+        spread, scores = detections_file.covariances(mine)[order], mine[detections_file.SCORE][order]
+        found.append(Detections(camera.name, frames, frame[order], pixels[order], spread, scores, streaks))
+        check_step(f"{path}, camera {shown(camera.name)}", frames)
     return found, notes
-
-
-def _of_camera(name: str, rows: Mask, values: dict[str, Array]) -> Detections:
-    mine = {column: numbers[rows] for column, numbers in values.items()}
-    frames, frame = np.unique(mine["t"], return_inverse=True)
-    order = np.argsort(frame, kind="stable")
-    pixels = np.column_stack((mine["u"], mine["v"]))
-    streaks = np.full((len(order), 2, 2), np.nan)
-    spread, scores = detections_file.covariances(mine)[order], mine[detections_file.SCORE][order]
-    return Detections(name, frames, frame[order], pixels[order], spread, scores, streaks)

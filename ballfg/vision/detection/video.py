@@ -127,8 +127,8 @@ class ImageFolder(Video):
 
     def sample(self, count: int) -> list[Image]:
         """At most `count` images spread over the recording."""
-        few = min(count, len(self._files))
-        return [self._image(self._files[turn * len(self._files) // few]) for turn in range(few)]
+        few = min(count, self.count)
+        return [self._image(self._files[turn * self.count // few]) for turn in range(few)]
 
     def _decoded(self) -> Iterator[tuple[float, Image]]:
         return ((np.nan, self._image(file)) for file in self._files)

@@ -65,7 +65,20 @@ def write_tracking(
     Raises: OSError: something cannot be written. ValueError: a track that breaks a rule of datasets.
     """
     with whole_folder(folder, earlier=FILES) as stage:
-        _write_tables(stage, tracking, info)
+        if tracking.balls:
+            write_dataset(stage, info, tracking.tracks)
+        else:
+            write_info(stage / INFO_FILE, info)
+            with TableWriter(stage / TRACKS) as empty:
+                empty.write({KEY: np.zeros(0, dtype=object)} | {name: np.zeros(0) for name in (*VALUES, *SIGMAS)})
+        write_cameras(stage / CAMERAS_FILE, tracking.cameras)
+        with TableWriter(stage / DETECTIONS_FILE) as detections:
+            for camera, seen in enumerate(tracking.detections):
+                names = np.full(len(seen), "", dtype=object)  # of the balls; candidates of no ball have none
+                for name, ball in zip(tracking.names, tracking.balls, strict=True):
+                    names[tracking.rows(ball, camera)] = name
+                columns = seen_columns(seen.times, seen.camera, seen.pixels, seen.covariances)
+                detections.write({KEY: names} | columns | {SCORE: seen.scores})
         sheet = ContactSheet(tracking, info.table_height, table)
         passing = [sheet.passing(camera, opened()) for camera, opened in enumerate(streams or ())]
         if passing and overlay:
@@ -75,21 +88,3 @@ def write_tracking(
                 pass
         sheet.write(stage / SHEET)
         return [name for name in FILES if (stage / name).is_file()]
-
-
-def _write_tables(stage: Path, tracking: Tracking, info: DatasetInfo) -> None:
-    if tracking.balls:
-        write_dataset(stage, info, tracking.tracks)
-    else:
-        write_info(stage / INFO_FILE, info)
-        with TableWriter(stage / TRACKS) as empty:
-            empty.write({KEY: np.zeros(0, dtype=object)} | {name: np.zeros(0) for name in (*VALUES, *SIGMAS)})
-    write_cameras(stage / CAMERAS_FILE, tracking.cameras)
-    with TableWriter(stage / DETECTIONS_FILE) as detections:
-        for camera in range(len(tracking.cameras)):
-            seen = tracking.detections[camera]
-            names = np.full(len(seen), "", dtype=object)  # of the balls; candidates of no ball have none
-            for name, ball in zip(tracking.names, tracking.balls, strict=True):
-                names[tracking.rows(ball, camera)] = name
-            columns = seen_columns(seen.times, seen.camera, seen.pixels, seen.covariances)
-            detections.write({KEY: names} | columns | {SCORE: seen.scores})
