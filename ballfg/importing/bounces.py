@@ -1,21 +1,27 @@
-"""Finds the height of the table from the bounces of the balls."""
+"""Determines the height of the table from the bounces of the balls, and the ball by its drag."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.importing.choices import Choices, Guess, UndecidedError
+from ballfg.importing.frame import Frame
+from ballfg.tracks import TABLE_TENNIS, Ball, Track
+from ballfg.tracks.info import TENNIS
 
 _ARM: Final = 0.06  # s of flight for the fit on each side of a bounce
 _LEAST_SAMPLES: Final = 3
-_LEAST_SPEED: Final = 0.7
-"""m/s, least speed of the fall before and of the rise after a bounce; slower ones are rolling balls and noise."""
+_LEAST_SPEED: Final = 0.7  # m/s, of the fall before and the rise after a bounce; slower are rolling balls and noise
 _MOST_RESIDUAL: Final = 0.02  # m, root mean square about the two flights; more means a hit, an outlier, or two balls
 _SAME: Final = 0.04  # m: bounces within this distance of each other are on one surface
 _SHARE: Final = 0.3  # of the most frequent surface's bounces that make a higher one the table: balls bounce on below it
 _GRAVITY: Final = 10.0  # m/s^2, of the fitted arcs: gravity and a little topspin. An error of 5 moves a bounce by 2 mm.
+BALLS: Final = {"table-tennis": TABLE_TENNIS, "tennis": TENNIS}
+_TENNIS_DRAG: Final = 0.045  # 1/m; halfway, in ratio, between the drags of the two balls
+_SURE_WINDOWS: Final = 30  # number of flight parts from which their drag distinguishes the balls
 
 
 @dataclass(frozen=True)
@@ -82,3 +88,44 @@ def _arc(times: Array, heights: Array, origin: float) -> tuple[float, float, flo
     (height, speed), *_ = np.linalg.lstsq(design, lifted, rcond=None)
     residual = lifted - design @ (height, speed)
     return float(height), float(speed), float(np.sqrt(np.mean(residual**2)))
+
+
+def ball_of(choices: Choices, frame: Frame) -> tuple[Ball, Guess]:
+    """The ball, and the confidence in it.
+
+    Args: choices: of the user.  frame: with the drag (1/m) of the flights.
+    Raises: FileNotFoundError, ValueError: an unknown chosen ball, or a file that cannot be read.
+    """
+    if choices.ball is not None:
+        from ballfg.simulation.balls import ball_kind
+
+        ball = BALLS[choices.ball] if choices.ball in BALLS else ball_kind(choices.ball).ball
+        return ball, Guess("ball", choices.ball, "as given", "stated", f"--ball {choices.ball}")
+    why, sure = "too little flight to show the drag", "unsure"
+    if frame.drag is not None and frame.windows >= _SURE_WINDOWS:
+        why = f"the drag is only {frame.drag:.2f} 1/m (a tennis ball has 0.02): if it is another ball, name it"
+        if frame.drag >= _TENNIS_DRAG:
+            why, sure = f"drag {frame.drag:.2f} 1/m; a table-tennis ball has 0.13, a tennis ball 0.02", "likely"
+    return TABLE_TENNIS, Guess("ball", "table-tennis", why, sure, "--ball tennis")
+
+
+def table_of(tracks: Sequence[Track], ball: Ball, choices: Choices) -> tuple[float, Guess]:
+    """The height of the table's surface in m, and the confidence in it.
+
+    Args: tracks: in m and s with z up.  ball: its radius lies between a bounce and the surface.  choices: of the user.
+    Raises: UndecidedError: no bounce shows it.
+    """
+    if choices.table_height is not None:
+        height = choices.table_height
+        return height, Guess("table height", f"{height:g} m", "as given", "stated", f"--table-height {height:g}")
+    found = surface((track.seconds, track.positions) for track in tracks)
+    if found is None:
+        lowest = min(float(track.positions[:, 2].min()) for track in tracks)
+        what = f"no bounce shows the height of the table (m, along the up axis); the lowest sample is at {lowest:.2f} m"
+        raise UndecidedError(what, "table-height", (), f"{lowest - ball.radius:.2f}" if lowest > 0.5 else "0.76")
+    height = round(found.centre - ball.radius, 4)
+    others = "".join(f"; also at {other - ball.radius:.2f} m" for other in found.others)
+    one = "1 bounce" if found.bounces == 1 else f"{found.bounces} bounces"
+    why = f"{one}, scatter {1e3 * found.spread:.1f} mm{others}"
+    sure = "sure" if found.bounces >= 3 and not found.others else "likely"
+    return height, Guess("table height", f"{height:g} m", why, sure, f"--table-height {height:g}")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ballfg.checks import short_text
-from ballfg.importing.ball_and_table import ball_of, table_of
+from ballfg.importing.bounces import ball_of, table_of
 from ballfg.importing.choices import Choices, Guess, UndecidedError
 from ballfg.importing.columns import Roles
 from ballfg.importing.formats.raw import RawTable

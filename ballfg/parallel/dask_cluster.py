@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from ballfg.checks import one_line
 from ballfg.parallel.same_versions import HERE, differences, own_versions
-from ballfg.parallel.work import Work, compute, packed
+from ballfg.parallel.work import Work, compute, packed, too_many_deaths
 
 CONNECT: Final = 10.0  # s, timeout for the scheduler, and for its first worker
 NOBODY: Final = 60.0  # s without any worker after which the work ends
@@ -139,10 +139,7 @@ class _Chunk:
         try:
             return pickle.loads(self._future.result())
         except KilledWorker:
-            raise ChildProcessError(
-                f"workers must live while they work; dask lost too many over a chunk that begins with {self._first}. "
-                "Memory is probably short: give workers more of it."
-            ) from None
+            raise too_many_deaths("dask", self._first) from None
 
     def cancel(self) -> None:
         """Cancels the chunk."""

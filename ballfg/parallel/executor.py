@@ -20,15 +20,12 @@ class Pending(Protocol):
 
     def done(self) -> bool:
         """True if `result` returns, or raises, at once."""
-        ...
 
     def result(self) -> Any:
         """The result of the chunk, once it is there; raises the function's exceptions."""
-        ...
 
     def cancel(self) -> object:
         """Cancels the chunk, unless a worker has begun it."""
-        ...
 
 
 class Executor(Protocol):
@@ -40,15 +37,12 @@ class Executor(Protocol):
     @property
     def slots(self) -> int:
         """Number of chunks that others compute at the same time."""
-        ...
 
     def sender(self, function: Callable[[Sequence[Any]], Any]) -> Callable[[Sequence[Any]], Pending]:
         """Submits a function of a chunk, and returns a function that submits its chunks one by one."""
-        ...
 
     def stop(self) -> None:
         """Ends the present work at once: after an error, or Ctrl-C."""
-        ...
 
 
 def executor(jobs: int, *, helped: bool = True) -> Executor | None:

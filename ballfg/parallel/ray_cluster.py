@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from ballfg.checks import one_line
 from ballfg.parallel.same_versions import HERE, differences, own_versions
-from ballfg.parallel.work import Work, compute, packed
+from ballfg.parallel.work import Work, compute, packed, too_many_deaths
 
 MOST_DEATHS: Final = 3  # largest number of workers that a chunk may lose
 
@@ -93,10 +93,7 @@ class _Chunk:
         except self._ray.exceptions.RayTaskError as error:
             raise error.cause from None
         except (self._ray.exceptions.WorkerCrashedError, self._ray.exceptions.OutOfMemoryError):
-            raise ChildProcessError(
-                f"workers must live while they work; ray lost too many over a chunk that begins with {self._first}. "
-                "Memory is probably short: give workers more of it."
-            ) from None
+            raise too_many_deaths("ray", self._first) from None
 
     def cancel(self) -> None:
         """Cancels the chunk."""

@@ -59,6 +59,12 @@ def compute(name: str, content: bytes, chunk: bytes, versions: dict[str, str]) -
         return packed(alone(function, pickle.loads(chunk)))
 
 
+def too_many_deaths(cluster: str, first: str) -> ChildProcessError:
+    """The error for a chunk whose workers died."""
+    problem = f"workers must live while they work; {cluster} lost too many over a chunk that begins with {first}"
+    return ChildProcessError(f"{problem}. Memory is probably short: give workers more of it.")
+
+
 def each(function: Callable[[Any], R], chunk: Sequence[Any]) -> list[R]:
     """A function of each item of a chunk."""
     return [function(item) for item in chunk]

@@ -31,8 +31,7 @@ MAX_RATE_RATIO = 100.0  # a median time step that differs from the declared rate
 BASELINE: Final = 0.05  # s to each side for an acceleration: 3 mm of noise leave 3 m/s^2, in a track's median 0.5
 LEAST_FALLING: Final = 0.2  # least share of a track that falls along -z as a ball does, for undoubted axes
 MOSTLY: Final = 0.5  # share of a track that falls along +z, above which z seems to point down
-FALLS: Final = (0.4, 1.9)
-"""Multiples of gravity between which a flying ball's vertical acceleration lies; strong topspin doubles it."""
+FALLS: Final = (0.4, 1.9)  # gravities between which a flying ball's vertical acceleration lies; topspin doubles it
 LEAST_REVERSAL: Final = 0.8  # m/s. A ball that falls and then rises at least so fast within a few samples has bounced.
 NEAR_SURFACE: Final = 0.08  # m from every declared surface beyond which a bounce is doubtful; one step of a fast ball
 AXES: Final = ("x", "y", "z")

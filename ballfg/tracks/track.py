@@ -37,11 +37,9 @@ class Measurements(Protocol):
     @property
     def name(self) -> str:
         """Name of the kind of measurement."""
-        ...
 
     def select(self, samples: NDArray[np.bool_]) -> Self:
         """The measurements of the selected samples (n,) bool of the track."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)

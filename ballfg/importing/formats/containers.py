@@ -19,8 +19,7 @@ from ballfg.importing.formats.text_files import text_table
 MAX_DEPTH: Final = 40  # largest depth of nested groups
 MAX_MEMBERS: Final = 20_000  # files of an archive, or datasets and groups of an HDF5 file: four for each of 5,000 shots
 EXCEL_FREE: Final = 1_000_000  # bytes of XML that any Excel file may hold: openpyxl reads some 2 MB a second
-EXCEL_CELLS: Final = 25_000
-"""Cells that any Excel file may have, plus one for each two bytes of its size: a number takes three or more."""
+EXCEL_CELLS: Final = 25_000  # of any Excel file, plus one for each two bytes of its size: a number takes three or more
 _PLAIN: Final = "Save plain arrays of numbers with numpy.savez."
 
 

@@ -81,8 +81,7 @@ def check_agreement(balls: Sequence[SeenBall], cameras: Sequence[Camera]) -> Agr
     Source: docs/associate.md.
     """
     cameras = list(cameras)
-    pixels, covariances = _views(balls, cameras)
-    scene = _scene(cameras, pixels, covariances)
+    scene = _scene(balls, cameras)
     if (few := len(scene.points)) < LEAST_POINTS:
         why = f"{few} points were seen by three cameras or more; {LEAST_POINTS} are needed to check them."
         return Agreement(None, {}, float("nan"), f"Whether the cameras agree is not known: {why}")
@@ -104,22 +103,18 @@ def check_agreement(balls: Sequence[SeenBall], cameras: Sequence[Camera]) -> Agr
     return Agreement(culprit, by_camera, before, _sentence(culprit, by_camera, before))
 
 
-def _views(balls: Sequence[SeenBall], cameras: list[Camera]) -> tuple[Array, Array]:
-    """Pixels (n, c, 2) of the balls in every camera at their points' times, covariances; NaN where not seen."""
+def _scene(balls: Sequence[SeenBall], cameras: list[Camera]) -> _Scene:
+    """The points, with the pixels of the balls in every camera at the points' times."""
     ends = np.cumsum([0, *map(len, balls)])
     pixels = np.full((ends[-1], len(cameras), 2), np.nan)
     covariances = np.full((ends[-1], len(cameras), 2, 2), np.nan)
     for ball, start, end in zip(balls, ends[:-1], ends[1:], strict=True):
-        seen = ball.sightings
+        own = ball.sightings
         for k, camera in enumerate(cameras):
-            rows = seen.camera == seen.cameras.index(camera.name)
-            if rows.any():
-                line = path(seen.times[rows] - camera.time_offset, seen.pixels[rows], seen.covariances[rows])
+            mine = own.camera == own.cameras.index(camera.name)
+            if mine.any():
+                line = path(own.times[mine] - camera.time_offset, own.pixels[mine], own.covariances[mine])
                 pixels[start:end, k], covariances[start:end, k] = line.at(ball.times)
-    return pixels, covariances
-
-
-def _scene(cameras: list[Camera], pixels: Array, covariances: Array) -> _Scene:
     seen = np.asarray(np.isfinite(pixels).all(axis=-1))
     rows = np.flatnonzero(seen.sum(axis=1) >= 3)
     if len(rows):

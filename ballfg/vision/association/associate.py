@@ -13,9 +13,16 @@ import numpy as np
 from ballfg.checks import check_count, check_range
 from ballfg.tracks.sightings import Sightings
 from ballfg.tracks.stamps import elapsed, written
-from ballfg.vision.association.completing import complete
 from ballfg.vision.association.flights import is_ball, successions
-from ballfg.vision.association.gathering import SAME_SHUTTER, Footage, Gathered, SeenBall, gather, shared_stamps
+from ballfg.vision.association.gathering import (
+    SAME_SHUTTER,
+    Footage,
+    Gathered,
+    SeenBall,
+    complete,
+    gather,
+    shared_stamps,
+)
 from ballfg.vision.association.matching import Piece, match
 from ballfg.vision.association.tracklets import find_tracklets
 from ballfg.vision.camera import Camera

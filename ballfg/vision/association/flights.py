@@ -26,8 +26,7 @@ _WINDOWS: Final = (0.15, 0.3, 0.6)  # s, for an acceleration: short against a fl
 _LEAST_IN_WINDOW: Final = 5  # points of such a window: three make the parabola
 _TELLING: Final = 2.0  # m/s^2, largest standard deviation of an acceleration; with more, a hovering object would pass
 _SIGMAS: Final = 3.0  # tolerance in standard deviations of a measured acceleration
-_FALLING: Final = 0.5
-"""Least share of the informative windows in which a ball falls; it may be held, hit or at rest in the others."""
+_FALLING: Final = 0.5  # least share of informative windows in which a ball falls; else it is held, hit, at rest
 _END: Final = 0.08  # s, length of a track's end that is extrapolated
 _STEADY: Final = 10.0  # m/s^2, standard deviation for drag and lift, which the extrapolation leaves out
 _FLOOR: Final = 0.01  # m, standard deviation of an extrapolated position apart from noise

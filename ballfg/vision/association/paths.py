@@ -16,8 +16,7 @@ from ballfg.arrays import Array, Index, Mask
 
 MAX_GAP: Final = 0.06  # s, longest bridged gap between two samples of a smooth part: three frames lost at 60 Hz
 RATE_OF_CHANGE: Final = 5.0
-"""1/s, how fast an acceleration changes by its own size, in an image or in space: 15 m/s seen from 3 m away. What a
-polynomial leaves out is taken to be the acceleration times a power of this."""
+"""1/s, change of an acceleration by its own size (15 m/s at 3 m); its power times that is left out by a polynomial."""
 KINK_CHANCE: Final = 1e-5  # probability with which noise alone passes for a kink
 _SAME: Final = 1e-6  # s, a time this close to a sample is the sample's
 _INSIDE: Final = 4  # samples of the cubic between two samples

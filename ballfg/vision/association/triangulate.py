@@ -16,8 +16,7 @@ from ballfg.checks import check_array, check_each
 from ballfg.vision.camera import Camera
 
 MISSED: Final = 1e-6  # share of right candidates that the tests may refuse
-MAX_SIGMA: Final = 0.5
-"""m, standard deviation along the least certain direction from which rays count as parallel: then there is no point."""
+MAX_SIGMA: Final = 0.5  # m, standard deviation in the least certain direction, from which rays count as parallel
 _GATES: Final = tuple(float(chi2.isf(MISSED, degrees)) for degrees in (1, 2))  # of two rays, of a further view
 _STEPS: Final = 3  # Gauss-Newton steps; from halfway between two rays the second moves less than a micrometre
 _HOPELESS: Final = 1e-6  # information in 1 / `MAX_SIGMA`^2 below which a normal matrix is singular up to rounding
@@ -79,21 +78,7 @@ def triangulate(cameras: Sequence[Camera], pixels: ArrayLike, covariances: Array
     Source: docs/derivations/triangulation.md; Hartley, Zisserman, Multiple View Geometry (2004), sections 12.2 and 5.2.
     """
     cameras = list(check_each("cameras", cameras, Camera, "Read them with read_cameras."))
-    pixels, covariances = _checked(len(cameras), pixels, covariances)
-    views = _views(cameras, pixels, covariances)
-    points, used = _consensus(views)
-    points, spread = _refined(views, points, used)
-    found = np.asarray(np.isfinite(points).all(axis=1) & ((views.project(points)[2] > 0.0) | ~used).all(axis=1))
-    found[found] &= np.linalg.eigvalsh(spread[found])[:, -1] <= MAX_SIGMA**2
-    points[~found], spread[~found], used[~found] = np.nan, np.nan, False
-    residuals = np.full(pixels.shape, np.nan)
-    for c, camera in enumerate(cameras):
-        residuals[found, c] = pixels[found, c] - camera.project(points[found])
-    return Triangulated(points, spread, used, residuals)
-
-
-def _checked(count: int, pixels: ArrayLike, covariances: ArrayLike) -> tuple[Array, Array]:
-    pixels, covariances = check_array("pixels", pixels), check_array("covariances", covariances)
+    pixels, covariances, count = check_array("pixels", pixels), check_array("covariances", covariances), len(cameras)
     if count < 2:
         raise ValueError(f"cameras must be at least two to triangulate; got {count}. Add a camera.")
     if pixels.ndim != 3 or pixels.shape[1:] != (count, 2):
@@ -104,7 +89,16 @@ def _checked(count: int, pixels: ArrayLike, covariances: ArrayLike) -> tuple[Arr
     bad = ~((seen[:, 0, 0] > 0.0) & (np.linalg.det(seen) > 0.0)) if len(seen) else np.zeros(0, dtype=bool)
     if bad.any():
         raise ValueError(f"covariances must be positive definite, px^2; got {seen[bad][0].tolist()}")
-    return pixels, covariances
+    views = _views(cameras, pixels, covariances)
+    points, used = _consensus(views)
+    points, spread = _refined(views, points, used)
+    found = np.asarray(np.isfinite(points).all(axis=1) & ((views.project(points)[2] > 0.0) | ~used).all(axis=1))
+    found[found] &= np.linalg.eigvalsh(spread[found])[:, -1] <= MAX_SIGMA**2
+    points[~found], spread[~found], used[~found] = np.nan, np.nan, False
+    residuals = np.full(pixels.shape, np.nan)
+    for c, camera in enumerate(cameras):
+        residuals[found, c] = pixels[found, c] - camera.project(points[found])
+    return Triangulated(points, spread, used, residuals)
 
 
 def _views(cameras: list[Camera], pixels: Array, covariances: Array) -> _Views:

@@ -63,43 +63,39 @@ def calibrate_extrinsics(lens: Camera, marked: Marked) -> Extrinsics:
         for points out of a plane G. Terzakis, M. Lourakis, "A consistently fast and globally optimal solution to the
         perspective-n-point problem", ECCV 2020 (SQPNP).
     """
-    flat = _check_points(lens, marked)
+    where, flat = f"camera {shown(lens.name)}", _check_points(lens, marked)
     poses = sorted(_poses(lens, marked, flat), key=lambda camera: _squares(camera, marked))
     above = [camera for camera in poses if not flat or _is_above(camera, marked.points)]
     if not above:
-        raise ValueError(
-            f"camera {shown(lens.name)}: points must be seen from above; these are mirrored, as if seen from below. "
-            "Swap left and right, or correct the points."
-        )
+        problem = f"{where}: points must be seen from above; these are mirrored, as if seen from below"
+        raise ValueError(f"{problem}. Swap left and right, or correct the points.")
     best = Extrinsics(above[0], marked, np.zeros((6, 6)))
     if best.rms > (most := MAX_RMS * marked.sigma):
-        problem = f"camera {shown(lens.name)}: points must be explained within {most:g} px; got {best.rms:.1f}"
+        problem = f"{where}: points must be explained within {most:g} px; got {best.rms:.1f}"
         raise ValueError(f"{problem}. {_culprit(best)}Check names and pixels, and that the lens is this camera's.")
     alike = [camera for camera in above[1:2] if _squares(camera, marked) - _squares(above[0], marked) < CLEARLY]
     if any(np.linalg.norm(above[0].centre - c.centre) > FLAT * np.linalg.norm(above[0].tvec) for c in alike):
-        problem = f"camera {shown(lens.name)}: points must tell one pose; two explain them alike"
+        problem = f"{where}: points must tell one pose; two explain them alike"
         raise ValueError(f"{problem}. Mark more points, farther apart or at other heights.")
     return replace(best, covariance=_covariance(best))
 
 
 def _check_points(lens: Camera, marked: Marked) -> bool:
     """True if the points lie in a plane; refuses points that do not determine a pose."""
+    where = f"camera {shown(lens.name)}"
     if len(marked.points) < MIN_POINTS:
-        raise ValueError(
-            f"camera {shown(lens.name)}: at least {MIN_POINTS} points must be marked; got {len(marked.points)} "
-            f"({listed(marked.names)}). Mark more."
-        )
+        got = f"{len(marked.points)} ({listed(marked.names)})"
+        raise ValueError(f"{where}: at least {MIN_POINTS} points must be marked; got {got}. Mark more.")
     inside = ((marked.pixels >= -0.5) & (marked.pixels <= np.array(lens.size) - 0.5)).all(axis=1)
     if not inside.all():
         first = int(np.argmin(inside))
-        raise ValueError(
-            f"camera {shown(lens.name)}: pixels must lie in the image of {lens.size[0]}x{lens.size[1]}; "
-            f"{marked.names[first]} is at {marked.pixels[first].tolist()}. Correct it, or the camera's size."
-        )
+        got = f"{marked.names[first]} is at {marked.pixels[first].tolist()}"
+        problem = f"{where}: pixels must lie in the image of {lens.size[0]}x{lens.size[1]}; {got}"
+        raise ValueError(f"{problem}. Correct it, or the camera's size.")
     extent = np.linalg.svd(marked.points - marked.points.mean(axis=0), compute_uv=False)
     seen = np.linalg.svd(marked.pixels - marked.pixels.mean(axis=0), compute_uv=False)
     if extent[1] < FLAT * extent[0] or seen[1] < FLAT * seen[0]:
-        problem = f"camera {shown(lens.name)}: points must not lie in one line; {listed(marked.names)} do"
+        problem = f"{where}: points must not lie in one line; {listed(marked.names)} do"
         raise ValueError(f"{problem}. Mark points on both sides of the table.")
     return bool(extent[2] < FLAT * extent[1])
 
@@ -124,10 +120,8 @@ def _poses(lens: Camera, marked: Marked, flat: bool) -> list[Camera]:
     ]
     cameras = [camera for camera in cameras if (camera.depth(points) > 0.0).all()]
     if not cameras:
-        raise ValueError(
-            f"camera {shown(lens.name)}: points must be explained by some pose; there is none with them all in front "
-            "of the camera. Check which point is which."
-        )
+        problem = "points must be explained by some pose; there is none with them all in front of the camera"
+        raise ValueError(f"camera {shown(lens.name)}: {problem}. Check which point is which.")
     return cameras
 
 

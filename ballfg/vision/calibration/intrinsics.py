@@ -14,9 +14,7 @@ from ballfg.vision.calibration.lens_covariance import covariance_of_lens, pixel_
 from ballfg.vision.camera import DISTORTIONS, Camera
 
 MIN_VIEWS: Final = 8  # a view tells two numbers about the lens (Zhang 2000, section 2.3)
-MIN_TURN: Final = np.radians(10.0)
-"""rad that some two boards must be turned against each other. Parallel boards cannot tell a long lens from a near
-board: OpenCV then reports tiny deviations of a focal length that is wrong by half."""
+MIN_TURN: Final = np.radians(10.0)  # rad between two boards: parallel ones confuse a long lens with a near board
 MAX_FOCAL_SIGMA: Final = 0.02  # relative standard deviation of the focal length: 2 % are 6 cm at a distance of 3 m
 MIN_COVERAGE: Final = 0.4  # of the image's cells with corners: outside of them, the distortion is extrapolated
 CELLS: Final = (8, 5)  # number of such cells across and down
@@ -100,7 +98,7 @@ def calibrate_intrinsics(name: str, views: Sequence[View], distortion: int = 5) 
     if distortion not in DISTORTIONS:
         lengths = ", ".join(map(str, DISTORTIONS))
         raise ValueError(f"distortion must be one of {lengths} coefficients; got {distortion}. 5 do for most lenses.")
-    missed = tuple(view.name for view in views if len(view.pixels) == 0)
+    where, missed = f"camera {shown(name)}", tuple(view.name for view in views if len(view.pixels) == 0)
     used = [view for view in views if len(view.pixels)]
     _check_views(name, used, missed)
     fitted = _fit(name, used, distortion)
@@ -110,7 +108,7 @@ def calibrate_intrinsics(name: str, views: Sequence[View], distortion: int = 5) 
         if len(used) < MIN_VIEWS or len(left_out) > MAX_LEFT_OUT * (len(used) + len(left_out)):
             names = ", ".join(view.name for view in left_out)
             raise ValueError(
-                f"camera {shown(name)}: views must agree on one lens; {len(left_out)} of {len(used) + len(left_out)} "
+                f"{where}: views must agree on one lens; {len(left_out)} of {len(used) + len(left_out)} "
                 f"do not ({names}). Check that board and focus were never changed, and delete blurred images."
             )
         fitted = _fit(name, used, distortion)
@@ -133,18 +131,19 @@ def coverage(size: tuple[int, int], pixels: Array) -> float:
 
 
 def _check_views(name: str, used: Sequence[View], missed: Sequence[str]) -> None:
+    where = f"camera {shown(name)}"
     if len(used) < MIN_VIEWS:
         lack = f" No board (or hardly any of it) in {', '.join(missed)}." if missed else ""
         raise ValueError(
-            f"camera {shown(name)}: at least {MIN_VIEWS} images must show the board; got {len(used)} of "
+            f"{where}: at least {MIN_VIEWS} images must show the board; got {len(used)} of "
             f"{len(used) + len(missed)}.{lack} Check squares and kind of board, or take more, turned differently."
         )
     for view in used:
         if view.size != used[0].size:
             first, other = (f"{one.size[0]}x{one.size[1]}" for one in (used[0], view))
             raise ValueError(
-                f"camera {shown(name)}: images must have one size; {used[0].name} has {first} and {view.name} "
-                f"{other} pixels. Take them all as the videos will be."
+                f"{where}: images must have one size; {used[0].name} has {first} and {view.name} {other} pixels. "
+                "Take them all as the videos will be."
             )
 
 
@@ -161,10 +160,9 @@ def _fit(name: str, views: Sequence[View], distortion: int) -> Intrinsics:
         bent = np.array(np.ravel(coefficients)[:distortion], dtype=np.float64)
         camera = Camera(name, size, np.array(matrix, dtype=np.float64), bent, np.zeros(3), np.zeros(3))
     except (cv2.error, ValueError):
-        raise ValueError(
-            f"camera {shown(name)}: views must tell the lens; no lens explains them. "
-            "Turn the board to different sides, up to 45 degrees, and check that it is flat."
-        ) from None
+        problem = f"camera {shown(name)}: views must tell the lens; no lens explains them"
+        remedy = "Turn the board to different sides, up to 45 degrees, and check that it is flat."
+        raise ValueError(f"{problem}. {remedy}") from None
     finally:
         cv2.setNumThreads(threads)
     posed = zip(views, rvecs, tvecs, strict=True)
@@ -187,39 +185,32 @@ def _outlying(fitted: Intrinsics) -> int | None:
 
 
 def _check_fit(name: str, fitted: Intrinsics) -> None:
-    turned = turn(np.stack([view.normal for view in fitted.views]))
+    where, turned = f"camera {shown(name)}", turn(np.stack([view.normal for view in fitted.views]))
     if turned < MIN_TURN:
-        raise ValueError(
-            f"camera {shown(name)}: boards must be turned against each other by {np.degrees(MIN_TURN):.0f} degrees or "
-            f"more; got {np.degrees(turned):.1f}. Parallel boards cannot tell the focal length: turn it all ways."
-        )
+        rule = f"boards must be turned against each other by {np.degrees(MIN_TURN):.0f} degrees or more"
+        problem = f"{where}: {rule}; got {np.degrees(turned):.1f}"
+        raise ValueError(f"{problem}. Parallel boards cannot tell the focal length: turn it all ways.")
     sigma = float((fitted.sigmas[:2] / fitted.camera.matrix[[0, 1], [0, 1]]).max())
     if not sigma <= MAX_FOCAL_SIGMA:
-        raise ValueError(
-            f"camera {shown(name)}: the focal length must be known to {100 * MAX_FOCAL_SIGMA:g} %; got "
-            f"{100 * sigma:.1f} %. Take more images, with the board near and turned to all sides, up to 45 degrees."
-        )
+        problem = f"{where}: the focal length must be known to {100 * MAX_FOCAL_SIGMA:g} %; got {100 * sigma:.1f} %"
+        raise ValueError(f"{problem}. Take more images, with the board near and turned to all sides, up to 45 degrees.")
     if fitted.coverage < MIN_COVERAGE:
-        raise ValueError(
-            f"camera {shown(name)}: corners must lie in {100 * MIN_COVERAGE:.0f} % of the image or more; "
-            f"got {100 * fitted.coverage:.0f} %. Take images with the board near all borders and corners of the image."
-        )
-    sigma, _ = fitted.ray_sigma
+        rule = f"corners must lie in {100 * MIN_COVERAGE:.0f} % of the image or more"
+        problem = f"{where}: {rule}; got {100 * fitted.coverage:.0f} %"
+        raise ValueError(f"{problem}. Take images with the board near all borders and corners of the image.")
+    (sigma, _), coefficients = fitted.ray_sigma, len(fitted.camera.distortion)
     if not sigma <= MAX_RAY_SIGMA:
-        raise ValueError(
-            f"camera {shown(name)}: the lens must be known to {MAX_RAY_SIGMA:g} px in {RAYS:.0%} of the image; "
-            f"got {sigma:.1f} px. Take images with the board in its corners, or fewer coefficients than "
-            f"{len(fitted.camera.distortion)}."
-        )
+        rule = f"the lens must be known to {MAX_RAY_SIGMA:g} px in {RAYS:.0%} of the image; got {sigma:.1f} px"
+        remedy = f"Take images with the board in its corners, or fewer coefficients than {coefficients}."
+        raise ValueError(f"{where}: {rule}. {remedy}")
     camera, pixels = fitted.camera, pixel_grid(fitted.camera)
     plane = camera.normalized(pixels)
     again = camera.project(np.column_stack((plane, np.ones(len(plane)))))
     apart = float(np.linalg.norm(again - pixels, axis=1).max())
     if not apart <= MAX_FOLD or _has_pole(camera, float((plane**2).sum(axis=1).max())):
-        raise ValueError(
-            f"camera {shown(camera.name)}: the distortion must be possible to undo; it folds a part of the image. "
-            f"Take images with the board in all its corners, or fewer coefficients than {len(camera.distortion)}."
-        )
+        rule = "the distortion must be possible to undo; it folds a part of the image"
+        remedy = f"Take images with the board in all its corners, or fewer coefficients than {coefficients}."
+        raise ValueError(f"{where}: {rule}. {remedy}")
 
 
 def _has_pole(camera: Camera, limit: float) -> bool:

@@ -24,8 +24,7 @@ STANDS_OUT: Final = 3.0  # sigmas of noise above which a pixel counts for the fi
 FAINT: Final = 0.3  # share of the strongest contrast: with less, a change's noise would weigh too much
 MOST_STEPS: Final = 8
 HOPELESS: Final = (0.3, 0.2, 0.15)
-"""A fit that leaves over a larger share of the change, to start with, after one step, after more, is given up: balls
-leave 0.02 and then less than 0.01, sleeves and shadows 0.1 to 0.9."""
+"""Share of the change left over, at first and after steps, that ends a fit: balls leave 0.02, sleeves 0.1 to 0.9."""
 REACH: Final = 1.2
 RING: Final = 3.5  # px. The fit takes pixels within REACH radii and RING of the streak that it starts from.
 MOST_WORK: Final = 24000  # pixels times nodes of a fit; of a larger ball it takes every second pixel, every third, ...

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 
 from ballfg.arrays import Array, Index
 from ballfg.vision.arrays import Image
+from ballfg.vision.tracking.overlay import Colour, bgr, by_score, hexadecimal, polyline, ring, uncover
 from ballfg.vision.tracking.pipeline import Tracking
-from ballfg.vision.tracking.view_painter import Colour, bgr, by_score, hexadecimal, polyline, ring, uncover
 
 Extent = tuple[float, float, float, float]
 

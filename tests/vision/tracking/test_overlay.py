@@ -18,17 +18,21 @@ from ballfg.vision.association.gathering import SeenBall
 from ballfg.vision.detection.detections import Candidates, Detections
 from ballfg.vision.tracking.contact_sheet import EXPOSURES, MOST_TRACKS, WIDTH, ContactSheet, View
 from ballfg.vision.tracking.overlay import (
+    CAPTION,
     HELD,
+    RING,
     VIEW_WIDTH,
     Image,
     OverlayPainter,
+    ViewPainter,
+    bgr,
+    caption,
     play,
     schedule,
     shown,
     write_overlay,
 )
 from ballfg.vision.tracking.pipeline import Tracking
-from ballfg.vision.tracking.view_painter import CAPTION, RING, ViewPainter, bgr, caption
 
 SIZE = (640, 360)
 RATE = 100.0
