@@ -11,23 +11,14 @@ from typing import Final
 
 from ballfg.checks import one_line, short_text
 
-FREE: Final = 32_000_000
-"""Number of bytes that any file may unpack to."""
-RATIO: Final = 20
-"""Multiple of its own size that a file may unpack to beyond that. Measurements shrink to a half or third, whole rows of
-zeros to a tenth."""
-NUMBER: Final = 8
-"""Number of bytes of a number in memory, whatever its size in a file."""
-MAX_TEXT: Final = 250_000_000
-"""Largest number of bytes of a text file that is held whole."""
-MAX_LINE: Final = 1 << 18
-"""Largest number of characters in a line of a table. Lines of results have some 400."""
-MAX_COLUMNS: Final = 10_000
-"""Largest number of columns of a table. Marker systems write a few hundred."""
-MAX_PIXELS: Final = 64_000_000
-"""Largest number of pixels of an image or a frame: 192 MB of three colours. A frame in 4K has 8 million."""
-_SAID: Final = 160
-"""Largest number of characters of a library's own words."""
+FREE: Final = 32_000_000  # number of bytes that any file may unpack to
+RATIO: Final = 20  # multiple of its own size that it may unpack to beyond that; measurements shrink to a third
+NUMBER: Final = 8  # number of bytes of a number in memory, whatever its size in a file
+MAX_TEXT: Final = 250_000_000  # largest number of bytes of a text file that is held whole
+MAX_LINE: Final = 1 << 18  # Largest number of characters in a line of a table. Lines of results have some 400.
+MAX_COLUMNS: Final = 10_000  # Largest number of columns of a table. Marker systems write a few hundred.
+MAX_PIXELS: Final = 64_000_000  # of an image or a frame: 192 MB of three colours; a frame in 4K has 8 million
+_SAID: Final = 160  # largest number of characters of a library's own words
 
 
 @contextmanager
@@ -54,9 +45,7 @@ def most_unpacked(path: Path, free: int = FREE) -> int:
 def check_unpacked(path: Path, size: int, free: int = FREE) -> None:
     """Refuses a file that claims to hold far more than its own size allows; call it before unpacking.
 
-    Args:
-        path: of the file.
-        size: bytes that its content would take in memory, `NUMBER` for each cell of a table.
+    Args: path: of the file.  size: bytes that its content would take in memory, `NUMBER` for each cell of a table.
         free: number of bytes that any file may unpack to; fewer for a format with slow readers.
     Raises: ValueError: more than that and 20 times the size of the file.
     """
@@ -75,10 +64,7 @@ def check_parts(path: Path, what: str, count: int, most: int) -> None:
 
 
 def check_pixels(path: Path, width: int, height: int) -> None:
-    """Refuses an image or video with an impossible size, px; call it before decoding.
-
-    Raises: ValueError: more than `MAX_PIXELS`, or zero.
-    """
+    """Refuses an image of 0 or over `MAX_PIXELS` px, before it is decoded. Raises: ValueError."""
     if not 0 < width * height <= MAX_PIXELS:
         raise ValueError(
             f"{path} must have at most {MAX_PIXELS / 1e6:g} million pixels; it says {width} x {height}. Scale it down."

@@ -15,37 +15,28 @@ import numpy as np
 from ballfg.checks import shown
 from ballfg.files.strict_yaml import MAX_DEPTH, YamlError, parse_yaml
 
-Tree: TypeAlias = str | list["Tree"] | dict[str, "Tree"] | None
-"""A scalar as written, a sequence, or a map."""
-
-MAX_BYTES: Final = 1_000_000
-"""Largest size of a file: each camera takes a few thousand."""
+Tree: TypeAlias = str | list["Tree"] | dict[str, "Tree"] | None  # a scalar as written, a sequence, or a map
+MAX_BYTES: Final = 1_000_000  # largest size of a file: each camera takes a few thousand
 ENDINGS: Final = (".xml", ".json", ".yml", ".yaml")
-_SHAPES: Final = (("rows", "cols"), ("sizes",))
-"""Nodes with the size of a matrix: one of two dimensions, one of any number."""
-_TYPE: Final = re.compile(r"([1-9]?)[ucwsifdh]")
-"""Type of a matrix: count and kind of the numbers in each place."""
+_SHAPES: Final = (("rows", "cols"), ("sizes",))  # nodes with a matrix's size: of two dimensions, of any number
+_TYPE: Final = re.compile(r"([1-9]?)[ucwsifdh]")  # type of a matrix: count and kind of the numbers in each place
 _MAX_SIDE: Final = 1_000_000
 _TOKEN: Final = re.compile(r'"(?:[^"\\]|\\.)*"|\S+', re.DOTALL)
 
 
 def read_storage(path: Path) -> dict[str, Tree]:
-    """The map at the top of a file; all values are text.
-
-    Raises: ValueError: it cannot be parsed; the message names the file.
-    """
+    """The map at the top of a file; all values are text. Raises: ValueError: it cannot be parsed."""
     if path.stat().st_size > MAX_BYTES:
         raise ValueError(f"{path}: must have at most {MAX_BYTES / 1e6:g} MB. Give the file of the cameras alone.")
+    rule = f"{path}: must be a file of OpenCV's FileStorage"
     try:
         text = path.read_text(encoding="utf-8-sig")
         content = _from_xml(text) if path.suffix.lower() == ".xml" else _from_yaml(text)
     except (UnicodeDecodeError, YamlError, ElementTree.ParseError, _StorageError) as error:
         problem = error.problem if isinstance(error, YamlError) else " ".join(str(error).split())
-        raise ValueError(
-            f"{path}: must be a file of OpenCV's FileStorage; it cannot be parsed ({problem}). Correct it."
-        ) from None
+        raise ValueError(f"{rule}; it cannot be parsed ({problem}). Correct it.") from None
     if not isinstance(content, dict):
-        raise ValueError(f"{path}: must be a file of OpenCV's FileStorage, with names at its top. Correct it.")
+        raise ValueError(f"{rule}, with names at its top. Correct it.")
     return content
 
 
@@ -64,16 +55,18 @@ def number(node: Tree, where: str) -> float:
 
 
 def numbers(node: Tree, where: str) -> list[float] | list[list[float]]:
-    """The numbers of a matrix or a sequence, flat unless it is a matrix of several rows and columns.
-
-    Raises: ValueError: another value; `where` begins the message.
-    """
+    """The numbers of a sequence or matrix, in rows if it has several and columns. Raises: ValueError: other values."""
     if isinstance(node, list) and all(isinstance(item, str) for item in node):
         return [number(item, where) for item in node]
     if not is_matrix(node):
         raise ValueError(f"{where} must be a matrix or a list of numbers. Correct it.")
     assert isinstance(node, dict)
-    rows, columns = _sides(node, where)
+    if "sizes" in node:
+        sizes = node["sizes"] if isinstance(node["sizes"], list) else [node["sizes"]]
+        first, *others = (_count(size, f"{where}, sizes") for size in sizes)
+        rows, columns = (first, math.prod(others)) if others else (1, first)
+    else:
+        rows, columns = _count(node["rows"], f"{where}, rows"), _count(node["cols"], f"{where}, cols")
     kind = _TYPE.fullmatch(str(node["dt"]))
     if kind is None:
         raise ValueError(f"{where}, dt must be a type such as d; got {shown(node['dt'])}. Correct it.")
@@ -93,15 +86,6 @@ def numbers(node: Tree, where: str) -> list[float] | list[list[float]]:
 
 class _StorageError(ValueError):
     """Text in another format than FileStorage."""
-
-
-def _sides(node: dict[str, Tree], where: str) -> tuple[int, int]:
-    """Number of rows and columns of a matrix."""
-    if "sizes" not in node:
-        return _count(node["rows"], f"{where}, rows"), _count(node["cols"], f"{where}, cols")
-    sizes = node["sizes"] if isinstance(node["sizes"], list) else [node["sizes"]]
-    first, *others = (_count(size, f"{where}, sizes") for size in sizes)
-    return (first, math.prod(others)) if others else (1, first)
 
 
 def _count(node: Tree, where: str) -> int:

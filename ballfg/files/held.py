@@ -19,12 +19,9 @@ from typing import Any, Final
 
 from ballfg.files.own_folder import PRIVATE, state_folder
 
-MARK: Final = ".ballfg-"
-"""Prefix of the names of hidden folders."""
-NEW, OLD = "new", "old"
-"""Entries of a hidden folder: the new folder, and the one that it replaces."""
-PATIENCE: Final = 0.3
-"""s after which a lock counts as that of a writer."""
+MARK: Final = ".ballfg-"  # prefix of the names of hidden folders
+NEW, OLD = "new", "old"  # entries of a hidden folder: the new folder, and the one that it replaces
+PATIENCE: Final = 0.3  # s after which a lock counts as that of a writer
 _DISK: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
 _records: ContextVar[dict[Path, Path | None]] = ContextVar("records")
 """Results and hidden folders that this line of work holds: the files of the locks, None for a result that could not be
@@ -62,7 +59,11 @@ def held(target: Path, argument: str = "out") -> Iterator[None]:
             yield
         return
     try:
-        _clear_after(record, target)
+        for place in _left(record):  # the remains of a killed process; a folder that it had moved gets its name back
+            with suppress(OSError):
+                if (place / OLD).is_dir() and not os.path.lexists(target):
+                    os.rename(place / OLD, target)
+            _remove(place)
         _write(record, os.getpid(), "w")
         with _holding(target, record):
             yield
@@ -124,15 +125,6 @@ def _left(record: Path) -> list[Path]:
     places = [Path(line) for line in _read(record) if isinstance(line, str) and os.path.lexists(line)]
     found = ((place, place.lstat()) for place in places)
     return [place for place, one in found if stat.S_ISDIR(one.st_mode) and one.st_uid == os.geteuid()]
-
-
-def _clear_after(record: Path, target: Path) -> None:
-    """Removes the remains of a killed process; a folder that it had moved away gets its name back."""
-    for place in _left(record):
-        with suppress(OSError):
-            if (place / OLD).is_dir() and not os.path.lexists(target):
-                os.rename(place / OLD, target)
-        _remove(place)
 
 
 def _remove(place: Path) -> None:

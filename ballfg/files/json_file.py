@@ -6,18 +6,13 @@ from typing import Any, Final
 
 from ballfg.files.damaged import whole_content
 
-MAX_VALUES: Final = 8_000_000
-"""Largest number of values in a text, weighted by `_COSTS`: some 300 MB. A capture of 30 MB has 5 to 7 million."""
-_COSTS: Final = {",": 1, ":": 2, "[": 4, "{": 4}
-"""Weights of a value, a name, a list and a mapping, by the sign of each, in proportion to their memory."""
+MAX_VALUES: Final = 8_000_000  # of a text, weighted by `_COSTS`: some 300 MB; a capture of 30 MB has 5 to 7 million
+_COSTS: Final = {",": 1, ":": 2, "[": 4, "{": 4}  # of a value, a name, a list, a mapping: in proportion to their memory
 TOO_MANY: Final = f"it must hold at most {MAX_VALUES} values, a name counted as 2, a list or mapping as 4"
 
 
 def read_json(path: Path) -> Any:
-    """The content of a file.
-
-    Raises: ValueError: not JSON in UTF-8, or too large; the caller names the file. OSError.
-    """
+    """The content of a file. Raises: ValueError: no JSON, or too large; the caller names the file. OSError."""
     try:
         return parse_json(whole_content(path).decode("utf-8"))
     except UnicodeDecodeError:

@@ -76,10 +76,7 @@ def is_own(folder: Path) -> bool:
 
 
 def own_bytes(path: Path) -> bytes:
-    """The content of a file that only this user and root can change; check its folder by `is_own` before.
-
-    Raises: OSError: it cannot be read. ValueError: another user owns it or may write to it, or it is not a file.
-    """
+    """The content of a file that only this user and root can change. Raises: OSError. ValueError: others can."""
     with open(path, "rb") as file:
         found = os.fstat(file.fileno())
         own = stat.S_ISREG(found.st_mode) and found.st_uid in (_ROOT, os.geteuid())

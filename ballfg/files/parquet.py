@@ -12,10 +12,8 @@ import pyarrow.parquet as pq
 from ballfg.checks import MAX_TEXT
 from ballfg.files.damaged import MAX_COLUMNS, NUMBER, check_parts, check_unpacked, library_reads
 
-MAX_FOOTER: Final = 16_000_000
-"""Largest number of bytes of the metadata at a file's end: some 100,000 pieces of columns."""
-MAX_PIECES: Final = 100_000
-"""Largest number of columns times groups of rows."""
+MAX_FOOTER: Final = 16_000_000  # bytes of the metadata at a file's end: some 100,000 pieces of columns
+MAX_PIECES: Final = 100_000  # largest number of columns times groups of rows
 _BUFFER: Final = 1 << 20
 _REMEDY: Final = "Write it again."
 
@@ -51,10 +49,8 @@ def texts_of(column: pa.Array | pa.ChunkedArray) -> list[Any]:
         if not pa.types.is_dictionary(chunk.type):
             found += chunk.to_pylist()
             continue
-        words = [
-            word.decode("utf-8", "replace")[:MAX_TEXT] if isinstance(word, bytes) else word[:MAX_TEXT]
-            for word in chunk.dictionary.to_pylist()
-        ]
+        plain = chunk.dictionary.to_pylist()
+        words = [(one.decode("utf-8", "replace") if isinstance(one, bytes) else one)[:MAX_TEXT] for one in plain]
         found += [None if code is None else words[code] for code in chunk.indices.to_pylist()]
     return found
 
@@ -62,9 +58,7 @@ def texts_of(column: pa.Array | pa.ChunkedArray) -> list[Any]:
 def _unpacked(about: Any) -> int:
     """Number of bytes of all columns by the metadata: of the pages, plus a number for each value."""
     size = 0
-    for group in range(about.num_row_groups):
-        rows = about.row_group(group)
-        for place in range(about.num_columns):
-            piece = rows.column(place)
+    for rows in map(about.row_group, range(about.num_row_groups)):
+        for piece in map(rows.column, range(about.num_columns)):
             size += max(piece.total_uncompressed_size, NUMBER * max(piece.num_values, rows.num_rows))
     return max(size, NUMBER * about.num_rows * about.num_columns)

@@ -19,9 +19,7 @@ T = TypeVar("T")
 def run_file(path: Path, what: str) -> ModuleType:
     """The module of a file, under a name that no import finds, so that worker processes get its whole content.
 
-    Args:
-        path: of a trusted file: all of its code runs.
-        what: kind of content, for the module's name.
+    Args: path: of a trusted file: all of its code runs.  what: kind of content, for the module's name.
     Raises: ValueError: if it does not run; the message has the line.
     """
     module = ModuleType(f"ballfg {what} {path}")
@@ -39,9 +37,8 @@ def load_classes(registry: Registry[T], path: str | Path) -> tuple[type[T], ...]
 
     Args: registry: for classes of one kind.  path: of a file that you trust: all of its code runs.
     Returns: the classes, in the order in which they stand there.
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is no Python, does not run, defines no such class, or one that the registry refuses.
+    Raises: FileNotFoundError: if there is no such file. ValueError: if it is no Python, does not run, defines no such
+        class, or one that the registry refuses.
     """
     path, sort = check_path("path", path).resolve(), registry.sort
     if path.is_dir():

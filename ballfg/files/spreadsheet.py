@@ -8,8 +8,7 @@ Source: OWASP, CSV Injection; Application Security Verification Standard 5, 1.2.
 import re
 from typing import Final
 
-QUOTED: Final = r"^'*[=+\-@\t\r\n＝＋－＠]"
-"""Text with an apostrophe, or in need of one: for RE2 and Python alike."""
+QUOTED: Final = r"^'*[=+\-@\t\r\n＝＋－＠]"  # text with an apostrophe, or in need of one: for RE2 and Python alike
 NUMBER: Final = r"^[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$"
 _QUOTED, _NUMBER = re.compile(QUOTED), re.compile(NUMBER, re.ASCII)
 

@@ -13,17 +13,13 @@ import yaml
 from ballfg.checks import shown, type_name
 
 MAX_BYTES: Final = 16_000_000
-MAX_NODES: Final = 250_000
-"""Largest number of values and keys with all aliases expanded; they take 2 s."""
+MAX_NODES: Final = 250_000  # largest number of values and keys with all aliases expanded; they take 2 s
 MAX_DEPTH: Final = 40
-MAX_DIGITS: Final = 100
-"""Largest number of characters in a number."""
-MAX_KEY: Final = 1000
-"""Largest number of characters in a key, which messages quote in full."""
+MAX_DIGITS: Final = 100  # largest number of characters in a number
+MAX_KEY: Final = 1000  # largest number of characters in a key, which messages quote in full
 _TAG: Final = "tag:yaml.org,2002:"
 _NUMBERS: Final = (f"{_TAG}int", f"{_TAG}float")
-_PARSER: Final = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-"""libyaml's parser, ten times as fast, if PyYAML was built with it."""
+_PARSER: Final = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml's is ten times as fast
 _TEXT_LOADER: Final = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 
 
@@ -51,10 +47,7 @@ class YamlError(ValueError):
 
 
 def read_yaml(path: Path) -> Any:
-    """The content of a YAML file; None if it is empty.
-
-    Raises: ValueError: if it is not YAML, exceeds a bound, or repeats a key (a `YamlError`).
-    """
+    """The content of a file; None if it is empty. Raises: YamlError: no YAML, out of bounds, or a repeated key."""
     if path.stat().st_size > MAX_BYTES:
         raise YamlError(str(path), f"it must have at most {MAX_BYTES / 1e6:g} MB")
     try:
@@ -71,7 +64,11 @@ def parse_yaml(text: str, where: str, *, text_only: bool = False) -> Any:
     Raises: ValueError: as `read_yaml`.
     """
     try:
-        _check_events(where, text)
+        sizes = _Sizes()  # refuses deep nesting, aliases that multiply or contain themselves, tags
+        for event in yaml.parse(text, Loader=_PARSER):
+            if problem := sizes.add(event):
+                mark = event.start_mark
+                raise YamlError(where, problem, None if mark is None else mark.line + 1)
         loader = (_TEXT_LOADER if text_only else _Loader)(text)
         try:
             node = loader.get_single_node()
@@ -81,17 +78,14 @@ def parse_yaml(text: str, where: str, *, text_only: bool = False) -> Any:
             loader.dispose()
     except yaml.MarkedYAMLError as error:
         problem = ", ".join(part for part in (error.context, error.problem) if part)
-        mark = error.problem_mark or error.context_mark
-        raise YamlError(where, problem, None if mark is None else mark.line + 1) from None
+        place = error.problem_mark or error.context_mark
+        raise YamlError(where, problem, None if place is None else place.line + 1) from None
     except yaml.YAMLError as error:
         raise YamlError(where, getattr(error, "reason", str(error))) from None
 
 
 def read_mapping(path: Path) -> dict[Any, Any]:
-    """The content of a YAML file that must be a mapping.
-
-    Raises: FileNotFoundError: no such file. ValueError: not YAML, a repeated key, no mapping; with the file's name.
-    """
+    """The mapping in a YAML file. Raises: FileNotFoundError. ValueError: no YAML, a repeated key, no mapping."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be a file that exists. Correct the path.")
     return mapping(f"{path}: the content", read_yaml(path))
@@ -103,16 +97,6 @@ def mapping(what: str, content: Any) -> dict[Any, Any]:
         got = "an empty one" if content == {} else type_name(content)
         raise ValueError(f"{what} must be a mapping; got {got}. Write it as 'key: value'.")
     return content
-
-
-def _check_events(where: str, text: str) -> None:
-    """Refuses costly text: deep nesting, aliases that multiply or contain themselves, tags."""
-    sizes = _Sizes()
-    for event in yaml.parse(text, Loader=_PARSER):
-        problem = sizes.add(event)
-        if problem:
-            mark = event.start_mark
-            raise YamlError(where, problem, None if mark is None else mark.line + 1)
 
 
 class _Sizes:
@@ -134,7 +118,11 @@ class _Sizes:
             self.nodes += 1
             if event.tag is not None and event.tag != f"{_TAG}str":
                 return f"values must be written without a tag; got {shown(event.tag)}"
-            self._begin(event)
+            collection = isinstance(event, yaml.CollectionStartEvent)
+            if collection:
+                self.open.append((event.anchor, self.nodes - 1))
+            if event.anchor:
+                self.anchors[event.anchor] = None if collection else 1
         elif isinstance(event, yaml.CollectionEndEvent):
             anchor, before = self.open.pop()
             if anchor:
@@ -143,20 +131,9 @@ class _Sizes:
             return f"values must be nested at most {MAX_DEPTH} deep"
         return f"it must hold at most {MAX_NODES} values, aliases written out" if self.nodes > MAX_NODES else ""
 
-    def _begin(self, event: yaml.ScalarEvent | yaml.CollectionStartEvent) -> None:
-        """Notes the anchor of a value."""
-        collection = isinstance(event, yaml.CollectionStartEvent)
-        if collection:
-            self.open.append((event.anchor, self.nodes - 1))
-        if event.anchor:
-            self.anchors[event.anchor] = None if collection else 1
-
 
 def _check_values(where: str, loader: Any, node: yaml.Node | None, prefix: str, seen: set[yaml.Node]) -> None:
-    """Refuses, at any depth, a malformed value and a repeated key.
-
-    The safe loader would silently take the last of two equal keys.
-    """
+    """Refuses, at any depth, a malformed value and a repeated key, of which a loader would take the last."""
     if node is None or node in seen:  # an alias leads to a known node
         return
     seen.add(node)

@@ -8,15 +8,11 @@ from torch import Tensor
 
 from ballfg.files.damaged import library_reads
 
-MAX_HEADER: Final = 1_000_000
-"""Largest number of bytes of the names and shapes in a file; the header of this package's networks has some 2,000."""
+MAX_HEADER: Final = 1_000_000  # bytes of names and shapes in a file; those of this package's networks take some 2,000
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
-    """The tensors of a file by name.
-
-    Raises: ValueError: a damaged file, with its name. FileNotFoundError: no such file.
-    """
+    """The tensors of a file by name. Raises: ValueError: a damaged file. FileNotFoundError: no such file."""
     if not path.is_file():
         raise FileNotFoundError(f"{path} must be a file of weights; there is none. Copy it again.")
     with library_reads(path, "safetensors"):

@@ -28,19 +28,14 @@ def whole_file(path: Path, argument: str = "out") -> Iterator[Path]:
     with held(target, argument), hidden(target.parent, target, path) as place:
         temporary = place / path.name
         yield temporary
-        _as_before(temporary, target)
+        with suppress(FileNotFoundError):  # the owner and the mode of the file that it replaces
+            found = target.stat()
+            with suppress(PermissionError):
+                os.chown(temporary, found.st_uid, found.st_gid)
+            os.chmod(temporary, stat.S_IMODE(found.st_mode) & 0o777)
         flush(temporary)
         os.replace(temporary, target)
         flush(target.parent)
-
-
-def _as_before(temporary: Path, target: Path) -> None:
-    """Gives a file the owner and the mode of the one that it replaces."""
-    with suppress(FileNotFoundError):
-        found = target.stat()
-        with suppress(PermissionError):
-            os.chown(temporary, found.st_uid, found.st_gid)
-        os.chmod(temporary, stat.S_IMODE(found.st_mode) & 0o777)
 
 
 def write_text(path: Path, text: str) -> None:

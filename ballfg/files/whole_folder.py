@@ -17,8 +17,7 @@ from ballfg.files.whole_file import check_parent, flush
 P = ParamSpec("P")
 T = TypeVar("T")
 
-DEEPEST: Final = 100
-"""Largest depth of folders in a result."""
+DEEPEST: Final = 100  # largest depth of folders in a result
 
 
 @contextmanager
@@ -83,10 +82,7 @@ def reserved(folder: Path, argument: str = "out") -> Iterator[None]:
 
 
 def check_folder(folder: Path, argument: str = "out") -> Path:
-    """The folder without links.
-
-    Raises: FileNotFoundError: its parent does not exist. ValueError: it is a file, or a link that leads nowhere.
-    """
+    """The folder without links. Raises: FileNotFoundError: no parent. ValueError: a file, or a link to nowhere."""
     check_parent(folder, argument)
     if os.path.lexists(folder) and not folder.is_dir():
         raise ValueError(f"{argument} must be a folder; {folder} is a file. Choose another name.")
@@ -138,10 +134,7 @@ def _exchangeable(folder: Path, argument: str) -> Path:
 
 
 def _staying(old: Path, new: Path, patterns: Collection[str]) -> Iterator[tuple[Path, Path, str]]:
-    """The files of an earlier result that stay: each file, its place in the new folder, and its name.
-
-    Folders are made in the new one, and get their modes at the end. Raises: OSError: one is mounted, or too deep.
-    """
+    """The files of an earlier result that stay: file, new place, name. Raises: OSError: one is mounted, or too deep."""
     folders = [""]
     for within in folders:
         if within.count("/") == DEEPEST or (within and os.path.ismount(old / within)):
@@ -191,10 +184,7 @@ def exchange(one: Path, other: Path) -> None:
 
 
 def of_one_state(read: Callable[P, T]) -> Callable[P, T]:
-    """A reader that repeats if its folder was exchanged meanwhile, so that all files belong to one result.
-
-    Args: read: takes the folder, or a file in it, as its first argument.
-    """
+    """A reader that repeats if the folder, or that of the file, in its first argument was exchanged meanwhile."""
 
     @wraps(read)
     def steady(*args: P.args, **kwargs: P.kwargs) -> T:

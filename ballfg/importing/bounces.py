@@ -1,4 +1,4 @@
-"""Finds the height of the table from the bounces of the balls."""
+"""Determines the height of the table from the bounces of the balls, and the ball by its drag."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -7,49 +7,42 @@ from typing import Final
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.importing.choices import Choices, Guess, UndecidedError
+from ballfg.importing.frame import Frame
+from ballfg.tracks import TABLE_TENNIS, Ball, Track
+from ballfg.tracks.info import TENNIS
 
-_ARM: Final = 0.06
-"""s of flight for the fit on each side of a bounce."""
+_ARM: Final = 0.06  # s of flight for the fit on each side of a bounce
 _LEAST_SAMPLES: Final = 3
-_LEAST_SPEED: Final = 0.7
-"""m/s, least speed of the fall before and of the rise after a bounce; slower ones are rolling balls and noise."""
-_MOST_RESIDUAL: Final = 0.02
-"""m, largest root mean square about the two flights; a larger one means a hit, an outlier, or two balls."""
-_SAME: Final = 0.04
-"""m: bounces within this distance of each other are on one surface."""
-_SHARE: Final = 0.3
-"""Share of the most frequent surface's bounces from which a higher surface is the table: balls bounce on below it."""
-_GRAVITY: Final = 10.0
-"""m/s^2, of the fitted arcs: gravity and a little topspin. An error of 5 moves a bounce by 2 mm."""
+_LEAST_SPEED: Final = 0.7  # m/s, of the fall before and the rise after a bounce; slower are rolling balls and noise
+_MOST_RESIDUAL: Final = 0.02  # m, root mean square about the two flights; more means a hit, an outlier, or two balls
+_SAME: Final = 0.04  # m: bounces within this distance of each other are on one surface
+_SHARE: Final = 0.3  # of the most frequent surface's bounces that make a higher one the table: balls bounce on below it
+_GRAVITY: Final = 10.0  # m/s^2, of the fitted arcs: gravity and a little topspin. An error of 5 moves a bounce by 2 mm.
+BALLS: Final = {"table-tennis": TABLE_TENNIS, "tennis": TENNIS}
+_TENNIS_DRAG: Final = 0.045  # 1/m; halfway, in ratio, between the drags of the two balls
+_SURE_WINDOWS: Final = 30  # number of flight parts from which their drag distinguishes the balls
 
 
 @dataclass(frozen=True)
 class Surface:
     """A height at which balls bounce."""
 
-    centre: float
-    """m, of the ball's centre at contact, the median of the bounces."""
-    spread: float
-    """m, standard deviation of one bounce."""
+    centre: float  # m, of the ball's centre at contact, the median of the bounces
+    spread: float  # m, standard deviation of one bounce
     bounces: int
-    others: tuple[float, ...] = ()
-    """m, centres at further surfaces."""
+    others: tuple[float, ...] = ()  # m, centres at further surfaces
 
 
 def surface(shots: Iterable[tuple[Array, Array]]) -> Surface | None:
-    """The surface of most bounces, or a higher one with nearly as many.
-
-    Args: shots: times (n,) s and positions (n, 3) m, z up.
-    Returns: None without a bounce.
-    """
+    """The surface of most bounces, or a higher one with nearly as many; of times (n,) s and positions (n, 3) m."""
     heights = np.sort([height for t, p in shots for height in bounce_heights(t, p[:, 2])])
     groups: list[Array] = []
     while len(heights):
         near = np.searchsorted(heights, heights + _SAME, side="right") - np.searchsorted(heights, heights - _SAME)
-        middle = heights[int(np.argmax(near))]
-        inside = np.abs(heights - middle) <= _SAME
-        groups.append(heights[inside])
-        heights = heights[np.abs(heights - middle) > 2.0 * _SAME]
+        apart = np.abs(heights - heights[int(np.argmax(near))])
+        groups.append(heights[apart <= _SAME])
+        heights = heights[apart > 2.0 * _SAME]
     if not groups:
         return None
     often = [group for group in groups if len(group) >= max(_SHARE * len(groups[0]), 1.0)]
@@ -60,39 +53,31 @@ def surface(shots: Iterable[tuple[Array, Array]]) -> Surface | None:
 
 
 def bounce_heights(times: Array, heights: Array) -> list[float]:
-    """The heights (m) of one ball's bounces: where the arc before meets the arc after.
-
-    Args: times: (n,) s.  heights: (n,) m.
-    """
+    """Heights (m) of a ball's bounces, where arcs before and after meet; of times (n,) s and heights (n,) m."""
     found: list[tuple[float, float, float]] = []
-    n = len(times)
-    for i in range(1, n - 2):
+    for i in range(1, len(times) - 2):
         # the bounce lies between samples i and i + 1, or one of them is the lowest of its neighbours
         if min(heights[i], heights[i + 1]) > min(heights[i - 1], heights[i + 2]):
             continue
-        arms = _arms(times, i)
-        if arms is None:
+        first = min(int(np.searchsorted(times, times[i] - _ARM)), max(i - _LEAST_SAMPLES + 1, 0))
+        last = int(np.searchsorted(times, times[i + 1] + _ARM, side="right"))
+        last = max(last, min(i + 1 + _LEAST_SAMPLES, len(times)))
+        if i + 1 - first < _LEAST_SAMPLES or last - i - 1 < _LEAST_SAMPLES:
             continue
+        arms = (slice(first, i + 1), slice(i + 1, last))  # the flight before, up to i, and after
         before, after = (_arc(times[part], heights[part], times[i]) for part in arms)
         if before[1] > -_LEAST_SPEED or after[1] < _LEAST_SPEED or max(before[2], after[2]) > _MOST_RESIDUAL:
             continue
         when = (before[0] - after[0]) / (after[1] - before[1])
         step = times[i + 1] - times[i]
         if -0.1 * step <= when <= 1.1 * step:
-            found.append(
-                (before[2] + after[2], times[i] + when, before[0] + before[1] * when - 0.5 * _GRAVITY * when**2)
-            )
-    return [height for _, _, height in _distinct(found)]
-
-
-def _arms(times: Array, i: int) -> Sequence[slice] | None:
-    """The samples of the flight before, up to i, and after, from i + 1."""
-    first = max(int(np.searchsorted(times, times[i] - _ARM)), 0)
-    last = int(np.searchsorted(times, times[i + 1] + _ARM, side="right"))
-    first, last = min(first, max(i - _LEAST_SAMPLES + 1, 0)), max(last, min(i + 1 + _LEAST_SAMPLES, len(times)))
-    if i + 1 - first < _LEAST_SAMPLES or last - i - 1 < _LEAST_SAMPLES:
-        return None
-    return slice(first, i + 1), slice(i + 1, last)
+            height = before[0] + before[1] * when - 0.5 * _GRAVITY * when**2
+            found.append((before[2] + after[2], times[i] + when, height))
+    kept: list[tuple[float, float, float]] = []
+    for bounce in sorted(found):  # the best-fitting of bounces less than the length of an arm apart
+        if all(abs(bounce[1] - other[1]) > _ARM for other in kept):
+            kept.append(bounce)
+    return [height for _, _, height in kept]
 
 
 def _arc(times: Array, heights: Array, origin: float) -> tuple[float, float, float]:
@@ -105,10 +90,42 @@ def _arc(times: Array, heights: Array, origin: float) -> tuple[float, float, flo
     return float(height), float(speed), float(np.sqrt(np.mean(residual**2)))
 
 
-def _distinct(found: list[tuple[float, float, float]]) -> list[tuple[float, float, float]]:
-    """The best-fitting of bounces less than the length of an arm apart."""
-    kept: list[tuple[float, float, float]] = []
-    for bounce in sorted(found):
-        if all(abs(bounce[1] - other[1]) > _ARM for other in kept):
-            kept.append(bounce)
-    return kept
+def ball_of(choices: Choices, frame: Frame) -> tuple[Ball, Guess]:
+    """The ball, and the confidence in it.
+
+    Args: choices: of the user.  frame: with the drag (1/m) of the flights.
+    Raises: FileNotFoundError, ValueError: an unknown chosen ball, or a file that cannot be read.
+    """
+    if choices.ball is not None:
+        from ballfg.simulation.balls import ball_kind
+
+        ball = BALLS[choices.ball] if choices.ball in BALLS else ball_kind(choices.ball).ball
+        return ball, Guess("ball", choices.ball, "as given", "stated", f"--ball {choices.ball}")
+    why, sure = "too little flight to show the drag", "unsure"
+    if frame.drag is not None and frame.windows >= _SURE_WINDOWS:
+        why = f"the drag is only {frame.drag:.2f} 1/m (a tennis ball has 0.02): if it is another ball, name it"
+        if frame.drag >= _TENNIS_DRAG:
+            why, sure = f"drag {frame.drag:.2f} 1/m; a table-tennis ball has 0.13, a tennis ball 0.02", "likely"
+    return TABLE_TENNIS, Guess("ball", "table-tennis", why, sure, "--ball tennis")
+
+
+def table_of(tracks: Sequence[Track], ball: Ball, choices: Choices) -> tuple[float, Guess]:
+    """The height of the table's surface in m, and the confidence in it.
+
+    Args: tracks: in m and s with z up.  ball: its radius lies between a bounce and the surface.  choices: of the user.
+    Raises: UndecidedError: no bounce shows it.
+    """
+    if choices.table_height is not None:
+        height = choices.table_height
+        return height, Guess("table height", f"{height:g} m", "as given", "stated", f"--table-height {height:g}")
+    found = surface((track.seconds, track.positions) for track in tracks)
+    if found is None:
+        lowest = min(float(track.positions[:, 2].min()) for track in tracks)
+        what = f"no bounce shows the height of the table (m, along the up axis); the lowest sample is at {lowest:.2f} m"
+        raise UndecidedError(what, "table-height", (), f"{lowest - ball.radius:.2f}" if lowest > 0.5 else "0.76")
+    height = round(found.centre - ball.radius, 4)
+    others = "".join(f"; also at {other - ball.radius:.2f} m" for other in found.others)
+    one = "1 bounce" if found.bounces == 1 else f"{found.bounces} bounces"
+    why = f"{one}, scatter {1e3 * found.spread:.1f} mm{others}"
+    sure = "sure" if found.bounces >= 3 and not found.others else "likely"
+    return height, Guess("table height", f"{height:g} m", why, sure, f"--table-height {height:g}")

@@ -7,12 +7,10 @@ from typing import Final
 from ballfg.checks import check_choice, check_instance, check_number, check_text, short_text, shown
 from ballfg.importing.fall import AXES, LENGTHS, TIMES
 
-ROLES: Final = ("t", "frame", "trajectory", "x", "y", "z", "sigma_x", "sigma_y", "sigma_z")
-"""Possible roles of a column."""
-MAX_WHAT: Final = 900
-"""Largest number of characters of an open question in a message."""
-MAX_CHOICE: Final = 240
-"""Largest number of characters of a choice in it, for three column names of usual length."""
+ROLES: Final = ("t", "frame", "trajectory", "x", "y", "z", "sigma_x", "sigma_y", "sigma_z")  # of a column
+_EXAMPLE: Final = "--columns t=stamp,x=X."
+MAX_WHAT: Final = 900  # largest number of characters of an open question in a message
+MAX_CHOICE: Final = 240  # largest number of characters of a choice in it, for three column names of usual length
 
 
 class UndecidedError(ValueError):
@@ -53,29 +51,22 @@ class Choices:
     name: str | None = None
 
     def __post_init__(self) -> None:
-        for option, value, known in (
-            ("length", self.length, tuple(LENGTHS)),
-            ("time", self.time, tuple(TIMES)),
-            ("up", self.up, AXES),
-            ("flip", self.flip, ("x", "y", "z")),
-        ):
-            if value is not None:
-                check_choice(f"--{option}", value, known)
-        check_instance("--columns", self.columns, Mapping, "Write --columns t=stamp,x=X.")
+        for option, choices in {"length": (*LENGTHS,), "time": (*TIMES,), "up": AXES, "flip": ("x", "y", "z")}.items():
+            if getattr(self, option) is not None:
+                check_choice(f"--{option}", getattr(self, option), choices)
+        check_instance("--columns", self.columns, Mapping, f"Write {_EXAMPLE}")
         for role, column in self.columns.items():
             check_text(f"the column of {shown(role)} in --columns", column)
             if role not in ROLES:
-                raise ValueError(
-                    f"--columns must name roles among {', '.join(ROLES)}; got {shown(role)}. Write --columns "
-                    "t=stamp,x=X."
-                )
+                known = ", ".join(ROLES)
+                raise ValueError(f"--columns must name roles among {known}; got {shown(role)}. Write {_EXAMPLE}")
         for option, number in (("rate", self.rate), ("split-gap", self.split_gap)):
             if number is not None:
                 check_number(f"--{option}", number, above=0.0)
         if self.table_height is not None:
             check_number("--table-height", self.table_height, "m")
-        for option, text in (("ball", self.ball), ("key", self.key), ("topic", self.topic), ("name", self.name)):
-            check_text(f"--{option}", text, optional=True)
+        for option in ("ball", "key", "topic", "name"):
+            check_text(f"--{option}", getattr(self, option), optional=True)
 
 
 @dataclass(frozen=True)
@@ -85,18 +76,12 @@ class Guess:
     what: str
     value: str
     why: str
-    sure: str
-    """stated, sure, likely or unsure."""
-    option: str
-    """The option that changes it, as typed; empty if it cannot be changed."""
+    sure: str  # stated, sure, likely or unsure
+    option: str  # the option that changes it, as typed; empty if it cannot be changed
 
 
 def parse_columns(text: str) -> dict[str, str]:
-    """Roles and columns from text such as "t=stamp,x=X".
-
-    Returns: role -> name of the column.
-    Raises: ValueError: another form.
-    """
+    """Role -> column from text such as "t=stamp,x=X". Raises: ValueError: another form."""
     found: dict[str, str] = {}
     for part in text.split(","):
         role, sign, column = part.partition("=")

@@ -12,14 +12,11 @@ from ballfg.importing.formats.raw import RawTable, is_number, numbers
 from ballfg.importing.names import Meaning, meanings
 from ballfg.importing.stamps import as_stamps
 
-RATES: Final = ("rate", "fps", "frame_rate", "framerate", "hz", "sampling_rate", "frequency")
-"""Names of a constant that is the number of frames per second."""
+RATES: Final = ("rate", "fps", "frame_rate", "framerate", "hz", "sampling_rate", "frequency")  # frames per second
 UNITS: Final = ("unit", "units", "length_unit", "position_unit")
-_REGULAR: Final = 0.3
-"""Largest median deviation of the steps of a time column, in median steps; coordinates vary more."""
+_REGULAR: Final = 0.3  # largest median deviation of the steps of a time column, in median steps; coordinates vary more
 _FORWARD: Final = 0.9
-_PIECES: Final = 0.2
-"""Largest number of changes, per row, of a column with the names of trajectories."""
+_PIECES: Final = 0.2  # largest number of changes, per row, of a column with the names of trajectories
 
 
 @dataclass(frozen=True)
@@ -27,8 +24,7 @@ class Roles:
     """The columns of one table by role."""
 
     places: tuple[str, str, str]
-    time: tuple[str, ...]
-    """One column of stamps, two of s and ns, or none."""
+    time: tuple[str, ...]  # one column of stamps, two of s and ns, or none
     frame: str | None = None
     trajectory: str | None = None
     sigmas: tuple[str, str, str] | None = None
@@ -40,10 +36,7 @@ class Roles:
 
 
 def roles_of(table: RawTable, choices: Choices) -> Roles | None:
-    """The roles of a table's columns; None if it holds no positions.
-
-    Raises: UndecidedError: several readings. ValueError: only positions in an image, or an unknown column.
-    """
+    """The roles of a table's columns; None without positions. Raises: UndecidedError. ValueError: an unknown column."""
     given = {role: _existing(table, name) for role, name in choices.columns.items()}
     read = {name: meanings(name) for name in table.columns} if table.named else {}
     places, units = _places(table, read, given)
@@ -60,7 +53,11 @@ def roles_of(table: RawTable, choices: Choices) -> Roles | None:
             frames += [counter] if counter else []
         if table.named and not time and not frames:
             return None
-        trajectory = trajectory or _pieces(table, {*time, *frames})
+        for name, column in table.columns.items() if trajectory is None else ():
+            changes = int((column[1:] != column[:-1]).sum()) if column.dtype.kind != "f" else 0
+            if name not in (*time, *frames) and 0 < changes <= _PIECES * len(column):
+                trajectory = name
+                break
         found = _numeric_rest(table, {*time, *frames, *([trajectory] if trajectory else [])})
         left = [n for n, c in table.columns.items() if is_number(c) and n not in (*time, *frames, trajectory)]
         if len(found) < 3 and len(left) == 3:  # a coordinate may be constant
@@ -68,12 +65,8 @@ def roles_of(table: RawTable, choices: Choices) -> Roles | None:
         if len(found) < 3:
             return None
         if len(found) > 3:
-            raise UndecidedError(
-                f"{table.where}: x, y and z must be three columns; {listed(found[:8])} may be meant",
-                "columns",
-                (),
-                "x={},y={},z={}".format(*found[:3]),
-            )
+            what = f"{table.where}: x, y and z must be three columns; {listed(found[:8])} may be meant"
+            raise UndecidedError(what, "columns", (), "x={},y={},z={}".format(*found[:3]))
         places = (found[0], found[1], found[2])
         counters = frames
     frame = given.get("frame") or next((n for n, ms in read.items() for m in ms if m.role == "frame"), None)
@@ -81,6 +74,9 @@ def roles_of(table: RawTable, choices: Choices) -> Roles | None:
     if not time and frame is None:
         time, frame = _time_by_numbers(table, {*places, *([trajectory] if trajectory else [])})
     sigmas, unit, rate = _sigmas(read, given), _constant(table, UNITS), _constant(table, RATES)
+    time_unit = "ns" if len(time) == 2 else None
+    if len(time) == 1:
+        time_unit = next((m.unit for m in read.get(time[0], []) if m.role in ("t", "seconds") and m.unit), None)
     used = {*places, *time, *(sigmas or ())} | {one for one in (frame, trajectory) if one}
     return Roles(
         places,
@@ -89,7 +85,7 @@ def roles_of(table: RawTable, choices: Choices) -> Roles | None:
         trajectory,
         sigmas,
         units or (unit.strip().lower() if isinstance(unit, str) else None),
-        _time_unit(read, time),
+        time_unit,
         float(rate) if isinstance(rate, int | float) and rate > 0 else None,
         by_name,
         tuple(name for name in table.columns if name not in used and name.lower() not in (*RATES, *UNITS)),
@@ -133,11 +129,8 @@ def _places(
     found_units = {meaning.unit for _, meaning in best[0].values()}
     if len(found_units) > 1:
         units = sorted(short_text(str(unit)) for unit in found_units)
-        raise UndecidedError(
-            f"{table.where}: x, y and z must have one unit; their names state {', '.join(units)}",
-            "length",
-            [unit for unit in units if unit != "None"],
-        )
+        what = f"{table.where}: x, y and z must have one unit; their names state {', '.join(units)}"
+        raise UndecidedError(what, "length", [unit for unit in units if unit != "None"])
     return (chosen["x"], chosen["y"], chosen["z"]), found_units.pop()
 
 
@@ -177,9 +170,8 @@ def _named_time(
     best = [name for rank, name in candidates if rank == least]
     moving = [name for name in best if len(set(table.columns[name][:1000].tolist())) > 1] or best
     if len(moving) > 1 and not _one_clock(table, moving):
-        raise UndecidedError(
-            f"{table.where}: {' and '.join(moving)} may both be the time", "columns", [f"t={name}" for name in moving]
-        )
+        what = f"{table.where}: {' and '.join(moving)} may both be the time"
+        raise UndecidedError(what, "columns", [f"t={name}" for name in moving])
     return (moving[0],)
 
 
@@ -192,9 +184,9 @@ def _one_clock(table: RawTable, names: list[str]) -> bool:
         a, b = (np.asarray(one - one[0], dtype=np.float64) for one in (first, other))
         slope = float(a @ b) / max(float(a @ a), 1e-300)
         power = np.log10(abs(slope)) if slope else np.inf
-        if not np.isfinite(power):
+        if not np.isfinite(power) or abs(power - round(power)) > 1e-3:
             return False
-        if abs(power - round(power)) > 1e-3 or np.abs(b - slope * a).max() > 1e-3 * max(np.abs(b).max(), 1e-300):
+        if np.abs(b - slope * a).max() > 1e-3 * max(np.abs(b).max(), 1e-300):
             return False
     return True
 
@@ -204,13 +196,10 @@ def _trajectory(
 ) -> str | None:
     if "trajectory" in given:
         return given["trajectory"]
-    candidates = sorted(
-        (m.rank, name) for name, found in read.items() for m in found if m.role == "trajectory" and name not in used
-    )
-    for _, name in candidates:
+    ranked = [(m.rank, name) for name, found in read.items() for m in found if m.role == "trajectory"]
+    for _, name in sorted(ranked):
         column = table.texts.get(name, table.columns[name])
-        distinct = len(set(column.tolist()))
-        if distinct <= max(1, len(column) // 3):
+        if name not in used and len(set(column.tolist())) <= max(1, len(column) // 3):
             return name
     return None
 
@@ -221,9 +210,9 @@ def _numeric_rest(table: RawTable, used: set[str]) -> list[str]:
     for name, column in table.columns.items():
         values = numbers(column)
         held = values[np.isfinite(values)]
-        counts = column.dtype.kind == "i" and len(held) > 2 and bool((np.abs(np.diff(held)) <= 1).mean() > _FORWARD)
-        if name not in used and len(held) > 2 and np.ptp(held) > 0 and not counts:
-            found.append(name)
+        if name not in used and len(held) > 2 and np.ptp(held) > 0:
+            counts = column.dtype.kind == "i" and (np.abs(np.diff(held)) <= 1).mean() > _FORWARD
+            found += [] if counts else [name]
     return found
 
 
@@ -248,27 +237,10 @@ def _time_by_numbers(table: RawTable, used: set[str]) -> tuple[tuple[str, ...], 
     return ((), name) if counter else ((name,), None)
 
 
-def _pieces(table: RawTable, used: set[str]) -> str | None:
-    for name, column in table.columns.items():
-        if name in used or column.dtype.kind == "f":
-            continue
-        changes = int((column[1:] != column[:-1]).sum())
-        if 0 < changes <= _PIECES * len(column):
-            return name
-    return None
-
-
 def _sigmas(read: Mapping[str, list[Meaning]], given: Mapping[str, str]) -> tuple[str, str, str] | None:
     found = {m.role: name for name, ms in read.items() for m in ms if m.role.startswith("sigma")} | dict(given)
-    if all(f"sigma_{axis}" in found for axis in "xyz"):
-        return found["sigma_x"], found["sigma_y"], found["sigma_z"]
-    return None
-
-
-def _time_unit(read: Mapping[str, list[Meaning]], time: tuple[str, ...]) -> str | None:
-    if len(time) != 1:
-        return "ns" if time else None
-    return next((m.unit for m in read.get(time[0], []) if m.role in ("t", "seconds") and m.unit), None)
+    x, y, z = (found.get(f"sigma_{axis}") for axis in "xyz")
+    return (x, y, z) if x and y and z else None
 
 
 def _constant(table: RawTable, names: tuple[str, ...]) -> object:

@@ -2,34 +2,25 @@
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.state import STANDARD_GRAVITY
 
-LENGTHS: Final = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
-"""Units of length in m."""
-TIMES: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-"""Units of time in s."""
-AXES: Final = ("x", "-x", "y", "-y", "z", "-z")
-"""Possible directions of up."""
-
-_WINDOW: Final = 0.12
-"""s for the fit of an acceleration: with 3 mm of noise at 100 Hz its error is 2 m/s^2, and most flights are longer."""
-_STEPS: Final = (1e-4, 0.34)
-"""s between two samples, least and most: no camera of balls is faster, and slower ones do not show the fall."""
+LENGTHS: Final = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}  # units of length in m
+TIMES: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # units of time in s
+Shot: TypeAlias = tuple[Array, Array]  # stamps (n,) and positions (n, 3)
+AXES: Final = ("x", "-x", "y", "-y", "z", "-z")  # possible directions of up
+_WINDOW: Final = 0.12  # s, fit of an acceleration: 3 mm of noise at 100 Hz leave 2 m/s^2; most flights are longer
+_STEPS: Final = (1e-4, 0.34)  # s between two samples: no camera is faster, and slower ones do not show the fall
 _LEAST_SAMPLES: Final = 5
-_WIDTH: Final = 0.3
-"""Standard deviation, in gravities, of an acceleration about its model: noise, spin and bounces in the window."""
-_DRAGS: Final = np.linspace(0.0, 0.2, 11)
-"""1/m; a table-tennis ball has 0.13, a tennis ball 0.02."""
+_WIDTH: Final = 0.3  # gravities, standard deviation of an acceleration about its model: noise, spin, bounces
+_DRAGS: Final = np.linspace(0.0, 0.2, 11)  # 1/m; a table-tennis ball has 0.13, a tennis ball 0.02
 _MOST_WINDOWS: Final = 4000
-_MOST_SPEED: Final = 120.0
-"""m/s, largest speed; the fastest smash of any ball game is slower."""
-_COINCIDENCE: Final = 0.02
-"""Share of windows that fit a wrong axis or unit by chance; it keeps the ratio of two small scores near one."""
+_MOST_SPEED: Final = 120.0  # m/s, largest speed; the fastest smash of any ball game is slower
+_COINCIDENCE: Final = 0.02  # share of windows that fit by chance; it keeps the ratio of two small scores near one
 
 
 @dataclass(frozen=True)
@@ -39,15 +30,13 @@ class Scale:
     length: str
     time: str
     up: str
-    score: float
-    """Weighted share of the windows with the acceleration of a falling ball, 0 to 1."""
+    score: float  # weighted share of the windows with the acceleration of a falling ball, 0 to 1
     windows: int
-    drag: float
-    """1/m, the quadratic drag that fits the windows best."""
+    drag: float  # 1/m, the quadratic drag that fits the windows best
 
 
 def scales(
-    shots: Sequence[tuple[Array, Array]],
+    shots: Sequence[Shot],
     lengths: Collection[str] = tuple(LENGTHS),
     times: Collection[str] = tuple(TIMES),
     ups: Collection[str] = AXES,
@@ -86,7 +75,7 @@ def odds(best: float, other: float) -> float:
     return (best + _COINCIDENCE) / (other + _COINCIDENCE)
 
 
-def _windows(shots: Sequence[tuple[Array, Array]], unit: float) -> tuple[Array, Array]:
+def _windows(shots: Sequence[Shot], unit: float) -> tuple[Array, Array]:
     """Velocities and accelerations (k, 3) in lengths per s and s^2, of windows that overlap by half."""
     steps = [float(np.median(np.diff(t))) * unit for t, _ in shots if len(t) >= _LEAST_SAMPLES]
     if not steps or not _STEPS[0] <= np.median(steps) <= _STEPS[1]:

@@ -8,18 +8,15 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.importing.choices import Choices, Guess, UndecidedError
-from ballfg.importing.fall import AXES, LENGTHS, TIMES, Scale, odds, scales
+from ballfg.importing.fall import AXES, LENGTHS, TIMES, Scale, Shot, odds, scales
 
-_LIKELY: Final = 2.0
-"""Least odds of the best reading against the next."""
+_LIKELY: Final = 2.0  # least odds of the best reading against the next
 _SURE: Final = 4.0
-_AGAINST: Final = 4.0
-"""Odds against a stated unit from which it is doubted."""
-_LEAST_SCORE: Final = 0.12
-"""Least score of a falling ball."""
+_AGAINST: Final = 4.0  # odds against a stated unit from which it is doubted
+_LEAST_SCORE: Final = 0.12  # least score of a falling ball
 RATES: Final = (24, 25, 30, 50, 60, 90, 100, 120, 125, 150, 180, 200, 240, 250, 300, 360, 400, 480, 500, 600, 960, 1000)
 """Hz, of usual cameras."""
-
+_NAMES: Final = {"length": "unit of length", "time": "unit of time", "up": "up axis"}
 _DECIMAL: Final = ("m", "cm", "mm")
 
 TURNS: Final = {
@@ -41,8 +38,7 @@ class Frame:
     time: str
     up: str
     flip: str | None
-    drag: float | None
-    """1/m, from the falls."""
+    drag: float | None  # 1/m, from the falls
     windows: int = 0
 
     def metres(self, positions: Array) -> Array:
@@ -72,11 +68,7 @@ class Frame:
 
 
 def find_frame(
-    shots: Sequence[tuple[Array, Array]],
-    choices: Choices,
-    stated_length: str | None,
-    stated_time: str | None,
-    time_why: str,
+    shots: Sequence[Shot], choices: Choices, stated_length: str | None, stated_time: str | None, time_why: str
 ) -> tuple[Frame, list[Guess]]:
     """The units and the up axis, with a line of the proposal for each.
 
@@ -98,62 +90,47 @@ def find_frame(
     if not found and not decided:
         _no_flight(shots, known_length, known_time)
     best = found[0] if found else Scale(lengths[0], times[0], ups[0], 0.0, 0, 0.0)
-    if not decided:
-        for option, values in (("length", lengths), ("time", times), ("up", ups)):
-            _decide(option, best, found, len(values) > 1)
-    why = f"balls fall at 9.81 m/s^2 in it: {best.score:.0%} of {best.windows} short stretches agree"
+    for option, values in (("length", lengths), ("time", times), ("up", ups)):
+        if len(values) > 1:
+            _decide(option, best, found)
     lines = [
-        _line("unit of length", "length", best, found, choices.length, stated_length, why, "named in the source"),
-        _line("unit of time", "time", best, found, choices.time, stated_time, why, time_why),
-        _line("up axis", "up", best, found, choices.up, None, why, ""),
+        _line("length", best, found, choices.length, stated_length, "named in the source"),
+        _line("time", best, found, choices.time, stated_time, time_why),
+        _line("up", best, found, choices.up, None, ""),
     ]
     drag = best.drag if best.score >= _LEAST_SCORE else None
     frame = Frame(best.length, best.time, best.up, choices.flip, drag, best.windows)
-    hand = (
-        f"mirrored along {choices.flip} as stated"
-        if choices.flip
-        else "taken for right-handed: positions cannot show it"
-    )
-    lines.append(Guess("turn", frame.rotation, hand, "stated" if choices.flip else "likely", "--flip y"))
+    hand, sure = "taken for right-handed: positions cannot show it", "likely"
+    if choices.flip:
+        hand, sure = f"mirrored along {choices.flip} as stated", "stated"
+    lines.append(Guess("turn", frame.rotation, hand, sure, "--flip y"))
     return frame, lines
 
 
-def likely_rate(shots: Sequence[tuple[Array, Array]], length: str | None) -> int | None:
+def likely_rate(shots: Sequence[Shot], length: str | None) -> int | None:
     """The usual camera rate at which balls fall with gravity; stamps are numbers of frames.
 
     Args: shots: frames (n,) and positions (n, 3).  length: their unit if known; else m, cm or mm, which no usual rates
         confuse.
     """
     lengths = (length,) if length in LENGTHS else _DECIMAL
-    scored = [
-        (found[0].score, rate)
-        for rate in RATES
-        if (found := scales([(t / rate, p) for t, p in shots], lengths, ("s",)))
-    ]
-    best = max(scored, default=(0.0, 0))
-    return best[1] if best[0] >= _LEAST_SCORE else None
+    found = {rate: scales([(t / rate, p) for t, p in shots], lengths, ("s",)) for rate in RATES}
+    score, rate = max(((best[0].score, rate) for rate, best in found.items() if best), default=(0.0, 0))
+    return rate if score >= _LEAST_SCORE else None
 
 
 def _line(
-    what: str,
-    option: str,
-    best: Scale,
-    found: Sequence[Scale],
-    chosen: str | None,
-    stated: str | None,
-    why: str,
-    named: str,
+    option: str, best: Scale, found: Sequence[Scale], chosen: str | None, stated: str | None, named: str
 ) -> Guess:
     value = getattr(best, option)
-    typed = f"--{option} {value}"
+    why, sure = f"balls fall at 9.81 m/s^2 in it: {best.score:.0%} of {best.windows} short stretches agree", "likely"
     if chosen:
-        return Guess(what, value, "as given", "stated", typed)
-    ratio = _ratio(option, best, found)
-    if stated == value:
-        return Guess(
-            what, value, f"{named}, and the fall agrees" if best.score > _LEAST_SCORE else named, "sure", typed
-        )
-    return Guess(what, value, why, "sure" if ratio >= _SURE else "likely", typed)
+        why, sure = "as given", "stated"
+    elif stated == value:
+        why, sure = f"{named}, and the fall agrees" if best.score > _LEAST_SCORE else named, "sure"
+    elif _ratio(option, best, found) >= _SURE:
+        sure = "sure"
+    return Guess(_NAMES[option], value, why, sure, f"--{option} {value}")
 
 
 def _ratio(option: str, best: Scale, found: Sequence[Scale]) -> float:
@@ -161,34 +138,32 @@ def _ratio(option: str, best: Scale, found: Sequence[Scale]) -> float:
     return np.inf if other is None else odds(best.score, other.score)
 
 
-def _decide(option: str, best: Scale, found: Sequence[Scale], open_: bool) -> None:
+def _decide(option: str, best: Scale, found: Sequence[Scale]) -> None:
     """Refuses a reading that is hardly better than another one."""
     ratio = _ratio(option, best, found)
-    if not open_ or (ratio >= _LIKELY and best.score >= _LEAST_SCORE):
+    if ratio >= _LIKELY and best.score >= _LEAST_SCORE:
         return
     values = list(dict.fromkeys(getattr(one, option) for one in found))[:3]
     if ratio == np.inf:
         values = [getattr(best, option)]
-    what = {"length": "unit of length", "time": "unit of time", "up": "up axis"}[option]
-    raise UndecidedError(
-        f"the {what} does not show in the fall of the ball, which fits {best.score:.0%} of the flight", option, values
-    )
+    what = f"the {_NAMES[option]} does not show in the fall of the ball, which fits {best.score:.0%} of the flight"
+    raise UndecidedError(what, option, values)
 
 
-def _no_flight(shots: Sequence[tuple[Array, Array]], length: str | None, time: str | None) -> None:
+def _no_flight(shots: Sequence[Shot], length: str | None, time: str | None) -> None:
     steps = np.concatenate([np.diff(t) for t, _ in shots]) if shots else np.zeros(1)
     step = float(np.median(steps))
-    what = f"no stretch of flight is long enough to show the units: the median step of the times is {step:g}"
-    option, example = ("time", "ms") if time is None else ("length", "mm") if length is None else ("up", "z")
     if not step > 0.0 and (steps > 0.0).any():
         raise UndecidedError("most stamps have several positions, as of two balls", "columns", (), "trajectory=NAME")
     if not step > 0.0:
         raise UndecidedError("the times do not increase", "columns", (), "t=NAME")
+    what = f"no stretch of flight is long enough to show the units: the median step of the times is {step:g}"
+    option, example = ("time", "ms") if time is None else ("length", "mm") if length is None else ("up", "z")
     raise UndecidedError(what, option, (), example)
 
 
 def _contradiction(
-    shots: Sequence[tuple[Array, Array]],
+    shots: Sequence[Shot],
     found: Sequence[Scale],
     choices: Choices,
     stated: Mapping[str, str | None],
@@ -212,6 +187,5 @@ def _contradiction(
         alone = [one for one in others if all(getattr(one, name) == unit for name, unit in kept.items())]
         if alone and odds(alone[0].score, score) >= _AGAINST:
             other = getattr(alone[0], option)
-            raise UndecidedError(
-                f"the names say {value}, but balls fall at 9.81 m/s^2 if it is {other}", option, (other, value)
-            )
+            what = f"the names say {value}, but balls fall at 9.81 m/s^2 if it is {other}"
+            raise UndecidedError(what, option, (other, value))

@@ -1,7 +1,7 @@
 """Gathers the shots of a source's tables, with their names, ends and labels."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -17,10 +17,8 @@ from ballfg.importing.frame import Frame, likely_rate
 from ballfg.importing.shots import GAP, GAP_STEPS, Counts, SourceShot, cut, split_at_gaps
 from ballfg.tracks.track import Label
 
-MOST_SHOTS: Final = 60
-"""Number of shots for the determination of units, evenly over the source."""
-_INTERRUPTED: Final = 0.5
-"""Share of files or recordings with gaps, above which a gap ends a shot instead of hiding a ball."""
+MOST_SHOTS: Final = 60  # number of shots for the determination of units, evenly over the source
+_INTERRUPTED: Final = 0.5  # share of files with gaps, above which a gap ends a shot instead of hiding a ball
 
 
 def understood(tables: Sequence[RawTable], choices: Choices) -> tuple[list[RawTable], Roles, list[RawTable]]:
@@ -49,13 +47,8 @@ def understood(tables: Sequence[RawTable], choices: Choices) -> tuple[list[RawTa
         raise questions[0]
     if not read:
         largest = max(tables, key=len)
-        columns = listed(largest.columns)
-        raise UndecidedError(
-            f"{largest.where}: no columns look like x, y and z; there are {columns}",
-            "columns",
-            (),
-            "t=NAME,x=NAME,y=NAME,z=NAME",
-        )
+        what = f"{largest.where}: no columns look like x, y and z; there are {listed(largest.columns)}"
+        raise UndecidedError(what, "columns", (), "t=NAME,x=NAME,y=NAME,z=NAME")
     signatures = {(one.places, one.time, one.trajectory) for _, one in read}
     if len(signatures) > 1 and len(read) > 1:
         names = [same[0].name or same[0].source for same, _ in read]
@@ -67,9 +60,7 @@ def understood(tables: Sequence[RawTable], choices: Choices) -> tuple[list[RawTa
 def shots_of(tables: Sequence[RawTable], roles: Roles, choices: Choices, counts: Counts) -> list[SourceShot]:
     """The shots of all tables, in the source's units, with unique names.
 
-    Raises:
-        UndecidedError: no times and no rate; the message has a fitting rate.
-        ValueError: no shot with two samples.
+    Raises: UndecidedError: no times and no rate; the message has a fitting rate. ValueError: no shot with two samples.
     """
     try:
         parts = [(table, cut(table, roles, choices, counts)) for table in tables]
@@ -81,12 +72,8 @@ def shots_of(tables: Sequence[RawTable], roles: Roles, choices: Choices, counts:
         rate = likely_rate([relative(shot) for shot in frames[:MOST_SHOTS]], roles.length_unit)
         if rate is None:
             raise
-        raise UndecidedError(
-            f"{tables[0].where} has no times in s: the number of frames per second is needed; the fall of the ball "
-            f"fits about {rate} Hz",
-            "rate",
-            (str(rate),),
-        ) from None
+        what = f"{tables[0].where} has no times in s: the number of frames per second is needed"
+        raise UndecidedError(f"{what}; the fall of the ball fits about {rate} Hz", "rate", (str(rate),)) from None
     if not any(shots for _, shots in parts):
         raise ValueError(f"{tables[0].where} must hold two samples of a shot or more; each has less. Check the export.")
     named = Counter(shot.name for _, shots in parts for shot in shots)
@@ -105,8 +92,7 @@ def shots_of(tables: Sequence[RawTable], roles: Roles, choices: Choices, counts:
 
 
 def _unique(shots: Iterable[SourceShot]) -> list[SourceShot]:
-    seen: Counter[str] = Counter()
-    found = []
+    seen, found = Counter[str](), []
     for shot in shots:
         seen[shot.name] += 1
         found.append(shot if seen[shot.name] == 1 else replace(shot, name=f"{shot.name}#{seen[shot.name]}"))
@@ -119,21 +105,13 @@ def relative(shot: SourceShot) -> tuple[Array, Array]:
 
 
 def split(shots: list[SourceShot], roles: Roles, frame: Frame, choices: Choices) -> tuple[list[SourceShot], Guess]:
-    """The shots, cut at gaps in time that end a shot, and the guess for that.
-
-    Args: shots: in the source's units.  roles: of their columns.  frame: its units.  choices: of the user.
-    """
+    """The shots in the source's units, cut at gaps in time that end a shot, and the guess for that."""
     unit = TIMES[frame.time]
     count = len(shots)
-    if choices.split_gap is not None:
-        done = _unique(split_at_gaps(shots, unit, choices.split_gap))
-        return done, Guess(
-            "shots",
-            str(len(done)),
-            f"cut at gaps of {choices.split_gap:g} s, as given",
-            "stated",
-            f"--split-gap {choices.split_gap:g}",
-        )
+    if (given := choices.split_gap) is not None:
+        done = _unique(split_at_gaps(shots, unit, given))
+        why = f"cut at gaps of {given:g} s, as given"
+        return done, Guess("shots", str(len(done)), why, "stated", f"--split-gap {given:g}")
     if roles.trajectory is not None:
         why = f"one for each value of {shown(roles.trajectory)}"
         return shots, Guess("shots", str(count), why, "sure", f"--columns trajectory={roles.trajectory}")
@@ -164,22 +142,13 @@ def with_labels(shots: list[SourceShot], beside: Sequence[RawTable]) -> list[Sou
             keys = [str(value) for value in column.tolist()]
             if not set(keys) & names or len(set(keys)) < len(keys):
                 continue
-            rows = {one: i for i, one in enumerate(keys)}
-            others = {name: values.tolist() for name, values in table.columns.items() if name != key}
-            shots = [
-                replace(shot, labels={**shot.labels, **_row(others, rows[shot.name])}) if shot.name in rows else shot
-                for shot in shots
-            ]
+            labels: dict[str, dict[str, Label]] = {one: {} for one in keys}
+            for name, values in table.columns.items():
+                for one, value in zip(keys, values.tolist() if name != key else (), strict=False):
+                    if isinstance(value, str) and value:
+                        labels[one][name] = value
+                    elif isinstance(value, int | float) and np.isfinite(value):
+                        labels[one][name] = float(value)
+            shots = [replace(shot, labels={**shot.labels, **labels.get(shot.name, {})}) for shot in shots]
             break
     return shots
-
-
-def _row(columns: Mapping[str, list[Any]], row: int) -> dict[str, Label]:
-    found: dict[str, Label] = {}
-    for name, values in columns.items():
-        value = values[row]
-        if isinstance(value, str) and value:
-            found[name] = value
-        elif isinstance(value, int | float) and np.isfinite(value):
-            found[name] = float(value)
-    return found

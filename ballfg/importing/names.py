@@ -54,12 +54,9 @@ class Meaning:
 
     role: str
     """t, frame, trajectory, x, y, z, sigma_x, sigma_y, sigma_z, seconds or nanoseconds (of a stamp in two parts)."""
-    rank: int
-    """0 for an unambiguous name; larger for vaguer ones."""
-    unit: str | None = None
-    """As in the name, normalised; unknown text in brackets stays as it is."""
-    group: str = ""
-    """The other words of the name: x, y and z with the same ones belong together."""
+    rank: int  # 0 for an unambiguous name; larger for vaguer ones
+    unit: str | None = None  # as in the name, normalised; unknown text in brackets stays as it is
+    group: str = ""  # the other words of the name: x, y and z with the same ones belong together
 
 
 def unit_of_text(text: str) -> str | None:
@@ -75,12 +72,9 @@ def meanings(name: str) -> list[Meaning]:
     unit_text = bracket[1] if bracket else None
     bare = name[: bracket.start()] if bracket else name
     words = [word.lower() for part in _WORDS.findall(bare) for word in _CAMEL.split(part)]
-    found = [_as_time(words, unit_text), _as_place(words, unit_text), _as_trajectory(words, bare)]
+    found = [_as_time(words, unit_text), _as_place(words, unit_text), _as_trajectory(words)]
     known = [meaning for meaning in found if meaning is not None]
-    return [
-        replace(meaning, rank=meaning.rank + 1, group=f"{meaning.group}#{copy}") if copy else meaning
-        for meaning in known
-    ]
+    return [replace(one, rank=one.rank + 1, group=f"{one.group}#{copy}") for one in known] if copy else known
 
 
 def _as_time(words: list[str], bracket: str | None) -> Meaning | None:
@@ -121,20 +115,16 @@ def _as_place(words: list[str], bracket: str | None) -> Meaning | None:
     axes = [word for word in axes if not word.isdigit()] or axes  # "marker1_x" and "x_1" are both along x
     if not axes:
         return None
-    axes = axes[-1:]
-    others = [word for i, word in enumerate(words) if word != axes[0]]
-    if set(others) & _NOT_A_POSITION:
+    others = [word for word in words if word != axes[-1]]
+    axis, group, unique = _AXIS[axes[-1]], ".".join(others), set(others)
+    if unique & _NOT_A_POSITION:
         return None
-    axis = _AXIS[axes[0]]
-    if set(others) & _SIGMA:
-        return Meaning(f"sigma_{axis}", 0, unit, ".".join(others))
-    if axes[0].isdigit() and not set(others) & _FILLER:
+    if unique & _SIGMA:
+        return Meaning(f"sigma_{axis}", 0, unit, group)
+    if axes[-1].isdigit() and not unique & _FILLER:
         return None
-    strange = [word for word in others if word not in _FILLER]
-    rank = 0 if not others else 1 if not strange else 2
-    if "ball" in others:
-        rank = min(rank, 1)
-    return Meaning(axis, rank, unit, ".".join(others))
+    rank = 0 if not others else 1 if unique <= _FILLER or "ball" in unique else 2
+    return Meaning(axis, rank, unit, group)
 
 
 def _split(word: str) -> list[str]:
@@ -145,17 +135,13 @@ def _split(word: str) -> list[str]:
     return [word]
 
 
-def _as_trajectory(words: list[str], name: str) -> Meaning | None:
+def _as_trajectory(words: list[str]) -> Meaning | None:
     kept = [word for word in words if word not in ("id", "nr", "no", "number", "index", "name", "num", "idx")]
-    if not kept and words:
-        kept = ["id"]
-    if len(kept) == 1 and (kept[0] in _TRAJECTORY or kept[0].removesuffix("id") in _TRAJECTORY):
-        word = kept[0] if kept[0] in _TRAJECTORY else kept[0].removesuffix("id")
-        return Meaning("trajectory", _TRAJECTORY.index(word))
-    return None
+    word = kept[0] if kept else "id"
+    word = word if word in _TRAJECTORY else word.removesuffix("id")
+    known = len(kept) <= 1 and words and word in _TRAJECTORY
+    return Meaning("trajectory", _TRAJECTORY.index(word)) if known else None
 
 
 def _unit(text: str | None, units: Mapping[str, str]) -> str | None:
-    if text is None:
-        return None
-    return units.get(text.lower(), text)
+    return None if text is None else units.get(text.lower(), text)

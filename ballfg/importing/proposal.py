@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ballfg.checks import short_text
-from ballfg.importing.ball_and_table import ball_of, table_of
+from ballfg.importing.bounces import ball_of, table_of
 from ballfg.importing.choices import Choices, Guess, UndecidedError
 from ballfg.importing.columns import Roles
 from ballfg.importing.formats.raw import RawTable
@@ -29,8 +29,7 @@ class Proposal:
     info: DatasetInfo
     tracks: list[Track]
     guesses: list[Guess]
-    notes: list[str]
-    """Omitted or reordered rows, one sentence each."""
+    notes: list[str]  # omitted or reordered rows, one sentence each
 
 
 def propose(data: Any, choices: Choices) -> Proposal:
@@ -100,9 +99,8 @@ def _tracks(shots: Sequence[SourceShot], frame: Frame) -> tuple[list[Track], lis
         try:
             values = tidy(RowGroup(shot.name, shot.rows, np.concatenate(parts, axis=1)), where, findings)
         except ValueError as error:
-            raise UndecidedError(
-                f"{str(error).rpartition('. ')[0]}; a column may tell two balls apart", "columns", (), "trajectory=NAME"
-            ) from None
+            what = f"{str(error).rpartition('. ')[0]}; a column may tell two balls apart"
+            raise UndecidedError(what, "columns", (), "trajectory=NAME") from None
         sigmas = values[:, 4:] if values.shape[1] > 4 else None
         tracks.append(Track(values[:, 0], values[:, 1:4], sigmas, shot.labels, name=shot.name))
     notes = findings.notes()
@@ -115,14 +113,10 @@ def _column_guesses(roles: Roles) -> list[Guess]:
     why = "names" if roles.by_name else "what the numbers are like"
     sure = "sure" if roles.by_name else "likely"
     time = "+".join(roles.time) or (f"{roles.frame} / rate" if roles.frame else "row / rate")
-    columns = {"t": time, "x, y, z": ", ".join(roles.places)}
-    if roles.trajectory:
-        columns["trajectory"] = roles.trajectory
-    if roles.sigmas:
-        columns["sigmas"] = ", ".join(roles.sigmas)
-    typed = {
-        "t": "--columns t=NAME",
-        "x, y, z": "--columns x=NAME,y=NAME,z=NAME",
-        "trajectory": "--columns trajectory=NAME",
-    }
-    return [Guess(f"column {key}", value, why, sure, typed.get(key, "")) for key, value in columns.items()]
+    columns = (
+        ("t", time, "--columns t=NAME"),
+        ("x, y, z", ", ".join(roles.places), "--columns x=NAME,y=NAME,z=NAME"),
+        ("trajectory", roles.trajectory, "--columns trajectory=NAME"),
+        ("sigmas", ", ".join(roles.sigmas or ()), ""),
+    )
+    return [Guess(f"column {key}", value, why, sure, typed) for key, value, typed in columns if value]

@@ -1,7 +1,7 @@
 """Cuts rows into shots: by a column, by file, where time restarts, and at gaps."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Final
 
@@ -16,16 +16,11 @@ from ballfg.importing.formats.raw import Column, RawTable, is_number, numbers
 from ballfg.importing.stamps import Stamps, as_stamps, is_date, joined, missing
 from ballfg.tracks.track import Label
 
-_DISORDER: Final = 3.0
-"""Median steps: an earlier stamp within this came late; beyond it a new shot begins."""
-_LARGEST: Final = 1e15
-"""In the source's units; a larger number is not a position in any unit, and counts as missing."""
-_ALONE: Final = 5.0
-"""A row of zeros is a missing sample if its distance from its neighbours is this multiple of the median."""
-GAP: Final = 0.5
-"""s without samples after which a new shot begins."""
-GAP_STEPS: Final = 20.0
-"""Least number of median steps in such a gap."""
+_DISORDER: Final = 3.0  # median steps: an earlier stamp within this came late; beyond it a new shot begins
+_LARGEST: Final = 1e15  # in the source's units; a larger number is not a position in any unit, and counts as missing
+_ALONE: Final = 5.0  # median steps from its neighbours at which a row of zeros is a missing sample
+GAP: Final = 0.5  # s without samples after which a new shot begins
+GAP_STEPS: Final = 20.0  # least number of median steps in such a gap
 
 
 @dataclass(frozen=True)
@@ -33,15 +28,11 @@ class SourceShot:
     """The samples of one shot in the units of their source."""
 
     name: str
-    stamps: Stamps
-    """(n,) non-decreasing."""
-    positions: Array
-    """(n, 3)"""
-    sigmas: Array | None
-    """(n, 3)"""
+    stamps: Stamps  # (n,) non-decreasing
+    positions: Array  # (n, 3)
+    sigmas: Array | None  # (n, 3)
     labels: Mapping[str, Label]
-    rows: NDArray[np.intp]
-    """(n,) index into the source's table."""
+    rows: NDArray[np.intp]  # (n,) index into the source's table
     table: RawTable
 
 
@@ -58,16 +49,14 @@ class Counts:
 
     def notes(self) -> list[str]:
         """One sentence for each kind."""
-        said = [
-            (self.missing, "rows without a time or a position left out"),
-            (self.zeros, "rows with x = y = z = 0 far from their neighbours left out as missing samples"),
-            (self.late, "rows put in the order of their times"),
-            (self.short, "shots of fewer than two samples left out"),
-        ]
-        found = [f"{count} {words}" for count, words in said if count]
-        if self.ignored:
-            found.append(f"columns left out: {', '.join(sorted(self.ignored))}")
-        return found
+        said = {
+            f"{self.missing} rows without a time or a position left out": self.missing,
+            f"{self.zeros} rows with x = y = z = 0 far from their neighbours left out as missing samples": self.zeros,
+            f"{self.late} rows put in the order of their times": self.late,
+            f"{self.short} shots of fewer than two samples left out": self.short,
+            f"columns left out: {', '.join(sorted(self.ignored))}": self.ignored,
+        }
+        return [sentence for sentence, count in said.items() if count]
 
 
 def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list[SourceShot]:
@@ -75,12 +64,13 @@ def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list
 
     Raises: UndecidedError: no time and no rate. ValueError: text for a time, or no row with a position.
     """
-    lacking = [name for name in _needed(roles) if name not in table.columns]
+    alone = (name for name in (roles.frame, roles.trajectory) if name is not None)
+    needed = (*roles.time, *roles.places, *alone, *(roles.sigmas or ()))
+    lacking = [name for name in needed if name not in table.columns]
     if lacking:
         raise ValueError(f"{table.where} must have the columns of the other tables; {listed(lacking)} missing. Add it.")
     stamps = _stamps(table, roles, choices, counts)
-    positions = np.stack([numbers(table.columns[name]) for name in roles.places], axis=1)
-    sigmas = None
+    positions, sigmas = np.stack([numbers(table.columns[name]) for name in roles.places], axis=1), None
     held = ~missing(stamps) & (np.abs(positions) <= _LARGEST).all(axis=1)
     if roles.sigmas is not None:
         sigmas = np.stack([numbers(table.columns[name]) for name in roles.sigmas], axis=1)
@@ -88,13 +78,8 @@ def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list
     counts.missing += int((~held).sum())
     rows = np.flatnonzero(held)
     if not len(rows):
-        columns = ", ".join((*roles.time, *roles.places))
-        raise UndecidedError(
-            f"{table.where}: no row has a time and a position in {columns}",
-            "columns",
-            (),
-            "t=NAME,x=NAME,y=NAME,z=NAME",
-        )
+        what = f"{table.where}: no row has a time and a position in {', '.join((*roles.time, *roles.places))}"
+        raise UndecidedError(what, "columns", (), "t=NAME,x=NAME,y=NAME,z=NAME")
     if roles.trajectory is None:
         parts = _at_restarts(stamps, rows, counts)
         names = [f"{i:03d}" for i in range(len(parts))]
@@ -121,10 +106,7 @@ def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list
 
 
 def split_at_gaps(shots: Iterable[SourceShot], unit: float, gap: float) -> list[SourceShot]:
-    """The shots, cut at gaps of `gap` s.
-
-    Args: unit: s in the unit of the stamps.  gap: s.
-    """
+    """The shots, cut at gaps of `gap` s. Args: unit: s in the unit of the stamps.  gap: s."""
     found: list[SourceShot] = []
     for shot in shots:
         steps = np.diff(shot.stamps).astype(np.float64) * unit
@@ -135,16 +117,9 @@ def split_at_gaps(shots: Iterable[SourceShot], unit: float, gap: float) -> list[
         cuts = [0, *places.tolist(), len(shot.stamps)]
         pieces = [slice(a, b) for a, b in pairwise(cuts) if b - a >= 2]
         for i, part in enumerate(pieces):
-            found.append(
-                replace(
-                    shot,
-                    name=f"{shot.name}-{i:03d}",
-                    stamps=shot.stamps[part],
-                    positions=shot.positions[part],
-                    sigmas=None if shot.sigmas is None else shot.sigmas[part],
-                    rows=shot.rows[part],
-                )
-            )
+            sigmas = None if shot.sigmas is None else shot.sigmas[part]
+            name, stamps, positions = f"{shot.name}-{i:03d}", shot.stamps[part], shot.positions[part]
+            found.append(SourceShot(name, stamps, positions, sigmas, shot.labels, shot.rows[part], shot.table))
     return found
 
 
@@ -156,22 +131,15 @@ def _stamps(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> 
         frames = None if roles.frame is None else numbers(table.columns[roles.frame])
         if rate is None:
             seen = (
-                "has frames but no time"
-                if frames is not None
-                else f"has no column of times, but {listed(table.columns)}"
+                f"has no column of times, but {listed(table.columns)}" if frames is None else "has frames but no time"
             )
             raise UndecidedError(f"{table.where} {seen}: the number of frames per second is needed", "rate", (), "120")
         return (np.arange(len(table), dtype=np.float64) if frames is None else frames) / rate
     column = table.columns[roles.time[0]]
     stamps = as_stamps(column)
     if stamps is None:
-        raise UndecidedError(
-            f"{table.where}: the column of times, {shown(roles.time[0])}, must hold numbers or dates; it holds "
-            f"{shown(str(column[0])[:30])}",
-            "columns",
-            (),
-            "t=NAME",
-        )
+        what = f"{table.where}: the column of times, {shown(roles.time[0])}, must hold numbers or dates"
+        raise UndecidedError(f"{what}; it holds {shown(str(column[0])[:30])}", "columns", (), "t=NAME")
     counts.dates |= is_date(column)
     return stamps
 
@@ -190,10 +158,8 @@ def _at_restarts(stamps: Stamps, rows: NDArray[np.intp], counts: Counts) -> list
 
 def _ordered(part: NDArray[np.intp], stamps: Stamps, counts: Counts) -> NDArray[np.intp]:
     late = int((np.diff(stamps[part]) < 0).sum())
-    if not late:
-        return part
     counts.late += late
-    return part[np.argsort(stamps[part], kind="stable")]
+    return part[np.argsort(stamps[part], kind="stable")] if late else part
 
 
 def _by_name(
@@ -203,12 +169,12 @@ def _by_name(
     codes = np.array([codes_of.setdefault(str(value), len(codes_of)) for value in column[rows].tolist()])
     order = np.argsort(codes, kind="stable")
     parts = np.split(rows[order], np.flatnonzero(np.diff(codes[order])) + 1)
-    return [_ordered(part, stamps, counts) for part in parts], [_text(column[part[0]]) for part in parts]
-
-
-def _text(value: object) -> str:
-    number = float(value) if isinstance(value, float | np.floating) else None
-    return f"{number:.0f}" if number is not None and number.is_integer() else str(value) or "unnamed"
+    values = [column[part[0]] for part in parts]
+    whole = [isinstance(value, float | np.floating) and float(value).is_integer() for value in values]
+    names = [
+        f"{value:.0f}" if is_whole else str(value) or "unnamed" for value, is_whole in zip(values, whole, strict=True)
+    ]
+    return [_ordered(part, stamps, counts) for part in parts], names
 
 
 def _lone_zeros(positions: Array, counts: Counts) -> NDArray[np.bool_]:
@@ -233,20 +199,11 @@ def _labels(
         if column is None:  # in the first table, but not in this one
             counts.ignored.add(name)
         elif all((column[part] == column[part[0]]).all() for part in parts) and is_name(name) and name != "trajectory":
-            found[name] = [_label(column, int(part[0])) for part in parts]
+            cells = [column[part[0]] for part in parts]
+            if is_number(column):
+                found[name] = [float(cell) if np.isfinite(cell) else None for cell in cells]
+            else:
+                found[name] = [short_text(" ".join(str(cell).split()), MAX_TEXT) or None for cell in cells]
         elif not is_number(column) or np.isfinite(numbers(column)).any():
             counts.ignored.add(name)
     return found
-
-
-def _needed(roles: Roles) -> tuple[str, ...]:
-    """The columns that every table of a source must have."""
-    alone = (name for name in (roles.frame, roles.trajectory) if name is not None)
-    return (*roles.time, *roles.places, *alone, *(roles.sigmas or ()))
-
-
-def _label(column: Column, row: int) -> Label | None:
-    if is_number(column):
-        value = float(column[row])
-        return value if np.isfinite(value) else None
-    return short_text(" ".join(str(column[row]).split()), MAX_TEXT) or None

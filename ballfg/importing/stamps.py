@@ -11,18 +11,13 @@ from ballfg.arrays import Array
 from ballfg.importing.formats.raw import MISSING, Column
 from ballfg.tracks.stamps import elapsed
 
-Stamps = NDArray[Any]
-"""(n,) int64 or float64, in an unknown unit."""
-
-NO_STAMP: Final = np.iinfo(np.int64).min
-"""Marks a missing stamp among whole numbers."""
+Stamps = NDArray[Any]  # (n,) int64 or float64, in an unknown unit
+NO_STAMP: Final = np.iinfo(np.int64).min  # marks a missing stamp among whole numbers
 _CLOCK: Final = re.compile(r"^(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d+)?)$")
 _FINE: Final = re.compile(r"^(.*:\d{2})[.,](\d+)(.*)$")
 _DIVISORS: Final = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
-_LATEST: Final = 1e19
-"""Largest stamp: 300 years in ns."""
-_FAR: Final = 1e6
-"""s: larger stamps are counted from the first one, so that a float keeps their microseconds."""
+_LATEST: Final = 1e19  # largest stamp: 300 years in ns
+_FAR: Final = 1e6  # s: larger stamps are counted from the first one, so that a float keeps their microseconds
 
 
 def as_stamps(column: Column) -> Stamps | None:
@@ -30,9 +25,8 @@ def as_stamps(column: Column) -> Stamps | None:
     if column.dtype.kind in "if":
         return column
     parsed = [_parsed(str(cell)) for cell in column]
-    present = sum(1 for one in parsed if one is not None)
-    empty = sum(1 for cell in column if str(cell).lower() in MISSING)
-    if not present or present + empty < len(column):
+    present = sum(one is not None for one in parsed)
+    if not present or present + sum(str(cell).lower() in MISSING for cell in column) < len(column):
         return None
     return np.array([NO_STAMP if one is None else one for one in parsed], dtype=np.int64)
 

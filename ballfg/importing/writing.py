@@ -16,10 +16,8 @@ from ballfg.tracks.info import INFO_FILE
 from ballfg.tracks.writing import DATASET_FILES, TRUTH_FILE, TRUTH_FILES
 
 PAGE: Final = "import.html"
-_MOST_SHOTS: Final = 40
-"""Number of drawn shots, evenly over the dataset."""
-_MOST_POINTS: Final = 300
-"""Largest number of drawn samples of a shot."""
+_MOST_SHOTS: Final = 40  # number of drawn shots, evenly over the dataset
+_MOST_POINTS: Final = 300  # largest number of drawn samples of a shot
 
 
 def write_import(folder: Path, proposal: Proposal, file_format: Literal["csv", "parquet"], force: bool) -> None:
@@ -62,7 +60,8 @@ def _drawing(tracks: Sequence[Track], height: float) -> Html:
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    across = _across(tracks)
+    # the horizontal axis of the longer flights
+    across = int(np.argmax(np.median([np.ptp(track.positions[:, :2], axis=0) for track in tracks], axis=0)))
     with mpl.rc_context({"svg.hashsalt": "ballfg", "svg.fonttype": "none", "font.size": 9}):
         figure = Figure(figsize=(9.0, 6.5), layout="constrained")
         side, above = figure.subplots(2, 1)
@@ -80,9 +79,3 @@ def _drawing(tracks: Sequence[Track], height: float) -> Html:
         metadata: dict[str, Any] = {"Date": None, "Creator": None}
         figure.savefig(text, format="svg", metadata=metadata)
     return Html(text.getvalue()[text.getvalue().index("<svg") :])
-
-
-def _across(tracks: Sequence[Track]) -> int:
-    """The horizontal axis of the longer flights."""
-    extents = np.median([np.ptp(track.positions[:, :2], axis=0) for track in tracks], axis=0)
-    return int(np.argmax(extents))

@@ -15,23 +15,19 @@ from typing import Any, Final
 
 from ballfg.checks import one_line
 from ballfg.parallel.same_versions import HERE, differences, own_versions
-from ballfg.parallel.work import Work, compute, packed
+from ballfg.parallel.work import Work, compute, packed, too_many_deaths
 
-CONNECT: Final = 10.0
-"""s, timeout for the scheduler, and for its first worker."""
-NOBODY: Final = 60.0
-"""s without any worker after which the work ends."""
-LOOK: Final = 5.0
-"""s between two checks of the cluster while a chunk is computed."""
+CONNECT: Final = 10.0  # s, timeout for the scheduler, and for its first worker
+NOBODY: Final = 60.0  # s without any worker after which the work ends
+LOOK: Final = 5.0  # s between two checks of the cluster while a chunk is computed
 
 
 class DaskCluster:
     """All workers of a scheduler.
 
     Args: address: of the scheduler, such as tcp://10.0.0.1:8786.
-    Raises:
-        ValueError: no address, `distributed` is not installed, or workers with other versions.
-        ConnectionError: no scheduler or no worker is there.
+    Raises: ValueError: no address, `distributed` is not installed, or workers with other versions. ConnectionError: no
+        scheduler or no worker is there.
     """
 
     batch, helped = 16, False
@@ -40,14 +36,11 @@ class DaskCluster:
         try:
             import distributed
         except ImportError:
-            raise ValueError(
-                'cluster dask needs dask, which is not installed. Run: pip install "ballfg[dask]"'
-            ) from None
+            what = "cluster dask needs dask, which is not installed"
+            raise ValueError(f'{what}. Run: pip install "ballfg[dask]"') from None
         if not re.fullmatch(r"(\w+://)?[^/]+:\d+", address or ""):
-            raise ValueError(
-                f"address must be that of a dask scheduler, such as tcp://10.0.0.1:8786; got {address}. "
-                "Copy it from what the scheduler prints."
-            )
+            problem = f"address must be that of a dask scheduler, such as tcp://10.0.0.1:8786; got {address}"
+            raise ValueError(f"{problem}. Copy it from what the scheduler prints.")
         self._address, self._workers = address, 0
         self._looked, self._nobody_since = -LOOK, math.inf
         logging.getLogger("distributed").setLevel(logging.CRITICAL)  # important messages are raised here
@@ -96,9 +89,8 @@ class DaskCluster:
         self._workers, self._looked = workers, (now := time.monotonic())
         self._nobody_since = math.inf if workers else min(now, self._nobody_since)
         if now - self._nobody_since > NOBODY:
-            raise ConnectionError(
-                f"the dask scheduler at {self._address} must have workers; the last left {NOBODY:g} s ago."
-            )
+            rule = f"the dask scheduler at {self._address} must have workers"
+            raise ConnectionError(f"{rule}; the last left {NOBODY:g} s ago.")
 
     def stop(self) -> None:
         """Does nothing: chunks are cancelled one by one, and the cluster continues without them."""
@@ -116,8 +108,7 @@ class DaskCluster:
                 f"Start them: dask worker {self._address} --nworkers 4 --nthreads 1."
             ) from None
         for worker, theirs in self._client.run(eval, HERE).items():
-            different = differences(theirs, f"the worker {worker}")
-            if different:
+            if different := differences(theirs, f"the worker {worker}"):
                 raise ValueError(different)
 
 
@@ -132,10 +123,7 @@ class _Chunk:
         return bool(self._future.done())
 
     def result(self) -> Any:
-        """The result; see Pending.
-
-        Raises: ChildProcessError: the chunk lost too many workers. ConnectionError: the cluster is gone.
-        """
+        """The result; see Pending. Raises: ChildProcessError: too many workers lost. ConnectionError: no cluster."""
         from distributed import KilledWorker
 
         while not self._future.done():
@@ -151,10 +139,7 @@ class _Chunk:
         try:
             return pickle.loads(self._future.result())
         except KilledWorker:
-            raise ChildProcessError(
-                f"workers must live while they work; dask lost too many over a chunk that begins with {self._first}. "
-                "Memory is probably short: give workers more of it."
-            ) from None
+            raise too_many_deaths("dask", self._first) from None
 
     def cancel(self) -> None:
         """Cancels the chunk."""

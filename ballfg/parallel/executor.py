@@ -11,9 +11,7 @@ from ballfg.checks import check_count, shown
 from ballfg.machine import MOST_JOBS
 from ballfg.parallel.work import is_inside
 
-CLUSTERS = ("dask", "ray")
-"""Kinds of clusters, by ballfg's extra for their library."""
-
+CLUSTERS = ("dask", "ray")  # kinds of clusters, by ballfg's extra for their library
 _CLUSTER: ContextVar[Executor | None] = ContextVar("cluster", default=None)
 
 
@@ -22,38 +20,29 @@ class Pending(Protocol):
 
     def done(self) -> bool:
         """True if `result` returns, or raises, at once."""
-        ...
 
     def result(self) -> Any:
         """The result of the chunk, once it is there; raises the function's exceptions."""
-        ...
 
     def cancel(self) -> object:
         """Cancels the chunk, unless a worker has begun it."""
-        ...
 
 
 class Executor(Protocol):
     """Processes that compute chunks, of this machine or of a cluster."""
 
-    batch: int
-    """Number of tracks in a chunk."""
-
-    helped: bool
-    """True if the calling process is one of them: it then computes chunks itself instead of waiting."""
+    batch: int  # number of tracks in a chunk
+    helped: bool  # True if the calling process is one of them: it then computes chunks itself instead of waiting
 
     @property
     def slots(self) -> int:
         """Number of chunks that others compute at the same time."""
-        ...
 
     def sender(self, function: Callable[[Sequence[Any]], Any]) -> Callable[[Sequence[Any]], Pending]:
         """Submits a function of a chunk, and returns a function that submits its chunks one by one."""
-        ...
 
     def stop(self) -> None:
         """Ends the present work at once: after an error, or Ctrl-C."""
-        ...
 
 
 def executor(jobs: int, *, helped: bool = True) -> Executor | None:
@@ -103,20 +92,18 @@ def on_cluster(kind: str | None, address: str | None = None) -> Iterator[int | N
         return
     if kind not in CLUSTERS:
         raise ValueError(f"cluster must be {' or '.join(CLUSTERS)}; got {shown(kind)}. Choose one of them.")
-    opened = _open(kind, address)
+    opened: Any
+    if kind == "dask":
+        from ballfg.parallel.dask_cluster import DaskCluster
+
+        opened = DaskCluster(address)
+    else:
+        from ballfg.parallel.ray_cluster import RayCluster
+
+        opened = RayCluster(address)
     token = _CLUSTER.set(opened)
     try:
         yield opened.slots
     finally:
         _CLUSTER.reset(token)
         opened.close()
-
-
-def _open(kind: str, address: str | None) -> Any:
-    if kind == "dask":
-        from ballfg.parallel.dask_cluster import DaskCluster
-
-        return DaskCluster(address)
-    from ballfg.parallel.ray_cluster import RayCluster
-
-    return RayCluster(address)

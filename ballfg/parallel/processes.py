@@ -23,11 +23,8 @@ from ballfg.parallel.same_versions import own_versions
 from ballfg.parallel.work import Work, packed
 
 ONE_THREAD: Final = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-MOST_DEATHS: Final = 3
-"""Largest number of processes that a chunk may lose: it is then the probable cause."""
-BEGIN: Final = "import sys; exec(sys.stdin.readline())"
-"""Code of a new process; the line that it reads lets it find the modules of this one."""
-
+MOST_DEATHS: Final = 3  # largest number of processes that a chunk may lose: it is then the probable cause
+BEGIN: Final = "import sys; exec(sys.stdin.readline())"  # code of a process; the line that it reads finds our modules
 Told = Callable[[Any], object]
 
 
@@ -84,9 +81,10 @@ class _Chunk:
     def result(self) -> Any:
         """The result; see Pending. Raises: ChildProcessError: the chunk lost too many processes."""
         kind, content = self._future.result()
+        found = pickle.loads(content)
         if kind == "error":
-            raise pickle.loads(content)
-        return pickle.loads(content)
+            raise found
+        return found
 
     def cancel(self) -> bool:
         """Cancels the chunk unless a process has begun it."""
@@ -108,10 +106,8 @@ class _Chunk:
                 crew.put_back(process)
                 return answer
             crew.bury(process)
-        raise ChildProcessError(
-            f"processes must live while they work; {MOST_DEATHS} died over a chunk that begins with {self._first}. "
-            "Memory is probably short: use fewer processes."
-        )
+        problem = f"processes must live while they work; {MOST_DEATHS} died over a chunk that begins with {self._first}"
+        raise ChildProcessError(f"{problem}. Memory is probably short: use fewer processes.")
 
 
 _Line = SimpleQueue[_Chunk | None]
@@ -124,7 +120,7 @@ class _Crew:
         self._processes: set[_Process] = set()
         self._free: list[_Process] = []
         self._lines: dict[int, _Line] = {}
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._stopped = False
 
     @property
@@ -153,29 +149,23 @@ class _Crew:
                 process = self._free.pop()
                 if process.lives():
                     return process
-                self._bury(process)
+                self.bury(process)
             process = _Process()
             self._processes.add(process)
             return process
 
     def put_back(self, process: "_Process") -> None:
         with self._lock:
-            self._free.append(process)
             if self._stopped:
-                self._bury_free()
+                self.bury(process)
+            else:
+                self._free.append(process)
 
     def bury(self, process: "_Process") -> None:
         with self._lock:
-            self._bury(process)
-
-    def _bury_free(self) -> None:
-        while self._free:
-            self._bury(self._free.pop())
-
-    def _bury(self, process: "_Process") -> None:
-        process.kill()
-        process.close()
-        self._processes.discard(process)
+            process.kill()
+            process.close()
+            self._processes.discard(process)
 
     def stop(self) -> None:
         """Ends all processes; waiting threads find that theirs has died."""
@@ -183,7 +173,8 @@ class _Crew:
             self._stopped = True
             for process in self._processes:
                 process.kill()
-            self._bury_free()
+            while self._free:
+                self.bury(self._free.pop())
             for size, line in self._lines.items():
                 for _ in range(size):
                     line.put(None)

@@ -6,10 +6,9 @@ from typing import Any, Final
 
 from ballfg.checks import one_line
 from ballfg.parallel.same_versions import HERE, differences, own_versions
-from ballfg.parallel.work import Work, compute, packed
+from ballfg.parallel.work import Work, compute, packed, too_many_deaths
 
-MOST_DEATHS: Final = 3
-"""Largest number of workers that a chunk may lose."""
+MOST_DEATHS: Final = 3  # largest number of workers that a chunk may lose
 
 
 class RayCluster:
@@ -52,11 +51,8 @@ class RayCluster:
         work = Work.of(function)
         content = self._ray.put(work.content)
 
-        def send(chunk: Sequence[Any]) -> _Chunk:
-            sent = self._task.remote(work.name, content, packed(chunk), own_versions())
-            return _Chunk(self._ray, sent, chunk)
-
-        return send
+        submit = self._task.remote
+        return lambda chunk: _Chunk(self._ray, submit(work.name, content, packed(chunk), own_versions()), chunk)
 
     def stop(self) -> None:
         """Does nothing: chunks are cancelled one by one, and the cluster continues without them."""
@@ -76,8 +72,7 @@ class RayCluster:
             if node["Alive"] and node["Resources"].get("CPU"):
                 there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
                 theirs = self._ray.get(self._ray.remote(asked).options(scheduling_strategy=there).remote(HERE))
-                different = differences(theirs, f"the node {node['NodeManagerAddress']}")
-                if different:
+                if different := differences(theirs, f"the node {node['NodeManagerAddress']}"):
                     raise ValueError(different)
 
 
@@ -98,10 +93,7 @@ class _Chunk:
         except self._ray.exceptions.RayTaskError as error:
             raise error.cause from None
         except (self._ray.exceptions.WorkerCrashedError, self._ray.exceptions.OutOfMemoryError):
-            raise ChildProcessError(
-                f"workers must live while they work; ray lost too many over a chunk that begins with {self._first}. "
-                "Memory is probably short: give workers more of it."
-            ) from None
+            raise too_many_deaths("ray", self._first) from None
 
     def cancel(self) -> None:
         """Cancels the chunk."""

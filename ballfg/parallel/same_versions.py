@@ -7,10 +7,8 @@ from pathlib import Path
 
 from ballfg.machine import versions
 
-PACKAGES = ("ballfg", "torch", "numpy", "scipy", "numba", "gtsam")
-"""Packages whose version may change a result."""
-SOURCE = "source of ballfg"
-"""Name of the digest of ballfg's own files: a checkout may change without its version."""
+PACKAGES = ("ballfg", "torch", "numpy", "scipy", "numba", "gtsam")  # packages whose version may change a result
+SOURCE = "source of ballfg"  # name of the digest of ballfg's own files: a checkout may change without its version
 HERE = (
     "dict(__import__('ballfg.parallel.same_versions', fromlist=['own_versions']).own_versions()) "
     "if (find := __import__('importlib.util').util.find_spec)('ballfg') and find('ballfg.parallel') else {}"
@@ -27,10 +25,7 @@ def own_versions() -> dict[str, str]:
 
 
 def differences(theirs: dict[str, str], whose: str = "a worker") -> str | None:
-    """A message on versions that differ from those of this process; None if there are none.
-
-    Args: theirs: versions of the other process.  whose: name of its worker.
-    """
+    """A message on versions of a process, `whose`, that differ from those of this one; None without any."""
     own = own_versions()
     if theirs == own:
         return None

@@ -14,12 +14,9 @@ from ballfg.parallel.work import alone
 T = TypeVar("T")
 R = TypeVar("R")
 
-AHEAD: Final = 3
-"""Largest number of unfinished chunks per worker."""
-HELPED: Final = 8
-"""Largest number of further chunks that are done but not consumed. Both bound the memory."""
-LOOK: Final = 0.02
-"""s between two checks for finished chunks."""
+AHEAD: Final = 3  # largest number of unfinished chunks per worker
+HELPED: Final = 8  # Largest number of further chunks that are done but not consumed. Both bound the memory.
+LOOK: Final = 0.02  # s between two checks for finished chunks
 
 
 def in_order(

@@ -16,9 +16,7 @@ from ballfg.parallel.same_versions import differences
 T = TypeVar("T")
 R = TypeVar("R")
 
-KEPT = 4
-"""Number of functions that a worker keeps. Their models and machine code then serve all of their chunks."""
-
+KEPT = 4  # Number of functions that a worker keeps. Their models and machine code then serve all of their chunks.
 _INSIDE: ContextVar[bool] = ContextVar("inside", default=False)
 _functions: OrderedDict[str, Callable[..., Any]] = OrderedDict()
 _one_at_a_time = Lock()
@@ -51,11 +49,20 @@ def compute(name: str, content: bytes, chunk: bytes, versions: dict[str, str]) -
     Args: name, content: of the `Work`.  chunk: pickled.  versions: of the calling process.
     Raises: ValueError: the versions differ from those of this process; and the function's exceptions.
     """
-    different = differences(versions)
-    if different:
+    if different := differences(versions):
         raise ValueError(different)
     with _one_at_a_time:
-        return packed(alone(_function(name, content), pickle.loads(chunk)))
+        function = _functions.pop(name) if name in _functions else pickle.loads(content)
+        _functions[name] = function  # the last one used stands last
+        while len(_functions) > KEPT:
+            _functions.popitem(last=False)
+        return packed(alone(function, pickle.loads(chunk)))
+
+
+def too_many_deaths(cluster: str, first: str) -> ChildProcessError:
+    """The error for a chunk whose workers died."""
+    problem = f"workers must live while they work; {cluster} lost too many over a chunk that begins with {first}"
+    return ChildProcessError(f"{problem}. Memory is probably short: give workers more of it.")
 
 
 def each(function: Callable[[Any], R], chunk: Sequence[Any]) -> list[R]:
@@ -87,12 +94,3 @@ def alone(function: Callable[[T], R], argument: T) -> R:
 def is_inside() -> bool:
     """True if this code runs as part of a chunk."""
     return _INSIDE.get()
-
-
-def _function(name: str, content: bytes) -> Callable[..., Any]:
-    if name not in _functions:
-        _functions[name] = pickle.loads(content)
-        while len(_functions) > KEPT:
-            _functions.popitem(last=False)
-    _functions.move_to_end(name)
-    return _functions[name]

@@ -11,9 +11,7 @@ from typing import Any, Final
 from ballfg.collector import collect_rarely
 from ballfg.parallel.work import compute, packed
 
-IDLE: Final = 300.0
-"""s without work after which a process ends."""
-
+IDLE: Final = 300.0  # s without work after which a process ends
 _asker: Connection | None = None
 
 

@@ -20,42 +20,20 @@ from ballfg.state import STANDARD_GRAVITY, Z
 if TYPE_CHECKING:
     from ballfg.tracks.grouping import RowGroup
 
-MERGE_DISTANCE = 0.1
-"""m: two rows at one stamp farther apart are refused; one frame of a ball at 15 m/s and 150 Hz."""
-
-MAX_COORDINATE = 1000.0
-"""m: positions farther from the origin are refused."""
-
-MAX_EXTENT = 250.0
-"""m: a longer track is refused; no struck ball flies farther."""
-
-MAX_SPEED = 343.0
-"""m/s: a track whose median speed is above that of sound is refused."""
-
-MAX_MEDIAN_SIGMA = 1.0
-"""m: a track with a larger median sigma is refused."""
-
-MAX_STEP = 1.0
-"""s: a track whose median time step is longer is refused; no bounce could be seen in it."""
-
-MIN_STEP = 1e-6
-"""s: a track whose median time step is shorter is refused; no camera is that fast."""
-
-MAX_RATE_RATIO = 100.0
-"""A median time step that differs from the declared rate by more than this factor is refused."""
-
-BASELINE: Final = 0.05
-"""s to each side for an acceleration: with 3 mm of noise its error is 3 m/s^2, that of a track's median 0.5."""
-LEAST_FALLING: Final = 0.2
-"""Least share of a track that falls along -z as a ball does, for undoubted axes."""
-MOSTLY: Final = 0.5
-"""Share of a track that falls along +z, above which z seems to point down."""
-FALLS: Final = (0.4, 1.9)
-"""Multiples of gravity between which a flying ball's vertical acceleration lies; strong topspin doubles it."""
-LEAST_REVERSAL: Final = 0.8
-"""m/s. A ball that falls and then rises at least so fast within a few samples has bounced."""
-NEAR_SURFACE: Final = 0.08
-"""m. Distance from every declared surface beyond which a bounce is doubtful; a fast ball falls so far in one step."""
+MERGE_DISTANCE = 0.1  # m: two rows at one stamp farther apart are refused; one frame of a ball at 15 m/s and 150 Hz
+MAX_COORDINATE = 1000.0  # m: positions farther from the origin are refused
+MAX_EXTENT = 250.0  # m: a longer track is refused; no struck ball flies farther
+MAX_SPEED = 343.0  # m/s: a track whose median speed is above that of sound is refused
+MAX_MEDIAN_SIGMA = 1.0  # m: a track with a larger median sigma is refused
+MAX_STEP = 1.0  # s: a track whose median time step is longer is refused; no bounce could be seen in it
+MIN_STEP = 1e-6  # s: a track whose median time step is shorter is refused; no camera is that fast
+MAX_RATE_RATIO = 100.0  # a median time step that differs from the declared rate by more than this factor is refused
+BASELINE: Final = 0.05  # s to each side for an acceleration: 3 mm of noise leave 3 m/s^2, in a track's median 0.5
+LEAST_FALLING: Final = 0.2  # least share of a track that falls along -z as a ball does, for undoubted axes
+MOSTLY: Final = 0.5  # share of a track that falls along +z, above which z seems to point down
+FALLS: Final = (0.4, 1.9)  # gravities between which a flying ball's vertical acceleration lies; topspin doubles it
+LEAST_REVERSAL: Final = 0.8  # m/s. A ball that falls and then rises at least so fast within a few samples has bounced.
+NEAR_SURFACE: Final = 0.08  # m from every declared surface beyond which a bounce is doubtful; one step of a fast ball
 AXES: Final = ("x", "y", "z")
 
 _NAMED = 3  # number of trajectories that a note names
@@ -76,16 +54,14 @@ class Findings:
         """One sentence for each kind of repair."""
         notes = []
         if self.repeats:
-            notes.append(f"{_count(self.repeats, 'exact repeat')} dropped")
-        if self.sorted_tracks:
-            count = _count(len(self.sorted_tracks), "trajectory", "trajectories")
+            notes.append(f"{self.repeats} exact repeat{'s' * (self.repeats != 1)} dropped")
+        if late := len(self.sorted_tracks):
+            count = f"{late} trajector{'y' if late == 1 else 'ies'}"
             notes.append(f"rows of {count} were not in time order: sorted ({_some(self.sorted_tracks)})")
-        if self.merged:
-            count = _count(len(self.merged), "stamp")
-            notes.append(
-                f"{count} with different rows, up to {self.merged_distance * 100:.1f} cm apart: "
-                f"averaged ({_some(self.merged)})"
-            )
+        if merged := len(self.merged):
+            what = f"{merged} stamp{'s' * (merged != 1)} with different rows"
+            most = f"up to {self.merged_distance * 100:.1f} cm apart"
+            notes.append(f"{what}, {most}: averaged ({_some(self.merged)})")
         return notes
 
 
@@ -97,10 +73,8 @@ def check_step(label: str, stamps: Array) -> None:
     """
     step = float(np.median(np.diff(stamps))) if len(stamps) > 2 else MIN_STEP
     if not MIN_STEP <= step <= MAX_STEP:
-        raise ValueError(
-            f"{label}: t must be in s, with a median step of {MIN_STEP:g} to {MAX_STEP:g} s; got {step:.4g} s. "
-            "The unit is probably ms or us: convert it."
-        )
+        problem = f"{label}: t must be in s, with a median step of {MIN_STEP:g} to {MAX_STEP:g} s; got {step:.4g} s"
+        raise ValueError(f"{problem}. The unit is probably ms or us: convert it.")
 
 
 def tidy(group: RowGroup, where: Where, findings: Findings | None = None) -> Array:
@@ -111,13 +85,11 @@ def tidy(group: RowGroup, where: Where, findings: Findings | None = None) -> Arr
     """
     findings = Findings() if findings is None else findings
     values, rows = group.values, group.rows
-    steps = np.diff(values[:, 0])
-    if (steps < 0).any():
+    if (np.diff(values[:, 0]) < 0).any():
         findings.sorted_tracks.append(repr(group.name))
         order = np.argsort(values[:, 0], kind="stable")
         values, rows = values[order], rows[order]
-        steps = np.diff(values[:, 0])
-    if (steps == 0).any():
+    if (np.diff(values[:, 0]) == 0).any():
         values = _one_per_stamp(replace(group, rows=rows, values=values), where, findings)
     if len(values) < 2:
         raise ValueError(
@@ -133,8 +105,7 @@ def fuse(values: Array) -> Array:
     With sigmas it is weighted by 1 / sigma^2, and its sigma is that of the weighted mean, times a factor >= 1 if the
     measurements disagree by more than their sigmas allow.
 
-    Args:
-        values: (k, 4) or (k, 7), k >= 2, one stamp.
+    Args: values: (k, 4) or (k, 7), k >= 2, one stamp.
     Returns: (4,) or (7,).
     Source: Particle Data Group, Review of Particle Physics, Introduction, unconstrained averaging (scale factor S).
     """
@@ -161,10 +132,8 @@ def check_scale(label: str, times: Array, positions: Array, sigmas: Array | None
     farthest = float(max(high.max(), -low.min()))
     extent = float(np.hypot.reduce(high - low))
     if extent > MAX_EXTENT:
-        raise ValueError(
-            f"{label}: x, y, z must be in m, and a track at most {MAX_EXTENT:g} m long; got {extent:.4g}. "
-            "The unit is probably mm: divide by 1000."
-        )
+        problem = f"{label}: x, y, z must be in m, and a track at most {MAX_EXTENT:g} m long; got {extent:.4g}"
+        raise ValueError(f"{problem}. The unit is probably mm: divide by 1000.")
     if farthest > MAX_COORDINATE:
         raise ValueError(
             f"{label}: x, y, z must be in m and within {MAX_COORDINATE:g} m of the origin; got {farthest:.4g}. "
@@ -172,10 +141,8 @@ def check_scale(label: str, times: Array, positions: Array, sigmas: Array | None
         )
     if step > MAX_STEP or step < MIN_STEP or misses_rate:
         expected = f"{MIN_STEP:g} to {MAX_STEP:g} s apart" + (f", near 1/{rate:g} s (rate)" if rate else "")
-        raise ValueError(
-            f"{label}: t must be in s, its stamps {expected}; got a median step of {step:.4g}. "
-            f"{_time_remedy(step, rate)}"
-        )
+        problem = f"{label}: t must be in s, its stamps {expected}; got a median step of {step:.4g}"
+        raise ValueError(f"{problem}. {_time_remedy(step, rate)}")
     with np.errstate(over="ignore"):  # a single step may be almost zero
         speed = float(np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1) / steps))
     if speed > MAX_SPEED:
@@ -237,10 +204,6 @@ def _time_remedy(step: float, rate: float | None) -> str:
     return f"The unit is probably {unit}: divide by {units[unit]:g}."
 
 
-def _count(number: int, one: str, many: str | None = None) -> str:
-    return f"{number} {one if number == 1 else many or one + 's'}"
-
-
 def _some(names: list[str]) -> str:
     more = len(names) - _NAMED
     return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
@@ -258,10 +221,8 @@ def _other_axis(times: Array, positions: Array, reach: int) -> tuple[str, ...]:
         return ()
     if rises.mean() >= MOSTLY:
         return ("the ball rises faster and faster along z: z seems to point down. Turn the sign of z.",)
-    if abs(acceleration[Z]) >= low / 2:
-        return ()
     other = int(np.abs(acceleration[:2]).argmax())
-    if not low <= abs(acceleration[other]) <= high:
+    if abs(acceleration[Z]) >= low / 2 or not low <= abs(acceleration[other]) <= high:
         return ()
     return (f"the ball falls along {AXES[other]}, not along z: exchange the axes so that z points up.",)
 
@@ -275,10 +236,8 @@ def _other_surface(
     rise = (z[inner + reach] - z[inner]) / (times[inner + reach] - times[inner])
     lowest = z[inner] == sliding_window_view(z, 2 * reach + 1).min(axis=1)
     bounces = z[inner[lowest & (fall < -LEAST_REVERSAL) & (rise > LEAST_REVERSAL)]] - radius
-    if not len(bounces) or not len(surfaces):
-        return ()
-    gaps = np.abs(bounces[:, None] - np.array(surfaces)).min(axis=1)
-    if np.median(gaps) <= NEAR_SURFACE:
+    gaps = np.abs(bounces[:, None] - np.array(surfaces)).min(axis=1, initial=np.inf)
+    if not len(bounces) or not len(surfaces) or np.median(gaps) <= NEAR_SURFACE:
         return ()
     heights = " and ".join(f"{height:g}" for height in surfaces)
     return (

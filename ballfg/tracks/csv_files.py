@@ -7,6 +7,7 @@ can afford to read the file cell by cell.
 import csv
 import re
 from collections.abc import Collection, Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import IO
 
@@ -19,8 +20,7 @@ from ballfg.files.spreadsheet import bare
 
 _NUMBER = re.compile(r"\s*[+-]?(\d++\.?\d*+|\.\d++)([eE][+-]?\d+)?\s*", re.ASCII)
 _NOT_FINITE = re.compile(r"\s*[+-]?(nan|inf|infinity)\s*", re.IGNORECASE)
-MAX_HEADER = 1 << 16
-"""Largest number of bytes in the line of column names."""
+MAX_HEADER = 1 << 16  # largest number of bytes in the line of column names
 
 
 def is_number(cell: str) -> bool:
@@ -29,19 +29,14 @@ def is_number(cell: str) -> bool:
 
 
 def read_header(path: Path) -> list[str]:
-    """The column names of a CSV file.
-
-    Raises: ValueError: an empty file, one that is not UTF-8 text, or a first line of more than `MAX_HEADER` bytes.
-    """
+    """The column names of a CSV file. Raises: ValueError: empty, not UTF-8, or a line beyond `MAX_HEADER` bytes."""
     with path.open("rb") as file:
         first = re.split(rb"[\r\n]", file.read(MAX_HEADER + 1), maxsplit=1)[0]
     if not first.strip():
         raise ValueError(f"{path}: must begin with a line of column names; got an empty file or line. Add the header.")
     if len(first) > MAX_HEADER:
-        raise ValueError(
-            f"{path}, line 1: the line of column names must have at most {MAX_HEADER} bytes; it has more. "
-            "Leave columns out, or put each row on a line of its own."
-        )
+        problem = f"{path}, line 1: the line of column names must have at most {MAX_HEADER} bytes; it has more"
+        raise ValueError(f"{problem}. Leave columns out, or put each row on a line of its own.")
     text = first.decode("utf-8-sig", errors="surrogateescape")
     if "\0" in text or _has_surrogate(text):
         raise _not_utf8(path, 1)
@@ -108,27 +103,18 @@ def records(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 def _lines(path: Path, file: IO[str]) -> Iterator[str]:
     """The lines of a file. Raises: ValueError: a longer one than `MAX_LINE`."""
-    number = 0
-    while line := file.readline(MAX_LINE + 1):
-        number += 1
+    for number, line in enumerate(iter(lambda: file.readline(MAX_LINE + 1), ""), 1):
         if len(line) > MAX_LINE:
-            raise ValueError(
-                f"{path}, line {number}: must have at most {MAX_LINE} characters; it has more. Put each row on a line "
-                "of its own."
-            )
+            what = f"{path}, line {number}: must have at most {MAX_LINE} characters; it has more"
+            raise ValueError(f"{what}. Put each row on a line of its own.")
         yield line
 
 
 def lines_of_rows(path: Path, rows: Sequence[int]) -> list[int]:
     """The line numbers, from 1, of rows of data counted from 0."""
-    wanted = dict.fromkeys(rows, 0)
-    last = max(rows)
-    for row, (line, _) in enumerate(records(path)):
-        if row in wanted:
-            wanted[row] = line
-        if row == last:
-            break
-    return [wanted[row] for row in rows]
+    first = enumerate(islice(records(path), max(rows) + 1))
+    lines = {row: line for row, (line, _) in first if row in rows}
+    return [lines.get(row, 0) for row in rows]
 
 
 def explain(path: Path, numeric: Sequence[str], reason: str) -> ValueError:
@@ -159,17 +145,14 @@ def no_rows(path: Path) -> ValueError:
 def row_problem(header: list[str], numeric: Sequence[str], cells: list[str]) -> str | None:
     """The end of a message about a row with too few or too many cells, or without a required number."""
     if len(cells) != len(header):
-        return (
-            f": must have {len(header)} cells, one for each column of the header; got {len(cells)}. "
-            "Complete the line or delete it."
-        )
+        what = f": must have {len(header)} cells, one for each column of the header; got {len(cells)}"
+        return f"{what}. Complete the line or delete it."
     for name in numeric:
         cell = cells[header.index(name)]
         if not _NUMBER.fullmatch(cell) and not _NOT_FINITE.fullmatch(cell):
-            got = f"got {shown(cell)}" if cell.strip() else "got an empty cell"
-            return (
-                f", column {shown(name)}: must be a number with a decimal point; {got}. Correct it or delete the line."
-            )
+            got = shown(cell) if cell.strip() else "an empty cell"
+            what = f", column {shown(name)}: must be a number with a decimal point"
+            return f"{what}; got {got}. Correct it or delete the line."
     return None
 
 

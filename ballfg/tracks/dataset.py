@@ -9,7 +9,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Final
 
-from ballfg.checks import check_path, shown
+from ballfg.checks import check_path, listed, shown
 from ballfg.files.whole_folder import of_one_state
 from ballfg.tracks.checks import Findings, check_scale, tidy
 from ballfg.tracks.detections_file import DETECTIONS_FILE
@@ -27,6 +27,11 @@ class Dataset(TrackFolder):
 
     Iterating streams the file, so that one track at a time is in memory; each `for` loop starts again at the first.
     The tracks come in the order in which their names first appear.
+
+    Attributes:
+        path: the folder.
+        info: the content of `dataset.yaml`.
+        notes: ignored and repaired entries, one sentence each.
     """
 
     rough: Final = False
@@ -35,15 +40,8 @@ class Dataset(TrackFolder):
     def __init__(
         self, path: Path, info: DatasetInfo, source: RowSource, index: Index, labels: LabelTable, notes: list[str]
     ) -> None:
-        self.path = path
-        """The folder."""
-        self.info = info
-        """The content of `dataset.yaml`."""
-        self.notes = notes
-        """Ignored and repaired entries, one sentence each."""
-        self._source = source
-        self._index = index
-        self._labels = labels
+        self.path, self.info, self.notes = path, info, notes
+        self._source, self._index, self._labels = source, index, labels
         self._attached: Callable[[Track], Track] | None = None
 
     def __len__(self) -> int:
@@ -91,8 +89,6 @@ class Dataset(TrackFolder):
     def track(self, name: str) -> Track:
         """One track by its name; reads the file up to it.
 
-        Args: name: of the trajectory.
-        Returns: the track.
         Raises: ValueError: if there is no track of that name.
         """
         if isinstance(name, str) and name in self._index.names:
@@ -132,10 +128,8 @@ def read_dataset(folder: str | PathLike[str]) -> Dataset:
     labels = LabelTable({}, {})
     if (path / LABELS_FILE).is_file():
         labels = read_labels(path / LABELS_FILE, index.names)
-        if len(labels) < len(index.names):
-            notes.append(
-                f"{LABELS_FILE}: {len(index.names) - len(labels)} of {len(index.names)} trajectories unlabelled"
-            )
+        if missing := len(index.names) - len(labels):
+            notes.append(f"{LABELS_FILE}: {missing} of {len(index.names)} trajectories unlabelled")
     findings = Findings()
     for group in groups(source, index):
         check_group(source, group, info, findings)
@@ -157,18 +151,14 @@ def _open_source(folder: Path) -> RowSource:
     if len(present) > 1:
         raise ValueError(f"{folder} must hold one table of tracks; got {' and '.join(present)}. Delete one of them.")
     if not present:
-        raise FileNotFoundError(
-            f"{folder} must hold {' or '.join(TRACK_FILES)}; got {_listing(folder)}. "
-            "Add it: trajectory,t,x,y,z (docs/tracks.md)."
-        )
+        problem = f"{folder} must hold {' or '.join(TRACK_FILES)}; got {_listing(folder)}"
+        raise FileNotFoundError(f"{problem}. Add it: trajectory,t,x,y,z (docs/tracks.md).")
     source = CsvRows if present[0].endswith(".csv") else ParquetRows
     return source(folder / present[0])
 
 
 def _listing(folder: Path) -> str:
-    names = sorted(entry.name for entry in folder.iterdir())
-    shown = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
-    return shown or "an empty folder"
+    return listed(sorted(entry.name for entry in folder.iterdir())) if any(folder.iterdir()) else "an empty folder"
 
 
 def check_group(source: RowSource, group: RowGroup, info: DatasetInfo, findings: Findings) -> None:

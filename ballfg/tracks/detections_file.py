@@ -22,24 +22,16 @@ from ballfg.tracks.sightings import Sightings
 from ballfg.tracks.table import TableWriter
 
 Texts = NDArray[np.str_]
-Rule = tuple[str, Callable[[Array], NDArray[np.bool_]]]
-"""The rule for the numbers of a column, in words and as a test."""
-
+Rule = tuple[str, Callable[[Array], NDArray[np.bool_]]]  # the rule for the numbers of a column, in words and as a test
 CAMERA: Final = "camera"
 PLACE: Final = ("t", "u", "v")
 NOISE: Final = ("sigma_u", "sigma_v", "rho_uv")
 SCORE: Final = "score"
 OPTIONAL: Final = (*NOISE, SCORE)
-UNSTATED: Final = {"sigma_u": 0.5, "sigma_v": 0.5, "rho_uv": 0.0}
-"""px. Half a pixel, as reached by a detector of patch centres."""
-LEAST_SIGMA: Final = 1e-4
-"""px. Best resolution of a camera; a graph with far surer pixels cannot be solved in double precision."""
-MOST_PIXELS: Final = 1e6
-"""px. Largest width of an image; larger numbers overflow when squared."""
-_SIGMA: Final[Rule] = (
-    f"{LEAST_SIGMA:g} to {MOST_PIXELS:.0f} px",
-    lambda x: (x >= LEAST_SIGMA) & (x <= MOST_PIXELS),
-)
+UNSTATED: Final = {"sigma_u": 0.5, "sigma_v": 0.5, "rho_uv": 0.0}  # px; half a pixel, as of patch centres
+LEAST_SIGMA: Final = 1e-4  # px, best resolution of a camera; far surer pixels cannot be solved in double precision
+MOST_PIXELS: Final = 1e6  # px. Largest width of an image; larger numbers overflow when squared.
+_SIGMA: Final[Rule] = (f"{LEAST_SIGMA:g} to {MOST_PIXELS:.0f} px", lambda x: (x >= LEAST_SIGMA) & (x <= MOST_PIXELS))
 _PIXEL: Final[Rule] = (f"finite, at most {MOST_PIXELS:.0f} px", lambda x: np.abs(x) <= MOST_PIXELS)
 RULES: Final[Mapping[str, Rule]] = {
     "u": _PIXEL,
@@ -77,15 +69,21 @@ def read_sightings(
         time_offsets: s, by camera of the rig: rows are sorted by t less the offset.
     Returns: sightings by trajectory, in the order in which the trajectories first appear; ignored entries, one sentence
         each.
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: a missing or repeated column, a cell out of its range, an unknown camera, or several candidates of
-            one ball with equal scores; the message names file, line and column.
+    Raises: FileNotFoundError: there is no such file. ValueError: a missing or repeated column, a cell out of its range,
+        an unknown camera, or several candidates of one ball with equal scores; the message names file, line and column.
     """
     path = Path(path)
-    header, table, nameless = _read(path, list(time_offsets))
+    header, texts, numbers = read_columns(path, REQUIRED)
+    (lines,) = np.nonzero(np.char.strip(texts[KEY]) != "")
+    values = {name: column[lines] for name, column in numbers.items()}
+    check_values(path, values, lines)
+    check_cameras(path, texts[CAMERA][lines], lines, list(time_offsets))
+    values |= {name: np.full(len(lines), value) for name, value in UNSTATED.items() if name not in values}
+    number_of = {name: number for number, name in enumerate(time_offsets)}
+    seen_by = np.array([number_of[name] for name in texts[CAMERA][lines].tolist()], dtype=np.int64)
+    table = _Table(path, lines, texts[KEY][lines], seen_by, values)
     notes = [f"{path.name}: column {shown(name)} ignored" for name in header if name not in (*REQUIRED, *OPTIONAL)]
-    if nameless:
+    if nameless := len(texts[KEY]) - len(lines):
         notes.append(f"{path.name}: {nameless} rows without a trajectory left out")
     rows, doubles = _chosen(table)
     if doubles:
@@ -97,9 +95,9 @@ def read_sightings(
     found = {}
     for name in dict.fromkeys(table.names.tolist()):
         mine = rows[table.names[rows] == name]
-        values = {column: numbers[mine] for column, numbers in table.values.items()}
-        pixels = np.column_stack((values["u"], values["v"]))
-        found[name] = Sightings(tuple(time_offsets), table.camera[mine], values["t"], pixels, covariances(values))
+        own = {column: numbers[mine] for column, numbers in table.values.items()}
+        pixels = np.column_stack((own["u"], own["v"]))
+        found[name] = Sightings(tuple(time_offsets), table.camera[mine], own["t"], pixels, covariances(own))
     return found, notes
 
 
@@ -115,25 +113,8 @@ def write_sightings(path: str | os.PathLike[str], balls: Iterable[tuple[str, Sig
             table.write({KEY: name} | seen_columns(seen.times, camera, seen.pixels, seen.covariances))
 
 
-def _read(path: Path, cameras: list[str]) -> tuple[list[str], _Table, int]:
-    """The header, the checked rows with a ball's name, and the number of other rows."""
-    header, texts, numbers = read_columns(path, REQUIRED)
-    (lines,) = np.nonzero(np.char.strip(texts[KEY]) != "")
-    names, seen_by = texts[KEY][lines], texts[CAMERA][lines]
-    values = {name: column[lines] for name, column in numbers.items()}
-    check_values(path, values, lines)
-    check_cameras(path, seen_by, lines, cameras)
-    values |= {name: np.full(len(lines), value) for name, value in UNSTATED.items() if name not in values}
-    number_of = {name: number for number, name in enumerate(cameras)}
-    camera = np.array([number_of[name] for name in seen_by.tolist()], dtype=np.int64)
-    return header, _Table(path, lines, names, camera, values), len(texts[KEY]) - len(lines)
-
-
 def _chosen(table: _Table) -> tuple[NDArray[np.int64], int]:
-    """One row for each ball, camera and stamp, the best scored, ascending; and the number of the others.
-
-    Raises: ValueError: two rows of the same score.
-    """
+    """The best scored row for each ball, camera and stamp; the number of others. Raises: ValueError: equal scores."""
     score = table.values.get(SCORE, np.zeros(len(table.lines)))
     order = np.lexsort((-score, table.values["t"], table.camera, table.names))
     same = np.ones(max(len(order) - 1, 0), dtype=bool)
@@ -199,10 +180,8 @@ def check_values(
         rule, holds = rules.get(name, (f"finite, at most {LARGEST:g} in size", np.isfinite))
         wrong = ~((np.abs(column) <= LARGEST) & holds(column))
         if wrong.any():
-            raise ValueError(
-                f"{_place(path, lines[wrong], name)} must be {rule}; got {column[wrong][0]:g}. "
-                "Correct it or delete the line."
-            )
+            problem = f"{_place(path, lines[wrong], name)} must be {rule}; got {column[wrong][0]:g}"
+            raise ValueError(f"{problem}. Correct it or delete the line.")
 
 
 def check_cameras(
@@ -232,15 +211,8 @@ def covariances(values: Mapping[str, Array]) -> Array:
 def seen_columns(times: Array, camera: ArrayLike, pixels: Array, spread: Array) -> dict[str, ArrayLike]:
     """The columns of a table from stamps (n,) s, cameras, pixels (n, 2) and covariances (n, 2, 2) px^2."""
     sigma_u, sigma_v = (np.sqrt(spread[:, i, i]) for i in (0, 1))
-    return {
-        "t": times,
-        CAMERA: camera,
-        "u": pixels[:, 0],
-        "v": pixels[:, 1],
-        "sigma_u": sigma_u,
-        "sigma_v": sigma_v,
-        "rho_uv": spread[:, 0, 1] / (sigma_u * sigma_v),
-    }
+    noise = {"sigma_u": sigma_u, "sigma_v": sigma_v, "rho_uv": spread[:, 0, 1] / (sigma_u * sigma_v)}
+    return {"t": times, CAMERA: camera, "u": pixels[:, 0], "v": pixels[:, 1], **noise}
 
 
 def _place(path: Path, lines: NDArray[np.int64], column: str) -> str:

@@ -10,7 +10,6 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import groupby, pairwise
-from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +19,7 @@ from ballfg.checks import LARGEST, NAME_RULE, is_name, shown
 from ballfg.tracks.csv_files import no_rows
 from ballfg.tracks.rows import Block, RowSource
 
-MIN_SIGMA, MAX_SIGMA = 1e-9, 1e6
-"""m: allowed standard deviations of a sample; a large one marks a sample with little weight."""
+MIN_SIGMA, MAX_SIGMA = 1e-9, 1e6  # m, of a sample; a large one marks a sample with little weight
 
 
 @dataclass(frozen=True)
@@ -30,35 +28,22 @@ class RowGroup:
 
     name: str
 
-    rows: NDArray[np.int64]
-    """(n,) number of each row in the file, from 0."""
-
-    values: Array
-    """(n, 4) or (n, 7), as in Block."""
+    rows: NDArray[np.int64]  # (n,) number of each row in the file, from 0
+    values: Array  # (n, 4) or (n, 7), as in Block
 
 
 @dataclass(frozen=True)
 class Index:
     """The result of one scan of the file."""
 
-    names: list[str]
-    """The trajectories in the order in which they first appear."""
-
-    counts: NDArray[np.int64]
-    """(number of trajectories,) rows of each."""
-
-    contiguous: bool
-    """True if the rows of each trajectory are contiguous."""
-
-    stamp: tuple[int, int]
-    """Size (bytes) and modification time (ns) of the scanned file."""
+    names: list[str]  # the trajectories in the order in which they first appear
+    counts: NDArray[np.int64]  # (number of trajectories,) rows of each
+    contiguous: bool  # True if the rows of each trajectory are contiguous
+    stamp: tuple[int, int]  # size (bytes) and modification time (ns) of the scanned file
 
 
 def scan(source: RowSource) -> Index:
-    """Reads the file once, checks every cell and counts the rows of each trajectory.
-
-    Raises: ValueError: no rows, a nameless trajectory, a value that is not finite, an invalid sigma.
-    """
+    """Reads the file once, checks every cell, counts rows of trajectories. Raises: ValueError: no rows, a bad cell."""
     stamp = source.stamp()
     codes_of: dict[str, int] = {}
     counts: list[int] = []
@@ -81,10 +66,7 @@ def scan(source: RowSource) -> Index:
 
 
 def groups(source: RowSource, index: Index) -> Iterator[RowGroup]:
-    """Yields the trajectories in the order of their first rows.
-
-    Raises: ValueError: if the file has changed since the scan.
-    """
+    """The trajectories in the order of their first rows. Raises: ValueError: the file has changed since the scan."""
     if source.stamp() != index.stamp:
         raise ValueError(f"{source.path}: must not change while it is in use; it did. Call read_dataset again.")
     return _stream(source) if index.contiguous else _regroup(source, index)
@@ -95,10 +77,8 @@ def check_cells(source: RowSource, block: Block) -> None:
     for code, name in enumerate(block.names):
         if not name or not is_name(name):
             row = block.start + int(np.argmax(block.codes == code))
-            raise ValueError(
-                f"{source.where(row)}, column 'trajectory': must be {NAME_RULE}; got {shown(name or '')}. "
-                "Fill in a name."
-            )
+            problem = f"{source.where(row)}, column 'trajectory': must be {NAME_RULE}; got {shown(name or '')}"
+            raise ValueError(f"{problem}. Fill in a name.")
     bad = ~(np.abs(block.values) <= LARGEST)
     sigmas = block.values[:, 4:]
     bad[:, 4:] |= (sigmas < MIN_SIGMA) | (sigmas > MAX_SIGMA)
@@ -133,37 +113,26 @@ def _stream(source: RowSource) -> Iterator[RowGroup]:
         for start, end in _runs(block.codes)
     )
     for name, run in groupby(pieces, key=lambda piece: piece.name):
-        yield _joined(name, list(run))
-
-
-def _joined(name: str, pieces: list[RowGroup]) -> RowGroup:
-    rows = np.concatenate([piece.rows for piece in pieces])
-    return RowGroup(name, rows, np.concatenate([piece.values for piece in pieces]))
+        rows, values = zip(*((piece.rows, piece.values) for piece in run), strict=True)
+        yield RowGroup(name, np.concatenate(rows), np.concatenate(values))
 
 
 def _regroup(source: RowSource, index: Index) -> Iterator[RowGroup]:
     width = 1 + len(source.columns)
+    codes_of = {name: code for code, name in enumerate(index.names)}
+    position = (np.cumsum(index.counts) - index.counts).tolist()
     with tempfile.TemporaryFile(prefix="ballfg-") as file:
-        _write_ordered(file, source, index, width)
+        for block in source.blocks():  # each row, its number and values, goes to its trajectory's place
+            codes = _global_codes(block, codes_of)
+            order = np.argsort(codes, kind="stable")
+            table = np.column_stack([(block.start + order).astype(np.float64), block.values[order]])
+            for start, end in _runs(codes[order]):
+                code = int(codes[order[start]])
+                file.seek(position[code] * width * 8)
+                file.write(table[start:end].tobytes())
+                position[code] += end - start
         file.seek(0)
         for name, count in zip(index.names, index.counts, strict=True):
             table = np.frombuffer(file.read(int(count) * width * 8), dtype=np.float64).reshape(-1, width)
             # A row number is exact in float64 up to 2**53.
             yield RowGroup(name, table[:, 0].astype(np.int64), table[:, 1:])
-
-
-def _write_ordered(file: IO[bytes], source: RowSource, index: Index, width: int) -> None:
-    """Writes each row (its number, its values) to its trajectory's place in the file."""
-    codes_of = {name: code for code, name in enumerate(index.names)}
-    ends = np.cumsum(index.counts)
-    position = (ends - index.counts).tolist()
-    for block in source.blocks():
-        codes = _global_codes(block, codes_of)
-        order = np.argsort(codes, kind="stable")
-        codes = codes[order]
-        table = np.column_stack([(block.start + order).astype(np.float64), block.values[order]])
-        for start, end in _runs(codes):
-            code = int(codes[start])
-            file.seek(position[code] * width * 8)
-            file.write(table[start:end].tobytes())
-            position[code] += end - start

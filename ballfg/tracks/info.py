@@ -1,7 +1,7 @@
 """Reads, checks and writes `dataset.yaml`, the description of a dataset."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -46,23 +46,19 @@ class Ball:
 
     radius: float
     """m"""
-
     mass: float
     """kg"""
 
     def __post_init__(self) -> None:
-        for key, unit, (least, limit), instead in (("radius", "m", _RADII, "mm"), ("mass", "kg", _MASSES, "g")):
-            value = check_number(
-                f"ball.{key}", getattr(self, key), unit, above=0.0, least=least, limit=limit, instead=instead
-            )
-            object.__setattr__(self, key, value)
+        for key, unit, (least, limit), other in (("radius", "m", _RADII, "mm"), ("mass", "kg", _MASSES, "g")):
+            value, label = getattr(self, key), f"ball.{key}"
+            checked = check_number(label, value, unit, above=0.0, least=least, limit=limit, instead=other)
+            object.__setattr__(self, key, checked)
 
 
 TABLE_TENNIS = Ball(radius=0.02, mass=0.0027)
 """ITTF, The Laws of Table Tennis, 2.3: diameter 40 mm, 2.7 g."""
-
-TENNIS = Ball(radius=0.0335, mass=0.0577)
-"""ITF Rules of Tennis, Appendix I, type 2: diameter 65.4-68.6 mm, 56.0-59.4 g; the middle of both."""
+TENNIS = Ball(radius=0.0335, mass=0.0577)  # ITF Rules of Tennis, Appendix I, type 2: middle of the limits
 
 
 @dataclass(frozen=True)
@@ -74,34 +70,24 @@ class DatasetInfo:
 
     name: str
     """One line of text."""
-
     table_height: float
     """z of the table's surface, m."""
-
     ball: Ball
     """Radius (m) and mass (kg)."""
-
     rate: float | None = None
     """Nominal sampling rate, Hz. Computations use the stamps of the tracks."""
-
     position_noise: float | None = None
     """Standard deviation of one measured coordinate, m."""
-
     spin_noise: float | None = None
     """Standard deviation of one component of the spin labels, rad/s."""
-
     source: str | None = None
     """Origin of the data."""
-
     licence: str | None = None
     """Terms of use."""
-
     table_extent: tuple[float, float, float, float] | None = None
     """(x_low, x_high, y_low, y_high) m, the table's ends; None if unknown."""
-
     noise: TrackNoise | None = None
     """All known noise of the tracks, as from `ballfg noise`; it takes precedence over the two numbers above."""
-
     imported: Mapping[str, Any] | None = None
     """Origin and conversion of the tracks, as `ballfg import` records them in the section `import`; for people."""
 
@@ -141,10 +127,8 @@ class DatasetInfo:
         frame = _section(content, "frame", {"up": "...", "table_height": "..."})
         ball = _section(content, "ball", {"radius": "...", "mass": "..."})
         if frame["up"] != "z":
-            raise ValueError(
-                f"frame.up must be 'z', the only up axis that is supported; got {shown(frame['up'])}. "
-                "Rotate the positions so that z points up."
-            )
+            problem = f"frame.up must be 'z', the only up axis that is supported; got {shown(frame['up'])}"
+            raise ValueError(f"{problem}. Rotate the positions so that z points up.")
         _need(content, "name", "")
         return cls(
             name=content["name"],
@@ -161,11 +145,7 @@ class DatasetInfo:
         frame: dict[str, Any] = {"up": "z", "table_height": self.table_height}
         if self.table_extent is not None:
             frame["table"] = {"x": list(self.table_extent[:2]), "y": list(self.table_extent[2:])}
-        content: dict[str, Any] = {
-            "name": self.name,
-            "frame": frame,
-            "ball": {field.name: getattr(self.ball, field.name) for field in fields(Ball)},
-        }
+        content: dict[str, Any] = {"name": self.name, "frame": frame, "ball": asdict(self.ball)}
         optional = {key: getattr(self, key) for key in _OPTIONAL}
         content |= {key: value for key, value in optional.items() if value is not None}
         if self.noise is not None:
@@ -190,21 +170,15 @@ class TrackFolder:
 
 
 def read_info(path: Path) -> tuple[DatasetInfo, list[str]]:
-    """Reads a `dataset.yaml`.
-
-    Returns: the info, and a note for each unknown key.
-    Raises: ValueError: not readable as YAML, or a bad field; the message names file and field.
-    """
+    """The info in a `dataset.yaml`, and notes on unknown keys. Raises: ValueError: no YAML, or a bad field."""
     try:
         content = read_yaml(path)
     except YamlError as error:
         place = "" if error.line is None else f", line {error.line}"
         raise ValueError(f"{path}{place}: must be valid YAML; {error.problem}. Correct it.") from None
     if not isinstance(content, dict):
-        raise ValueError(
-            f"{path}: must hold fields such as 'name: my_shots'; got {type_name(content)}. "
-            f"Give at least {', '.join(_REQUIRED)}."
-        )
+        problem = f"{path}: must hold fields such as 'name: my_shots'; got {type_name(content)}"
+        raise ValueError(f"{problem}. Give at least {', '.join(_REQUIRED)}.")
     content = {str(key): value for key, value in content.items()}
     try:
         info = DatasetInfo.from_mapping(content)
@@ -221,8 +195,7 @@ def read_info(path: Path) -> tuple[DatasetInfo, list[str]]:
 
 def write_info(path: Path, info: DatasetInfo) -> None:
     """Writes a `dataset.yaml`; floats read back bit for bit."""
-    text = yaml.safe_dump(info.to_mapping(), sort_keys=False, allow_unicode=True)
-    path.write_text(text, encoding="utf-8")
+    path.write_text(yaml.safe_dump(info.to_mapping(), sort_keys=False, allow_unicode=True), encoding="utf-8")
 
 
 def _section(content: Mapping[str, Any], key: str, fields: Mapping[str, str], prefix: str = "") -> dict[str, Any]:
@@ -246,11 +219,8 @@ def _stated_extent(frame: Mapping[str, Any]) -> tuple[Any, ...] | None:
     table = _section(frame, "table", {"x": "[0.0, 2.74]", "y": "[-0.76, 0.76]"}, "frame.")
     for axis in "xy":
         if not isinstance(table[axis], list) or len(table[axis]) != 2:
-            raise ValueError(
-                f"frame.table.{axis} must be two numbers in m, the table's ends along {axis}; got "
-                f"{shown(table[axis])}. "
-                f"Write {axis}: [low, high]."
-            )
+            what = f"frame.table.{axis} must be two numbers in m, the table's ends along {axis}"
+            raise ValueError(f"{what}; got {shown(table[axis])}. Write {axis}: [low, high].")
     return (*table["x"], *table["y"])
 
 
@@ -275,8 +245,7 @@ def _checked_extent(extent: Any) -> tuple[float, ...]:
 
 
 def _need(content: Mapping[str, Any], key: str, prefix: str) -> None:
-    if content.get(key) is not None:
-        return
-    found = nearest(key, (str(name) for name in content if name not in _KNOWN))
-    remedy = f"Add it, or rename {shown(found)}." if found else "Add it."
-    raise ValueError(f"{prefix}{key} is required; got {listed(content)}. {remedy}")
+    if content.get(key) is None:
+        found = nearest(key, (str(name) for name in content if name not in _KNOWN))
+        remedy = f"Add it, or rename {shown(found)}." if found else "Add it."
+        raise ValueError(f"{prefix}{key} is required; got {listed(content)}. {remedy}")

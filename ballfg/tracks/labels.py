@@ -42,11 +42,7 @@ class LabelTable:
 
 
 def read_labels(path: Path, trajectories: Collection[str]) -> LabelTable:
-    """Reads a `labels.csv`.
-
-    Raises: ValueError: a missing or repeated column, a ragged line, a row without a track, a second row for a track, or
-        text in place of a number; the message names line and column.
-    """
+    """Reads a `labels.csv`. Raises: ValueError: a bad column or row; the message names line and column."""
     header = csv_files.read_header(path)
     csv_files.check_header(path, header, (KEY,), (KEY,))
     for name in header:
@@ -55,64 +51,43 @@ def read_labels(path: Path, trajectories: Collection[str]) -> LabelTable:
                 f"{path}, line 1: the name of each column must be {NAME_RULE}; got {shown(name)}. Name it or delete it."
             )
     csv_files.check_header(path, header, (), header)
-    rows, lines, cells = _read_rows(path, header, set(trajectories))
-    columns = {
-        name: _column(path, name, [row[i] for row in cells], lines) for i, name in enumerate(header) if name != KEY
-    }
-    return LabelTable(columns, rows)
-
-
-def _read_rows(
-    path: Path, header: list[str], trajectories: set[str]
-) -> tuple[dict[str, int], list[int], list[list[str]]]:
-    """The row number of each trajectory, the line of each row, the cells of each row."""
-    key = header.index(KEY)
-    rows: dict[str, int] = {}
-    lines: list[int] = []
-    cells: list[list[str]] = []
+    known, key = set(trajectories), header.index(KEY)
+    found: dict[str, tuple[int, list[str]]] = {}  # line and cells of each trajectory
     for line, row in csv_files.records(path):
-        problem = csv_files.row_problem(header, (), row)
-        if problem:
+        if problem := csv_files.row_problem(header, (), row):
             raise ValueError(f"{path}, line {line}{problem}")
-        name = row[key]
-        if name in rows:
+        name, where = row[key], f"{path}, line {line}: trajectory {shown(row[key])}"
+        if name in found:
+            raise ValueError(f"{where} must have one row; line {found[name][0]} is another. Delete one of them.")
+        if name not in known:
             raise ValueError(
-                f"{path}, line {line}: trajectory {shown(name)} must have one row; line {lines[rows[name]]} is another."
-                " Delete one of them."
+                f"{where} must have a track; there is none of that name. Names are compared as text, zeros "
+                f"included.{did_you_mean(name, known)}"
             )
-        if name not in trajectories:
-            raise ValueError(
-                f"{path}, line {line}: trajectory {shown(name)} must have a track; there is none of that name. "
-                f"Names are compared as text, zeros included.{did_you_mean(name, trajectories)}"
-            )
-        rows[name] = len(cells)
-        lines.append(line)
-        cells.append(row)
-    return rows, lines, cells
+        found[name] = line, row
+    lines = [line for line, _ in found.values()]
+    texts = {name: [row[i] for _, row in found.values()] for i, name in enumerate(header) if name != KEY}
+    columns = {name: _column(path, name, cells, lines) for name, cells in texts.items()}
+    return LabelTable(columns, {name: number for number, name in enumerate(found)})
 
 
 def _column(path: Path, name: str, cells: list[str], lines: list[int]) -> list[Label | None]:
+    def refuse(
+        number: int, problem: str, remedy: str = "Correct it, or leave the cell empty if it is unknown."
+    ) -> None:
+        raise ValueError(f"{path}, line {lines[number]}, column {shown(name)}: must be {problem}. {remedy}")
+
     text: list[Label | None] = [cell or None for cell in cells]
-    for cell, line in zip(cells, lines, strict=True):
+    for number, cell in enumerate(cells):
         if not is_text(cell):
-            raise ValueError(
-                f"{path}, line {line}, column {shown(name)}: must be {TEXT_RULE}; got {shown(cell)}. Correct it."
-            )
-    if name in TEXT_LABELS:
+            refuse(number, f"{TEXT_RULE}; got {shown(cell)}", "Correct it.")
+    others = [number for number, cell in enumerate(cells) if cell.strip() and not csv_files.is_number(cell)]
+    if name in TEXT_LABELS or (others and name not in NUMERIC_LABELS):
         return text
-    for cell, line in zip(cells, lines, strict=True):
-        if cell.strip() and not csv_files.is_number(cell):
-            if name not in NUMERIC_LABELS:
-                return text
-            raise ValueError(
-                f"{path}, line {line}, column {shown(name)}: must be a number; got {shown(cell)}. "
-                "Correct it, or leave the cell empty if it is unknown."
-            )
+    if others:
+        refuse(others[0], f"a number; got {shown(cells[others[0]])}")
     values: list[Label | None] = [float(cell) if cell.strip() else None for cell in cells]
-    for value, line in zip(values, lines, strict=True):
-        if name in SPIN_LABELS and isinstance(value, float) and abs(value) > FASTEST_SPIN:
-            raise ValueError(
-                f"{path}, line {line}, column {shown(name)}: must be within {FASTEST_SPIN:g} rad/s, as the spin of "
-                f"every ball; got {value:g}. Correct it, or leave the cell empty if it is unknown."
-            )
+    for number, value in enumerate(values if name in SPIN_LABELS else ()):
+        if isinstance(value, float) and abs(value) > FASTEST_SPIN:
+            refuse(number, f"within {FASTEST_SPIN:g} rad/s, as the spin of every ball; got {value:g}")
     return values

@@ -67,10 +67,7 @@ def dataset_in_memory(info: DatasetInfo, tracks: Sequence[Track], notes: Sequenc
     findings = Findings()
     for group in groups(source, index):
         check_group(source, group, info, findings)
-    return Dataset(Path(f"{info.name} (in memory)"), info, source, index, _labels(tracks), [*notes, *findings.notes()])
-
-
-def _labels(tracks: Sequence[Track]) -> LabelTable:
-    names = dict.fromkeys(name for track in tracks for name in track.labels)
-    columns: dict[str, list[Label | None]] = {name: [track.labels.get(name) for track in tracks] for name in names}
-    return LabelTable(columns, {track.name: i for i, track in enumerate(tracks)} if names else {})
+    labels = dict.fromkeys(label for track in tracks for label in track.labels)
+    columns: dict[str, list[Label | None]] = {label: [track.labels.get(label) for track in tracks] for label in labels}
+    table = LabelTable(columns, {track.name: i for i, track in enumerate(tracks)} if labels else {})
+    return Dataset(Path(f"{info.name} (in memory)"), info, source, index, table, [*notes, *findings.notes()])

@@ -9,33 +9,20 @@ from typing import Any, Final
 
 from ballfg.checks import check_instance, check_number, did_you_mean, shown, type_name
 
-LARGEST: Final[Mapping[str, float]] = {
-    "position": 1.0,
-    "memory": 1.0,
-    "memory_time": 10.0,
-    "stamp_jitter": 1.0,
-    "spin_label": 5000.0,
-    "spin_prior": 5000.0,
-    "acceleration": 100.0,
-    "contact_velocity": 50.0,
-    "contact_tangential": 50.0,
-    "contact_spin": 5000.0,
+LIMITS: Final[Mapping[str, tuple[str, float]]] = {
+    "position": ("m", 1.0),
+    "memory": ("m", 1.0),
+    "memory_time": ("s", 10.0),
+    "stamp_jitter": ("s", 1.0),
+    "spin_label": ("rad/s", 5000.0),
+    "spin_prior": ("rad/s", 5000.0),
+    "acceleration": ("m/s^2/sqrt(Hz)", 100.0),
+    "contact_velocity": ("m/s", 50.0),
+    "contact_tangential": ("m/s", 50.0),
+    "contact_spin": ("rad/s", 5000.0),
 }
-"""Largest value of each number; a larger one is in another unit."""
-SMALLEST: Final = 1e-9
-"""Least nonzero value of each number; with smaller noise, rounding errors outweigh the motion."""
-UNITS: Final[Mapping[str, str]] = {
-    "position": "m",
-    "memory": "m",
-    "memory_time": "s",
-    "stamp_jitter": "s",
-    "spin_label": "rad/s",
-    "spin_prior": "rad/s",
-    "acceleration": "m/s^2/sqrt(Hz)",
-    "contact_velocity": "m/s",
-    "contact_tangential": "m/s",
-    "contact_spin": "rad/s",
-}
+"""Unit and largest value of each number; a larger one is in another unit."""
+SMALLEST: Final = 1e-9  # least nonzero value of each number; with smaller noise, rounding errors outweigh the motion
 PER_AXIS: Final = ("position", "memory")
 MAY_BE_ZERO: Final = ("memory", "stamp_jitter", "contact_tangential")
 
@@ -49,39 +36,29 @@ class TrackNoise:
 
     position: tuple[float, float, float] | None = None
     """m, of the white error of a measured x, y, z."""
-
     memory: tuple[float, float, float] | None = None
     """m, of the tracker's error along x, y, z that lasts from sample to sample."""
-
     memory_time: float | None = None
     """s, over which the correlation of that error falls to 1 / e."""
-
     stamp_jitter: float | None = None
     """s, of the error of a stamp."""
-
     spin_label: float | None = None
     """rad/s, of one component of a spin label."""
-
     spin_prior: float | None = None
     """rad/s, of one component of the spin of a ball without a label, about zero."""
-
     acceleration: float | None = None
     """m/s^2/sqrt(Hz), density of the unmodelled acceleration."""
-
     contact_velocity: float | None = None
     """m/s, of each component of the velocity after a bounce."""
-
     contact_tangential: float | None = None
     """m/s, in addition, of its two components along the surface."""
-
     contact_spin: float | None = None
     """rad/s, of each component of the spin after a bounce."""
-
     coefficients: Mapping[str, float] = field(default_factory=dict)
     """Spread of coefficients between tracks, by the name of the parameter, in its own unit."""
 
     def __post_init__(self) -> None:
-        for name in LARGEST:
+        for name in LIMITS:
             value = getattr(self, name)
             if value is not None:
                 object.__setattr__(self, name, _checked(name, value))
@@ -112,7 +89,7 @@ class TrackNoise:
     def to_mapping(self) -> dict[str, Any]:
         """The section of a file with this noise, without unknown numbers."""
         content: dict[str, Any] = {}
-        for name in LARGEST:
+        for name in LIMITS:
             value = getattr(self, name)
             if value is not None:
                 content[name] = list(value) if name in PER_AXIS else value
@@ -121,11 +98,10 @@ class TrackNoise:
 
 def _checked(name: str, value: Any) -> Any:
     above, least = (-1e-300, -math.inf) if name in MAY_BE_ZERO else (0.0, SMALLEST)
+    unit, limit = LIMITS[name]
 
     def number(what: str, one: Any) -> float:
-        return check_number(
-            what, one, UNITS[name], above=above, least=least, limit=LARGEST[name], instead=f"m{UNITS[name]}"
-        )
+        return check_number(what, one, unit, above=above, least=least, limit=limit, instead=f"m{unit}")
 
     if name not in PER_AXIS:
         return number(f"noise.{name}", value)

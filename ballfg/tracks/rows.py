@@ -31,34 +31,22 @@ _PARQUET_BLOCK = 1 << 14  # rows a block
 class Block:
     """Consecutive rows of the file."""
 
-    start: int
-    """Number of the first row, counted from 0 at the first row of data."""
-
-    names: list[str | None]
-    """The distinct trajectory names of the block; None for an empty cell of a Parquet file."""
-
-    codes: NDArray[np.int32]
-    """(n,) index into `names` for each row."""
-
-    values: Array
-    """(n, 4) t, x, y, z in s and m, or (n, 7) with the sigmas in m."""
+    start: int  # number of the first row, counted from 0 at the first row of data
+    names: list[str | None]  # the distinct trajectory names of the block; None for an empty cell of a Parquet file
+    codes: NDArray[np.int32]  # (n,) index into `names` for each row
+    values: Array  # (n, 4) t, x, y, z in s and m, or (n, 7) with the sigmas in m
 
 
 class RowSource(ABC):
-    """A track table that can be read repeatedly, in blocks.
-
-    Raises: ValueError: a missing or repeated column.
-    """
+    """A track table that can be read repeatedly, in blocks. Raises: ValueError: a missing or repeated column."""
 
     def __init__(self, path: Path, header: Sequence[str]) -> None:
         csv_files.check_header(path, header, (KEY, *VALUES), (KEY, *VALUES, *SIGMAS))
         present = [name for name in SIGMAS if name in header]
         if present and len(present) < len(SIGMAS):
             absent = ", ".join(name for name in SIGMAS if name not in present)
-            raise ValueError(
-                f"{path}: sigma columns must be all three or none; {absent} missing, got {', '.join(present)}. "
-                "Add the missing ones or drop the others."
-            )
+            problem = f"{path}: sigma columns must be all three or none; {absent} missing, got {', '.join(present)}"
+            raise ValueError(f"{problem}. Add the missing ones or drop the others.")
         self.path = path
         self.columns = [*VALUES, *present]
         self.ignored = [name for name in header if name not in (KEY, *self.columns)]
@@ -115,10 +103,8 @@ class ParquetRows(RowSource):
         for name in self.columns:
             kind = schema.field(name).type
             if not (pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_decimal(kind)):
-                raise ValueError(
-                    f"{path}, column {shown(name)}: must hold numbers; got type {kind}. "
-                    "Convert it to float64 (SI units)."
-                )
+                what = f"{path}, column {shown(name)}: must hold numbers; got type {kind}"
+                raise ValueError(f"{what}. Convert it to float64 (SI units).")
 
     def blocks(self) -> Iterator[Block]:
         """Reads the file from its start; see RowSource."""
@@ -130,9 +116,8 @@ class ParquetRows(RowSource):
                     yield _block(batch.select(names), start)
                     start += batch.num_rows
         except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-            raise ValueError(
-                f"{self.path}: cannot be read as a table of tracks; {one_line(error)}. Write it again."
-            ) from None
+            what = f"{self.path}: cannot be read as a table of tracks; {one_line(error)}"
+            raise ValueError(f"{what}. Write it again.") from None
 
     def where(self, *rows: int) -> str:
         """The file and the numbers of these rows, counted from 1; see RowSource."""

@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from ballfg.arrays import Array
 from ballfg.checks import check_array, check_iterable, check_name, shown
 
-ROUNDING = 1e-6
-"""Relative to the trace: tolerance for the symmetry of a covariance from single precision."""
+ROUNDING = 1e-6  # relative to the trace: tolerance for the symmetry of a covariance from single precision
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,16 +26,12 @@ class Sightings:
 
     cameras: tuple[str, ...]
     """Names of the rig's cameras, including those without a sighting."""
-
     camera: NDArray[np.int64]
     """(m,) number of each sighting's camera: an index into `cameras`."""
-
     times: Array
     """(m,) s, stamps as recorded by the camera."""
-
     pixels: Array
     """(m, 2) px, place of the ball's centre in the middle of the exposure."""
-
     covariances: Array
     """(m, 2, 2) px^2."""
 
@@ -54,23 +49,15 @@ class Sightings:
         m = len(times)
         camera = np.asarray(self.camera)
         if camera.shape != (m,) or camera.dtype.kind not in "iu" or not ((camera >= 0) & (camera < len(names))).all():
-            raise ValueError(
-                f"camera must be ({m},) whole numbers from 0 to {len(names) - 1}; got {shown(camera.tolist())}. "
-                "Number the cameras in the order of their names."
-            )
+            problem = f"camera must be ({m},) whole numbers from 0 to {len(names) - 1}; got {shown(camera.tolist())}"
+            raise ValueError(f"{problem}. Number the cameras in the order of their names.")
         object.__setattr__(self, "camera", camera.astype(np.int64))
         for field, shape in {"times": (m,), "pixels": (m, 2), "covariances": (m, 2, 2)}.items():
-            object.__setattr__(self, field, _floats(field, getattr(self, field), shape))
-        self._check_stamps()
-        good = are_covariances(self.covariances)
-        if not good.all():
-            row = int(np.argmin(good))
-            raise ValueError(
-                f"covariances must be symmetric and positive definite; covariances[{row}]="
-                f"{self.covariances[row].tolist()}. Give the variance of u and v in px^2."
-            )
-
-    def _check_stamps(self) -> None:
+            array = check_array(field, getattr(self, field), shape, "Pass one row per sighting.")
+            if not np.isfinite(array).all():
+                row = int(np.argwhere(~np.isfinite(array))[0][0])
+                raise ValueError(f"{field} must be finite; {field}[{row}]={array[row].tolist()}. Drop that sighting.")
+            object.__setattr__(self, field, array)
         for number, name in enumerate(self.cameras):
             rows = np.flatnonzero(self.camera == number)
             wrong = np.flatnonzero(np.diff(self.times[rows]) <= 0.0)
@@ -80,26 +67,21 @@ class Sightings:
                     f"times of camera {shown(name)} must increase; times[{second}]={self.times[second]} <= "
                     f"times[{first}]={self.times[first]}. Sort the rows, and keep one sighting a frame."
                 )
+        good = are_covariances(self.covariances)
+        if not good.all():
+            row = int(np.argmin(good))
+            raise ValueError(
+                f"covariances must be symmetric and positive definite; covariances[{row}]="
+                f"{self.covariances[row].tolist()}. Give the variance of u and v in px^2."
+            )
 
     def __len__(self) -> int:
         return len(self.times)
 
     def select(self, rows: ArrayLike) -> Sightings:
-        """A part of the rows.
-
-        Args: rows: (k,) their numbers, ascending, or (m,) bool.
-        Raises: ValueError: if none remains.
-        """
+        """The rows of the numbers (k,), ascending, or of the mask (m,) bool. Raises: ValueError: if none remains."""
         kept = np.asarray(rows)
         return Sightings(self.cameras, self.camera[kept], self.times[kept], self.pixels[kept], self.covariances[kept])
-
-
-def _floats(field: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    array = check_array(field, value, shape, "Pass one row per sighting.")
-    if not np.isfinite(array).all():
-        row = int(np.argwhere(~np.isfinite(array))[0][0])
-        raise ValueError(f"{field} must be finite; {field}[{row}]={array[row].tolist()}. Drop that sighting.")
-    return array
 
 
 def are_covariances(matrices: Array) -> NDArray[np.bool_]:

@@ -7,10 +7,8 @@ from numpy.typing import ArrayLike
 
 from ballfg.arrays import Array
 
-TICKS = 1e6
-"""1/s. Files usually state stamps in whole microseconds."""
-SUMMED = 1e-12
-"""s. Tolerance for sums of whole microseconds."""
+TICKS = 1e6  # 1/s. Files usually state stamps in whole microseconds.
+SUMMED = 1e-12  # s. Tolerance for sums of whole microseconds.
 STAMP_TOLERANCE = 1.5e-6
 """s. A stamp this little after the end of an interval belongs to it: stamps are rounded to a microsecond, or to doubles
 0.24 us apart, and their differences by up to one."""

@@ -47,10 +47,9 @@ class TableWriter:
         check_file(self.path, "path")
         self._file: BinaryIO | None = None
         self._parquet: pq.ParquetWriter | None = None
-        self._has_header = False
         self._schema: pa.Schema | None = None
         self._pending: list[pa.RecordBatch] = []
-        self._pending_rows = 0
+        self._has_header, self._pending_rows = False, 0
 
     def __enter__(self) -> "TableWriter":
         self._context = self._opened()
@@ -87,8 +86,7 @@ class TableWriter:
         if self._file is None:
             raise RuntimeError("write must be called inside `with TableWriter(path) as table:`; it was not.")
         batch = _batch(columns)
-        if self._schema is None:
-            self._schema = batch.schema
+        self._schema = self._schema or batch.schema
         self._pending.append(_conformed(batch, self._schema))
         self._pending_rows += batch.num_rows
         if self._pending_rows >= _BLOCK_ROWS:
@@ -107,10 +105,14 @@ class TableWriter:
                 self._has_header = True
             for place, field in enumerate(table.schema):
                 if pa.types.is_string(field.type):
-                    table = table.set_column(place, field, _guarded(table.column(place)))
+                    text = table.column(place)  # formulas get quoted; see `ballfg.files.spreadsheet`
+                    formula = pc.match_substring_regex(text, QUOTED)
+                    risky = pc.and_(formula, pc.invert(pc.match_substring_regex(text, NUMBER)))
+                    quoted = pc.binary_join_element_wise("'", text, "")
+                    table = table.set_column(place, field, pc.if_else(risky, quoted, text))
             texts = [column for column in table.columns if pa.types.is_string(column.type)]
-            quoted = any(pc.any(pc.match_substring_regex(column, '[,;"\t\r\n]')).as_py() for column in texts)
-            style = pa_csv.WriteOptions(include_header=False, quoting_style="needed" if quoted else "none")
+            quotes = any(pc.any(pc.match_substring_regex(column, '[,;"\t\r\n]')).as_py() for column in texts)
+            style = pa_csv.WriteOptions(include_header=False, quoting_style="needed" if quotes else "none")
             pa_csv.write_csv(table, self._file, style)
         else:
             if self._parquet is None:
@@ -126,16 +128,13 @@ def _batch(columns: Mapping[str, ArrayLike]) -> pa.RecordBatch:
     arrays = {name: np.asarray(values) for name, values in columns.items()}
     for name, array in arrays.items():
         if array.ndim > 1:
-            raise ValueError(
-                f"columns[{shown(name)}] must have shape (n,); got {array.shape}. Pass one column at a time."
-            )
+            what = f"columns[{shown(name)}] must have shape (n,); got {array.shape}"
+            raise ValueError(f"{what}. Pass one column at a time.")
     lengths = {name: len(array) for name, array in arrays.items() if array.ndim == 1}
     if len(set(lengths.values())) > 1:
         raise ValueError(f"columns must have one length; got {lengths}. Pass one value per row.")
     count = next(iter(lengths.values()), 1)
-    return pa.RecordBatch.from_arrays(
-        [_arrow(name, array, count) for name, array in arrays.items()], names=list(arrays)
-    )
+    return pa.RecordBatch.from_pydict({name: _arrow(name, array, count) for name, array in arrays.items()})
 
 
 def _arrow(name: str, array: np.ndarray, count: int) -> pa.Array:
@@ -156,23 +155,13 @@ def _arrow(name: str, array: np.ndarray, count: int) -> pa.Array:
     return pa.array(array, type=kind)
 
 
-def _guarded(column: pa.ChunkedArray) -> pa.ChunkedArray:
-    """The texts of a column, with formulas quoted; see `ballfg.files.spreadsheet`."""
-    risky = pc.and_(pc.match_substring_regex(column, QUOTED), pc.invert(pc.match_substring_regex(column, NUMBER)))
-    return pc.if_else(risky, pc.binary_join_element_wise("'", column, ""), column)
-
-
 def _conformed(batch: pa.RecordBatch, schema: pa.Schema) -> pa.RecordBatch:
     """The block with the first block's types; whole numbers may be in a column of floats."""
     if batch.schema.names != schema.names:
-        raise ValueError(
-            f"columns must be those of the first block, {schema.names}; got {batch.schema.names}. "
-            "Write the same columns in each block."
-        )
+        problem = f"columns must be those of the first block, {schema.names}; got {batch.schema.names}"
+        raise ValueError(f"{problem}. Write the same columns in each block.")
     for name, got, want in zip(schema.names, batch.schema.types, schema.types, strict=True):
         if got != want and not (pa.types.is_integer(got) and pa.types.is_floating(want)):
-            raise ValueError(
-                f"columns[{shown(name)}] must be {want} as in the first block; got {got}. Convert it, or write floats "
-                "from the start."
-            )
+            problem = f"columns[{shown(name)}] must be {want} as in the first block; got {got}"
+            raise ValueError(f"{problem}. Convert it, or write floats from the start.")
     return batch if batch.schema == schema else batch.cast(schema)

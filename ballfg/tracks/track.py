@@ -26,11 +26,8 @@ from ballfg.tracks.stamps import STAMP_TOLERANCE, elapsed
 
 SPIN_LABELS = ("spin_x", "spin_y", "spin_z")
 
-FASTEST_BALL = 200.0
-"""m/s. Largest speed of a ball; the record of all sports is a shuttlecock's, 157 m/s."""
-FASTEST_SPIN = 2000.0
-"""rad/s. Largest spin of a ball; a golf ball off a wedge reaches 1,200."""
-
+FASTEST_BALL = 200.0  # m/s. Largest speed of a ball; the record of all sports is a shuttlecock's, 157 m/s.
+FASTEST_SPIN = 2000.0  # rad/s. Largest spin of a ball; a golf ball off a wedge reaches 1,200.
 Label = float | str
 
 
@@ -40,11 +37,9 @@ class Measurements(Protocol):
     @property
     def name(self) -> str:
         """Name of the kind of measurement."""
-        ...
 
     def select(self, samples: NDArray[np.bool_]) -> Self:
         """The measurements of the selected samples (n,) bool of the track."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,62 +56,49 @@ class Track:
 
     times: Array
     """(n,) s, n >= 1, strictly increasing. The origin is the data's own."""
-
     positions: Array
     """(n, 3) m, world frame, z up."""
-
     sigmas: Array | None = None
     """(n, 3) m, standard deviation of each coordinate, positive; None if the data do not state it."""
-
     labels: Mapping[str, Label] = field(default_factory=dict)
     """Labels of the shot: spin_x, spin_y, spin_z (rad/s, at the first sample), group, launcher settings."""
-
     name: str = "track"
     """The trajectory's name, as in the column `trajectory`: "000" stays "000"."""
-
     observations: tuple[Any, ...] = ()
     """Measurements other than positions: `ballfg.estimation.Observation`s, one of a name."""
-
     rough: bool = False
     """True if the positions were computed from the observations: they then serve to find events only."""
-
     part: bool = False
     """True for a part of a longer track. Its scale was checked with the whole; a few samples do not show it."""
-
     dataset: Any = None
     """The dataset of the track, with its ball, table and noise. Processes do not get it."""
 
     def __post_init__(self) -> None:
         check_name("track name", self.name, "Rename the trajectory.")
-        times = _finite(self.name, "times", self.times)
+        where = f"track {shown(self.name)}"
+        times = _finite(where, "times", self.times)
         if times.ndim != 1 or len(times) == 0:
-            raise ValueError(
-                f"track {shown(self.name)}: times must have shape (n,) with n >= 1; got {times.shape}. "
-                "Pass one stamp per sample."
-            )
+            rule = "times must have shape (n,) with n >= 1"
+            raise ValueError(f"{where}: {rule}; got {times.shape}. Pass one stamp per sample.")
         wrong = np.flatnonzero(np.diff(times) <= 0)
         if wrong.size:
             i = int(wrong[0]) + 1
-            raise ValueError(
-                f"track {shown(self.name)}: times must be strictly increasing; times[{i}]={times[i]} <= "
-                f"times[{i - 1}]={times[i - 1]}. Sort or drop duplicates."
-            )
-        positions = _finite(self.name, "positions", self.positions, (len(times), 3))
+            got = f"times[{i}]={times[i]} <= times[{i - 1}]={times[i - 1]}"
+            raise ValueError(f"{where}: times must be strictly increasing; {got}. Sort or drop duplicates.")
+        positions = _finite(where, "positions", self.positions, (len(times), 3))
         sigmas = self.sigmas
         if sigmas is not None:
-            sigmas = _finite(self.name, "sigmas", sigmas, (len(times), 3))
+            sigmas = _finite(where, "sigmas", sigmas, (len(times), 3))
             if (sigmas <= 0).any():
                 i, axis = (int(k) for k in np.argwhere(sigmas <= 0)[0])
-                raise ValueError(
-                    f"track {shown(self.name)}: sigmas must be positive; sigmas[{i}, {axis}]={sigmas[i, axis]}. "
-                    "Give a standard deviation in m, or no sigmas at all."
-                )
-        labels = _checked_labels(self.name, self.labels)
+                rule = f"{where}: sigmas must be positive; sigmas[{i}, {axis}]={sigmas[i, axis]}"
+                raise ValueError(f"{rule}. Give a standard deviation in m, or no sigmas at all.")
+        labels = _checked_labels(where, self.labels)
         for key, value in {"times": times, "positions": positions, "sigmas": sigmas, "labels": labels}.items():
             object.__setattr__(self, key, value)
         check_flag("rough", self.rough)
         check_flag("part", self.part)
-        observations = _checked_observations(self.name, self.observations, len(times), self.rough)
+        observations = _checked_observations(where, self.observations, len(times), self.rough)
         object.__setattr__(self, "observations", observations)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -162,19 +144,15 @@ class Track:
     @property
     def spin_label(self) -> Array | None:
         """(3,) rad/s: the labelled spin at the first sample; None unless all three components are labelled."""
-        values = [self.labels.get(key) for key in SPIN_LABELS]
-        if any(value is None for value in values):
-            return None
-        return np.array(values, dtype=np.float64)
+        values = [self.labels[key] for key in SPIN_LABELS if key in self.labels]
+        return np.array(values, dtype=np.float64) if len(values) == len(SPIN_LABELS) else None
 
     def between(self, start: float, end: float) -> Track:
         """The samples with start <= time <= end, as a new track.
 
         The spin labels belong to the first sample, so a part without that sample does not have them.
 
-        Args:
-            start: s, in the track's own time.
-            end: s, in the track's own time.
+        Args: start, end: s, in the track's own time.
         Raises: ValueError: if no sample lies there. TypeError: a start or end that is no number.
         """
         start, end = as_float("start", start, "s"), as_float("end", end, "s")
@@ -187,16 +165,12 @@ class Track:
                 f"track {shown(self.name)}: between(start, end) must hold a sample; got [{start:g}, {end:g}] s while "
                 f"the track covers [{self.times[0]:g}, {self.times[-1]:g}] s. Widen the interval."
             )
-        labels = dict(self.labels)
-        if not inside[0]:
-            labels = {key: value for key, value in labels.items() if key not in SPIN_LABELS}
-        sigmas = None if self.sigmas is None else self.sigmas[inside]
         return replace(
             self,
             times=self.times[inside],
             positions=self.positions[inside],
-            sigmas=sigmas,
-            labels=labels,
+            sigmas=None if self.sigmas is None else self.sigmas[inside],
+            labels={key: value for key, value in self.labels.items() if inside[0] or key not in SPIN_LABELS},
             observations=tuple(observation.select(inside) for observation in self.observations),
             part=self.part or not inside.all(),
         )
@@ -209,73 +183,58 @@ class Track:
         return self.between(-np.inf, end)
 
 
-def _checked_observations(track: str, observations: object, samples: int, rough: bool) -> tuple[Any, ...]:
+def _checked_observations(where: str, observations: object, samples: int, rough: bool) -> tuple[Any, ...]:
     found = tuple(observations) if isinstance(observations, Iterable) else (observations,)
     for observation in found:
         if not isinstance(getattr(observation, "name", None), str) or not hasattr(observation, "select"):
             raise TypeError(
-                f"track {shown(track)}: observations must be a tuple of Observations; got "
-                f"{type_name(observation)} {shown(observation)}. Give RadarSpeed or another one of ballfg.estimation."
+                f"{where}: observations must be a tuple of Observations; got {type_name(observation)} "
+                f"{shown(observation)}. Give RadarSpeed or another one of ballfg.estimation."
             )
         last = int(np.max(observation.state, initial=0))
         if last >= samples:
             raise ValueError(
-                f"track {shown(track)}: state of {shown(observation.name)} must be the index of a sample, at most "
-                f"{samples - 1}; got {last}. Readings with times of their own: {type(observation).__name__}.at."
+                f"{where}: state of {shown(observation.name)} must be the index of a sample, at most {samples - 1}; "
+                f"got {last}. Readings with times of their own: {type(observation).__name__}.at."
             )
     names = [observation.name for observation in found]
     if len(set(names)) < len(names):
-        raise ValueError(
-            f"track {shown(track)}: observations must have different names; got {names}. Join those of one name."
-        )
+        raise ValueError(f"{where}: observations must have different names; got {names}. Join those of one name.")
     if rough and not names:
-        raise ValueError(
-            f"track {shown(track)}: rough positions must come with the observations that they were made from."
-        )
+        raise ValueError(f"{where}: rough positions must come with the observations that they were made from.")
     return found
 
 
-def _finite(track: str, argument: str, value: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
-    array = check_array(f"track {shown(track)}: {argument}", value, shape, "Pass one row per sample.")
+def _finite(where: str, argument: str, value: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
+    array = check_array(f"{where}: {argument}", value, shape, "Pass one row per sample.")
     if not np.isfinite(array).all():
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        place = ", ".join(map(str, index))
-        raise ValueError(
-            f"track {shown(track)}: {argument} must be finite; {argument}[{place}]={array[index]}. Drop that sample."
-        )
+        got = f"{argument}[{', '.join(map(str, index))}]={array[index]}"
+        raise ValueError(f"{where}: {argument} must be finite; {got}. Drop that sample.")
     return array
 
 
-def _checked_labels(track: str, labels: Mapping[str, Label]) -> dict[str, Label]:
+def _checked_labels(where: str, labels: Mapping[str, Label]) -> dict[str, Label]:
     if not isinstance(labels, Mapping):
         raise TypeError(
-            f"track {shown(track)}: labels must be a mapping of names to numbers or text; got {type_name(labels)} "
+            f"{where}: labels must be a mapping of names to numbers or text; got {type_name(labels)} "
             f"{shown(labels)}. Write them like {{'spin_y': 120.0}}."
         )
     checked: dict[str, Label] = {}
     for key, value in labels.items():
         if not isinstance(key, str) or not is_name(key) or key == "trajectory":
-            raise ValueError(
-                f"track {shown(track)}: label names must be {NAME_RULE}, other than 'trajectory'; got {shown(key)}. "
-                "Rename it."
-            )
+            rule = f"label names must be {NAME_RULE}, other than 'trajectory'"
+            raise ValueError(f"{where}: {rule}; got {shown(key)}. Rename it.")
         if isinstance(value, str) and key not in SPIN_LABELS:
             if not is_text(value):
-                raise ValueError(
-                    f"track {shown(track)}: label {shown(key)} must be {TEXT_RULE}; got {shown(value)}. Correct it."
-                )
+                raise ValueError(f"{where}: label {shown(key)} must be {TEXT_RULE}; got {shown(value)}. Correct it.")
             checked[key] = value
         elif isinstance(value, int | float | np.integer | np.floating) and np.isfinite(value):
             if key in SPIN_LABELS and abs(value) > FASTEST_SPIN:
-                raise ValueError(
-                    f"track {shown(track)}: label {shown(key)} must be within {FASTEST_SPIN:g} rad/s, as the spin "
-                    f"of every ball; got {value:g}. Correct it, or leave it out if it is unknown."
-                )
+                rule = f"label {shown(key)} must be within {FASTEST_SPIN:g} rad/s, as the spin of every ball"
+                raise ValueError(f"{where}: {rule}; got {value:g}. Correct it, or leave it out if it is unknown.")
             checked[key] = float(value)
         else:
-            rule = "a finite number" if key in SPIN_LABELS else "a finite number or text"
-            raise ValueError(
-                f"track {shown(track)}: label {shown(key)} must be {rule}; got {shown(value)}. "
-                "Leave the label out if it is unknown."
-            )
+            rule = f"label {shown(key)} must be a finite number{'' if key in SPIN_LABELS else ' or text'}"
+            raise ValueError(f"{where}: {rule}; got {shown(value)}. Leave the label out if it is unknown.")
     return checked

@@ -7,7 +7,6 @@ from os import PathLike
 from pathlib import Path
 from typing import Final, Literal, TextIO
 
-from ballfg.arrays import Array
 from ballfg.checks import check_choice, check_each, check_instance, check_path, shown
 from ballfg.files.spreadsheet import guarded
 from ballfg.files.whole_folder import whole_folder
@@ -20,13 +19,10 @@ from ballfg.tracks.rows import KEY, SIGMAS, VALUES
 from ballfg.tracks.table import TableWriter
 from ballfg.tracks.track import Track
 
-DATASET_FILES = (INFO_FILE, *TRACK_FILES, LABELS_FILE)
-"""All possible names of a dataset's files."""
-TRUTH_FILE: Final = "truth.yaml"
-"""Settings of a simulation; in its folder, the files below belong to the simulated tracks alone."""
+DATASET_FILES = (INFO_FILE, *TRACK_FILES, LABELS_FILE)  # all possible names of a dataset's files
+TRUTH_FILE: Final = "truth.yaml"  # settings of a simulation; in its folder, the files below belong to it alone
 TRUTH_FILES: Final = (TRUTH_FILE, "truth.csv", "truth.parquet", "model.yaml", "model.learned-*")
 """All names, or patterns of names, of a simulation's further files."""
-
 _SPOOL = "labels.jsonl"
 
 
@@ -59,7 +55,13 @@ def write_dataset(
         with (stage / _SPOOL).open("x", encoding="utf-8") as spool:
             label_names = _write_tracks(stage / f"tracks.{file_format}", info, tracks, spool)
         if label_names:
-            _write_labels(stage / LABELS_FILE, stage / _SPOOL, label_names)
+            with (stage / LABELS_FILE).open("x", encoding="utf-8", newline="") as file:
+                writer = csv.writer(file, lineterminator="\n")
+                writer.writerow(map(guarded, (KEY, *label_names)))
+                with (stage / _SPOOL).open(encoding="utf-8") as lines:
+                    for cells in map(json.loads, lines):
+                        row = (cells.get(name, "") for name in (KEY, *label_names))
+                        writer.writerow(guarded(cell) if isinstance(cell, str) else cell for cell in row)
         (stage / _SPOOL).unlink()
 
 
@@ -73,7 +75,10 @@ def _write_tracks(path: Path, info: DatasetInfo, tracks: Iterable[Track], spool:
             has_sigmas = track.sigmas is not None if has_sigmas is None else has_sigmas
             _check_track(track, names, info, has_sigmas)
             names.add(track.name)
-            table.write(_columns(track))
+            columns = dict(zip(VALUES[1:], track.positions.T, strict=True))
+            if track.sigmas is not None:
+                columns |= dict(zip(SIGMAS, track.sigmas.T, strict=True))
+            table.write({KEY: track.name, VALUES[0]: track.times, **columns})
             if track.labels:
                 label_names.update(dict.fromkeys(track.labels))
                 spool.write(json.dumps({KEY: track.name, **track.labels}) + "\n")
@@ -88,31 +93,11 @@ def _check_track(track: Track, names: set[str], info: DatasetInfo, has_sigmas: b
     if len(track) < 2:
         raise ValueError(f"track {shown(track.name)} must have at least two samples; got one. Leave it out.")
     if (track.sigmas is not None) != has_sigmas:
-        raise ValueError(
-            f"tracks must have sigmas all or none; {shown(track.name)} differs from the first. "
-            "Set sigmas=None in all of them, or give them all."
-        )
+        what = f"tracks must have sigmas all or none; {shown(track.name)} differs from the first"
+        raise ValueError(f"{what}. Set sigmas=None in all of them, or give them all.")
     if track.sigmas is not None and not (MIN_SIGMA <= track.sigmas.min() <= track.sigmas.max() <= MAX_SIGMA):
         raise ValueError(
             f"track {shown(track.name)}: sigmas must be {MIN_SIGMA:g} to {MAX_SIGMA:g} m; "
             f"got {track.sigmas.min():g} to {track.sigmas.max():g}. Correct them or set sigmas=None."
         )
     check_scale(f"track {shown(track.name)}", track.times, track.positions, track.sigmas, info.rate)
-
-
-def _columns(track: Track) -> dict[str, Array | str]:
-    columns: dict[str, Array | str] = {KEY: track.name, VALUES[0]: track.times}
-    columns |= {name: track.positions[:, axis] for axis, name in enumerate(VALUES[1:])}
-    if track.sigmas is not None:
-        columns |= {name: track.sigmas[:, axis] for axis, name in enumerate(SIGMAS)}
-    return columns
-
-
-def _write_labels(path: Path, spool: Path, label_names: list[str]) -> None:
-    with path.open("x", encoding="utf-8", newline="") as file, spool.open(encoding="utf-8") as lines:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(map(guarded, (KEY, *label_names)))
-        for line in lines:
-            cells = json.loads(line)
-            row = (cells.get(name, "") for name in (KEY, *label_names))
-            writer.writerow(guarded(cell) if isinstance(cell, str) else cell for cell in row)

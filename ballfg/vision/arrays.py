@@ -4,5 +4,4 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array32 = NDArray[np.float32]
-Image = NDArray[np.uint8]
-"""(h, w, 3) blue, green, red, or (h, w) grey."""
+Image = NDArray[np.uint8]  # (h, w, 3) blue, green, red, or (h, w) grey

@@ -11,15 +11,12 @@ from numpy.typing import ArrayLike
 from ballfg.arrays import Array, Mask
 from ballfg.checks import check_array, check_name, check_number, shown
 
-MOST_PIXELS: Final = 1_000_000
-"""Largest number of px of one side of an image."""
+MOST_PIXELS: Final = 1_000_000  # largest number of px of one side of an image
 DISTORTIONS: Final = (0, 4, 5, 8, 12, 14)
 """Lengths of distortion vectors in OpenCV: none; k1 k2 p1 p2; k3; k4 k5 k6; thin prism s1-s4; tilt tau_x tau_y."""
 _PRECISELY: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-12)
 """OpenCV undoes distortion by five steps of a fixed point by default: 0.1 pixel off in a wide lens."""
-
-WIDEST_ASKED: Final = 6.0
-"""Tangent of the widest angle from the axis at which a lens is tested for turning back: 80 degrees."""
+WIDEST_ASKED: Final = 6.0  # tangent of the angle from the axis up to which a lens is tested: 80 degrees
 WIDEST_STEPS: Final = 6001
 
 
@@ -38,22 +35,16 @@ class Camera:
 
     name: str
     """Unique among the cameras of a rig."""
-
     size: tuple[int, int]
     """Width and height of the image, pixels."""
-
     matrix: Array
     """(3, 3) focal lengths and principal point, pixels: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]."""
-
     distortion: Array
     """(k,) dimensionless coefficients in OpenCV's order; k one of `DISTORTIONS`."""
-
     rvec: Array
     """(3,) rad, rotation vector from the world to the camera."""
-
     tvec: Array
     """(3,) m, the world's origin in the camera's frame."""
-
     time_offset: float = 0.0
     """s, delay of the camera's stamps: an event stamped t happened at t - time_offset."""
 
@@ -68,29 +59,22 @@ class Camera:
         count = np.asarray(self.distortion).size
         if count not in DISTORTIONS:
             lengths = ", ".join(map(str, DISTORTIONS))
-            raise ValueError(
-                f"camera {shown(self.name)}: distortion must have one of {lengths} coefficients; got {count}. "
-                "Give them in OpenCV's order k1, k2, p1, p2, k3, ..."
-            )
+            what = f"{where}: distortion must have one of {lengths} coefficients; got {count}"
+            raise ValueError(f"{what}. Give them in OpenCV's order k1, k2, p1, p2, k3, ...")
         for field, shape in {"matrix": (3, 3), "rvec": (3,), "tvec": (3,), "distortion": (count,)}.items():
-            object.__setattr__(self, field, self._checked(field, getattr(self, field), shape))
+            array = check_array(f"{where}: {field}", getattr(self, field), remedy=f"Give {shape} numbers.")
+            if array.size != np.prod(shape, dtype=int):
+                raise ValueError(f"{where}: {field} must have shape {shape}; got {array.shape}")
+            if not np.isfinite(array).all():
+                raise ValueError(f"{where}: {field} must be finite; got {array.tolist()}")
+            array = array.reshape(shape)
+            array.setflags(write=False)
+            object.__setattr__(self, field, array)
         k = self.matrix
         if not (k[0, 0] > 0 and k[1, 1] > 0 and k[1, 0] == 0 and (k[2] == (0, 0, 1)).all() and k[0, 1] == 0):
-            raise ValueError(
-                f"camera {shown(self.name)}: matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0; "
-                f"got {k.tolist()}"
-            )
+            rule = "matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0"
+            raise ValueError(f"{where}: {rule}; got {k.tolist()}")
         object.__setattr__(self, "time_offset", check_number(f"{where}: time_offset", self.time_offset, "s"))
-
-    def _checked(self, field: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-        array = check_array(f"camera {shown(self.name)}: {field}", value, remedy=f"Give {shape} numbers.")
-        if array.size != np.prod(shape, dtype=int):
-            raise ValueError(f"camera {shown(self.name)}: {field} must have shape {shape}; got {array.shape}")
-        if not np.isfinite(array).all():
-            raise ValueError(f"camera {shown(self.name)}: {field} must be finite; got {array.tolist()}")
-        array = array.reshape(shape)
-        array.setflags(write=False)
-        return array
 
     @cached_property
     def rotation(self) -> Array:

@@ -17,13 +17,10 @@ from ballfg.files.strict_yaml import mapping, read_mapping
 from ballfg.files.whole_file import whole_file, write_text
 from ballfg.vision.camera import Camera
 
-CAMERAS_FILE: Final = "cameras.yaml"
-"""Its name in the folder of a dataset or a scene."""
+CAMERAS_FILE: Final = "cameras.yaml"  # its name in the folder of a dataset or a scene
 LENS: Final = ("size", "matrix", "distortion")
 POSE: Final = ("rvec", "tvec")
-FIELDS: Final = (*LENS, *POSE, "time_offset")
-"""Fields of a camera in the file, in order; docs/calibrate.md explains them."""
-
+FIELDS: Final = (*LENS, *POSE, "time_offset")  # in the file's order; docs/calibrate.md explains them
 _MATRIX: Final = "camera_matrix"
 _NODES: Final = {
     "matrix": (_MATRIX,),
@@ -49,7 +46,9 @@ def read_cameras(path: str | PathLike[str], *, posed: bool = True) -> list[Camer
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be a file with cameras; there is none. Correct the path.")
     try:
-        if _is_storage(path):
+        with path.open("rb") as file:
+            begins = file.read(8).removeprefix(b"\xef\xbb\xbf")
+        if path.suffix.lower() in (".xml", ".json") or begins.startswith(b"%YAML"):
             cameras = _from_storage(path)
         else:
             content = read_mapping(path)
@@ -112,14 +111,6 @@ def write_opencv(path: str | PathLike[str], cameras: Iterable[Camera], *, posed:
         storage.release()
 
 
-def _is_storage(path: Path) -> bool:
-    """True for a file of FileStorage: .xml, .json, or YAML that begins with a %YAML line."""
-    if path.suffix.lower() in (".xml", ".json"):
-        return True
-    with path.open("rb") as file:
-        return file.read(8).removeprefix(b"\xef\xbb\xbf").startswith(b"%YAML")
-
-
 def _from_storage(path: Path) -> dict[str, dict[str, Any]]:
     """Name of each camera -> its fields as in `cameras.yaml`; unrelated nodes are ignored.
 
@@ -161,41 +152,18 @@ def _camera(name: str, content: Any, posed: bool) -> Camera:
             "Add it, or let 'ballfg calibrate-cameras --intrinsics FILE --table TABLE' find where the camera stands."
         )
     size, offset = fields["size"], fields.get("time_offset", 0.0)
-    if not (
-        isinstance(size, list | tuple)
-        and len(size) == 2
-        and all(is_number(side) and isinstance(side, Integral) for side in size)
-    ):
-        raise ValueError(
-            f"{where}: size must be width and height in pixels, as [1280, 720]; got {shown(size)}. Correct it."
-        )
+    sides = size if isinstance(size, list | tuple) else ()
+    if len(sides) != 2 or not all(is_number(side) and isinstance(side, Integral) for side in sides):
+        what = f"{where}: size must be width and height in pixels, as [1280, 720]; got {shown(size)}"
+        raise ValueError(f"{what}. Correct it.")
     if not is_number(offset):
-        raise ValueError(
-            f"{where}: time_offset must be a number in s; got {shown(offset)}. Write it like 0.004 or 4.0e-3."
-        )
-    return Camera(
-        name=name,
-        size=(size[0], size[1]),
-        matrix=fields["matrix"],
-        distortion=fields["distortion"],
-        rvec=np.zeros(3) if missing else fields["rvec"],
-        tvec=np.zeros(3) if missing else fields["tvec"],
-        time_offset=offset,
-    )
+        what = f"{where}: time_offset must be a number in s; got {shown(offset)}"
+        raise ValueError(f"{what}. Write it like 0.004 or 4.0e-3.")
+    rvec, tvec = (np.zeros(3) if missing else fields[field] for field in POSE)
+    return Camera(name, (sides[0], sides[1]), fields["matrix"], fields["distortion"], rvec, tvec, offset)
 
 
 def _fields(node: Mapping[str, Tree], where: str) -> dict[str, Any]:
-    fields: dict[str, Any] = {"size": _size(node, where)}
-    for field, names in _NODES.items():
-        present = [name for name in names if name in node]
-        if present:
-            fields[field] = numbers(node[present[0]], f"{where}: node {present[0]!r}")
-    if "time_offset" in node:
-        fields["time_offset"] = number(node["time_offset"], f"{where}: node 'time_offset'")
-    return fields
-
-
-def _size(node: Mapping[str, Tree], where: str) -> list[int]:
     if "image_size" in node:
         sides = np.ravel(numbers(node["image_size"], f"{where}: node 'image_size'"))
     elif "image_width" in node and "image_height" in node:
@@ -203,7 +171,13 @@ def _size(node: Mapping[str, Tree], where: str) -> list[int]:
     else:
         raise ValueError(f"{where}: nodes 'image_width' and 'image_height' are required; got {listed(node)}. Add them.")
     if len(sides) != 2 or not np.isfinite(sides).all() or (sides != np.trunc(sides)).any():
-        raise ValueError(
-            f"{where}: the image's size must be two whole numbers; got {shown(sides.tolist())}. Correct it."
-        )
-    return [int(side) for side in sides]
+        got = shown(sides.tolist())
+        raise ValueError(f"{where}: the image's size must be two whole numbers; got {got}. Correct it.")
+    fields: dict[str, Any] = {"size": [int(side) for side in sides]}
+    for field, names in _NODES.items():
+        present = [name for name in names if name in node]
+        if present:
+            fields[field] = numbers(node[present[0]], f"{where}: node {present[0]!r}")
+    if "time_offset" in node:
+        fields["time_offset"] = number(node["time_offset"], f"{where}: node 'time_offset'")
+    return fields

@@ -12,28 +12,13 @@ from ballfg.checks import one_line
 from ballfg.files.damaged import check_pixels, whole_content
 from ballfg.vision.arrays import Image
 
-ENDINGS: Final = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
-"""Endings of images in a folder; other files are ignored."""
-FORMATS: Final = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "PPM", "MPO")
-"""Of Pillow's, which reads the headers alone. MPO: a JPEG with further pictures behind it, as telephones write."""
-_TILES: Final = (322, 323)
-"""Tags of TIFF: width and height of the pieces in which the pixels are kept."""
+ENDINGS: Final = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")  # others are ignored
+FORMATS: Final = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "PPM", "MPO")  # Pillow's; MPO: telephones' JPEG
+_TILES: Final = (322, 323)  # tags of TIFF: width and height of the pieces in which the pixels are kept
 
 
 def read_image(path: Path, flags: int) -> Image:
-    """An image as OpenCV decodes it, (h, w) or (h, w, 3) uint8, BGR.
-
-    Args: path: of the file.  flags: of `cv2.imdecode`.
-    Raises: ValueError: not an image, or one of more than 64 million pixels; the message names the file. OSError.
-    """
-    _check_size(path)
-    image = cv2.imdecode(np.frombuffer(whole_content(path), dtype=np.uint8), flags)
-    if image is None:
-        raise ValueError(f"image {path} must be readable; OpenCV cannot decode it. Write it again or remove it.")
-    return np.asarray(image, dtype=np.uint8)
-
-
-def _check_size(path: Path) -> None:
+    """An image by `cv2.imdecode`, (h, w) or (h, w, 3) uint8, BGR. Raises: ValueError: none, or too large. OSError."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Header.DecompressionBombWarning)  # our own bound is lower
@@ -49,3 +34,7 @@ def _check_size(path: Path) -> None:
         raise ValueError(f"image {path} must be readable; {why}. Write it again or remove it.") from None
     for width, height in sizes:
         check_pixels(path, width, height)
+    image = cv2.imdecode(np.frombuffer(whole_content(path), dtype=np.uint8), flags)
+    if image is None:
+        raise ValueError(f"image {path} must be readable; OpenCV cannot decode it. Write it again or remove it.")
+    return np.asarray(image, dtype=np.uint8)

@@ -39,9 +39,7 @@ class CameraBank:
     def project(self, points: Tensor, camera: Tensor) -> Tensor:
         """Pixels of points, each in the camera of its row; NaN for those that are behind it or beyond its lens.
 
-        Args:
-            points: (n, 3) m.
-            camera: (n,) int64, numbers of cameras.
+        Args: points: (n, 3) m.  camera: (n,) int64, numbers of cameras.
         Returns: (n, 2) pixels, differentiable in the points.
         """
         local = (self._rotation[camera] @ points.unsqueeze(-1)).squeeze(-1) + self._tvec[camera]

@@ -257,7 +257,7 @@ def test_videos_become_the_tracks_that_were_flown(scene: Path, tracked: Path) ->
     assert np.sqrt(np.concatenate(squares).mean()) < 0.005
     overlay = cv2.VideoCapture(str(tracked / "overlay.mp4"))
     assert int(overlay.get(cv2.CAP_PROP_FRAME_COUNT)) == len((scene / "left_stamps.csv").read_text().split()) - 1
-    assert (overlay.get(cv2.CAP_PROP_FRAME_WIDTH), overlay.get(cv2.CAP_PROP_FRAME_HEIGHT)) == (1920, 390)
+    assert (overlay.get(cv2.CAP_PROP_FRAME_WIDTH), overlay.get(cv2.CAP_PROP_FRAME_HEIGHT)) == (1920, 360)
 
 
 @pytest.mark.thorough

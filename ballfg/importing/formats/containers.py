@@ -3,7 +3,8 @@
 import math
 import sys
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -15,14 +16,10 @@ from ballfg.importing.formats.nested import nested_tables
 from ballfg.importing.formats.raw import RawTable, table_of
 from ballfg.importing.formats.text_files import text_table
 
-MAX_DEPTH: Final = 40
-"""Largest depth of nested groups."""
-MAX_MEMBERS: Final = 20_000
-"""Largest number of files in an archive, or of datasets and groups in an HDF5 file: four for each of 5,000 shots."""
-EXCEL_FREE: Final = 1_000_000
-"""Bytes of XML that any Excel file may hold, whatever its size: openpyxl reads some 2 MB a second."""
-EXCEL_CELLS: Final = 25_000
-"""Cells that any Excel file may have, plus one for each two bytes of its size: a number takes three or more."""
+MAX_DEPTH: Final = 40  # largest depth of nested groups
+MAX_MEMBERS: Final = 20_000  # files of an archive, or datasets and groups of an HDF5 file: four for each of 5,000 shots
+EXCEL_FREE: Final = 1_000_000  # bytes of XML that any Excel file may hold: openpyxl reads some 2 MB a second
+EXCEL_CELLS: Final = 25_000  # of any Excel file, plus one for each two bytes of its size: a number takes three or more
 _PLAIN: Final = "Save plain arrays of numbers with numpy.savez."
 
 
@@ -36,7 +33,6 @@ def read_parquet(path: Path) -> list[RawTable]:
         table = file.read(use_threads=False).flatten()
         check_unpacked(path, sum(_copied(chunk) for column in table.columns for chunk in column.chunks))
         columns = _columns(pa, table)
-    rows: list[dict[str, Any]] = []
     if any(isinstance(values, list) and values and isinstance(values[0], list) for values in columns.values()):
         rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
         return nested_tables(rows, path.stem, str(path))
@@ -77,15 +73,10 @@ def _copied(array: Any, inside: bool = False) -> int:
 
 def read_excel(path: Path) -> list[RawTable]:
     """The tables of an Excel file, one per sheet. Raises: ValueError: no openpyxl, or not an Excel file."""
-    try:
-        import openpyxl
-    except ImportError:
-        raise ValueError(
-            f"{path} must be read by the package openpyxl; it is not there. Install it: pip install 'ballfg[excel]'."
-        ) from None
     import csv
     import io
 
+    openpyxl = _imported("openpyxl", "excel", path)
     if not zipfile.is_zipfile(path):
         raise ValueError(f"{path} must be an Excel file (.xlsx); it is none. Save it again as .xlsx or CSV.")
     with library_reads(path, "Excel"), zipfile.ZipFile(path) as archive:
@@ -123,23 +114,9 @@ def _rows(path: Path, sheet: Any, most: int) -> Iterator[list[str]]:
     for row in sheet.iter_rows(values_only=True):
         count += len(row)
         check_parts(path, "cells", count, most)
-        cells = _cells(row)
+        cells = ["" if cell is None else cell.isoformat() if hasattr(cell, "isoformat") else str(cell) for cell in row]
         if any(cells):
             yield cells
-
-
-def _cells(row: Iterable[Any]) -> list[str]:
-    """The cells of a row as text."""
-    return [
-        ""
-        if cell is None
-        else cell.isoformat()
-        if hasattr(cell, "isoformat")
-        else repr(cell)
-        if isinstance(cell, float)
-        else str(cell)
-        for cell in row
-    ]
 
 
 def read_npz(path: Path) -> list[RawTable]:
@@ -159,21 +136,15 @@ def read_npz(path: Path) -> list[RawTable]:
 
 
 def read_hdf5(path: Path) -> list[RawTable]:
-    """The tables of an HDF5 file: compound or 2-D datasets, and groups of columns.
-
-    Raises: ValueError: no h5py, or not an HDF5 file.
-    """
-    h5py = _h5py(path)
+    """The tables of an HDF5 file: datasets and groups of columns. Raises: ValueError: no h5py, or no HDF5 file."""
+    h5py = _imported("h5py", "hdf5", path)
     with library_reads(path, "HDF5"), h5py.File(path, "r") as file:
         content = _Group(h5py, path).content(file, 0)
     return nested_tables(content, path.stem, str(path))
 
 
 def read_bag(path: Path, topic: str | None) -> list[RawTable]:
-    """The positions of one topic of a ROS 2 bag, stamped in s from its first message.
-
-    Raises: ValueError: no rosbags, no such topic, several topics, or several balls in one message.
-    """
+    """The positions of one topic of a ROS 2 bag, in s from its first message. Raises: ValueError: none, or several."""
     from ballfg.live.sources.bag import bag_samples
 
     samples = list(bag_samples(path, topic))
@@ -190,14 +161,12 @@ def read_bag(path: Path, topic: str | None) -> list[RawTable]:
     return [table_of(path.stem, columns, str(path))]
 
 
-def _h5py(path: Path) -> Any:
+def _imported(package: str, extra: str, path: Path) -> Any:
     try:
-        import h5py
+        return import_module(package)
     except ImportError:
-        raise ValueError(
-            f"{path} must be read by the package h5py; it is not installed. Install it: pip install 'ballfg[hdf5]'."
-        ) from None
-    return h5py
+        what = f"{path} must be read by the package {package}; it is not installed"
+        raise ValueError(f"{what}. Install it: pip install 'ballfg[{extra}]'.") from None
 
 
 class _Group:
@@ -211,9 +180,8 @@ class _Group:
     def content(self, group: Any, depth: int) -> dict[str, Any]:
         """Arrays and numbers of a group, by name."""
         content: dict[str, Any] = {}
-        for key, value in group.attrs.items():
-            if isinstance(value, str | int | float | np.integer | np.floating):
-                content[key] = value
+        plain = (str, int, float, np.integer, np.floating)
+        content |= {key: value for key, value in group.attrs.items() if isinstance(value, plain)}
         if depth > MAX_DEPTH:
             raise ValueError(f"{self._path}: groups must be nested at most {MAX_DEPTH} deep. Write it flatter.")
         check_parts(self._path, "groups and datasets", len(self._seen) + len(group), MAX_MEMBERS)
@@ -229,10 +197,7 @@ class _Group:
         return content
 
     def _is_known(self, group: Any, key: str) -> bool:
-        """True if another link has led there: two links in each of 40 groups would be 2^40 ways.
-
-        Raises: ValueError: a link to another file.
-        """
+        """True if another link has led there: else 40 groups had 2^40 ways. Raises: ValueError: a link to a file."""
         link = group.id.links.get_info(key.encode("utf-8", "surrogateescape"))
         if link.type not in (self._h5py.h5l.TYPE_HARD, self._h5py.h5l.TYPE_SOFT):
             raise ValueError(f"{self._path} must hold its data itself; {shown(key)} is a link to another file.")
@@ -272,17 +237,15 @@ def _array_bytes(path: Path) -> int:
     if not zipfile.is_zipfile(path):
         with path.open("rb") as file:
             return _header_bytes(file)
-    size = 0
     with zipfile.ZipFile(path) as archive:
         members = archive.infolist()
         check_parts(path, "arrays", len(members), MAX_MEMBERS)
+        size = 0
         for member in members:
-            within = member.file_size
-            if member.filename.endswith(".npy"):
-                with archive.open(member) as file:
-                    within = max(within, _header_bytes(file))
-            size += within
-    return size
+            with archive.open(member) as file:
+                within = _header_bytes(file) if member.filename.endswith(".npy") else 0
+            size += max(member.file_size, within)
+        return size
 
 
 def _header_bytes(file: IO[bytes]) -> int:

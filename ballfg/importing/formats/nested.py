@@ -8,12 +8,9 @@ import numpy as np
 
 from ballfg.importing.formats.raw import RawTable, table_of
 
-_LEAST: Final = 3
-"""Least number of rows of a list as a table; shorter lists are points or settings."""
-_POINT: Final = 4
-"""Largest number of coordinates of a point in one row."""
-MAX_PARTS: Final = 100_000
-"""Largest number of searched lists and mappings; each shot is one or a few."""
+_LEAST: Final = 3  # least number of rows of a list as a table; shorter lists are points or settings
+_POINT: Final = 4  # largest number of coordinates of a point in one row
+MAX_PARTS: Final = 100_000  # largest number of searched lists and mappings; each shot is one or a few
 
 
 def nested_tables(content: Any, name: str, source: str) -> list[RawTable]:
@@ -44,7 +41,8 @@ class _Source:
 
 def _tables(content: Any, name: str, source: _Source, known: Mapping[str, Any]) -> list[RawTable]:
     if hasattr(content, "columns") and hasattr(content, "to_numpy"):  # a DataFrame of pandas or of another library
-        content = {_label(label): np.asarray(content[label]) for label in content.columns}
+        labels = [".".join(filter(None, map(str, x))) if isinstance(x, tuple) else str(x) for x in content.columns]
+        content = {label: np.asarray(content[name]) for label, name in zip(labels, content.columns, strict=True)}
     if isinstance(content, np.ndarray):
         return _of_array(content, name, source, known)
     if isinstance(content, Mapping):
@@ -52,10 +50,6 @@ def _tables(content: Any, name: str, source: _Source, known: Mapping[str, Any]) 
     if isinstance(content, list | tuple) and len(content):
         return _of_list(list(content), name, source, known)
     return []
-
-
-def _label(label: Any) -> str:
-    return ".".join(str(part) for part in label if str(part)) if isinstance(label, tuple) else str(label)
 
 
 def _of_array(array: np.ndarray, name: str, source: _Source, known: Mapping[str, Any]) -> list[RawTable]:
@@ -72,7 +66,7 @@ def _of_array(array: np.ndarray, name: str, source: _Source, known: Mapping[str,
         array = array.T
     if array.shape[1] < 3 or len(array) < _LEAST:
         return []
-    columns: dict[str, Any] = {str(i): array[:, i] for i in range(array.shape[1])}
+    columns: dict[str, Any] = {str(i): column for i, column in enumerate(array.T)}
     return [_table(name, columns, source, {}, named=False)]
 
 
@@ -88,10 +82,8 @@ def _of_mapping(content: Mapping[Any, Any], name: str, source: _Source, known: M
     if length >= _LEAST and len(columns) >= 2:
         return [_table(name, columns, source, below)]
     source.add(len(parts))
-    found: list[RawTable] = []
-    for key, value in parts.items():
-        found += _tables(value, f"{name}/{key}" if name else key, source, below)
-    return found
+    named = {f"{name}/{key}" if name else key: value for key, value in parts.items()}
+    return [table for key, value in named.items() for table in _tables(value, key, source, below)]
 
 
 def _vectors(key: str, value: Any) -> dict[str, Any]:
@@ -111,13 +103,11 @@ def _vectors(key: str, value: Any) -> dict[str, Any]:
     squeezed = array.reshape(-1) if array.ndim == 2 and 1 in array.shape else array
     if squeezed.ndim == 1:
         return {key: squeezed}
-    if squeezed.ndim != 2:
-        return {}
-    if squeezed.shape[0] in (2, 3) and squeezed.shape[1] > _POINT:
+    if squeezed.ndim == 2 and squeezed.shape[0] in (2, 3) and squeezed.shape[1] > _POINT:
         squeezed = squeezed.T
-    if squeezed.shape[1] in (2, 3):
-        return {f"{key}.{i}": squeezed[:, i] for i in range(squeezed.shape[1])}
-    return {}
+    if squeezed.ndim != 2 or squeezed.shape[1] not in (2, 3):
+        return {}
+    return {f"{key}.{i}": column for i, column in enumerate(squeezed.T)}
 
 
 def _of_list(items: list[Any], name: str, source: _Source, known: Mapping[str, Any]) -> list[RawTable]:
@@ -134,10 +124,7 @@ def _of_list(items: list[Any], name: str, source: _Source, known: Mapping[str, A
             return [_table(name, columns, source, known, named=False)]
     parts = [(i, item) for i, item in enumerate(items) if not _is_scalar(item)]
     source.add(len(parts))
-    found: list[RawTable] = []
-    for i, item in parts:
-        found += _tables(item, f"{name}/{i:03d}", source, known)
-    return found
+    return [table for i, item in parts for table in _tables(item, f"{name}/{i:03d}", source, known)]
 
 
 def _flat(item: Mapping[str, Any], prefix: str = "") -> dict[str, Any] | None:

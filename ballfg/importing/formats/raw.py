@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -11,49 +12,25 @@ from numpy.typing import NDArray
 from ballfg.checks import MAX_TEXT, shown
 from ballfg.files.damaged import MAX_COLUMNS
 
-Column = NDArray[Any]
-"""(n,) int64, float64 or object (text)."""
-
-MISSING: Final = (
-    "",
-    "-",
-    "--",
-    "?",
-    "nan",
-    "na",
-    "n/a",
-    "#n/a",
-    "null",
-    "none",
-    "nil",
-    "missing",
-    "lost",
-    "inf",
-    "-inf",
-)
-"""Marks of a missing number in files, in lower case."""
+Column = NDArray[Any]  # (n,) int64, float64 or object (text)
+MISSING: Final = (  # marks of a missing number, in lower case
+    "", "-", "--", "?", "nan", "na", "n/a", "#n/a", "null", "none", "nil", "missing", "lost", "inf", "-inf",
+)  # fmt: skip
 WITH_UNIT: Final = re.compile(r"^\s*([-+]?(?:\d++\.?\d*+|\.\d++)(?:[eE][-+]?\d++)?)\s*([^\W\d_]{1,3})\s*$")
 """A number with its unit, such as 12.5 mm."""
-_MOSTLY: Final = 0.5
-"""Least share of numbers among the cells of a numeric column."""
+_MOSTLY: Final = 0.5  # least share of numbers among the cells of a numeric column
 
 
 @dataclass
 class RawTable:
     """One table of a source."""
 
-    name: str
-    """Name of the table in its file; the file's own name for a single table."""
-    columns: dict[str, Column]
-    """By name, in the order of the file."""
-    source: str = ""
-    """Name of the file, for messages."""
-    named: bool = True
-    """True if the columns have names of their own."""
-    notes: list[str] = field(default_factory=list)
-    """Omissions during reading."""
-    texts: dict[str, Column] = field(default_factory=dict)
-    """Columns of numbers with some other cells, as written."""
+    name: str  # name of the table in its file; the file's own name for a single table
+    columns: dict[str, Column]  # by name, in the order of the file
+    source: str = ""  # name of the file, for messages
+    named: bool = True  # True if the columns have names of their own
+    notes: list[str] = field(default_factory=list)  # omissions during reading
+    texts: dict[str, Column] = field(default_factory=dict)  # columns of numbers with some other cells, as written
 
     @property
     def doubts(self) -> dict[str, str]:
@@ -74,27 +51,17 @@ class RawTable:
 
 
 def table_of(name: str, columns: Mapping[str, Any], source: str = "", named: bool = True) -> RawTable:
-    """A table from columns that are arrays or lists (n,) of anything; text that is numbers becomes numbers.
-
-    Raises: ValueError: more than `MAX_COLUMNS`.
-    """
+    """A table from columns (n,) of anything; text that is numbers becomes numbers. Raises: ValueError: too many."""
     if len(columns) > MAX_COLUMNS:
         raise ValueError(f"{source} must have at most {MAX_COLUMNS} columns; got {len(columns)}. Leave some out.")
-    ready: dict[str, Column] = {}
-    texts: dict[str, Column] = {}
-    for label, values in columns.items():
-        column, new_label, text = _column(label, values)
-        ready[new_label] = column
-        if text is not None:
-            texts[new_label] = text
-    return RawTable(name, ready, source, named, texts=texts)
+    read = [_column(label, values) for label, values in columns.items()]
+    texts = {label: text for _, label, text in read if text is not None}
+    return RawTable(name, {label: column for column, label, _ in read}, source, named, texts=texts)
 
 
 def numbers(column: Column) -> NDArray[np.float64]:
     """The column as float64 (n,); NaN for text."""
-    if column.dtype.kind in "iuf":
-        return column.astype(np.float64)
-    return np.full(len(column), np.nan)
+    return column.astype(np.float64) if is_number(column) else np.full(len(column), np.nan)
 
 
 def is_number(column: Column) -> bool:
@@ -104,11 +71,8 @@ def is_number(column: Column) -> bool:
 
 def _column(label: str, values: Any) -> tuple[Column, str, Column | None]:
     array = values if isinstance(values, np.ndarray) else _array(values)
-    if array.dtype.kind == "M":
-        stamps = array.astype("datetime64[ns]").astype(np.int64)
-        return stamps, f"{label} [ns]", None
-    if array.dtype.kind == "m":
-        return array.astype("timedelta64[ns]").astype(np.int64), f"{label} [ns]", None
+    if array.dtype.kind in "mM":  # time differences and dates
+        return array.astype(f"{array.dtype.kind}8[ns]").astype(np.int64), f"{label} [ns]", None
     if array.dtype.kind in "bui":
         return array.astype(np.int64), label, None
     if array.dtype.kind == "f":
@@ -118,19 +82,12 @@ def _column(label: str, values: Any) -> tuple[Column, str, Column | None]:
 
 def _array(values: Sequence[Any]) -> Column:
     held = list(values)
-    kinds: tuple[tuple[tuple[type, ...], type], ...] = (
-        ((bool, int, np.integer), np.int64),
-        ((int, float, np.number), np.float64),
-    )
-    for kind, dtype in kinds:
+    kinds: dict[type, tuple[type, ...]] = {np.int64: (bool, int, np.integer), np.float64: (int, float, np.number)}
+    for dtype, kind in kinds.items():
         if held and all(isinstance(value, kind) for value in held):
-            try:
+            with suppress(OverflowError):  # digits without end are not a measured number
                 return np.array(held, dtype=dtype)
-            except OverflowError:  # digits without end are not a measured number
-                continue
-    made = np.empty(len(held), dtype=object)
-    made[:] = held
-    return made
+    return _objects(held)
 
 
 def _cell(value: Any) -> str:
@@ -139,38 +96,33 @@ def _cell(value: Any) -> str:
     if isinstance(value, bytes):
         return value.decode("utf-8", "replace").strip()
     text = value if isinstance(value, str) else value.isoformat() if hasattr(value, "isoformat") else str(value)
-    return (text if len(text) <= MAX_TEXT else text[:MAX_TEXT]).strip()
+    return text[:MAX_TEXT].strip()
 
 
 def _from_text(label: str, cells: list[str]) -> tuple[Column, str, Column | None]:
     """Numbers if most cells are numbers; whole numbers keep all their digits."""
     if any(len(cell) > 1 and cell[0] == "0" and cell.isdigit() for cell in cells):  # 007 is a name
-        return _text(cells), label, None
+        return _objects(cells), label, None
     present = [i for i, cell in enumerate(cells) if cell.lower() not in MISSING]
     for convert in (_whole, _real):
         parsed = [convert(cells[i]) for i in present]
         wrong = [cells[i] for i, value in zip(present, parsed, strict=True) if value is None]
         if present and not wrong:
             return _filled(len(cells), present, parsed), label, None
-    if not present or len(wrong) > (1.0 - _MOSTLY) * len(present):
-        return _with_units(label, cells, present)
-    return _filled(len(cells), present, parsed), label, _text(cells)
-
-
-def _with_units(label: str, cells: list[str], present: list[int]) -> tuple[Column, str, Column | None]:
-    """Cells such as "12.5 mm", with one unit in all of them; else the text as it is."""
-    found = [WITH_UNIT.match(cells[i]) for i in present]
+    if present and len(wrong) <= (1.0 - _MOSTLY) * len(present):
+        return _filled(len(cells), present, parsed), label, _objects(cells)
+    found = [WITH_UNIT.match(cells[i]) for i in present]  # such as "12.5 mm", with one unit in all of them
     units = {match[2] if match else "" for match in found}
     if present and len(units) == 1 and all(found):
         values = [float(match[1]) for match in found if match]
         return _filled(len(cells), present, values), f"{label} [{units.pop()}]", None
-    return _text(cells), label, None
+    return _objects(cells), label, None
 
 
-def _text(cells: list[str]) -> Column:
-    text = np.empty(len(cells), dtype=object)
-    text[:] = cells
-    return text
+def _objects(values: list[Any]) -> Column:
+    made = np.empty(len(values), dtype=object)
+    made[:] = values
+    return made
 
 
 def _filled(count: int, places: list[int], values: Sequence[float | int | None]) -> Column:

@@ -2,12 +2,11 @@
 
 import json
 import zipfile
-from collections.abc import Iterable, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final
 
-from ballfg.checks import check_path, shown
+from ballfg.checks import check_path, listed, shown
 from ballfg.files.json_file import TOO_MANY, has_too_many, parse_json
 from ballfg.importing.formats.containers import read_bag, read_excel, read_hdf5, read_npz, read_parquet
 from ballfg.importing.formats.matlab import read_matlab
@@ -26,15 +25,13 @@ READERS: Final = {
 _MAGIC: Final = (
     (b"PAR1", read_parquet), (b"\x89HDF", read_hdf5), (b"\x93NUMPY", read_npz), (b"MATLAB 5.0", read_matlab),
 )  # fmt: skip
-_OWN: Final = ("import.html", "truth.csv", "truth.parquet")
-"""Files in a dataset's folder that hold no measurements."""
+_OWN: Final = ("import.html", "truth.csv", "truth.parquet")  # files in a dataset's folder that hold no measurements
 
 
 def tables_of(data: Any, topic: str | None = None, key: str | None = None) -> list[RawTable]:
     """All tables of a source.
 
-    Args:
-        data: a path or several, of files and folders; a DataFrame, a dict of arrays, an array, or a list of these.
+    Args: data: a path or several, of files and folders; a DataFrame, a dict of arrays, an array, or a list of these.
         topic: of a ROS bag.  key: part of the names of the wanted tables.
     Raises: FileNotFoundError: no such path. ValueError: unreadable, or no table of that key.
     """
@@ -46,23 +43,17 @@ def tables_of(data: Any, topic: str | None = None, key: str | None = None) -> li
     else:
         found, name = nested_tables(data, "", "data"), "data"
     if not found:
-        raise ValueError(
-            f"{name} must hold a table with a time and x, y, z; none was found. Give (n, 4) numbers t, x, y, z, or "
-            "columns of these names."
-        )
+        problem = f"{name} must hold a table with a time and x, y, z; none was found"
+        raise ValueError(f"{problem}. Give (n, 4) numbers t, x, y, z, or columns of these names.")
     if key is None:
         return found
     chosen = [table for table in found if table.name == key or Path(table.source).name == key] or [
         table for table in found if key in f"{table.source}/{table.name}"
     ]
     if not chosen:
-        raise ValueError(f"--key must name a table of the source; got {shown(key)}, there are {_listed(found)}.")
+        names = listed(dict.fromkeys(table.name or table.source for table in found))
+        raise ValueError(f"--key must name a table of the source; got {shown(key)}, there are {names}.")
     return chosen
-
-
-def _listed(tables: Iterable[RawTable]) -> str:
-    names = list(dict.fromkeys(table.name or table.source for table in tables))
-    return ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
 
 
 def _of_path(path: Path, topic: str | None) -> list[RawTable]:
@@ -71,24 +62,17 @@ def _of_path(path: Path, topic: str | None) -> list[RawTable]:
     if path.is_file():
         return _of_file(path, topic)
     if not path.is_dir():
-        raise ValueError(
-            f"source must be a file or a folder; {path} is a pipe or a device. Write what comes to a file."
-        )
+        raise ValueError(f"source must be a file or folder; {path} is a pipe or a device. Write what comes to a file.")
     if (path / "metadata.yaml").is_file() or any(path.glob("*.db3")):
         return read_bag(path, topic)
-    files = sorted(file for file in path.rglob("*") if file.is_file() and _is_table(file))
+    known = (*TEXT[:-1], *JSON, *BAGS, *READERS, *_added())
+    files = [file for file in sorted(path.rglob("*")) if file.is_file() and file.suffix.lower() in known]
+    files = [file for file in files if not file.name.startswith(".") and file.name not in _OWN]
+    files = [file for file in files if "readme" not in file.name.lower()]
     if not files:
-        listing = ", ".join(sorted(entry.name for entry in path.iterdir())[:8]) or "nothing"
+        listing = listed(sorted(entry.name for entry in path.iterdir()))
         raise ValueError(f"{path} must hold files of measurements, such as .csv or .json; got {listing}. Name another.")
-    found: list[RawTable] = []
-    for file in files:
-        found += _of_file(file, topic)
-    return found
-
-
-def _is_table(file: Path) -> bool:
-    known = file.suffix.lower() in (*TEXT[:-1], *JSON, *BAGS, *READERS, *_added())
-    return known and not file.name.startswith(".") and file.name not in _OWN and "readme" not in file.name.lower()
+    return [table for file in files for table in _of_file(file, topic)]
 
 
 def _added() -> dict[str, type[Format]]:
@@ -127,33 +111,20 @@ def _json(path: Path, text: str) -> list[RawTable]:
         content = parse_json(text)
     except json.JSONDecodeError as error:
         lines = [line for line in text.splitlines() if line.strip()]
-        if not _whole_line(lines[0]):
+        try:
+            parse_json(lines[0])
+        except json.JSONDecodeError:
             raise ValueError(
                 f"{path}, line {error.lineno}: must be valid JSON; {error.msg} at column {error.colno}, as in a file "
                 "that was cut off. Write it again, whole."
             ) from None
-        content = _json_lines(path, lines)
+        content = []
+        for number, line in enumerate(lines, 1):
+            try:
+                content.append(parse_json(line))
+            except json.JSONDecodeError as wrong:
+                problem = f"{path}, line {number}: must be valid JSON; {wrong.msg} at column {wrong.colno}"
+                raise ValueError(f"{problem}. Correct or delete the line.") from None
     if isinstance(content, dict) and not any(isinstance(value, list | dict) for value in content.values()):
         content = [content]
     return nested_tables(content, path.stem, str(path))
-
-
-def _whole_line(line: str) -> bool:
-    try:
-        parse_json(line)
-    except json.JSONDecodeError:
-        return False
-    return True
-
-
-def _json_lines(path: Path, lines: Sequence[str]) -> list[Any]:
-    values: list[Any] = []
-    for number, line in enumerate(lines, 1):
-        try:
-            values.append(parse_json(line))
-        except json.JSONDecodeError as error:
-            raise ValueError(
-                f"{path}, line {number}: must be valid JSON; {error.msg} at column {error.colno}. Correct or delete "
-                "the line."
-            ) from None
-    return values

@@ -18,19 +18,13 @@ SEPARATORS: Final = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars"
 _COMMENTS: Final = ("#", "%", "//")
 _NUMBER: Final = re.compile(r"^[-+]?(\d++\.?\d*+|\.\d++)([eE][-+]?\d++)?$")
 _DECIMAL_COMMA: Final = re.compile(r"^[-+]?\d*,\d+([eE][-+]?\d++)?$")
-_LOOK: Final = 200
-"""Number of lines for finding the separator."""
-_HEAD: Final = 4096
-"""Number of bytes at the beginning for recognising text."""
-_CONTROL: Final = 0.02
-"""Share of control characters from which a file is not text."""
+_LOOK: Final = 200  # number of lines for finding the separator
+_HEAD: Final = 4096  # number of bytes at the beginning for recognising text
+_CONTROL: Final = 0.02  # share of control characters from which a file is not text
 
 
 def read_text_table(path: Path) -> list[RawTable]:
-    """The one table of a text file.
-
-    Raises: ValueError: not text, empty, or without rows of numbers; the message describes the content.
-    """
+    """The one table of a text file. Raises: ValueError: not text, empty, or without rows of numbers."""
     return [text_table(decoded(path), path.stem, str(path))]
 
 
@@ -64,21 +58,18 @@ def text_table(text: str, name: str, source: str) -> RawTable:
     try:
         return _text_table(text, name, source)
     except csv.Error as error:  # more than 131,072 characters without a separator
-        raise ValueError(
-            f"{source} must hold rows of numbers: a time and x, y, z; {one_line(error)}. Export the table as CSV."
-        ) from None
+        what = f"{source} must hold rows of numbers: a time and x, y, z; {one_line(error)}"
+        raise ValueError(f"{what}. Export the table as CSV.") from None
 
 
 def _text_table(text: str, name: str, source: str) -> RawTable:
     lines = [line for line in text.splitlines() if line.strip()]
     longest = max(map(len, lines), default=0)
     if longest > MAX_LINE:
-        raise ValueError(
-            f"{source} must have lines of at most {MAX_LINE} characters; one has {longest}. Export the table as CSV, "
-            "one row a line."
-        )
-    comments = [line for line in lines if line.lstrip().startswith(_COMMENTS)]
+        what = f"{source} must have lines of at most {MAX_LINE} characters; one has {longest}"
+        raise ValueError(f"{what}. Export the table as CSV, one row a line.")
     rows_of_text = [line for line in lines if not line.lstrip().startswith(_COMMENTS)]
+    comments = [line for line in lines if line.lstrip().startswith(_COMMENTS)]
     separator = _separator(rows_of_text)
     rows = _cells(rows_of_text, separator)
     comma = separator != "," or any(_DECIMAL_COMMA.match(cell) for row in rows[-5:] for cell in row)
@@ -106,15 +97,15 @@ def _text_table(text: str, name: str, source: str) -> RawTable:
 
 def _separator(lines: Sequence[str]) -> str:
     """The separator that gives most lines the same number of cells, most of them numbers."""
-    best, most = ",", (0.0, -math.inf)
+    best, most = ",", (-math.inf, 0.0)
     for separator in SEPARATORS:
         rows = _cells(lines[-_LOOK:], separator)
         widths = Counter(len(row) for row in rows)
         if not widths:
             continue
         width, count = widths.most_common(1)[0]
-        score = (count / sum(widths.values()) if width > 1 else 0.0, _numbers(rows))
-        if score[1] > most[1] or (score[1] == most[1] and score[0] > most[0]):
+        score = (_numbers(rows), count / sum(widths.values()) if width > 1 else 0.0)
+        if score > most:
             best, most = separator, score
     return best
 
@@ -162,11 +153,9 @@ def _joined(header: Sequence[Sequence[str]], width: int) -> list[str]:
     names: list[list[str]] = [[] for _ in range(width)]
     units = [""] * width
     for row in header:
-        if (
-            sum(unit_of_text(cell) is not None for cell in row) >= 2
-            and all(unit_of_text(cell) is not None or cell in ("", "-", "1") for cell in row)
-            and any(names)
-        ):
+        known = [unit_of_text(cell) is not None for cell in row]
+        others = [cell for cell, is_unit in zip(row, known, strict=True) if not is_unit]
+        if any(names) and sum(known) >= 2 and set(others) <= {"", "-", "1"}:
             units = list(row)
             continue
         for i, cell in enumerate(row):
@@ -174,8 +163,7 @@ def _joined(header: Sequence[Sequence[str]], width: int) -> list[str]:
                 names[i].append(cell)
     joined = [".".join(parts) or str(i) for i, parts in enumerate(names)]
     full = [f"{name} [{unit.strip('[]()')}]" if unit else name for name, unit in zip(joined, units, strict=True)]
-    counts: Counter[str] = Counter()
-    unique = []
+    counts, unique = Counter[str](), []
     for name in full:
         counts[name] += 1
         unique.append(name if counts[name] == 1 else f"{name}#{counts[name]}")

@@ -20,27 +20,16 @@ from ballfg.vision.association.triangulate import triangulate
 from ballfg.vision.calibration.lens_covariance import POSE, slopes_of
 from ballfg.vision.camera import Camera
 
-LEAST_MISFIT: Final = 3.0
-"""Largest squared error of agreeing cameras, relative to noise: half a pixel for centres good to 0.3."""
-LEAST_EXPLAINED: Final = 0.8
-"""Least share of the error beyond noise that a culprit must explain."""
-CLEARLY: Final = 4.0
-"""Least ratio of the unexplained error of another camera: correcting the wrong one of three cameras may halve the
-disagreement, but never ends it."""
-CLEARLY_WORSE: Final = 1.5
-"""Least ratio of the squared errors, noise included."""
-LEAST_POINTS: Final = 20
-"""Fewest points, each seen by three cameras or more: six numbers are fitted to them."""
-MOST_POINTS: Final = 600
-"""Most points that are used, evenly spread: more do not change the answer."""
-_LOOSE: Final = 20.0
-"""px, noise for points from views that may be wrong."""
-_UNSEEN: Final = 1e4
-"""px, error of a sighting whose point lies behind the camera or beyond its lens: more than any image's width."""
-_FAR: Final = 9.0
-"""Median squared errors at which a point counts half."""
-_STEPS: Final = 8
-"""Gauss-Newton steps; a camera turned by five degrees is right after six."""
+LEAST_MISFIT: Final = 3.0  # squared error of agreeing cameras over the noise's: half a pixel for centres good to 0.3
+LEAST_EXPLAINED: Final = 0.8  # least share of the error beyond noise that a culprit must explain
+CLEARLY: Final = 4.0  # least ratio of another camera's unexplained error: correcting a wrong one of three may halve it
+CLEARLY_WORSE: Final = 1.5  # least ratio of the squared errors, noise included
+LEAST_POINTS: Final = 20  # fewest points, each seen by three cameras or more: six numbers are fitted to them
+MOST_POINTS: Final = 600  # most points that are used, evenly spread: more do not change the answer
+_LOOSE: Final = 20.0  # px, noise for points from views that may be wrong
+_UNSEEN: Final = 1e4  # px, error of a sighting whose point lies behind the camera or beyond its lens
+_FAR: Final = 9.0  # median squared errors at which a point counts half
+_STEPS: Final = 8  # Gauss-Newton steps; a camera turned by five degrees is right after six
 _PRIOR: Final = np.diag([0.1**-2] * 3 + [0.3**-2] * 3)
 """Information about a nudge, 0.1 rad of turn and 0.3 m of shift: keeps the fit in place where points are too few."""
 
@@ -51,16 +40,12 @@ class CameraAgreement:
 
     residual: float
     """px, median distance of its sightings from the points of the others; NaN if fewer than two others saw them."""
-
     explained: float
     """Share of the disagreement beyond noise that a correction of this camera removes; NaN without disagreement."""
-
     rotation: float
     """Degrees, turn of that correction."""
-
     shift: float
     """m, shift of its centre in that correction."""
-
     corrected: float
     """px, the median distance with the corrected camera; NaN where `residual` is."""
 
@@ -71,13 +56,10 @@ class Agreement:
 
     culprit: str | None
     """The one camera whose correction explains the disagreement; None if they agree or if no single one does."""
-
     by_camera: Mapping[str, CameraAgreement]
     """By name, in the rig's order; empty where too little was seen by three cameras."""
-
     misfit: float
     """Median squared reprojection error over that of the noise: about 1 where cameras agree; NaN if not known."""
-
     sentence: str
     """A summary for readers."""
 
@@ -99,11 +81,10 @@ def check_agreement(balls: Sequence[SeenBall], cameras: Sequence[Camera]) -> Agr
     Source: docs/associate.md.
     """
     cameras = list(cameras)
-    pixels, covariances = _views(balls, cameras)
-    scene = _scene(cameras, pixels, covariances)
-    if len(scene.points) < LEAST_POINTS:
-        few = f"{len(scene.points)} points were seen by three cameras or more; {LEAST_POINTS} are needed to check them."
-        return Agreement(None, {}, float("nan"), f"Whether the cameras agree is not known: {few}")
+    scene = _scene(balls, cameras)
+    if (few := len(scene.points)) < LEAST_POINTS:
+        why = f"{few} points were seen by three cameras or more; {LEAST_POINTS} are needed to check them."
+        return Agreement(None, {}, float("nan"), f"Whether the cameras agree is not known: {why}")
     before = _misfit(scene, cameras, _refined(scene, cameras, scene.points, None)[0])
     by_camera = {}
     for k, camera in enumerate(cameras):
@@ -122,24 +103,18 @@ def check_agreement(balls: Sequence[SeenBall], cameras: Sequence[Camera]) -> Agr
     return Agreement(culprit, by_camera, before, _sentence(culprit, by_camera, before))
 
 
-def _views(balls: Sequence[SeenBall], cameras: list[Camera]) -> tuple[Array, Array]:
-    """Pixels (n, c, 2) of the balls in every camera at their points' times, covariances; NaN where not seen."""
-    pixels, covariances = [np.zeros((0, len(cameras), 2))], [np.zeros((0, len(cameras), 2, 2))]
-    for ball in balls:
-        seen = ball.sightings
-        places = np.full((len(ball), len(cameras), 2), np.nan)
-        spreads = np.full((len(ball), len(cameras), 2, 2), np.nan)
+def _scene(balls: Sequence[SeenBall], cameras: list[Camera]) -> _Scene:
+    """The points, with the pixels of the balls in every camera at the points' times."""
+    ends = np.cumsum([0, *map(len, balls)])
+    pixels = np.full((ends[-1], len(cameras), 2), np.nan)
+    covariances = np.full((ends[-1], len(cameras), 2, 2), np.nan)
+    for ball, start, end in zip(balls, ends[:-1], ends[1:], strict=True):
+        own = ball.sightings
         for k, camera in enumerate(cameras):
-            rows = seen.camera == seen.cameras.index(camera.name)
-            if rows.any():
-                line = path(seen.times[rows] - camera.time_offset, seen.pixels[rows], seen.covariances[rows])
-                places[:, k], spreads[:, k] = line.at(ball.times)
-        pixels.append(places)
-        covariances.append(spreads)
-    return np.concatenate(pixels), np.concatenate(covariances)
-
-
-def _scene(cameras: list[Camera], pixels: Array, covariances: Array) -> _Scene:
+            mine = own.camera == own.cameras.index(camera.name)
+            if mine.any():
+                line = path(own.times[mine] - camera.time_offset, own.pixels[mine], own.covariances[mine])
+                pixels[start:end, k], covariances[start:end, k] = line.at(ball.times)
     seen = np.asarray(np.isfinite(pixels).all(axis=-1))
     rows = np.flatnonzero(seen.sum(axis=1) >= 3)
     if len(rows):
@@ -159,18 +134,16 @@ def _errors(scene: _Scene, cameras: list[Camera], points: Array) -> Array:
     return np.where(np.isnan(scene.pixels), 0.0, np.nan_to_num(scene.pixels - projected, nan=_UNSEEN))
 
 
-def _squares(scene: _Scene, errors: Array) -> Array:
-    return np.asarray(np.einsum("nci,ncij,ncj->n", errors, scene.weights, errors))
-
-
 def _misfit(scene: _Scene, cameras: list[Camera], points: Array) -> float:
-    return float(np.median(_squares(scene, _errors(scene, cameras, points)) / scene.expected))
+    errors = _errors(scene, cameras, points)
+    return float(np.median(np.einsum("nci,ncij,ncj->n", errors, scene.weights, errors) / scene.expected))
 
 
 def _refined(scene: _Scene, cameras: list[Camera], points: Array, nudged: int | None) -> tuple[Array, list[Camera]]:
     """Gauss-Newton on all points and, if one is named, on a camera's pose: the points and the cameras then."""
     cameras = list(cameras)
-    start = None if nudged is None else np.concatenate((cameras[nudged].rvec, cameras[nudged].tvec))
+    first = cameras[nudged or 0]
+    start = np.concatenate((first.rvec, first.tvec))
     for _ in range(_STEPS):
         errors = _errors(scene, cameras, points)
         slopes = [slopes_of(c, points, c.rvec, c.tvec)[:, :POSE].reshape(-1, 2, POSE) for c in cameras]
@@ -179,11 +152,12 @@ def _refined(scene: _Scene, cameras: list[Camera], points: Array, nudged: int | 
         information = np.einsum("ncij,ncik->njk", by_point, weighted)
         gradient = np.einsum("ncij,nci->nj", weighted, errors)
         points = points + np.linalg.solve(information, gradient[..., None])[..., 0]
-        if nudged is not None and start is not None:
+        if nudged is not None:
             by_pose, mine = slopes[nudged], scene.weights[:, nudged] @ slopes[nudged]
             mixed = np.einsum("nij,nik->njk", weighted[:, nudged], by_pose)
             removed = np.linalg.solve(information, mixed)
-            squares = _squares(scene, errors)  # Cauchy weights: points far worse than the median count less
+            # Cauchy weights: points far worse than the median count less
+            squares = np.einsum("nci,ncij,ncj->n", errors, scene.weights, errors)
             trust = 1.0 / (1.0 + squares / (_FAR * (np.median(squares) + 1.0)))
             # The points are eliminated from the normal equations (Schur complement).
             schur = np.einsum("n,nij,nik->jk", trust, mine, by_pose) - np.einsum("n,nji,njk->ik", trust, mixed, removed)
@@ -216,13 +190,12 @@ def _culprit(by_camera: Mapping[str, CameraAgreement], misfit: float) -> str | N
 
 def _sentence(culprit: str | None, by_camera: Mapping[str, CameraAgreement], misfit: float) -> str:
     distances = ", ".join(f"{name} {seen.residual:.2f} px" for name, seen in by_camera.items())
+    each = f"each from the points of the others by {distances}"
     if misfit <= LEAST_MISFIT:
-        return f"The cameras agree: each from the points of the others by {distances}."
+        return f"The cameras agree: {each}."
     if culprit is None:
-        return (
-            f"The cameras disagree, and no single one explains it (each from the points of the others by {distances}). "
-            "Calibrate them again, and check their time offsets."
-        )
+        why = f"The cameras disagree, and no single one explains it ({each})."
+        return f"{why} Calibrate them again, and check their time offsets."
     seen = by_camera[culprit]
     return (
         f"Camera {culprit} has moved since its calibration: it is off by {seen.residual:.1f} px from the points of the "

@@ -10,21 +10,26 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.arrays import Index
 from ballfg.checks import check_count, check_range
 from ballfg.tracks.sightings import Sightings
 from ballfg.tracks.stamps import elapsed, written
-from ballfg.vision.association.completing import complete
 from ballfg.vision.association.flights import is_ball, successions
-from ballfg.vision.association.gathering import SAME_SHUTTER, Footage, Gathered, SeenBall, gather, shared_stamps
+from ballfg.vision.association.gathering import (
+    SAME_SHUTTER,
+    Footage,
+    Gathered,
+    SeenBall,
+    complete,
+    gather,
+    shared_stamps,
+)
 from ballfg.vision.association.matching import Piece, match
 from ballfg.vision.association.tracklets import find_tracklets
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections
 
 _NONE: Final = np.zeros(0, dtype=np.int64)
-_DISPUTED: Final = 2
-"""Most frames in which two parts of one flight both have a candidate: one of the two candidates is wrong then."""
+_DISPUTED: Final = 2  # most frames in which two parts of one flight both have a candidate, one of them wrong
 
 
 @dataclass(frozen=True)
@@ -36,7 +41,6 @@ class AssociationSettings:
 
     least_score: float = 0.3
     """In [0, 1]; candidates with a lower score are not used."""
-
     least_points: int = 6
     """Points of the shortest track that is kept; at least 3."""
 
@@ -62,7 +66,10 @@ def associate(
     """
     settings = settings or AssociationSettings()
     footage = _footage(detections, cameras, settings)
-    pieces = _pieces(footage)
+    pieces = []
+    for number, (camera, seen) in enumerate(zip(footage.cameras, footage.detections, strict=True)):
+        focal = float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
+        pieces += [Piece(number, rows, footage.path(number, rows)) for rows in find_tracklets(seen, focal)]
     matching = match(pieces, footage.cameras)
     footage = replace(footage, offset=matching.offset)
     balls = []
@@ -96,14 +103,6 @@ def _footage(detections: Sequence[Detections], cameras: Sequence[Camera], settin
     return Footage(list(cameras), chosen, shared_stamps(frames, SAME_SHUTTER), origin, stamps)
 
 
-def _pieces(footage: Footage) -> list[Piece]:
-    pieces = []
-    for number, (camera, seen) in enumerate(zip(footage.cameras, footage.detections, strict=True)):
-        focal = float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
-        pieces += [Piece(number, rows, footage.path(number, rows)) for rows in find_tracklets(seen, focal)]
-    return pieces
-
-
 def _joined(footage: Footage, balls: list[Gathered]) -> list[Gathered]:
     """The balls, those of one flight joined."""
     following = dict(successions([ball.track for ball in balls]))
@@ -122,8 +121,12 @@ def _joined(footage: Footage, balls: list[Gathered]) -> list[Gathered]:
         if len(chain) == 1:
             joined.append(balls[number])
             continue
-        parts = zip(footage.detections, *(balls[i].rows for i in chain), strict=True)
-        joined.append(gather(footage, [_undisputed(seen, np.concatenate(rows)) for seen, *rows in parts]))
+        undisputed = []  # rows in ascending order, without frames that have two
+        for seen, *parts in zip(footage.detections, *(balls[i].rows for i in chain), strict=True):
+            rows = np.concatenate(parts)
+            _, position, count = np.unique(seen.frame[rows], return_inverse=True, return_counts=True)
+            undisputed.append(np.sort(rows[count[position] == 1]))
+        joined.append(gather(footage, undisputed))
     return joined
 
 
@@ -134,19 +137,12 @@ def _may_follow(footage: Footage, one: Gathered, other: Gathered) -> bool:
     return all(np.isin(frame[mine], frame[theirs]).sum() <= _DISPUTED for frame, mine, theirs in pairs)
 
 
-def _undisputed(seen: Detections, rows: Index) -> Index:
-    """Rows in ascending order, without frames that have two."""
-    _, position, count = np.unique(seen.frame[rows], return_inverse=True, return_counts=True)
-    return np.sort(rows[count[position] == 1])
-
-
 def _seen_ball(footage: Footage, ball: Gathered) -> SeenBall:
     camera = np.repeat(np.arange(len(ball.rows)), [len(rows) for rows in ball.rows])
     pairs = list(zip(footage.detections, ball.rows, strict=True))
     since = np.concatenate([seen.times[rows] for seen, rows in pairs])
     order = np.argsort(since - np.array([c.time_offset for c in footage.cameras])[camera], kind="stable")
-    frames = [seen.frame[rows] for seen, rows in pairs]
-    stamps = np.concatenate([own[frame] for own, frame in zip(footage.stamps, frames, strict=True)])
+    stamps = np.concatenate([own[seen.frame[rows]] for own, (seen, rows) in zip(footage.stamps, pairs, strict=True)])
     sightings = Sightings(
         tuple(c.name for c in footage.cameras),
         camera[order],

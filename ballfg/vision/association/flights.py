@@ -5,6 +5,7 @@ continuation of the first meets that of the second in the gap, with a kink where
 """
 
 from collections.abc import Sequence
+from itertools import permutations
 from typing import Final
 
 import numpy as np
@@ -14,59 +15,35 @@ from ballfg.arrays import Array
 from ballfg.state import STANDARD_GRAVITY
 from ballfg.vision.association.paths import Path
 
-LONGEST_GAP: Final = 0.3
-"""s. A ball that reappears after a longer gap is a new one."""
-LONGEST_HIT_GAP: Final = 0.1
-"""s. A ball may have been hit in a gap up to this long, and may leave it with any velocity; in a longer one it may only
-have bounced."""
-FASTEST: Final = 80.0
-"""m/s, no ball that is struck by hand is faster: the fastest served tennis balls have 73."""
-LEAST_WAY: Final = 0.05
-"""m, least extent of a ball's track."""
-GRAVITY: Final = np.array([0.0, 0.0, -STANDARD_GRAVITY])
-"""m/s^2"""
-_SLACK: Final = 3.0
-"""m/s^2, tolerance of a slow ball's acceleration about gravity: error of the calibration, lift of a fast spin."""
-_AIR: Final = 0.25
-"""1/m, growth of that tolerance with the square of the speed: drag of 0.13 and as much lift."""
-_WINDOWS: Final = (0.15, 0.3, 0.6)
-"""s, windows in which an acceleration is measured: short against a flight; the longer ones serve noisy tracks."""
-_LEAST_IN_WINDOW: Final = 5
-"""Points of such a window: three make the parabola."""
-_TELLING: Final = 2.0
-"""m/s^2, largest standard deviation of an acceleration that is compared with gravity: with a larger one a hovering
-object would pass."""
-_SIGMAS: Final = 3.0
-"""Tolerance in standard deviations of a measured acceleration."""
-_FALLING: Final = 0.5
-"""Least share of the informative windows in which a ball falls; it may be held, hit or at rest in the others."""
-_END: Final = 0.08
-"""s, length of a track's end that is extrapolated."""
-_STEADY: Final = 10.0
-"""m/s^2, standard deviation for drag and lift, which the extrapolation leaves out."""
-_FLOOR: Final = 0.01
-"""m, standard deviation of an extrapolated position apart from noise."""
-_FARTHEST: Final = 0.15
-"""m, greatest distance between the ends of one flight, whatever their covariance: two balls may be that close."""
-_GATE: Final = 16.0
-"""Largest squared distance of two continuations, whitened: 4 sigma."""
-_FRICTION: Final = 0.5
-"""Largest relative change of the horizontal velocity in a bounce."""
-_LEAST_CHANGE: Final = 1.0
-"""m/s, change of the horizontal velocity that is always allowed: spin accelerates a ball that drops."""
-_STEPS: Final = 25
-"""Number of times in a gap at which continuations are compared."""
+LONGEST_GAP: Final = 0.3  # s. A ball that reappears after a longer gap is a new one.
+LONGEST_HIT_GAP: Final = 0.1  # s; in a gap so long a ball may have been hit, in a longer one it may only have bounced
+FASTEST: Final = 80.0  # m/s, no ball that is struck by hand is faster: the fastest served tennis balls have 73
+LEAST_WAY: Final = 0.05  # m, least extent of a ball's track
+GRAVITY: Final = np.array([0.0, 0.0, -STANDARD_GRAVITY])  # m/s^2
+_SLACK: Final = 3.0  # m/s^2 about gravity for a slow ball: error of the calibration, lift of a fast spin
+_AIR: Final = 0.25  # 1/m, growth of that tolerance with the square of the speed: drag of 0.13 and as much lift
+_WINDOWS: Final = (0.15, 0.3, 0.6)  # s, for an acceleration: short against a flight; the longer ones serve noisy tracks
+_LEAST_IN_WINDOW: Final = 5  # points of such a window: three make the parabola
+_TELLING: Final = 2.0  # m/s^2, largest standard deviation of an acceleration; with more, a hovering object would pass
+_SIGMAS: Final = 3.0  # tolerance in standard deviations of a measured acceleration
+_FALLING: Final = 0.5  # least share of informative windows in which a ball falls; else it is held, hit, at rest
+_END: Final = 0.08  # s, length of a track's end that is extrapolated
+_STEADY: Final = 10.0  # m/s^2, standard deviation for drag and lift, which the extrapolation leaves out
+_FLOOR: Final = 0.01  # m, standard deviation of an extrapolated position apart from noise
+_FARTHEST: Final = 0.15  # m, greatest distance between the ends of one flight, whatever their covariance
+_GATE: Final = 16.0  # largest squared distance of two continuations, whitened: 4 sigma
+_FRICTION: Final = 0.5  # largest relative change of the horizontal velocity in a bounce
+_LEAST_CHANGE: Final = 1.0  # m/s, always allowed change of the horizontal velocity: spin accelerates a dropped ball
+_STEPS: Final = 25  # number of times in a gap at which continuations are compared
 
 
 def is_ball(track: Path) -> bool:
     """True for a track in space (d = 3) of a ball: long enough, not too fast, and falling."""
     if np.ptp(track.values, axis=0).max() < LEAST_WAY:
         return False
-    for length in _WINDOWS:
-        falling = _falling(track, length)
-        if falling:
-            return float(np.mean(falling)) >= _FALLING
-    return False
+    found = (_falling(track, length) for length in _WINDOWS)
+    first = next((falling for falling in found if falling), [False])
+    return float(np.mean(first)) >= _FALLING
 
 
 def _falling(track: Path, length: float) -> list[bool]:
@@ -77,9 +54,8 @@ def _falling(track: Path, length: float) -> list[bool]:
         for start in np.arange(track.times[rows[0]], track.times[rows[-1]] + 0.5 * length, 0.5 * length):
             window = rows[(track.times[rows] >= start) & (track.times[rows] <= start + length)]
             if len(window) >= _LEAST_IN_WINDOW:
-                falls = _falls(track, window)
-                found += [falls] if falls is not None else []
-    return found
+                found.append(_falls(track, window))
+    return [falls for falls in found if falls is not None]
 
 
 def _falls(track: Path, window: NDArray[np.intp]) -> bool | None:
@@ -100,10 +76,7 @@ def _falls(track: Path, window: NDArray[np.intp]) -> bool | None:
 
 
 def meeting(earlier: Path, later: Path) -> float | None:
-    """Squared distance, whitened, of the continuations of two tracks in the gap between them.
-
-    None where the tracks are not of one flight: the gap is too long, or the continuations miss each other.
-    """
+    """Squared whitened distance of two tracks' continuations in the gap between them; None if not of one flight."""
     start, end = float(earlier.times[-1]), float(later.times[0])
     if end < start or end - start > LONGEST_GAP or min(len(earlier.times), len(later.times)) < 2:
         return None
@@ -141,14 +114,9 @@ def _continued(track: Path, times: Array, last: bool) -> tuple[Array, Array, Arr
 
 def successions(tracks: Sequence[Path]) -> list[tuple[int, int]]:
     """Pairs (earlier, later) of tracks of one flight, best first; no track is twice on the same side."""
-    found = []
-    for i, earlier in enumerate(tracks):
-        for j, later in enumerate(tracks):
-            cost = meeting(earlier, later) if i != j else None
-            if cost is not None:
-                found.append((cost, i, j))
+    costs = {(i, j): meeting(tracks[i], tracks[j]) for i, j in permutations(range(len(tracks)), 2)}
     pairs: list[tuple[int, int]] = []
-    for _, i, j in sorted(found):
+    for _, (i, j) in sorted((cost, pair) for pair, cost in costs.items() if cost is not None):
         if all(i != earlier and j != later for earlier, later in pairs):
             pairs.append((i, j))
     return pairs

@@ -16,42 +16,26 @@ from ballfg.arrays import Array, Index
 from ballfg.vision.association.paths import Path
 from ballfg.vision.camera import Camera
 
-WORST_OFFSET: Final = 5.0
-"""px, prior standard deviation of a calibration's error."""
-LEAST_OFFSET: Final = 0.3
-"""px, least error of a calibration in the matching."""
-_SIGNIFICANT: Final = 0.5
-"""Least excess of the miss of right pairs' rays, as a share of the noise's variance."""
-_MEDIAN_SQUARE: Final = 0.4549
-"""Median of the square of a standard normal number."""
-_GATE: Final = 9.0
-"""Squared deviations at which two pieces do not belong together: 3 sigma of calibration and noise together."""
-_LEAST_COMMON: Final = 2
-"""Times at which both pieces must be known; a track that ends just after a bounce has no more."""
-_LEAST_SUPPORT: Final = 1.5
-"""Common times that must speak for a pair, less what speaks against it."""
-_LONG: Final = 8
-"""Common times from which a pair of pieces says something about the calibration."""
-_SPEEDING: Final = 2.0
-"""Largest excess of a speed between two pieces over those of both: at a bounce or a hit."""
-_NEARBY: Final = 15.0
-"""px, how far apart two successive pieces of one camera may be at least, however slow they are."""
-_NEAREST: Final = 0.1
-"""m, least distance from either camera at which two rays may meet."""
+WORST_OFFSET: Final = 5.0  # px, prior standard deviation of a calibration's error
+LEAST_OFFSET: Final = 0.3  # px, least error of a calibration in the matching
+_SIGNIFICANT: Final = 0.5  # least excess of the miss of right pairs' rays, as a share of the noise's variance
+_MEDIAN_SQUARE: Final = 0.4549  # median of the square of a standard normal number
+_GATE: Final = 9.0  # squared deviations at which two pieces part: 3 sigma of calibration and noise together
+_LEAST_COMMON: Final = 2  # times at which both pieces must be known; a track that ends just after a bounce has no more
+_LEAST_SUPPORT: Final = 1.5  # common times that must speak for a pair, less what speaks against it
+_LONG: Final = 8  # common times from which a pair of pieces says something about the calibration
+_SPEEDING: Final = 2.0  # largest excess of a speed between two pieces over those of both: at a bounce or a hit
+_NEARBY: Final = 15.0  # px, how far apart two successive pieces of one camera may be at least, however slow they are
+_NEAREST: Final = 0.1  # m, least distance from either camera at which two rays may meet
 
 
 @dataclass(frozen=True, eq=False)
 class Piece:
     """A smoothly moving object in one camera."""
 
-    camera: int
-    """Number of the camera."""
-
-    rows: Index
-    """(k,) its candidates."""
-
-    path: Path
-    """Its place in the image, over true time."""
+    camera: int  # number of the camera
+    rows: Index  # (k,) its candidates
+    path: Path  # its place in the image, over true time
 
     @property
     def start(self) -> float:
@@ -86,9 +70,7 @@ class Matching:
 
     groups: list[list[int]]
     """Numbers of pieces of the same object, in the order of the first; unmatched pieces are left out."""
-
-    offset: float
-    """px, excess miss of rays of one object beyond noise, in the worst pair of cameras; 0 without any."""
+    offset: float  # px, excess miss of rays of one object beyond noise, in the worst pair of cameras; 0 without any
 
 
 def match(pieces: Sequence[Piece], cameras: Sequence[Camera]) -> Matching:
@@ -109,35 +91,24 @@ def match(pieces: Sequence[Piece], cameras: Sequence[Camera]) -> Matching:
 def _pairs(pieces: Sequence[Piece], cameras: Sequence[Camera]) -> list[_Pair]:
     """All pairs of pieces of different cameras that overlap, compared in one call for each pair of cameras."""
     pairs = []
+    camera = np.array([piece.camera for piece in pieces])
+    starts, ends = (np.array([piece.path.times[place] for piece in pieces]) for place in (0, -1))
     for one, other in combinations(range(len(cameras)), 2):
-        meeting: list[tuple[int, int]] = []
-        seen: list[tuple[Array, Array, Array, Array]] = []
-        for i, j in _overlapping(pieces, one, other):
-            common = _common(pieces[i], pieces[j])
-            if len(common[0]) >= _LEAST_COMMON:
-                meeting.append((i, j))
-                seen.append(common)
+        common: dict[tuple[int, int], tuple[Array, Array, Array, Array]] = {}
+        for i in np.flatnonzero(camera == one).tolist():
+            for j in np.flatnonzero((camera == other) & (starts < ends[i]) & (ends > starts[i])).tolist():
+                common[i, j] = _common(pieces[i], pieces[j])
+        meeting = [ij for ij, arrays in common.items() if len(arrays[0]) >= _LEAST_COMMON]
         if not meeting:
             continue
+        seen = [common[ij] for ij in meeting]
         pixels, spread, others, other_spread = (np.concatenate(arrays) for arrays in zip(*seen, strict=True))
         misses, slopes = epipolar_miss(cameras[one], cameras[other], pixels, others)
         variances = _along(slopes[:, :2], spread) + _along(slopes[:, 2:], other_spread)
-        ends = np.cumsum([len(common[0]) for common in seen])[:-1]
-        cut = zip(meeting, np.split(misses, ends), np.split(variances, ends), strict=True)
-        pairs += [_Pair(i, j, miss, variance) for (i, j), miss, variance in cut]
+        cuts = np.cumsum([len(arrays[0]) for arrays in seen])[:-1]
+        cut = zip(meeting, np.split(misses, cuts), np.split(variances, cuts), strict=True)
+        pairs += [_Pair(*ij, miss, variance) for ij, miss, variance in cut]
     return pairs
-
-
-def _overlapping(pieces: Sequence[Piece], one: int, other: int) -> list[tuple[int, int]]:
-    """Pieces of one camera with those of another that were there at the same time."""
-    theirs = np.array([j for j, piece in enumerate(pieces) if piece.camera == other], dtype=int)
-    starts, ends = np.array([pieces[j].start for j in theirs]), np.array([pieces[j].end for j in theirs])
-    return [
-        (i, int(j))
-        for i, piece in enumerate(pieces)
-        if piece.camera == one
-        for j in theirs[(starts < piece.end) & (ends > piece.start)]
-    ]
 
 
 def _common(first: Piece, second: Piece) -> tuple[Array, Array, Array, Array]:
@@ -166,13 +137,11 @@ def _offsets(pieces: Sequence[Piece], pairs: Sequence[_Pair], count: int) -> dic
                 best[piece, camera] = (support, pair)
     offsets = {}
     for one, other in combinations(range(count), 2):
-        squares, variances = [np.zeros(0)], [np.zeros(0)]
-        for (piece, camera), (_, pair) in best.items():
-            mutual = best.get((pair.second, one), (0.0, None))[1] is pair
-            if pieces[piece].camera == one and camera == other and mutual and len(pair.misses) >= _LONG:
-                squares.append(pair.misses**2)
-                variances.append(pair.variances)
-        square, variance = np.concatenate(squares), np.concatenate(variances)
+        chosen = [pair for (piece, to), (_, pair) in best.items() if pieces[piece].camera == one and to == other]
+        mutual = [pair for pair in chosen if best.get((pair.second, one), (0.0, None))[1] is pair]
+        long = [pair for pair in mutual if len(pair.misses) >= _LONG]
+        square = np.concatenate([np.zeros(0), *(pair.misses**2 for pair in long)])
+        variance = np.concatenate([np.zeros(0), *(pair.variances for pair in long)])
         known = np.isfinite(square)
         if known.any():
             beyond = float(np.median(square[known] / variance[known])) / _MEDIAN_SQUARE - 1.0
@@ -237,17 +206,13 @@ def epipolar_miss(first: Camera, second: Camera, pixels: Array, others: Array) -
     by_second = other_normal @ second.rotation[:2].T / second.matrix[[0, 1], [0, 1]]
     slopes = np.concatenate((by_first, by_second), axis=1)
     size = np.linalg.norm(slopes, axis=1)
-    meets = (_distances(rays, towards, between) > _NEAREST).all(axis=1) & (size > 0.0)
+    a, b, c = (rays**2).sum(axis=1), (rays * towards).sum(axis=1), (towards**2).sum(axis=1)
+    d, e = rays @ between, towards @ between
+    determinant = a * c - b**2
+    determinant[determinant <= 0.0] = np.nan  # parallel
+    along = np.stack(((c * d - b * e) / determinant, (b * d - a * e) / determinant))  # m, where they are closest
+    meets = (along > _NEAREST).all(axis=0) & (size > 0.0)
     size[~meets] = np.nan
     miss[known] = (rays * normal).sum(axis=1) / size
     gradient[known] = slopes / size[:, None]
     return miss, gradient
-
-
-def _distances(rays: Array, towards: Array, between: Array) -> Array:
-    """(n, 2) m, how far along the two rays they are closest; NaN where parallel."""
-    a, b, c = (rays**2).sum(axis=1), (rays * towards).sum(axis=1), (towards**2).sum(axis=1)
-    d, e = rays @ between, towards @ between
-    determinant = a * c - b**2
-    determinant[determinant <= 0.0] = np.nan
-    return np.stack(((c * d - b * e) / determinant, (b * d - a * e) / determinant), axis=1)

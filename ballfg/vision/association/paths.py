@@ -14,43 +14,29 @@ from scipy.stats import chi2
 
 from ballfg.arrays import Array, Index, Mask
 
-MAX_GAP: Final = 0.06
-"""s, longest bridged gap between two samples of a smooth part: three frames lost at 60 Hz."""
+MAX_GAP: Final = 0.06  # s, longest bridged gap between two samples of a smooth part: three frames lost at 60 Hz
 RATE_OF_CHANGE: Final = 5.0
-"""1/s, how fast an acceleration changes by its own size, in an image or in space: 15 m/s seen from 3 m away. What a
-polynomial leaves out is taken to be the acceleration times a power of this."""
-KINK_CHANCE: Final = 1e-5
-"""Probability with which noise alone passes for a kink."""
-_SAME: Final = 1e-6
-"""s, a time this close to a sample is the sample's."""
-_INSIDE: Final = 4
-"""Samples of the cubic between two samples."""
-_ASIDE: Final = 5
-"""Samples of the quadratic that continues a part towards a kink: one would do with three, but noisily."""
-_WING: Final = 3
-"""Samples on either side of an interval in the test for a kink."""
+"""1/s, change of an acceleration by its own size (15 m/s at 3 m); its power times that is left out by a polynomial."""
+KINK_CHANCE: Final = 1e-5  # probability with which noise alone passes for a kink
+_SAME: Final = 1e-6  # s, a time this close to a sample is the sample's
+_INSIDE: Final = 4  # samples of the cubic between two samples
+_ASIDE: Final = 5  # samples of the quadratic that continues a part towards a kink: one would do with three, but noisily
+_WING: Final = 3  # samples on either side of an interval in the test for a kink
 
 
 @dataclass(frozen=True, eq=False)
 class Path:
     """Samples in order of time; values of any dimension d (2: an image, 3: space)."""
 
-    times: Array
-    """(n,) s, strictly increasing."""
-
-    values: Array
-    """(n, d)"""
-
-    covariances: Array
-    """(n, d, d)"""
-
-    parts: Index
-    """(n,) number of the smooth part that a sample belongs to, from 0, rising by at most one."""
+    times: Array  # (n,) s, strictly increasing
+    values: Array  # (n, d)
+    covariances: Array  # (n, d, d)
+    parts: Index  # (n,) number of the smooth part that a sample belongs to, from 0, rising by at most one
 
     def at(self, times: Array) -> tuple[Array, Array]:
         """Values (k, d) at times (k,) and their covariances (k, d, d), interpolation error included; NaN if unknown."""
-        values = np.full((len(times), self.values.shape[1]), np.nan)
-        covariances = np.full((len(times), self.values.shape[1], self.values.shape[1]), np.nan)
+        d = self.values.shape[1]
+        values, covariances = np.full((len(times), d), np.nan), np.full((len(times), d, d), np.nan)
         if len(self.times) < 2:
             return values, covariances
         right = np.clip(np.searchsorted(self.times, times), 1, len(self.times) - 1)
@@ -124,9 +110,8 @@ class Path:
         bend = np.linalg.norm(derivative, axis=1) * (2.0 if known == 2 else RATE_OF_CHANGE)
         remainder = bend * near * RATE_OF_CHANGE ** max(degree - 1, 0)
         spread = (remainder / (2.0, 2.0, 6.0, 24.0)[degree]) ** 2
-        return values, covariances / scale[:, None, None] ** (2 * order) + spread[:, None, None] * np.eye(
-            values.shape[1]
-        )
+        eye = np.eye(values.shape[1])
+        return values, covariances / scale[:, None, None] ** (2 * order) + spread[:, None, None] * eye
 
 
 def path(times: Array, values: Array, covariances: Array) -> Path:

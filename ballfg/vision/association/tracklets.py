@@ -16,22 +16,14 @@ from ballfg.arrays import Index
 from ballfg.vision.association.paths import RATE_OF_CHANGE
 from ballfg.vision.detection.detections import Detections
 
-MAX_MISSED: Final = 3
-"""Frames in a row that a piece may miss."""
-MAX_TURN: Final = 15.0
-"""rad/s, fastest motion across the view that is followed: 15 m/s at a distance of 1 m."""
-_PULL: Final = 7.0
-"""rad/s^2, acceleration across the view of what moves slowly: gravity at 1.4 m."""
-_GATE: Final = 16.0
-"""Squared deviation, in variances of the prediction, up to which a candidate continues a piece: 4 sigma."""
-_MARGIN: Final = 9.0
-"""Least advantage of the best answer's cost over the next for an unambiguous choice."""
-_LEAST_VARIANCE: Final = 0.06
-"""px^2, least variance of a candidate, a quarter of a pixel's sigma: compression, shading, the lens."""
-_SCORE_COST: Final = 6.0
-"""Cost of a candidate of score 0 against one of score 1."""
-_STILL: Final = 3.0
-"""px, what moves by less over its piece's life does not move."""
+MAX_MISSED: Final = 3  # frames in a row that a piece may miss
+MAX_TURN: Final = 15.0  # rad/s, fastest motion across the view that is followed: 15 m/s at a distance of 1 m
+_PULL: Final = 7.0  # rad/s^2, acceleration across the view of what moves slowly: gravity at 1.4 m
+_GATE: Final = 16.0  # squared deviation, in variances of the prediction, that continues a piece: 4 sigma
+_MARGIN: Final = 9.0  # least advantage of the best answer's cost over the next for an unambiguous choice
+_LEAST_VARIANCE: Final = 0.06  # px^2, of a candidate, a quarter of a pixel's sigma: compression, shading, the lens
+_SCORE_COST: Final = 6.0  # cost of a candidate of score 0 against one of score 1
+_STILL: Final = 3.0  # px, what moves by less over its piece's life does not move
 
 
 @dataclass(eq=False)
@@ -67,9 +59,8 @@ def find_tracklets(detections: Detections, focal: float) -> list[Index]:
         recent = [*recent, candidates][-4:]
         if not candidates:
             continue
-        lost = [piece for piece in open_pieces if number - piece.seen[-1].frame > MAX_MISSED + 1]
-        done += lost
-        open_pieces = [piece for piece in open_pieces if piece not in lost]
+        done += [piece for piece in open_pieces if number - piece.seen[-1].frame > MAX_MISSED + 1]
+        open_pieces = [piece for piece in open_pieces if number - piece.seen[-1].frame <= MAX_MISSED + 1]
         _offer(open_pieces, candidates, focal)
         _accept(open_pieces, done)
         open_pieces += _start(recent, focal)

@@ -15,20 +15,13 @@ from ballfg.arrays import Array, Mask
 from ballfg.checks import check_array, check_each
 from ballfg.vision.camera import Camera
 
-MISSED: Final = 1e-6
-"""Share of right candidates that the tests may refuse: a wrong one that close to the truth does no harm."""
-MAX_SIGMA: Final = 0.5
-"""m, standard deviation along the least certain direction from which rays count as parallel: then there is no point."""
-_GATES: Final = tuple(float(chi2.isf(MISSED, degrees)) for degrees in (1, 2))
-"""Bounds of squared whitened residuals: of two rays that miss each other (1), of a further view (2)."""
-_STEPS: Final = 3
-"""Gauss-Newton steps; from the point halfway between two rays the second already moves it by less than a micrometre."""
-_HOPELESS: Final = 1e-6
-"""Information, in units of 1 / `MAX_SIGMA`^2, below which a normal matrix is singular up to rounding."""
-_TINY_ANGLE: Final = 1e-12
-"""Squared sine below which two rays are parallel to the precision of float64: halfway between them is then nowhere."""
-_AROUND: Final = 0.5 * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-"""px, steps of the central differences, a pixel wide, that say how far a pixel reaches in the undistorted image."""
+MISSED: Final = 1e-6  # share of right candidates that the tests may refuse
+MAX_SIGMA: Final = 0.5  # m, standard deviation in the least certain direction, from which rays count as parallel
+_GATES: Final = tuple(float(chi2.isf(MISSED, degrees)) for degrees in (1, 2))  # of two rays, of a further view
+_STEPS: Final = 3  # Gauss-Newton steps; from halfway between two rays the second moves less than a micrometre
+_HOPELESS: Final = 1e-6  # information in 1 / `MAX_SIGMA`^2 below which a normal matrix is singular up to rounding
+_TINY_ANGLE: Final = 1e-12  # squared sine below which two rays are parallel in float64: halfway between them is nowhere
+_AROUND: Final = 0.5 * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])  # px, steps of differences
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,13 +30,10 @@ class Triangulated:
 
     points: Array
     """(n, 3) m, world."""
-
     covariances: Array
     """(n, 3, 3) m^2."""
-
     used: Mask
     """(n, c) True for views that took part; wrong ones do not."""
-
     residuals: Array
     """(n, c, 2) px, seen minus projected, including views that did not take part; NaN without a sighting."""
 
@@ -88,21 +78,7 @@ def triangulate(cameras: Sequence[Camera], pixels: ArrayLike, covariances: Array
     Source: docs/derivations/triangulation.md; Hartley, Zisserman, Multiple View Geometry (2004), sections 12.2 and 5.2.
     """
     cameras = list(check_each("cameras", cameras, Camera, "Read them with read_cameras."))
-    pixels, covariances = _checked(len(cameras), pixels, covariances)
-    views = _views(cameras, pixels, covariances)
-    points, used = _consensus(views)
-    points, spread = _refined(views, points, used)
-    found = np.asarray(np.isfinite(points).all(axis=1) & ((views.project(points)[2] > 0.0) | ~used).all(axis=1))
-    found[found] &= np.linalg.eigvalsh(spread[found])[:, -1] <= MAX_SIGMA**2
-    points[~found], spread[~found], used[~found] = np.nan, np.nan, False
-    residuals = np.full(pixels.shape, np.nan)
-    for c, camera in enumerate(cameras):
-        residuals[found, c] = pixels[found, c] - camera.project(points[found])
-    return Triangulated(points, spread, used, residuals)
-
-
-def _checked(count: int, pixels: ArrayLike, covariances: ArrayLike) -> tuple[Array, Array]:
-    pixels, covariances = check_array("pixels", pixels), check_array("covariances", covariances)
+    pixels, covariances, count = check_array("pixels", pixels), check_array("covariances", covariances), len(cameras)
     if count < 2:
         raise ValueError(f"cameras must be at least two to triangulate; got {count}. Add a camera.")
     if pixels.ndim != 3 or pixels.shape[1:] != (count, 2):
@@ -113,7 +89,16 @@ def _checked(count: int, pixels: ArrayLike, covariances: ArrayLike) -> tuple[Arr
     bad = ~((seen[:, 0, 0] > 0.0) & (np.linalg.det(seen) > 0.0)) if len(seen) else np.zeros(0, dtype=bool)
     if bad.any():
         raise ValueError(f"covariances must be positive definite, px^2; got {seen[bad][0].tolist()}")
-    return pixels, covariances
+    views = _views(cameras, pixels, covariances)
+    points, used = _consensus(views)
+    points, spread = _refined(views, points, used)
+    found = np.asarray(np.isfinite(points).all(axis=1) & ((views.project(points)[2] > 0.0) | ~used).all(axis=1))
+    found[found] &= np.linalg.eigvalsh(spread[found])[:, -1] <= MAX_SIGMA**2
+    points[~found], spread[~found], used[~found] = np.nan, np.nan, False
+    residuals = np.full(pixels.shape, np.nan)
+    for c, camera in enumerate(cameras):
+        residuals[found, c] = pixels[found, c] - camera.project(points[found])
+    return Triangulated(points, spread, used, residuals)
 
 
 def _views(cameras: list[Camera], pixels: Array, covariances: Array) -> _Views:
@@ -180,7 +165,9 @@ def _proposal(views: _Views, i: int, j: int) -> tuple[Array, Mask, Array]:
 
 def _halfway(views: _Views, i: int, j: int) -> Array:
     """(n, 3) the middle of the shortest line between the rays of two views; NaN where they are parallel."""
-    first, second = (_directions(views, c) for c in (i, j))
+    local = np.concatenate((views.planes, np.ones((*views.seen.shape, 1))), axis=2)
+    sizes = np.linalg.norm(local, axis=2, keepdims=True)
+    first, second = (local[:, c] @ views.rotations[c] / sizes[:, c] for c in (i, j))
     centres = [-views.rotations[c].T @ views.translations[c] for c in (i, j)]
     between = centres[1] - centres[0]
     cosine = np.einsum("ni,ni->n", first, second)
@@ -190,11 +177,6 @@ def _halfway(views: _Views, i: int, j: int) -> Array:
     near = (along_first - cosine * along_second) / sine2
     far = (cosine * along_first - along_second) / sine2
     return np.asarray(0.5 * (centres[0] + near[:, None] * first + centres[1] + far[:, None] * second))
-
-
-def _directions(views: _Views, c: int) -> Array:
-    local = np.concatenate((views.planes[:, c], np.ones((len(views.planes), 1))), axis=1)
-    return np.asarray(local @ views.rotations[c] / np.linalg.norm(local, axis=1, keepdims=True))
 
 
 def _refined(views: _Views, points: Array, used: Mask) -> tuple[Array, Array]:

@@ -16,46 +16,31 @@ from ballfg.checks import shown
 from ballfg.vision.arrays import Image
 from ballfg.vision.image_file import ENDINGS, read_image
 
-MIN_CORNERS: Final = 8
-"""Least number of corners in a view: a homography needs 4, and twice as many reveal a wrong one."""
+MIN_CORNERS: Final = 8  # least number of corners in a view: a homography needs 4, and twice as many reveal a wrong one
 DICTIONARIES: Final = tuple(sorted(n.removeprefix("DICT_") for n in dir(cv2.aruco) if n.startswith("DICT_")))
 """Names of ArUco's dictionaries, without `DICT_`."""
 _SEARCH: Final = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
 _REFINE: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-3)
-_WINDOW: Final = 0.25
-"""Half the window of the refinement, as a share of the distance to the next corner, which it must not contain."""
-_WINDOW_LIMITS: Final = (2, 8)
-"""px, least and largest half window: smaller sees no edges, larger sees the lens bend them."""
-_IN_SQUARE: Final = 0.3
-"""Distance from a corner at which the four squares around it are sampled, as a share of a square's side."""
-_UNLIKE: Final = 0.5
-"""Two squares that touch at a corner only may differ by this share of the contrast; more, and it is no such corner."""
-_TRIED: Final = 3
-"""Images in which other numbers of squares are tried where nothing was found: each costs up to a second."""
+_WINDOW: Final = 0.25  # half the refinement's window, as a share of the distance to the next corner
+_WINDOW_LIMITS: Final = (2, 8)  # px: a smaller half window sees no edges, a larger one sees the lens bend them
+_IN_SQUARE: Final = 0.3  # distance from a corner at which its four squares are sampled, as a share of a side
+_UNLIKE: Final = 0.5  # share of the contrast by which two squares that touch at a corner only may differ
+_TRIED: Final = 3  # images without a board in which other numbers of squares are tried: each costs up to a second
 
 
 @dataclass(frozen=True)
 class _Squares:
     """Squares of a board."""
 
-    least: ClassVar[int]
-    """Fewest squares in a row and in a column."""
-
-    columns: int
-    """Squares in a row, the outermost ones too: one more than there are inner corners."""
-
-    rows: int
-    """Rows of squares."""
-
-    square: float
-    """m, side of a square."""
+    least: ClassVar[int]  # fewest squares in a row and in a column
+    columns: int  # squares in a row, the outermost ones too: one more than there are inner corners
+    rows: int  # rows of squares
+    square: float  # m, side of a square
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < self.least:
-            raise ValueError(
-                f"squares must be at least {self.least} a row and column; got {self.columns}x{self.rows}. "
-                "Count all squares, the outermost ones too."
-            )
+            problem = f"squares must be at least {self.least} a row and column; got {self.columns}x{self.rows}"
+            raise ValueError(f"{problem}. Count all squares, the outermost ones too.")
         if not 0.0 < self.square < np.inf:
             raise ValueError(f"square must be the side of a square in m, above 0; got {self.square:g}. Measure it.")
 
@@ -90,26 +75,18 @@ class Charuco(_Squares):
 
     least: ClassVar[int] = 3
 
-    marker: float
-    """m, side of a marker."""
-
-    dictionary: str = "4X4_100"
-    """One of `DICTIONARIES`."""
-
-    legacy: bool = False
-    """Printed by OpenCV before 4.6, which began boards with an even number of rows with a marker."""
+    marker: float  # m, side of a marker
+    dictionary: str = "4X4_100"  # one of `DICTIONARIES`
+    legacy: bool = False  # printed by OpenCV before 4.6, which began boards with an even number of rows with a marker
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0.0 < self.marker < self.square:
-            raise ValueError(
-                f"marker must be above 0 and smaller than a square of {self.square:g} m; got {self.marker:g}. "
-                "Measure both on the print."
-            )
+            problem = f"marker must be above 0 and smaller than a square of {self.square:g} m; got {self.marker:g}"
+            raise ValueError(f"{problem}. Measure both on the print.")
         if self.dictionary not in DICTIONARIES:
-            raise ValueError(
-                f"dictionary must be one of {', '.join(DICTIONARIES)}; got {shown(self.dictionary)}. Choose one."
-            )
+            known = ", ".join(DICTIONARIES)
+            raise ValueError(f"dictionary must be one of {known}; got {shown(self.dictionary)}. Choose one.")
         needed, there = self.columns * self.rows // 2, len(_dictionary(self.dictionary).bytesList)
         if there < needed:
             raise ValueError(
@@ -120,8 +97,8 @@ class Charuco(_Squares):
     @cached_property
     def board(self) -> cv2.aruco.CharucoBoard:
         """OpenCV's board."""
-        size = (self.columns, self.rows)
-        board = cv2.aruco.CharucoBoard(size, self.square, self.marker, _dictionary(self.dictionary))
+        sides, words = (self.columns, self.rows), _dictionary(self.dictionary)
+        board = cv2.aruco.CharucoBoard(sides, self.square, self.marker, words)
         board.setLegacyPattern(self.legacy)
         return board
 
@@ -143,43 +120,28 @@ Board: TypeAlias = Chessboard | Charuco
 class View:
     """The corners of a board in one image."""
 
-    name: str
-    """Name of the image's file."""
-
-    size: tuple[int, int]
-    """px, width and height of the image."""
-
-    pixels: Array
-    """(n, 2) px, corners in the image; n is 0 where no board was found."""
-
-    points: Array
-    """(n, 3) m, the same corners on the board, z = 0."""
+    name: str  # name of the image's file
+    size: tuple[int, int]  # px, width and height of the image
+    pixels: Array  # (n, 2) px, corners in the image; n is 0 where no board was found
+    points: Array  # (n, 3) m, the same corners on the board, z = 0
 
 
 def image_files(places: Iterable[str]) -> list[Path]:
-    """The images in folders, of patterns such as `calib/left_*.png`, or given one by one; sorted within each place.
-
-    Raises: FileNotFoundError: a place where there is no image; the message names it.
-    """
+    """The images in folders, of patterns such as `left_*.png`, or single ones. Raises: FileNotFoundError: none."""
     files: list[Path] = []
     for place in places:
         path = Path(place)
         found = sorted(path.iterdir()) if path.is_dir() else sorted(map(Path, glob.glob(place))) or [path]
         images = [file for file in found if file.is_file() and file.suffix.lower() in ENDINGS]
         if not images:
-            endings = ", ".join(ENDINGS)
-            raise FileNotFoundError(
-                f"{place}: must be a folder, a pattern or a file of images ({endings}). Correct it."
-            )
+            what = f"{place}: must be a folder, a pattern or a file of images ({', '.join(ENDINGS)})"
+            raise FileNotFoundError(f"{what}. Correct it.")
         files += images
     return files
 
 
 def read_grey(path: Path) -> Image:
-    """A grey image (h, w) as the sensor saw it: a camera's note that it was held upright is left aside.
-
-    Raises: ValueError: not an image; the message names the file.
-    """
+    """A grey image (h, w) as the sensor saw it, whatever its orientation note. Raises: ValueError: not an image."""
     return read_image(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
 
 
@@ -198,10 +160,8 @@ def suggested(files: Sequence[Path], board: Board) -> str:
             continue
         other = replace(board, columns=board.columns + more, rows=board.rows + more)
         if any(len(view.pixels) for view in find_views(files[:_TRIED], other)):
-            return (
-                f" The images show {other.columns}x{other.rows} squares: "
-                "squares are counted with the outermost ones, not the corners between them."
-            )
+            squares = f" The images show {other.columns}x{other.rows} squares"
+            return f"{squares}: squares are counted with the outermost ones, not the corners between them."
     return ""
 
 

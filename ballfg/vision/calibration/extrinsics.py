@@ -12,14 +12,10 @@ from ballfg.vision.calibration.lens_covariance import POSE, slopes_of
 from ballfg.vision.calibration.table_points import Marked
 from ballfg.vision.camera import Camera
 
-MIN_POINTS: Final = 4
-"""Three points have up to four poses."""
-FLAT: Final = 0.01
-"""Share of the points' extent: points closer to a line or plane count as lying in it."""
-MAX_RMS: Final = 4.0
-"""Multiple of the pixels' sigma: with larger residuals a point has a wrong name or place."""
-CLEARLY: Final = 9.0
-"""Least excess of the second best pose, in sums of squared whitened residuals: three sigmas."""
+MIN_POINTS: Final = 4  # three points have up to four poses
+FLAT: Final = 0.01  # share of the points' extent: points closer to a line or plane count as lying in it
+MAX_RMS: Final = 4.0  # multiple of the pixels' sigma: with larger residuals a point has a wrong name or place
+CLEARLY: Final = 9.0  # least excess of the second best pose, in sums of squared whitened residuals: three sigmas
 _REFINE: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 
 
@@ -29,9 +25,7 @@ class Extrinsics:
 
     camera: Camera
 
-    marked: Marked
-    """The points of its calibration."""
-
+    marked: Marked  # the points of its calibration
     covariance: Array
     """(6, 6) of a small turn of the camera about the world's axes (rad) and of its centre (m), for an exact lens."""
 
@@ -62,54 +56,47 @@ def calibrate_extrinsics(lens: Camera, marked: Marked) -> Extrinsics:
     Every pose that could be meant is refined: a flat target has two. One from which the points would be seen from
     below is not meant.
 
-    Args:
-        lens: a camera; its pose has no part.
-        marked: at least four points, not in one line.
+    Args: lens: a camera; its pose has no part.  marked: at least four points, not in one line.
     Raises: ValueError: too few points or all in a line, none in the image, no pose that explains them, or two that
         do; the message names the camera.
     Source: T. Collins, A. Bartoli, "Infinitesimal plane-based pose estimation", IJCV 109, 2014 (OpenCV's IPPE);
         for points out of a plane G. Terzakis, M. Lourakis, "A consistently fast and globally optimal solution to the
         perspective-n-point problem", ECCV 2020 (SQPNP).
     """
-    flat = _check_points(lens, marked)
+    where, flat = f"camera {shown(lens.name)}", _check_points(lens, marked)
     poses = sorted(_poses(lens, marked, flat), key=lambda camera: _squares(camera, marked))
     above = [camera for camera in poses if not flat or _is_above(camera, marked.points)]
     if not above:
-        raise ValueError(
-            f"camera {shown(lens.name)}: points must be seen from above; these are mirrored, as if seen from below. "
-            "Swap left and right, or correct the points."
-        )
+        problem = f"{where}: points must be seen from above; these are mirrored, as if seen from below"
+        raise ValueError(f"{problem}. Swap left and right, or correct the points.")
     best = Extrinsics(above[0], marked, np.zeros((6, 6)))
-    _check_fit(best)
-    if len(above) > 1 and _squares(above[1], marked) - _squares(above[0], marked) < CLEARLY and _apart(*above[:2]):
-        raise ValueError(
-            f"camera {shown(lens.name)}: points must tell one pose; two explain them alike. "
-            "Mark more points, farther apart or at other heights."
-        )
+    if best.rms > (most := MAX_RMS * marked.sigma):
+        problem = f"{where}: points must be explained within {most:g} px; got {best.rms:.1f}"
+        raise ValueError(f"{problem}. {_culprit(best)}Check names and pixels, and that the lens is this camera's.")
+    alike = [camera for camera in above[1:2] if _squares(camera, marked) - _squares(above[0], marked) < CLEARLY]
+    if any(np.linalg.norm(above[0].centre - c.centre) > FLAT * np.linalg.norm(above[0].tvec) for c in alike):
+        problem = f"{where}: points must tell one pose; two explain them alike"
+        raise ValueError(f"{problem}. Mark more points, farther apart or at other heights.")
     return replace(best, covariance=_covariance(best))
 
 
 def _check_points(lens: Camera, marked: Marked) -> bool:
     """True if the points lie in a plane; refuses points that do not determine a pose."""
+    where = f"camera {shown(lens.name)}"
     if len(marked.points) < MIN_POINTS:
-        raise ValueError(
-            f"camera {shown(lens.name)}: at least {MIN_POINTS} points must be marked; got {len(marked.points)} "
-            f"({listed(marked.names)}). Mark more."
-        )
+        got = f"{len(marked.points)} ({listed(marked.names)})"
+        raise ValueError(f"{where}: at least {MIN_POINTS} points must be marked; got {got}. Mark more.")
     inside = ((marked.pixels >= -0.5) & (marked.pixels <= np.array(lens.size) - 0.5)).all(axis=1)
     if not inside.all():
         first = int(np.argmin(inside))
-        raise ValueError(
-            f"camera {shown(lens.name)}: pixels must lie in the image of {lens.size[0]}x{lens.size[1]}; "
-            f"{marked.names[first]} is at {marked.pixels[first].tolist()}. Correct it, or the camera's size."
-        )
+        got = f"{marked.names[first]} is at {marked.pixels[first].tolist()}"
+        problem = f"{where}: pixels must lie in the image of {lens.size[0]}x{lens.size[1]}; {got}"
+        raise ValueError(f"{problem}. Correct it, or the camera's size.")
     extent = np.linalg.svd(marked.points - marked.points.mean(axis=0), compute_uv=False)
     seen = np.linalg.svd(marked.pixels - marked.pixels.mean(axis=0), compute_uv=False)
     if extent[1] < FLAT * extent[0] or seen[1] < FLAT * seen[0]:
-        raise ValueError(
-            f"camera {shown(lens.name)}: points must not lie in one line; {listed(marked.names)} do. "
-            "Mark points on both sides of the table."
-        )
+        problem = f"{where}: points must not lie in one line; {listed(marked.names)} do"
+        raise ValueError(f"{problem}. Mark points on both sides of the table.")
     return bool(extent[2] < FLAT * extent[1])
 
 
@@ -133,10 +120,8 @@ def _poses(lens: Camera, marked: Marked, flat: bool) -> list[Camera]:
     ]
     cameras = [camera for camera in cameras if (camera.depth(points) > 0.0).all()]
     if not cameras:
-        raise ValueError(
-            f"camera {shown(lens.name)}: points must be explained by some pose; there is none with them all in front "
-            "of the camera. Check which point is which."
-        )
+        problem = "points must be explained by some pose; there is none with them all in front of the camera"
+        raise ValueError(f"camera {shown(lens.name)}: {problem}. Check which point is which.")
     return cameras
 
 
@@ -153,37 +138,16 @@ def _is_above(camera: Camera, points: Array) -> bool:
     return bool((camera.centre - centre) @ normal * normal[2] >= 0.0)
 
 
-def _apart(one: Camera, other: Camera) -> bool:
-    """True if two poses differ."""
-    return bool(np.linalg.norm(one.centre - other.centre) > FLAT * np.linalg.norm(one.tvec))
-
-
 def _rms(residuals: Array) -> float:
     return float(np.sqrt((residuals**2).sum(axis=1).mean()))
-
-
-def _check_fit(found: Extrinsics) -> None:
-    if found.rms <= MAX_RMS * found.marked.sigma:
-        return
-    culprit = _culprit(found)
-    raise ValueError(
-        f"camera {shown(found.camera.name)}: points must be explained within {MAX_RMS * found.marked.sigma:g} px; "
-        f"got {found.rms:.1f}. {culprit}Check names and pixels, and that the lens is this camera's."
-    )
 
 
 def _culprit(found: Extrinsics) -> str:
     """A sentence with the one point whose removal resolves the error, if there is one."""
     marked = found.marked
-    for i in range(len(marked.names)):
-        rest = Marked(
-            (*marked.names[:i], *marked.names[i + 1 :]),
-            np.delete(marked.points, i, axis=0),
-            np.delete(marked.pixels, i, axis=0),
-            marked.sigma,
-        )
-        if len(rest.names) <= MIN_POINTS:
-            return ""
+    for i in range(len(marked.names) if len(marked.names) > MIN_POINTS + 1 else 0):
+        names = (*marked.names[:i], *marked.names[i + 1 :])
+        rest = Marked(names, *(np.delete(a, i, axis=0) for a in (marked.points, marked.pixels)), marked.sigma)
         cameras = _poses(found.camera, rest, _check_points(found.camera, rest))
         if min(_rms(camera.project(rest.points) - rest.pixels) for camera in cameras) <= MAX_RMS / 3 * marked.sigma:
             return f"Without {shown(marked.names[i])} the others agree. "
@@ -196,15 +160,12 @@ def _covariance(found: Extrinsics) -> Array:
     by_pose = slopes_of(camera, marked.points, camera.rvec, camera.tvec)[:, :POSE]
     rotation, slope = cv2.Rodrigues(camera.rvec)
     slopes = np.asarray(slope, dtype=np.float64).reshape(3, 3, 3)  # of the rotation, by the three of rvec
-    turns = np.stack([_axis(rotation.T @ by_r) for by_r in slopes], axis=1)
+    skews = [rotation.T @ by_r for by_r in slopes]
+    axes = [np.array([skew[2, 1] - skew[1, 2], skew[0, 2] - skew[2, 0], skew[1, 0] - skew[0, 1]]) for skew in skews]
+    turns = np.stack(axes, axis=1) / 2.0
     centres = np.stack([-by_r.T @ camera.tvec for by_r in slopes], axis=1)
     moved = np.block([[turns, np.zeros((3, 3))], [centres, -rotation.T]])
     freedom = 2 * len(marked.points) - 6
     shown = found.rms * np.sqrt(len(marked.points) / freedom)  # rms is of distances: two numbers a point
     sigma = max(marked.sigma, shown)
     return np.asarray(sigma**2 * moved @ np.linalg.inv(by_pose.T @ by_pose) @ moved.T)
-
-
-def _axis(skew: Array) -> Array:
-    """(3,) vector whose cross product is the skew matrix (3, 3)."""
-    return np.array([skew[2, 1] - skew[1, 2], skew[0, 2] - skew[2, 0], skew[1, 0] - skew[0, 1]]) / 2.0

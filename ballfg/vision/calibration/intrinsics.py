@@ -1,7 +1,6 @@
 """Calibrates a lens from views of a board, and checks whether the views determine it."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -14,29 +13,17 @@ from ballfg.vision.calibration.boards import View
 from ballfg.vision.calibration.lens_covariance import covariance_of_lens, pixel_grid, sigma_of_rays
 from ballfg.vision.camera import DISTORTIONS, Camera
 
-MIN_VIEWS: Final = 8
-"""A view tells two numbers about the lens (Zhang 2000, section 2.3); eight are enough to tell errors from the lens."""
-MIN_TURN: Final = np.radians(10.0)
-"""rad that some two boards must be turned against each other. Parallel boards cannot tell a long lens from a near
-board: OpenCV then reports tiny deviations of a focal length that is wrong by half."""
-MAX_FOCAL_SIGMA: Final = 0.02
-"""Relative standard deviation of the focal length: 2 % are 6 cm at a distance of 3 m."""
-MIN_COVERAGE: Final = 0.4
-"""Least share of the image's cells with corners: outside of them, the distortion is extrapolated."""
-CELLS: Final = (8, 5)
-"""Number of such cells across and down."""
-OUTLYING: Final = 3.0
-"""Times the median of the views' errors: a view beyond it has a wrong corner or moved while it was exposed."""
-MIN_OUTLYING: Final = 0.15
-"""px. A view with a smaller error is kept, however good the others are."""
-MAX_LEFT_OUT: Final = 1 / 3
-"""Largest share of views that are left out: if more disagree with the rest, the rest may be wrong."""
-MAX_RAY_SIGMA: Final = 1.0
-"""px, largest standard deviation of a projected ray: 3 mm at a distance of 3 m."""
-RAYS: Final = 0.95
-"""Share of the image to which that applies: the outermost corners of a wide lens rarely see a board."""
-MAX_FOLD: Final = 0.05
-"""px. Distortion undone and done again must lead back to each pixel, or the model folds the image there."""
+MIN_VIEWS: Final = 8  # a view tells two numbers about the lens (Zhang 2000, section 2.3)
+MIN_TURN: Final = np.radians(10.0)  # rad between two boards: parallel ones confuse a long lens with a near board
+MAX_FOCAL_SIGMA: Final = 0.02  # relative standard deviation of the focal length: 2 % are 6 cm at a distance of 3 m
+MIN_COVERAGE: Final = 0.4  # of the image's cells with corners: outside of them, the distortion is extrapolated
+CELLS: Final = (8, 5)  # number of such cells across and down
+OUTLYING: Final = 3.0  # medians of the views' errors: a view beyond has a wrong corner or moved while it was exposed
+MIN_OUTLYING: Final = 0.15  # px. A view with a smaller error is kept, however good the others are.
+MAX_LEFT_OUT: Final = 1 / 3  # share of views that are left out: if more disagree, the rest may be wrong
+MAX_RAY_SIGMA: Final = 1.0  # px, largest standard deviation of a projected ray: 3 mm at a distance of 3 m
+RAYS: Final = 0.95  # share of the image to which that applies: the outermost corners of a wide lens rarely see a board
+MAX_FOLD: Final = 0.05  # px: distortion undone and done again leads back to each pixel, or the model folds the image
 _CRITERIA: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 _FIX_RADIAL: Final = cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
 _FLAGS: Final = {
@@ -55,14 +42,9 @@ class FittedView:
 
     view: View
 
-    rvec: Array
-    """(3,) rad, rotation from the board to the camera."""
-
-    tvec: Array
-    """(3,) m, the board's origin in the camera's frame."""
-
-    residuals: Array
-    """(n, 2) px, corners as seen minus as projected."""
+    rvec: Array  # (3,) rad, rotation from the board to the camera
+    tvec: Array  # (3,) m, the board's origin in the camera's frame
+    residuals: Array  # (n, 2) px, corners as seen minus as projected
 
     @property
     def normal(self) -> Array:
@@ -79,23 +61,12 @@ class FittedView:
 class Intrinsics:
     """A calibrated lens."""
 
-    camera: Camera
-    """The camera at the world's origin, unturned: its pose is unknown."""
-
-    covariance: Array
-    """(4 + k, 4 + k) of fx, fy, cx, cy (px) and the k coefficients of the distortion."""
-
-    views: tuple[FittedView, ...]
-    """The views of the calibration."""
-
-    left_out: tuple[FittedView, ...]
-    """The views that disagree with it, in the order of their removal."""
-
-    missed: tuple[str, ...]
-    """Names of the images in which no board was found."""
-
-    coverage: float
-    """Share of the image's cells that hold corners."""
+    camera: Camera  # the camera at the world's origin, unturned: its pose is unknown
+    covariance: Array  # (4 + k, 4 + k) of fx, fy, cx, cy (px) and the k coefficients of the distortion
+    views: tuple[FittedView, ...]  # the views of the calibration
+    left_out: tuple[FittedView, ...]  # the views that disagree with it, in the order of their removal
+    missed: tuple[str, ...]  # names of the images in which no board was found
+    coverage: float  # share of the image's cells that hold corners
 
     @property
     def sigmas(self) -> Array:
@@ -117,19 +88,17 @@ class Intrinsics:
 def calibrate_intrinsics(name: str, views: Sequence[View], distortion: int = 5) -> Intrinsics:
     """Matrix and distortion of a camera.
 
-    Args:
-        views: of one board that lay at different places, turned differently; those without corners are counted only.
+    Args: views: of one board that lay at different places, turned differently; those without corners are counted only.
         distortion: how many coefficients: 0, 4, 5, 8, 12 or 14.
-    Raises:
-        ValueError: too few views, images of several sizes, views that cannot tell the focal length, corners in a
-            small part of the image only, or too many views that disagree; the message names the camera.
+    Raises: ValueError: too few views, images of several sizes, views that cannot tell the focal length, corners in a
+        small part of the image only, or too many views that disagree; the message names the camera.
     Source: Z. Zhang, "A flexible new technique for camera calibration", IEEE PAMI 22 (11), 2000; OpenCV's
         `calibrateCamera`.
     """
     if distortion not in DISTORTIONS:
         lengths = ", ".join(map(str, DISTORTIONS))
         raise ValueError(f"distortion must be one of {lengths} coefficients; got {distortion}. 5 do for most lenses.")
-    missed = tuple(view.name for view in views if len(view.pixels) == 0)
+    where, missed = f"camera {shown(name)}", tuple(view.name for view in views if len(view.pixels) == 0)
     used = [view for view in views if len(view.pixels)]
     _check_views(name, used, missed)
     fitted = _fit(name, used, distortion)
@@ -139,13 +108,15 @@ def calibrate_intrinsics(name: str, views: Sequence[View], distortion: int = 5) 
         if len(used) < MIN_VIEWS or len(left_out) > MAX_LEFT_OUT * (len(used) + len(left_out)):
             names = ", ".join(view.name for view in left_out)
             raise ValueError(
-                f"camera {shown(name)}: views must agree on one lens; {len(left_out)} of {len(used) + len(left_out)} "
+                f"{where}: views must agree on one lens; {len(left_out)} of {len(used) + len(left_out)} "
                 f"do not ({names}). Check that board and focus were never changed, and delete blurred images."
             )
         fitted = _fit(name, used, distortion)
     _check_fit(name, fitted)
-    outside = tuple(_pose(fitted.camera, view) for view in left_out)
-    return replace(fitted, left_out=outside, missed=missed)
+    given = [(view.points, view.pixels, fitted.camera.matrix, fitted.camera.distortion) for view in left_out]
+    poses = [cv2.solvePnP(*one)[1:] for one in given]
+    outside = [_fitted(fitted.camera, view, *map(np.ravel, pose)) for view, pose in zip(left_out, poses, strict=True)]
+    return replace(fitted, left_out=tuple(outside), missed=missed)
 
 
 def turn(normals: Array) -> float:
@@ -160,18 +131,19 @@ def coverage(size: tuple[int, int], pixels: Array) -> float:
 
 
 def _check_views(name: str, used: Sequence[View], missed: Sequence[str]) -> None:
+    where = f"camera {shown(name)}"
     if len(used) < MIN_VIEWS:
         lack = f" No board (or hardly any of it) in {', '.join(missed)}." if missed else ""
         raise ValueError(
-            f"camera {shown(name)}: at least {MIN_VIEWS} images must show the board; got {len(used)} of "
+            f"{where}: at least {MIN_VIEWS} images must show the board; got {len(used)} of "
             f"{len(used) + len(missed)}.{lack} Check squares and kind of board, or take more, turned differently."
         )
     for view in used:
         if view.size != used[0].size:
             first, other = (f"{one.size[0]}x{one.size[1]}" for one in (used[0], view))
             raise ValueError(
-                f"camera {shown(name)}: images must have one size; {used[0].name} has {first} and {view.name} "
-                f"{other} pixels. Take them all as the videos will be."
+                f"{where}: images must have one size; {used[0].name} has {first} and {view.name} {other} pixels. "
+                "Take them all as the videos will be."
             )
 
 
@@ -179,47 +151,30 @@ def _fit(name: str, views: Sequence[View], distortion: int) -> Intrinsics:
     points = [np.ascontiguousarray(view.points, dtype=np.float32) for view in views]
     pixels = [np.ascontiguousarray(view.pixels, dtype=np.float32) for view in views]
     size = views[0].size
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # on several it adds in another order each time, and the last digits differ
     try:
-        with _one_thread():
-            _, matrix, coefficients, rvecs, tvecs = cv2.calibrateCamera(
-                points, pixels, size, np.eye(3), np.zeros(0), flags=_FLAGS[distortion], criteria=_CRITERIA
-            )
+        _, matrix, coefficients, rvecs, tvecs = cv2.calibrateCamera(
+            points, pixels, size, np.eye(3), np.zeros(0), flags=_FLAGS[distortion], criteria=_CRITERIA
+        )
         bent = np.array(np.ravel(coefficients)[:distortion], dtype=np.float64)
         camera = Camera(name, size, np.array(matrix, dtype=np.float64), bent, np.zeros(3), np.zeros(3))
     except (cv2.error, ValueError):
-        raise ValueError(
-            f"camera {shown(name)}: views must tell the lens; no lens explains them. "
-            "Turn the board to different sides, up to 45 degrees, and check that it is flat."
-        ) from None
-    fitted = tuple(
-        _fitted(camera, view, np.ravel(rvec), np.ravel(tvec))
-        for view, rvec, tvec in zip(views, rvecs, tvecs, strict=True)
-    )
+        problem = f"camera {shown(name)}: views must tell the lens; no lens explains them"
+        remedy = "Turn the board to different sides, up to 45 degrees, and check that it is flat."
+        raise ValueError(f"{problem}. {remedy}") from None
+    finally:
+        cv2.setNumThreads(threads)
+    posed = zip(views, rvecs, tvecs, strict=True)
+    fitted = tuple(_fitted(camera, view, np.ravel(rvec), np.ravel(tvec)) for view, rvec, tvec in posed)
     share = coverage(size, np.concatenate([view.pixels for view in views]))
     covariance = covariance_of_lens(camera, [(v.view.points, v.rvec, v.tvec, v.residuals) for v in fitted])
     return Intrinsics(camera, covariance, fitted, (), (), share)
 
 
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """OpenCV on one thread: on several it adds in another order each time, and the last digits differ."""
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(threads)
-
-
 def _fitted(camera: Camera, view: View, rvec: Array, tvec: Array) -> FittedView:
     projected, _ = cv2.projectPoints(view.points, rvec, tvec, camera.matrix, camera.distortion)
     return FittedView(view, rvec, tvec, view.pixels - np.asarray(projected, dtype=np.float64).reshape(-1, 2))
-
-
-def _pose(camera: Camera, view: View) -> FittedView:
-    """A view that had no part in the calibration, with the pose that suits it best."""
-    _, rvec, tvec = cv2.solvePnP(view.points, view.pixels, camera.matrix, camera.distortion)
-    return _fitted(camera, view, np.ravel(rvec), np.ravel(tvec))
 
 
 def _outlying(fitted: Intrinsics) -> int | None:
@@ -230,44 +185,32 @@ def _outlying(fitted: Intrinsics) -> int | None:
 
 
 def _check_fit(name: str, fitted: Intrinsics) -> None:
-    turned = turn(np.stack([view.normal for view in fitted.views]))
+    where, turned = f"camera {shown(name)}", turn(np.stack([view.normal for view in fitted.views]))
     if turned < MIN_TURN:
-        raise ValueError(
-            f"camera {shown(name)}: boards must be turned against each other by {np.degrees(MIN_TURN):.0f} degrees or "
-            f"more; got {np.degrees(turned):.1f}. Parallel boards cannot tell the focal length: turn it all ways."
-        )
+        rule = f"boards must be turned against each other by {np.degrees(MIN_TURN):.0f} degrees or more"
+        problem = f"{where}: {rule}; got {np.degrees(turned):.1f}"
+        raise ValueError(f"{problem}. Parallel boards cannot tell the focal length: turn it all ways.")
     sigma = float((fitted.sigmas[:2] / fitted.camera.matrix[[0, 1], [0, 1]]).max())
     if not sigma <= MAX_FOCAL_SIGMA:
-        raise ValueError(
-            f"camera {shown(name)}: the focal length must be known to {100 * MAX_FOCAL_SIGMA:g} %; got "
-            f"{100 * sigma:.1f} %. Take more images, with the board near and turned to all sides, up to 45 degrees."
-        )
+        problem = f"{where}: the focal length must be known to {100 * MAX_FOCAL_SIGMA:g} %; got {100 * sigma:.1f} %"
+        raise ValueError(f"{problem}. Take more images, with the board near and turned to all sides, up to 45 degrees.")
     if fitted.coverage < MIN_COVERAGE:
-        raise ValueError(
-            f"camera {shown(name)}: corners must lie in {100 * MIN_COVERAGE:.0f} % of the image or more; "
-            f"got {100 * fitted.coverage:.0f} %. Take images with the board near all borders and corners of the image."
-        )
-    sigma, _ = fitted.ray_sigma
+        rule = f"corners must lie in {100 * MIN_COVERAGE:.0f} % of the image or more"
+        problem = f"{where}: {rule}; got {100 * fitted.coverage:.0f} %"
+        raise ValueError(f"{problem}. Take images with the board near all borders and corners of the image.")
+    (sigma, _), coefficients = fitted.ray_sigma, len(fitted.camera.distortion)
     if not sigma <= MAX_RAY_SIGMA:
-        raise ValueError(
-            f"camera {shown(name)}: the lens must be known to {MAX_RAY_SIGMA:g} px in {RAYS:.0%} of the image; "
-            f"got {sigma:.1f} px. Take images with the board in its corners, or fewer coefficients than "
-            f"{len(fitted.camera.distortion)}."
-        )
-    _check_fold(fitted.camera)
-
-
-def _check_fold(camera: Camera) -> None:
-    """Refuses a distortion that cannot be undone somewhere in the image."""
-    pixels = pixel_grid(camera)
+        rule = f"the lens must be known to {MAX_RAY_SIGMA:g} px in {RAYS:.0%} of the image; got {sigma:.1f} px"
+        remedy = f"Take images with the board in its corners, or fewer coefficients than {coefficients}."
+        raise ValueError(f"{where}: {rule}. {remedy}")
+    camera, pixels = fitted.camera, pixel_grid(fitted.camera)
     plane = camera.normalized(pixels)
     again = camera.project(np.column_stack((plane, np.ones(len(plane)))))
     apart = float(np.linalg.norm(again - pixels, axis=1).max())
     if not apart <= MAX_FOLD or _has_pole(camera, float((plane**2).sum(axis=1).max())):
-        raise ValueError(
-            f"camera {shown(camera.name)}: the distortion must be possible to undo; it folds a part of the image. "
-            f"Take images with the board in all its corners, or fewer coefficients than {len(camera.distortion)}."
-        )
+        rule = "the distortion must be possible to undo; it folds a part of the image"
+        remedy = f"Take images with the board in all its corners, or fewer coefficients than {coefficients}."
+        raise ValueError(f"{where}: {rule}. {remedy}")
 
 
 def _has_pole(camera: Camera, limit: float) -> bool:

@@ -11,11 +11,8 @@ from ballfg.vision.camera import Camera
 
 PosedBoard: TypeAlias = tuple[Array, Array, Array, Array]
 """Points (n, 3) m of a board, its rvec (3,) and tvec (3,), and the residuals (n, 2) px of its corners."""
-
-GRID_STEP: Final = 16
-"""px between the pixels of `pixel_grid`: a lens bends no faster."""
-POSE: Final = 6
-"""Numbers of a board's pose; in OpenCV's Jacobian they stand before those of the lens."""
+GRID_STEP: Final = 16  # px between the pixels of `pixel_grid`: a lens bends no faster
+POSE: Final = 6  # numbers of a board's pose; in OpenCV's Jacobian they stand before those of the lens
 
 
 def covariance_of_lens(camera: Camera, boards: Sequence[PosedBoard]) -> Array:
@@ -37,9 +34,8 @@ def covariance_of_lens(camera: Camera, boards: Sequence[PosedBoard]) -> Array:
         squares += float((residuals**2).sum())
         freedom += residuals.size - POSE
     scale = np.sqrt(np.diag(information))
-    if freedom <= 0 or not (scale > 0.0).all():
-        return np.diag(np.full(unknowns, np.inf))
-    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    known = freedom > 0 and (scale > 0.0).all()
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale)) if known else (np.zeros(1), scale)
     if values[0] <= np.finfo(np.float64).eps * unknowns:
         return np.diag(np.full(unknowns, np.inf))
     return np.asarray(squares / freedom * (vectors / values) @ vectors.T / np.outer(scale, scale))

@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
-from ballfg.arrays import Array
 from ballfg.vision.arrays import Image
 from ballfg.vision.calibration.extrinsics import Extrinsics
 from ballfg.vision.calibration.intrinsics import CELLS, RAYS, FittedView, Intrinsics
@@ -19,17 +18,12 @@ from ballfg.vision.camera import Camera
 COEFFICIENTS: Final = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 """Names of OpenCV's distortion coefficients, in their order."""
 BLUE, VERMILION, GREY = "#0072b2", "#d55e00", "#8c8c8c"
-OUTLINED: Final = withStroke(linewidth=1.5, foreground="white")
-"""For letters that must be read over any image."""
-ARROW: Final = 0.05
-"""Length of a residual of three times the median in the drawing, as a share of the image's width."""
-PARTS: Final = 40
-"""Number of parts of a drawn line, which the lens bends."""
-PANEL: Final = (5.0, 3.4)
-"""Inches, width and height of a panel."""
+OUTLINED: Final = withStroke(linewidth=1.5, foreground="white")  # for letters that must be read over any image
+ARROW: Final = 0.05  # length of a residual of three times the median in the drawing, as a share of the image's width
+PARTS: Final = 40  # number of parts of a drawn line, which the lens bends
+PANEL: Final = (5.0, 3.4)  # inches, width and height of a panel
 DPI: Final = 120
-IN_A_LINE: Final = 6
-"""Views that a line of the summary names."""
+IN_A_LINE: Final = 6  # views that a line of the summary names
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +32,8 @@ class Calibration:
 
     camera: Camera
 
-    lens: Intrinsics | None
-    """None if the lens was known before."""
-
-    place: Extrinsics | None
-    """None if the camera's pose was not calibrated."""
+    lens: Intrinsics | None  # None if the lens was known before
+    place: Extrinsics | None  # None if the camera's pose was not calibrated
 
 
 def summary(found: Calibration) -> Iterator[str]:
@@ -51,8 +42,15 @@ def summary(found: Calibration) -> Iterator[str]:
     yield f"{found.camera.name}: {width}x{height}"
     if found.lens is not None:
         yield from _lens_lines(found.lens)
-    if found.place is not None:
-        yield from _place_lines(found.place)
+    if (place := found.place) is not None:
+        x, y, z = place.camera.centre
+        errors = zip(place.marked.names, np.linalg.norm(place.residuals, axis=1), strict=True)
+        yield f"  place: {len(place.marked.names)} points, RMS {place.rms:.2f} px"
+        yield (
+            f"    at ({x:.3f}, {y:.3f}, {z:.3f}) m ± {1e3 * place.centre_sigma:.1f} mm, "
+            f"turned ± {np.degrees(place.turn_sigma):.3f} degrees"
+        )
+        yield "    px: " + ", ".join(f"{name} {error:.2f}" for name, error in errors)
 
 
 def _lens_lines(lens: Intrinsics) -> Iterator[str]:
@@ -61,11 +59,8 @@ def _lens_lines(lens: Intrinsics) -> Iterator[str]:
     usual, worst = lens.ray_sigma
     yield f"    rays known to {usual:.2f} px in {RAYS:.0%} of the image, {worst:.2f} px where worst"
     values, sigmas = _lens_numbers(lens)
-    yield (
-        "    "
-        + ", ".join(f"{name} {values[name]:.1f} ± {sigmas[name]:.1f}" for name in ("fx", "fy", "cx", "cy"))
-        + " px"
-    )
+    pinhole = ", ".join(f"{name} {values[name]:.1f} ± {sigmas[name]:.1f}" for name in ("fx", "fy", "cx", "cy"))
+    yield f"    {pinhole} px"
     bent = [name for name in values if name in COEFFICIENTS]
     if bent:
         yield "    " + ", ".join(f"{name} {values[name]:.4f} ± {sigmas[name]:.4f}" for name in bent)
@@ -77,17 +72,6 @@ def _lens_lines(lens: Intrinsics) -> Iterator[str]:
         yield f"    left out, they disagree with the others: {names}"
     if lens.missed:
         yield f"    no board, or hardly any of it, in: {', '.join(lens.missed)}"
-
-
-def _place_lines(place: Extrinsics) -> Iterator[str]:
-    x, y, z = place.camera.centre
-    yield f"  place: {len(place.marked.names)} points, RMS {place.rms:.2f} px"
-    yield (
-        f"    at ({x:.3f}, {y:.3f}, {z:.3f}) m ± {1e3 * place.centre_sigma:.1f} mm, "
-        f"turned ± {np.degrees(place.turn_sigma):.3f} degrees"
-    )
-    errors = np.linalg.norm(place.residuals, axis=1)
-    yield "    px: " + ", ".join(f"{name} {error:.2f}" for name, error in zip(place.marked.names, errors, strict=True))
 
 
 def content(found: Calibration) -> dict[str, Any]:
@@ -103,8 +87,7 @@ def content(found: Calibration) -> dict[str, Any]:
             "worst_ray_sigma": lens.ray_sigma[1],
             "values": values,
             "sigmas": sigmas,
-            "views": [_view(fitted) for fitted in lens.views],
-            "left_out": [_view(fitted) for fitted in lens.left_out],
+            **{kind: [_view(fitted) for fitted in getattr(lens, kind)] for kind in ("views", "left_out")},
             "missed": list(lens.missed),
         }
     if found.place is not None:
@@ -150,10 +133,10 @@ def calibration_picture(
     panels = figure.subplots(len(found), len(kinds), squeeze=False)
     for row, one in zip(panels, found, strict=True):
         for axes, (part, draw) in zip(row, kinds, strict=True):
-            if getattr(one, part) is None:
+            if (given := getattr(one, part)) is None:
                 axes.set_axis_off()
             else:
-                draw(axes, getattr(one, part))
+                draw(axes, given)
     return figure
 
 
@@ -193,8 +176,11 @@ def _table(axes: Axes, place: Extrinsics, image: Image | None, table_height: flo
     if image is not None:
         axes.imshow(image, cmap="gray", vmin=0, vmax=255)
     _image_axes(axes, place.camera)
-    for line in table_outline(table_height):
-        axes.plot(*_drawn(place.camera, line).T, color=VERMILION, linewidth=1.0)
+    share = np.linspace(0.0, 1.0, PARTS + 1)[:, None]
+    for start, end in table_outline(table_height):
+        points = (1.0 - share) * start + share * end
+        seen = place.camera.in_view(points)[:, None]  # outside the image distortion means nothing
+        axes.plot(*np.where(seen, place.camera.project(points), np.nan).T, color=VERMILION, linewidth=1.0)
     axes.plot(*place.marked.pixels.T, "o", color=BLUE, markersize=6, fillstyle="none")
     for name, pixel in zip(place.marked.names, place.marked.pixels, strict=True):
         axes.annotate(name, pixel, (4, 4), textcoords="offset points", size=6, color=BLUE, path_effects=[OUTLINED])
@@ -205,17 +191,7 @@ def _table(axes: Axes, place: Extrinsics, image: Image | None, table_height: flo
     )
 
 
-def _drawn(camera: Camera, line: Array) -> Array:
-    """(k, 2) px along a line (2, 3) m; NaN outside the image, where distortion means nothing."""
-    share = np.linspace(0.0, 1.0, PARTS + 1)[:, None]
-    points = (1.0 - share) * line[0] + share * line[1]
-    return np.where(camera.in_view(points)[:, None], camera.project(points), np.nan)
-
-
 def _image_axes(axes: Axes, camera: Camera) -> None:
     width, height = camera.size
-    axes.set_xlim(-0.5, width - 0.5)
-    axes.set_ylim(height - 0.5, -0.5)
-    axes.set_aspect("equal")
-    axes.set_xlabel("u, px")
-    axes.set_ylabel("v, px")
+    limits = {"xlim": (-0.5, width - 0.5), "ylim": (height - 0.5, -0.5)}
+    axes.set(**limits, aspect="equal", xlabel="u, px", ylabel="v, px")

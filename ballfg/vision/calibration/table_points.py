@@ -16,10 +16,8 @@ from ballfg.tracks.info import MAX_HEIGHT
 
 TABLE_LENGTH: Final = 2.74
 TABLE_WIDTH: Final = 1.525
-TABLE_HEIGHT: Final = 0.76
-"""m, ITTF Laws of Table Tennis 2.1.1 and 2.1.2."""
-CLICK_SIGMA: Final = 0.5
-"""px, standard deviation of a coordinate that was read off an image with care."""
+TABLE_HEIGHT: Final = 0.76  # m, ITTF Laws of Table Tennis 2.1.1 and 2.1.2
+CLICK_SIGMA: Final = 0.5  # px, standard deviation of a coordinate that was read off an image with care
 _FIELDS: Final = ("table_height", "sigma", "points", "cameras")
 
 
@@ -29,14 +27,9 @@ class Marked:
 
     names: tuple[str, ...]
 
-    points: Array
-    """(n, 3) m."""
-
-    pixels: Array
-    """(n, 2) px."""
-
-    sigma: float = CLICK_SIGMA
-    """px, standard deviation of each coordinate of the pixels."""
+    points: Array  # (n, 3) m
+    pixels: Array  # (n, 2) px
+    sigma: float = CLICK_SIGMA  # px, standard deviation of each coordinate of the pixels
 
 
 def table_points(height: float = TABLE_HEIGHT) -> dict[str, Array]:
@@ -64,11 +57,8 @@ def table_outline(height: float = TABLE_HEIGHT) -> list[Array]:
 class TableFile:
     """The content of a table file."""
 
-    table_height: float
-    """m, z of the table's surface."""
-
-    cameras: Mapping[str, Marked]
-    """The marked points of each camera, by name."""
+    table_height: float  # m, z of the table's surface
+    cameras: Mapping[str, Marked]  # the marked points of each camera, by name
 
 
 def read_table(path: str | PathLike[str]) -> TableFile:

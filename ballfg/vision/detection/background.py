@@ -1,36 +1,31 @@
-"""Learns a camera's background from frames of the recording and follows slow changes and flickering light."""
+"""Learns a camera's background, follows slow changes and flickering light, and finds regions that differ from it.
+
+The regions of a frame are connected changes of plausible size in the small picture; they get a closer look.
+"""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Mask
 from ballfg.vision.arrays import Array32, Image
 
-SHRINK: Final = 4
-"""Pixels of the image per pixel of the small picture for the search."""
-GRID: Final = (16, 9)
-"""Blocks, across and down, whose brightness tells how bright the light is; their median is no moving thing."""
-BRIGHT: Final = (8.0, 245.0)
-"""Grey levels of the blocks that count: darker ones are noise, brighter ones are clipped."""
-STRIPS: Final = 32
-"""A frame refreshes one of so many strips of the background: all of it would cost more than the search."""
-WEIGHT: Final = 0.08
-"""Weight of a frame in the strip that it refreshes; a still object fades in over STRIPS / WEIGHT = 400 frames."""
-COVERED_WEIGHT: Final = 0.008
-"""The same where something was found: a passing ball leaves 0.5 of 60 grey levels, a moved chair is gone in 4000
-frames."""
-SIGMAS: Final = 5.0
-"""Noise sigmas of the small picture, at that place, that a change must exceed to be looked at."""
-LEAST_CHANGE: Final = 5.0
-"""Grey levels that it must exceed besides: compression and rounding make errors that the frames learned from lack."""
-ROUNDING: Final = 1.0 / 12.0
-"""Grey levels^2, variance of rounding to whole ones. It keeps a noise-free video's covariance regular."""
-FEWEST: Final = 3
-"""Images that a background is learned from at least."""
+SHRINK: Final = 4  # pixels of the image per pixel of the small picture for the search
+GRID: Final = (16, 9)  # blocks, across and down, for the brightness of the light; their median is no moving thing
+BRIGHT: Final = (8.0, 245.0)  # grey levels of the blocks that count: darker ones are noise, brighter ones are clipped
+STRIPS: Final = 32  # a frame refreshes one strip of the background: all of it would cost more than the search
+WEIGHT: Final = 0.08  # of a frame in its strip; a still object fades in over STRIPS / WEIGHT = 400 frames
+COVERED_WEIGHT: Final = 0.008  # where something was found: a ball leaves 0.5 of 60 grey levels
+SIGMAS: Final = 5.0  # noise sigmas of the small picture, at that place, that a change must exceed to be looked at
+LEAST_CHANGE: Final = 5.0  # grey levels that it must exceed besides: errors of compression and rounding
+ROUNDING: Final = 1.0 / 12.0  # grey levels^2, variance of rounding; a noise-free video's covariance stays regular
+FEWEST: Final = 3  # images that a background is learned from at least
+MARGIN: Final = 6  # px of background around a region: the mask misses up to a small pixel of the rim
+LEAST_MASS: Final = 12.0  # Grey levels x small pixels: a ball of 4 px and 15 grey levels. Less is noise or lost to it.
 
 
 class Background:
@@ -52,10 +47,8 @@ class Background:
     """
 
     def __init__(self, images: Sequence[Image]) -> None:
-        if len(images) < FEWEST:
-            raise ValueError(
-                f"images must be at least three to learn a background; got {len(images)}. Pass more frames."
-            )
+        if (few := len(images)) < FEWEST:
+            raise ValueError(f"images must be at least three to learn a background; got {few}. Pass more frames.")
         shapes = {image.shape for image in images}
         if len(shapes) > 1 or len(images[0].shape) != 3 or images[0].shape[2] != 3:
             raise ValueError(f"images must have one shape (h, w, 3); got {sorted(shapes)}. Pass frames of one camera.")
@@ -68,7 +61,11 @@ class Background:
         self.full = _mean_near(level, middle, 3.0 * float(np.sqrt(self.noise.max())))
         self.small = np.asarray(shrunk(self.full), dtype=np.float32)
         self.blotches = _blotches(level, self.full, self.noise)
-        self.threshold = self._thresholds([shrunk(image) for image in level])
+        # larger at noise, at edges under compression, and at moving leaves
+        spread = _median([cv2.absdiff(shrunk(image), self.small.astype(np.uint8)) for image in level])
+        restless = cv2.dilate(spread.max(axis=2), np.ones((3, 3), dtype=np.uint8))
+        sigma = np.hypot(1.4826 * restless, np.sqrt(self.noise.max()) / SHRINK)
+        self.threshold = np.minimum(LEAST_CHANGE + SIGMAS * sigma, 255.0).astype(np.uint8)
         self.gains: Array = np.ones(3)
         self._strip = 0
 
@@ -76,13 +73,6 @@ class Background:
     def shape(self) -> tuple[int, int]:
         """Height and width, px."""
         return (self.full.shape[0], self.full.shape[1])
-
-    def _thresholds(self, smalls: list[Image]) -> Image:
-        """Thresholds of a change: larger at noise, at edges under compression, and at moving leaves."""
-        spread = _median([cv2.absdiff(small, self.small.astype(np.uint8)) for small in smalls])
-        restless = cv2.dilate(spread.max(axis=2), np.ones((3, 3), dtype=np.uint8))
-        sigma = np.hypot(1.4826 * restless, np.sqrt(self.noise.max()) / SHRINK)
-        return np.minimum(LEAST_CHANGE + SIGMAS * sigma, 255.0).astype(np.uint8)
 
     def follow(self, small: Image) -> Image:
         """The change (h/4, w/4) uint8 grey levels in a frame's small picture, of the channel that differs most."""
@@ -96,10 +86,7 @@ class Background:
         return np.asarray(self.full[rows, columns] * self.gains.astype(np.float32), dtype=np.float32)
 
     def absorb(self, image: Image, small: Image, found: Image) -> None:
-        """Takes a frame's light and clouds into the background.
-
-        Args: image: the frame.  small: it, shrunk.  found: (h/4, w/4) uint8, 255 where something is in front.
-        """
+        """Takes light and clouds of a frame into the background; found: (h/4, w/4) uint8, 255 where covered."""
         height, width = self.shape
         rows = slice(self._strip * height // STRIPS, (self._strip + 1) * height // STRIPS)
         self._strip = (self._strip + 1) % STRIPS
@@ -154,8 +141,7 @@ def _median(images: Sequence[NDArray]) -> Image:
 
 def _mean_near(images: Sequence[NDArray], middle: Image, near: float) -> Array32:
     """(h, w, 3) mean of what lies within `near` of the median: its noise is a quarter of the median's rounding."""
-    total = np.zeros(middle.shape, dtype=np.float32)
-    count = np.zeros(middle.shape, dtype=np.float32)
+    total, count = np.zeros(middle.shape, dtype=np.float32), np.zeros(middle.shape, dtype=np.float32)
     for image in images:
         close = (cv2.absdiff(image, middle) <= max(near, 1.0)).astype(np.float32)
         count += close
@@ -179,3 +165,69 @@ def _blotches(images: Sequence[NDArray], mean: Array32, noise: Array) -> float:
     far = np.abs(rest).max(axis=1)
     calm = rest[far <= 3.0 * np.median(far) + ROUNDING]
     return max(1.0, float(np.sqrt((calm**2).mean(axis=0).sum() * SHRINK**2 / np.trace(noise))))
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """A connected change.
+
+    Attributes:
+        rows, columns: of the image, with a margin.
+        free: (rows, columns) True for pixels of this region or the background, not of another; None if all are.
+        mass: grey levels x small pixels, the change summed.
+    """
+
+    rows: slice
+    columns: slice
+    free: Mask | None
+    mass: float
+
+    def free_of(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(m, ...) the values (rows, columns, ...) of free pixels."""
+        if self.free is None:
+            return values.reshape(-1, *values.shape[2:])
+        return values[self.free]
+
+    def places(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """(m,) px, x and y of the free pixels."""
+        x = np.arange(self.columns.start, self.columns.stop, dtype=np.float32)
+        y = np.arange(self.rows.start, self.rows.stop, dtype=np.float32)
+        shape = (len(y), len(x))
+        return self.free_of(np.broadcast_to(x, shape)), self.free_of(np.broadcast_to(y[:, None], shape))
+
+
+def find_regions(background: Background, image: Image, widest: float, longest: float, most: int) -> list[Region]:
+    """Regions of one frame, the heaviest first; the background follows the frame.
+
+    Args: image: (h, w, 3).  widest, longest: px, of a ball and of its streak.  most: how many at most.
+    """
+    small = shrunk(image)
+    change = background.follow(small)
+    found = cv2.compare(change, background.threshold, cv2.CMP_GT)
+    joined = np.asarray(cv2.morphologyEx(found, cv2.MORPH_CLOSE, np.ones((3, 3), dtype=np.uint8)), dtype=np.uint8)
+    background.absorb(image, small, joined)
+    regions = []
+    for contour in cv2.findContours(joined, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]:
+        _, sides, _ = cv2.minAreaRect(contour)  # from middle to middle of the outermost pixels: a pixel short
+        if min(sides) * SHRINK <= widest and max(sides) * SHRINK <= widest + longest:
+            regions.append(_region(joined, change, cv2.boundingRect(contour), contour[0, 0], background.shape))
+    heavy = [region for region in regions if region.mass >= LEAST_MASS]
+    return sorted(heavy, key=lambda region: -region.mass)[:most]
+
+
+def _region(joined: Image, change: Image, box: Sequence[int], seed: NDArray, shape: tuple[int, int]) -> Region:
+    """The region in a box (left, top, width, height) of the small picture that holds the pixel `seed`."""
+    left, top, width, height = box
+    rows = slice(max(top * SHRINK - MARGIN, 0), min((top + height) * SHRINK + MARGIN, shape[0]))
+    columns = slice(max(left * SHRINK - MARGIN, 0), min((left + width) * SHRINK + MARGIN, shape[1]))
+    y = np.minimum(np.arange(rows.start, rows.stop) // SHRINK, joined.shape[0] - 1)
+    x = np.minimum(np.arange(columns.start, columns.stop) // SHRINK, joined.shape[1] - 1)
+    near = np.s_[y[0] : y[-1] + 1, x[0] : x[-1] + 1]
+    count, labels = cv2.connectedComponents(joined[near], connectivity=8)
+    own = labels == labels[seed[1] - y[0], seed[0] - x[0]]
+    mass = float(change[near][own].sum())
+    if count <= 2:
+        return Region(rows, columns, None, mass)
+    others = cv2.dilate(((joined[near] > 0) & ~own).astype(np.uint8), np.ones((3, 3), dtype=np.uint8)) > 0
+    free = ~(others & ~own)[np.ix_(y - y[0], x - x[0])]
+    return Region(rows, columns, free, mass)

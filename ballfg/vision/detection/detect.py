@@ -1,5 +1,6 @@
 """Runs detectors, ballfg's or a user's, over videos, one after the other or each in its process."""
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import count
@@ -23,15 +24,10 @@ from ballfg.vision.detection.video import Video, open_video
 
 T = TypeVar("T")
 
-Maker = Callable[[Video], Detector]
-"""Makes the detector of a camera from its video."""
-
-SAMPLE: Final = 15
-"""Number of frames for a background: objects at the same place in eight of them are background."""
-LOOKS: Final = 0.05
-"""s without a message after which the processes are checked."""
-TELLS: Final = 20
-"""Number of frames between progress messages of a process."""
+Maker = Callable[[Video], Detector]  # makes the detector of a camera from its video
+SAMPLE: Final = 15  # number of frames for a background: objects at the same place in eight of them are background
+LOOKS: Final = 0.05  # s without a message after which the processes are checked
+TELLS: Final = 20  # number of frames between progress messages of a process
 SEARCHED: Final = "frames searched"
 
 
@@ -57,9 +53,8 @@ def load_detector(text: str) -> Maker:
     Args: text: `FILE.py:NAME`; the file is one that you trust: all of its code runs.
     Returns: what makes the detector of a camera, fit to be sent to other processes: the function as it is, or an
         instance of the class, made without arguments.
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: a text of another form, a file that does not run, or a name that is no callable of it.
+    Raises: FileNotFoundError: there is no such file. ValueError: a text of another form, a file that does not run, or a
+        name that is no callable of it.
     """
     file, colon, name = text.rpartition(":")
     if not (colon and file and name.isidentifier()):
@@ -87,8 +82,7 @@ def detect(video: Video, camera: str, detector: Detector, watch: Watch = unwatch
         `Candidates`.
     """
     seen: list[tuple[float, Candidates]] = []
-    for _ in watch(_run(video, detector, seen), video.count, SEARCHED):
-        pass
+    deque(watch(_run(video, detector, seen), video.count, SEARCHED), maxlen=0)
     return Detections.of_frames(camera, seen)
 
 
@@ -111,23 +105,17 @@ def detect_all(
     Raises: TypeError, ValueError, FileNotFoundError: as `open_video` and `detect`.
     """
     opened = {name: open_video(path, (stamps or {}).get(name)) for name, path in videos.items()}
+    total = sum(video.count for video in opened.values())
     if jobs == 1 or len(opened) < 2:
-        total = sum(video.count for video in opened.values())
         seen: dict[str, list[tuple[float, Candidates]]] = {name: [] for name in opened}
         steps = (step for name, video in opened.items() for step in _run(video, make(video), seen[name]))
-        for _ in watch(steps, total, SEARCHED):
-            pass
+        deque(watch(steps, total, SEARCHED), maxlen=0)
         return {name: Detections.of_frames(name, frames) for name, frames in seen.items()}
-    return _in_processes(opened, make, jobs, watch)
-
-
-def _in_processes(videos: Mapping[str, Video], make: Maker, jobs: int, watch: Watch) -> dict[str, Detections]:
-    others, told = Processes(min(jobs, len(videos)), helped=False), SimpleQueue[int]()
+    others, told = Processes(min(jobs, len(opened)), helped=False), SimpleQueue[int]()
     send = others.sender(_job, told.put)
-    running = {name: send([(video, name, make)]) for name, video in videos.items()}
+    running = {name: send([(video, name, make)]) for name, video in opened.items()}
     try:
-        for _ in watch(_told(told, running.values()), sum(video.count for video in videos.values()), SEARCHED):
-            pass
+        deque(watch(_told(told, running.values()), total, SEARCHED), maxlen=0)
         return {name: job.result() for name, job in running.items()}
     except BaseException:
         others.stop()  # what the other cameras see is of no use any more
@@ -170,10 +158,8 @@ def _run(video: Video, detector: Detector, seen: list[tuple[float, Candidates]])
     for number, (stamp, image) in enumerate(video.frames()):
         candidates = detector(image)
         if not isinstance(candidates, Candidates):
-            raise TypeError(
-                f"a detector must return Candidates; got {type(candidates).__name__} for frame {number}. "
-                "Make them with Candidates.at(pixels, sigma)."
-            )
+            problem = f"a detector must return Candidates; got {type(candidates).__name__} for frame {number}"
+            raise TypeError(f"{problem}. Make them with Candidates.at(pixels, sigma).")
         seen.append((stamp, candidates))
         yield number
 

@@ -14,8 +14,7 @@ from ballfg.checks import check_array, shown
 from ballfg.tracks.sightings import are_covariances
 from ballfg.vision.arrays import Image
 
-_SHAPES: Final = {"pixels": (2,), "covariances": (2, 2), "scores": (), "streaks": (2, 2)}
-"""Fields of each candidate with their shapes, for a frame and a recording alike."""
+_SHAPES: Final = {"pixels": (2,), "covariances": (2, 2), "scores": (), "streaks": (2, 2)}  # of each
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,13 +27,10 @@ class Candidates:
 
     pixels: Array
     """(k, 2) px, the ball's centre in mid exposure; (0, 0) is the centre of the top left pixel."""
-
     covariances: Array
     """(k, 2, 2) px^2."""
-
     scores: Array
     """(k,) dimensionless, in [0, 1], similarity to a ball."""
-
     streaks: Array
     """(k, 2, 2) px, centre at the shutter's opening and closing, in unknown order; NaN where not blurred."""
 
@@ -76,22 +72,16 @@ class Detections:
 
     camera: str
     """Name of the camera."""
-
     frames: Array
     """(f,) s, recorded stamps of all frames, strictly increasing."""
-
     frame: Index
     """(n,) number of each candidate's frame, not decreasing."""
-
     pixels: Array
     """(n, 2) px, the ball's centre in mid exposure; (0, 0) is the centre of the top left pixel."""
-
     covariances: Array
     """(n, 2, 2) px^2."""
-
     scores: Array
     """(n,) dimensionless, in [0, 1], similarity to a ball."""
-
     streaks: Array
     """(n, 2, 2) px, centre at the shutter's opening and closing, in unknown order; NaN where not blurred."""
 
@@ -99,8 +89,15 @@ class Detections:
         if not isinstance(self.camera, str):
             raise TypeError(f"camera must be a name; got {shown(self.camera)}. Put it in quotes.")
         what = f"detections of camera {shown(self.camera)}"
-        object.__setattr__(self, "frames", _numbers(what, "frames", self.frames, (np.asarray(self.frames).size,)))
-        _check_increasing(what, self.frames)
+        stamps = _numbers(what, "frames", self.frames, (np.asarray(self.frames).size,))
+        object.__setattr__(self, "frames", stamps)
+        wrong = np.flatnonzero(~(np.diff(stamps) > 0.0))
+        if len(wrong):
+            i = int(wrong[0]) + 1
+            problem = f"{what}: frames must be strictly increasing; frames[{i}]={stamps[i]} after {stamps[i - 1]}"
+            raise ValueError(f"{problem}. Sort the frames or correct the stamps.")
+        if not np.isfinite(stamps).all():
+            raise ValueError(f"{what}: frames must be finite; got {stamps[~np.isfinite(stamps)][0]}.")
         _check_fields(self, what)
         frame = np.array(self.frame, dtype=np.int64)
         if frame.shape != (len(self.pixels),):
@@ -122,27 +119,16 @@ class Detections:
         return np.asarray(self.frames[self.frame])
 
     def in_frame(self, number: int) -> Candidates:
-        """The candidates of one frame.
-
-        Returns: its candidates, k >= 0.
-        """
+        """The candidates of one frame."""
         rows = slice(*np.searchsorted(self.frame, (number, number + 1)))
         return Candidates(*(getattr(self, field)[rows] for field in _SHAPES))
 
     def select(self, keep: Mask) -> Detections:
-        """A part of the candidates.
-
-        Args: keep: (n,) bool, the candidates to keep.
-        Returns: the detections with these candidates and all frames.
-        """
+        """The detections with the candidates of `keep` (n,) bool, and all frames."""
         return replace(self, **{field: getattr(self, field)[keep] for field in ("frame", *_SHAPES)})
 
     def best_scores(self, count: int = 3) -> Array:
-        """The highest scores.
-
-        Args: count: of scores.
-        Returns: (k,) dimensionless, best first, with k at most `count`.
-        """
+        """(k,) dimensionless, the highest scores, best first, with k at most `count`."""
         return np.sort(self.scores)[::-1][:count].copy()
 
     @classmethod
@@ -150,7 +136,6 @@ class Detections:
         """Joins the candidates of frames.
 
         Args: camera: name of the camera.  seen: stamp (s) and candidates of each frame, in order.
-        Returns: the detections of the recording.
         Raises: ValueError: stamps that do not increase.
         """
         pairs = list(seen)
@@ -168,18 +153,6 @@ def _numbers(what: str, field: str, value: ArrayLike, shape: tuple[int, ...]) ->
     array = check_array(f"{what}: {field}", value, shape, "Pass one row per candidate.")
     array.setflags(write=False)
     return array
-
-
-def _check_increasing(what: str, stamps: Array) -> None:
-    wrong = np.flatnonzero(~(np.diff(stamps) > 0.0))
-    if len(wrong):
-        i = int(wrong[0]) + 1
-        raise ValueError(
-            f"{what}: frames must be strictly increasing; frames[{i}]={stamps[i]} after {stamps[i - 1]}. "
-            "Sort the frames or correct the stamps."
-        )
-    if not np.isfinite(stamps).all():
-        raise ValueError(f"{what}: frames must be finite; got {stamps[~np.isfinite(stamps)][0]}.")
 
 
 def _check_fields(owner: Candidates | Detections, what: str) -> None:

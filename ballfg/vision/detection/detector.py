@@ -1,4 +1,7 @@
-"""Detects small fast balls: background, regions, a swept disc fitted to each, and a score."""
+"""Detects small fast balls: background, regions, a swept disc fitted to each, and a score.
+
+The score marks the similarity of a candidate to a ball by shape, contrast, size and colour.
+"""
 
 from __future__ import annotations
 
@@ -10,27 +13,27 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.checks import check_array, check_choice, check_count, check_range
-from ballfg.vision.arrays import Image
+from ballfg.vision.arrays import Array32, Image
 from ballfg.vision.camera import MOST_PIXELS
-from ballfg.vision.detection.background import Background
+from ballfg.vision.detection.background import Background, Region, find_regions
 from ballfg.vision.detection.detections import Candidates
-from ballfg.vision.detection.regions import Region, find_regions
-from ballfg.vision.detection.scoring import score
-from ballfg.vision.detection.streak import LOOK, Look, Patch, StreakFit, fit_streak, start
+from ballfg.vision.detection.streak import LOOK, Look, Patch, StreakFit, fit_streak, start, swept
 
 Colour = Literal["white", "orange"]
 
-MODEL_ERROR: Final = 0.02
-"""px per px of blotches, sigma that every centre has besides the noise's: the disc's edge is not quite the lens's, and
-compression, which makes the blotches, moves edges."""
-LEARNS: Final = 0.8
-"""Score from which a candidate teaches what edge and shading to expect."""
-FORGETS: Final = 0.98
-"""Factor on earlier information per teaching candidate: the light on the ball changes as it flies."""
-SUREST: Final = (0.15, 0.08, 0.08)
-"""Least sigmas of the expected edge (px) and shading: they change along a flight, and may be learned wrong."""
-VISIBLE_STREAK: Final = 3.0
-"""px, and sigmas of its length: a shorter streak is given as not blurred, since its direction is chance."""
+MODEL_ERROR: Final = 0.02  # px per px of blotches, sigma of every centre besides noise: compression moves edges
+LEARNS: Final = 0.8  # score from which a candidate teaches what edge and shading to expect
+FORGETS: Final = 0.98  # factor on earlier information per teaching candidate: the light on the ball changes as it flies
+SUREST: Final = (0.15, 0.08, 0.08)  # least sigmas of the expected edge (px) and shading: they change along a flight
+VISIBLE_STREAK: Final = 3.0  # px, and sigmas of its length: a shorter streak's direction is chance
+UNEXPLAINED: Final = 0.06  # share of the change left over at which the mark for shape is 1/e; hands leave 0.1 and more
+ODD: Final = 2.0  # sigmas from the `Look` first expected beyond which the mark for looks falls by half per sigma
+STRENGTH: Final = 15.0  # ratio of signal to noise, over the whole candidate, at which the mark for contrast is 1 - 1/e
+SIZE: Final = 0.2  # relative error of the diameter, beyond the limits, at which the mark for size is 1/e
+UNSETTLED: Final = 0.5  # mark of a fit that did not converge
+WHITE: Final = (0.25, 0.2)  # saturation up to which a ball is white, and the scale beyond
+ORANGE: Final = (8.0, 48.0, 12.0)  # degrees of hue of an orange or yellow ball, and the scale beyond
+PALE: Final = (0.35, 0.15)  # saturation from which a ball is orange, and the scale below that
 
 
 @dataclass(frozen=True)
@@ -42,13 +45,10 @@ class DetectorSettings:
 
     diameter: tuple[float, float] = (4.0, 40.0)
     """px, least and greatest diameter."""
-
     longest_streak: float = 60.0
     """px, largest motion of a ball during an exposure."""
-
     colour: Colour | None = None
     """Colour of the ball; None: any colour that differs from the background's."""
-
     most: int = 6
     """Largest number of closely examined candidates per frame."""
 
@@ -76,29 +76,32 @@ class BallDetector:
 
         Args: images: at least three, (h, w, 3) grey levels, spread over the recording; see `Background`.
             settings: assumptions on the ball; None: the default ones.
-        Returns: the detector of that camera.
         Raises: ValueError: too few images, or of several sizes.
         """
         return cls(Background(images), settings)
 
     def __call__(self, image: Image) -> Candidates:
-        """The candidates of the next frame.
-
-        Args: image: (h, w, 3) grey levels, BGR.
-        Raises: ValueError: an image of another size than the background's.
-        """
+        """The candidates of the next frame (h, w, 3), BGR. Raises: ValueError: another size than the background's."""
         if image.shape != self.background.full.shape:
-            raise ValueError(
-                f"image must have the background's shape {self.background.full.shape}; got {image.shape}. "
-                "Learn a detector for each camera."
-            )
+            problem = f"image must have the background's shape {self.background.full.shape}; got {image.shape}"
+            raise ValueError(f"{problem}. Learn a detector for each camera.")
         known = self.settings
         regions = find_regions(self.background, image, known.diameter[1], known.longest_streak, known.most)
         rated = [found for region in regions if (found := self._fitted(image, region)) is not None]
         for fit, rating in rated:
             if rating >= LEARNS:
                 self._look = learned(self._look, fit, self.background.blotches)
-        return _candidates(rated, MODEL_ERROR * self.background.blotches)
+        if not rated:
+            return Candidates.none()
+        covariances = np.stack([fit.covariance for fit, _ in rated])
+        centres = np.stack([fit.centre for fit, _ in rated])
+        halves = np.stack([fit.half for fit, _ in rated])
+        lengths = 2.0 * np.hypot(halves[:, 0], halves[:, 1])
+        spread = 2.0 * np.sqrt(np.trace(covariances[:, 2:4, 2:4], axis1=1, axis2=2))
+        halves[(lengths < VISIBLE_STREAK) | (lengths < VISIBLE_STREAK * spread)] = np.nan
+        floor = MODEL_ERROR * self.background.blotches
+        of_centres, scores = covariances[:, :2, :2] + floor**2 * np.eye(2), np.array([mark for _, mark in rated])
+        return Candidates(centres, of_centres, scores, np.stack((centres - halves, centres + halves), axis=1))
 
     def _fitted(self, image: Image, region: Region) -> tuple[StreakFit, float] | None:
         """The swept disc that explains a region, in pixels of the image, and its score; None where none does."""
@@ -138,13 +141,8 @@ def patch_of(change: np.ndarray, behind: np.ndarray, region: Region, noise: Arra
     direction /= length
     along = direction.astype(np.float32)
     shade = behind @ along
-    return Patch(
-        *region.places(),
-        change @ along,
-        shade - shade.mean(),
-        float(shade.mean()),
-        float(np.sqrt(direction @ noise @ direction)),
-    )
+    sigma = float(np.sqrt(direction @ noise @ direction))
+    return Patch(*region.places(), change @ along, shade - shade.mean(), float(shade.mean()), sigma)
 
 
 def learned(look: Look, fit: StreakFit, blotches: float) -> Look:
@@ -160,19 +158,42 @@ def learned(look: Look, fit: StreakFit, blotches: float) -> Look:
     return Look(np.asarray(mean, dtype=np.float64), information * np.outer(scale, scale))
 
 
-def _candidates(rated: Sequence[tuple[StreakFit, float]], floor: float) -> Candidates:
-    """Candidates from the fits of a frame and their scores; floor: px, sigma added to each centre's."""
-    if not rated:
-        return Candidates.none()
-    covariances = np.stack([fit.covariance for fit, _ in rated])
-    centres = np.stack([fit.centre for fit, _ in rated])
-    halves = np.stack([fit.half for fit, _ in rated])
-    lengths = 2.0 * np.hypot(halves[:, 0], halves[:, 1])
-    spread = 2.0 * np.sqrt(np.trace(covariances[:, 2:4, 2:4], axis1=1, axis2=2))
-    halves[(lengths < VISIBLE_STREAK) | (lengths < VISIBLE_STREAK * spread)] = np.nan
-    return Candidates(
-        centres,
-        covariances[:, :2, :2] + floor**2 * np.eye(2),
-        np.array([rating for _, rating in rated]),
-        np.stack((centres - halves, centres + halves), axis=1),
-    )
+def score(
+    fit: StreakFit,
+    patch: Patch,
+    change: Array32,
+    behind: Array32,
+    diameter: tuple[float, float],
+    colour: Colour | None,
+) -> float:
+    """Mark of a candidate, 0 to 1.
+
+    Args: change, behind: (m, 3) grey levels, difference to the background and background of these pixels.
+        diameter: px, least and greatest.
+    """
+    shape = np.exp(-((fit.unexplained / UNEXPLAINED) ** 2)) * (1.0 if fit.settled else UNSETTLED)
+    strength = 1.0 - np.exp(-((fit.strength / STRENGTH) ** 2))
+    looks = 0.5 ** max(fit.oddness - ODD, 0.0)
+    size = 2.0 * fit.radius
+    off = max(diameter[0] / size - 1.0, size / diameter[1] - 1.0, 0.0)
+    mark = shape * looks * strength * np.exp(-((off / SIZE) ** 2))
+    if colour is not None:
+        mark *= _colour_mark(swept(patch.x, patch.y, fit.values)[0], change, behind, colour)
+    return float(np.clip(mark, 0.0, 1.0))
+
+
+def _colour_mark(coverage: Array32, change: Array32, behind: Array32, colour: Colour) -> float:
+    column = coverage[:, None]  # without the background that shines through the streak
+    ball = (column * (change + column * behind)).sum(axis=0) / (column**2).sum()
+    blue, green, red = np.maximum(ball.astype(np.float64), 0.0)
+    most, least = max(blue, green, red, 1.0), min(blue, green, red)
+    saturation = (most - least) / most
+    if colour == "white":
+        lighter = coverage @ change.sum(axis=1) > 0.0
+        return float(np.exp(-((max(saturation - WHITE[0], 0.0) / WHITE[1]) ** 2))) * float(lighter)
+    if not red >= green >= blue or red == blue:
+        return 0.0
+    hue = 60.0 * (green - blue) / (red - blue)
+    off = max(ORANGE[0] - hue, hue - ORANGE[1], 0.0) / ORANGE[2]
+    pale = max(PALE[0] - saturation, 0.0) / PALE[1]
+    return float(np.exp(-(off**2) - pale**2))

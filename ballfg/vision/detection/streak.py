@@ -18,41 +18,25 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array
 from ballfg.vision.arrays import Array32
 
-LONGEST_HALF: Final = 15.0
-"""px, prior sigma of half a streak. It only matters below a pixel, where the length hardly shows in the image."""
-NODE_SPACING: Final = 1.8
-"""px of streak per quadrature node: two edge widths, which Gauss-Legendre integrates to 1e-3 of the contrast."""
-STANDS_OUT: Final = 3.0
-"""Sigmas of noise above which a pixel counts for the first values: one in a thousand does by chance."""
-FAINT: Final = 0.3
-"""Share of the strongest contrast: where the background leaves the ball less, a change's noise would weigh too much."""
+LONGEST_HALF: Final = 15.0  # px, prior sigma of half a streak; it only matters below a pixel
+NODE_SPACING: Final = 1.8  # px of streak per node: two edge widths, which Gauss-Legendre integrates to 1e-3
+STANDS_OUT: Final = 3.0  # sigmas of noise above which a pixel counts for the first values
+FAINT: Final = 0.3  # share of the strongest contrast: with less, a change's noise would weigh too much
 MOST_STEPS: Final = 8
 HOPELESS: Final = (0.3, 0.2, 0.15)
-"""A fit that leaves over a larger share of the change, to start with, after one step, after more, is given up: balls
-leave 0.02 and then less than 0.01, sleeves and shadows 0.1 to 0.9."""
+"""Share of the change left over, at first and after steps, that ends a fit: balls leave 0.02, sleeves 0.1 to 0.9."""
 REACH: Final = 1.2
-RING: Final = 3.5
-"""px. The fit takes pixels within REACH radii and RING of the streak that it starts from."""
-MOST_WORK: Final = 24000
-"""Pixels times nodes that a fit takes; of a larger ball it takes every second pixel, every third, ..."""
-SETTLED: Final = np.array([0.02, 0.02, 0.1, 0.1, 0.05])
-"""px. Gauss-Newton is over when centre, half streak and radius moved by less: the next step is a tenth of that."""
-SAME: Final = 0.02
-"""Relative step of the contrast below which it is settled."""
-DRIFT: Final = 1.5
-"""px from first values to last beyond which a fit may have missed pixels of the streak."""
-BLUNT: Final = 1.0
-"""px. Half a streak shorter than this hardly shows, wanders with the noise and need not come to rest."""
-LONGEST_STEP: Final = 3.0
-"""px, of any parameter in one step: further out the linearisation is worthless."""
-SHARPEST: Final = 0.35
-"""px, the least softness of an edge: that of a square pixel alone, without a lens."""
-_ROUNDING: Final = np.float32(1e-6)
-"""px, added to distances from the centre, which are divided by; far below a pixel's share of any sum."""
-SMALLEST: Final = 1.0
-"""px, the least radius: less is a point, and all shapes of it look alike."""
-CENTRE, HALF, RADIUS, CONTRAST, LOOK = slice(0, 2), slice(2, 4), 4, 5, slice(6, 9)
-"""Places of the parameters in a vector of nine."""
+RING: Final = 3.5  # px. The fit takes pixels within REACH radii and RING of the streak that it starts from.
+MOST_WORK: Final = 24000  # pixels times nodes of a fit; of a larger ball it takes every second pixel, every third, ...
+SETTLED: Final = np.array([0.02, 0.02, 0.1, 0.1, 0.05])  # px: centre, half streak and radius moved by less
+SAME: Final = 0.02  # relative step of the contrast below which it is settled
+DRIFT: Final = 1.5  # px from first values to last beyond which a fit may have missed pixels of the streak
+BLUNT: Final = 1.0  # px: half a streak shorter than this hardly shows, wanders with the noise and need not come to rest
+LONGEST_STEP: Final = 3.0  # px, of any parameter in one step: further out the linearisation is worthless
+SHARPEST: Final = 0.35  # px, the least softness of an edge: that of a square pixel alone, without a lens
+_ROUNDING: Final = np.float32(1e-6)  # px, added to distances from the centre, which are divided by
+SMALLEST: Final = 1.0  # px, the least radius: less is a point, and all shapes of it look alike
+CENTRE, HALF, RADIUS, CONTRAST, LOOK = slice(0, 2), slice(2, 4), 4, 5, slice(6, 9)  # places in a vector
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,9 +146,7 @@ def _nodes(half: Array) -> int:
 def swept(x: Array32, y: Array32, values: Array) -> tuple[Array32, Array32]:
     """Coverage of pixels by the swept disc, and its derivatives.
 
-    Args:
-        x, y: (m,) px.
-        values: (9,) as in `StreakFit`.
+    Args: x, y: (m,) px.  values: (9,) as in `StreakFit`.
     Returns: (m,) coverage; (8, m): its derivatives by centre (2), half streak (2), radius and edge; the swept gradients
         (2) of a shading that is one at the rim.
     """
@@ -181,18 +163,10 @@ def swept(x: Array32, y: Array32, values: Array) -> tuple[Array32, Array32]:
     by_x, by_y = along * dx, along * dy
     disc = (disc + 1) * (1 / (2 * radius))
     moments = weights * nodes
-    rows = (
-        (weights, by_x),
-        (weights, by_y),
-        (moments, by_x),
-        (moments, by_y),
-        (weights, slope),
-        (-weights, slope * inward),
-        (weights, disc * dx),
-        (weights, disc * dy),
-    )
-    parts = np.empty((len(rows), x.size), dtype=np.float32)
-    for row, (moment, array) in zip(parts, rows, strict=True):
+    moment_of = (weights, weights, moments, moments, weights, -weights, weights, weights)
+    arrays = (by_x, by_y, by_x, by_y, slope, slope * inward, disc * dx, disc * dy)
+    parts = np.empty((len(arrays), x.size), dtype=np.float32)
+    for row, moment, array in zip(parts, moment_of, arrays, strict=True):
         np.matmul(moment, array, out=row)
     return (weights @ disc) * radius, parts
 

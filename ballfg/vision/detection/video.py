@@ -18,8 +18,7 @@ from ballfg.tracks.checks import check_step
 from ballfg.vision.arrays import Image
 from ballfg.vision.image_file import ENDINGS, read_image
 
-SHORT: Final = (3, 0.02)
-"""Frames, and share of them, that may be missing at the end of what the container announces: it often estimates."""
+SHORT: Final = (3, 0.02)  # frames, and share, that may be missing at the end of what the container announces
 
 
 class Video(ABC):
@@ -47,18 +46,15 @@ class Video(ABC):
         Raises: ValueError: stamps that do not increase, an image of another size, frames that are fewer or more than
             the stamps or, by over 2 %, fewer than announced.
         """
-        last = -np.inf
-        number = -1
+        last, number = -np.inf, -1
         for number, (stamp, image) in enumerate(self._decoded()):
             if self._stamps is not None:
                 if number >= len(self._stamps):
                     raise ValueError(self._mismatch("more"))
                 stamp = float(self._stamps[number])
             if not stamp > last:
-                raise ValueError(
-                    f"stamps of {self.path} must increase; frame {number} has {stamp:.6f} s after {last:.6f} s. "
-                    "Give a CSV file with the stamps of the frames."
-                )
+                problem = f"stamps of {self.path} must increase; frame {number} has {stamp:.6f} s after {last:.6f} s"
+                raise ValueError(f"{problem}. Give a CSV file with the stamps of the frames.")
             last = stamp
             yield stamp, image
         self._check_count(number + 1)
@@ -67,10 +63,8 @@ class Video(ABC):
         if self._stamps is not None and read < len(self._stamps):
             raise ValueError(self._mismatch(f"only {read}"))
         if self._stamps is None and self.count - read > max(SHORT[0], SHORT[1] * self.count):
-            raise ValueError(
-                f"video {self.path} must be whole; it announces {self.count} frames and ends after {read}. "
-                "Copy it again, or give a CSV file with stamps for those that are there."
-            )
+            problem = f"video {self.path} must be whole; it announces {self.count} frames and ends after {read}"
+            raise ValueError(f"{problem}. Copy it again, or give a CSV file with stamps for those that are there.")
 
     def _mismatch(self, found: str) -> str:
         rows = 0 if self._stamps is None else len(self._stamps)
@@ -78,10 +72,7 @@ class Video(ABC):
 
     @abstractmethod
     def sample(self, count: int) -> list[Image]:
-        """Images spread over the recording.
-
-        Returns: images (h, w, 3) uint8, at most `count`.
-        """
+        """Images spread over the recording. Returns: images (h, w, 3) uint8, at most `count`."""
 
     @abstractmethod
     def _decoded(self) -> Iterator[tuple[float, Image]]:
@@ -136,8 +127,8 @@ class ImageFolder(Video):
 
     def sample(self, count: int) -> list[Image]:
         """At most `count` images spread over the recording."""
-        few = min(count, len(self._files))
-        return [self._image(self._files[turn * len(self._files) // few]) for turn in range(few)]
+        few = min(count, self.count)
+        return [self._image(self._files[turn * self.count // few]) for turn in range(few)]
 
     def _decoded(self) -> Iterator[tuple[float, Image]]:
         return ((np.nan, self._image(file)) for file in self._files)
@@ -146,9 +137,8 @@ class ImageFolder(Video):
         image = read_image(file, cv2.IMREAD_COLOR)
         size = (image.shape[1], image.shape[0])
         if size != self.size:
-            raise ValueError(
-                f"images of {self.path} must have one size; {file.name} has {size}, the first {self.size}."
-            )
+            what = f"images of {self.path} must have one size"
+            raise ValueError(f"{what}; {file.name} has {size}, the first {self.size}.")
         return image
 
 
@@ -196,10 +186,8 @@ def read_stamps(path: Path) -> Array:
             raise ValueError(f"{where}: t must be a finite number of seconds; got {shown(row.get('t'))}. Correct it.")
         stamps.append(float(row["t"]))
         if len(stamps) > 1 and not stamps[-1] > stamps[-2]:
-            raise ValueError(
-                f"{where}: t must increase; frame {len(stamps) - 1} has {stamps[-1]!r} s after {stamps[-2]!r} s. "
-                "Sort the rows or correct the stamps."
-            )
+            problem = f"{where}: t must increase; frame {len(stamps) - 1} has {stamps[-1]!r} s after {stamps[-2]!r} s"
+            raise ValueError(f"{problem}. Sort the rows or correct the stamps.")
     if not stamps:
         raise ValueError(f"{path} must have one row a frame; got none.")
     check_step(str(path), np.array(stamps))

@@ -1,154 +1,207 @@
 """Draws the contact sheet: each track in every view and in space, for a quick check."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
+import cv2
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Index
+from ballfg.vision.arrays import Image
+from ballfg.vision.tracking.overlay import Colour, bgr, by_score, hexadecimal, polyline, ring, uncover
 from ballfg.vision.tracking.pipeline import Tracking
-from ballfg.vision.tracking.strobe import EXPOSURES, HEIGHT, WIDTH, ZOOM, AllCandidates, Picture, Strobe
-from ballfg.vision.tracking.view_painter import hexadecimal
 
 Extent = tuple[float, float, float, float]
 
-MOST_TRACKS: Final = 12
-"""Rows of the sheet; of more tracks as many, spread evenly, are shown."""
-MOST_VIEWS: Final = 4
-"""Cameras in a row: the first ones of the rig."""
-INCH: Final = 3.1
-"""Width of a view."""
-WIDER: Final = 1.2
-"""Width of a plot, in views."""
-TITLE: Final = 0.3
-"""Inches for a line of text and the space round it."""
-PROPORTION: Final = 1.45
-"""Width of a plot over its height, at least."""
-DPI: Final = 100
-"""Pixels an inch: a view then is drawn a third smaller than it was put together."""
-AROUND: Final = 0.15
-"""m shown round the points."""
-TABLE: Final = "#2a7f4f"
-"""Colour of the table."""
+MOST_TRACKS: Final = 12  # rows of the sheet; of more tracks as many, spread evenly, are shown
+MOST_VIEWS: Final = 4  # cameras in a row: the first ones of the rig
+EXPOSURES: Final = 9  # frames that are combined in a view
+MOST_RINGS: Final = 500  # candidates that the sheet of a recording without a ball shows: the best ones
+WIDTH, ASPECT = 480, 16 / 9  # px of a view, and its width over its height
+AROUND: Final = 60.0  # px left free around the flight in the frame, so that one sees where it was
+LEAST_WIDTH: Final = 320.0  # px of the frame that are shown at least: less is blurred by the enlargement
+CLEAR: Final = 8.0  # px around a ball in which nothing is drawn over it
+BLANK: Final = 60  # grey of a view that was not filmed
+INCH, WIDER = 3.1, 1.2  # inches, width of a view; width of a plot in views
+PROPORTION: Final = 1.45  # least width of a plot over its height
+BESIDE: Final = 0.15  # m shown around the points
+TABLE: Final = "#2a7f4f"  # colour of the table
+
+
+class View:
+    """One camera's picture, made of several of its frames: each pixel from the frame in which it is least usual.
+
+    Args: frames: (n,) numbers to choose from.  pixels: (n, 2) px, what is seen in them.  size: px, of the image.
+    """
+
+    def __init__(self, frames: Index, pixels: Array, size: tuple[int, int]) -> None:
+        picked = _spread(len(frames), EXPOSURES)
+        self._frames = set(frames[picked].tolist())
+        self._balls = pixels[picked] if len(pixels) else pixels
+        self._box = _box(pixels, size) if len(pixels) else (0, 0, *size)
+        self._images: list[Image] = []
+
+    @property
+    def last(self) -> int:
+        """Number of the last frame that it needs; -1 without one."""
+        return max(self._frames, default=-1)
+
+    def see(self, number: int, image: Image) -> None:
+        """Takes what it needs of a frame (h, w, 3), given by its number."""
+        if number in self._frames:
+            left, top, width, height = self._box
+            self._images.append(_scaled(image[top : top + height, left : left + width]))
+
+    def picture(self, marks: Array, colours: Sequence[Colour], trail: Array) -> Image:
+        """(h, `WIDTH`, 3), with rings of these colours at marks (n, 2) px and a line along the trail (k, 2) px."""
+        left, top, width, height = self._box
+        view = _scaled(np.full((height, width, 3), BLANK, np.uint8))
+        if self._images:  # of each pixel the image that differs most from the median
+            stack = np.stack(self._images).astype(np.int16)
+            far = np.abs(stack - np.median(stack, axis=0)).sum(axis=-1).argmax(axis=0)
+            view = np.take_along_axis(stack, far[None, ..., None], axis=0)[0].astype(np.uint8)
+        clean = view.copy()
+
+        def place(pixels: Array) -> Array:
+            return np.asarray((pixels - (left, top) + 0.5) * WIDTH / width - 0.5)
+
+        polyline(view, place(trail), colours[0] if colours else (0, 0, 0))
+        for mark, colour in zip(marks, colours, strict=True):
+            ring(view, place(mark), 2.0, colour, 2)
+        for ball in self._balls if self._images else ():
+            uncover(view, clean, place(ball), CLEAR)
+        return view
 
 
 class ContactSheet:
-    """Collects pictures while the videos pass by (`strobe.tapped`), then writes the sheet.
+    """Collects pictures while the videos pass by, then writes the sheet.
 
-    Args: ball_radius: m.  table_height: m, z of the table's surface.
-        table: (x_low, x_high, y_low, y_high) m; None where it is not known.
+    Args: table_height: m, z of the table's surface.  table: (x_low, x_high, y_low, y_high) m; None if it is not known.
     """
 
-    def __init__(self, tracking: Tracking, ball_radius: float, table_height: float, table: Extent | None) -> None:
-        self._tracking = tracking
-        self._height, self._table = table_height, table
-        count = len(tracking.balls)
-        self._shown = np.unique(np.linspace(0, count - 1, min(count, MOST_TRACKS)).round().astype(int)).tolist()
-        views = range(min(len(tracking.cameras), MOST_VIEWS))
-        self._strobes: list[list[Strobe]] = [
-            [Strobe(tracking, track, i, ball_radius) for i in views] for track in self._shown
-        ]
-        self._all: list[AllCandidates] = [] if count else [AllCandidates(tracking, i) for i in views]
+    def __init__(self, tracking: Tracking, table_height: float, table: Extent | None) -> None:
+        self._tracking, self._height, self._table = tracking, table_height, table
+        self._shown = _spread(len(tracking.balls), MOST_TRACKS).tolist()
+        self._views: list[list[View]] = []
+        cameras = list(enumerate(tracking.cameras[:MOST_VIEWS]))
+        for track in self._shown:
+            seen = [tracking.seen(tracking.balls[track], camera) for camera, _ in cameras]
+            pairs = zip(seen, cameras, strict=True)
+            self._views.append([View(one.frames, one.pixels, model.size) for one, (_, model) in pairs])
+        if not self._shown:
+            frames = [np.arange(len(tracking.detections[camera].frames)) for camera, _ in cameras]
+            pairs_of_all = zip(frames, cameras, strict=True)
+            self._views.append([View(numbers, np.zeros((0, 2)), model.size) for numbers, (_, model) in pairs_of_all])
 
-    def pictures_of(self, camera: int) -> list[Picture]:
-        """The pictures that need a camera's frames."""
-        rows: list[Sequence[Picture]] = [*self._strobes, self._all]
-        return [row[camera] for row in rows if camera < len(row)]
+    def passing(self, camera: int, stream: Iterable[tuple[float, Image]]) -> Iterator[tuple[float, Image]]:
+        """Passes the frames of a camera on, and keeps of them what the sheet needs."""
+        for number, (time, image) in enumerate(stream):
+            for row in self._views:
+                if camera < len(row):
+                    row[camera].see(number, image)
+            yield time, image
+
+    def last(self, camera: int) -> int:
+        """Number of the last frame of a camera that the sheet needs; -1 without one."""
+        return max((row[camera].last for row in self._views if camera < len(row)), default=-1)
 
     def write(self, path: Path) -> None:
         """Writes the sheet as a PNG; views that were not filmed are grey."""
-        figure = self._flights() if self._strobes else self._candidates()
-        figure.savefig(path, format="png", dpi=DPI, metadata={"Software": None})
+        figure = self.flights() if self._shown else self._candidates()
+        figure.savefig(path, format="png", dpi=100, metadata={"Software": None})
 
-    def _flights(self) -> Figure:
-        rows, views = len(self._strobes), len(self._strobes[0])
+    def flights(self) -> Figure:
+        """The sheet of a recording with balls."""
+        rows, views, count = len(self._shown), len(self._views[0]), len(self._tracking.balls)
         widths = [1.0] * views + [WIDER] * 2
-        row_height = INCH * (HEIGHT + ZOOM) / WIDTH + TITLE
-        figure = Figure(figsize=(INCH * sum(widths), row_height * rows + 2 * TITLE), layout="constrained")
+        size = (INCH * sum(widths), (INCH / ASPECT + 0.9) * rows + 0.6)
+        figure = Figure(figsize=size, layout="constrained")
         panels = np.asarray(figure.subplots(rows, len(widths), squeeze=False, width_ratios=widths), dtype=object)
-        for row, track, strobes in zip(panels, self._shown, self._strobes, strict=True):
-            self._draw_row(row, track, strobes)
+        for row, track, pictures in zip(panels, self._shown, self._views, strict=True):
+            for camera, (panel, view) in enumerate(zip(row, pictures, strict=False)):
+                self._draw_view(panel, view, track, camera)
+            row[0].set_title(f"track {self._tracking.names[track]}     " + row[0].get_title(), size=8)
+            self._draw_space(row[-2:], track)
         for panel in panels[-1, -2:]:
             panel.set_xlabel("x, m", size=8)
-        figure.suptitle(self._title(), size=10, wrap=True)
+        which = f"{count} track{'s' * (count != 1)}" if rows == count else f"{rows} of {count} tracks"
+        figure.suptitle(
+            f"{which}: the ball in up to {EXPOSURES} frames of each camera, with the points' trail and the sightings. "
+            "Right: points ± 1 sigma from the side and from above.",
+            size=10,
+            wrap=True,
+        )
         return figure
+
+    def _draw_view(self, panel: Axes, view: View, track: int, camera: int) -> None:
+        ball, model = self._tracking.balls[track], self._tracking.cameras[camera]
+        marks = self._tracking.seen(ball, camera).pixels
+        _show(panel, view.picture(marks, [bgr(track)] * len(marks), model.project(ball.points)))
+        panel.set_title(f"{model.name}: {len(marks)} sightings", size=8)
+
+    def _draw_space(self, panels: Sequence[Axes], track: int) -> None:
+        """The points with their standard deviations from the side and from above; one scale in all rows."""
+        ball, every = self._tracking.balls[track], np.concatenate([ball.points for ball in self._tracking.balls])
+        low, high = every.min(axis=0) - BESIDE, every.max(axis=0) + BESIDE
+        low[2] = min(low[2], self._height - BESIDE)
+        table = self._table or (low[0], high[0], np.nan, np.nan)
+        if self._table is not None:
+            low[:2] = np.minimum(low[:2], np.array(table[::2]) - BESIDE)
+            high[:2] = np.maximum(high[:2], np.array(table[1::2]) + BESIDE)
+        panels[0].plot(table[:2], [self._height] * 2, color=TABLE, linewidth=2.5, zorder=1)
+        panels[1].fill(np.array(table)[[0, 1, 1, 0]], np.array(table)[[2, 2, 3, 3]], color=TABLE, alpha=0.35, lw=0)
+        panels[0].set_title(f"from the side: {ball.times[0]:.3f} to {ball.times[-1]:.3f} s", size=8)
+        panels[1].set_title(f"from above: {len(ball.times)} points", size=8)
+        sigmas = np.sqrt(np.diagonal(ball.covariances, axis1=1, axis2=2))
+        for panel, up in zip(panels, (2, 1), strict=True):
+            style = {"color": hexadecimal(track), "ecolor": "#777777", "elinewidth": 0.6, "linewidth": 0.6}
+            panel.errorbar(
+                *ball.points[:, (0, up)].T, sigmas[:, up], sigmas[:, 0], fmt="o-", markersize=2.6, zorder=2, **style
+            )
+            middle, half = (low[up] + high[up]) / 2, max(high[up] - low[up], (high[0] - low[0]) / PROPORTION) / 2
+            panel.set(xlim=(low[0], high[0]), ylim=(middle - half, middle + half), aspect="equal")
+            panel.set_ylabel(f"{'xyz'[up]}, m", size=8)
+            panel.tick_params(labelsize=7)
+            panel.grid(color="#dddddd", linewidth=0.5)
 
     def _candidates(self) -> Figure:
-        figure = Figure(figsize=(INCH * len(self._all), INCH * HEIGHT / WIDTH + 3 * TITLE), layout="constrained")
-        panels = figure.subplots(1, len(self._all), squeeze=False)[0]
-        for panel, picture, seen in zip(panels, self._all, self._tracking.detections, strict=False):
-            panel.imshow(picture.picture()[..., ::-1], interpolation="lanczos")
-            panel.set_axis_off()
-            best = ", ".join(f"{score:.2f}" for score in seen.best_scores()) or "none"
-            panel.set_title(f"{seen.camera}: best scores {best}", size=8)
-        figure.suptitle("no ball: candidates of all frames on the middle one, the brighter the likelier", size=10)
+        """The sheet of a recording without a ball: the best candidates of all frames, the brighter the likelier."""
+        (views,) = self._views
+        figure = Figure(figsize=(INCH * len(views), INCH / ASPECT + 0.9), layout="constrained")
+        for panel, view, seen in zip(
+            figure.subplots(1, len(views), squeeze=False)[0], views, self._tracking.detections, strict=False
+        ):
+            best = np.argsort(-seen.scores, kind="stable")[:MOST_RINGS][::-1]
+            _show(panel, view.picture(seen.pixels[best], [by_score(s) for s in seen.scores[best]], np.zeros((0, 2))))
+            scores = ", ".join(f"{score:.2f}" for score in seen.best_scores()) or "none"
+            panel.set_title(f"{seen.camera}: best scores {scores}", size=8)
+        figure.suptitle("no ball: candidates of all frames, the brighter the likelier", size=10)
         return figure
 
-    def _title(self) -> str:
-        shown, count = len(self._shown), len(self._tracking.balls)
-        which = f"{count} track{'s' * (count != 1)}" if shown == count else f"{shown} of {count} tracks"
-        views = "where each camera saw the ball"
-        if any(strobe.filmed for row in self._strobes for strobe in row):
-            views = (
-                f"the ball cut from up to {EXPOSURES} frames of each camera with its trail; below, from near, "
-                "in a circle of its expected size"
-            )
-        return f"{which}: {views}. Right: points ± 1 sigma from the side and from above."
 
-    def _draw_row(self, row: Sequence[Axes], track: int, strobes: Sequence[Strobe]) -> None:
-        ball, name = self._tracking.balls[track], self._tracking.names[track]
-        for panel, strobe, camera in zip(row, strobes, self._tracking.cameras, strict=False):
-            panel.imshow(strobe.picture()[..., ::-1], interpolation="lanczos")
-            panel.set_axis_off()
-            panel.set_title(f"{camera.name}: {strobe.count} sightings", size=8)
-        row[0].set_title(f"track {name}     " + row[0].get_title(), size=8, color="black")
-        sigmas = np.sqrt(np.diagonal(ball.covariances, axis1=1, axis2=2))
-        self._draw_side(row[-2], ball.points, sigmas, track)
-        self._draw_top(row[-1], ball.points, sigmas, track)
-        row[-2].set_title(f"from the side: {ball.times[0]:.3f} to {ball.times[-1]:.3f} s", size=8)
-        row[-1].set_title(f"from above: {len(ball.times)} points", size=8)
-
-    def _draw_side(self, panel: Axes, points: Array, sigmas: Array, track: int) -> None:
-        low, high = self._limits()
-        ends = (low[0], high[0]) if self._table is None else self._table[:2]
-        panel.plot(ends, (self._height, self._height), color=TABLE, linewidth=2.5, zorder=1)
-        _draw_points(panel, points[:, (0, 2)], sigmas[:, (0, 2)], track)
-        _frame(panel, (low[0], high[0]), (min(low[2], self._height - AROUND), high[2]), "z, m")
-
-    def _draw_top(self, panel: Axes, points: Array, sigmas: Array, track: int) -> None:
-        low, high = self._limits()
-        if self._table is not None:
-            x_low, x_high, y_low, y_high = self._table
-            panel.fill((x_low, x_high, x_high, x_low), (y_low, y_low, y_high, y_high), color=TABLE, alpha=0.35, lw=0)
-        _draw_points(panel, points[:, :2], sigmas[:, :2], track)
-        _frame(panel, (low[0], high[0]), (low[1], high[1]), "y, m")
-
-    def _limits(self) -> tuple[Array, Array]:
-        """(3,) m each: the lowest and highest coordinates on show, the same in all rows."""
-        points = np.concatenate([ball.points for ball in self._tracking.balls])
-        low, high = points.min(axis=0) - AROUND, points.max(axis=0) + AROUND
-        if self._table is not None:
-            corners = np.array(self._table).reshape(2, 2).T
-            low[:2], high[:2] = np.minimum(low[:2], corners[0] - AROUND), np.maximum(high[:2], corners[1] + AROUND)
-        return low, high
+def _spread(count: int, most: int) -> Index:
+    """At most so many of the numbers below `count`, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 
 
-def _draw_points(panel: Axes, places: Array, sigmas: Array, track: int) -> None:
-    across, up = places.T
-    colour = hexadecimal(track)
-    panel.errorbar(across, up, sigmas[:, 1], sigmas[:, 0], fmt="none", ecolor="#777777", elinewidth=0.6, zorder=2)
-    panel.plot(across, up, "o-", color=colour, markersize=2.6, linewidth=0.6, markeredgecolor="#333333", mew=0.3)
+def _show(panel: Axes, picture: Image) -> None:
+    panel.imshow(picture[..., ::-1], interpolation="lanczos")
+    panel.set_axis_off()
 
 
-def _frame(panel: Axes, across: tuple[float, float], up: tuple[float, float], name: str) -> None:
-    """Limits with one scale on both axes; the height on show grows until the plot is as high as a view."""
-    middle, half = (up[0] + up[1]) / 2, max(up[1] - up[0], (across[1] - across[0]) / PROPORTION) / 2
-    panel.set_xlim(*across)
-    panel.set_ylim(middle - half, middle + half)
-    panel.set_aspect("equal")
-    panel.set_ylabel(name, size=8)
-    panel.tick_params(labelsize=7)
-    panel.grid(color="#dddddd", linewidth=0.5)
+def _scaled(image: Image) -> Image:
+    size = (WIDTH, round(image.shape[0] * WIDTH / image.shape[1]))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def _box(pixels: Array, size: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Left, top, width and height, px, of the part of the frame that holds all pixels, in a view's proportions."""
+    low, high = pixels.min(axis=0) - AROUND, pixels.max(axis=0) + AROUND
+    width = max(high[0] - low[0], (high[1] - low[1]) * ASPECT, LEAST_WIDTH)
+    width = min(width, size[0], size[1] * ASPECT)
+    sides = np.array([width, width / ASPECT])
+    left, top = np.clip((low + high) / 2 - sides / 2, 0.0, np.array(size) - sides).astype(int)
+    return int(left), int(top), int(sides[0]), int(sides[1])

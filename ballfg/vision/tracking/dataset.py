@@ -18,16 +18,13 @@ from ballfg.vision.camera_file import CAMERAS_FILE, write_cameras
 from ballfg.vision.tracking.contact_sheet import ContactSheet, Extent
 from ballfg.vision.tracking.overlay import write_overlay
 from ballfg.vision.tracking.pipeline import Tracking
-from ballfg.vision.tracking.strobe import tapped
 
 Streams = Sequence[Callable[[], Iterator[tuple[float, Image]]]]
 """For each camera a function that opens its video and gives stamps (s) and images."""
-
 TRACKS: Final = "tracks.csv"
 OVERLAY: Final = "overlay.mp4"
 SHEET: Final = "contact_sheet.png"
-FILES: Final = (INFO_FILE, TRACKS, DETECTIONS_FILE, CAMERAS_FILE, OVERLAY, SHEET)
-"""All written files."""
+FILES: Final = (INFO_FILE, TRACKS, DETECTIONS_FILE, CAMERAS_FILE, OVERLAY, SHEET)  # all written files
 
 
 def check_result_folder(folder: Path, inputs: Sequence[Path], *, force: bool) -> None:
@@ -68,41 +65,26 @@ def write_tracking(
     Raises: OSError: something cannot be written. ValueError: a track that breaks a rule of datasets.
     """
     with whole_folder(folder, earlier=FILES) as stage:
-        _write_tables(stage, tracking, info)
-        sheet = ContactSheet(tracking, info.ball.radius, info.table_height, table)
-        if streams is not None:
-            _run_videos(stage, tracking, sheet, streams, overlay, watch)
+        if tracking.balls:
+            write_dataset(stage, info, tracking.tracks)
+        else:
+            write_info(stage / INFO_FILE, info)
+            with TableWriter(stage / TRACKS) as empty:
+                empty.write({KEY: np.zeros(0, dtype=object)} | {name: np.zeros(0) for name in (*VALUES, *SIGMAS)})
+        write_cameras(stage / CAMERAS_FILE, tracking.cameras)
+        with TableWriter(stage / DETECTIONS_FILE) as detections:
+            for camera, seen in enumerate(tracking.detections):
+                names = np.full(len(seen), "", dtype=object)  # of the balls; candidates of no ball have none
+                for name, ball in zip(tracking.names, tracking.balls, strict=True):
+                    names[tracking.rows(ball, camera)] = name
+                columns = seen_columns(seen.times, seen.camera, seen.pixels, seen.covariances)
+                detections.write({KEY: names} | columns | {SCORE: seen.scores})
+        sheet = ContactSheet(tracking, info.table_height, table)
+        passing = [sheet.passing(camera, opened()) for camera, opened in enumerate(streams or ())]
+        if passing and overlay:
+            write_overlay(stage / OVERLAY, tracking, passing, watch)
+        for camera, frames in enumerate(passing if not overlay else ()):
+            for _ in itertools.islice(frames, sheet.last(camera) + 1):
+                pass
         sheet.write(stage / SHEET)
         return [name for name in FILES if (stage / name).is_file()]
-
-
-def _run_videos(
-    stage: Path, tracking: Tracking, sheet: ContactSheet, streams: Streams, overlay: bool, watch: Watch
-) -> None:
-    """Runs through the videos once more, for both kinds of pictures."""
-    pictures = [sheet.pictures_of(i) for i in range(len(streams))]
-    taps = [tapped(opened(), wanted) for opened, wanted in zip(streams, pictures, strict=True)]
-    if overlay:
-        write_overlay(stage / OVERLAY, tracking, taps, watch)
-    for tap, wanted in zip(taps, pictures, strict=True):
-        last = max((frame for picture in wanted for frame in picture.frames), default=-1)
-        for _ in itertools.islice(tap, 0 if overlay else last + 1):
-            pass
-
-
-def _write_tables(stage: Path, tracking: Tracking, info: DatasetInfo) -> None:
-    if tracking.balls:
-        write_dataset(stage, info, tracking.tracks)
-    else:
-        write_info(stage / INFO_FILE, info)
-        with TableWriter(stage / TRACKS) as empty:
-            empty.write({KEY: np.zeros(0, dtype=object)} | {name: np.zeros(0) for name in (*VALUES, *SIGMAS)})
-    write_cameras(stage / CAMERAS_FILE, tracking.cameras)
-    with TableWriter(stage / DETECTIONS_FILE) as detections:
-        for camera in range(len(tracking.cameras)):
-            seen = tracking.detections[camera]
-            names = np.full(len(seen), "", dtype=object)  # of the balls; candidates of no ball have none
-            for name, ball in zip(tracking.names, tracking.balls, strict=True):
-                names[tracking.rows(ball, camera)] = name
-            columns = seen_columns(seen.times, seen.camera, seen.pixels, seen.covariances)
-            detections.write({KEY: names} | columns | {SCORE: seen.scores})

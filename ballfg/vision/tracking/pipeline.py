@@ -20,21 +20,16 @@ from ballfg.vision.detection.detections import Detections, Detector
 from ballfg.vision.detection.video import Video, open_video
 from ballfg.vision.tracking.recordings import check_sizes
 
-FEWEST: Final = 2
-"""Least number of cameras: a single one does not see the distance of a ball."""
-DIGITS: Final = 3
-"""Least number of digits in a track's name: names then sort as their tracks do."""
+FEWEST: Final = 2  # least number of cameras: a single one does not see the distance of a ball
+DIGITS: Final = 3  # least number of digits in a track's name: names then sort as their tracks do
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
     """One ball in one camera."""
 
-    frames: Index
-    """(m,) numbers of the camera's frames, increasing."""
-
-    pixels: Array
-    """(m, 2) px."""
+    frames: Index  # (m,) numbers of the camera's frames, increasing
+    pixels: Array  # (m, 2) px
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,13 +38,10 @@ class Tracking:
 
     cameras: tuple[Camera, ...]
     """The rig."""
-
     detections: tuple[Detections, ...]
     """All candidates of each camera, in the order of `cameras`."""
-
     balls: tuple[SeenBall, ...]
     """In the order of their first points."""
-
     agreement: Agreement | None
     """The agreement of the cameras; None without a ball."""
 
@@ -76,21 +68,13 @@ class Tracking:
         return float(f"{1.0 / step:.6g}")
 
     def seen(self, ball: SeenBall, camera: int) -> Seen:
-        """The frames in which a camera saw a ball, and its pixels.
-
-        Args: ball: one of `balls`.  camera: number of the camera.
-        Returns: numbers of the frames, and pixels.
-        """
+        """The frames in which a camera, by its number, saw one of `balls`, and its pixels."""
         rows = ball.sightings.camera == camera
         frames = np.searchsorted(self.detections[camera].frames, ball.sightings.times[rows])
         return Seen(frames.astype(np.int64), ball.sightings.pixels[rows])
 
     def rows(self, ball: SeenBall, camera: int) -> Index:
-        """The candidates of a camera that are sightings of a ball.
-
-        Args: ball: one of `balls`.  camera: number of the camera.
-        Returns: (m,) numbers of the candidates.
-        """
+        """(m,) numbers of the candidates of a camera, by its number, that are sightings of one of `balls`."""
         detections, seen = self.detections[camera], self.seen(ball, camera)
         first, end = (np.searchsorted(detections.frame, seen.frames, side) for side in ("left", "right"))
         found = [
@@ -155,10 +139,7 @@ def check_rig(cameras: Sequence[Camera]) -> None:
 
 
 def check_overlap(detections: Sequence[Detections], cameras: Sequence[Camera]) -> None:
-    """Refuses a camera that recorded while no other did: its clock or file is another recording's.
-
-    Raises: ValueError: naming the camera and when each one filmed.
-    """
+    """Refuses a camera that recorded while no other did. Raises: ValueError: naming it and the times of all."""
     spans: dict[str, tuple[float, float]] = {}
     for seen, camera in zip(detections, cameras, strict=True):
         if len(seen.frames):
@@ -167,7 +148,5 @@ def check_overlap(detections: Sequence[Detections], cameras: Sequence[Camera]) -
         others = [span for other, span in spans.items() if other != name]
         if others and not any(start <= last and first <= end for first, last in others):
             when = "; ".join(f"{shown(other)} {first:g} to {last:g} s" for other, (first, last) in spans.items())
-            raise ValueError(
-                f"videos must overlap in time; camera {shown(name)} overlaps with no other: {when} (true time). "
-                "Check stamps and time_offset, or that the files are of one recording."
-            )
+            problem = f"videos must overlap in time; camera {shown(name)} overlaps with no other: {when} (true time)"
+            raise ValueError(f"{problem}. Check stamps and time_offset, or that the files are of one recording.")

@@ -7,8 +7,7 @@ from typing import Final
 from ballfg.checks import did_you_mean, listed, shown
 from ballfg.vision.camera import Camera
 
-SAME_SHAPE: Final = 0.01
-"""Largest relative difference between the proportions of a video and of its camera, for a scaled picture."""
+SAME_SHAPE: Final = 0.01  # largest relative difference between the proportions of a scaled video and its camera's
 
 
 def match_videos(given: Sequence[str], cameras: Sequence[Camera], ignored: Sequence[str] = ()) -> dict[str, Path]:
@@ -26,21 +25,17 @@ def match_videos(given: Sequence[str], cameras: Sequence[Camera], ignored: Seque
         if name in ignored:
             continue
         if name not in names:
-            raise ValueError(
-                f"video {shown(text)} must be of a camera: {listed(names)}; got {shown(name)}. Rename it, or write "
-                f"NAME={path}.{did_you_mean(name, names)}"
-            )
+            problem = f"video {shown(text)} must be of a camera: {listed(names)}; got {shown(name)}"
+            raise ValueError(f"{problem}. Rename it, or write NAME={path}.{did_you_mean(name, names)}")
         if name in found:
-            raise ValueError(
-                f"camera {shown(name)} must have one video; got {found[name]} and {path}. Drop one of them."
-            )
+            both = f"{found[name]} and {path}"
+            raise ValueError(f"camera {shown(name)} must have one video; got {both}. Drop one of them.")
         found[name] = path
     missing = [name for name in names if name not in found]
     if missing:
         raise ValueError(
             f"every camera must have a video; got none for {' and '.join(map(shown, missing))}. "
-            f"Give it as {missing[0]}=FILE, "
-            f"or leave the camera out with --without {missing[0]}."
+            f"Give it as {missing[0]}=FILE, or leave the camera out with --without {missing[0]}."
         )
     return {name: found[name] for name in names}
 
@@ -55,11 +50,7 @@ def named_path(text: str, names: Sequence[str]) -> tuple[str, Path]:
 
 
 def stamp_files(given: Sequence[str], cameras: Sequence[Camera]) -> dict[str, Path]:
-    """The files of stamps of some cameras.
-
-    Args: given: `name=path`.
-    Raises: ValueError: a word without a name, a name of no camera, or one that comes twice.
-    """
+    """The files of stamps of cameras, given as `name=path`. Raises: ValueError: no name, no camera's, or twice."""
     names = [camera.name for camera in cameras]
     found: dict[str, Path] = {}
     for text in given:
@@ -74,10 +65,7 @@ def stamp_files(given: Sequence[str], cameras: Sequence[Camera]) -> dict[str, Pa
 
 
 def without(cameras: Sequence[Camera], names: Sequence[str]) -> list[Camera]:
-    """The remaining cameras.
-
-    Raises: ValueError: a name of no camera.
-    """
+    """The remaining cameras. Raises: ValueError: a name of no camera."""
     known = [camera.name for camera in cameras]
     for name in names:
         if name not in known:
@@ -87,26 +75,19 @@ def without(cameras: Sequence[Camera], names: Sequence[str]) -> list[Camera]:
 
 
 def check_sizes(sizes: Mapping[str, tuple[int, int]], cameras: Sequence[Camera]) -> None:
-    """Refuses a calibration of another resolution than the video's.
-
-    Args: sizes: camera -> width and height of its video, px.
-    Raises: ValueError: naming the camera, both sizes and what to do.
-    """
+    """Refuses a calibration of another resolution than the videos' (px). Raises: ValueError: with both sizes."""
     for camera in cameras:
-        size = sizes[camera.name]
-        if size != camera.size:
-            calibrated, filmed = (f"{width}x{height}" for width, height in (camera.size, size))
-            raise ValueError(
-                f"camera {shown(camera.name)} must be calibrated at the size of its video; got {calibrated} in the "
-                f"cameras' file and a video of {filmed}. {_remedy(camera.size, size)}"
-            )
-
-
-def _remedy(calibrated: tuple[int, int], filmed: tuple[int, int]) -> str:
-    across, down = (new / old for new, old in zip(filmed, calibrated, strict=True))
-    if abs(across / down - 1.0) > SAME_SHAPE:
-        return "Calibrate it again at that size: the pictures have different proportions."
-    return (
-        f"If the whole picture was scaled, set size to [{filmed[0]}, {filmed[1]}] and multiply fx, fy by {across:.6g}; "
-        f"cx, cy become {across:.6g} (c + 0.5) - 0.5. If it was cropped, calibrate again."
-    )
+        (width, height), (old_width, old_height) = sizes[camera.name], camera.size
+        if (width, height) == camera.size:
+            continue
+        across = width / old_width
+        remedy = (
+            f"If the whole picture was scaled, set size to [{width}, {height}] and multiply fx, fy by {across:.6g}; "
+            f"cx, cy become {across:.6g} (c + 0.5) - 0.5. If it was cropped, calibrate again."
+        )
+        if abs(across / (height / old_height) - 1.0) > SAME_SHAPE:
+            remedy = "Calibrate it again at that size: the pictures have different proportions."
+        raise ValueError(
+            f"camera {shown(camera.name)} must be calibrated at the size of its video; got {old_width}x{old_height} in "
+            f"the cameras' file and a video of {width}x{height}. {remedy}"
+        )

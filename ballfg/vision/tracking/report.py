@@ -24,9 +24,7 @@ def blind_cameras(tracking: Tracking) -> Iterator[str]:
 def disagreement(tracking: Tracking) -> str | None:
     """A sentence on the calibration; None if the cameras agree or too little was seen."""
     found = tracking.agreement
-    if found is None or not (found.culprit is not None or found.misfit > LEAST_MISFIT):
-        return None
-    return found.sentence
+    return found.sentence if found and (found.culprit is not None or found.misfit > LEAST_MISFIT) else None
 
 
 def no_ball(tracking: Tracking) -> str:

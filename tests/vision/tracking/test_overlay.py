@@ -16,28 +16,29 @@ from ballfg.tracks.sightings import Sightings
 from ballfg.vision import Camera
 from ballfg.vision.association.gathering import SeenBall
 from ballfg.vision.detection.detections import Candidates, Detections
-from ballfg.vision.tracking.contact_sheet import MOST_TRACKS, ContactSheet
+from ballfg.vision.tracking.contact_sheet import EXPOSURES, MOST_TRACKS, WIDTH, ContactSheet, View
 from ballfg.vision.tracking.overlay import (
+    CAPTION,
     HELD,
-    STRIP,
+    RING,
     VIEW_WIDTH,
     Image,
     OverlayPainter,
+    ViewPainter,
+    bgr,
+    caption,
     play,
     schedule,
     shown,
     write_overlay,
 )
 from ballfg.vision.tracking.pipeline import Tracking
-from ballfg.vision.tracking.strobe import HEIGHT, WIDTH, ZOOM, Strobe, tapped
-from ballfg.vision.tracking.view_painter import CAPTION, RING, ViewPainter, bgr, caption
 
 SIZE = (640, 360)
 RATE = 100.0
 FRAMES = 60
 START, END = 10, 50
 BACKGROUND, BALL = (60, 90, 70), (240, 250, 245)
-RADIUS = 0.02
 
 
 def camera(name: str, turn: float) -> Camera:
@@ -139,7 +140,7 @@ def test_playing_skips_and_repeats_frames_as_the_clock_wants() -> None:
 def test_the_ball_is_ringed_in_its_colour_in_each_view() -> None:
     tracking = made()
     painter = OverlayPainter(tracking)
-    assert painter.size == (2 * VIEW_WIDTH, SIZE[1] + STRIP)
+    assert painter.size == (2 * VIEW_WIDTH, SIZE[1])
     moments = schedule(tracking.detections, RIG)
     pages = list(painter.paint_all(moments, [filmed(0), filmed(1)]))
     assert len(pages) == FRAMES
@@ -165,7 +166,7 @@ def test_the_video_has_a_frame_for_each_moment(tmp_path: Path) -> None:
     shapes = []
     while (read := video.read())[0]:
         shapes.append(read[1].shape)
-    assert shapes == [(SIZE[1] + STRIP, 2 * VIEW_WIDTH, 3)] * FRAMES
+    assert shapes == [(SIZE[1], 2 * VIEW_WIDTH, 3)] * FRAMES
     assert watched == [(FRAMES, "overlay frames drawn")]
     with pytest.raises(OSError, match="cannot write this video"):
         write_overlay(tmp_path / "no" / "overlay.mp4", made(), [filmed(0), filmed(1)])
@@ -182,28 +183,38 @@ def test_a_view_without_a_frame_says_so() -> None:
 # --- the contact sheet ---------------------------------------------------------------------------------------------
 
 
-def test_the_strobe_holds_balls_of_several_frames() -> None:
+def sheet_of(tracking: Tracking, *cameras: int) -> ContactSheet:
+    """A sheet that has seen the frames of some cameras."""
+    sheet = ContactSheet(tracking, 0.0, (-0.5, 0.5, -0.3, 0.3))
+    for number in cameras:
+        for _ in sheet.passing(number, filmed(number)):
+            pass
+    return sheet
+
+
+def test_a_view_holds_balls_of_several_frames_beside_the_marks() -> None:
     tracking = made()
-    strobe = Strobe(tracking, 0, 0, RADIUS)
-    for _ in tapped(filmed(0), [strobe]):
-        pass
-    picture = strobe.picture()
-    assert picture.shape == (HEIGHT + ZOOM, WIDTH, 3)
-    white = (picture[:HEIGHT].astype(int).min(axis=2) > 200).astype(np.uint8)
-    assert cv2.connectedComponents(white)[0] - 1 == len(strobe.frames) == 9
-    for place in range(5):  # close-ups: a ball in the middle of each
-        middle = picture[HEIGHT + ZOOM // 2, place * ZOOM + ZOOM // 2].astype(int)
-        assert np.abs(middle - BALL).max() < 20
+    seen = tracking.seen(tracking.balls[0], 0)
+    view = View(seen.frames, seen.pixels, SIZE)
+    for number, (_, image) in enumerate(filmed(0)):
+        view.see(number, image)
+    trail = RIG[0].project(tracking.balls[0].points)
+    picture = view.picture(seen.pixels, [bgr(0)] * len(seen.pixels), trail)
+    assert picture.shape[1:] == (WIDTH, 3)
+    assert view.last == END - 1
+    white = (picture.astype(int).min(axis=2) > 200).astype(np.uint8)
+    assert cv2.connectedComponents(white)[0] - 1 == EXPOSURES
+    assert (np.abs(picture.astype(int) - bgr(0)).max(axis=2) < 20).sum() > 50
 
 
 def test_a_camera_that_never_saw_the_ball_has_a_blank_picture() -> None:
     tracking = made()
     only_left = tracking.balls[0].sightings.select(tracking.balls[0].sightings.camera == 0)
     tracking = replace(tracking, balls=(replace(tracking.balls[0], sightings=only_left),))
-    strobe = Strobe(tracking, 0, 1, RADIUS)
-    assert strobe.count == 0
-    assert strobe.frames == set()
-    assert strobe.picture().shape == (HEIGHT + ZOOM, WIDTH, 3)
+    sheet = sheet_of(tracking, 1)
+    assert sheet.last(1) == -1
+    blank, _ = (np.asarray(panel.images[0].get_array()) for panel in reversed(sheet.flights().axes[:2]))
+    assert np.median(blank) == 60
 
 
 def test_the_sheet_is_the_same_to_the_byte_and_has_a_row_a_track(tmp_path: Path) -> None:
@@ -211,11 +222,7 @@ def test_the_sheet_is_the_same_to_the_byte_and_has_a_row_a_track(tmp_path: Path)
     for count in (1, 2):
         pages = []
         for again in range(2 if count == 1 else 1):
-            sheet = ContactSheet(made(count), RADIUS, 0.0, (-0.5, 0.5, -0.3, 0.3))
-            for number in range(2):
-                for _ in tapped(filmed(number), sheet.pictures_of(number)):
-                    pass
-            sheet.write(tmp_path / f"{again}.png")
+            sheet_of(made(count), 0, 1).write(tmp_path / f"{again}.png")
             pages.append((tmp_path / f"{again}.png").read_bytes())
         assert len(set(pages)) == 1
         heights.append(cv2.imread(str(tmp_path / "0.png")).shape[0])
@@ -223,7 +230,7 @@ def test_the_sheet_is_the_same_to_the_byte_and_has_a_row_a_track(tmp_path: Path)
 
 
 def test_titles_of_the_sheet_are_alike_and_do_not_run_into_each_other() -> None:
-    figure = ContactSheet(made(2), RADIUS, 0.0, (-0.5, 0.5, -0.3, 0.3))._flights()
+    figure = sheet_of(made(2)).flights()
     figure.draw_without_rendering()
     places = [panel.title.get_window_extent() for panel in figure.axes]
     assert len(places) == 8
@@ -262,17 +269,13 @@ def test_text_can_be_read_on_a_white_picture() -> None:
 
 
 def test_of_many_tracks_some_are_shown() -> None:
-    sheet = ContactSheet(made(5 * MOST_TRACKS), RADIUS, 0.0, None)
-    assert len(sheet.pictures_of(0)) == MOST_TRACKS
+    figure = ContactSheet(made(5 * MOST_TRACKS), 0.0, None).flights()
+    assert len(figure.axes) == 4 * MOST_TRACKS
 
 
 def test_a_recording_without_a_ball_shows_its_candidates(tmp_path: Path) -> None:
-    sheet = ContactSheet(replace(made(), balls=()), RADIUS, 0.0, None)
-    (picture,) = sheet.pictures_of(1)
-    for _ in tapped(filmed(1), [picture]):
-        pass
-    drawn = picture.picture()  # type: ignore[attr-defined]
-    u, v = (RIG[1].project(centre(np.array([START / RATE])))[0] + 0.5) * WIDTH / SIZE[0] - 0.5
-    assert drawn[round(v), round(u + 3)].min() > 150
+    sheet = sheet_of(replace(made(), balls=()), 1)
     sheet.write(tmp_path / "sheet.png")
-    assert cv2.imread(str(tmp_path / "sheet.png")) is not None
+    drawn = cv2.imread(str(tmp_path / "sheet.png"))
+    assert drawn is not None
+    assert (drawn.min(axis=2) > 200)[60:-20, 330:].sum() > 100  # white rings of candidates of score 1
