@@ -29,24 +29,17 @@ _SYNONYMS = {
 }
 
 
-MAX_SHOWN = 80
-"""Largest number of characters of a value in a message."""
-LARGEST = 1e100
-"""Largest size of a measured number, in any unit: squares of much larger ones overflow."""
-MAX_SAID = 160
-"""Largest number of characters of a library's own words in a message."""
-MAX_LISTED = 12
-"""Largest number of names of a list in a message."""
+MAX_SHOWN = 80  # Largest number of characters of a value in a message
+LARGEST = 1e100  # Largest size of a measured number, in any unit: squares of much larger ones overflow
+MAX_SAID = 160  # Largest number of characters of a library's own words in a message
+MAX_LISTED = 12  # Largest number of names of a list in a message
 MAX_NAME = 200
 """Largest number of characters of a name of a track, dataset, camera, label or group, which go to files and pages."""
-MAX_TEXT = 2000
-"""Largest number of characters of other text in a file, such as the source of data."""
+MAX_TEXT = 2000  # Largest number of characters of other text in a file, such as the source of data
 MAX_PATH, MAX_PART = 4095, 255
 """Largest numbers of characters of a path and of a name in it: no file system has longer ones."""
-_JOINERS = "\u200c\u200d"
-"""Invisible letters in Persian, Indian scripts and emoji."""
-_MAX_COMPARED = 200
-"""Largest number of candidates for a misspelt name; each takes some 20 microseconds."""
+_JOINERS = "\u200c\u200d"  # Invisible letters in Persian, Indian scripts and emoji
+_MAX_COMPARED = 200  # Largest number of candidates for a misspelt name; each takes some 20 microseconds
 
 
 def type_name(value: object) -> str:

@@ -3,8 +3,7 @@
 import gc
 from typing import Final
 
-MADE: Final = 50_000
-"""Growth in the number of objects before Python collects the new ones; its default is 700."""
+MADE: Final = 50_000  # Growth in the number of objects before Python collects the new ones; its default is 700
 
 
 def collect_rarely() -> None:

@@ -13,8 +13,7 @@ DATE: Final = "SOURCE_DATE_EPOCH"
 """Environment variable with a date in seconds since 1970 that replaces the present one, so that a page can be
 reproduced byte for byte (reproducible-builds.org)."""
 
-MOST_JOBS: Final = 10_000
-"""Largest number of processes; no machine has more cores."""
+MOST_JOBS: Final = 10_000  # Largest number of processes; no machine has more cores
 
 
 def usable_cores() -> int:

@@ -25,11 +25,9 @@ PACKAGE = "ballfg"
 class Source:
     """The package that a registered class comes from."""
 
-    package: str
-    """Name of the installed package; the name of the module without one."""
+    package: str  # Name of the installed package; the name of the module without one
 
-    version: str | None
-    """None without an installed package."""
+    version: str | None  # None without an installed package
 
     def __str__(self) -> str:
         return self.package if self.version is None else f"{self.package} {self.version}"

@@ -8,14 +8,11 @@ from ballfg.benchmarks.results import CURVE_MARK, Row
 
 RIGHT: Final = {"nees": 9.0, "nees_velocity": 3.0, "nis_median": 2.37, "nis_mean": 3.0}
 """Value of a metric where stated covariances are right: degrees of freedom; of `nis_median` chi-square's median."""
-GIVEN_SPIN: Final = ("paper",)
-"""Cases in which every method is given the true spin, which then has no error."""
-GIVEN: Final = "given"
-"""Replaces the error of given quantities in a table."""
+GIVEN_SPIN: Final = ("paper",)  # Cases in which every method is given the true spin, which then has no error
+GIVEN: Final = "given"  # Replaces the error of given quantities in a table
 NEES_PLACE: Final = re.compile(r"nees_\w+")
 COVERAGE: Final = re.compile(r"(?:conformal_)?coverage_(\d+)(?:_\w+)?")
-NONE_WANTED: Final = ("not_converged", "failed", "places_outside_99")
-"""Counts whose target is zero."""
+NONE_WANTED: Final = ("not_converged", "failed", "places_outside_99")  # Counts whose target is zero
 OF_CASE: Final = {
     "naming, spin labels": "1",
     "naming, no spin labels": "1",
@@ -26,12 +23,10 @@ OF_CASE: Final = {
     "planted in measured sets": "1",
 }
 """Target values of all shares and ratios of a table of `ballfg-bench loop` or `planted`."""
-JUDGED: Final = ("nees", "coverage_90", "nis_median")
-"""Metrics of the consistency of covariances, the sharpest first."""
+JUDGED: Final = ("nees", "coverage_90", "nis_median")  # Metrics of the consistency of covariances, the sharpest first
 NEAR, NEAR_SHARE = 0.1, 0.03
 """A NEES within 10 % of its target, and a coverage within three points of it, count as right."""
-ALIKE: Final = 1.01
-"""Ratio of errors up to which methods count as equally good."""
+ALIKE: Final = 1.01  # Ratio of errors up to which methods count as equally good
 COMPARED: Final = {
     "velocity_rmse": "velocity",
     "position_rmse": "position",

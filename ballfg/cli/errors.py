@@ -9,22 +9,17 @@ import typer
 
 from ballfg.interrupts import interrupted, say_so
 
-BAD_INPUT = 2
-"""Exit status for input that cannot be used."""
-NOT_ESTIMATED = 3
-"""Exit status if everything was written, but some tracks could not be estimated."""
-INTERRUPTED = 130
-"""Exit status after Ctrl-C, as in shells."""
+BAD_INPUT = 2  # Exit status for input that cannot be used
+NOT_ESTIMATED = 3  # Exit status if everything was written, but some tracks could not be estimated
+INTERRUPTED = 130  # Exit status after Ctrl-C, as in shells
 
-_LONGEST: Final = 2000
-"""Largest number of characters of a message; a file of one endless line would fill the terminal."""
+_LONGEST: Final = 2000  # Largest number of characters of a message; a file of one endless line would fill the terminal
 _NAME: Final = 200
 """Largest number of characters of a name that is not text; Linux limits names in a folder to 255 bytes."""
 USER_ERRORS = (ValueError, TypeError, OSError, MemoryError)
 """Errors that a user can mend: input, paths, a full disk, too little memory. All others are faults of the program and
 keep their traceback."""
-NO_MEMORY: Final = "can't allocate memory"
-"""torch's message in place of a MemoryError."""
+NO_MEMORY: Final = "can't allocate memory"  # torch's message in place of a MemoryError
 
 
 def guarded(command: Callable[[], object]) -> int:

@@ -27,10 +27,8 @@ if TYPE_CHECKING:
     from ballfg.tracks import Dataset
 
 
-MOST_FAILURES = 10
-"""Number of failed tracks that are named; further ones are counted."""
-MOST_DOUBTS = 3
-"""Number of tracks whose doubts are printed; further ones are counted."""
+MOST_FAILURES = 10  # Number of failed tracks that are named; further ones are counted
+MOST_DOUBTS = 3  # Number of tracks whose doubts are printed; further ones are counted
 
 
 def check_dataset(folder: Path) -> Path:
@@ -124,15 +122,13 @@ class Inputs(Generic[D]):
     dataset: D
     model: BallModel
     surfaces: Surfaces
-    observed: float
-    """s from the start of each track that a noise estimate may use."""
+    observed: float  # s from the start of each track that a noise estimate may use
 
     def estimator(self, method: str, solver: Solver | None = None, group: str | None = None) -> Estimator:
         """The estimator of a name, with the noise of the dataset.
 
         Args:
-            method: its name.
-            solver: of its factor graph; None: the usual one.
+            method: its name.  solver: of its factor graph; None: the usual one.
             group: of tracks whose labels name none; None: unknown.
         Raises: ValueError: if there is no such estimator or group, or the solver cannot solve it.
         """
@@ -242,10 +238,7 @@ def open_model(data: Dataset | SightedDataset, model: Path | None, ball: str | N
 
 
 def check_out(out: Path, dataset: Path) -> None:
-    """Refuses a result in the place of the measurements.
-
-    Raises: ValueError: if `out` is a table of the dataset.
-    """
+    """Refuses a result in the place of the measurements. Raises: ValueError: if `out` is a table of the dataset."""
     if out.stem in DATASET_TABLES and out.resolve().parent == dataset.resolve():
         raise ValueError(f"out must not be a table of the dataset itself; got {out}. Choose another name.")
 

@@ -18,10 +18,7 @@ KINDS = ("state", "newcomer", "lost", "refused", "continued")
 
 
 def answer(update: BallUpdate, outlook: Outlook | None, tag: tuple[tuple[str, Any], ...]) -> Fields:
-    """The fields of a line.
-
-    Args: outlook: None for a line without state.  tag: further fields, from the input.
-    """
+    """The fields of a line. Args: outlook: None for a line without state. tag: further fields, from the input."""
     fields: Fields = {"kind": update.kind}
     if update.ball is not None:
         fields["ball"] = update.ball

@@ -16,12 +16,9 @@ from ballfg.live.gate import Known
 
 PARTS = 4
 """Number of copies of the estimator within a lag: a late sample costs the pushes of the lag and of a quarter of it."""
-LEAST_APART = 8
-"""Least number of samples between two copies: a copy costs some 0.7 ms."""
-LOOK_BACK = 24
-"""Number of last samples in which an event may still be found or moved."""
-SAME_EVENT = 0.03
-"""s. Two events of a kind that lie closer are the same."""
+LEAST_APART = 8  # Least number of samples between two copies: a copy costs some 0.7 ms
+LOOK_BACK = 24  # Number of last samples in which an event may still be found or moved
+SAME_EVENT = 0.03  # s. Two events of a kind that lie closer are the same.
 
 
 @dataclass(frozen=True, order=True)
@@ -29,9 +26,7 @@ class Kept:
     """A sample of a ball.
 
     Attributes:
-        time: s.
-        position: (3,) m.
-        sigma: (3,) m, or None.
+        time: s.  position: (3,) m.  sigma: (3,) m, or None.
         by_hit: True if the sample was taken as one after a hit: it was off the ball's path.
     """
 
@@ -179,7 +174,6 @@ class Ball:
 
 
 def _events(motion: Motion, before: Motion, start: float, end: float) -> Sequence[BallEvent]:
-    """Events between two samples."""
     if not motion.linked:
         return [BallEvent("gap", end)]
     found = [BallEvent("bounce", start + t, h) for t, h in zip(motion.times, motion.heights, strict=True)]

@@ -4,19 +4,13 @@ import math
 
 import numpy as np
 
-SHORTEST = 1e-3
-"""ms, the end of the first bin."""
-STEPS = 200
-"""Bins per factor of ten: a percentile is right to 1.2 %."""
-DECADES = 9
-"""Number of factors of ten, from a microsecond to a thousand seconds."""
+SHORTEST = 1e-3  # ms, the end of the first bin
+STEPS = 200  # Bins per factor of ten: a percentile is right to 1.2 %
+DECADES = 9  # Number of factors of ten, from a microsecond to a thousand seconds
 
 
 class Latencies:
-    """A histogram of latencies.
-
-    Attributes: count: number of latencies.  worst: ms.
-    """
+    """A histogram of latencies. Attributes: count: number of latencies. worst: ms."""
 
     def __init__(self) -> None:
         self.count = 0

@@ -8,12 +8,9 @@ from ballfg.arrays import Array
 from ballfg.live.ball import Kept
 from ballfg.live.gate import Gate, Known
 
-PATIENCE = 0.2
-"""s. A newcomer unseen for longer is forgotten."""
-SPEED = 12.0
-"""m/s per axis, spread of the velocity of a ball with one position."""
-BEND = 12.0
-"""m/s^2, deviation of a path from a line through two positions."""
+PATIENCE = 0.2  # s. A newcomer unseen for longer is forgotten.
+SPEED = 12.0  # m/s per axis, spread of the velocity of a ball with one position
+BEND = 12.0  # m/s^2, deviation of a path from a line through two positions
 
 
 class Newcomer:

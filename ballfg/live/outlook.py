@@ -17,8 +17,7 @@ from ballfg.prediction.crossing import Crossing
 from ballfg.prediction.forecast import carried_by
 from ballfg.state import VELOCITY
 
-VAGUE = 3.0
-"""m/s, standard deviation of the velocity beyond which predictions carry no information."""
+VAGUE = 3.0  # m/s, standard deviation of the velocity beyond which predictions carry no information
 AXES = ("x", "y", "z")
 
 
@@ -38,10 +37,7 @@ class Outlook:
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane across one axis.
-
-    Attributes: axis: x, y or z.  place: m.
-    """
+    """A plane across one axis. Attributes: axis: x, y or z. place: m."""
 
     axis: str
     place: float

@@ -27,8 +27,7 @@ class Wanted:
     """The predictions for every state.
 
     Attributes:
-        horizon: s, range of the search for events.
-        plane: whose crossing is predicted; None without one.
+        horizon: s, range of the search for events.  plane: whose crossing is predicted; None without one.
         patience: s. A live line that waited longer gets no prediction if another one waits, so that states catch up.
     """
 
@@ -74,7 +73,6 @@ class Session:
             self._tell(update, now)
 
     def _take(self, group: Sequence[Arrival]) -> None:
-        """The arrivals of one stamp."""
         if group[0].sample is None:
             self.malformed += 1
             self._write(encoded(refusal(group[0].problem), 1e3 * (perf_counter() - group[0].read)))
@@ -96,7 +94,6 @@ class Session:
             self._tell(update, arrival.read, arrival)
 
     def _tell(self, update: BallUpdate, read: float, arrival: Arrival | None = None) -> None:
-        """Writes the line of one update."""
         outlook = None
         if update.kind == "state" and update.state is not None:
             waited = perf_counter() - read

@@ -19,16 +19,12 @@ from ballfg.live.newcomer import Newcomer
 from ballfg.tracks import Ball as BallKind
 from ballfg.tracks.stamps import StreamOrigin
 
-GAP = 0.5
-"""s. A ball unseen for longer is lost; the estimator links nothing over longer gaps either."""
-CONFIRM = 3
-"""Number of consistent samples that make a ball: the least that allow a check of the velocity."""
-MOST_BALLS = 16
-"""Largest number of balls at once."""
+GAP = 0.5  # s. A ball unseen for longer is lost; the estimator links nothing over longer gaps either.
+CONFIRM = 3  # Number of consistent samples that make a ball: the least that allow a check of the velocity
+MOST_BALLS = 16  # Largest number of balls at once
 MOST_NEWCOMERS = 32
 """Largest number of possible balls. The oldest are dropped first, so that clutter costs a bounded time."""
-FARTHEST = 1000.0
-"""m, of a coordinate. A larger one is in another unit."""
+FARTHEST = 1000.0  # m, of a coordinate. A larger one is in another unit.
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,8 +158,7 @@ class Tracker:
         Positions of one stamp belong to different balls. They may come in one call or in several.
 
         Args:
-            time: s, on the sender's clock.
-            positions: (3,) or (n, 3) m.
+            time: s, on the sender's clock.  positions: (3,) or (n, 3) m.
             sigmas: (3,) or (n, 3) m, their standard deviations; None: the settings'.
         Returns: balls that were lost until then, and one update per position, in their order. An unusable position is
             refused: a sender's errors raise nothing.
@@ -198,7 +193,6 @@ class Tracker:
         return replace(state, time=self._stamp(state.time))
 
     def _dated(self, update: BallUpdate) -> BallUpdate:
-        """An update on the sender's clock."""
         return replace(
             update,
             time=self._stamp(update.time),
@@ -236,7 +230,6 @@ class Tracker:
             frame.updates[k] = BallUpdate("refused", frame.time, position=point, reason=reason)
 
     def _turn_clock(self, frame: _Frame) -> list[BallUpdate]:
-        """Classifies the stamp and drops outdated balls."""
         stamp = self._clock.tell(frame.time)
         gone: list[BallUpdate] = []
         if stamp is Stamp.OLD:
@@ -322,7 +315,6 @@ class Tracker:
         frame.updates[k] = BallUpdate("refused", frame.time, position=frame.positions[k], reason=reason)
 
     def _taken(self, ball: Ball, frame: _Frame, k: int, kept: Kept) -> BallUpdate:
-        """A ball's update with a sample; after a failure the ball restarts with it."""
         reason, displaced = "", ball.at(kept.time)
         try:
             state = ball.take(kept)
@@ -341,7 +333,6 @@ class Tracker:
         )
 
     def _to_newcomers(self, frame: _Frame) -> None:
-        """Assigns open positions to the newcomers that they fit; those with enough samples become balls."""
         rows, t = frame.open, frame.time
         newcomers = [newcomer for newcomer in self._newcomers if not newcomer.has(t)]
         costs = np.full((len(rows), len(newcomers)), FAR)
@@ -374,7 +365,6 @@ class Tracker:
         return update
 
     def _begin_newcomers(self, frame: _Frame) -> None:
-        """Begins a newcomer for each remaining position."""
         for k in frame.open:
             newcomer = Newcomer(Kept(frame.time, frame.positions[k], frame.sigmas[k]), self.gate)
             self._newcomers.append(newcomer)

@@ -9,12 +9,10 @@ import numpy as np
 from ballfg.arrays import Array, Index
 from ballfg.pages.shot import SAME_STAMP, ShownShot
 
-LEVEL = 0.9
-"""Nominal coverage of an interval."""
+LEVEL = 0.9  # Nominal coverage of an interval
 HALF_WIDTH = NormalDist().inv_cdf((1.0 + LEVEL) / 2.0)
 """Standard deviations on either side of a prediction for that coverage."""
-BIN = 0.05
-"""s, width of the bins of the horizon."""
+BIN = 0.05  # s, width of the bins of the horizon
 
 
 @dataclass(frozen=True)

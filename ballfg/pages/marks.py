@@ -15,8 +15,7 @@ LARGEST_ACCELERATION = 150.0
 """m/s^2. Air and gravity change a velocity less than this: drag of a table-tennis ball at 25 m/s is 80 m/s^2."""
 SUDDEN = 1.5
 """m/s. A smaller jump is not taken for a hit: velocities err, and bounces change them at the edge of a step."""
-GAP = 0.1
-"""s. During a longer step the motion is unknown: the ball may have bounced several times."""
+GAP = 0.1  # s. During a longer step the motion is unknown: the ball may have bounced several times.
 
 
 @dataclass(frozen=True)
@@ -34,10 +33,7 @@ def marks(times: Array, states: Array, surfaces: Sequence[float], radius: float)
     A contact is a turn of the vertical velocity from down to up near a surface, a hit is a jump of the velocity beyond
     air, gravity or a contact. Steps of more than `GAP` have none.
 
-    Args:
-        times: (m,) s.  states: (m, 9).
-        surfaces: m, heights of table and floor.
-        radius: m, of the ball.
+    Args: times: (m,) s.  states: (m, 9).  surfaces: m, heights of table and floor.  radius: m, of the ball.
     """
     for i, step in enumerate(np.diff(times)):
         if step > GAP:

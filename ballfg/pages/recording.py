@@ -9,12 +9,9 @@ from ballfg.pages.outline import Outline
 from ballfg.pages.shot import ShownShot
 from ballfg.pages.shown import Shown
 
-RADIUS = 0.02
-"""m, of the moving ball, as large as a table-tennis ball."""
-SPIN_LENGTH = 0.001
-"""m of an arrow for each rad/s of spin."""
-FLAT = 0.005
-"""m, half the thickness of the drawn table."""
+RADIUS = 0.02  # m, of the moving ball, as large as a table-tennis ball
+SPIN_LENGTH = 0.001  # m of an arrow for each rad/s of spin
+FLAT = 0.005  # m, half the thickness of the drawn table
 
 
 def record(shown: Shown, path: Path) -> None:

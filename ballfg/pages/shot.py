@@ -13,16 +13,10 @@ class ShownShot:
     """The contents of one track's drawing; arrays without rows stand for missing ones.
 
     Attributes:
-        name: of the track.
-        times: (n,) s, stamps of the samples.
-        positions: (n, 3) m, as measured.
-        noise: (n, 3) m, standard deviation of each measured coordinate; NaN if unknown.
-        state_times: (m,) s.
-        states: (m, 9) position m, velocity m/s, spin rad/s.
-        state_sigmas: (m, 9) in the same units.
-        predicted_times: (k,) s.
-        predicted: (k, 3) m.
-        predicted_sigmas: (k, 3) m, of a measured position.
+        name: of the track.  times: (n,) s, stamps of the samples.  positions: (n, 3) m, as measured.
+        noise: (n, 3) m, standard deviation of each measured coordinate; NaN if unknown.  state_times: (m,) s.
+        states: (m, 9) position m, velocity m/s, spin rad/s.  state_sigmas: (m, 9) in the same units.
+        predicted_times: (k,) s.  predicted: (k, 3) m.  predicted_sigmas: (k, 3) m, of a measured position.
         marks: contacts and hits in the states.
     """
 
@@ -67,5 +61,4 @@ def _at(times: Array, known: Array, values: Array) -> Array:
     return found
 
 
-SAME_STAMP = 1e-9
-"""s. Tables keep all digits of a stamp, so that those of one sample agree far better."""
+SAME_STAMP = 1e-9  # s. Tables keep all digits of a stamp, so that those of one sample agree far better.

@@ -17,19 +17,14 @@ from ballfg.state import POSITION, SPIN, VELOCITY
 
 LENGTH_DECIMALS, TIME_DECIMALS, VELOCITY_DECIMALS, SPIN_DECIMALS = 5, 5, 3, 1
 """Digits after the point of m, s, m/s and rad/s in the page: 10 um is far below what trackers resolve."""
-SIGMA_DECIMALS = 6
-"""Digits of standard deviations in m: those of a state may be a tenth of a mm."""
+SIGMA_DECIMALS = 6  # Digits of standard deviations in m: those of a state may be a tenth of a mm
 LARGEST = 8.0
 """Standard deviations beyond which a residual is drawn at the edge, so that an outlier does not hide the others."""
-CANDIDATES = 10
-"""Number of effects of a diagnosis in the drawing, those that explain most."""
+CANDIDATES = 10  # Number of effects of a diagnosis in the drawing, those that explain most
 
 
 def show_page(shown: Shown) -> str:
-    """The whole page, self-contained.
-
-    Args: shown: result of `collect`.
-    """
+    """The whole page, self-contained. Args: shown: result of `collect`."""
     name = _name(shown)
     header = tag("header", tag("p", name), tag("h1", _sentence(shown)), items(shown.notes))
     parts = [_flight(shown), _measured_and_predicted(shown), _residuals(shown), _coverage(shown), _diagnosis(shown)]
@@ -54,7 +49,6 @@ def _name(shown: Shown) -> str:
 
 
 def _sentence(shown: Shown) -> str:
-    """A sentence on the content of the page."""
     given, count = shown.given, len(shown.shots)
     if not count:
         return "The diagnosis of a model."

@@ -18,8 +18,7 @@ from ballfg.benchmarks.resumable import in_processes
 from ballfg.progress import progress
 from ballfg.simulation.scene.config import Clock
 
-LATE: Final = {"right": 0.004}
-"""s, delay of the stamps in recordings with a late clock."""
+LATE: Final = {"right": 0.004}  # s, delay of the stamps in recordings with a late clock
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,8 @@ import numpy as np
 from ballfg.benchmarks.cameras.scenes import Filmed
 from ballfg.vision import Camera, associate, check_agreement
 
-TURN: Final = 0.5
-"""Degrees."""
-AXES: Final = {"right": 0, "down": 1, "forward": 2}
-"""Axes of a camera's frame that it is turned about."""
+TURN: Final = 0.5  # Degrees
+AXES: Final = {"right": 0, "down": 1, "forward": 2}  # Axes of a camera's frame that it is turned about
 
 
 @dataclass(frozen=True)
@@ -21,8 +19,7 @@ class Turn:
     """One camera turned about one axis.
 
     Attributes:
-        camera, axis: the turned camera and its axis.
-        named: the camera that the check names, None for none.
+        camera, axis: the turned camera and its axis.  named: the camera that the check names, None for none.
         found: degrees by which the check finds the camera turned; NaN where it finds nothing.
     """
 

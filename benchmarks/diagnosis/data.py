@@ -58,7 +58,6 @@ def actual_model(case: Case) -> AnalyticModel:
 
 
 def _simulation(case: Case, session: int) -> SimulationConfig:
-    """One session; the tracks are shared out evenly."""
     taken = case.recording
     return SimulationConfig(
         tracks=taken.tracks // len(case.sessions),

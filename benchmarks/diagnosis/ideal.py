@@ -9,13 +9,12 @@ weight is one.
 Source: D. R. Cox and D. V. Hinkley, Theoretical Statistics, 1974, section 9.3.
 """
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import TypeAdapter
 from scipy import optimize, stats
 
 from ballfg.arrays import Array
@@ -23,7 +22,7 @@ from ballfg.benchmarks.diagnosis.cases import Case, Recording, planted_case
 from ballfg.benchmarks.diagnosis.data import declared_model, make_dataset
 from ballfg.benchmarks.diagnosis.effects import PLANTS
 from ballfg.benchmarks.diagnosis.record import case_digest
-from ballfg.benchmarks.resumable import read_record, write_record
+from ballfg.benchmarks.resumable import Kept
 from ballfg.diagnosis.fit.fit import fit_model
 from ballfg.diagnosis.fit.holdout import launcher_labels
 from ballfg.diagnosis.fit.problem import Fit
@@ -32,23 +31,19 @@ from ballfg.diagnosis.hypotheses.signatures import hypothesis_signatures, visibl
 from ballfg.diagnosis.search.candidates import ALARM
 from ballfg.estimation import Smoother, dataset_settings, dataset_surfaces
 
-LEVEL = ALARM
-"""False-alarm rate of the score tests of one round of the loop."""
-POWER = 0.9
-"""Probability at which an effect counts as detectable."""
+LEVEL = ALARM  # False-alarm rate of the score tests of one round of the loop
+POWER = 0.9  # Probability at which an effect counts as detectable
 
 
 @dataclass(frozen=True)
-class Ideal:
+class Ideal(Kept):
     """The ideal test of an effect.
 
     Attributes:
-        digest: of the case that it was computed from.
-        rank: degrees of freedom; 0 where the data do not show the effect.
-        information: non-centrality at size 1.
+        rank: degrees of freedom; 0 where the data do not show the effect.  information: non-centrality at size 1.
     """
 
-    digest: str
+    what = "an ideal test"
     rank: int
     information: float
 
@@ -63,10 +58,6 @@ class Ideal:
         """(...) probability that an effect of some sizes (...) is found."""
         noncentrality = self.information * np.asarray(sizes, dtype=np.float64) ** 2
         return np.asarray(power(noncentrality, self.rank)) if self.rank else np.zeros_like(noncentrality)
-
-    def save(self, path: Path) -> None:
-        """Write the file whole or not at all."""
-        write_record(path, asdict(self))
 
 
 def power(noncentrality: ArrayLike, rank: int) -> Array:
@@ -103,11 +94,3 @@ def ideal_of(case: Case) -> Ideal:
     efficient, direction = found.efficient(), plant.direction()
     rank = visible_directions(efficient.total, efficient.raw).shape[1]
     return Ideal(case_digest(case), rank, float(direction @ efficient.total @ direction))
-
-
-def read_ideal(path: Path, digest: str) -> Ideal | None:
-    """The ideal test in a file; None if there is no file, or one of another case.
-
-    Raises: ValueError: if the file holds something else.
-    """
-    return read_record(path, digest, TypeAdapter(Ideal).validate_python, "an ideal test")

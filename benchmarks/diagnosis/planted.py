@@ -28,22 +28,15 @@ from ballfg.dynamics import EFFECTS, Coefficient
 from ballfg.estimation.noise.tracker_errors import JITTER, MEMORY
 from ballfg.tracks import read_dataset
 
-SETS = ("aimy", "ballgun", "robot_rallies", "spindoe")
-"""Folders that are changed if no other ones are given."""
+SETS = ("aimy", "ballgun", "robot_rallies", "spindoe")  # Folders that are changed if no other ones are given
 PART, TITLE, ALL = "planted", "planted in measured sets", "all"
-QUICK_TRACKS = 12
-"""Number of tracks of each set in a quick look."""
-QUICK_CHANGES = ("frame_tilt", "stamp_jitter", "wind")
-"""One each of frame, noise and flight."""
-RANDOM = (JITTER, MEMORY)
-"""Standard deviations: they add in squares to what the set had before."""
-SIGMAS = 3.0
-"""Distance from the planted change up to which a strength counts as found."""
-DRIFT = "_drift"
-"""Ending of the name of an effect that changes along the recording."""
+QUICK_TRACKS = 12  # Number of tracks of each set in a quick look
+QUICK_CHANGES = ("frame_tilt", "stamp_jitter", "wind")  # One each of frame, noise and flight
+RANDOM = (JITTER, MEMORY)  # Standard deviations: they add in squares to what the set had before
+SIGMAS = 3.0  # Distance from the planted change up to which a strength counts as found
+DRIFT = "_drift"  # Ending of the name of an effect that changes along the recording
 
-Strength = tuple[float, float]
-"""Value and standard deviation."""
+Strength = tuple[float, float]  # Value and standard deviation
 
 
 @dataclass(frozen=True)

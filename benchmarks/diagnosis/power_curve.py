@@ -9,8 +9,7 @@ from scipy import optimize, special
 
 from ballfg.arrays import Array
 
-NAMED = 0.9
-"""Share of seeds from which on an effect of some size counts as named."""
+NAMED = 0.9  # Share of seeds from which on an effect of some size counts as named
 SLOPE_PRIOR = 10.0
 """Standard deviation of the curve's slope about zero, in logits per unit of the size's logarithm. It makes the fit
 exist where outcomes part cleanly; a curve of that slope goes from 10 to 90 % within a factor of 1.6."""

@@ -3,19 +3,14 @@
 import hashlib
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from importlib import metadata
-from pathlib import Path
-
-from pydantic import TypeAdapter
 
 from ballfg.benchmarks.diagnosis.cases import Case
-from ballfg.benchmarks.resumable import read_record as read_any
-from ballfg.benchmarks.resumable import write_record
-from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Finding, Value
+from ballfg.benchmarks.resumable import Kept
+from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Value
 
-RANKED = 8
-"""Leading candidates of a round that are kept, beside those planted."""
+RANKED = 8  # Leading candidates of a round that are kept, beside those planted
 
 
 @dataclass(frozen=True)
@@ -42,24 +37,20 @@ class Ranked:
 
 
 @dataclass(frozen=True)
-class Record:
+class Record(Kept):
     """A finished case.
 
     Attributes:
-        digest: of the case: a record of another one does not count.
         verdict: as in the report.
-        found: findings in order.
-        rounds: leading candidates of each round, best first, and those planted.
+        found: findings in order.  rounds: leading candidates of each round, best first, and those planted.
         errors: mm, prediction error on the judging half: `before`, `after`, of the true model `true`, and where there
             is a fallback, with it (`fallback`, the one after) and with named effects only (`named`).
         patterns: p-values of the tests for remaining patterns, by their place.
         tracks, judged: numbers of tracks in the dataset and on the judging half.
-        seconds: of the diagnosis, wall clock.
-        strengths: of the change that measured tracks underwent, by coefficient.
+        seconds: of the diagnosis, wall clock.  strengths: of the change that measured tracks underwent, by coefficient.
         probabilities: stated, that an effect is there, by its name.
     """
 
-    digest: str
     verdict: str
     found: tuple[Found, ...]
     rounds: tuple[tuple[Ranked, ...], ...]
@@ -70,18 +61,6 @@ class Record:
     seconds: float
     strengths: Mapping[str, float] = field(default_factory=dict)
     probabilities: Mapping[str, float] = field(default_factory=dict)
-
-    def save(self, path: Path) -> None:
-        """Write the file whole or not at all."""
-        write_record(path, asdict(self))
-
-
-def read_record(path: Path, digest: str) -> Record | None:
-    """The record in a file; None if there is no file, or one of another case.
-
-    Raises: ValueError: if the file is no record.
-    """
-    return read_any(path, digest, TypeAdapter(Record).validate_python, "a finished case")
 
 
 def record_of(case: Case, digest: str, diagnosis: Diagnosis, true: Errors | None, seconds: float) -> Record:
@@ -95,7 +74,10 @@ def record_of(case: Case, digest: str, diagnosis: Diagnosis, true: Errors | None
     return Record(
         digest=digest,
         verdict=diagnosis.verdict.value,
-        found=tuple(_found(finding) for finding in diagnosis.findings),
+        found=tuple(
+            Found(f.name, tuple(f.indistinguishable_from), float(f.p_value), float(f.delta_bic), _values(f.parameters))
+            for f in diagnosis.findings
+        ),
         rounds=tuple(_leading(listed, case.planted) for listed in diagnosis.rounds),
         errors={name: float(one.prediction_rmse_mm) for name, one in errors.items()},
         patterns={test.where: float(test.p_value) for test in left.tests},
@@ -104,12 +86,6 @@ def record_of(case: Case, digest: str, diagnosis: Diagnosis, true: Errors | None
         seconds=seconds,
         probabilities=dict(diagnosis.probabilities),
     )
-
-
-def _found(finding: Finding) -> Found:
-    alike = tuple(finding.indistinguishable_from)
-    values = _values(finding.parameters)
-    return Found(finding.name, alike, float(finding.p_value), float(finding.delta_bic), values)
 
 
 def _values(values: Mapping[str, Value]) -> dict[str, tuple[float, float | None]]:

@@ -14,10 +14,8 @@ from ballfg.benchmarks.results import Results
 from ballfg.diagnosis.result import Verdict
 
 ALL = "all"
-HIDDEN = "all that hide"
-"""Rows over the effects that have equals; `ALL` is over the others."""
-FAILED = "failed"
-"""Metric of the number of cases of a part that ended in an error; they count as wrong."""
+HIDDEN = "all that hide"  # Rows over the effects that have equals; `ALL` is over the others
+FAILED = "failed"  # Metric of the number of cases of a part that ended in an error; they count as wrong
 TITLES = {
     "naming": "naming, spin labels",
     "no_labels": "naming, no spin labels",
@@ -31,8 +29,7 @@ TITLES = {
 """The name in `results.json` of each part's rows."""
 LARGEST_IDEAL = 2.0
 """Largest multiple of its typical size that the ideal test may need for a search at an effect's limit."""
-FEW_TRACKS = 25
-"""Null datasets of so many tracks are also counted apart."""
+FEW_TRACKS = 25  # Null datasets of so many tracks are also counted apart
 
 Records = Mapping[str, Record]
 

@@ -6,15 +6,18 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TypeVar
 
 from ballfg.benchmarks.diagnosis.cases import Case
 from ballfg.benchmarks.diagnosis.data import declared_model, make_dataset, measured_dataset
-from ballfg.benchmarks.diagnosis.ideal import Ideal, ideal_case, ideal_of, read_ideal
-from ballfg.benchmarks.diagnosis.record import Record, case_digest, read_record, record_of
+from ballfg.benchmarks.diagnosis.ideal import Ideal, ideal_case, ideal_of
+from ballfg.benchmarks.diagnosis.record import Record, case_digest, record_of
 from ballfg.benchmarks.diagnosis.true_model import true_errors
-from ballfg.benchmarks.resumable import collect
+from ballfg.benchmarks.resumable import Kept, collect
 from ballfg.diagnosis import diagnose
 from ballfg.diagnosis.result import Diagnosis
+
+K = TypeVar("K", bound=Kept)
 
 
 def run_case(case: Case, diagnose: Callable[..., Diagnosis] = diagnose) -> Record:
@@ -42,35 +45,38 @@ def collect_records(
     A case whose diagnosis raises has no record: stderr reports it, it counts as failed, and the next run repeats it.
     """
 
-    def path(case: Case) -> Path:
-        return folder / f"{case.name}.json"
-
-    def finish(case: Case) -> Record | None:
+    def tried(case: Case) -> Record | None:
         try:
-            record = run(case)
+            return run(case)
         except Exception as error:  # counted as a failure of the diagnosis: one bad case must not end a long run
             print(f"{case.name}: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
             return None
-        record.save(path(case))
-        return record
 
-    found = collect(cases, lambda case: read_record(path(case), case_digest(case)), finish, jobs, "diagnoses finished")
-    return {case.name: record for case, record in zip(cases, found, strict=True) if record is not None}
+    found = _collect(Record, {case.name: case for case in cases}, tried, folder, jobs, "diagnoses finished")
+    return {name: record for name, record in found.items() if record is not None}
 
 
 def collect_ideals(
     names: Iterable[str], seed: int, folder: Path, jobs: int, compute: Callable[[Case], Ideal] = ideal_of
 ) -> dict[str, Ideal]:
     """The ideal tests of effects by name: read where they are there, else computed and kept."""
-    cases = [ideal_case(name, seed) for name in names]
+    cases = {f"ideal-{name}": ideal_case(name, seed) for name in names}
+    found = _collect(Ideal, cases, compute, folder, jobs, "ideal tests finished")
+    return {cases[name].subject: ideal for name, ideal in found.items() if ideal is not None}
 
-    def path(case: Case) -> Path:
-        return folder / f"ideal-{case.subject}.json"
 
-    def finish(case: Case) -> Ideal:
-        ideal = compute(case)
-        ideal.save(path(case))
-        return ideal
+def _collect(
+    kind: type[K], cases: Mapping[str, Case], make: Callable[[Case], K | None], folder: Path, jobs: int, what: str
+) -> dict[str, K | None]:
+    """Kept parts by the names of their files without the ending."""
 
-    found = collect(cases, lambda case: read_ideal(path(case), case_digest(case)), finish, jobs, "ideal tests finished")
-    return {case.subject: ideal for case, ideal in zip(cases, found, strict=True) if ideal is not None}
+    def finish(name: str) -> K | None:
+        made = make(cases[name])
+        if made is not None:
+            made.save(folder / f"{name}.json")
+        return made
+
+    def read(name: str) -> K | None:
+        return kind.read(folder / f"{name}.json", case_digest(cases[name]))
+
+    return dict(zip(cases, collect(list(cases), read, finish, jobs, what), strict=True))

@@ -8,8 +8,7 @@ from ballfg.benchmarks.diagnosis.record import Found, Record
 from ballfg.diagnosis.hypotheses.hypothesis import TWINS
 from ballfg.diagnosis.result import Outcome, Verdict
 
-LARGEST_GROUP = 3
-"""Effects that a diagnosis may name together and still be right."""
+LARGEST_GROUP = 3  # Effects that a diagnosis may name together and still be right
 
 
 def named(record: Record, planted: Iterable[str]) -> bool:

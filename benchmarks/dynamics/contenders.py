@@ -19,8 +19,7 @@ from ballfg.prediction import Belief, Propagator
 from ballfg.state import POSITION
 from ballfg.tracks import Track
 
-BLOCK: Final = 64
-"""Tracks that are rolled out together."""
+BLOCK: Final = 64  # Tracks that are rolled out together
 NO_NOISE: Final = ProcessNoise(acceleration=0.005, spin=0.05, contact_velocity=0.001, contact_spin=0.2)
 """For the truth, which has no process noise: a fiftieth of what models start from, as little as stays well conditioned;
 a fifth of it changes the errors by less than 1 %."""
@@ -32,8 +31,7 @@ class Job:
 
     Attributes:
         tasks: what it learns from, all of it together, and is judged by, each by itself.
-        method: its name in `METHODS`.
-        seed: of its training.
+        method: its name in `METHODS`.  seed: of its training.
         folder: its own, for what training writes; it may hold an unfinished training to go on with.
         quick: train just enough to see that everything works.
     """
@@ -54,8 +52,7 @@ class Contender(Protocol):
     """A trained method, or one that needs no training.
 
     Attributes:
-        name: the method in `results.json`.
-        parameter_count: numbers that were learned, 0 for none.
+        name: the method in `results.json`.  parameter_count: numbers that were learned, 0 for none.
         training_seconds: s, wall clock; 0 where nothing was learned.
     """
 

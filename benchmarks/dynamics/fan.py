@@ -12,16 +12,12 @@ from ballfg.simulation.settings import SETTING_LEVELS, Settings
 from ballfg.state import POSITION, SPIN, VELOCITY
 from ballfg.tracks import Track
 
-SPEED_LEVEL: Final = 11
-"""The launcher's middle velocity level."""
-DURATION: Final = 1.2
-"""s that are shown."""
+SPEED_LEVEL: Final = 11  # The launcher's middle velocity level
+DURATION: Final = 1.2  # s that are shown
 RATE: Final = 120.0
 """Hz, of the paths and of the short straight track that tells a contender the direction of the launch."""
-STRAIGHT: Final = 12
-"""Samples of that track."""
-DIGITS: Final = 5
-"""Resolution of a kept coordinate in m, 0.01 mm."""
+STRAIGHT: Final = 12  # Samples of that track
+DIGITS: Final = 5  # Resolution of a kept coordinate in m, 0.01 mm
 
 
 Point = tuple[float, float, float]
@@ -31,9 +27,7 @@ Point = tuple[float, float, float]
 class Fan:
     """Paths from one launch.
 
-    Attributes:
-        topspin: by level, m, without sidespin, to `DIGITS`.
-        sidespin: by level, m, without topspin.
+    Attributes: topspin: by level, m, without sidespin, to `DIGITS`.  sidespin: by level, m, without topspin.
     """
 
     topspin: dict[int, list[Point]]

@@ -11,7 +11,7 @@ import numpy as np
 from ballfg.benchmarks.dynamics.contenders import Contender, GraphContender, Job
 from ballfg.benchmarks.dynamics.fan import fan_of
 from ballfg.benchmarks.dynamics.methods import METHODS
-from ballfg.benchmarks.dynamics.record import Record, job_digest, read_record
+from ballfg.benchmarks.dynamics.record import Record, job_digest
 from ballfg.benchmarks.dynamics.scoring import score_path
 from ballfg.benchmarks.dynamics.task import Task
 from ballfg.benchmarks.dynamics.trained import recipe
@@ -19,8 +19,7 @@ from ballfg.benchmarks.resumable import collect
 from ballfg.benchmarks.speed.stopwatch import milliseconds
 from ballfg.learning.run.loop import TrainingStoppedError
 
-TIMED: Final = 20
-"""Tracks whose predictions are timed one by one."""
+TIMED: Final = 20  # Tracks whose predictions are timed one by one
 
 
 def collect_records(
@@ -63,7 +62,7 @@ def _digest(job: Job, number: int) -> str:
 
 def read(job: Job) -> dict[int, Record] | None:
     """The records of a finished job by the numbers of its tasks; None if one is missing."""
-    records = {k: read_record(record_path(job, k), _digest(job, k)) for k in judged(job)}
+    records = {k: Record.read(record_path(job, k), _digest(job, k)) for k in judged(job)}
     whole = {k: record for k, record in records.items() if record is not None}
     return whole if len(whole) == len(records) else None
 

@@ -9,8 +9,7 @@ from typing import Any, Final
 from ballfg.benchmarks.estimators.measured import HORIZON
 from ballfg.learning.registry import NETWORKS, SEQUENCES
 
-RESIDUAL: Final = "analytic+mnn"
-"""The method in which a network corrects the nominal model."""
+RESIDUAL: Final = "analytic+mnn"  # The method in which a network corrects the nominal model
 
 SIMULATED: Final[dict[str, Any]] = {
     "optimizer": {"learning_rate": 2e-3, "batch": 32, "epochs": 20, "clip": 5.0, "noise_step": 40.0},

@@ -25,10 +25,8 @@ class Plan:
     """The amount of computation.
 
     Attributes:
-        tracks: synthetic ones.
-        measured: measured tracks at most; None for all.
-        seeds: how often each trained method is trained.
-        quick: train just enough to see that everything works.
+        tracks: synthetic ones.  measured: measured tracks at most; None for all.
+        seeds: how often each trained method is trained.  quick: train just enough to see that everything works.
     """
 
     tracks: int

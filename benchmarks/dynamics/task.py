@@ -15,8 +15,7 @@ from ballfg.tracks.info import DatasetInfo
 APEXES: Final = ("before_1", "1_2", "2_3")
 """The flights whose highest point is judged: before the first bounce, between the first two, between the next two."""
 VALIDATE_ONE_IN: Final = 10
-SPLIT_LABEL: Final = "split"
-"""The label in a written task that says which part a track belongs to."""
+SPLIT_LABEL: Final = "split"  # The label in a written task that says which part a track belongs to
 
 
 @dataclass(frozen=True)
@@ -30,8 +29,7 @@ class TaskShot:
         judged: number of first samples for the errors; the rest of the track serves for apexes only.
         bounces: (b,) s, on the track's clock, in order.
         apexes: (3, 3) m, the highest points of the flights in `APEXES`; NaN where a flight has none inside the track.
-        apex_times: (3,) s; NaN likewise.
-        states: (n, 9) the true states; None for measured tracks.
+        apex_times: (3,) s; NaN likewise.  states: (n, 9) the true states; None for measured tracks.
     """
 
     track: Track
@@ -54,15 +52,13 @@ class Task:
     """A comparison.
 
     Attributes:
-        case: its name in `results.json`.
-        info: the declared table, ball, rate and position noise.
+        case: its name in `results.json`.  info: the declared table, ball, rate and position noise.
         surfaces: table and floor, for every model.
         settings: of the estimator, the same for every model but for noise that a model has learned.
         launcher: spin per level for models that do not learn it; None where the tracks have no levels.
         launcher_labels: labels from which trained models learn the spin.
         observe: the observed part of a shot, as in a training config.
-        truth: the true dynamics; None for measured tracks.
-        train: shots to learn from.  validation: shots to judge by.
+        truth: the true dynamics; None for measured tracks.  train: shots to learn from.  validation: shots to judge by.
     """
 
     case: str

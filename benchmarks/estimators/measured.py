@@ -21,21 +21,14 @@ from ballfg.estimation.track_prediction import TrackPrediction
 from ballfg.progress import progress
 from ballfg.tracks import Dataset
 
-OBSERVE = 0.25
-"""s, observed part of each track."""
-HORIZON = 0.3
-"""s, predicted part after it."""
-END = 0.05
-"""s, end of the horizon to which `prediction_end_error` applies."""
-CALIBRATION = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
-"""Nominal levels of the calibration curve."""
+OBSERVE = 0.25  # s, observed part of each track
+HORIZON = 0.3  # s, predicted part after it
+END = 0.05  # s, end of the horizon to which `prediction_end_error` applies
+CALIBRATION = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)  # Nominal levels of the calibration curve
 QUARTILES = {"median": 0.5, "lower_quartile": 0.25, "upper_quartile": 0.75}
-BINS = np.linspace(0.0, HORIZON, 13)
-"""s, edges of the error-growth curve."""
-WHOLE = "smoother (whole tracks)"
-"""The method in `results.json` of rows about smoothing without prediction."""
-WITHIN = 5.0
-"""Standard deviations within which a whitened innovation is explained."""
+BINS = np.linspace(0.0, HORIZON, 13)  # s, edges of the error-growth curve
+WHOLE = "smoother (whole tracks)"  # The method in `results.json` of rows about smoothing without prediction
+WITHIN = 5.0  # Standard deviations within which a whitened innovation is explained
 
 
 @dataclass(frozen=True)
@@ -43,8 +36,7 @@ class Measured:
     """The estimates and predictions of a dataset's tracks.
 
     Attributes:
-        name: of the dataset.
-        predictions: by method, of the tracks that last longer than the observed part.
+        name: of the dataset.  predictions: by method, of the tracks that last longer than the observed part.
         smoothed: the smoother's estimates of the whole tracks.
         unseen: number of tracks that end within the observed part.
     """

@@ -21,10 +21,8 @@ class Size:
     """The amount of computation.
 
     Attributes:
-        compared: synthetic tracks in each protocol.
-        consistency: synthetic tracks whose NEES is taken.
-        measured: measured tracks at most; None for all.
-        counts: numbers of observations on the curves.
+        compared: synthetic tracks in each protocol.  consistency: synthetic tracks whose NEES is taken.
+        measured: measured tracks at most; None for all.  counts: numbers of observations on the curves.
     """
 
     compared: int
@@ -36,8 +34,7 @@ class Size:
 COUNTS = (5, 6, 7, 8, 10, 12, 15, 20, 25, 30, 40, 50, 60, 70, 80)
 FULL = Size(compared=50, consistency=200, measured=None, counts=COUNTS)
 QUICK = Size(compared=10, consistency=40, measured=12, counts=(5, 10, 20, 40, 80))
-CONSISTENCY_SEED = 1_000_000
-"""Added to the seed: other tracks than those of the comparison."""
+CONSISTENCY_SEED = 1_000_000  # Added to the seed: other tracks than those of the comparison
 
 
 def run_synthetic(results: Results, out: Path, size: Size, jobs: int) -> list[Path]:

@@ -11,10 +11,8 @@ from ballfg.benchmarks.metrics import Figure, Statistic, bootstrap, chi_square_b
 from ballfg.benchmarks.results import CURVE_MARK, Results
 from ballfg.state import STATE_DIM, VELOCITY
 
-SETTLED = 20
-"""Observations from which on the errors at the newest sample are pooled into one number."""
-BLOCKS = {"state": slice(0, STATE_DIM), "velocity": VELOCITY}
-"""Components whose coverage is reported."""
+SETTLED = 20  # Observations from which on the errors at the newest sample are pooled into one number
+BLOCKS = {"state": slice(0, STATE_DIM), "velocity": VELOCITY}  # Components whose coverage is reported
 PLACES = {"first": 0.0, "quarter": 0.25, "middle": 0.5, "three_quarters": 0.75, "last": 1.0}
 """Places of the consistency test on a track, as shares of its samples."""
 

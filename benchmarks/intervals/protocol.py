@@ -18,10 +18,8 @@ from ballfg.estimation import Settings, Smoother, Status, estimate_noise, predic
 from ballfg.estimation.noise.estimate import spread_over
 from ballfg.tracks import Track
 
-OBSERVED: Final = 0.25
-"""s, observed part of a judged track."""
-HORIZON: Final = 0.3
-"""s, predicted part."""
+OBSERVED: Final = 0.25  # s, observed part of a judged track
+HORIZON: Final = 0.3  # s, predicted part
 USUAL: Final = "usual noise"
 OBSERVED_PARTS: Final = "noise from observed parts"
 OTHER_TRACKS: Final = "noise from other tracks"
@@ -33,9 +31,7 @@ class Judged:
     """Predictions of some tracks against what was measured.
 
     Attributes:
-        errors: (n, 3) m, of all predicted samples.
-        sigmas: (n, 3) m.
-        tracks: (n,) number of the track of each.
+        errors: (n, 3) m, of all predicted samples.  sigmas: (n, 3) m.  tracks: (n,) number of the track of each.
         failed: number of tracks without an estimate.
     """
 

@@ -23,11 +23,9 @@ LEVEL: Final = 0.9
 RATES: Final = (60.0, 90.0, 120.0, 180.0, 240.0)
 MEMORY_TIMES: Final = (0.0, 0.005, 0.01, 0.02, 0.03)
 JITTERS: Final = (0.0, 0.0005, 0.001, 0.002)
-MOST_JITTER: Final = 0.15
-"""Share of a frame; the simulator refuses more, because stamps would change places."""
+MOST_JITTER: Final = 0.15  # Share of a frame; the simulator refuses more, because stamps would change places
 DROPS: Final = (0.0, 0.05, 0.2)
-OTHER_SEED: Final = 1000
-"""Added to a setting's seed: tracks that its diagnosis has not seen."""
+OTHER_SEED: Final = 1000  # Added to a setting's seed: tracks that its diagnosis has not seen
 PLANTED_SEED: Final = 500
 DIAGNOSED: Final = "model from diagnose"
 
@@ -127,7 +125,6 @@ def _diagnosed(results: Results, config: SimulationConfig, jobs: int) -> None:
 
 
 def _written(path: Path, config: SimulationConfig) -> tuple[Dataset, BallModel]:
-    """A simulated dataset and its true model."""
     write_simulation(path, config)
     dataset = read_dataset(path)
     return dataset, load_model(path / "model.yaml", radius=dataset.ball.radius)

@@ -40,10 +40,7 @@ QUICK: Final = TrainedPlan(epochs=1, pairs=1)
 
 
 def run_trained(results: Results, folders: Sequence[Path], plan: TrainedPlan, jobs: int) -> None:
-    """Rows of all pairs: `a + b -> c`.
-
-    Raises: ValueError: fewer than three datasets, or two of one name.
-    """
+    """Rows of all pairs: `a + b -> c`. Raises: ValueError: fewer than three datasets, or two of one name."""
     datasets = [read_dataset(folder) for folder in folders]
     names = [dataset.info.name for dataset in datasets]
     if len(datasets) < 3 or len(set(names)) < len(names):
@@ -90,7 +87,6 @@ def _judged(model: BallModel, dataset: Dataset, jobs: int) -> Judged:
 
 
 def _median(judged: Judged) -> float:
-    """Median over tracks of the root mean square error, m."""
     return float(np.median(judged.rmse_by_track()))
 
 

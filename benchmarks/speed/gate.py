@@ -10,8 +10,7 @@ from ballfg.benchmarks.results import Row
 from ballfg.checks import one_line, short_text
 from ballfg.files.json_file import read_json
 
-CONTROL: Final = "banded_time"
-"""Bound by Python's own speed, as the estimators are."""
+CONTROL: Final = "banded_time"  # Bound by Python's own speed, as the estimators are
 RARE: Final = ("_p99", "_p999", "_worst")
 """Ends of metrics of the slowest runs, which other work on the machine decides."""
 UNSTEADY: Final = ("matrix", "stream")

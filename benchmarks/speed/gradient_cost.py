@@ -21,8 +21,7 @@ METHODS: Final[Mapping[str, GradientMethod]] = {
     "gauss-newton": GaussNewtonGradient(),
     "unrolled": UnrolledGradient(8),
 }
-EXACT: Final = 1e-12
-"""Tolerance of the linear solution in the reference gradient; training takes `SOLUTION_TOLERANCE`."""
+EXACT: Final = 1e-12  # Tolerance of the linear solution in the reference gradient; training takes `SOLUTION_TOLERANCE`
 
 
 def time_gradients(watch: Stopwatch, model: LearnedModel, graph: BallGraph, start: Values) -> None:

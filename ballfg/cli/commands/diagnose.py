@@ -27,8 +27,7 @@ if TYPE_CHECKING:
     from ballfg.diagnosis.result import Diagnosis
 
 
-NAME_AT = 0.9
-"""Probability from which on an effect is named."""
+NAME_AT = 0.9  # Probability from which on an effect is named
 
 
 def diagnose(

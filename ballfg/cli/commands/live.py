@@ -98,7 +98,7 @@ def live(
     with (
         contextlib.closing(_source(replay, bag, listen, idle, speed, topic, data)) as source,
         _output(out, source) as write,
-        _watchers(out, source, viewer, wanted.horizon) as watchers,
+        _watchers(out, viewer, wanted.horizon) as watchers,
     ):
         warm_up(tracker, wanted)
         trust = f"; {source.trust}" if source.trust else ""
@@ -231,13 +231,13 @@ def _output(out: Path | None, source: Source) -> Iterator[Callable[[bytes], None
 
 
 @contextlib.contextmanager
-def _watchers(out: Path | None, source: Source, viewer: bool, horizon: float) -> Iterator[list[Watcher]]:
+def _watchers(out: Path | None, viewer: bool, horizon: float) -> Iterator[list[Watcher]]:
     with contextlib.ExitStack() as stack:
         found: list[Watcher] = []
         if out is not None and out.suffix == MCAP:
             from ballfg.live.bag_writer import BagWriter
 
-            found.append(stack.enter_context(BagWriter(out, horizon, source.repeats)))
+            found.append(stack.enter_context(BagWriter(out, horizon)))
         if viewer:
             from ballfg.live.viewer import Viewer
 

@@ -30,8 +30,7 @@ MEANINGS = {
     "coefficients": ("spread of coefficients from track to track / usual", 1.0, ""),
 }
 """Meaning of each number, factor to its printed unit, and that unit."""
-UNKNOWN = 0.7
-"""Standard deviation of a logarithm beyond which the tracks give hardly more than the order of magnitude."""
+UNKNOWN = 0.7  # Standard deviation of a logarithm beyond which the tracks give hardly more than the order of magnitude
 
 
 def noise(
@@ -84,7 +83,6 @@ def noise(
 
 
 def _table(found: NoiseEstimate) -> list[str]:
-    """A line for each number: meaning, value, error bar."""
     content: dict[str, Any] = found.noise.to_mapping() | {"coefficients": found.coefficient_factor}
     lines = []
     for name, error in found.relative_errors.items():

@@ -93,7 +93,6 @@ def _check_outputs(out: Path | None, png: Path | None, rerun: Path | None) -> No
 
 
 def _write_picture(shown: Shown, png: Path) -> None:
-    """The first shot of the page, for papers."""
     from ballfg.pages.pictures import views
 
     if not shown.shots:

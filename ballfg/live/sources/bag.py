@@ -13,8 +13,7 @@ from ballfg.live.sources.bag_limits import check_bag
 from ballfg.live.sources.lines import Sample
 
 Point = Any
-Reading = tuple[Sequence[Point], Any]
-"""The points of a message, and the covariance (36,) of a single one or None."""
+Reading = tuple[Sequence[Point], Any]  # The points of a message, and the covariance (36,) of a single one or None
 
 READERS: dict[str, Callable[[Any], Reading]] = {
     "geometry_msgs/msg/PointStamped": lambda m: ([m.point], None),

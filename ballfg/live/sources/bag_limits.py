@@ -14,11 +14,9 @@ from ballfg.files.strict_yaml import read_mapping
 
 ENDINGS: Final = (".mcap", ".db3")
 METADATA: Final = "metadata.yaml"
-_CHUNK: Final = 6
-"""Opcode of a chunk in MCAP, the only record that is compressed."""
+_CHUNK: Final = 6  # Opcode of a chunk in MCAP, the only record that is compressed
 _BLOCK: Final = 1 << 20
-_GENERATED: Final = 2
-"""Value of sqlite's `table_xinfo` from which a column is computed."""
+_GENERATED: Final = 2  # Value of sqlite's `table_xinfo` from which a column is computed
 
 
 def check_bag(bag: Path) -> None:
@@ -53,7 +51,6 @@ def _check_file(path: Path, ending: str, messages: bool = False) -> None:
 
 
 def _mcap(path: Path) -> Iterator[tuple[bytes, str]]:
-    """Data and compression of each chunk."""
     with path.open("rb") as file:
         end = file.seek(0, 2)
         file.seek(8)

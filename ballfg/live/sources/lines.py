@@ -7,8 +7,7 @@ from typing import Any
 
 from ballfg.files.json_file import parse_json
 
-LONGEST = 65536
-"""Largest number of bytes of a line; the rest of a longer one is skipped."""
+LONGEST = 65536  # Largest number of bytes of a line; the rest of a longer one is skipped
 MOST_POSITIONS = 64
 """Largest number of positions of one stamp: more than the tracker follows. Thousands would delay everybody."""
 COLUMNS = ("t", "x", "y", "z")
@@ -20,9 +19,7 @@ class Sample:
     """The content of one line: the positions of one stamp.
 
     Attributes:
-        time: s.
-        positions: of each ball x, y, z in m.
-        sigmas: as many standard deviations, m; None without them.
+        time: s.  positions: of each ball x, y, z in m.  sigmas: as many standard deviations, m; None without them.
         tag: further fields of the answer, such as the trajectory of a replay.
     """
 
@@ -41,10 +38,7 @@ class LineReader:
         self._width = 0
 
     def read(self, line: bytes) -> Sample | None:
-        """The sample of a line; None for a header, a comment or an empty line.
-
-        Raises: ValueError: any other line.
-        """
+        """The sample of a line; None for a header, a comment or an empty line. Raises: ValueError: any other line."""
         if len(line) > LONGEST:
             raise ValueError(f"a line must have at most {LONGEST} bytes; got more. Send one sample a line.")
         text = line.decode("utf-8", errors="replace").strip().removeprefix("\ufeff")

@@ -10,8 +10,7 @@ from ballfg.live.sources.source import Source
 from ballfg.tracks import Dataset
 from ballfg.tracks.stamps import written
 
-PAUSE = 1.0
-"""s between two tracks: longer than a ball may stay unseen."""
+PAUSE = 1.0  # s between two tracks: longer than a ball may stay unseen
 
 
 class Replay(Source):

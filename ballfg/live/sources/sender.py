@@ -11,10 +11,8 @@ from typing import NamedTuple
 
 from ballfg.live.sources.lines import LONGEST, MOST_POSITIONS, LineReader, Sample
 
-WAITING = 1024
-"""Largest number of waiting lines in all, shared by the senders with waiting lines."""
-PAUSE = 0.005
-"""s between two checks whether a full sender may continue."""
+WAITING = 1024  # Largest number of waiting lines in all, shared by the senders with waiting lines
+PAUSE = 0.005  # s between two checks whether a full sender may continue
 
 
 @dataclass(frozen=True)
@@ -22,8 +20,7 @@ class Arrival:
     """One line of input.
 
     Attributes:
-        read: s, `time.perf_counter` when it was read.
-        sample: its content; None for an unusable line.
+        read: s, `time.perf_counter` when it was read.  sample: its content; None for an unusable line.
         problem: reason for an unusable line.
     """
 
@@ -63,8 +60,7 @@ class Sender:
 
     Attributes:
         waiting: lines, or samples of a replay, with the time at which they were read (s, `time.perf_counter`).
-        most: largest present number of waiting lines.
-        heard: s, `time.perf_counter` at the end of its last line.
+        most: largest present number of waiting lines.  heard: s, `time.perf_counter` at the end of its last line.
         dropped: number of lines dropped for newer ones.
     """
 
@@ -94,10 +90,7 @@ class Sender:
             pass
 
     def cut(self, chunk: bytes, *, last: bool = False) -> Iterator[Line]:
-        """The lines completed by a chunk that was just read.
-
-        Args: last: True if nothing continues the chunk.
-        """
+        """The lines completed by a chunk that was just read. Args: last: True if nothing continues the chunk."""
         now = perf_counter()
         found = self._buffer.feed(chunk)
         if last:

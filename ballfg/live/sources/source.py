@@ -11,18 +11,15 @@ from time import perf_counter
 
 from ballfg.live.sources.sender import WAITING, Arrival, Line, Sender
 
-LEAST = 16
-"""Least number of lines that each sender may have waiting."""
-CHUNK = 65536
-"""Number of bytes read at once from standard input, or of a packet."""
+LEAST = 16  # Least number of lines that each sender may have waiting
+CHUNK = 65536  # Number of bytes read at once from standard input, or of a packet
 
 
 class Source:
     """A stream of lines or samples.
 
     Attributes:
-        name: for messages.
-        trust: a sentence on who may send to it; empty if only this process's user can.
+        name: for messages.  trust: a sentence on who may send to it; empty if only this process's user can.
         live: True if lines come at their own pace, so that they must be read at once. Other sources wait until read.
         repeats: True if the stream starts from its beginning when opened again, as a file does.
         lossy: True if the oldest lines of a full sender are dropped; else the source reads no more of it.
@@ -87,10 +84,7 @@ class Inbox:
             threading.Thread(target=self._fill, name="ballfg live input", daemon=True).start()
 
     def groups(self) -> Iterator[list[Arrival]]:
-        """Arrivals of one stamp at a time, each sender's in their order.
-
-        Raises: OSError: from the source.
-        """
+        """Arrivals of one stamp at a time, each sender's in their order. Raises: OSError: from the source."""
         if not self.source.live:
             yield from self._asked()
             return
@@ -137,7 +131,6 @@ class Inbox:
             now = perf_counter()
 
     def _fill(self) -> None:
-        """The reading thread."""
         try:
             for line in self.source.lines(self._stop):
                 self._put(line)
