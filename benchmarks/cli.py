@@ -94,7 +94,7 @@ class Run:
 
     def finish(self, results: Results, pictures: Sequence[Path] = ()) -> None:
         """Print the table, write `results.json`, say where everything is."""
-        from ballfg.benchmarks.tables import print_table
+        from ballfg.benchmarks.conclusions import print_table
 
         print_table(results.rows)
         path = results.write(self.out)

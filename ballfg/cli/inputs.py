@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Generic, Literal, TypeVar
 
 import typer
 
-from ballfg.cli.errors import NOT_ESTIMATED
+from ballfg.cli.start import NOT_ESTIMATED
 from ballfg.machine import usable_cores
 from ballfg.progress import progress
 

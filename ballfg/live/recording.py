@@ -12,7 +12,7 @@ from pathlib import Path
 
 from ballfg.files.json_file import parse_json
 from ballfg.files.whole_file import check_file
-from ballfg.live.answers import KINDS, encoded
+from ballfg.live.outlook import KINDS, encoded
 
 EVERY = 0.5  # s between two flushes to the disk
 BLOCK = 65536  # Number of bytes of an earlier recording read at once; the first line is shorter

@@ -12,10 +12,9 @@ from ballfg.dynamics import BallModel, Surfaces
 from ballfg.estimation.online.online import Online
 from ballfg.estimation.online.state import OnlineState
 from ballfg.estimation.settings import Settings
-from ballfg.live.ball import Ball, BallEvent, Kept
+from ballfg.live.ball import Ball, BallEvent, Kept, Newcomer
 from ballfg.live.clock import Clock, Stamp
 from ballfg.live.gate import FAR, GATE, HIT_GATE, Gate, assign
-from ballfg.live.newcomer import Newcomer
 from ballfg.tracks import Ball as BallKind
 from ballfg.tracks.stamps import StreamOrigin
 

@@ -8,10 +8,9 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.pages.coverage import HALF_WIDTH, LEVEL
 from ballfg.pages.html import Html, explained, items, section, table, tag
-from ballfg.pages.marks import GAP
 from ballfg.pages.outline import NET_HEIGHT, Outline
 from ballfg.pages.page import own, whole_page
-from ballfg.pages.shot import ShownShot
+from ballfg.pages.shot import GAP, ShownShot
 from ballfg.pages.shown import Shown
 from ballfg.state import POSITION, SPIN, VELOCITY
 

@@ -16,9 +16,8 @@ from matplotlib.axes import Axes
 
 from ballfg.benchmarks.diagnosis.cases import Case, by_name
 from ballfg.benchmarks.diagnosis.changes import CHANGES, applicable
-from ballfg.benchmarks.diagnosis.record import Found, Record
-from ballfg.benchmarks.diagnosis.runs import collect_records, run_case
-from ballfg.benchmarks.diagnosis.verdicts import is_one_of
+from ballfg.benchmarks.diagnosis.record import Found, Record, is_one_of
+from ballfg.benchmarks.diagnosis.suite import collect_records, run_case
 from ballfg.benchmarks.metrics import Figure, share
 from ballfg.benchmarks.pictures import BLUE, GREY, ORANGE, save
 from ballfg.benchmarks.results import Results

@@ -11,7 +11,7 @@ from scipy.stats import binom
 from ballfg.benchmarks.diagnosis.cases import Case, Recording
 from ballfg.benchmarks.diagnosis.effects import PLANTS, Plant
 from ballfg.benchmarks.diagnosis.record import Record
-from ballfg.benchmarks.diagnosis.runs import collect_records, run_case
+from ballfg.benchmarks.diagnosis.suite import collect_records, run_case
 from ballfg.benchmarks.metrics import CONFIDENCE, Figure
 from ballfg.benchmarks.results import Results
 from ballfg.benchmarks.resumable import RUNS_FOLDER

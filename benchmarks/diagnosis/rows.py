@@ -7,8 +7,7 @@ from ballfg.benchmarks.diagnosis.cases import BARE, STATED_NOISE, Case
 from ballfg.benchmarks.diagnosis.effects import PLANTS
 from ballfg.benchmarks.diagnosis.ideal import Ideal
 from ballfg.benchmarks.diagnosis.power_curve import Curve, power_curve
-from ballfg.benchmarks.diagnosis.record import Record
-from ballfg.benchmarks.diagnosis.verdicts import alarmed, complete, false_names, named, right
+from ballfg.benchmarks.diagnosis.record import Record, alarmed, complete, false_names, named, right
 from ballfg.benchmarks.metrics import median_and_range, share
 from ballfg.benchmarks.results import Results
 from ballfg.diagnosis.result import Verdict

@@ -12,8 +12,7 @@ from ballfg.benchmarks.dynamics.contenders import Contender, GraphContender, Job
 from ballfg.benchmarks.dynamics.fan import fan_of
 from ballfg.benchmarks.dynamics.methods import METHODS
 from ballfg.benchmarks.dynamics.record import Record, job_digest
-from ballfg.benchmarks.dynamics.scoring import score_path
-from ballfg.benchmarks.dynamics.task import Task
+from ballfg.benchmarks.dynamics.task import Task, score_path
 from ballfg.benchmarks.dynamics.trained import recipe
 from ballfg.benchmarks.resumable import collect
 from ballfg.benchmarks.speed.stopwatch import milliseconds

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from importlib import metadata
 
 from ballfg.benchmarks.dynamics.fan import Fan
-from ballfg.benchmarks.dynamics.scoring import PathScore
-from ballfg.benchmarks.dynamics.task import Task
+from ballfg.benchmarks.dynamics.task import PathScore, Task
 from ballfg.benchmarks.resumable import Kept
 
 

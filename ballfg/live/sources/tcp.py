@@ -7,7 +7,7 @@ from contextlib import suppress
 from time import perf_counter
 from typing import Any
 
-from ballfg.live.answers import encoded, refusal
+from ballfg.live.outlook import encoded, refusal
 from ballfg.live.sources.listener import SENDERS, WAIT, Listener, readable, written
 from ballfg.live.sources.sender import PAUSE, Line, Sender
 

@@ -16,13 +16,22 @@ from ballfg.benchmarks.diagnosis.cases import (
     planted_case,
     timed_cases,
 )
+from ballfg.benchmarks.diagnosis.data import planted_free
 from ballfg.benchmarks.diagnosis.ideal import Ideal
-from ballfg.benchmarks.diagnosis.record import Found, Ranked, Record, case_digest, record_of
+from ballfg.benchmarks.diagnosis.record import (
+    Found,
+    Ranked,
+    Record,
+    alarmed,
+    case_digest,
+    complete,
+    honest,
+    named,
+    record_of,
+    right,
+)
 from ballfg.benchmarks.diagnosis.rows import ALL, FAILED, HIDDEN, add_all, detectable
-from ballfg.benchmarks.diagnosis.runs import collect_records
-from ballfg.benchmarks.diagnosis.suite import run_loop
-from ballfg.benchmarks.diagnosis.true_model import planted_free
-from ballfg.benchmarks.diagnosis.verdicts import alarmed, complete, honest, named, right
+from ballfg.benchmarks.diagnosis.suite import collect_records, run_loop
 from ballfg.benchmarks.results import Results
 from tests.diagnosis.made_diagnosis import found, unexplained
 

@@ -14,8 +14,7 @@ from ballfg.benchmarks.dynamics.jobs import collect_records
 from ballfg.benchmarks.dynamics.measured import measured_shot
 from ballfg.benchmarks.dynamics.methods import METHODS
 from ballfg.benchmarks.dynamics.record import Record, task_digest
-from ballfg.benchmarks.dynamics.rows import add_rows
-from ballfg.benchmarks.dynamics.suite import Plan, _installed, run_dynamics
+from ballfg.benchmarks.dynamics.suite import Plan, _installed, add_rows, run_dynamics
 from ballfg.benchmarks.dynamics.truth import synthetic_task
 from ballfg.benchmarks.results import Results
 from ballfg.estimation import Estimate, Status
