@@ -9,8 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from ballfg.benchmarks.diagnosis.cases import Case
-from ballfg.benchmarks.diagnosis.ideal import Ideal
-from ballfg.benchmarks.diagnosis.power_curve import NAMED, Curve
+from ballfg.benchmarks.diagnosis.ideal import NAMED, Curve, Ideal
 from ballfg.benchmarks.diagnosis.record import Record
 from ballfg.benchmarks.diagnosis.rows import ALL, detectable, of_part, power_curves
 from ballfg.benchmarks.metrics import share

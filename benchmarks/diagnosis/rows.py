@@ -5,8 +5,7 @@ from functools import partial
 
 from ballfg.benchmarks.diagnosis.cases import BARE, STATED_NOISE, Case
 from ballfg.benchmarks.diagnosis.effects import PLANTS
-from ballfg.benchmarks.diagnosis.ideal import Ideal
-from ballfg.benchmarks.diagnosis.power_curve import Curve, power_curve
+from ballfg.benchmarks.diagnosis.ideal import Curve, Ideal, power_curve
 from ballfg.benchmarks.diagnosis.record import Record, alarmed, complete, false_names, named, right
 from ballfg.benchmarks.metrics import median_and_range, share
 from ballfg.benchmarks.results import Results

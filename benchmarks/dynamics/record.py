@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import metadata
 
-from ballfg.benchmarks.dynamics.fan import Fan
+from ballfg.benchmarks.dynamics.contenders import Fan
 from ballfg.benchmarks.dynamics.task import PathScore, Task
 from ballfg.benchmarks.resumable import Kept
 

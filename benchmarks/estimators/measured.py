@@ -100,7 +100,7 @@ def run_measured(results: Results, dataset: Dataset, tracks: int | None, jobs: i
     return measured
 
 
-def _error(prediction: TrackPrediction, after: float = 0.0, until: float = np.inf) -> float:
+def prediction_rmse(prediction: TrackPrediction, after: float = 0.0, until: float = np.inf) -> float:
     """m: root mean square distance between measured and predicted positions in a span (s) since the last observed one.
 
     NaN where nothing was measured in it.
@@ -109,11 +109,6 @@ def _error(prediction: TrackPrediction, after: float = 0.0, until: float = np.in
     within = (elapsed > after) & (elapsed <= until)
     errors = (prediction.measured - prediction.positions)[within]
     return root_mean_square(errors) if len(errors) else float("nan")
-
-
-def prediction_rmse(prediction: TrackPrediction) -> float:
-    """m: root mean square distance between measured and predicted positions of one track."""
-    return _error(prediction)
 
 
 def covered(predictions: Sequence[TrackPrediction], level: float, axes: slice = slice(0, 3)) -> tuple[Array, Array]:
@@ -151,7 +146,7 @@ def _statistics(predictions: Sequence[TrackPrediction]) -> list[tuple[str, str, 
     n = len(predictions)
     rmse = [1e3 * prediction_rmse(p) for p in predictions]
     found = [(f"prediction_rmse_{name}", "mm", quantile(rmse, q), n) for name, q in QUARTILES.items()]
-    ends = [1e3 * error for p in predictions if np.isfinite(error := _error(p, after=HORIZON - END))]
+    ends = [1e3 * error for p in predictions if np.isfinite(error := prediction_rmse(p, after=HORIZON - END))]
     if ends:
         found.append(("prediction_end_error_median", "mm", quantile(ends, 0.5), len(ends)))
     for level in LEVELS:
@@ -166,7 +161,7 @@ def _statistics(predictions: Sequence[TrackPrediction]) -> list[tuple[str, str, 
 def _add_growth(add: Callable[..., None], predictions: Sequence[TrackPrediction]) -> None:
     """Median and quartiles over tracks of the error in each bin of the horizon."""
     for low, high in pairwise(BINS):
-        errors = [error for p in predictions if np.isfinite(error := _error(p, low, high))]
+        errors = [error for p in predictions if np.isfinite(error := prediction_rmse(p, low, high))]
         for name, q in QUARTILES.items():
             if errors:
                 metric = f"prediction_error_{name}{CURVE_MARK}{(low + high) / 2:.4g}"
@@ -185,13 +180,10 @@ def _add_smoothing(results: Results, measured: Measured) -> None:
     for metric in ("within_5_sigma", "within_5_sigma_marked_fail", "share_marked", "share_wide"):
         figure = bootstrap(pooled_mean([c[metric] for c in counted], samples), len(counted), rng)
         results.add(case, WHOLE, metric, "1", figure, sum(samples))
-    counts = {
-        "hits": sum(len(e.hits) for e in estimates),
-        "contacts": sum(len(e.contacts) for e in estimates),
-        "not_converged": sum(e.status is not Status.OK for e in estimates),
-    }
-    for metric, count in counts.items():
-        results.add(case, WHOLE, metric, "1", count, len(estimates))
+    results.add(case, WHOLE, "hits", "1", sum(len(e.hits) for e in estimates), len(estimates))
+    results.add(case, WHOLE, "contacts", "1", sum(len(e.contacts) for e in estimates), len(estimates))
+    failed = sum(e.status is not Status.OK for e in estimates)
+    results.add(case, WHOLE, "not_converged", "1", failed, len(estimates))
 
 
 def _explained(estimate: Estimate) -> dict[str, int]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.benchmarks.estimators.measured import HORIZON, OBSERVE, run_measured
-from ballfg.benchmarks.estimators.protocols import Protocol, fair_protocol, paper_protocol
+from ballfg.benchmarks.estimators.protocols import fair_protocol, paper_protocol
 from ballfg.benchmarks.estimators.scoring import LEVELS, Scores, TrackScore, covered, every, pooled, score_tracks
 from ballfg.benchmarks.gaussian_settings import StepNoise
 from ballfg.benchmarks.metrics import Figure, Statistic, bootstrap, chi_square_band, pooled_mean, pooled_rms, ratio
@@ -24,20 +24,6 @@ SETTLED = 20  # Observations from which on the errors at the newest sample are p
 BLOCKS = {"state": slice(0, STATE_DIM), "velocity": VELOCITY}  # Components whose coverage is reported
 PLACES = {"first": 0.0, "quarter": 0.25, "middle": 0.5, "three_quarters": 0.75, "last": 1.0}
 """Places of the consistency test on a track, as shares of its samples."""
-
-
-def run_protocol(results: Results, protocol: Protocol, jobs: int, counts: Sequence[int]) -> None:
-    """Score all candidates, at the newest of several numbers of observations too, and add their rows."""
-    what = f"synthetic tracks estimated ({protocol.name})"
-    scores = score_tracks(protocol.candidates, protocol.tracks, counts, jobs, what)
-    add_rows(results, protocol.name, scores, counts)
-
-
-def run_consistency(results: Results, protocol: Protocol, jobs: int) -> None:
-    """Smooths all tracks and adds the rows on the consistency of the smoother's covariances."""
-    smoother = {"smoother": protocol.candidates["smoother"]}
-    what = f"synthetic tracks estimated ({protocol.name})"
-    add_consistency(results, protocol.name, score_tracks(smoother, protocol.tracks, (), jobs, what)["smoother"])
 
 
 def add_rows(results: Results, case: str, scores: Scores, counts: Sequence[int]) -> None:
@@ -179,10 +165,13 @@ def run_synthetic(results: Results, out: Path, size: Size, jobs: int) -> list[Pa
         print(f"{protocol.name}: {len(protocol.tracks)} tracks; {describe_settings(protocol.settings)}")
     for protocol in protocols:
         with doing(f"{protocol.name}: {len(protocol.tracks)} tracks by all estimators"):
-            run_protocol(results, protocol, jobs, size.counts)
+            what = f"synthetic tracks estimated ({protocol.name})"
+            scores = score_tracks(protocol.candidates, protocol.tracks, size.counts, jobs, what)
+            add_rows(results, protocol.name, scores, size.counts)
     many = fair_protocol(size.consistency, results.seed + CONSISTENCY_SEED, name="consistency")
     with doing(f"consistency: {len(many.tracks)} tracks"):
-        run_consistency(results, many, jobs)
+        smoother, what = {"smoother": many.candidates["smoother"]}, "synthetic tracks estimated (consistency)"
+        add_consistency(results, many.name, score_tracks(smoother, many.tracks, (), jobs, what)["smoother"])
     return [
         observations_picture(results.rows, name, title, out / f"estimators_{name}.png")
         for name, title in titles.items()
