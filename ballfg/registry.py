@@ -116,10 +116,7 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         return cls
 
     def lookup(self, name: str) -> type[T]:
-        """The class of a name.
-
-        Raises: ValueError: if there is none; the message lists the names there are.
-        """
+        """The class of a name. Raises: ValueError: if there is none; the message lists the names there are."""
         if name in self:
             return self[name]
         raise ValueError(

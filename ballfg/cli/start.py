@@ -3,7 +3,7 @@
 import errno
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 from typing import Annotated, Any, Final, NoReturn
 
@@ -150,15 +150,10 @@ def _while_read(run: Callable[[], int]) -> int:
 def _command(app: typer.Typer) -> Any:
     """A program's command line, each command with --quiet; built once in a process."""
     command, quiet = typer.main.get_command(app), _quiet()
-    for one in _commands(command):
+    own = getattr(command, "commands", None)  # of a group
+    for one in own.values() if own else (command,):
         one.params.append(quiet)
     return command
-
-
-def _commands(command: Any) -> Iterator[Any]:
-    """A group's commands, or the command itself."""
-    own = getattr(command, "commands", None)
-    yield from own.values() if own else (command,)
 
 
 def _asked(quiet: bool) -> None:

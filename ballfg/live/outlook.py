@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -78,12 +79,10 @@ def look_out(state: OnlineState, horizon: float, plane: Plane | None) -> Outlook
             carried = carried_by(state)
         except Exception as error:  # a prediction must not end the stream
             return Outlook(note=f"no prediction: {_one_line(error)}")
-        bounce = _tried(lambda: next_contact(*carried, horizon), "bounce", notes)
-        top = _tried(lambda: apex(*carried, horizon), "apex", notes)
-        crossing = None
-        if plane is not None:
-            across, place = plane.normal, plane.place
-            crossing = _tried(lambda: plane_crossing(*carried, across, place, horizon), "crossing", notes)
+        bounce = _tried(partial(next_contact, *carried, horizon), "bounce", notes)
+        top = _tried(partial(apex, *carried, horizon), "apex", notes)
+        across = None if plane is None else partial(plane_crossing, *carried, plane.normal, plane.place, horizon)
+        crossing = across and _tried(across, "crossing", notes)
     return Outlook(bounce, top, crossing, "; ".join(notes))
 
 
