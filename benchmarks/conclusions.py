@@ -3,6 +3,7 @@
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import Final, TextIO
 
 from ballfg.benchmarks.results import CURVE_MARK, Row
@@ -48,6 +49,19 @@ WORDS: Final = (
     (re.compile(r"^places_outside"), "places_outside_99: places of the track whose nees is outside its 99 % range"),
 )
 """Explanations of metrics for newcomers."""
+OF_LOOP: Final = {
+    "silence": "of {number} datasets without an effect {% effect named:.1f} % got a wrong name, {% any alarm:.1f} % "
+    "any alarm.",
+    "repair": "predictions with the corrected model are {after / true:.2f} times as far off as with the true one; with "
+    "the declared model they were {before / true:.2f} times as far off.",
+    "pairs": "{% both:.0f} % of {number} pairs of effects were named completely; {% first:.0f} % got a right first "
+    "name.",
+    "planted in measured sets": "of {number} changes {% named:.0f} % were named, {% within 3 sigma:.0f} % also with "
+    "their strength.",
+    "unknown physics": "physics of no catalogue: {% unexplained:.0f} % called unexplained; errors reduced in "
+    "{% reduced:.0f} %.",
+}
+"""Conclusions from the line over all data of a table of `ballfg-bench loop` or `planted`."""
 CASES: Final = {
     "paper": "free flights, true dynamics and spin known to all, noise on states at every step, as in the paper; the "
     "spin is given, not estimated: it adds nothing to nees, and its intervals always hold",
@@ -174,23 +188,10 @@ def _of_loop(case: str, by_metric: Mapping[str, Mapping[str, Row]]) -> Iterator[
     if case.startswith("naming"):
         shares = ", ".join(f"{100 * v:.0f} % at {name}" for name, v in values.items() if name.endswith("typical"))
         yield f"planted effects named right: {shares} size."
-    elif case == "silence" and {"effect named", "any alarm"} <= values.keys():
-        named, alarm = 100 * values["effect named"], 100 * values["any alarm"]
-        yield f"of {number} datasets without an effect {named:.1f} % got a wrong name, {alarm:.1f} % any alarm."
-    elif case == "repair" and {"after / true", "before / true"} <= values.keys():
-        yield (
-            f"predictions with the corrected model are {values['after / true']:.2f} times as far off as with the true "
-            f"one; with the declared model they were {values['before / true']:.2f} times as far off."
-        )
-    elif case == "pairs" and {"first", "both"} <= values.keys():
-        first, both = 100 * values["first"], 100 * values["both"]
-        yield f"{both:.0f} % of {number} pairs of effects were named completely; {first:.0f} % got a right first name."
-    elif case == "planted in measured sets" and {"named", "within 3 sigma"} <= values.keys():
-        named, near = 100 * values["named"], 100 * values["within 3 sigma"]
-        yield f"of {number} changes {named:.0f} % were named, {near:.0f} % also with their strength."
-    elif case == "unknown physics" and {"unexplained", "reduced"} <= values.keys():
-        called, reduced = 100 * values["unexplained"], 100 * values["reduced"]
-        yield f"physics of no catalogue: {called:.0f} % called unexplained; errors reduced in {reduced:.0f} %."
+    elif case in OF_LOOP:
+        percent = {f"% {name}": 100 * value for name, value in values.items()}
+        with suppress(KeyError):  # a part of the numbers is not there
+            yield OF_LOOP[case].format_map({**values, **percent, "number": number})
 
 
 def _value(row: Row) -> float:

@@ -52,7 +52,7 @@ def _shot(rerun: Any, recording: Any, shot: ShownShot) -> None:
     start, name = shot.start, f"shots/{rerun.escape_entity_path_part(shot.name)}"
     if len(shot.times):
         recording.log(f"{name}/measured", rerun.Points3D(shot.positions, radii=0.004), static=True)
-    for what, places in (("estimate", shot.states[:, :3]), ("prediction", shot.predicted)):
+    for what, _, places, _ in shot.lines:
         if len(places) > 1:
             recording.log(f"{name}/{what}", rerun.LineStrips3D([places]), static=True)
     for time, state in zip(shot.state_times, shot.states, strict=True):

@@ -1,12 +1,13 @@
 """A shot holds samples, states, predictions, contacts and hits of one track for drawing."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from statistics import NormalDist
 
 import numpy as np
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Index
 from ballfg.state import POSITION, STANDARD_GRAVITY, VELOCITY, VZ, Z
 
 NEAR = 0.05
@@ -101,6 +102,14 @@ class ShownShot:
         """Number of samples, states and predictions."""
         return len(self.times) + len(self.state_times) + len(self.predicted_times)
 
+    @property
+    def lines(self) -> list[tuple[str, Array, Array, Array]]:
+        """Name, stamps (k,) s, places (k, 3) m and their sigmas (k, 3) m of the estimate and of the prediction."""
+        return [
+            ("estimate", self.state_times, self.states[:, :3], self.state_sigmas[:, :3]),
+            ("prediction", self.predicted_times, self.predicted, self.predicted_sigmas),
+        ]
+
     def residuals(self) -> Array:
         """(n, 3) m, measured less estimated; NaN at samples without a state."""
         return self.positions - _at(self.times, self.state_times, self.states[:, :3])
@@ -121,3 +130,52 @@ def _at(times: Array, known: Array, values: Array) -> Array:
 
 
 SAME_STAMP = 1e-9  # s. Tables keep all digits of a stamp, so that those of one sample agree far better.
+
+
+LEVEL = 0.9  # Nominal coverage of an interval
+HALF_WIDTH = NormalDist().inv_cdf((1.0 + LEVEL) / 2.0)
+"""Standard deviations on either side of a prediction for that coverage."""
+BIN = 0.05  # s, width of the bins of the horizon
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Shares by horizon, the time since the last sample before the first predicted one.
+
+    Attributes:
+        horizons: (b,) s, the middle of each bin that holds samples.
+        shares: (b, 3) of the coordinates x, y, z inside their intervals, 0 to 1.
+        samples: (b,) counts.  shots: (b,) counts.
+    """
+
+    horizons: Array
+    shares: Array
+    samples: Index
+    shots: Index
+
+
+def coverage(shots: Iterable[ShownShot]) -> Coverage:
+    """The coverage of the predictions of many shots.
+
+    Args: shots: with samples and predictions; samples outside of the predicted part are left out.
+    """
+    held: dict[int, Array] = {}
+    samples: dict[int, int] = {}
+    tracks: dict[int, int] = {}
+    for shot in shots:
+        errors = np.abs(shot.prediction_errors())
+        known = np.isfinite(errors).all(axis=1)
+        before = shot.times[shot.times < shot.predicted_times[0]] if len(shot.predicted_times) else shot.times
+        if not known.any() or not len(before):
+            continue
+        inside = errors[known] <= HALF_WIDTH * shot.predicted_sigmas[known]
+        bins = np.floor((shot.predicted_times[known] - before[-1] + SAME_STAMP) / BIN).astype(int)
+        for b in np.unique(bins).tolist():
+            held[b] = held.get(b, np.zeros(3)) + inside[bins == b].sum(axis=0)
+            samples[b] = samples.get(b, 0) + int((bins == b).sum())
+            tracks[b] = tracks.get(b, 0) + 1
+    order = sorted(held)
+    counts = np.array([samples[b] for b in order], dtype=np.int64)
+    sums = np.array([held[b] for b in order]).reshape(-1, 3)
+    middles = (np.array(order, dtype=np.float64) + 0.5) * BIN
+    return Coverage(middles, sums / counts[:, None], counts, np.array([tracks[b] for b in order], dtype=np.int64))

@@ -7,10 +7,9 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.checks import did_you_mean, shown
-from ballfg.pages.coverage import Coverage, coverage
 from ballfg.pages.given import Given
 from ballfg.pages.outline import Outline, outline
-from ballfg.pages.shot import SAME_STAMP, ShownShot, marks
+from ballfg.pages.shot import SAME_STAMP, Coverage, ShownShot, coverage, marks
 from ballfg.pages.tables import ResultTable
 from ballfg.tracks import Track
 

@@ -102,7 +102,9 @@ def _changes(
     changes = {}
     for coefficient, should in planted.items():
         value, sigma = now[coefficient]
-        was, its_sigma = before.get(coefficient, (_absence(change, coefficient), 0.0))
+        listed = None if change.endswith(DRIFT) else _listed(change).get(coefficient)
+        absent = 0.0 if listed is None or listed.absent is None else listed.absent
+        was, its_sigma = before.get(coefficient, (absent, 0.0))
         expected, slope = was + should, 1.0
         if change in RANDOM:
             expected = math.hypot(was, should)
@@ -133,12 +135,6 @@ def strengths(values: Mapping[str, tuple[float, float | None]]) -> dict[str, Str
         if sigma is not None:
             found[coefficient] = (value, sigma) if first is None else (value - first[0], math.hypot(sigma, first[1]))
     return found
-
-
-def _absence(change: str, coefficient: str) -> float:
-    """The value of a coefficient where nothing is changed."""
-    listed = _listed(change).get(coefficient)
-    return 0.0 if listed is None or listed.absent is None or change.endswith(DRIFT) else listed.absent
 
 
 def _listed(change: str) -> dict[str, Coefficient]:

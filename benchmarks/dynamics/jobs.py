@@ -12,10 +12,9 @@ import numpy as np
 
 from ballfg.benchmarks.dynamics import contenders
 from ballfg.benchmarks.dynamics.contenders import Contender, GraphContender, Job, fan_of
-from ballfg.benchmarks.dynamics.recipes import RESIDUAL
 from ballfg.benchmarks.dynamics.record import Record, job_digest
 from ballfg.benchmarks.dynamics.task import Task, score_path
-from ballfg.benchmarks.dynamics.trained import recipe, trained_contender
+from ballfg.benchmarks.dynamics.trained import RESIDUAL, recipe, trained_contender
 from ballfg.benchmarks.resumable import collect
 from ballfg.benchmarks.speed.stopwatch import milliseconds
 from ballfg.learning.run.loop import TrainingStoppedError

@@ -29,15 +29,8 @@ NINETY = 1.645  # Standard deviations to each side of a normal distribution's ce
 
 def _line(method: str) -> dict[str, Any]:
     colour, width, dashes = STYLES.get(method, OTHER)
-    return {
-        "color": colour,
-        "linestyle": dashes,
-        "label": method,
-        "linewidth": width,
-        "zorder": 10.0 - width,
-        "marker": "o",
-        "markersize": 3,
-    }
+    line = {"color": colour, "linestyle": dashes, "linewidth": width, "zorder": 10.0 - width}
+    return line | {"label": method, "marker": "o", "markersize": 3}
 
 
 def _band(method: str) -> dict[str, Any]:

@@ -175,7 +175,10 @@ def run_intervals(
     if datasets:
         work = [(dataset, method) for dataset in datasets for method in METHODS]
         for dataset, method in progress(work, len(work), "sets judged"):
-            _measured(results, dataset, method, first, jobs)
+            model, known = nominal_model(dataset.ball), dataset.info.position_noise is not None
+            settings, tracks = dataset_settings(dataset, model), list(dataset)[:first]
+            judged = judged_both_ways(method, model, known_surfaces(dataset), settings, tracks, jobs, known)
+            add_judged(results, dataset.info.name, method, judged)
         return
     configs = [simulated_config(results.seed, number, plan.tracks) for number in range(plan.settings)]
     if diagnosed:
@@ -183,15 +186,6 @@ def run_intervals(
         configs += [planted_config(results.seed, number, plan.tracks) for number in repeats]
     for config in progress(configs, len(configs), "simulated settings judged"):
         (_diagnosed if diagnosed else _simulated)(results, config, jobs)
-
-
-def _measured(results: Results, dataset: Dataset, method: str, first: int | None, jobs: int) -> None:
-    tracks = list(dataset)[:first]
-    model = nominal_model(dataset.ball)
-    surfaces = known_surfaces(dataset)
-    known = dataset.info.position_noise is not None
-    judged = judged_both_ways(method, model, surfaces, dataset_settings(dataset, model), tracks, jobs, known)
-    add_judged(results, dataset.info.name, method, judged)
 
 
 def known_surfaces(dataset: Dataset) -> Surfaces:

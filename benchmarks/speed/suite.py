@@ -50,22 +50,6 @@ METHODS: Final[Mapping[str, GradientMethod]] = {
 EXACT: Final = 1e-12  # Tolerance of the linear solution in the reference gradient; training takes `SOLUTION_TOLERANCE`
 
 
-def time_gradients(watch: Stopwatch, model: LearnedModel, graph: BallGraph, start: Values) -> None:
-    """Forward: from the first guess to the minimum. Backward: from a derivative by all states to one by all weights.
-
-    Building the torch objective belongs to the backward pass.
-    """
-    minimum, kind = TRAINING.minimize(graph, start), model.architecture.kind
-    forward = watch.time(kind, "forward_time", lambda: TRAINING.minimize(graph, start))
-    exact = backward(model, graph, minimum, ImplicitGradient(), EXACT)
-    for name, method in METHODS.items():
-        row, once = f"{kind}, {name}", partial(backward, model, graph, minimum, method)
-        found = once()
-        figure = watch.time(row, "backward_time", once)
-        watch.add(row, "backward_over_forward", figure.value / forward.value, watch.runs)
-        watch.add(row, "gradient_error", float((found - exact).norm() / exact.norm()))
-
-
 def backward(
     model: LearnedModel,
     graph: BallGraph,
@@ -216,10 +200,23 @@ def _time_coefficients(watch: Stopwatch, model: AnalyticModel, track: Track) -> 
 
 
 def _time_gradients(watch: Stopwatch, model: AnalyticModel, track: Track, iterations: int) -> None:
-    """The gradient through the estimate, with the learned model that the analytic one was put into."""
+    """The gradient through the estimate, with the learned model that the analytic one was put into.
+
+    Forward: from the first guess to the minimum. Backward: from a derivative by all states to one by all weights;
+    building the torch objective belongs to it.
+    """
     learned = build(Architecture.of("mnn+gs"), radius=model.radius)
     pretrain(learned, model, 0, iterations)
-    time_gradients(watch, learned, *_problem(Smoother(learned, NO_SURFACE, problem_settings()), track))
+    graph, start = _problem(Smoother(learned, NO_SURFACE, problem_settings()), track)
+    minimum, kind = TRAINING.minimize(graph, start), learned.architecture.kind
+    forward = watch.time(kind, "forward_time", lambda: TRAINING.minimize(graph, start))
+    exact = backward(learned, graph, minimum, ImplicitGradient(), EXACT)
+    for name, method in METHODS.items():
+        row, once = f"{kind}, {name}", partial(backward, learned, graph, minimum, method)
+        found = once()
+        figure = watch.time(row, "backward_time", once)
+        watch.add(row, "backward_over_forward", figure.value / forward.value, watch.runs)
+        watch.add(row, "gradient_error", float((found - exact).norm() / exact.norm()))
 
 
 def _time_minimisation(watch: Stopwatch, name: str, smoother: Smoother, graph: BallGraph, values: Values) -> None:

@@ -186,9 +186,8 @@ def _source(
 ) -> Source:
     from ballfg.checks import check_number
     from ballfg.live.sources.bag import bag_samples
-    from ballfg.live.sources.replay import Replay, dataset_samples
     from ballfg.live.sources.sockets import listen as listened
-    from ballfg.live.sources.source import Pipe
+    from ballfg.live.sources.source import Pipe, Replay, dataset_samples
 
     check_number("idle", idle, "s", above=0.0, limit=1e9)
     if replay is not None and bag:
