@@ -5,9 +5,6 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-Array: TypeAlias = NDArray[np.float64]
-"""Numbers."""
-Index: TypeAlias = NDArray[np.int64]
-"""Indices and counts."""
-Mask: TypeAlias = NDArray[np.bool_]
-"""Selects some of several things."""
+Array: TypeAlias = NDArray[np.float64]  # Numbers
+Index: TypeAlias = NDArray[np.int64]  # Indices and counts
+Mask: TypeAlias = NDArray[np.bool_]  # Selects some of several things

@@ -29,24 +29,17 @@ _SYNONYMS = {
 }
 
 
-MAX_SHOWN = 80
-"""Largest number of characters of a value in a message."""
-LARGEST = 1e100
-"""Largest size of a measured number, in any unit: squares of much larger ones overflow."""
-MAX_SAID = 160
-"""Largest number of characters of a library's own words in a message."""
-MAX_LISTED = 12
-"""Largest number of names of a list in a message."""
+MAX_SHOWN = 80  # Largest number of characters of a value in a message
+LARGEST = 1e100  # Largest size of a measured number, in any unit: squares of much larger ones overflow
+MAX_SAID = 160  # Largest number of characters of a library's own words in a message
+MAX_LISTED = 12  # Largest number of names of a list in a message
 MAX_NAME = 200
 """Largest number of characters of a name of a track, dataset, camera, label or group, which go to files and pages."""
-MAX_TEXT = 2000
-"""Largest number of characters of other text in a file, such as the source of data."""
+MAX_TEXT = 2000  # Largest number of characters of other text in a file, such as the source of data
 MAX_PATH, MAX_PART = 4095, 255
 """Largest numbers of characters of a path and of a name in it: no file system has longer ones."""
-_JOINERS = "\u200c\u200d"
-"""Invisible letters in Persian, Indian scripts and emoji."""
-_MAX_COMPARED = 200
-"""Largest number of candidates for a misspelt name; each takes some 20 microseconds."""
+_JOINERS = "\u200c\u200d"  # Invisible letters in Persian, Indian scripts and emoji
+_MAX_COMPARED = 200  # Largest number of candidates for a misspelt name; each takes some 20 microseconds
 
 
 def type_name(value: object) -> str:
@@ -100,10 +93,7 @@ def listed(names: Collection[object]) -> str:
 
 
 def check_text(label: str, value: object, *, optional: bool = False) -> None:
-    """Refuses a value other than non-empty text.
-
-    Raises: TypeError: not text. ValueError: only spaces.
-    """
+    """Refuses a value other than non-empty text. Raises: TypeError: not text. ValueError: only spaces."""
     if value is None and optional:
         return
     if not isinstance(value, str):
@@ -203,13 +193,9 @@ def check_number(
     """A finite number as a float.
 
     Args:
-        label: name of the argument in the message.
-        value: to be checked.
-        unit: of the number.
-        above: the value must be greater, if given.
-        least: the smallest plausible value, if it differs from `above`.
-        limit: the largest plausible size in this unit.
-        instead: the probable unit of a larger value.
+        label: name of the argument in the message.  value: to be checked.  unit: of the number.
+        above: the value must be greater, if given.  least: the smallest plausible value, if it differs from `above`.
+        limit: the largest plausible size in this unit.  instead: the probable unit of a larger value.
     Raises: TypeError: not a number. ValueError: not finite, or out of range.
     """
     number = as_float(label, value, unit)
@@ -227,10 +213,7 @@ def check_number(
 
 
 def check_range(label: str, value: Any, low: float, high: float) -> float:
-    """A number within [low, high] as a float.
-
-    Raises: TypeError: not a number. ValueError: out of range, as NaN is.
-    """
+    """A number within [low, high] as a float. Raises: TypeError: not a number. ValueError: out of range, as NaN is."""
     number = as_float(label, value)
     if not low <= number <= high:
         top = "" if math.isinf(high) else f", at most {high:g}"
@@ -252,10 +235,7 @@ def check_count(label: str, value: Any, low: int, high: int | None = None) -> in
 
 
 def check_instance(label: str, value: Any, kind: type[Any], remedy: str) -> Any:
-    """The value, if it is of a type.
-
-    Raises: TypeError: naming both types.
-    """
+    """The value, if it is of a type. Raises: TypeError: naming both types."""
     if not isinstance(value, kind):
         raise TypeError(f"{label} must be {_article(kind)}; got {type_name(value)} {shown(value)}. {remedy}")
     return value
@@ -266,10 +246,7 @@ def _article(kind: type) -> str:
 
 
 def as_float(label: str, value: Any, unit: str = "") -> float:
-    """A real number as a float, which may be NaN or infinite; a bool is refused.
-
-    Raises: TypeError: naming the type.
-    """
+    """A real number as a float, which may be NaN or infinite; a bool is refused. Raises: TypeError: naming the type."""
     if not is_number(value):
         rule, got = (
             (f"a number in {unit}", f"{type_name(value)} {shown(value)}") if unit else ("a number", shown(value))
@@ -282,10 +259,7 @@ def as_float(label: str, value: Any, unit: str = "") -> float:
 
 
 def check_iterable(label: str, value: object) -> None:
-    """Refuses a single value, and text.
-
-    Raises: TypeError: naming the type.
-    """
+    """Refuses a single value, and text. Raises: TypeError: naming the type."""
     if not isinstance(value, Iterable) or isinstance(value, str | bytes):
         raise TypeError(f"{label} must be a list or tuple; got {type_name(value)} {shown(value)}. Put it in a list.")
 
@@ -300,20 +274,14 @@ def check_each(label: str, values: Iterable[T], kind: type[Any], remedy: str) ->
 
 
 def check_flag(label: str, value: object) -> bool:
-    """True or False.
-
-    Raises: TypeError: anything else.
-    """
+    """True or False. Raises: TypeError: anything else."""
     if not isinstance(value, bool | np.bool_):
         raise TypeError(f"{label} must be True or False; got {type_name(value)} {shown(value)}. Give one of them.")
     return bool(value)
 
 
 def check_choice(label: str, value: object, known: Collection[str]) -> None:
-    """Refuses a value other than the known names.
-
-    Raises: ValueError: listing them.
-    """
+    """Refuses a value other than the known names. Raises: ValueError: listing them."""
     if not isinstance(value, str) or value not in known:
         raise ValueError(f"{label} must be one of {listed(known)}; got {shown(value)}. Choose one of them.")
 

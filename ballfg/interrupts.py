@@ -15,8 +15,7 @@ SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 ONCE: Final = 5.0
 """s after a signal during which further ones have no effect: terminals and services send several, and none may
 interrupt cleaning up."""
-AGAIN: Final = 0.02
-"""s after which an interrupt that Python could not raise is repeated."""
+AGAIN: Final = 0.02  # s after which an interrupt that Python could not raise is repeated
 
 _listening: bool = False
 _number: int | None = None

@@ -15,20 +15,15 @@ from typing import Final, Protocol, TypeVar
 
 T = TypeVar("T")
 
-QUIET: Final = 2.0
-"""s. Shorter work shows nothing."""
-LINE_EVERY: Final = 2.5
-"""s, least time between plain lines."""
-BEAT: Final = 0.2
-"""s between two checks of the time since the last line."""
+QUIET: Final = 2.0  # s. Shorter work shows nothing.
+LINE_EVERY: Final = 2.5  # s, least time between plain lines
+BEAT: Final = 0.2  # s between two checks of the time since the last line
 VARIABLE: Final = "BALLFG_QUIET"
 """Environment variable that silences progress, as the option --quiet does; child processes inherit it."""
 
 
 @dataclass
 class _Stage:
-    """A stage of the work."""
-
     text: str
     since: float
 

@@ -25,11 +25,9 @@ PACKAGE = "ballfg"
 class Source:
     """The package that a registered class comes from."""
 
-    package: str
-    """Name of the installed package; the name of the module without one."""
+    package: str  # Name of the installed package; the name of the module without one
 
-    version: str | None
-    """None without an installed package."""
+    version: str | None  # None without an installed package
 
     def __str__(self) -> str:
         return self.package if self.version is None else f"{self.package} {self.version}"
@@ -118,10 +116,7 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         return cls
 
     def lookup(self, name: str) -> type[T]:
-        """The class of a name.
-
-        Raises: ValueError: if there is none; the message lists the names there are.
-        """
+        """The class of a name. Raises: ValueError: if there is none; the message lists the names there are."""
         if name in self:
             return self[name]
         raise ValueError(

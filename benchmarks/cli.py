@@ -5,59 +5,116 @@ Commands import what they need inside: `ballfg-bench --help` must not wait for t
 
 from __future__ import annotations
 
+import inspect
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial, wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ballfg.cli.inputs import CORES, Address, Cluster, workers
+from ballfg.cli.inputs import CORES, Address, Cluster, Jobs, print_notes, workers
 from ballfg.cli.start import start
 
 if TYPE_CHECKING:
     from ballfg.benchmarks.results import Results
     from ballfg.tracks import Dataset
 
-MEASURED = Path("../shared/data")
-"""Folder of the measured sets unless BALLFG_DATA names another."""
+MEASURED = Path("../shared/data")  # Folder of the measured sets unless BALLFG_DATA names another
 
 app = typer.Typer(name="ballfg-bench", add_completion=False, pretty_exceptions_enable=False)
 
-Data = Annotated[Path | None, typer.Option("--data", help="Dataset of measured tracks; synthetic tracks by default.")]
-Datasets = Annotated[
-    list[Path] | None,
-    typer.Option("--data", help="Dataset of measured tracks; may be repeated; synthetic tracks by default."),
-]
-Beside = Annotated[
-    list[Path] | None,
-    typer.Option("--data", help="Dataset of measured tracks in addition; may be repeated."),
-]
+Names, Paths = list[str] | None, list[Path] | None
+_data = partial(typer.Option, "--data")
+Data = Annotated[Path | None, _data(help="Dataset of measured tracks; synthetic tracks by default.")]
+Datasets = Annotated[Paths, _data(help="Dataset of measured tracks; may be repeated; synthetic tracks by default.")]
+Beside = Annotated[Paths, _data(help="Dataset of measured tracks in addition; may be repeated.")]
 Planted = Annotated[
-    list[Path] | None,
-    typer.Option("--data", help="Dataset of measured tracks; may be repeated; by default the sets in $BALLFG_DATA."),
+    Paths, _data(help="Dataset of measured tracks; may be repeated; by default the sets in $BALLFG_DATA.")
 ]
+Timed = Annotated[Path | None, _data(help="Dataset whose tracks are timed in addition to the fixed problem.")]
 Changes = Annotated[
-    list[str] | None,
-    typer.Option("--change", help="Name of the effect that is planted; may be repeated; all by default."),
-]
-Timed = Annotated[
-    Path | None, typer.Option("--data", help="Dataset whose tracks are timed in addition to the fixed problem.")
+    Names, typer.Option("--change", help="Name of the effect that is planted; may be repeated; all by default.")
 ]
 Transfer = Annotated[Path | None, typer.Option(help="Dataset on which the models are judged without learning from it.")]
 TransferTracks = Annotated[
     int | None, typer.Option(min=1, help="Number of tracks, the first ones, of the --transfer dataset; all by default.")
 ]
-Methods = Annotated[
-    list[str] | None,
-    typer.Option("--method", help="Name of a compared method; may be repeated; all by default."),
-]
+Methods = Annotated[Names, typer.Option("--method", help="Name of a compared method; may be repeated; all by default.")]
 Out = Annotated[Path, typer.Option("--out", help="Folder for results.json and pictures.")]
 Quick = Annotated[bool, typer.Option("--quick", help="A quick look at few tracks or runs, not a measurement.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Random seed.")]
-Jobs = Annotated[int, typer.Option("--jobs", min=1, help="Number of processes.", show_default="one per core")]
+
+
+@dataclass(frozen=True)
+class Run:
+    """The options that benchmarks share."""
+
+    out: Out = Path("results")
+    quick: Quick = False
+    seed: Seed = 0
+    jobs: Jobs = CORES
+    cluster: Cluster = None
+    address: Address = None
+
+    def results(self, command: str, data: Sequence[Path] = (), more: Sequence[str] = ()) -> Results:
+        """Empty results that name the command, with `more` words after the datasets; of paths the folder's name."""
+        import torch
+
+        from ballfg.benchmarks.results import Results
+
+        torch.set_num_threads(1)
+        words = ["ballfg-bench", command, *(word for one in data for word in ("--data", one.resolve().name)), *more]
+        return Results(" ".join([*words, *(["--quick"] if self.quick else []), "--seed", str(self.seed)]), self.seed)
+
+    @contextmanager
+    def folder(self) -> Iterator[Path]:
+        """The output folder, made if it does not exist; no other run writes there until the block ends."""
+        from ballfg.files.whole_folder import reserved
+
+        if self.out.exists() and not self.out.is_dir():
+            raise ValueError(f"--out must be a folder; {self.out} is a file. Choose another name.")
+        self.out.mkdir(parents=True, exist_ok=True)
+        with reserved(self.out, "--out"):
+            yield self.out
+
+    @contextmanager
+    def working(self) -> Iterator[tuple[Path, int]]:
+        """The output folder as workers find it, and their number."""
+        with workers(self.cluster, self.address, self.jobs) as processes, self.folder() as folder:
+            yield self.shared(folder), processes
+
+    def shared(self, folder: Path) -> Path:
+        """The folder as workers find it: those of a cluster share it, and were started anywhere."""
+        return folder if self.cluster is None else folder.resolve()
+
+    def finish(self, results: Results, pictures: Sequence[Path] = ()) -> None:
+        """Print the table, write `results.json`, say where everything is."""
+        from ballfg.benchmarks.conclusions import print_table
+
+        print_table(results.rows)
+        path = results.write(self.out)
+        print(f"\n{path}: {len(results.rows)} rows")
+        for picture in pictures:
+            print(self.out / picture.name)
+
+
+def _benchmark(command: Callable[..., None]) -> Callable[..., None]:
+    """Makes a command of a function whose first parameter stands for the options of `Run`, which come last."""
+    own, shared = (inspect.signature(one, eval_str=True).parameters for one in (command, Run))
+    parameters = [p.replace(kind=p.KEYWORD_ONLY) for p in (*list(own.values())[1:], *shared.values())]
+
+    @wraps(command)
+    def typed(**given: Any) -> None:
+        command(Run(**{name: given.pop(name) for name in shared}), **given)
+
+    typed.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    typed.__annotations__ = {p.name: p.annotation for p in parameters}
+    return app.command()(typed)
 
 
 @app.callback(invoke_without_command=True)
@@ -67,15 +124,10 @@ def _root(context: typer.Context) -> None:
         typer.echo(context.get_help())
 
 
-@app.command()
+@_benchmark
 def estimators(
+    run: Run,
     data: Data = None,
-    out: Out = Path("results"),
-    quick: Quick = False,
-    seed: Seed = 0,
-    jobs: Jobs = CORES,
-    cluster: Cluster = None,
-    address: Address = None,
 ) -> None:
     """Comparison of sliding window, EKF, RTS, online estimator and smoother on the same tracks.
 
@@ -86,25 +138,19 @@ def estimators(
     """
     from ballfg.benchmarks.estimators.suite import FULL, QUICK, run_dataset, run_synthetic
 
-    results = _start("estimators", [] if data is None else [data], quick, seed)
-    size = QUICK if quick else FULL
+    results, size = run.results("estimators", [] if data is None else [data]), QUICK if run.quick else FULL
     dataset = None if data is None else _open(data)  # before the folder: a wrong path leaves nothing behind
-    with workers(cluster, address, jobs) as processes, _folder(out) as folder:
+    with run.working() as (folder, processes):
         if dataset is None:
             pictures = run_synthetic(results, folder, size, processes)
         else:
             pictures = run_dataset(results, dataset, folder, size, processes)
-        _finish(results, out, pictures)
+        run.finish(results, pictures)
 
 
-@app.command()
+@_benchmark
 def cameras(
-    out: Out = Path("results"),
-    quick: Quick = False,
-    seed: Seed = 0,
-    jobs: Jobs = CORES,
-    cluster: Cluster = None,
-    address: Address = None,
+    run: Run,
 ) -> None:
     """Tracking from rendered videos of three cameras: points, velocities and clocks against the truth.
 
@@ -115,24 +161,18 @@ def cameras(
     """
     from ballfg.benchmarks.cameras.suite import FULL, QUICK, run_cameras
 
-    results = _start("cameras", [], quick, seed)
-    with workers(cluster, address, jobs) as processes, _folder(out) as folder:
-        pictures = run_cameras(results, folder, QUICK if quick else FULL, processes)
-        _finish(results, out, pictures)
+    results = run.results("cameras")
+    with run.working() as (folder, processes):
+        run.finish(results, run_cameras(results, folder, QUICK if run.quick else FULL, processes))
 
 
-@app.command()
+@_benchmark
 def dynamics(
+    run: Run,
     data: Datasets = None,
     transfer: Transfer = None,
     transfer_tracks: TransferTracks = None,
     method: Methods = None,
-    out: Out = Path("results"),
-    quick: Quick = False,
-    seed: Seed = 0,
-    jobs: Jobs = CORES,
-    cluster: Cluster = None,
-    address: Address = None,
 ) -> None:
     """Comparison of dynamics models that are trained on the same tracks and predict the same others.
 
@@ -152,27 +192,21 @@ def dynamics(
     words = [] if transfer is None else ["--transfer", transfer.resolve().name]
     words += [] if transfer_tracks is None else ["--transfer-tracks", str(transfer_tracks)]
     words += [word for name in method or () for word in ("--method", name)]
-    results = _start("dynamics", data or [], quick, seed, words)
+    results = run.results("dynamics", data or [], words)
     other = None if transfer is None else _open(transfer)
     measured = Measured([_open(one) for one in data], other, transfer_tracks) if data else None
-    plan = QUICK if quick else FULL
-    with workers(cluster, address, jobs) as processes, _folder(out) as folder:
-        pictures = run_dynamics(results, measured, _shared(folder, cluster), plan, processes, method)
-        _finish(results, out, pictures)
+    with run.working() as (folder, processes):
+        plan = QUICK if run.quick else FULL
+        run.finish(results, run_dynamics(results, measured, folder, plan, processes, method))
 
 
-@app.command()
+@_benchmark
 def loop(
+    run: Run,
     data: Beside = None,
     reliability: Annotated[
         bool, typer.Option("--reliability", help="Test stated probabilities, on sets with effects of random size.")
     ] = False,
-    out: Out = Path("results"),
-    quick: Quick = False,
-    seed: Seed = 0,
-    jobs: Jobs = CORES,
-    cluster: Cluster = None,
-    address: Address = None,
 ) -> None:
     """Test of the diagnosis: planted effects that it names, false alarms, and models that it repairs.
 
@@ -190,30 +224,24 @@ def loop(
 
     if reliability and data:
         raise typer.BadParameter("its sets are simulated. Leave out --data.", param_hint="--reliability")
-    results = _start("loop", data or [], quick, seed, ["--reliability"] if reliability else [])
-    for folder in data or []:
-        _open(folder)  # refuses a bad folder at once instead of hours later
-    plan = QUICK if quick else FULL
-    with workers(cluster, address, jobs) as processes, _folder(out) as place:
-        shared, kept = [_shared(one, cluster) for one in data or []], _shared(place, cluster)
+    results = run.results("loop", data or [], ["--reliability"] if reliability else [])
+    for one in data or []:
+        _open(one)  # refuses a bad folder at once instead of hours later
+    plan = QUICK if run.quick else FULL
+    with run.working() as (folder, processes):
         pictures: list[Path] = []
         if reliability:
-            run_reliability(results, kept, plan.reliability, processes)
+            run_reliability(results, folder, plan.reliability, processes)
         else:
-            pictures = run_loop(results, shared, kept, plan, processes)
-        _finish(results, out, pictures)
+            pictures = run_loop(results, list(map(run.shared, data or [])), folder, plan, processes)
+        run.finish(results, pictures)
 
 
-@app.command()
+@_benchmark
 def planted(
+    run: Run,
     data: Planted = None,
     change: Changes = None,
-    out: Out = Path("results"),
-    quick: Quick = False,
-    seed: Seed = 0,
-    jobs: Jobs = CORES,
-    cluster: Cluster = None,
-    address: Address = None,
 ) -> None:
     """Test of the diagnosis on measured tracks: effects planted in them that it names and measures.
 
@@ -235,18 +263,18 @@ def planted(
     if not folders:
         raise typer.BadParameter(f"there are no measured sets in {root}. Give --data.", param_hint="--data")
     words = [word for name in change or () for word in ("--change", name)]
-    results = _start("planted", data or [], quick, seed, words)
-    for folder in folders:
-        _open(folder)  # refuses a bad folder at once instead of hours later
-    chosen = change or (QUICK_CHANGES if quick else tuple(CHANGES))
-    with workers(cluster, address, jobs) as processes, _folder(out) as place:
-        shared, most = [_shared(one, cluster) for one in folders], QUICK_TRACKS if quick else None
-        pictures = run_planted(results, shared, _shared(place, cluster), chosen, most, processes)
-        _finish(results, out, pictures)
+    results = run.results("planted", data or [], words)
+    for one in folders:
+        _open(one)  # refuses a bad folder at once instead of hours later
+    chosen, most = (change or QUICK_CHANGES, QUICK_TRACKS) if run.quick else (change or tuple(CHANGES), None)
+    with run.working() as (folder, processes):
+        pictures = run_planted(results, list(map(run.shared, folders)), folder, chosen, most, processes)
+        run.finish(results, pictures)
 
 
-@app.command()
+@_benchmark
 def intervals(
+    run: Run,
     data: Datasets = None,
     tracks: Annotated[int | None, typer.Option(min=4, help="Number of tracks of each --data, the first ones.")] = None,
     trained: Annotated[
@@ -255,12 +283,6 @@ def intervals(
     diagnosed: Annotated[
         bool, typer.Option("--diagnosed", help="Predict new simulated tracks with the model of a diagnosis.")
     ] = False,
-    out: Out = Path("results"),
-    quick: Quick = False,
-    seed: Seed = 0,
-    jobs: Jobs = CORES,
-    cluster: Cluster = None,
-    address: Address = None,
 ) -> None:
     """Coverage of 90 % prediction intervals, with the noise as usual and with the noise that tracks show.
 
@@ -277,18 +299,18 @@ def intervals(
         raise typer.BadParameter("it is for simulated tracks. Leave out --data.", param_hint="--diagnosed")
     more = [*([] if tracks is None else ["--tracks", str(tracks)]), *(["--trained"] if trained else [])]
     more += ["--diagnosed"] if diagnosed else []
-    results = _start("intervals", data or [], quick, seed, more)
+    results = run.results("intervals", data or [], more)
     if trained and tracks is not None:
         raise typer.BadParameter("networks are judged on all tracks. Leave it out.", param_hint="--tracks")
     datasets = [] if trained else [_open(one) for one in data or []]
-    with workers(cluster, address, jobs) as processes:
+    with workers(run.cluster, run.address, run.jobs) as processes:
         if trained:
-            networks.run_trained(results, data or [], networks.QUICK if quick else networks.FULL, processes)
+            networks.run_trained(results, data or [], networks.QUICK if run.quick else networks.FULL, processes)
         else:
-            plan = suite.QUICK if quick else suite.FULL
+            plan = suite.QUICK if run.quick else suite.FULL
             suite.run_intervals(results, datasets, plan, processes, tracks, diagnosed)
-    with _folder(out) as folder:
-        _finish(results, folder, [])
+    with run.folder():
+        run.finish(results)
 
 
 @app.command()
@@ -325,15 +347,16 @@ def speed(
     if peers and data is not None:
         raise typer.BadParameter("peers solve the fixed problems only. Leave it out.", param_hint="--data")
     words = [*(["--peers"] if peers else []), *(word for name in interpreters for word in ("--peer", name))]
-    results, size = _start("speed", [] if data is None else [data], quick, seed, words), QUICK if quick else FULL
+    run, size = Run(out, quick, seed), QUICK if quick else FULL
+    results = run.results("speed", [] if data is None else [data], words)
     if gate is not None and not gate.is_file():
         raise typer.BadParameter(f"there is no file {gate}. Give an earlier results.json.", param_hint="--gate")
     if peers:
         run_peers(results, interpreters, size)
     else:
         run_speed(results, None if data is None else _open(data), size)
-    with _folder(out) as folder:
-        _finish(results, folder, [])
+    with run.folder():
+        run.finish(results)
     if gate is not None:
         try:
             print("\n" + "\n".join(check_ratios(results.rows, gate)))
@@ -343,7 +366,6 @@ def speed(
 
 
 def _interpreters(words: Sequence[str]) -> dict[str, Path]:
-    """Paths by library."""
     pairs = [word.partition("=") for word in words]
     for library, sign, path in pairs:
         if not (library and sign and path):
@@ -351,56 +373,13 @@ def _interpreters(words: Sequence[str]) -> dict[str, Path]:
     return {library: Path(path) for library, _, path in pairs}
 
 
-def _start(command: str, data: Sequence[Path], quick: bool, seed: int, more: Sequence[str] = ()) -> Results:
-    """Empty results that name the command, with `more` words after the datasets; of a path only the folder's name."""
-    import torch
-
-    from ballfg.benchmarks.results import Results
-
-    torch.set_num_threads(1)
-    words = ["ballfg-bench", command]
-    words += [word for one in data for word in ("--data", one.resolve().name)]
-    words += [*more, *(["--quick"] if quick else []), "--seed", str(seed)]
-    return Results(" ".join(words), seed)
-
-
 def _open(data: Path) -> Dataset:
-    """A dataset; repairs in it are noted on stderr."""
     from ballfg.estimation.reading import with_readings
     from ballfg.tracks import read_dataset
 
     dataset = with_readings(read_dataset(data))
-    for note in dataset.notes:
-        print(f"note: {note}", file=sys.stderr)
+    print_notes(dataset.notes)
     return dataset
-
-
-@contextmanager
-def _folder(out: Path) -> Iterator[Path]:
-    """The output folder, made if it does not exist; no other run writes there until the block ends."""
-    from ballfg.files.whole_folder import reserved
-
-    if out.exists() and not out.is_dir():
-        raise ValueError(f"--out must be a folder; {out} is a file. Choose another name.")
-    out.mkdir(parents=True, exist_ok=True)
-    with reserved(out, "--out"):
-        yield out
-
-
-def _shared(folder: Path, cluster: str | None) -> Path:
-    """The folder as workers find it: those of a cluster share it, and were started anywhere."""
-    return folder if cluster is None else folder.resolve()
-
-
-def _finish(results: Results, out: Path, pictures: Sequence[Path]) -> None:
-    """Print the table, write `results.json`, say where everything is."""
-    from ballfg.benchmarks.tables import print_table
-
-    print_table(results.rows)
-    path = results.write(out)
-    print(f"\n{path}: {len(results.rows)} rows")
-    for picture in pictures:
-        print(picture)
 
 
 def run(arguments: Sequence[str] | None = None) -> None:

@@ -1,21 +1,20 @@
-"""Explains the numbers of a benchmark by target values and conclusions in sentences under each table."""
+"""Prints rows of numbers as tables, with target values and conclusions in sentences."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Final
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from typing import Final, TextIO
 
 from ballfg.benchmarks.results import CURVE_MARK, Row
 
 RIGHT: Final = {"nees": 9.0, "nees_velocity": 3.0, "nis_median": 2.37, "nis_mean": 3.0}
 """Value of a metric where stated covariances are right: degrees of freedom; of `nis_median` chi-square's median."""
-GIVEN_SPIN: Final = ("paper",)
-"""Cases in which every method is given the true spin, which then has no error."""
-GIVEN: Final = "given"
-"""Replaces the error of given quantities in a table."""
+GIVEN_SPIN: Final = ("paper",)  # Cases in which every method is given the true spin, which then has no error
+GIVEN: Final = "given"  # Replaces the error of given quantities in a table
 NEES_PLACE: Final = re.compile(r"nees_\w+")
 COVERAGE: Final = re.compile(r"(?:conformal_)?coverage_(\d+)(?:_\w+)?")
-NONE_WANTED: Final = ("not_converged", "failed", "places_outside_99")
-"""Counts whose target is zero."""
+NONE_WANTED: Final = ("not_converged", "failed", "places_outside_99")  # Counts whose target is zero
 OF_CASE: Final = {
     "naming, spin labels": "1",
     "naming, no spin labels": "1",
@@ -26,12 +25,10 @@ OF_CASE: Final = {
     "planted in measured sets": "1",
 }
 """Target values of all shares and ratios of a table of `ballfg-bench loop` or `planted`."""
-JUDGED: Final = ("nees", "coverage_90", "nis_median")
-"""Metrics of the consistency of covariances, the sharpest first."""
+JUDGED: Final = ("nees", "coverage_90", "nis_median")  # Metrics of the consistency of covariances, the sharpest first
 NEAR, NEAR_SHARE = 0.1, 0.03
 """A NEES within 10 % of its target, and a coverage within three points of it, count as right."""
-ALIKE: Final = 1.01
-"""Ratio of errors up to which methods count as equally good."""
+ALIKE: Final = 1.01  # Ratio of errors up to which methods count as equally good
 COMPARED: Final = {
     "velocity_rmse": "velocity",
     "position_rmse": "position",
@@ -52,6 +49,19 @@ WORDS: Final = (
     (re.compile(r"^places_outside"), "places_outside_99: places of the track whose nees is outside its 99 % range"),
 )
 """Explanations of metrics for newcomers."""
+OF_LOOP: Final = {
+    "silence": "of {number} datasets without an effect {% effect named:.1f} % got a wrong name, {% any alarm:.1f} % "
+    "any alarm.",
+    "repair": "predictions with the corrected model are {after / true:.2f} times as far off as with the true one; with "
+    "the declared model they were {before / true:.2f} times as far off.",
+    "pairs": "{% both:.0f} % of {number} pairs of effects were named completely; {% first:.0f} % got a right first "
+    "name.",
+    "planted in measured sets": "of {number} changes {% named:.0f} % were named, {% within 3 sigma:.0f} % also with "
+    "their strength.",
+    "unknown physics": "physics of no catalogue: {% unexplained:.0f} % called unexplained; errors reduced in "
+    "{% reduced:.0f} %.",
+}
+"""Conclusions from the line over all data of a table of `ballfg-bench loop` or `planted`."""
 CASES: Final = {
     "paper": "free flights, true dynamics and spin known to all, noise on states at every step, as in the paper; the "
     "spin is given, not estimated: it adds nothing to nees, and its intervals always hold",
@@ -178,24 +188,76 @@ def _of_loop(case: str, by_metric: Mapping[str, Mapping[str, Row]]) -> Iterator[
     if case.startswith("naming"):
         shares = ", ".join(f"{100 * v:.0f} % at {name}" for name, v in values.items() if name.endswith("typical"))
         yield f"planted effects named right: {shares} size."
-    elif case == "silence" and {"effect named", "any alarm"} <= values.keys():
-        named, alarm = 100 * values["effect named"], 100 * values["any alarm"]
-        yield f"of {number} datasets without an effect {named:.1f} % got a wrong name, {alarm:.1f} % any alarm."
-    elif case == "repair" and {"after / true", "before / true"} <= values.keys():
-        yield (
-            f"predictions with the corrected model are {values['after / true']:.2f} times as far off as with the true "
-            f"one; with the declared model they were {values['before / true']:.2f} times as far off."
-        )
-    elif case == "pairs" and {"first", "both"} <= values.keys():
-        first, both = 100 * values["first"], 100 * values["both"]
-        yield f"{both:.0f} % of {number} pairs of effects were named completely; {first:.0f} % got a right first name."
-    elif case == "planted in measured sets" and {"named", "within 3 sigma"} <= values.keys():
-        named, near = 100 * values["named"], 100 * values["within 3 sigma"]
-        yield f"of {number} changes {named:.0f} % were named, {near:.0f} % also with their strength."
-    elif case == "unknown physics" and {"unexplained", "reduced"} <= values.keys():
-        called, reduced = 100 * values["unexplained"], 100 * values["reduced"]
-        yield f"physics of no catalogue: {called:.0f} % called unexplained; errors reduced in {reduced:.0f} %."
+    elif case in OF_LOOP:
+        percent = {f"% {name}": 100 * value for name, value in values.items()}
+        with suppress(KeyError):  # a part of the numbers is not there
+            yield OF_LOOP[case].format_map({**values, **percent, "number": number})
 
 
 def _value(row: Row) -> float:
     return float("nan") if row.value is None else row.value
+
+
+def print_table(rows: Iterable[Row], stream: TextIO | None = None) -> None:
+    """One table a case, a line per metric and a column per method; drawn on a terminal, plain text elsewhere.
+
+    Target values stand in a column of their own, conclusions below the table.
+    """
+    stream = stream or sys.stdout
+    shown = [row for row in rows if CURVE_MARK not in row.metric]
+    for case in dict.fromkeys(row.case for row in shown):
+        of_case = [row for row in shown if row.case == case]
+        columns, lines = _pivot(of_case)
+        goals = [should_be(case, line[0], line[1]) for line in lines]
+        if any(goals):
+            columns = [*columns, "should be"]
+            lines = [[*line, goal] for line, goal in zip(lines, goals, strict=True)]
+        if stream.isatty():
+            _print_rich(case, columns, lines, stream)
+        else:
+            _print_plain(case, columns, lines, stream)
+        for sentence in conclusions(case, of_case):
+            print(f"-> {sentence}", file=stream)
+        for words in legend(case, of_case):
+            print(f"   {words}", file=stream)
+
+
+def _pivot(rows: list[Row]) -> tuple[list[str], list[list[str]]]:
+    """Column heads, and lines of cells: metric, unit, one cell a method."""
+    methods = list(dict.fromkeys(row.method for row in rows))
+    keys = list(dict.fromkeys((row.metric, row.unit) for row in rows))
+    cells = {(row.metric, row.unit, row.method): _cell(row) for row in rows}
+    lines = [[metric, unit, *(cells.get((metric, unit, m), "") for m in methods)] for metric, unit in keys]
+    return ["metric", "unit", *methods], lines
+
+
+def _cell(row: Row) -> str:
+    if is_given(row.case, row.metric):
+        return GIVEN
+    text = _number(row.value)
+    return text if row.low is None or row.high is None else f"{text} [{_number(row.low)}, {_number(row.high)}]"
+
+
+def _number(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.0f}" if value == int(value) and abs(value) < 1e6 else f"{value:.3g}"
+
+
+def _print_plain(case: str, columns: list[str], lines: list[list[str]], stream: TextIO) -> None:
+    widths = [max(len(line[i]) for line in [columns, *lines]) for i in range(len(columns))]
+    print(f"\n{case}", file=stream)
+    for line in [columns, *lines]:
+        print("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip(), file=stream)
+
+
+def _print_rich(case: str, columns: list[str], lines: list[list[str]], stream: TextIO) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=case, title_justify="left")
+    for i, name in enumerate(columns):
+        table.add_column(name, overflow="fold", justify="left" if i < 2 else "right")
+    for line in lines:
+        table.add_row(*line)
+    Console(file=stream).print(table)

@@ -9,12 +9,9 @@ from scipy.stats import binomtest, chi2, norm
 
 from ballfg.arrays import Array, Index
 
-RESAMPLES = 1000
-"""Number of bootstrap samples: the ends of a 95 % interval then vary by about a tenth of its length."""
-CONFIDENCE = 0.95
-"""Level of the bootstrap's and of Wilson's intervals."""
-BAND = 0.99
-"""Level of the chi-square bands."""
+RESAMPLES = 1000  # Number of bootstrap samples: the ends of a 95 % interval then vary by about a tenth of its length
+CONFIDENCE = 0.95  # Level of the bootstrap's and of Wilson's intervals
+BAND = 0.99  # Level of the chi-square bands
 
 Statistic = Callable[[Index], Array]
 """From track numbers (b, m), b resamples of m tracks, to a figure for each resample (b,)."""
@@ -61,10 +58,7 @@ def inside(errors: Array, sigmas: Array, level: float) -> NDArray[np.bool_]:
 
 
 def share(outcomes: Sequence[bool]) -> Figure:
-    """The share of true outcomes, with Wilson's interval.
-
-    Raises: ValueError: if there is no outcome.
-    """
+    """The share of true outcomes, with Wilson's interval. Raises: ValueError: if there is no outcome."""
     if not outcomes:
         raise ValueError("outcomes must not be empty; got none. Count something first.")
     interval = binomtest(sum(outcomes), len(outcomes)).proportion_ci(CONFIDENCE, method="wilson")
@@ -72,10 +66,7 @@ def share(outcomes: Sequence[bool]) -> Figure:
 
 
 def median_and_range(values: Sequence[float]) -> Figure:
-    """The median of some values (n,), with the lowest and the highest one.
-
-    Raises: ValueError: if there is no value.
-    """
+    """The median of some values (n,), with the lowest and the highest one. Raises: ValueError: if there is no value."""
     if not values:
         raise ValueError("values must not be empty; got none. Measure something first.")
     return Figure(float(np.median(values)), min(values), max(values))

@@ -24,10 +24,8 @@ class Row:
 
     Attributes:
         case: names the data (`paper`, `fair`, `aimy` ...).
-        method: names the estimator, model or part (`smoother`, `ekf` ...).
-        metric: names the quantity.
-        unit: SI or a multiple, or `1` for none.
-        value: None where it is not finite.
+        method: names the estimator, model or part (`smoother`, `ekf` ...).  metric: names the quantity.
+        unit: SI or a multiple, or `1` for none.  value: None where it is not finite.
         low, high: ends of its interval, None where it has none.
         n: number of tracks, samples or runs; docs/benchmarks.md says which for each metric.
     """
@@ -46,9 +44,7 @@ class Row:
 class Results:
     """All numbers of one run of a benchmark.
 
-    Attributes:
-        command: as typed, with a dataset's folder name in place of its path.
-        seed: random seed.
+    Attributes: command: as typed, with a dataset's folder name in place of its path.  seed: random seed.
     """
 
     command: str

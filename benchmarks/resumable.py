@@ -1,9 +1,12 @@
 """Resumes long runs: keeps records of finished parts, and computes the missing ones in processes."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
+
+from pydantic import TypeAdapter
 
 from ballfg.checks import one_line, short_text
 from ballfg.files.json_file import read_json
@@ -16,8 +19,7 @@ from ballfg.progress import progress
 T = TypeVar("T")
 R = TypeVar("R")
 
-RUNS_FOLDER = "runs"
-"""Folder in a benchmark's output with a JSON file for each finished part."""
+RUNS_FOLDER = "runs"  # Folder in a benchmark's output with a JSON file for each finished part
 
 
 def in_processes(work: Callable[[T], R], items: Sequence[T], jobs: int, what: str) -> list[R]:
@@ -45,21 +47,28 @@ def collect(
     return found
 
 
-def write_record(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a record whole or not at all. Raises: ValueError: if a number is not finite."""
-    write_text(path, json.dumps(content, allow_nan=False) + "\n")
+@dataclass(frozen=True)
+class Kept:
+    """What is kept of a finished part, as a JSON file. `digest`: of its settings; a record of others does not count."""
 
+    what: ClassVar[str] = "a finished case"  # In messages
+    digest: str
 
-def read_record(path: Path, digest: str, build: Callable[[dict[str, Any]], R], what: str) -> R | None:
-    """The record that `build` makes of a file's content; None if there is no file, or its `digest` is another.
+    def save(self, path: Path) -> None:
+        """Write the file whole or not at all. Raises: ValueError: if a number is not finite."""
+        write_text(path, json.dumps(asdict(self), allow_nan=False) + "\n")
 
-    Raises: ValueError: if the file does not hold a record; the message names `what` it should be.
-    """
-    if not path.is_file():
-        return None
-    try:
-        content: dict[str, Any] = read_json(path)
-        return None if content["digest"] != digest else build(content)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        reason = short_text(f"{type(error).__name__}: {one_line(error)}")
-        raise ValueError(f"{path}: must be {what} ({reason}). Delete it, and it is run again.") from error
+    @classmethod
+    def read(cls, path: Path, digest: str) -> Self | None:
+        """The record in a file; None if there is no file, or its `digest` is another.
+
+        Raises: ValueError: if the file holds something else.
+        """
+        if not path.is_file():
+            return None
+        try:
+            content: dict[str, Any] = read_json(path)
+            return None if content["digest"] != digest else TypeAdapter(cls).validate_python(content)
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            reason = short_text(f"{type(error).__name__}: {one_line(error)}")
+            raise ValueError(f"{path}: must be {cls.what} ({reason}). Delete it, and it is run again.") from error

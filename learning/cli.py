@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ballfg.cli.errors import guarded
+from ballfg.cli.start import guarded
 from ballfg.cli.start import start
 from ballfg.machine import usable_cores
 from ballfg.progress import alive, announce, idle, progress

@@ -7,8 +7,8 @@ import os
 
 import pytest
 
-from ballfg.collector import collect_rarely
 from ballfg.dynamics import EFFECTS, AnalyticModel
+from ballfg.machine import collect_rarely
 from ballfg.progress import VARIABLE
 
 collect_rarely()  # as the commands do

@@ -53,7 +53,7 @@ def run():
         raise ImportError("initialization failed")
 """
 GUARDED = """
-from ballfg.cli.errors import guarded
+from ballfg.cli.start import guarded
 
 def work():
     try:

@@ -10,8 +10,8 @@ from contextlib import suppress
 from importlib import import_module
 from typing import NoReturn
 
-from ballfg.collector import collect_rarely
 from ballfg.interrupts import interrupted, let_go, listen, say_so
+from ballfg.machine import collect_rarely
 
 
 def ballfg() -> None:

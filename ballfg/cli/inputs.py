@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Generic, Literal, TypeVar
 
 import typer
 
-from ballfg.cli.errors import NOT_ESTIMATED
+from ballfg.cli.start import NOT_ESTIMATED
 from ballfg.machine import usable_cores
 from ballfg.progress import progress
 
@@ -27,10 +27,8 @@ if TYPE_CHECKING:
     from ballfg.tracks import Dataset
 
 
-MOST_FAILURES = 10
-"""Number of failed tracks that are named; further ones are counted."""
-MOST_DOUBTS = 3
-"""Number of tracks whose doubts are printed; further ones are counted."""
+MOST_FAILURES = 10  # Number of failed tracks that are named; further ones are counted
+MOST_DOUBTS = 3  # Number of tracks whose doubts are printed; further ones are counted
 
 
 def check_dataset(folder: Path) -> Path:
@@ -114,7 +112,6 @@ class Source(enum.StrEnum):
 
 
 D = TypeVar("D", bound="Dataset | SightedDataset")
-Opened = TypeVar("Opened", "Dataset", "SightedDataset")
 
 
 @dataclass(frozen=True)
@@ -124,15 +121,13 @@ class Inputs(Generic[D]):
     dataset: D
     model: BallModel
     surfaces: Surfaces
-    observed: float
-    """s from the start of each track that a noise estimate may use."""
+    observed: float  # s from the start of each track that a noise estimate may use
 
     def estimator(self, method: str, solver: Solver | None = None, group: str | None = None) -> Estimator:
         """The estimator of a name, with the noise of the dataset.
 
         Args:
-            method: its name.
-            solver: of its factor graph; None: the usual one.
+            method: its name.  solver: of its factor graph; None: the usual one.
             group: of tracks whose labels name none; None: unknown.
         Raises: ValueError: if there is no such estimator or group, or the solver cannot solve it.
         """
@@ -176,60 +171,46 @@ def open_inputs(
         observed: s from the start of each track that a noise estimate may use.
         ball: name of the dataset's known ball; None: any ball.
     """
+    from ballfg.estimation import dataset_surfaces
     from ballfg.estimation.reading import with_readings
     from ballfg.tracks import read_dataset
 
     know_effects(effects_files)
-    return _inputs(with_readings(read_dataset(dataset)), model, observed, ball)
+    data = with_readings(read_dataset(dataset))
+    return Inputs(data, open_model(data, model, ball), dataset_surfaces(data), observed)
 
 
 def open_sighted(
     dataset: Path, model: Path | None, effects_files: Iterable[Path] | None = None, ball: str | None = None
 ) -> Inputs[SightedDataset]:
     """`open_inputs` for sightings."""
-    from ballfg.estimation import read_sighted
+    from ballfg.estimation import dataset_surfaces, read_sighted
 
     know_effects(effects_files)
-    return _inputs(read_sighted(dataset), model, ball=ball)
-
-
-def _inputs(data: Opened, model: Path | None, observed: float = math.inf, ball: str | None = None) -> Inputs[Opened]:
-    from ballfg.estimation import dataset_surfaces
-
-    return Inputs(data, open_model(data, model, ball), dataset_surfaces(data), observed)
-
-
-def check_ball(data: Dataset | SightedDataset, name: str) -> None:
-    """Checks that a named ball agrees with the dataset's.
-
-    Raises: ValueError: if the name is unknown, or the dataset's radius and mass differ from that ball's.
-    """
-    from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball
-    from ballfg.dynamics.nominal import known_name
-
-    wanted, own = known_ball(name), data.ball
-    if known_name(own) != wanted:
-        ball = KNOWN_BALLS[wanted].ball
-        raise ValueError(
-            f"--ball {name} has a radius of {ball.radius:g} m and {ball.mass:g} kg; {data.path} states "
-            f"{own.radius:g} m and {own.mass:g} kg. Leave --ball out, or correct ball in dataset.yaml."
-        )
+    data = read_sighted(dataset)
+    return Inputs(data, open_model(data, model, ball), dataset_surfaces(data), math.inf)
 
 
 def open_model(data: Dataset | SightedDataset, model: Path | None, ball: str | None = None) -> BallModel:
     """The model of a file, or the nominal one; prints notes on data and model on stderr.
 
     Args: ball: name of the data's known ball; None: any ball.
+    Raises: ValueError: if that name is unknown, or the data's radius and mass differ from that ball's.
     """
     import torch
 
     from ballfg.dynamics import load_model, nominal_model
-    from ballfg.dynamics.nominal import inertia_factor, nominal_note
+    from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball
+    from ballfg.dynamics.nominal import inertia_factor, known_name, nominal_note
     from ballfg.estimation.configure import table_note
     from ballfg.estimation.reading import unused_model
 
-    if ball is not None:
-        check_ball(data, ball)
+    if ball is not None and known_name(data.ball) != (wanted := known_ball(ball)):
+        named, own = KNOWN_BALLS[wanted].ball, data.ball
+        raise ValueError(
+            f"--ball {ball} has a radius of {named.radius:g} m and {named.mass:g} kg; {data.path} states "
+            f"{own.radius:g} m and {own.mass:g} kg. Leave --ball out, or correct ball in dataset.yaml."
+        )
     torch.set_num_threads(1)  # the batches are small: threads cost more time than they save
     notes = [*data.notes, *filter(None, [table_note(data)])]
     if model is None:
@@ -242,10 +223,7 @@ def open_model(data: Dataset | SightedDataset, model: Path | None, ball: str | N
 
 
 def check_out(out: Path, dataset: Path) -> None:
-    """Refuses a result in the place of the measurements.
-
-    Raises: ValueError: if `out` is a table of the dataset.
-    """
+    """Refuses a result in the place of the measurements. Raises: ValueError: if `out` is a table of the dataset."""
     if out.stem in DATASET_TABLES and out.resolve().parent == dataset.resolve():
         raise ValueError(f"out must not be a table of the dataset itself; got {out}. Choose another name.")
 

@@ -7,9 +7,8 @@ from matplotlib.figure import Figure
 
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.track_prediction import TrackPrediction
-from ballfg.pages.marks import Mark
 from ballfg.pages.pictures import by_axis
-from ballfg.pages.shot import ShownShot
+from ballfg.pages.shot import Mark, ShownShot
 
 PARTS: Final = (("position", "m"), ("velocity", "m/s"), ("spin", "rad/s"))
 AXES: Final = ("x", "y", "z")

@@ -10,9 +10,9 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.estimation.online.state import OnlineState
-from ballfg.live.mcap import Chunk, Message, chunk_of, ending, opening, whole_chunks
+from ballfg.live.mcap import Chunk, Message, chunk_of, ending, opening
 from ballfg.live.outlook import Outlook, unusable
-from ballfg.live.recording import Recording, refuse_repeated, refused, say_continued
+from ballfg.live.recording import Recording
 from ballfg.live.sources.bag import need_rosbags
 from ballfg.live.tracker import BallUpdate
 from ballfg.state import POSITION, SPIN, VELOCITY
@@ -21,25 +21,21 @@ FRAME = "world"
 STATES = "/ball/odometry"
 PATHS = "/ball/path"
 TOPICS = ((STATES, "nav_msgs/msg/Odometry"), (PATHS, "nav_msgs/msg/Path"))
-LATEST = 2.1e9
-"""s; later stamps do not fit a ROS message, whose seconds have 32 bits."""
-UNKNOWN = 1e6
-"""rad^2, variance of the orientation, which is not estimated."""
+LATEST = 2.1e9  # s; later stamps do not fit a ROS message, whose seconds have 32 bits
+UNKNOWN = 1e6  # rad^2, variance of the orientation, which is not estimated
 
 
 class BagWriter:
     """Appends `nav_msgs/Odometry` for each state and `nav_msgs/Path` for its prediction to an MCAP file.
 
-    The messages of half a second form one chunk. The end of the file is written when the context ends. A file without
-    it, after a kill, can be continued as well.
+    The messages of half a second form one chunk. The end of the file is written when the context ends; readers of this
+    package add it to the file of a killed writer.
 
-    Args:
-        out: the file.  horizon: s, of the paths.
-        repeats: True if the input starts from its beginning again, so that it continues nothing.
-    Raises: ValueError: the package `rosbags` is missing, or the file is no bag to continue; and as `Recording`.
+    Args: out: the file.  horizon: s, of the paths.
+    Raises: ValueError: the package `rosbags` is missing, or the file holds something; and as `Recording`.
     """
 
-    def __init__(self, out: Path, horizon: float, repeats: bool = True) -> None:
+    def __init__(self, out: Path, horizon: float) -> None:
         need_rosbags()
         from rosbags.typesys import Stores, get_typestore
 
@@ -50,11 +46,10 @@ class BagWriter:
         self._messages: list[Message] = []
         self._turn = threading.Lock()
         self._recording = Recording(out, self._flush)
-        try:
-            self._continue(repeats)
-        except BaseException:
+        if self._recording.size:
             self._recording.__exit__()
-            raise
+            raise ValueError(f"out must be a new file for a bag; {out} holds something. Choose another name.")
+        self._recording.append(self._opening)
 
     def __enter__(self) -> BagWriter:
         return self
@@ -64,29 +59,7 @@ class BagWriter:
             self._flush()
             self._recording.append(ending(self._opening, self._chunks, len(TOPICS)))
 
-    def _continue(self, repeats: bool) -> None:
-        """Makes the file end with its last whole chunk."""
-        recording, begin = self._recording, len(self._opening)
-        if recording.size:
-            refuse_repeated(recording.path, repeats)
-        found = recording.read(0, begin)
-        if not self._opening.startswith(found):
-            raise refused(recording.path)
-        if len(found) < begin:
-            recording.cut(0)
-            recording.append(self._opening)
-            return
-        try:
-            self._chunks = whole_chunks(recording.read, begin, recording.size, len(TOPICS))
-        except ValueError:  # damaged: content after the damage must not be cut off
-            raise refused(recording.path) from None
-        end, size = self._chunks[-1].end if self._chunks else begin, recording.size
-        ended = recording.read(end, size - end) == ending(self._opening, self._chunks, len(TOPICS))
-        recording.cut(end)
-        say_continued(recording.path, end, 0 if ended else size - end)
-
     def _flush(self) -> None:
-        """Appends the messages since the last chunk."""
         with self._turn:
             if self._messages:
                 content, chunk = chunk_of(self._messages, len(TOPICS), self._recording.size)

@@ -1,4 +1,4 @@
-"""A ball of a tracker holds its estimator, and copies of it for the insertion of late samples."""
+"""A ball of a tracker holds its estimator, and copies of it for late samples; a newcomer may become a ball."""
 
 from bisect import bisect_left, insort
 from collections import deque
@@ -12,16 +12,13 @@ from ballfg.arrays import Array
 from ballfg.estimation.online.online import Online
 from ballfg.estimation.online.state import OnlineState
 from ballfg.estimation.smoother.motion import Motion
-from ballfg.live.gate import Known
+from ballfg.live.gate import Gate, Known
 
 PARTS = 4
 """Number of copies of the estimator within a lag: a late sample costs the pushes of the lag and of a quarter of it."""
-LEAST_APART = 8
-"""Least number of samples between two copies: a copy costs some 0.7 ms."""
-LOOK_BACK = 24
-"""Number of last samples in which an event may still be found or moved."""
-SAME_EVENT = 0.03
-"""s. Two events of a kind that lie closer are the same."""
+LEAST_APART = 8  # Least number of samples between two copies: a copy costs some 0.7 ms
+LOOK_BACK = 24  # Number of last samples in which an event may still be found or moved
+SAME_EVENT = 0.03  # s. Two events of a kind that lie closer are the same.
 
 
 @dataclass(frozen=True, order=True)
@@ -29,9 +26,7 @@ class Kept:
     """A sample of a ball.
 
     Attributes:
-        time: s.
-        position: (3,) m.
-        sigma: (3,) m, or None.
+        time: s.  position: (3,) m.  sigma: (3,) m, or None.
         by_hit: True if the sample was taken as one after a hit: it was off the ball's path.
     """
 
@@ -179,7 +174,6 @@ class Ball:
 
 
 def _events(motion: Motion, before: Motion, start: float, end: float) -> Sequence[BallEvent]:
-    """Events between two samples."""
     if not motion.linked:
         return [BallEvent("gap", end)]
     found = [BallEvent("bounce", start + t, h) for t, h in zip(motion.times, motion.heights, strict=True)]
@@ -188,3 +182,55 @@ def _events(motion: Motion, before: Motion, start: float, end: float) -> Sequenc
     if motion.rest is not None and before.rest is None:
         found.append(BallEvent("rest", end, motion.rest))
     return found
+
+
+PATIENCE = 0.2  # s. A newcomer unseen for longer is forgotten.
+SPEED = 12.0  # m/s per axis, spread of the velocity of a ball with one position
+BEND = 12.0  # m/s^2, deviation of a path from a line through two positions
+
+
+class Newcomer:
+    """The first positions of a possible ball."""
+
+    patience = PATIENCE
+
+    def __init__(self, first: Kept, gate: Gate) -> None:
+        self.samples = [first]
+        self.gate = gate
+
+    @property
+    def last(self) -> float:
+        """s, the newest stamp."""
+        return self.samples[-1].time
+
+    def has(self, time: float) -> bool:
+        """True if it has a sample of that stamp."""
+        return any(kept.time == time for kept in self.samples)
+
+    def repeats(self, time: float, position: Array) -> bool:
+        """True if it has exactly that sample."""
+        return any(kept.time == time and np.array_equal(kept.position, position) for kept in self.samples)
+
+    def take(self, kept: Kept) -> None:
+        """Takes in a sample."""
+        insort(self.samples, kept)
+
+    def distances(self, time: float, positions: Array) -> Array:
+        """(n,) squared Mahalanobis distances of positions (n, 3) m from its region at a time."""
+        if abs(time - self.last) > PATIENCE:
+            return np.full(len(positions), np.inf)
+        return self.gate.on_path(self._known(), time, positions)
+
+    def _known(self) -> Known:
+        """A line through the first and the last sample, at the last."""
+        first, last = self.samples[0], self.samples[-1]
+        noise, dt = self.gate.noise, last.time - first.time
+        mean, covariance = np.zeros(6), np.zeros((6, 6))
+        mean[:3], covariance[:3, :3] = last.position, np.diag(noise)
+        if dt > 0.0:
+            mean[3:] = (last.position - first.position) / dt
+            covariance[3:, 3:] = np.diag(2 * noise / dt**2 + (BEND * dt) ** 2)
+            covariance[:3, 3:] = covariance[3:, :3] = np.diag(noise / dt)
+        else:
+            covariance[3:, 3:] = SPEED**2 * np.eye(3)
+        return Known(last.time, mean, covariance)

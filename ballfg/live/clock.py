@@ -4,23 +4,17 @@ import math
 from collections import deque
 from enum import Enum, auto
 
-RESTART_AFTER = 3
-"""Number of consecutive rising stamps far behind that mean a restart of the clock."""
+RESTART_AFTER = 3  # Number of consecutive rising stamps far behind that mean a restart of the clock
 
 
 class Stamp(Enum):
     """Classes of stamps in a stream."""
 
-    NEW = auto()
-    """Later than all before it, or equal to the last."""
-    LATE = auto()
-    """Earlier than the newest, by no more than the lag."""
-    OLD = auto()
-    """Earlier than that."""
-    BACK = auto()
-    """The previous stamp was wrong: the stream continues from before it."""
-    RESTART = auto()
-    """The sender's clock has restarted."""
+    NEW = auto()  # Later than all before it, or equal to the last
+    LATE = auto()  # Earlier than the newest, by no more than the lag
+    OLD = auto()  # Earlier than that
+    BACK = auto()  # The previous stamp was wrong: the stream continues from before it
+    RESTART = auto()  # The sender's clock has restarted
 
 
 class Clock:
@@ -31,9 +25,7 @@ class Clock:
 
     Args: lag: s.  gap: s, longest time that a ball may stay unseen.
 
-    Attributes:
-        newest: s.
-        safe: s, the newest stamp that is not in doubt.
+    Attributes: newest: s.  safe: s, the newest stamp that is not in doubt.
     """
 
     def __init__(self, lag: float, gap: float) -> None:

@@ -15,24 +15,17 @@ from ballfg.arrays import Array
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.prediction.state import BallState
 
-GATE = 30.0
-"""Squared Mahalanobis distance, 3 degrees of freedom: one good position in a million exceeds it."""
+GATE = 30.0  # Squared Mahalanobis distance, 3 degrees of freedom: one good position in a million exceeds it
 LONG_GATE = 16.0
 """The same after a silence of more than `HIT_TIME`, when the region of a ball is wide and may hold another ball."""
 HIT_GATE = 9.0
 """The same for a ball that may have been hit: a position beyond three standard deviations begins another ball."""
-HIT_TIME = 0.1
-"""s. After a longer silence a ball is searched only on its path: a hit could have moved it anywhere."""
-HIT_SPEED = 10.0
-"""m/s per axis, by which a hit moves the ball away from its path, apart from half of its own speed."""
-SLACK = 4.0
-"""m/s^2. Spread of the acceleration beside gravity and drag: the Magnus force of a strong spin is 20."""
-SLIDE = 1.0
-"""m/s. Spread of the change of tangential velocity in a bounce."""
-FLOOR = 0.002
-"""m. Least noise of a position."""
-FAR = 1e6
-"""Cost of an impossible pair."""
+HIT_TIME = 0.1  # s. After a longer silence a ball is searched only on its path: a hit could have moved it anywhere.
+HIT_SPEED = 10.0  # m/s per axis, by which a hit moves the ball away from its path, apart from half of its own speed
+SLACK = 4.0  # m/s^2. Spread of the acceleration beside gravity and drag: the Magnus force of a strong spin is 20.
+SLIDE = 1.0  # m/s. Spread of the change of tangential velocity in a bounce.
+FLOOR = 0.002  # m. Least noise of a position.
+FAR = 1e6  # Cost of an impossible pair
 
 
 @dataclass(frozen=True)
@@ -40,9 +33,7 @@ class Known:
     """The belief on a ball at a time.
 
     Attributes:
-        time: s.
-        mean: (6,) position m and velocity m/s.
-        covariance: (6, 6) of that, in the products of those units.
+        time: s.  mean: (6,) position m and velocity m/s.  covariance: (6, 6) of that, in the products of those units.
     """
 
     time: float

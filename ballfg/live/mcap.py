@@ -17,21 +17,16 @@ from typing import Any, NamedTuple
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = 1, 2, 3, 4, 5, 6, 7, 8
 STATISTICS, DATA_END = 11, 15
-RECORD = struct.Struct("<BQ")
-"""Header of each record: its kind and its number of bytes."""
+RECORD = struct.Struct("<BQ")  # Header of each record: its kind and its number of bytes
 SPAN = struct.Struct("<QQQIIQ")
 """Header of a chunk: first and last time (ns), bytes of the content, checksum (0: none), length of the name of the
 compression (0: none), bytes of the content again."""
-INDEX = struct.Struct("<HI")
-"""Header of an index: channel, bytes of the entries."""
-ENTRY = struct.Struct("<QQ")
-"""Entry of an index: time of a message (ns) and its offset in the chunk."""
+INDEX = struct.Struct("<HI")  # Header of an index: channel, bytes of the entries
+ENTRY = struct.Struct("<QQ")  # Entry of an index: time of a message (ns) and its offset in the chunk
 WRITER = "ballfg"
-LONGEST_OPENING = 1 << 20
-"""Largest number of bytes of an opening; that of the two topics of `ballfg live` has 4,000."""
+LONGEST_OPENING = 1 << 20  # Largest number of bytes of an opening; that of the two topics of `ballfg live` has 4,000
 
-Read = Callable[[int, int], bytes]
-"""Function that reads bytes of a file from an offset on, at most a given number."""
+Read = Callable[[int, int], bytes]  # Function that reads bytes of a file from an offset on, at most a given number
 
 
 class Message(NamedTuple):
@@ -47,8 +42,7 @@ class Chunk:
     """Place of a chunk in the file.
 
     Attributes:
-        first, last: ns, times of its messages.
-        offset: bytes, of its record.  content: bytes of its messages.
+        first, last: ns, times of its messages.  offset: bytes, of its record.  content: bytes of its messages.
         counts: messages of each channel.
     """
 

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 
+from ballfg.arrays import Array
 from ballfg.checks import shown
 from ballfg.estimation.online.state import OnlineState
 from ballfg.estimation.result import Status
+from ballfg.live.tracker import BallUpdate
 from ballfg.prediction import BallState, apex, next_contact, plane_crossing
 from ballfg.prediction.crossing import Crossing
 from ballfg.prediction.forecast import carried_by
-from ballfg.state import VELOCITY
+from ballfg.state import POSITION, SPIN, VELOCITY
 
-VAGUE = 3.0
-"""m/s, standard deviation of the velocity beyond which predictions carry no information."""
+VAGUE = 3.0  # m/s, standard deviation of the velocity beyond which predictions carry no information
 AXES = ("x", "y", "z")
 
 
@@ -38,10 +42,7 @@ class Outlook:
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane across one axis.
-
-    Attributes: axis: x, y or z.  place: m.
-    """
+    """A plane across one axis. Attributes: axis: x, y or z. place: m."""
 
     axis: str
     place: float
@@ -78,12 +79,10 @@ def look_out(state: OnlineState, horizon: float, plane: Plane | None) -> Outlook
             carried = carried_by(state)
         except Exception as error:  # a prediction must not end the stream
             return Outlook(note=f"no prediction: {_one_line(error)}")
-        bounce = _tried(lambda: next_contact(*carried, horizon), "bounce", notes)
-        top = _tried(lambda: apex(*carried, horizon), "apex", notes)
-        crossing = None
-        if plane is not None:
-            across, place = plane.normal, plane.place
-            crossing = _tried(lambda: plane_crossing(*carried, across, place, horizon), "crossing", notes)
+        bounce = _tried(partial(next_contact, *carried, horizon), "bounce", notes)
+        top = _tried(partial(apex, *carried, horizon), "apex", notes)
+        across = None if plane is None else partial(plane_crossing, *carried, plane.normal, plane.place, horizon)
+        crossing = across and _tried(across, "crossing", notes)
     return Outlook(bounce, top, crossing, "; ".join(notes))
 
 
@@ -113,3 +112,81 @@ def _tried(find: Callable[[], Crossing | None], what: str, notes: list[str]) -> 
 
 def _one_line(error: Exception) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())[:200]
+
+
+Fields = dict[str, Any]
+KINDS = ("state", "newcomer", "lost", "refused", "continued")
+"""Kinds of lines; the last one marks where a command continued an earlier recording."""
+
+
+def answer(update: BallUpdate, outlook: Outlook | None, tag: tuple[tuple[str, Any], ...]) -> Fields:
+    """The fields of a line. Args: outlook: None for a line without state. tag: further fields, from the input."""
+    fields: Fields = {"kind": update.kind}
+    if update.ball is not None:
+        fields["ball"] = update.ball
+    if update.kind == "lost":
+        return fields | {"t": update.time, "samples": update.samples}
+    if update.kind == "state" and update.state is not None and outlook is not None:
+        fields |= _state(update, outlook)
+    else:
+        fields |= {"t_input": _number(update.time)}
+        fields |= {"samples": update.samples} if update.samples else {}
+        fields |= {"reason": update.reason} if update.reason else {}
+    if update.position is not None:
+        fields["measured"] = _numbers(update.position)
+    return fields | dict(tag)
+
+
+def refusal(reason: str) -> Fields:
+    """The fields of a line about an unreadable input line."""
+    return {"kind": "refused", "reason": reason}
+
+
+def encoded(fields: Fields, latency: float) -> bytes:
+    """A line with its latency, ms."""
+    text = json.dumps(fields, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return f'{text[:-1]},"latency_ms":{latency:.3f}}}\n'.encode()
+
+
+def _state(update: BallUpdate, outlook: Outlook) -> Fields:
+    state = update.state
+    assert state is not None
+    return {
+        "t": state.time,
+        "t_input": update.time,
+        "late": update.late,
+        "samples": update.samples,
+        "status": state.status.name.lower(),
+        "position": _numbers(state.mean[POSITION]),
+        "velocity": _numbers(state.mean[VELOCITY]),
+        "spin": _numbers(state.mean[SPIN]),
+        "covariance": [_numbers(row) for row in state.covariance],
+        "innovation": _numbers(state.innovation) if np.isfinite(state.innovation).all() else None,
+        "events": [
+            {"kind": e.kind, "t": e.time} | ({} if e.height is None else {"z": e.height}) for e in update.events
+        ],
+        "bounce": _crossing(outlook.bounce),
+        "apex": _crossing(outlook.apex),
+        "crossing": _crossing(outlook.crossing),
+        "note": "; ".join(text for text in (update.reason, outlook.note) if text),
+    }
+
+
+def _crossing(event: Crossing | None) -> Fields | None:
+    if event is None:
+        return None
+    return {
+        "t": event.time,
+        "sigma_t": _number(event.time_sigma),
+        "state": _numbers(event.state),
+        "sigma": _numbers(np.sqrt(np.maximum(np.diagonal(event.covariance), 0.0))),
+    }
+
+
+def _numbers(values: Array) -> list[float | None]:
+    """Numbers for JSON, which has no NaN."""
+    return [_number(x) for x in values.tolist()]
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -12,14 +12,11 @@ from pathlib import Path
 
 from ballfg.files.json_file import parse_json
 from ballfg.files.whole_file import check_file
-from ballfg.live.answers import KINDS, encoded
+from ballfg.live.outlook import KINDS, encoded
 
-EVERY = 0.5
-"""s between two flushes to the disk."""
-BLOCK = 65536
-"""Number of bytes of an earlier recording read at once; the first line is shorter."""
-OPENING = b'{"kind":"'
-"""Beginning of each line."""
+EVERY = 0.5  # s between two flushes to the disk
+BLOCK = 65536  # Number of bytes of an earlier recording read at once; the first line is shorter
+OPENING = b'{"kind":"'  # Beginning of each line
 
 
 class Recording:
@@ -30,8 +27,7 @@ class Recording:
     Args:
         path: of the file; created if it does not exist.
         flush: appends pending content; a thread calls it twice a second.
-    Attributes:
-        size: number of whole bytes.
+    Attributes: size: number of whole bytes.
     Raises: FileNotFoundError: no such folder. ValueError: it is a folder or a device, or another process records to it.
         OSError: it cannot be opened.
     """
@@ -92,7 +88,6 @@ class Recording:
             os.close(self._handle)
 
     def _keep(self) -> None:
-        """The flushing thread."""
         while not self._stop.wait(EVERY):
             try:
                 self._bring_out()
@@ -124,8 +119,16 @@ def lines_recording(path: Path, repeats: bool) -> Recording:
     recording = Recording(path)
     try:
         if recording.size:
-            refuse_repeated(path, repeats)
-            _check_lines(recording)
+            if repeats:
+                raise ValueError(
+                    "out must be a new file for a replay or a file as input, which begin at their beginning again; "
+                    f"{path} holds something. Choose another name, or remove it."
+                )
+            if not _is_ours(recording):
+                raise ValueError(
+                    f"out must be a new file or a recording of ballfg live to continue; {path} is neither. Choose "
+                    "another name."
+                )
             _cut_half_line(recording)
     except BaseException:
         recording.__exit__()
@@ -135,55 +138,31 @@ def lines_recording(path: Path, repeats: bool) -> Recording:
     return recording
 
 
-def refuse_repeated(path: Path, repeats: bool) -> None:
-    """Refuses an existing file if the input starts from its beginning again. Raises: ValueError."""
-    if repeats:
-        raise ValueError(
-            f"out must be a new file for a replay or a file as input, which begin at their beginning again; {path} "
-            "holds something. Choose another name, or remove it."
-        )
-
-
-def refused(path: Path) -> ValueError:
-    """The error for a file of another kind."""
-    return ValueError(
-        f"out must be a new file or a recording of ballfg live to continue; {path} is neither. Choose another name."
-    )
-
-
-def say_continued(path: Path, size: int, cut: int) -> None:
-    """Tells the user that a recording is continued. Args: size, cut: numbers of bytes kept and cut off."""
-    half = f"; {cut} bytes at its end, which a kill or a full disk had left incomplete, were cut off" if cut else ""
-    print(f"ballfg live: continuing {path}, which holds {size} bytes{half}", file=sys.stderr)
-
-
-def _check_lines(recording: Recording) -> None:
-    """Refuses a file whose first line is not from `ballfg live`. Raises: ValueError."""
+def _is_ours(recording: Recording) -> bool:
+    """True if the first line is one of `ballfg live`, or half of one if the command was killed at once."""
     first, ended, _ = recording.read(0, BLOCK).partition(b"\n")
-    if not ended and recording.size < BLOCK:  # half a line, of a command that was killed at once
-        if not (first.startswith(OPENING) or OPENING.startswith(first)):
-            raise refused(recording.path)
-        return
+    if not ended and recording.size < BLOCK:
+        return first.startswith(OPENING) or OPENING.startswith(first)
     try:
         content = parse_json(first.decode())
     except ValueError:
-        raise refused(recording.path) from None
-    if not isinstance(content, dict) or content.get("kind") not in KINDS:
-        raise refused(recording.path)
+        return False
+    return isinstance(content, dict) and content.get("kind") in KINDS
 
 
 def _cut_half_line(recording: Recording) -> None:
-    """Cuts off the content after the last whole line."""
+    """Cuts off the content after the last whole line, and tells the user that the recording is continued."""
     size = end = recording.size
     while end:
         begin = max(0, end - BLOCK)
         place = recording.read(begin, end - begin).rfind(b"\n")
+        end = begin + place + 1 if place >= 0 else begin
         if place >= 0:
-            end = begin + place + 1
             break
-        end = begin
     recording.cut(end)
-    say_continued(recording.path, end, size - end)
+    cut = size - end
+    half = f"; {cut} bytes at its end, which a kill or a full disk had left incomplete, were cut off" if cut else ""
+    print(f"ballfg live: continuing {recording.path}, which holds {end} bytes{half}", file=sys.stderr)
 
 
 def _lock(handle: int, path: Path) -> None:

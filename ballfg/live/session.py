@@ -1,17 +1,54 @@
 """Runs a session of `ballfg live`: samples go from an inbox to a tracker, answers to the output."""
 
 import gc
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Protocol
 
+import numpy as np
+
 from ballfg.estimation.online.warm_up import warmed_up
-from ballfg.live.answers import answer, encoded, refusal
-from ballfg.live.latency import Latencies
-from ballfg.live.outlook import Outlook, Plane, look_out
+from ballfg.live.outlook import Outlook, Plane, answer, encoded, look_out, refusal
 from ballfg.live.sources.source import Arrival, Inbox
 from ballfg.live.tracker import BallUpdate, Tracker
+
+SHORTEST = 1e-3  # ms, the end of the first bin
+STEPS = 200  # Bins per factor of ten: a percentile is right to 1.2 %
+DECADES = 9  # Number of factors of ten, from a microsecond to a thousand seconds
+
+
+class Latencies:
+    """A histogram of latencies. Attributes: count: number of latencies. worst: ms."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.worst = 0.0
+        self._bins = np.zeros(STEPS * DECADES + 1, dtype=np.int64)
+
+    def add(self, milliseconds: float) -> None:
+        """Counts one latency."""
+        place = math.ceil(STEPS * math.log10(max(milliseconds, SHORTEST) / SHORTEST))
+        self._bins[min(place, len(self._bins) - 1)] += 1
+        self.count += 1
+        self.worst = max(self.worst, milliseconds)
+
+    def percentile(self, share: float) -> float:
+        """ms, latency that a share of all, from 0 to 1, does not exceed; NaN without any."""
+        if self.count == 0:
+            return math.nan
+        place = int(np.searchsorted(np.cumsum(self._bins), max(math.ceil(share * self.count), 1)))
+        return min(SHORTEST * 10.0 ** (place / STEPS), self.worst)
+
+    def __str__(self) -> str:
+        if self.count == 0:
+            return "no lines"
+        middle, p99, p999 = (self.percentile(share) for share in (0.5, 0.99, 0.999))
+        return (
+            f"latency of {self.count} lines: median {middle:.2f} ms, 99 % {p99:.2f} ms, 99.9 % {p999:.2f} ms, "
+            f"worst {self.worst:.2f} ms"
+        )
 
 
 class Watcher(Protocol):
@@ -27,8 +64,7 @@ class Wanted:
     """The predictions for every state.
 
     Attributes:
-        horizon: s, range of the search for events.
-        plane: whose crossing is predicted; None without one.
+        horizon: s, range of the search for events.  plane: whose crossing is predicted; None without one.
         patience: s. A live line that waited longer gets no prediction if another one waits, so that states catch up.
     """
 
@@ -74,7 +110,6 @@ class Session:
             self._tell(update, now)
 
     def _take(self, group: Sequence[Arrival]) -> None:
-        """The arrivals of one stamp."""
         if group[0].sample is None:
             self.malformed += 1
             self._write(encoded(refusal(group[0].problem), 1e3 * (perf_counter() - group[0].read)))
@@ -96,7 +131,6 @@ class Session:
             self._tell(update, arrival.read, arrival)
 
     def _tell(self, update: BallUpdate, read: float, arrival: Arrival | None = None) -> None:
-        """Writes the line of one update."""
         outlook = None
         if update.kind == "state" and update.state is not None:
             waited = perf_counter() - read

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,23 +13,18 @@ from ballfg.dynamics import BallModel, Surfaces
 from ballfg.estimation.online.online import Online
 from ballfg.estimation.online.state import OnlineState
 from ballfg.estimation.settings import Settings
-from ballfg.live.ball import Ball, BallEvent, Kept
+from ballfg.live.ball import Ball, BallEvent, Kept, Newcomer
 from ballfg.live.clock import Clock, Stamp
 from ballfg.live.gate import FAR, GATE, HIT_GATE, Gate, assign
-from ballfg.live.newcomer import Newcomer
 from ballfg.tracks import Ball as BallKind
 from ballfg.tracks.stamps import StreamOrigin
 
-GAP = 0.5
-"""s. A ball unseen for longer is lost; the estimator links nothing over longer gaps either."""
-CONFIRM = 3
-"""Number of consistent samples that make a ball: the least that allow a check of the velocity."""
-MOST_BALLS = 16
-"""Largest number of balls at once."""
+GAP = 0.5  # s. A ball unseen for longer is lost; the estimator links nothing over longer gaps either.
+CONFIRM = 3  # Number of consistent samples that make a ball: the least that allow a check of the velocity
+MOST_BALLS = 16  # Largest number of balls at once
 MOST_NEWCOMERS = 32
 """Largest number of possible balls. The oldest are dropped first, so that clutter costs a bounded time."""
-FARTHEST = 1000.0
-"""m, of a coordinate. A larger one is in another unit."""
+FARTHEST = 1000.0  # m, of a coordinate. A larger one is in another unit.
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +53,9 @@ class BallUpdate:
     events: tuple[BallEvent, ...] = ()
     late: bool = False
     reason: str = ""
+
+
+T = TypeVar("T", OnlineState, BallEvent, BallUpdate)
 
 
 @dataclass
@@ -98,6 +97,14 @@ class _Frame:
     def open(self) -> list[int]:
         """The positions without a result."""
         return [k for k, update in enumerate(self.updates) if update is None]
+
+    def kept(self, k: int, by_hit: bool = False) -> Kept:
+        """A position as a sample of a ball."""
+        return Kept(self.time, self.positions[k], self.sigmas[k], by_hit)
+
+    def refuse(self, k: int, reason: str) -> None:
+        """Refuses a position."""
+        self.updates[k] = BallUpdate("refused", self.time, position=self.positions[k], reason=reason)
 
 
 class Tracker:
@@ -154,7 +161,7 @@ class Tracker:
     @property
     def balls(self) -> dict[int, OnlineState]:
         """The newest state of every ball by its number."""
-        return {ball.number: self._dated_state(ball.states[-1]) for ball in self._balls}
+        return {ball.number: self._dated(ball.states[-1]) for ball in self._balls}
 
     def push(self, time: float, positions: ArrayLike, sigmas: ArrayLike | None = None) -> list[BallUpdate]:
         """Takes in the positions of one stamp.
@@ -162,8 +169,7 @@ class Tracker:
         Positions of one stamp belong to different balls. They may come in one call or in several.
 
         Args:
-            time: s, on the sender's clock.
-            positions: (3,) or (n, 3) m.
+            time: s, on the sender's clock.  positions: (3,) or (n, 3) m.
             sigmas: (3,) or (n, 3) m, their standard deviations; None: the settings'.
         Returns: balls that were lost until then, and one update per position, in their order. An unusable position is
             refused: a sender's errors raise nothing.
@@ -190,21 +196,13 @@ class Tracker:
             self._begin_newcomers(frame)
         return [self._dated(update) for update in (*gone, *frame.updates) if update is not None]
 
-    def _stamp(self, seconds: float) -> float:
-        """A stamp on the sender's clock, s, of a moment that is counted from the stream's first stamp."""
-        return self._origin.written(seconds)
-
-    def _dated_state(self, state: OnlineState) -> OnlineState:
-        return replace(state, time=self._stamp(state.time))
-
-    def _dated(self, update: BallUpdate) -> BallUpdate:
-        """An update on the sender's clock."""
-        return replace(
-            update,
-            time=self._stamp(update.time),
-            state=None if update.state is None else self._dated_state(update.state),
-            events=tuple(replace(event, time=self._stamp(event.time)) for event in update.events),
-        )
+    def _dated(self, what: T) -> T:
+        """A state, an event or an update on the sender's clock."""
+        dated = replace(what, time=self._origin.written(what.time))
+        if isinstance(dated, BallUpdate):
+            state, events = dated.state and self._dated(dated.state), tuple(map(self._dated, dated.events))
+            return replace(dated, state=state, events=events)
+        return dated
 
     def tidy(self) -> None:
         """Does the deferrable work: call it after the updates were used, for a quicker next push."""
@@ -233,17 +231,16 @@ class Tracker:
             else:
                 continue
             self.counts.malformed += 1
-            frame.updates[k] = BallUpdate("refused", frame.time, position=point, reason=reason)
+            frame.refuse(k, reason)
 
     def _turn_clock(self, frame: _Frame) -> list[BallUpdate]:
-        """Classifies the stamp and drops outdated balls."""
         stamp = self._clock.tell(frame.time)
         gone: list[BallUpdate] = []
         if stamp is Stamp.OLD:
             self.counts.old += len(frame.open)
             reason = f"older than the newest stamp by more than the lag of {self.lag:g} s"
             for k in frame.open:
-                frame.updates[k] = BallUpdate("refused", frame.time, position=frame.positions[k], reason=reason)
+                frame.refuse(k, reason)
         elif stamp is Stamp.RESTART:
             self.counts.restarts += 1
             gone = [self._lost(ball) for ball in self._balls]
@@ -260,14 +257,15 @@ class Tracker:
         self._newcomers = [newcomer for newcomer in self._newcomers if newcomer.last <= time]
         gone = []
         for ball in list(self._balls):
-            farewell, left = self._farewell(ball), False
+            farewell, left = self._lost(ball), False
             try:
                 left = ball.forget_after(time)
             except (ValueError, RuntimeError):
                 self.counts.failed += 1
-            if not left:
+            if left:
+                self.counts.lost -= 1
+            else:
                 self._balls.remove(ball)
-                self.counts.lost += 1
                 gone.append(farewell)
         return gone
 
@@ -281,9 +279,6 @@ class Tracker:
 
     def _lost(self, ball: Ball) -> BallUpdate:
         self.counts.lost += 1
-        return self._farewell(ball)
-
-    def _farewell(self, ball: Ball) -> BallUpdate:
         return BallUpdate("lost", ball.last, ball.number, state=ball.states[-1], samples=ball.samples)
 
     def _to_balls(self, frame: _Frame, gate: float, hit: bool) -> None:
@@ -299,7 +294,7 @@ class Tracker:
             costs[:, j] = (self.gate.if_hit if hit else self.gate.on_path)(known, t, frame.positions[rows])
         for i, j in assign(costs, gate):
             k = rows[i]
-            frame.updates[k] = self._taken(balls[j], frame, k, Kept(t, frame.positions[k], frame.sigmas[k], hit))
+            frame.updates[k] = self._taken(balls[j], frame, k, frame.kept(k, hit))
         if not hit:
             self._refuse_repeated(frame)
 
@@ -314,15 +309,11 @@ class Tracker:
                 same = np.array_equal(held.position, frame.positions[k])
                 apart = float(np.linalg.norm(held.position - frame.positions[k]))
                 if same or (near and apart < 2 * self.estimator.model.radius):  # two balls cannot be closer
-                    self._refuse(frame, k, f"ball {ball.number} has a position of this stamp")
+                    self.counts.repeated += 1
+                    frame.refuse(k, f"ball {ball.number} has a position of this stamp")
                     break
 
-    def _refuse(self, frame: _Frame, k: int, reason: str) -> None:
-        self.counts.repeated += 1
-        frame.updates[k] = BallUpdate("refused", frame.time, position=frame.positions[k], reason=reason)
-
     def _taken(self, ball: Ball, frame: _Frame, k: int, kept: Kept) -> BallUpdate:
-        """A ball's update with a sample; after a failure the ball restarts with it."""
         reason, displaced = "", ball.at(kept.time)
         try:
             state = ball.take(kept)
@@ -341,7 +332,6 @@ class Tracker:
         )
 
     def _to_newcomers(self, frame: _Frame) -> None:
-        """Assigns open positions to the newcomers that they fit; those with enough samples become balls."""
         rows, t = frame.open, frame.time
         newcomers = [newcomer for newcomer in self._newcomers if not newcomer.has(t)]
         costs = np.full((len(rows), len(newcomers)), FAR)
@@ -349,11 +339,12 @@ class Tracker:
             costs[:, j] = newcomer.distances(t, frame.positions[rows])
         for i, j in assign(costs, GATE):
             k, newcomer = rows[i], newcomers[j]
-            newcomer.take(Kept(t, frame.positions[k], frame.sigmas[k]))
+            newcomer.take(frame.kept(k))
             frame.updates[k] = self._grown(newcomer, frame, k)
         for k in frame.open:
             if any(newcomer.repeats(t, frame.positions[k]) for newcomer in self._newcomers):
-                self._refuse(frame, k, "a newcomer has this position already")
+                self.counts.repeated += 1
+                frame.refuse(k, "a newcomer has this position already")
 
     def _grown(self, newcomer: Newcomer, frame: _Frame, k: int) -> BallUpdate:
         """A newcomer's update with a sample, which may make it a ball."""
@@ -374,9 +365,8 @@ class Tracker:
         return update
 
     def _begin_newcomers(self, frame: _Frame) -> None:
-        """Begins a newcomer for each remaining position."""
         for k in frame.open:
-            newcomer = Newcomer(Kept(frame.time, frame.positions[k], frame.sigmas[k]), self.gate)
+            newcomer = Newcomer(frame.kept(k), self.gate)
             self._newcomers.append(newcomer)
             frame.updates[k] = self._grown(newcomer, frame, k)
         del self._newcomers[:-MOST_NEWCOMERS]

@@ -9,10 +9,8 @@ from ballfg.live.tracker import BallUpdate
 from ballfg.pages.recording import check_rerun
 from ballfg.prediction.crossing import Crossing
 
-EVERY = 3
-"""Number of states per drawn path: the eye sees no more, and drawing takes time from the stream."""
-SIGMAS = 2.0
-"""Radius of an event's ball in standard deviations of its place."""
+EVERY = 3  # Number of states per drawn path: the eye sees no more, and drawing takes time from the stream
+SIGMAS = 2.0  # Radius of an event's ball in standard deviations of its place
 
 
 class Viewer:

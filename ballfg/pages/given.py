@@ -13,8 +13,7 @@ from ballfg.pages.tables import Kind, ResultTable, columns_of, kind_of, read_tab
 from ballfg.tracks import Ball, Track, read_dataset
 from ballfg.tracks.info import DatasetInfo
 
-REPORT = "report.json"
-"""Name of the machine-readable file in a diagnosis folder."""
+REPORT = "report.json"  # Name of the machine-readable file in a diagnosis folder
 COULD_BE = (
     "a dataset (a folder with dataset.yaml), states of `ballfg estimate`, predictions of `ballfg predict` "
     "(.csv or .parquet), or a diagnosis of `ballfg diagnose` (its folder or report.json)"
@@ -53,8 +52,7 @@ class Given:
     """The contents to show; None for missing ones.
 
     Attributes:
-        dataset: the measured tracks.
-        states, predictions: tables of results, in the units of their columns.
+        dataset: the measured tracks.  states, predictions: tables of results, in the units of their columns.
         diagnosis: content of `report.json`.
     """
 

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-DPI = 110
-"""Dots per inch of pictures, which then fill a page on a common screen."""
+DPI = 110  # Dots per inch of pictures, which then fill a page on a common screen
 READABLE = 78
 """Least pixels on the screen for each inch of a picture: words of 10 points are then 11 pixels high. On a narrower
 screen a picture scrolls within its own box."""
@@ -47,8 +46,7 @@ def tag(name: str, *content: str, kind: str = "", **attributes: str) -> Html:
     """An element with escaped content.
 
     Args:
-        name: of the element.  content: text or HTML inside it.
-        kind: its CSS class.
+        name: of the element.  content: text or HTML inside it.  kind: its CSS class.
         attributes: others, by name; an underscore stands for a hyphen.
     """
     given = ({"class": kind} if kind else {}) | attributes
@@ -93,10 +91,7 @@ def meanings(words: Mapping[str, str]) -> Html:
 
 
 def bar(share: float, colour: str) -> Html:
-    """A horizontal bar.
-
-    Args: share: of the full width, 0 to 1.  colour: a CSS class of the page.
-    """
+    """A horizontal bar. Args: share: of the full width, 0 to 1. colour: a CSS class of the page."""
     return tag("span", tag("span", kind=f"bar {colour}", style=f"width:{100 * share:.1f}%"), kind="track")
 
 

@@ -9,12 +9,10 @@ from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR, TABLE_LENGTH, TABLE_WIDT
 from ballfg.tracks import TABLE_TENNIS
 from ballfg.tracks.info import TENNIS, DatasetInfo
 
-NET_HEIGHT = 0.1525
-"""m, height above the table, and overhang at its sides (ITTF Laws 2.2)."""
+NET_HEIGHT = 0.1525  # m, height above the table, and overhang at its sides (ITTF Laws 2.2)
 SMALL_BALL = 0.5 * (TABLE_TENNIS.radius + TENNIS.radius)
 """m. Balls below this radius count as table-tennis balls: their table has the size of the rules, and a net."""
-MARGIN = 0.2
-"""m by which a surface with unknown ends extends beyond the samples."""
+MARGIN = 0.2  # m by which a surface with unknown ends extends beyond the samples
 
 
 @dataclass(frozen=True)
@@ -22,10 +20,8 @@ class Outline:
     """Heights and ends of table and floor.
 
     Attributes:
-        height: m, of the surface.
-        extent: (x_low, x_high, y_low, y_high) m.
-        net: True if a net stands across the longer side.
-        floor: m, height of the floor; None if unknown.
+        height: m, of the surface.  extent: (x_low, x_high, y_low, y_high) m.
+        net: True if a net stands across the longer side.  floor: m, height of the floor; None if unknown.
         words: a sentence on the origin of the ends.
     """
 
@@ -42,10 +38,7 @@ class Outline:
 
 
 def outline(info: DatasetInfo, positions: Array) -> Outline:
-    """The table of a dataset.
-
-    Args: info: of the dataset.  positions: (n, 3) m, samples above the table, n >= 1.
-    """
+    """The table of a dataset. Args: info: of the dataset. positions: (n, 3) m, samples above the table, n >= 1."""
     small = info.ball.radius < SMALL_BALL
     floor = info.table_height - TABLE_ABOVE_FLOOR if small else None
     if info.table_extent is not None:

@@ -20,8 +20,7 @@ def whole_page(
     """The text of a page that adapts to wide and narrow screens and to paper.
 
     Args:
-        title: of the window.
-        content: text or HTML of the page, part by part.
+        title: of the window.  content: text or HTML of the page, part by part.
         style: CSS rules of this page, added to those of all pages.
         data: for the scripts, as JSON in the element `data`; without NaN and infinity.
         scripts: JavaScript, run in this order after the page has loaded.

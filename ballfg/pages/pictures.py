@@ -8,13 +8,13 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
 from ballfg.arrays import Array
-from ballfg.pages.coverage import HALF_WIDTH
 from ballfg.pages.outline import Outline
-from ballfg.pages.shot import ShownShot
+from ballfg.pages.shot import HALF_WIDTH, ShownShot
 
 AXES: Final = ("x", "y", "z")
-ESTIMATE, PREDICTION, MEASURED, TABLE = "#0072b2", "#d55e00", "#555555", "#2f7d6b"
+COLOURS: Final = {"estimate": "#0072b2", "prediction": "#d55e00"}
 """Okabe and Ito's blue and vermilion, distinct for every kind of colour vision."""
+MEASURED, TABLE = "#555555", "#2f7d6b"
 MARKERS: Final = {"contact": ("D", "#117733"), "hit": ("X", "#cc3311")}
 
 
@@ -44,15 +44,12 @@ def by_axis(shot: ShownShot) -> Figure:
     """x, y and z by time: measured, estimated and predicted, with 90 % bands."""
     figure = Figure(figsize=(8.0, 7.0), layout="constrained")
     panels = figure.subplots(3, 1, sharex=True)
-    parts = [
-        ("estimate", shot.state_times, shot.states[:, :3], shot.state_sigmas[:, :3], ESTIMATE),
-        ("prediction", shot.predicted_times, shot.predicted, shot.predicted_sigmas, PREDICTION),
-    ]
     for a, panel in enumerate(panels):
         if len(shot.times):
             panel.plot(shot.times, shot.positions[:, a], ".", color=MEASURED, markersize=4, label="measured")
-        for label, times, places, sigmas, colour in parts:
+        for label, times, places, sigmas in shot.lines:
             if len(times):
+                colour = COLOURS[label]
                 width = HALF_WIDTH * np.where(np.isfinite(sigmas[:, a]), sigmas[:, a], np.nan)
                 panel.plot(times, places[:, a], color=colour, linewidth=1.2, label=label)
                 panel.fill_between(
@@ -83,15 +80,11 @@ def _paths(panel: Axes, shot: ShownShot, across: int, up: int) -> None:
     view = [across, up]
     if len(shot.times):
         panel.plot(*shot.positions[:, view].T, ".", color=MEASURED, markersize=4, label="measured")
-    for label, places, sigmas, colour in (
-        ("estimate", shot.states[:, :3], shot.state_sigmas[:, :3], ESTIMATE),
-        ("prediction", shot.predicted, shot.predicted_sigmas, PREDICTION),
-    ):
+    for label, _, places, sigmas in shot.lines:
         if len(places):
-            panel.plot(*places[:, view].T, color=colour, linewidth=1.2, label=label)
-            panel.add_collection(
-                PolyCollection(list(_bands(places[:, view], sigmas[:, view])), facecolor=colour, alpha=0.25)
-            )
+            panel.plot(*places[:, view].T, color=COLOURS[label], linewidth=1.2, label=label)
+            bands = list(_bands(places[:, view], sigmas[:, view]))
+            panel.add_collection(PolyCollection(bands, facecolor=COLOURS[label], alpha=0.25))
     for kind, (symbol, colour) in MARKERS.items():
         found = np.array([mark.place for mark in shot.marks if mark.kind == kind]).reshape(-1, 3)
         if len(found):

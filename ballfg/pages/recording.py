@@ -9,12 +9,9 @@ from ballfg.pages.outline import Outline
 from ballfg.pages.shot import ShownShot
 from ballfg.pages.shown import Shown
 
-RADIUS = 0.02
-"""m, of the moving ball, as large as a table-tennis ball."""
-SPIN_LENGTH = 0.001
-"""m of an arrow for each rad/s of spin."""
-FLAT = 0.005
-"""m, half the thickness of the drawn table."""
+RADIUS = 0.02  # m, of the moving ball, as large as a table-tennis ball
+SPIN_LENGTH = 0.001  # m of an arrow for each rad/s of spin
+FLAT = 0.005  # m, half the thickness of the drawn table
 
 
 def record(shown: Shown, path: Path) -> None:
@@ -55,7 +52,7 @@ def _shot(rerun: Any, recording: Any, shot: ShownShot) -> None:
     start, name = shot.start, f"shots/{rerun.escape_entity_path_part(shot.name)}"
     if len(shot.times):
         recording.log(f"{name}/measured", rerun.Points3D(shot.positions, radii=0.004), static=True)
-    for what, places in (("estimate", shot.states[:, :3]), ("prediction", shot.predicted)):
+    for what, _, places, _ in shot.lines:
         if len(places) > 1:
             recording.log(f"{name}/{what}", rerun.LineStrips3D([places]), static=True)
     for time, state in zip(shot.state_times, shot.states, strict=True):

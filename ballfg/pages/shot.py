@@ -1,11 +1,71 @@
 """A shot holds samples, states, predictions, contacts and hits of one track for drawing."""
 
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from statistics import NormalDist
 
 import numpy as np
 
-from ballfg.arrays import Array
-from ballfg.pages.marks import Mark
+from ballfg.arrays import Array, Index
+from ballfg.state import POSITION, STANDARD_GRAVITY, VELOCITY, VZ, Z
+
+NEAR = 0.05
+"""m. A falling ball that would come this near to a surface before it rises again has met it; states err by less."""
+LARGEST_ACCELERATION = 150.0
+"""m/s^2. Air and gravity change a velocity less than this: drag of a table-tennis ball at 25 m/s is 80 m/s^2."""
+SUDDEN = 1.5
+"""m/s. A smaller jump is not taken for a hit: velocities err, and bounces change them at the edge of a step."""
+GAP = 0.1  # s. During a longer step the motion is unknown: the ball may have bounced several times.
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A contact or a hit. `kind`: "contact" or "hit".  `time`: s.  `place`: (3,) m, approximate place of the ball."""
+
+    kind: str
+    time: float
+    place: tuple[float, float, float]
+
+
+def marks(times: Array, states: Array, surfaces: Sequence[float], radius: float) -> Iterator[Mark]:
+    """Contacts and hits between the states of a track.
+
+    A contact is a turn of the vertical velocity from down to up near a surface, a hit is a jump of the velocity beyond
+    air, gravity or a contact. Steps of more than `GAP` have none.
+
+    Args: times: (m,) s.  states: (m, 9).  surfaces: m, heights of table and floor.  radius: m, of the ball.
+    """
+    for i, step in enumerate(np.diff(times)):
+        if step > GAP:
+            continue
+        before, after = states[i], states[i + 1]
+        contact = _contact(before, after, float(step), surfaces, radius)
+        if contact is not None:
+            yield _mark("contact", float(times[i]), before, contact)
+            continue
+        jump = float(np.linalg.norm(after[VELOCITY] - before[VELOCITY]))
+        if jump > SUDDEN + LARGEST_ACCELERATION * step:
+            yield _mark("hit", float(times[i]), before, 0.5 * float(step))
+
+
+def _contact(before: Array, after: Array, step: float, surfaces: Sequence[float], radius: float) -> float | None:
+    """Seconds from the first of two states to a contact with a surface; None without a contact."""
+    if not before[VZ] < 0.0 < after[VZ]:
+        return None
+    for surface in surfaces:
+        level = surface + radius
+        fall = float(before[Z]) - level
+        reached = fall + float(before[VZ]) * step - 0.5 * STANDARD_GRAVITY * step**2
+        if abs(fall) < NEAR or (fall > 0.0 and reached < NEAR):
+            falling = math.sqrt(float(before[VZ]) ** 2 + 2.0 * STANDARD_GRAVITY * max(fall, 0.0))
+            return min((falling + float(before[VZ])) / STANDARD_GRAVITY, step)
+    return None
+
+
+def _mark(kind: str, time: float, before: Array, later: float) -> Mark:
+    x, y, z = (before[POSITION] + later * before[VELOCITY]).tolist()
+    return Mark(kind, time + later, (x, y, z - 0.5 * STANDARD_GRAVITY * later**2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -13,16 +73,10 @@ class ShownShot:
     """The contents of one track's drawing; arrays without rows stand for missing ones.
 
     Attributes:
-        name: of the track.
-        times: (n,) s, stamps of the samples.
-        positions: (n, 3) m, as measured.
-        noise: (n, 3) m, standard deviation of each measured coordinate; NaN if unknown.
-        state_times: (m,) s.
-        states: (m, 9) position m, velocity m/s, spin rad/s.
-        state_sigmas: (m, 9) in the same units.
-        predicted_times: (k,) s.
-        predicted: (k, 3) m.
-        predicted_sigmas: (k, 3) m, of a measured position.
+        name: of the track.  times: (n,) s, stamps of the samples.  positions: (n, 3) m, as measured.
+        noise: (n, 3) m, standard deviation of each measured coordinate; NaN if unknown.  state_times: (m,) s.
+        states: (m, 9) position m, velocity m/s, spin rad/s.  state_sigmas: (m, 9) in the same units.
+        predicted_times: (k,) s.  predicted: (k, 3) m.  predicted_sigmas: (k, 3) m, of a measured position.
         marks: contacts and hits in the states.
     """
 
@@ -48,6 +102,14 @@ class ShownShot:
         """Number of samples, states and predictions."""
         return len(self.times) + len(self.state_times) + len(self.predicted_times)
 
+    @property
+    def lines(self) -> list[tuple[str, Array, Array, Array]]:
+        """Name, stamps (k,) s, places (k, 3) m and their sigmas (k, 3) m of the estimate and of the prediction."""
+        return [
+            ("estimate", self.state_times, self.states[:, :3], self.state_sigmas[:, :3]),
+            ("prediction", self.predicted_times, self.predicted, self.predicted_sigmas),
+        ]
+
     def residuals(self) -> Array:
         """(n, 3) m, measured less estimated; NaN at samples without a state."""
         return self.positions - _at(self.times, self.state_times, self.states[:, :3])
@@ -67,5 +129,53 @@ def _at(times: Array, known: Array, values: Array) -> Array:
     return found
 
 
-SAME_STAMP = 1e-9
-"""s. Tables keep all digits of a stamp, so that those of one sample agree far better."""
+SAME_STAMP = 1e-9  # s. Tables keep all digits of a stamp, so that those of one sample agree far better.
+
+
+LEVEL = 0.9  # Nominal coverage of an interval
+HALF_WIDTH = NormalDist().inv_cdf((1.0 + LEVEL) / 2.0)
+"""Standard deviations on either side of a prediction for that coverage."""
+BIN = 0.05  # s, width of the bins of the horizon
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Shares by horizon, the time since the last sample before the first predicted one.
+
+    Attributes:
+        horizons: (b,) s, the middle of each bin that holds samples.
+        shares: (b, 3) of the coordinates x, y, z inside their intervals, 0 to 1.
+        samples: (b,) counts.  shots: (b,) counts.
+    """
+
+    horizons: Array
+    shares: Array
+    samples: Index
+    shots: Index
+
+
+def coverage(shots: Iterable[ShownShot]) -> Coverage:
+    """The coverage of the predictions of many shots.
+
+    Args: shots: with samples and predictions; samples outside of the predicted part are left out.
+    """
+    held: dict[int, Array] = {}
+    samples: dict[int, int] = {}
+    tracks: dict[int, int] = {}
+    for shot in shots:
+        errors = np.abs(shot.prediction_errors())
+        known = np.isfinite(errors).all(axis=1)
+        before = shot.times[shot.times < shot.predicted_times[0]] if len(shot.predicted_times) else shot.times
+        if not known.any() or not len(before):
+            continue
+        inside = errors[known] <= HALF_WIDTH * shot.predicted_sigmas[known]
+        bins = np.floor((shot.predicted_times[known] - before[-1] + SAME_STAMP) / BIN).astype(int)
+        for b in np.unique(bins).tolist():
+            held[b] = held.get(b, np.zeros(3)) + inside[bins == b].sum(axis=0)
+            samples[b] = samples.get(b, 0) + int((bins == b).sum())
+            tracks[b] = tracks.get(b, 0) + 1
+    order = sorted(held)
+    counts = np.array([samples[b] for b in order], dtype=np.int64)
+    sums = np.array([held[b] for b in order]).reshape(-1, 3)
+    middles = (np.array(order, dtype=np.float64) + 0.5) * BIN
+    return Coverage(middles, sums / counts[:, None], counts, np.array([tracks[b] for b in order], dtype=np.int64))

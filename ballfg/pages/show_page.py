@@ -6,30 +6,23 @@ from typing import Any
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.pages.coverage import HALF_WIDTH, LEVEL
 from ballfg.pages.html import Html, explained, items, section, table, tag
-from ballfg.pages.marks import GAP
 from ballfg.pages.outline import NET_HEIGHT, Outline
 from ballfg.pages.page import own, whole_page
-from ballfg.pages.shot import ShownShot
+from ballfg.pages.shot import GAP, HALF_WIDTH, LEVEL, ShownShot
 from ballfg.pages.shown import Shown
 from ballfg.state import POSITION, SPIN, VELOCITY
 
 LENGTH_DECIMALS, TIME_DECIMALS, VELOCITY_DECIMALS, SPIN_DECIMALS = 5, 5, 3, 1
 """Digits after the point of m, s, m/s and rad/s in the page: 10 um is far below what trackers resolve."""
-SIGMA_DECIMALS = 6
-"""Digits of standard deviations in m: those of a state may be a tenth of a mm."""
+SIGMA_DECIMALS = 6  # Digits of standard deviations in m: those of a state may be a tenth of a mm
 LARGEST = 8.0
 """Standard deviations beyond which a residual is drawn at the edge, so that an outlier does not hide the others."""
-CANDIDATES = 10
-"""Number of effects of a diagnosis in the drawing, those that explain most."""
+CANDIDATES = 10  # Number of effects of a diagnosis in the drawing, those that explain most
 
 
 def show_page(shown: Shown) -> str:
-    """The whole page, self-contained.
-
-    Args: shown: result of `collect`.
-    """
+    """The whole page, self-contained. Args: shown: result of `collect`."""
     name = _name(shown)
     header = tag("header", tag("p", name), tag("h1", _sentence(shown)), items(shown.notes))
     parts = [_flight(shown), _measured_and_predicted(shown), _residuals(shown), _coverage(shown), _diagnosis(shown)]
@@ -54,7 +47,6 @@ def _name(shown: Shown) -> str:
 
 
 def _sentence(shown: Shown) -> str:
-    """A sentence on the content of the page."""
     given, count = shown.given, len(shown.shots)
     if not count:
         return "The diagnosis of a model."
@@ -191,7 +183,11 @@ def _number(value: float | None) -> str:
 
 def _data(shown: Shown) -> dict[str, Any]:
     """The data for the script; null stands for unknown numbers."""
-    held, found = shown.coverage, shown.given.diagnosis
+    held, found, diagnosis = shown.coverage, shown.given.diagnosis, None
+    if found is not None:  # `after` only if the model was changed, and the first round's candidates
+        before, after = (found["error"][which].get("by_track_mm", []) for which in ("before", "after"))
+        changed = None if after == before else after
+        diagnosis = {"before": before, "after": changed, "candidates": _candidates(found)}
     return {
         "half_width": HALF_WIDTH,
         "level": 100.0 * LEVEL,
@@ -207,7 +203,7 @@ def _data(shown: Shown) -> dict[str, Any]:
             "samples": held.samples.tolist(),
             "shots": held.shots.tolist(),
         },
-        "diagnosis": None if found is None else _tracks(found),
+        "diagnosis": diagnosis,
     }
 
 
@@ -233,11 +229,12 @@ def _shot(shot: ShownShot) -> dict[str, Any]:
         *_plain(shot.states[:, SPIN].T, SPIN_DECIMALS),
     ]
     known = len(shot.state_times) > 0
+    noise = _plain(shot.noise.T, SIGMA_DECIMALS) if known else []  # of each axis one number if all are equal
     return {
         "name": shot.name,
         "t": _plain(shot.times - start, TIME_DECIMALS),
         "positions": _plain(shot.positions.T, LENGTH_DECIMALS),
-        "noise": _noise(shot) if known else [],
+        "noise": [row[0] if len(set(row)) == 1 else row for row in noise],
         "residuals": _plain(shot.residuals().T, LENGTH_DECIMALS) if known else [],
         "state_t": _plain(shot.state_times - start, TIME_DECIMALS),
         "states": states,
@@ -248,18 +245,6 @@ def _shot(shot: ShownShot) -> dict[str, Any]:
         "prediction_errors": _plain(shot.prediction_errors().T, LENGTH_DECIMALS),
         "marks": [{"kind": mark.kind, "t": mark.time - start, "place": list(mark.place)} for mark in shot.marks],
     }
-
-
-def _noise(shot: ShownShot) -> list[Any]:
-    """The standard deviations of each axis: one number if all are equal, as in most datasets."""
-    rows = _plain(shot.noise.T, SIGMA_DECIMALS)
-    return [row[0] if len(set(row)) == 1 else row for row in rows]
-
-
-def _tracks(found: Mapping[str, Any]) -> dict[str, Any]:
-    """Errors on the held-out tracks, `after` only if the model was changed, and the first round's candidates."""
-    before, after = (found["error"][which].get("by_track_mm", []) for which in ("before", "after"))
-    return {"before": before, "after": None if after == before else after, "candidates": _candidates(found)}
 
 
 def _candidates(found: Mapping[str, Any]) -> list[dict[str, Any]]:

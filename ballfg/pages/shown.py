@@ -7,20 +7,16 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.checks import did_you_mean, shown
-from ballfg.pages.coverage import Coverage, coverage
 from ballfg.pages.given import Given
-from ballfg.pages.marks import marks
 from ballfg.pages.outline import Outline, outline
-from ballfg.pages.shot import SAME_STAMP, ShownShot
+from ballfg.pages.shot import SAME_STAMP, Coverage, ShownShot, coverage, marks
 from ballfg.pages.tables import ResultTable
 from ballfg.tracks import Track
 
-MOST_SHOTS = 40
-"""Number of shots on a page without named ones: a list that is still readable."""
+MOST_SHOTS = 40  # Number of shots on a page without named ones: a list that is still readable
 MOST_ROWS = 36_000
 """Largest number of samples, states and predictions on a page: about 3 MB beside the drawing library's 5 MB."""
-ROBUST = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
+ROBUST = 1.4826  # Standard deviation of a normal distribution over its median absolute deviation
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,9 +24,7 @@ class Shown:
     """The contents of a page.
 
     Attributes:
-        given: all given files.
-        shots: the chosen ones, in the dataset's order.
-        count: total number of shots.
+        given: all given files.  shots: the chosen ones, in the dataset's order.  count: total number of shots.
         table: its place; None without a dataset.
         coverage: of all predicted shots, not only the chosen ones; None without measured tracks or predictions.
         noise: a sentence on the standard deviation of the measured coordinates; empty if unknown.
@@ -95,10 +89,7 @@ def _names(given: Given) -> list[str]:
 
 
 def _check_results(given: Given) -> Iterator[str]:
-    """Notes on results for only a part of the shots.
-
-    Raises: ValueError: results of tracks outside of the dataset.
-    """
+    """Notes on results for only a part of the shots. Raises: ValueError: results of tracks outside of the dataset."""
     dataset = given.dataset
     for table in (given.states, given.predictions):
         if table is None or dataset is None:

@@ -19,8 +19,7 @@ from ballfg.tracks import csv_files
 from ballfg.tracks.rows import distinct
 
 KEYS = ("trajectory", "t")
-LARGEST = 1e12
-"""Largest number in a table, in SI units; sums and squares of larger ones overflow a page's numbers."""
+LARGEST = 1e12  # Largest number in a table, in SI units; sums and squares of larger ones overflow a page's numbers
 
 
 class Kind(enum.Enum):
@@ -35,8 +34,7 @@ class ResultTable:
     """A table of results.
 
     Attributes:
-        path: of the file.  kind: of the table.
-        rows: of each track, in the order in which the tracks first appear.
+        path: of the file.  kind: of the table.  rows: of each track, in the order in which the tracks first appear.
         values: (rows, 1 + c) t in s and the columns of the kind, sorted by track and time.
     """
 
@@ -59,10 +57,7 @@ def kind_of(columns: Sequence[str]) -> Kind | None:
 
 
 def columns_of(path: Path) -> list[str]:
-    """The names of a table's columns.
-
-    Raises: ValueError: the file cannot be read in the format of its ending.
-    """
+    """The names of a table's columns. Raises: ValueError: the file cannot be read in the format of its ending."""
     if path.suffix.lower() == ".parquet":
         with open_parquet(path) as file:
             return list(file.schema_arrow.names)

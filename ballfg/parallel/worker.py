@@ -8,7 +8,7 @@ from multiprocessing.connection import Connection
 from threading import Thread
 from typing import Any, Final
 
-from ballfg.collector import collect_rarely
+from ballfg.machine import collect_rarely
 from ballfg.parallel.work import compute, packed
 
 IDLE: Final = 300.0  # s without work after which a process ends

@@ -24,10 +24,8 @@ NAIVE, FACTORS = "smoother, as if synchronised", "smoother, camera factors"
 """Two of the ways to estimate, for comparison."""
 NEAR_BOUNCE: Final = 1.0
 """Frame intervals about a bounce that do not count: a stamp's velocity is before it or after it by chance."""
-BLIND: Final = 20.0
-"""px, motion of a ball of 10 m/s in half a frame at 120 Hz, 3 m away."""
-OTHER_BALL: Final = 0.5
-"""m. Distance of a state from a flight beyond which it belongs to another one."""
+BLIND: Final = 20.0  # px, motion of a ball of 10 m/s in half a frame at 120 Hz, 3 m away
+OTHER_BALL: Final = 0.5  # m. Distance of a state from a flight beyond which it belongs to another one.
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +109,6 @@ def clocks(filmed: Filmed) -> TimeOffsets:
 
 
 def _judged(filmed: Filmed, estimates: Sequence[Estimate]) -> Velocities:
-    """Errors by flight, at the stamps of each estimate, away from bounces."""
     step = 1.0 / filmed.recording.config.rate
     sums = np.zeros((3, len(filmed.recording.flights)))
     for number, flight in enumerate(filmed.recording.flights):

@@ -22,12 +22,10 @@ from ballfg.vision.detection.detect import detect_all
 from ballfg.vision.detection.detections import Detections
 from ballfg.vision.tracking.pipeline import Tracking, track_detections
 
-FALSE: Final = 0.05
-"""m. Distance from every ball beyond which a point is false."""
+FALSE: Final = 0.05  # m. Distance from every ball beyond which a point is false.
 MIXED: Final = 3
 """Points of a second ball that make a track one of two balls; where two nearly touch, a point or two may seem to be."""
-SAME_FRAME: Final = 0.5
-"""Share of a frame interval within which a point belongs to a frame."""
+SAME_FRAME: Final = 0.5  # Share of a frame interval within which a point belongs to a frame
 
 
 @dataclass(frozen=True)
@@ -92,8 +90,7 @@ class Judged:
     """The points of balls against the truth.
 
     Attributes:
-        errors: (n, 3) m, of points that belong to a ball.
-        squares: (n,) NEES of these.
+        errors: (n, 3) m, of points that belong to a ball.  squares: (n,) NEES of these.
         false: number of points that belong to no ball.
         seen: frames in which two cameras or more see a ball.  found: those that have a point.
         tracks: found.  mixed: those with points of more than one ball.  balls: launched.

@@ -1,25 +1,140 @@
 """Runs `ballfg-bench cameras`, from rendered videos to states, against the truth."""
 
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Final
 
+import cv2
+import matplotlib.pyplot as plt
 import numpy as np
+from numpy.typing import NDArray
 
-from ballfg.benchmarks.cameras.clocks import FACTORS, NAIVE, Velocities, clocks, compare
+from ballfg.benchmarks.cameras.clocks import FACTORS, NAIVE, Velocities, clocks, compare, sighted
 from ballfg.benchmarks.cameras.scenes import Filmed, Judged, Scenario, film, judge, scenarios
-from ballfg.benchmarks.cameras.speed import push_times, stream_times
-from ballfg.benchmarks.cameras.turned import AXES, TURN, Turn, turns
 from ballfg.benchmarks.metrics import bootstrap, median_and_quartiles, median_and_range, pooled_rms, ratio, share
+from ballfg.benchmarks.pictures import BLUE, ORANGE, save
 from ballfg.benchmarks.results import Results
 from ballfg.benchmarks.resumable import in_processes
+from ballfg.benchmarks.speed.stopwatch import milliseconds
+from ballfg.dynamics import nominal_model
+from ballfg.estimation import Online, Settings
+from ballfg.estimation.observations.sightings import sightings_of
+from ballfg.parallel.processes import Processes
 from ballfg.progress import progress
 from ballfg.simulation.scene.config import Clock
+from ballfg.simulation.scene.writing import write_scene
+from ballfg.vision import Camera, Detections, associate, check_agreement, detect_all, track_detections
 
-LATE: Final = {"right": 0.004}
-"""s, delay of the stamps in recordings with a late clock."""
+
+def stream_times(scenario: Scenario, runs: int) -> tuple[int, list[tuple[float, float]]]:
+    """Draws the videos, then times what `ballfg track` does before it draws pictures: a process for each camera.
+
+    Returns: frames of each camera; for each run the s from videos to candidates, with the start of the processes, and
+        the s from candidates to balls and to whether the cameras agree.
+    """
+    recording, times, frames = scenario.recording(), [], 0
+    with TemporaryDirectory() as folder:
+        scene = Path(folder) / "scene"
+        images = f"frames of {scenario.name}, timed"
+        write_scene(scene, recording, watch=lambda items, total, _: progress(items, total, images))
+        videos = {camera.name: scene / f"{camera.name}.mp4" for camera in recording.cameras}
+        for _ in progress(range(runs), runs, "runs timed"):
+            Processes(len(videos), helped=False).stop()  # each run starts its processes, as the command does
+            start = time.perf_counter()
+            found: dict[str, Detections] = detect_all(videos, jobs=len(videos))
+            searched = time.perf_counter()
+            track_detections(list(found.values()), recording.cameras)
+            times.append((searched - start, time.perf_counter() - searched))
+            frames = min(len(detections.frames) for detections in found.values())
+    return frames, times
+
+
+def push_times(filmed: Filmed) -> list[float]:
+    """Milliseconds of each sighting that the online estimator takes in, those of all balls."""
+    settings, taken = Settings.for_measured(nominal_model()), []
+    tracks = sighted(filmed)
+    for track in progress(tracks, len(tracks), "balls pushed online"):
+        rig = sightings_of(track)
+        online = Online(nominal_model(), filmed.recording.config.ball.surfaces, settings, cameras=rig.cameras)
+        seen = rig.sightings
+        for camera, at, pixel, covariance in zip(seen.camera, seen.times, seen.pixels, seen.covariances, strict=True):
+            push = partial(online.push_sighting, float(at), seen.cameras[camera], pixel, covariance)
+            taken.append(milliseconds(push))
+    return taken
+
+
+TURN: Final = 0.5  # Degrees
+AXES: Final = {"right": 0, "down": 1, "forward": 2}  # Axes of a camera's frame that it is turned about
+
+
+@dataclass(frozen=True)
+class Turn:
+    """One camera turned about one axis.
+
+    Attributes:
+        camera, axis: the turned camera and its axis.  named: the camera that the check names, None for none.
+        found: degrees by which the check finds the camera turned; NaN where it finds nothing.
+    """
+
+    camera: str
+    axis: str
+    named: str | None
+    found: float
+
+
+def turns(filmed: Filmed) -> Iterator[Turn]:
+    """Each camera turned about each axis in its declared calibration; the videos stay as they are."""
+    cameras = filmed.recording.cameras
+    for number, camera in enumerate(cameras):
+        for axis, column in AXES.items():
+            rig = [turned(c, column) if k == number else c for k, c in enumerate(cameras)]
+            agreement = check_agreement(associate(filmed.detections, rig), rig)
+            about = agreement.by_camera.get(camera.name)
+            found = float("nan") if about is None else about.rotation
+            yield Turn(camera.name, axis, agreement.culprit, found)
+
+
+def turned(camera: Camera, axis: int) -> Camera:
+    """The camera at the same place, turned by `TURN` about an axis of its own frame."""
+    turn, _ = cv2.Rodrigues(np.radians(TURN) * np.eye(3)[axis])
+    rotation = turn @ camera.rotation
+    return replace(camera, rvec=cv2.Rodrigues(rotation)[0].ravel(), tvec=-rotation @ camera.centre)
+
+
+def errors_picture(errors: Mapping[str, NDArray[np.float64]], path: Path) -> Path:
+    """The share of points within a distance of the truth, a curve for the errors (n, 3) m of each recording."""
+    figure, axes = plt.subplots(figsize=(7.4, 4.2), layout="constrained")
+    for name, error in errors.items():
+        distance = np.sort(1e3 * np.linalg.norm(error, axis=1))
+        axes.plot(distance, np.arange(1, len(distance) + 1) / len(distance), label=f"{name} ({len(distance)} points)")
+    axes.set(xscale="log", xlabel="distance from the truth, mm", ylabel="share of points within", ylim=(0, 1.01))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8, loc="lower right")
+    axes.set_title("Rendered scenes, three 1280x720 cameras: points against the truth", size=11)
+    return save(figure, path)
+
+
+def turns_picture(turns: Sequence[Turn], path: Path) -> Path:
+    """The turn that is found of each camera that was turned, by axis; crossed out where another camera is named."""
+    figure, axes = plt.subplots(figsize=(6.4, 3.4), layout="constrained")
+    for place, turn in enumerate(turns):
+        right = turn.named == turn.camera
+        axes.plot(place, turn.found, "o" if right else "x", color=BLUE if right else ORANGE, markersize=8)
+    axes.axhline(TURN, color="black", linewidth=0.8, linestyle="--", label=f"turned by {TURN:g} degrees")
+    axes.set_xticks(range(len(turns)), [f"{turn.camera}\n{turn.axis}" for turn in turns], fontsize=8)
+    axes.set(xlabel="camera, and the axis it was turned about", ylabel="turn found, degrees", ylim=(0, 2 * TURN))
+    axes.grid(axis="y", alpha=0.3)
+    axes.legend(fontsize=8)
+    axes.set_title("A turned camera: named (dots) or not (crosses)", size=11)
+    return save(figure, path)
+
+
+LATE: Final = {"right": 0.004}  # s, delay of the stamps in recordings with a late clock
 
 
 @dataclass(frozen=True)
@@ -42,8 +157,6 @@ QUICK: Final = Size(shots=2, late=1)
 
 def run_cameras(results: Results, out: Path, size: Size, jobs: int) -> list[Path]:
     """Film, track, judge, and add the rows. Returns: the pictures written to the existing folder `out`."""
-    from ballfg.benchmarks.cameras.pictures import errors_picture, turns_picture
-
     ways = scenarios(size.shots, results.seed)
     late = [_late(ways[1], number) for number in range(size.late)]
     filmed = in_processes(film, [*ways, *late], jobs, "recordings drawn and tracked")

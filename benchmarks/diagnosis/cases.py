@@ -12,10 +12,8 @@ import numpy as np
 from ballfg.benchmarks.diagnosis.effects import PAIRS, PLANTS, UNKNOWN
 from ballfg.simulation.settings import SETTING_LEVELS
 
-STATED_NOISE: Final = 0.003
-"""m, noise of positions that every dataset states; in most it is true."""
-LABEL_NOISE: Final = 4.0
-"""rad/s per component, noise of spin labels that every dataset states."""
+STATED_NOISE: Final = 0.003  # m, noise of positions that every dataset states; in most it is true
+LABEL_NOISE: Final = 4.0  # rad/s per component, noise of spin labels that every dataset states
 BARE: Final = ("magnus", "tangential_restitution", "table_height")
 """Effects removed from the nominal model to leave gravity, drag, restitution and friction."""
 
@@ -26,8 +24,7 @@ class Recording:
 
     Attributes:
         tracks: number.  rate: Hz.  position: m and spin: rad/s, true noise of positions and labels.
-        dropout, outliers: probability for each frame.  jitter: s, of the stamps.
-        labels: True if spins are labelled.
+        dropout, outliers: probability for each frame.  jitter: s, of the stamps.  labels: True if spins are labelled.
         levels: launcher levels by setting, for those that do not run through all of theirs.
     """
 
@@ -52,8 +49,7 @@ class Case:
         planted: names of the effects that the declared model lacks.
         left_out: effects of the nominal model that the declared one lacks.
         sessions: undeclared effects, as texts, of each session that the dataset consists of.
-        recording: settings of its tracks.
-        data: folder of measured tracks, which take the place of simulated ones.
+        recording: settings of its tracks.  data: folder of measured tracks, which take the place of simulated ones.
         change: name of a change of `CHANGES` that the measured tracks undergo; empty for none.
         most: number of measured tracks, evenly spread; None for all.
         repair: fit the true model too.  jobs: processes of the diagnosis.
@@ -90,13 +86,11 @@ class Plan:
 
     Attributes:
         effects, sizes: planted one by one, each in every size.
-        unlabelled: names of effects planted in data without spin labels.
-        pairs: names of two planted together.
+        unlabelled: names of effects planted in data without spin labels.  pairs: names of two planted together.
         seeds: of each at its typical size; the true model is fitted to the first of them.
         side_seeds: of each at other sizes, and of pairs.  unlabelled_seeds: where no spin is labelled.
         ratios, detection_seeds: sizes over the ideal test's, and seeds at each, where the detection limit is sought.
-        nulls: datasets that lack nothing.
-        unknown, unknown_seeds: physics outside the catalogue.
+        nulls: datasets that lack nothing.  unknown, unknown_seeds: physics outside the catalogue.
         timed: diagnoses that are timed alone.
         reliability: sets for the test of stated probabilities, which is a run of its own.
     """

@@ -22,25 +22,19 @@ from ballfg.state import POSITION, STATE_DIM
 from ballfg.tracks import Dataset, Track
 from ballfg.tracks.track import SPIN_LABELS
 
-TILT: Final = 0.02
-"""rad, turn of the frame about its x axis."""
-CLOCK: Final = 0.04
-"""Share by which durations are written too long."""
+TILT: Final = 0.02  # rad, turn of the frame about its x axis
+CLOCK: Final = 0.04  # Share by which durations are written too long
 STRETCH: Final = 0.05
 """Share by which heights are written too large. Gravity shows it; along the flight it would resemble drag."""
-STAMP_SIGMA: Final = 0.0025
-"""s, error of a stamp."""
+STAMP_SIGMA: Final = 0.0025  # s, error of a stamp
 MEMORY_SIGMA, MEMORY_TIME = 0.006, 0.02
 """m and s, of the tracker's lasting error: of each coordinate, and until its correlation is 1 / e."""
 MOVED: Final = 0.012
 """m by which the rig sinks half-way, so that later balls are written higher. A horizontal move would not show: the
 physics is the same everywhere above a table."""
-LOST: Final = 5
-"""Of so many frames the last is lost."""
-WIND_SPEED: Final = 0.6
-"""m/s, across the shots: along them a wind resembles drag."""
-FIRST_PART: Final = 0.25
-"""s of a track that show which way it was shot."""
+LOST: Final = 5  # Of so many frames the last is lost
+WIND_SPEED: Final = 0.6  # m/s, across the shots: along them a wind resembles drag
+FIRST_PART: Final = 0.25  # s of a track that show which way it was shot
 QUARTER_TURN: Final = {"xx": 0.0, "xy": 1.0, "yx": -1.0, "yy": 0.0}
 """Labels in a frame that is turned about the vertical: its x axis is the y axis of the positions."""
 

@@ -19,8 +19,7 @@ class Plant:
     """An effect that acts although the declared model lacks it.
 
     Attributes:
-        name: of the effect.
-        amounts: by coefficient, the addition at size 1.
+        name: of the effect.  amounts: by coefficient, the addition at size 1.
         base: value of those coefficients at size 0: the effect is absent, or as declared.
         left_out: the nominal model has it; the declared model is the nominal one without it.
         hidden: other effects or free coefficients do the same; an honest answer names one of those effects or says that

@@ -9,21 +9,21 @@ weight is one.
 Source: D. R. Cox and D. V. Hinkley, Theoretical Statistics, 1974, section 9.3.
 """
 
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import TypeAdapter
-from scipy import optimize, stats
+from scipy import optimize, special, stats
 
 from ballfg.arrays import Array
 from ballfg.benchmarks.diagnosis.cases import Case, Recording, planted_case
 from ballfg.benchmarks.diagnosis.data import declared_model, make_dataset
 from ballfg.benchmarks.diagnosis.effects import PLANTS
 from ballfg.benchmarks.diagnosis.record import case_digest
-from ballfg.benchmarks.resumable import read_record, write_record
+from ballfg.benchmarks.resumable import Kept
 from ballfg.diagnosis.fit.fit import fit_model
 from ballfg.diagnosis.fit.holdout import launcher_labels
 from ballfg.diagnosis.fit.problem import Fit
@@ -32,23 +32,19 @@ from ballfg.diagnosis.hypotheses.signatures import hypothesis_signatures, visibl
 from ballfg.diagnosis.search.candidates import ALARM
 from ballfg.estimation import Smoother, dataset_settings, dataset_surfaces
 
-LEVEL = ALARM
-"""False-alarm rate of the score tests of one round of the loop."""
-POWER = 0.9
-"""Probability at which an effect counts as detectable."""
+LEVEL = ALARM  # False-alarm rate of the score tests of one round of the loop
+POWER = 0.9  # Probability at which an effect counts as detectable
 
 
 @dataclass(frozen=True)
-class Ideal:
+class Ideal(Kept):
     """The ideal test of an effect.
 
     Attributes:
-        digest: of the case that it was computed from.
-        rank: degrees of freedom; 0 where the data do not show the effect.
-        information: non-centrality at size 1.
+        rank: degrees of freedom; 0 where the data do not show the effect.  information: non-centrality at size 1.
     """
 
-    digest: str
+    what = "an ideal test"
     rank: int
     information: float
 
@@ -63,10 +59,6 @@ class Ideal:
         """(...) probability that an effect of some sizes (...) is found."""
         noncentrality = self.information * np.asarray(sizes, dtype=np.float64) ** 2
         return np.asarray(power(noncentrality, self.rank)) if self.rank else np.zeros_like(noncentrality)
-
-    def save(self, path: Path) -> None:
-        """Write the file whole or not at all."""
-        write_record(path, asdict(self))
 
 
 def power(noncentrality: ArrayLike, rank: int) -> Array:
@@ -105,9 +97,56 @@ def ideal_of(case: Case) -> Ideal:
     return Ideal(case_digest(case), rank, float(direction @ efficient.total @ direction))
 
 
-def read_ideal(path: Path, digest: str) -> Ideal | None:
-    """The ideal test in a file; None if there is no file, or one of another case.
+NAMED = 0.9  # Share of seeds from which on an effect of some size counts as named
+SLOPE_PRIOR = 10.0
+"""Standard deviation of the curve's slope about zero, in logits per unit of the size's logarithm. It makes the fit
+exist where outcomes part cleanly; a curve of that slope goes from 10 to 90 % within a factor of 1.6."""
+MIDDLE_PRIOR = 2.0
+"""Standard deviation of the logarithm of the size at which the curve is at one half, about that of the sizes tried."""
 
-    Raises: ValueError: if the file holds something else.
+
+@dataclass(frozen=True)
+class Curve:
+    """Probability to be named against size: a logistic function of the size's logarithm.
+
+    Attributes:
+        middle: logarithm of the size at one half.  slope: logits per unit of the logarithm.
+        lowest, highest: sizes that were tried.
     """
-    return read_record(path, digest, TypeAdapter(Ideal).validate_python, "an ideal test")
+
+    middle: float
+    slope: float
+    lowest: float
+    highest: float
+
+    def at(self, sizes: ArrayLike) -> Array:
+        """(...) probabilities at some sizes (...)."""
+        return np.asarray(special.expit(self.slope * (np.log(sizes) - self.middle)))
+
+    @property
+    def limit(self) -> float:
+        """The size at `NAMED`; the lowest one tried where it lies below, infinite where it lies beyond the highest."""
+        size = float(np.exp(self.middle + special.logit(NAMED) / self.slope)) if self.slope > 0.0 else np.inf
+        return max(size, self.lowest) if size <= self.highest else np.inf
+
+
+def power_curve(sizes: Sequence[float], outcomes: Sequence[bool]) -> Curve:
+    """The most probable curve through outcomes at sizes.
+
+    Args: sizes: (n,) positive.  outcomes: (n,) whether the effect was named.
+    Raises: ValueError: if there is none.
+    """
+    if not outcomes:
+        raise ValueError("outcomes must not be empty; got none. Run some sizes first.")
+    logs, signs = np.log(sizes), np.where(outcomes, 1.0, -1.0)
+    centre = float(logs.mean())
+
+    def loss(parameters: Array) -> float:
+        middle, slope = parameters[0], np.exp(parameters[1])
+        fit = np.logaddexp(0.0, -signs * slope * (logs - middle)).sum()
+        return float(fit + 0.5 * ((middle - centre) / MIDDLE_PRIOR) ** 2 + 0.5 * (slope / SLOPE_PRIOR) ** 2)
+
+    starts = [(m, s) for m in (float(logs.min()), centre, float(logs.max())) for s in (0.0, 1.5)]
+    tried = [optimize.minimize(loss, start, method="Nelder-Mead") for start in starts]
+    middle, slope = min(tried, key=lambda t: float(t.fun)).x
+    return Curve(float(middle), float(np.exp(slope)), float(min(sizes)), float(max(sizes)))

@@ -9,22 +9,17 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from ballfg.benchmarks.diagnosis.cases import Case
-from ballfg.benchmarks.diagnosis.ideal import Ideal
-from ballfg.benchmarks.diagnosis.power_curve import NAMED, Curve
+from ballfg.benchmarks.diagnosis.ideal import NAMED, Curve, Ideal
 from ballfg.benchmarks.diagnosis.record import Record
 from ballfg.benchmarks.diagnosis.rows import ALL, detectable, of_part, power_curves
 from ballfg.benchmarks.metrics import share
 from ballfg.benchmarks.pictures import BLUE, GREY, ORANGE, plain_ticks, save
 from ballfg.benchmarks.results import Row
 
-COLUMNS: Final = 5
-"""Panels side by side."""
-NOTHING: Final = "nothing"
-"""Column of the diagnoses that named no effect."""
-FEW_DECADES: Final = 100.0
-"""Ratio of the largest to the smallest size up to which more than the decades are numbered."""
-POINTS: Final = 200
-"""Number of points of a drawn curve."""
+COLUMNS: Final = 5  # Panels side by side
+NOTHING: Final = "nothing"  # Column of the diagnoses that named no effect
+FEW_DECADES: Final = 100.0  # Ratio of the largest to the smallest size up to which more than the decades are numbered
+POINTS: Final = 200  # Number of points of a drawn curve
 
 
 def power_picture(

@@ -16,9 +16,8 @@ from matplotlib.axes import Axes
 
 from ballfg.benchmarks.diagnosis.cases import Case, by_name
 from ballfg.benchmarks.diagnosis.changes import CHANGES, applicable
-from ballfg.benchmarks.diagnosis.record import Found, Record
-from ballfg.benchmarks.diagnosis.runs import collect_records, run_case
-from ballfg.benchmarks.diagnosis.verdicts import is_one_of
+from ballfg.benchmarks.diagnosis.record import Found, Record, is_one_of
+from ballfg.benchmarks.diagnosis.suite import collect_records, run_case
 from ballfg.benchmarks.metrics import Figure, share
 from ballfg.benchmarks.pictures import BLUE, GREY, ORANGE, save
 from ballfg.benchmarks.results import Results
@@ -28,22 +27,15 @@ from ballfg.dynamics import EFFECTS, Coefficient
 from ballfg.estimation.noise.tracker_errors import JITTER, MEMORY
 from ballfg.tracks import read_dataset
 
-SETS = ("aimy", "ballgun", "robot_rallies", "spindoe")
-"""Folders that are changed if no other ones are given."""
+SETS = ("aimy", "ballgun", "robot_rallies", "spindoe")  # Folders that are changed if no other ones are given
 PART, TITLE, ALL = "planted", "planted in measured sets", "all"
-QUICK_TRACKS = 12
-"""Number of tracks of each set in a quick look."""
-QUICK_CHANGES = ("frame_tilt", "stamp_jitter", "wind")
-"""One each of frame, noise and flight."""
-RANDOM = (JITTER, MEMORY)
-"""Standard deviations: they add in squares to what the set had before."""
-SIGMAS = 3.0
-"""Distance from the planted change up to which a strength counts as found."""
-DRIFT = "_drift"
-"""Ending of the name of an effect that changes along the recording."""
+QUICK_TRACKS = 12  # Number of tracks of each set in a quick look
+QUICK_CHANGES = ("frame_tilt", "stamp_jitter", "wind")  # One each of frame, noise and flight
+RANDOM = (JITTER, MEMORY)  # Standard deviations: they add in squares to what the set had before
+SIGMAS = 3.0  # Distance from the planted change up to which a strength counts as found
+DRIFT = "_drift"  # Ending of the name of an effect that changes along the recording
 
-Strength = tuple[float, float]
-"""Value and standard deviation."""
+Strength = tuple[float, float]  # Value and standard deviation
 
 
 @dataclass(frozen=True)
@@ -110,7 +102,9 @@ def _changes(
     changes = {}
     for coefficient, should in planted.items():
         value, sigma = now[coefficient]
-        was, its_sigma = before.get(coefficient, (_absence(change, coefficient), 0.0))
+        listed = None if change.endswith(DRIFT) else _listed(change).get(coefficient)
+        absent = 0.0 if listed is None or listed.absent is None else listed.absent
+        was, its_sigma = before.get(coefficient, (absent, 0.0))
         expected, slope = was + should, 1.0
         if change in RANDOM:
             expected = math.hypot(was, should)
@@ -141,12 +135,6 @@ def strengths(values: Mapping[str, tuple[float, float | None]]) -> dict[str, Str
         if sigma is not None:
             found[coefficient] = (value, sigma) if first is None else (value - first[0], math.hypot(sigma, first[1]))
     return found
-
-
-def _absence(change: str, coefficient: str) -> float:
-    """The value of a coefficient where nothing is changed."""
-    listed = _listed(change).get(coefficient)
-    return 0.0 if listed is None or listed.absent is None or change.endswith(DRIFT) else listed.absent
 
 
 def _listed(change: str) -> dict[str, Coefficient]:

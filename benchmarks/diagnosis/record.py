@@ -1,21 +1,18 @@
-"""Keeps the record of a diagnosis, names, evidence, errors and seconds, as a JSON file for later runs."""
+"""Keeps the record of a diagnosis as a JSON file for later runs, and decides whether it was right."""
 
 import hashlib
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from importlib import metadata
-from pathlib import Path
 
-from pydantic import TypeAdapter
+from ballfg.benchmarks.diagnosis.cases import Case, Recording
+from ballfg.benchmarks.diagnosis.effects import PLANTS
+from ballfg.benchmarks.resumable import Kept
+from ballfg.diagnosis.hypotheses.hypothesis import TWINS
+from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Outcome, Value, Verdict
 
-from ballfg.benchmarks.diagnosis.cases import Case
-from ballfg.benchmarks.resumable import read_record as read_any
-from ballfg.benchmarks.resumable import write_record
-from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Finding, Value
-
-RANKED = 8
-"""Leading candidates of a round that are kept, beside those planted."""
+RANKED = 8  # Leading candidates of a round that are kept, beside those planted
 
 
 @dataclass(frozen=True)
@@ -42,24 +39,20 @@ class Ranked:
 
 
 @dataclass(frozen=True)
-class Record:
+class Record(Kept):
     """A finished case.
 
     Attributes:
-        digest: of the case: a record of another one does not count.
         verdict: as in the report.
-        found: findings in order.
-        rounds: leading candidates of each round, best first, and those planted.
+        found: findings in order.  rounds: leading candidates of each round, best first, and those planted.
         errors: mm, prediction error on the judging half: `before`, `after`, of the true model `true`, and where there
             is a fallback, with it (`fallback`, the one after) and with named effects only (`named`).
         patterns: p-values of the tests for remaining patterns, by their place.
         tracks, judged: numbers of tracks in the dataset and on the judging half.
-        seconds: of the diagnosis, wall clock.
-        strengths: of the change that measured tracks underwent, by coefficient.
+        seconds: of the diagnosis, wall clock.  strengths: of the change that measured tracks underwent, by coefficient.
         probabilities: stated, that an effect is there, by its name.
     """
 
-    digest: str
     verdict: str
     found: tuple[Found, ...]
     rounds: tuple[tuple[Ranked, ...], ...]
@@ -70,18 +63,6 @@ class Record:
     seconds: float
     strengths: Mapping[str, float] = field(default_factory=dict)
     probabilities: Mapping[str, float] = field(default_factory=dict)
-
-    def save(self, path: Path) -> None:
-        """Write the file whole or not at all."""
-        write_record(path, asdict(self))
-
-
-def read_record(path: Path, digest: str) -> Record | None:
-    """The record in a file; None if there is no file, or one of another case.
-
-    Raises: ValueError: if the file is no record.
-    """
-    return read_any(path, digest, TypeAdapter(Record).validate_python, "a finished case")
 
 
 def record_of(case: Case, digest: str, diagnosis: Diagnosis, true: Errors | None, seconds: float) -> Record:
@@ -95,7 +76,10 @@ def record_of(case: Case, digest: str, diagnosis: Diagnosis, true: Errors | None
     return Record(
         digest=digest,
         verdict=diagnosis.verdict.value,
-        found=tuple(_found(finding) for finding in diagnosis.findings),
+        found=tuple(
+            Found(f.name, tuple(f.indistinguishable_from), float(f.p_value), float(f.delta_bic), _values(f.parameters))
+            for f in diagnosis.findings
+        ),
         rounds=tuple(_leading(listed, case.planted) for listed in diagnosis.rounds),
         errors={name: float(one.prediction_rmse_mm) for name, one in errors.items()},
         patterns={test.where: float(test.p_value) for test in left.tests},
@@ -104,12 +88,6 @@ def record_of(case: Case, digest: str, diagnosis: Diagnosis, true: Errors | None
         seconds=seconds,
         probabilities=dict(diagnosis.probabilities),
     )
-
-
-def _found(finding: Finding) -> Found:
-    alike = tuple(finding.indistinguishable_from)
-    values = _values(finding.parameters)
-    return Found(finding.name, alike, float(finding.p_value), float(finding.delta_bic), values)
 
 
 def _values(values: Mapping[str, Value]) -> dict[str, tuple[float, float | None]]:
@@ -135,3 +113,49 @@ def case_digest(case: Case) -> str:
                 digest.update(path.name.encode())
                 digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+LARGEST_GROUP = 3  # Effects that a diagnosis may name together and still be right
+
+
+def named(record: Record, planted: Iterable[str]) -> bool:
+    """True if the first finding is a planted effect, or one of a small group of indistinguishable ones with it."""
+    return bool(record.found) and is_one_of(record.found[0], planted)
+
+
+def is_one_of(found: Found, planted: Iterable[str]) -> bool:
+    """True if a finding is a planted effect, or in a small group with one."""
+    group = (found.name, *found.alike)
+    return found.name in planted or (len(group) <= LARGEST_GROUP and not set(group).isdisjoint(planted))
+
+
+def honest(record: Record, name: str) -> bool:
+    """True for an effect with equals if its group is named, however large, or it is reported as invisible."""
+    if record.found:
+        return name in (record.found[0].name, *record.found[0].alike)
+    entries = {name, *(listed for listed, twins in TWINS.items() if name in twins)}  # exact twins are one entry
+    standings = [ranked.standing for ranked in record.rounds[-1] if ranked.name in entries] if record.rounds else []
+    return standings == [Outcome.INVISIBLE.value]
+
+
+def right(record: Record, planted: tuple[str, ...]) -> bool:
+    """True by `honest` for an effect with equals, else by `named`."""
+    if len(planted) == 1 and PLANTS[planted[0]].hidden:
+        return honest(record, planted[0])
+    return named(record, planted)
+
+
+def complete(record: Record, planted: tuple[str, ...]) -> bool:
+    """True if every planted effect is the whole or a part of some finding, and no finding is anything else."""
+    every = all(any(is_one_of(found, (name,)) for found in record.found) for name in planted)
+    return every and all(is_one_of(found, planted) for found in record.found)
+
+
+def false_names(record: Record, recording: Recording) -> list[str]:
+    """False names in a dataset whose model is complete; jitter of the stamps is false only where there is none."""
+    return [found.name for found in record.found if found.name != "stamp_jitter" or not recording.jitter]
+
+
+def alarmed(record: Record, recording: Recording) -> bool:
+    """True if a complete model was reported to lack something, by name or without one."""
+    return bool(false_names(record, recording)) or record.verdict == Verdict.UNEXPLAINED.value

@@ -11,19 +11,16 @@ from scipy.stats import binom
 from ballfg.benchmarks.diagnosis.cases import Case, Recording
 from ballfg.benchmarks.diagnosis.effects import PLANTS, Plant
 from ballfg.benchmarks.diagnosis.record import Record
-from ballfg.benchmarks.diagnosis.runs import collect_records, run_case
+from ballfg.benchmarks.diagnosis.suite import collect_records, run_case
 from ballfg.benchmarks.metrics import CONFIDENCE, Figure
 from ballfg.benchmarks.results import Results
 from ballfg.benchmarks.resumable import RUNS_FOLDER
 
 TITLE, ALL = "reliability", "all"
-EDGES = (0.5, 0.7, 0.9, 0.97, 1.0)
-"""Ends of the bins of the stated probability; a bin holds its lower end."""
+EDGES = (0.5, 0.7, 0.9, 0.97, 1.0)  # Ends of the bins of the stated probability; a bin holds its lower end
 MOST_PLANTED = 3
-SMALLEST, LARGEST = 0.2, 5.0
-"""Sizes over the usual one, between which their logarithms are uniform."""
-LABELLED = 0.5
-"""Share of the sets with spin labels."""
+SMALLEST, LARGEST = 0.2, 5.0  # Sizes over the usual one, between which their logarithms are uniform
+LABELLED = 0.5  # Share of the sets with spin labels
 
 
 def reliability_cases(count: int, seed: int) -> Iterator[Case]:

@@ -5,19 +5,15 @@ from functools import partial
 
 from ballfg.benchmarks.diagnosis.cases import BARE, STATED_NOISE, Case
 from ballfg.benchmarks.diagnosis.effects import PLANTS
-from ballfg.benchmarks.diagnosis.ideal import Ideal
-from ballfg.benchmarks.diagnosis.power_curve import Curve, power_curve
-from ballfg.benchmarks.diagnosis.record import Record
-from ballfg.benchmarks.diagnosis.verdicts import alarmed, complete, false_names, named, right
+from ballfg.benchmarks.diagnosis.ideal import Curve, Ideal, power_curve
+from ballfg.benchmarks.diagnosis.record import Record, alarmed, complete, false_names, named, right
 from ballfg.benchmarks.metrics import median_and_range, share
 from ballfg.benchmarks.results import Results
 from ballfg.diagnosis.result import Verdict
 
 ALL = "all"
-HIDDEN = "all that hide"
-"""Rows over the effects that have equals; `ALL` is over the others."""
-FAILED = "failed"
-"""Metric of the number of cases of a part that ended in an error; they count as wrong."""
+HIDDEN = "all that hide"  # Rows over the effects that have equals; `ALL` is over the others
+FAILED = "failed"  # Metric of the number of cases of a part that ended in an error; they count as wrong
 TITLES = {
     "naming": "naming, spin labels",
     "no_labels": "naming, no spin labels",
@@ -31,8 +27,7 @@ TITLES = {
 """The name in `results.json` of each part's rows."""
 LARGEST_IDEAL = 2.0
 """Largest multiple of its typical size that the ideal test may need for a search at an effect's limit."""
-FEW_TRACKS = 25
-"""Null datasets of so many tracks are also counted apart."""
+FEW_TRACKS = 25  # Null datasets of so many tracks are also counted apart
 
 Records = Mapping[str, Record]
 

@@ -1,4 +1,4 @@
-"""Defines the contenders of the dynamics comparison: their interface, graph models, untrained ones."""
+"""Defines the contenders of the dynamics comparison, and the fan of paths that each predicts for one launch."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -16,11 +16,12 @@ from ballfg.dynamics.motion.paths import paths
 from ballfg.estimation import Estimate, Settings, Smoother, Status
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction import Belief, Propagator
-from ballfg.state import POSITION
+from ballfg.simulation import table_tennis
+from ballfg.simulation.settings import SETTING_LEVELS
+from ballfg.state import POSITION, SPIN, VELOCITY
 from ballfg.tracks import Track
 
-BLOCK: Final = 64
-"""Tracks that are rolled out together."""
+BLOCK: Final = 64  # Tracks that are rolled out together
 NO_NOISE: Final = ProcessNoise(acceleration=0.005, spin=0.05, contact_velocity=0.001, contact_spin=0.2)
 """For the truth, which has no process noise: a fiftieth of what models start from, as little as stays well conditioned;
 a fifth of it changes the errors by less than 1 %."""
@@ -32,8 +33,7 @@ class Job:
 
     Attributes:
         tasks: what it learns from, all of it together, and is judged by, each by itself.
-        method: its name in `METHODS`.
-        seed: of its training.
+        method: its name in `METHODS`.  seed: of its training.
         folder: its own, for what training writes; it may hold an unfinished training to go on with.
         quick: train just enough to see that everything works.
     """
@@ -54,8 +54,7 @@ class Contender(Protocol):
     """A trained method, or one that needs no training.
 
     Attributes:
-        name: the method in `results.json`.
-        parameter_count: numbers that were learned, 0 for none.
+        name: the method in `results.json`.  parameter_count: numbers that were learned, 0 for none.
         training_seconds: s, wall clock; 0 where nothing was learned.
     """
 
@@ -165,3 +164,63 @@ def truth_contender(job: Job, task: Task) -> GraphContender:
         )
     settings = replace(task.settings, process=NO_NOISE)
     return replace(nominal_contender(job, task), model=task.truth, settings=settings)
+
+
+SPEED_LEVEL: Final = 11  # The launcher's middle velocity level
+DURATION: Final = 1.2  # s that are shown
+RATE: Final = 120.0
+"""Hz, of the paths and of the short straight track that tells a contender the direction of the launch."""
+STRAIGHT: Final = 12  # Samples of that track
+DIGITS: Final = 5  # Resolution of a kept coordinate in m, 0.01 mm
+
+
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Fan:
+    """Paths from one launch.
+
+    Attributes: topspin: by level, m, without sidespin, to `DIGITS`.  sidespin: by level, m, without topspin.
+    """
+
+    topspin: dict[int, list[Point]]
+    sidespin: dict[int, list[Point]]
+
+
+def _paths(contender: GraphContender, setting: str) -> dict[int, list[Point]]:
+    """The paths by the levels of one setting, the other one being zero."""
+    levels, start = SETTING_LEVELS[setting], _launch()
+    states = np.tile(start, (len(levels), 1))
+    for row, level in zip(states, levels, strict=True):
+        row[SPIN] = _spin(contender, start, {setting: float(level)})
+    times = np.arange(round(DURATION * RATE) + 1) / RATE
+    paths = contender.roll(states, [times] * len(levels))
+    return {level: np.round(path, DIGITS).tolist() for level, path in zip(levels, paths, strict=True)}
+
+
+def _launch() -> Array:
+    """(9,) the launcher's first state at the middle velocity level, without spread and spin."""
+    kind = table_tennis()
+    still = {name: 0.0 for name in ("position_spread", "speed_spread", "aim_spread", "spin_spread")}
+    launcher = kind.launcher.with_fields(still)
+    return np.asarray(
+        launcher.launch(np.array([[0, 0, SPEED_LEVEL]]), kind.surfaces.table_height, np.random.default_rng(0))[
+            0
+        ].numpy()
+    )
+
+
+def _spin(contender: GraphContender, start: Array, settings: dict[str, float]) -> Array:
+    """(3,) rad/s, the spin that launcher settings mean to the contender for a launch."""
+    times = np.arange(STRAIGHT) / RATE
+    positions = start[POSITION] + times[:, None] * start[VELOCITY]
+    labels = {"topspin": 0.0, "sidespin": 0.0, "speed": float(SPEED_LEVEL)} | settings
+    launch = contender.label(Track(times, positions, labels=labels, name="launch"))
+    label = contender.settings.spin_label(launch)
+    return np.zeros(3) if label is None else label.spin
+
+
+def fan_of(contender: GraphContender) -> Fan:
+    """The paths of all levels of topspin, and of all levels of sidespin, from the launcher's middle shot."""
+    return Fan(_paths(contender, "topspin"), _paths(contender, "sidespin"))

@@ -1,26 +1,75 @@
-"""Trains and judges the methods of the dynamics comparison, each in a process, and keeps finished ones."""
+"""Lists the methods of the dynamics comparison, trains and judges each in a process, and keeps finished ones."""
 
+import importlib.util
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 
-from ballfg.benchmarks.dynamics.contenders import Contender, GraphContender, Job
-from ballfg.benchmarks.dynamics.fan import fan_of
-from ballfg.benchmarks.dynamics.methods import METHODS
-from ballfg.benchmarks.dynamics.record import Record, job_digest, read_record
-from ballfg.benchmarks.dynamics.scoring import score_path
-from ballfg.benchmarks.dynamics.task import Task
-from ballfg.benchmarks.dynamics.trained import recipe
+from ballfg.benchmarks.dynamics import contenders
+from ballfg.benchmarks.dynamics.contenders import Contender, GraphContender, Job, fan_of
+from ballfg.benchmarks.dynamics.record import Record, job_digest
+from ballfg.benchmarks.dynamics.task import Task, score_path
+from ballfg.benchmarks.dynamics.trained import RESIDUAL, recipe, trained_contender
 from ballfg.benchmarks.resumable import collect
 from ballfg.benchmarks.speed.stopwatch import milliseconds
 from ballfg.learning.run.loop import TrainingStoppedError
 
-TIMED: Final = 20
-"""Tracks whose predictions are timed one by one."""
+
+@dataclass(frozen=True)
+class Method:
+    """A row of the comparison.
+
+    Attributes:
+        make: a contender for one of the job's tasks; what the method learns is learned at the first of them.
+        trained: True if a seed makes a difference; if not it runs once.
+        takes_part: on which tracks: `all`, `simulated` or `measured` ones.
+        transfers: True if it can be judged on tracks of a launcher outside of its training.
+        package: required package of an extra; empty if there is none.
+    """
+
+    make: Callable[[Job, Task], Contender]
+    trained: bool = True
+    takes_part: Literal["all", "simulated", "measured"] = "all"
+    transfers: bool = True
+    package: str = ""
+
+    @property
+    def installed(self) -> bool:
+        """True if its required package is installed."""
+        return not self.package or importlib.util.find_spec(self.package) is not None
+
+    def fits(self, tasks: Sequence[Task]) -> bool:
+        """True if it takes part on these tracks."""
+        return self.takes_part in ("all", "measured" if tasks[0].truth is None else "simulated")
+
+
+SEQUENCES: Final = ("lstm+aug", "diffusion+aug")
+"""Methods that know the settings of their training launchers, and nothing of spin."""
+TRAINED: Final = (*SEQUENCES, "a-tune+aug", "mlp+aug", "mlp+gs", "skip+gs", "mnn+gs")
+"""The methods of the paper's table."""
+
+METHODS: Final = {
+    "truth": Method(contenders.truth_contender, trained=False, takes_part="simulated"),
+    "nominal": Method(contenders.nominal_contender, trained=False),
+    "nominal+track": Method(contenders.adapting_contender, trained=False, takes_part="measured"),
+    **{
+        name: Method(
+            trained_contender, transfers=name not in SEQUENCES, package="diffusers" if "diffusion" in name else ""
+        )
+        for name in TRAINED
+    },
+    RESIDUAL: Method(trained_contender, takes_part="measured"),
+}
+"""Every method by name, in the order of the table: controls, then those that learn. `nominal+track` is the nominal
+model with coefficients of each track's own, `analytic+mnn` the nominal model with a network that corrects it."""
+
+
+TIMED: Final = 20  # Tracks whose predictions are timed one by one
 
 
 def collect_records(
@@ -63,7 +112,7 @@ def _digest(job: Job, number: int) -> str:
 
 def read(job: Job) -> dict[int, Record] | None:
     """The records of a finished job by the numbers of its tasks; None if one is missing."""
-    records = {k: read_record(record_path(job, k), _digest(job, k)) for k in judged(job)}
+    records = {k: Record.read(record_path(job, k), _digest(job, k)) for k in judged(job)}
     whole = {k: record for k, record in records.items() if record is not None}
     return whole if len(whole) == len(records) else None
 
@@ -92,7 +141,6 @@ def judge(contender: Contender, job: Job, number: int) -> Record:
     seen, times = [shot.seen for shot in shots], [shot.track.times for shot in shots]
     paths = contender.predict(seen, times)
     graph = contender if isinstance(contender, GraphContender) else None
-    failures = graph.failures if graph else 0
     timed = zip(seen[:TIMED], times[:TIMED], strict=True)
     spent = [milliseconds(partial(contender.predict, [track], [stamps])) for track, stamps in timed]
     return Record(
@@ -102,7 +150,7 @@ def judge(contender: Contender, job: Job, number: int) -> Record:
         parameters=contender.parameter_count,
         training_time=contender.training_seconds,
         inference_time=1e-3 * float(np.median(spent)),
-        not_converged=failures,
+        not_converged=graph.failures if graph else 0,
         scores=tuple(score_path(shot, path) for shot, path in zip(shots, paths, strict=True)),
         fan=fan_of(graph) if graph and task.launcher is not None else None,
     )

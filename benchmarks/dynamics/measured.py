@@ -17,8 +17,7 @@ from ballfg.progress import progress
 from ballfg.tracks import Dataset, Track
 from ballfg.tracks.stamps import STAMP_TOLERANCE
 
-LEAST_OBSERVED: Final = 10
-"""Samples of a quarter of a second that a shot must have: fewer do not show where it goes."""
+LEAST_OBSERVED: Final = 10  # Samples of a quarter of a second that a shot must have: fewer do not show where it goes
 
 GROUP: Final = "group"
 """The label of a launcher and its setting. Tracks without it are one group of their dataset's name."""
@@ -64,9 +63,7 @@ def measured_task(dataset: Dataset, jobs: int, tracks: int | None = None, *, lea
     bounces are those of the smoother. Tracks that end within the observed part, or begin with hardly a sample, are left
     out.
 
-    Args:
-        tracks: how many of the first ones; None for all.
-        learn: False: all shots are to judge by.
+    Args: tracks: how many of the first ones; None for all.  learn: False: all shots are to judge by.
     Raises: ValueError: if too few tracks are left.
     """
     model = nominal_model(dataset.info.ball)

@@ -37,10 +37,8 @@ TABLE_COLOUR: Final = "#2d6a4f"
 FLIGHT_NAMES: Final = dict(zip(APEXES, ("before bounce 1", "between 1 and 2", "between 2 and 3"), strict=True))
 FANNED: Final = ("mnn+gs", "skip+gs", "mlp+gs", "mlp", "a-tune", "nominal")
 """Whose paths are shown next to the true ones: the first of these that took part."""
-MARGIN: Final = 0.1
-"""m, shown round the table."""
-GROUP_WIDTH: Final = 0.8
-"""Width of a group of bars, for groups 1 apart."""
+MARGIN: Final = 0.1  # m, shown round the table
+GROUP_WIDTH: Final = 0.8  # Width of a group of bars, for groups 1 apart
 
 
 def _colour_of(method: str) -> str:
@@ -48,7 +46,6 @@ def _colour_of(method: str) -> str:
 
 
 def _of_metric(rows: Sequence[Row], case: str, metric: str) -> dict[str, Row]:
-    """The rows of a metric by method, those that have a value."""
     return {r.method: r for r in rows if (r.case, r.metric) == (case, metric) and r.value is not None}
 
 
@@ -79,7 +76,6 @@ def rmse_picture(rows: Sequence[Row], task: Task, path: Path) -> Path:
 
 
 def _bar(axes: Axes, place: float, row: Row, seeds: Array) -> None:
-    """One bar in mm with its interval, its seeds as dots and its value above."""
     top = value = 1e3 * (row.value or 0.0)
     axes.bar(place, value, GROUP_WIDTH, color=_colour_of(row.method))
     if row.low is not None and row.high is not None:

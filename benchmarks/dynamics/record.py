@@ -2,34 +2,25 @@
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib import metadata
-from pathlib import Path
 
-from pydantic import TypeAdapter
-
-from ballfg.benchmarks.dynamics.fan import Fan
-from ballfg.benchmarks.dynamics.scoring import PathScore
-from ballfg.benchmarks.dynamics.task import Task
-from ballfg.benchmarks.resumable import read_record as read_any
-from ballfg.benchmarks.resumable import write_record
+from ballfg.benchmarks.dynamics.contenders import Fan
+from ballfg.benchmarks.dynamics.task import PathScore, Task
+from ballfg.benchmarks.resumable import Kept
 
 
 @dataclass(frozen=True)
-class Record:
+class Record(Kept):
     """A finished contender.
 
     Attributes:
-        digest: of the task and the size of the training: a record of another one does not count.
-        method, seed: which contender.
-        parameters: numbers learned.  training_time: s, wall clock.
-        inference_time: s, median over single tracks.
-        not_converged: estimates among the validation tracks.
-        scores: one a validation track.
-        fan: paths for the picture; None for methods that have no dynamics.
+        method, seed: which contender.  parameters: numbers learned.  training_time: s, wall clock.
+        inference_time: s, median over single tracks.  not_converged: estimates among the validation tracks.
+        scores: one a validation track.  fan: paths for the picture; None for methods that have no dynamics.
     """
 
-    digest: str
+    what = "a finished run"
     method: str
     seed: int
     parameters: int
@@ -38,18 +29,6 @@ class Record:
     not_converged: int
     scores: tuple[PathScore, ...]
     fan: Fan | None
-
-    def save(self, path: Path) -> None:
-        """Write the file whole or not at all."""
-        write_record(path, asdict(self))
-
-
-def read_record(path: Path, digest: str) -> Record | None:
-    """The record in a file; None if there is no file, or one of another task.
-
-    Raises: ValueError: if the file is no record.
-    """
-    return read_any(path, digest, TypeAdapter(Record).validate_python, "a finished run")
 
 
 def task_digest(task: Task, recipe: str) -> str:

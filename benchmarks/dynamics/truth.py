@@ -39,20 +39,13 @@ from ballfg.simulation.synthetic import dataset_info
 from ballfg.state import POSITION, VZ
 
 CASE: Final = "synthetic"
-TRACKS: Final = 717
-"""As in the paper."""
-TRAIN_SHARE: Final = 0.8
-"""Share of tracks for training: 573 of 717; 144 judge."""
-RATE: Final = 120.0
-"""Hz."""
-NOISE: Final = 0.003
-"""m, of each measured coordinate."""
-MOST_SAMPLES: Final = 300
-"""Longest track; as many points as the paper predicts at once."""
-MOST_BOUNCES: Final = 3
-"""A track ends before the next one: the paper's tracks bounce once to three times."""
-OBSERVED: Final = 80
-"""Samples that a model is given; as in the paper."""
+TRACKS: Final = 717  # As in the paper
+TRAIN_SHARE: Final = 0.8  # Share of tracks for training: 573 of 717; 144 judge
+RATE: Final = 120.0  # Hz
+NOISE: Final = 0.003  # m, of each measured coordinate
+MOST_SAMPLES: Final = 300  # Longest track; as many points as the paper predicts at once
+MOST_BOUNCES: Final = 3  # A track ends before the next one: the paper's tracks bounce once to three times
+OBSERVED: Final = 80  # Samples that a model is given; as in the paper
 LABEL_NOISE: Final = 4.0
 """rad/s per axis, of the spin that `Launcher` reads off the settings: the spins of the launches spread by 3, and
 the direction of flight, taken from noisy samples, adds to that. The root mean square of the labels' errors is 3.9."""
@@ -66,8 +59,7 @@ EFFECTS: Final = (
     "tangential_restitution.e_t=0.25",
 )
 """Effects that act although no compared model declares them, or declares another value."""
-_SPLIT_STREAM: Final = 6
-"""Keeps the draw of the split apart from other draws of the same seed."""
+_SPLIT_STREAM: Final = 6  # Keeps the draw of the split apart from other draws of the same seed
 
 
 def synthetic_task(seed: int, tracks: int = TRACKS) -> Task:

@@ -21,27 +21,16 @@ STYLES: dict[str, tuple[str, float, Any]] = {
     "smoother": (BLUE, 1.3, "solid"),
 }
 """Colour, width in points and dashes. Methods that agree lie on top of each other: the lower ones are wider."""
-OTHER = ("black", 2.0, "solid")
-"""Style of a method that has none of its own."""
-LEAST_SHOWN = 0.1
-"""Lower end of a band divided by its mean; a logarithmic axis has no place for zero."""
-EXAMPLES = 3
-"""Tracks shown one by one."""
-NINETY = 1.645
-"""Standard deviations to each side of a normal distribution's central 90 %."""
+OTHER = ("black", 2.0, "solid")  # Style of a method that has none of its own
+LEAST_SHOWN = 0.1  # Lower end of a band divided by its mean; a logarithmic axis has no place for zero
+EXAMPLES = 3  # Tracks shown one by one
+NINETY = 1.645  # Standard deviations to each side of a normal distribution's central 90 %
 
 
 def _line(method: str) -> dict[str, Any]:
     colour, width, dashes = STYLES.get(method, OTHER)
-    return {
-        "color": colour,
-        "linestyle": dashes,
-        "label": method,
-        "linewidth": width,
-        "zorder": 10.0 - width,
-        "marker": "o",
-        "markersize": 3,
-    }
+    line = {"color": colour, "linestyle": dashes, "linewidth": width, "zorder": 10.0 - width}
+    return line | {"label": method, "marker": "o", "markersize": 3}
 
 
 def _band(method: str) -> dict[str, Any]:

@@ -22,17 +22,12 @@ from ballfg.tracks import Track
 from ballfg.tracks.track import SPIN_LABELS
 
 PAPER_SAMPLES = 80
-PAPER_RATE = 100.0
-"""Hz."""
-PAPER_NOISE = 0.005
-"""m. The paper gives none; triangulated detections of its cameras should be about that good."""
-KNOWN_SPIN = 0.01
-"""rad/s, and rad/s/sqrt(s): the spin is given, and does not change."""
+PAPER_RATE = 100.0  # Hz
+PAPER_NOISE = 0.005  # m. The paper gives none; triangulated detections of its cameras should be about that good.
+KNOWN_SPIN = 0.01  # rad/s, and rad/s/sqrt(s): the spin is given, and does not change
 
-FAIR_NOISE = 0.003
-"""m."""
-FAIR_SPIN_NOISE = 4.0
-"""rad/s, of the spin labels."""
+FAIR_NOISE = 0.003  # m
+FAIR_SPIN_NOISE = 4.0  # rad/s, of the spin labels
 
 AT_BOUNCE = 1e-3
 """s. At a sample this close to a bounce the position, by its noise, does not tell whether the ball has bounced already.
@@ -44,8 +39,7 @@ class Case:
     """A measured track and its truth.
 
     Attributes:
-        track: all that an estimator sees.
-        true_states: (n, 9).
+        track: all that an estimator sees.  true_states: (n, 9).
         away: (n,) False for samples within `AT_BOUNCE` of a true bounce.
     """
 
@@ -74,11 +68,8 @@ class Protocol:
     """Synthetic tracks and the estimators that are compared on them, with the same settings for all.
 
     Attributes:
-        name: the case in `results.json`.
-        settings: of every estimator.
-        tracks: with their truth.
-        candidates: by method.
-        surfaces: that the ball bounces on.
+        name: the case in `results.json`.  settings: of every estimator.  tracks: with their truth.
+        candidates: by method.  surfaces: that the ball bounces on.
     """
 
     name: str

@@ -14,8 +14,7 @@ from ballfg.estimation import Status
 from ballfg.estimation.filters.sliding_window import WINDOW
 from ballfg.state import POSITION, SPIN, VELOCITY
 
-LEVELS = (0.5, 0.9)
-"""Levels of the intervals with a reported coverage."""
+LEVELS = (0.5, 0.9)  # Levels of the intervals with a reported coverage
 
 
 @dataclass(frozen=True)
@@ -42,8 +41,7 @@ class TrackScore:
     ok: bool
 
 
-Scores = dict[str, list[TrackScore]]
-"""By method, in the order of the tracks."""
+Scores = dict[str, list[TrackScore]]  # By method, in the order of the tracks
 
 
 def score_tracks(
@@ -94,8 +92,7 @@ def _newest(candidate: Candidate, case: Case, whole: Array, counts: Sequence[int
     return found
 
 
-Selection = Callable[[TrackScore], NDArray[np.bool_]]
-"""(n,) True for samples that count."""
+Selection = Callable[[TrackScore], NDArray[np.bool_]]  # (n,) True for samples that count
 
 
 def judged(score: TrackScore) -> NDArray[np.bool_]:

@@ -5,15 +5,130 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
+from ballfg.arrays import Array
 from ballfg.benchmarks.estimators.measured import HORIZON, OBSERVE, run_measured
 from ballfg.benchmarks.estimators.protocols import fair_protocol, paper_protocol
-from ballfg.benchmarks.estimators.synthetic_rows import run_consistency, run_protocol
+from ballfg.benchmarks.estimators.scoring import LEVELS, Scores, TrackScore, covered, every, pooled, score_tracks
 from ballfg.benchmarks.gaussian_settings import StepNoise
-from ballfg.benchmarks.results import Results
+from ballfg.benchmarks.metrics import Figure, Statistic, bootstrap, chi_square_band, pooled_mean, pooled_rms, ratio
+from ballfg.benchmarks.results import CURVE_MARK, Results
 from ballfg.dynamics import nominal_model
 from ballfg.estimation import Settings, dataset_settings
 from ballfg.progress import doing
+from ballfg.state import STATE_DIM, VELOCITY
 from ballfg.tracks import Dataset
+
+SETTLED = 20  # Observations from which on the errors at the newest sample are pooled into one number
+BLOCKS = {"state": slice(0, STATE_DIM), "velocity": VELOCITY}  # Components whose coverage is reported
+PLACES = {"first": 0.0, "quarter": 0.25, "middle": 0.5, "three_quarters": 0.75, "last": 1.0}
+"""Places of the consistency test on a track, as shares of its samples."""
+
+
+def add_rows(results: Results, case: str, scores: Scores, counts: Sequence[int]) -> None:
+    """RMSE, ratios, NEES, coverage, and the curve over the number of observations.
+
+    Left out, unless the metric's name says `all`: samples before the window of five is full, where filter and window
+    know next to nothing, which would flatter every smoother; and samples at a bounce (`protocols.AT_BOUNCE`).
+    """
+    rng = np.random.default_rng([results.seed, 2])
+    for method, of_method in scores.items():
+        n = len(of_method)
+        for name, statistic, unit in _statistics(of_method, counts):
+            results.add(case, method, name, unit, bootstrap(statistic, n, rng), n)
+        results.add(case, method, "not_converged", "1", sum(not s.ok for s in of_method), n)
+        _add_curve(results, case, method, of_method, counts)
+    _add_ratios(results, case, scores, counts, rng)
+
+
+def _statistics(scores: Sequence[TrackScore], counts: Sequence[int]) -> list[tuple[str, Statistic, str]]:
+    """Metric, statistic and unit of everything that is pooled over samples."""
+    found = [
+        ("velocity_rmse", pooled_rms(*pooled(scores, "velocity", 2)), "m/s"),
+        ("velocity_rmse_all", pooled_rms(*pooled(scores, "velocity", 2, every)), "m/s"),
+        ("position_rmse", pooled_rms(*pooled(scores, "position", 2)), "m"),
+        ("spin_rmse", pooled_rms(*pooled(scores, "spin", 2)), "rad/s"),
+        ("nees", pooled_mean(*pooled(scores, "nees", 1)), "1"),
+        ("nees_velocity", pooled_mean(*pooled(scores, "velocity_nees", 1)), "1"),
+    ]
+    squares, number = _newest_sums(scores, counts)
+    if number.all():
+        found.append(("velocity_rmse_newest", pooled_rms(squares, number), "m/s"))
+    for i, level in enumerate(LEVELS):
+        for block, columns in BLOCKS.items():
+            share = pooled_mean(*covered(scores, i, columns))
+            found.append((f"coverage_{100 * level:.0f}_{block}", share, "1"))
+    return found
+
+
+def _newest_sums(scores: Sequence[TrackScore], counts: Sequence[int]) -> tuple[Array, Array]:
+    """For each track sum of squares and number of the newest-sample errors at `SETTLED` or more observations."""
+    settled = np.array(counts) >= min(SETTLED, max(counts))
+    newest = np.stack([score.newest for score in scores])[:, settled]
+    return np.nansum(newest**2, axis=1), np.isfinite(newest).sum(axis=1).astype(np.float64)
+
+
+def _add_curve(results: Results, case: str, method: str, scores: Sequence[TrackScore], counts: Sequence[int]) -> None:
+    """Root mean square, mean and standard deviation over tracks of the velocity error at sample k.
+
+    `newest`: when k samples were seen; `whole`: when the whole track was.
+    """
+    newest = np.stack([score.newest for score in scores])
+    for i, count in enumerate(counts):
+        whole = np.array([s.velocity[count - 1] for s in scores if len(s.away) >= count and s.away[count - 1]])
+        for when, errors in (("newest", newest[np.isfinite(newest[:, i]), i]), ("whole", whole)):
+            if len(errors) < 2:
+                continue
+            figures = {"rmse": np.sqrt((errors**2).mean()), "mean": errors.mean(), "sd": errors.std(ddof=1)}
+            for name, value in figures.items():
+                metric = f"velocity_{name}_{when}{CURVE_MARK}{count}"
+                results.add(case, method, metric, "m/s", float(value), len(errors))
+
+
+def _add_ratios(results: Results, case: str, scores: Scores, counts: Sequence[int], rng: np.random.Generator) -> None:
+    """The smoother's velocity RMSE divided by each other method's; below one, the smoother is better."""
+    statistics = {
+        method: {name: statistic for name, statistic, unit in _statistics(of_method, counts) if unit == "m/s"}
+        for method, of_method in scores.items()
+    }
+    n = len(scores["smoother"])
+    for metric, statistic in statistics["smoother"].items():
+        for method in scores:
+            if method != "smoother" and metric in statistics[method]:
+                figure = bootstrap(ratio(statistic, statistics[method][metric]), n, rng)
+                results.add(case, "smoother", f"{metric}_vs_{method}", "1", figure, n)
+
+
+def add_consistency(results: Results, case: str, scores: Sequence[TrackScore]) -> None:
+    """NEES at five places of each track, each mean with the band that it should lie in, and over all samples.
+
+    At one sample of each track the NEES are independent from track to track, so that their mean has an exact band:
+    low and high are its ends. Samples of one track are not independent: the mean over all of them has the interval of
+    a bootstrap over tracks. A place next to a bounce (`protocols.AT_BOUNCE`) moves to the nearest sample that is not.
+    """
+    n = len(scores)
+    band = chi_square_band(STATE_DIM, n)
+    outside = 0
+    for place, share in PLACES.items():
+        mean = float(np.mean([score.nees[_place(score, share)] for score in scores]))
+        outside += not band[0] <= mean <= band[1]
+        results.add(case, "smoother", f"nees_{place}", "1", Figure(mean, *band), n)
+    results.add(case, "smoother", "places_outside_99", "1", outside, len(PLACES))
+    rng = np.random.default_rng([results.seed, 3])
+    for name, select in (("nees", lambda score: score.away), ("nees_all", every)):
+        figure = bootstrap(pooled_mean(*pooled(scores, "nees", 1, select)), n, rng)
+        results.add(case, "smoother", name, "1", figure, n)
+    at_bounce = sum(int((~score.away).sum()) for score in scores)
+    results.add(case, "smoother", "samples_at_bounce", "1", at_bounce, sum(len(score.away) for score in scores))
+    results.add(case, "smoother", "not_converged", "1", sum(not s.ok for s in scores), n)
+
+
+def _place(score: TrackScore, share: float) -> int:
+    """The sample nearest to a share of the track that is not at a bounce."""
+    candidates = np.flatnonzero(score.away)
+    wanted = share * (len(score.away) - 1)
+    return int(candidates[np.abs(candidates - wanted).argmin()])
 
 
 @dataclass(frozen=True)
@@ -21,10 +136,8 @@ class Size:
     """The amount of computation.
 
     Attributes:
-        compared: synthetic tracks in each protocol.
-        consistency: synthetic tracks whose NEES is taken.
-        measured: measured tracks at most; None for all.
-        counts: numbers of observations on the curves.
+        compared: synthetic tracks in each protocol.  consistency: synthetic tracks whose NEES is taken.
+        measured: measured tracks at most; None for all.  counts: numbers of observations on the curves.
     """
 
     compared: int
@@ -36,8 +149,7 @@ class Size:
 COUNTS = (5, 6, 7, 8, 10, 12, 15, 20, 25, 30, 40, 50, 60, 70, 80)
 FULL = Size(compared=50, consistency=200, measured=None, counts=COUNTS)
 QUICK = Size(compared=10, consistency=40, measured=12, counts=(5, 10, 20, 40, 80))
-CONSISTENCY_SEED = 1_000_000
-"""Added to the seed: other tracks than those of the comparison."""
+CONSISTENCY_SEED = 1_000_000  # Added to the seed: other tracks than those of the comparison
 
 
 def run_synthetic(results: Results, out: Path, size: Size, jobs: int) -> list[Path]:
@@ -53,10 +165,13 @@ def run_synthetic(results: Results, out: Path, size: Size, jobs: int) -> list[Pa
         print(f"{protocol.name}: {len(protocol.tracks)} tracks; {describe_settings(protocol.settings)}")
     for protocol in protocols:
         with doing(f"{protocol.name}: {len(protocol.tracks)} tracks by all estimators"):
-            run_protocol(results, protocol, jobs, size.counts)
+            what = f"synthetic tracks estimated ({protocol.name})"
+            scores = score_tracks(protocol.candidates, protocol.tracks, size.counts, jobs, what)
+            add_rows(results, protocol.name, scores, size.counts)
     many = fair_protocol(size.consistency, results.seed + CONSISTENCY_SEED, name="consistency")
     with doing(f"consistency: {len(many.tracks)} tracks"):
-        run_consistency(results, many, jobs)
+        smoother, what = {"smoother": many.candidates["smoother"]}, "synthetic tracks estimated (consistency)"
+        add_consistency(results, many.name, score_tracks(smoother, many.tracks, (), jobs, what)["smoother"])
     return [
         observations_picture(results.rows, name, title, out / f"estimators_{name}.png")
         for name, title in titles.items()

@@ -11,11 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
 
-import numpy as np
-
-from ballfg.benchmarks.intervals.protocol import OBSERVED, Judged, judge
-from ballfg.benchmarks.intervals.suite import LEVEL, known_surfaces
-from ballfg.benchmarks.metrics import inside
+from ballfg.benchmarks.intervals.suite import OBSERVED, Judged, add_judged, judge, known_surfaces
 from ballfg.benchmarks.results import Results
 from ballfg.dynamics import BallModel, load_model, nominal_model
 from ballfg.estimation.configure import fitted_settings
@@ -40,17 +36,14 @@ QUICK: Final = TrainedPlan(epochs=1, pairs=1)
 
 
 def run_trained(results: Results, folders: Sequence[Path], plan: TrainedPlan, jobs: int) -> None:
-    """Rows of all pairs: `a + b -> c`.
-
-    Raises: ValueError: fewer than three datasets, or two of one name.
-    """
+    """Rows of all pairs: `a + b -> c`. Raises: ValueError: fewer than three datasets, or two of one name."""
     datasets = [read_dataset(folder) for folder in folders]
     names = [dataset.info.name for dataset in datasets]
     if len(datasets) < 3 or len(set(names)) < len(names):
         raise ValueError(f"data must be three datasets or more, of names that differ; got {names}. Repeat --data.")
     nominal = [_judged(nominal_model(dataset.ball), dataset, jobs) for dataset in datasets]
     for name, judged in zip(names, nominal, strict=True):
-        _add(results, name, NOMINAL, judged)
+        add_judged(results, name, NOMINAL, judged, whole=False)
     pairs = list(combinations(range(len(datasets)), 2))[: plan.pairs]
     for pair in progress(pairs, len(pairs), "pairs of datasets trained and judged"):
         with TemporaryDirectory() as folder:
@@ -62,8 +55,8 @@ def run_trained(results: Results, folders: Sequence[Path], plan: TrainedPlan, jo
                 model = load_model(file, radius=dataset.ball.radius, room=dataset.info.name)
                 judged = _judged(model.requires_grad_(False), dataset, jobs)
                 case = f"{names[pair[0]]} + {names[pair[1]]} -> {names[k]}"
-                _add(results, case, TRAINED, judged)
-                ratio = _median(judged) / _median(nominal[k])
+                add_judged(results, case, TRAINED, judged, whole=False)
+                ratio = judged.rmse / nominal[k].rmse
                 results.add(case, TRAINED, "error_ratio", "1", ratio, len(judged.rmse_by_track()))
 
 
@@ -87,16 +80,3 @@ def _config(folders: Sequence[Path], epochs: int, seed: int) -> TrainConfig:
 def _judged(model: BallModel, dataset: Dataset, jobs: int) -> Judged:
     settings = fitted_settings(dataset, model, OBSERVED)
     return judge(model, known_surfaces(dataset), settings, list(dataset), jobs)
-
-
-def _median(judged: Judged) -> float:
-    """Median over tracks of the root mean square error, m."""
-    return float(np.median(judged.rmse_by_track()))
-
-
-def _add(results: Results, case: str, method: str, judged: Judged) -> None:
-    count = len(judged.rmse_by_track())
-    held = 100.0 * float(inside(judged.errors, judged.sigmas, LEVEL).mean())
-    results.add(case, method, "coverage_90", "%", held, count)
-    results.add(case, method, "prediction_rmse_median", "mm", 1e3 * _median(judged), count)
-    results.add(case, method, "failed", "1", judged.failed, count)

@@ -13,13 +13,10 @@ from scipy.linalg import solveh_banded
 from ballfg.arrays import Array
 from ballfg.state import STANDARD_GRAVITY
 
-STEP_SIGMA = np.repeat((1e-3, 1e-2), 3)
-"""m and m/s, by which a step may be off."""
-TOLERANCE = 1e-9
-"""Share of the largest number of its kind by which the last step changes any."""
+STEP_SIGMA = np.repeat((1e-3, 1e-2), 3)  # m and m/s, by which a step may be off
+TOLERANCE = 1e-9  # Share of the largest number of its kind by which the last step changes any
 MOST_STEPS = 20
-BANDS = 12
-"""Diagonals of the normal matrix, its own and those above: a state of six and the next one."""
+BANDS = 12  # Diagonals of the normal matrix, its own and those above: a state of six and the next one
 
 
 @dataclass(frozen=True)
@@ -27,8 +24,7 @@ class BandedProblem:
     """Positions of one flight, its laws known.
 
     Attributes:
-        positions: (n, 3) m.  dt: s between them.  noise: m.
-        spin: (3,) rad/s, as labelled.  spin_noise: rad/s.
+        positions: (n, 3) m.  dt: s between them.  noise: m.  spin: (3,) rad/s, as labelled.  spin_noise: rad/s.
         drag, magnus: 1/m and dimensionless, of a = g - drag |v| v + magnus (spin x v).
     """
 

@@ -10,8 +10,7 @@ from ballfg.benchmarks.results import Row
 from ballfg.checks import one_line, short_text
 from ballfg.files.json_file import read_json
 
-CONTROL: Final = "banded_time"
-"""Bound by Python's own speed, as the estimators are."""
+CONTROL: Final = "banded_time"  # Bound by Python's own speed, as the estimators are
 RARE: Final = ("_p99", "_p999", "_worst")
 """Ends of metrics of the slowest runs, which other work on the machine decides."""
 UNSTEADY: Final = ("matrix", "stream")
@@ -59,19 +58,12 @@ def check_ratios(rows: Sequence[Row], baseline: Path) -> list[str]:
 def _ratios(rows: Sequence[Row]) -> dict[tuple[str, str, str], float]:
     """Times over the control of the same case, by case, method and metric."""
     controls, found = dict[str, float](), dict[tuple[str, str, str], float]()
-    for row in rows:
-        time = _time(row)
-        if row.metric == CONTROL and time is not None:
+    timed = [(row, row.value) for row in rows if row.value is not None and 1e-9 < row.value < 1e9]  # ps to ten days
+    for row, time in timed:
+        if row.metric == CONTROL:
             controls[row.case] = min(time, controls.get(row.case, time))
-    for row in rows:
+    for row, time in timed:
         steady = row.metric != CONTROL and not row.metric.startswith(UNSTEADY) and not row.metric.endswith(RARE)
-        steady = steady and not row.method.endswith("unrolled")
-        time = _time(row)
-        if row.unit == "ms" and steady and time is not None and row.case in controls:
+        if row.unit == "ms" and steady and not row.method.endswith("unrolled") and row.case in controls:
             found[row.case, row.method, row.metric] = time / controls[row.case]
     return found
-
-
-def _time(row: Row) -> float | None:
-    """The value, where it can be a time in ms: between a picosecond and ten days."""
-    return row.value if row.value is not None and 1e-9 < row.value < 1e9 else None

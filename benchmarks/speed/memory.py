@@ -11,8 +11,7 @@ import tempfile
 import time
 from pathlib import Path
 
-LOOK_EVERY = 0.2
-"""s between looks at the processes."""
+LOOK_EVERY = 0.2  # s between looks at the processes
 
 
 def main() -> None:

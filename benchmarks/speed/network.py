@@ -12,17 +12,13 @@ from ballfg.dynamics.model import Rates
 from ballfg.state import SPIN, STANDARD_GRAVITY, STATE_DIM, VELOCITY
 
 HIDDEN = 80
-SPEED_SCALE = 6.0
-"""m/s that the network sees as one."""
-SPIN_SCALE = 100.0
-"""rad/s that the network sees as one."""
-FORCE_SCALE = 10.0
-"""m/s^2, the network's output of one."""
+SPEED_SCALE = 6.0  # m/s that the network sees as one
+SPIN_SCALE = 100.0  # rad/s that the network sees as one
+FORCE_SCALE = 10.0  # m/s^2, the network's output of one
 SCALES = torch.tensor([SPEED_SCALE] * 3 + [SPIN_SCALE] * 3 + [SPEED_SCALE * SPIN_SCALE] * 3, dtype=torch.float64)
 GRAVITY = torch.tensor([0.0, 0.0, -STANDARD_GRAVITY], dtype=torch.float64)
 FIT_SAMPLES = 2000
-FIT_ITERATIONS = 600
-"""Iterations of L-BFGS; the fit then errs by about a twentieth of the aerodynamic acceleration."""
+FIT_ITERATIONS = 600  # Iterations of L-BFGS; the fit then errs by about a twentieth of the aerodynamic acceleration
 
 
 class NetworkFlight(BallModel):

@@ -20,31 +20,24 @@ from ballfg.simulation import SimulationConfig, simulate
 from ballfg.tracks import Track
 from ballfg.tracks.track import SPIN_LABELS
 
-RADIUS: Final = 0.02
-"""m."""
+RADIUS: Final = 0.02  # m
 GROUND: Final = Surfaces(0.0)
+NO_SURFACE: Final = Surfaces(-1e3)
 BOUNCING: Final = (0.0, 0.0, 0.3, 5.0, 0.5, -0.5, 0.0, 80.0, 20.0)
 """m, m/s, rad/s: a ball that bounces twice within 80 samples at 100 Hz."""
-LONG: Final = (20, 80, 320, 1280)
-"""Observations of one flight."""
-DENSE: Final = 400.0
-"""Hz, rate of these observations, so that the longest flight stays below a plausible speed."""
-STREAM_RATE: Final = 200.0
-"""Hz."""
-STREAM_NOISE: Final = 0.003
-"""m, as the simulation has it."""
-PAUSE: Final = 1.5
-"""s between two flights of a stream."""
-STEPS: Final = 300
-"""Number of steps of 10 ms in a rollout."""
-SLOWEST: Final = 3
-"""Runs of what takes seconds."""
+LONG: Final = (20, 80, 320, 1280)  # Observations of one flight
+DENSE: Final = 400.0  # Hz, rate of these observations, so that the longest flight stays below a plausible speed
+STREAM_RATE: Final = 200.0  # Hz
+STREAM_NOISE: Final = 0.003  # m, as the simulation has it
+PAUSE: Final = 1.5  # s between two flights of a stream
+STEPS: Final = 300  # Number of steps of 10 ms in a rollout
+SLOWEST: Final = 3  # Runs of what takes seconds
 
 
 def time_bounces(watch: Stopwatch, name: str, model: BallModel, noise: float, label_noise: float) -> None:
     """A whole estimate through two bounces: events, graph, minimisation, covariances."""
     times, rng = np.arange(80) / 100.0, np.random.default_rng(3)
-    positions = _path(nominal_model(RADIUS), BOUNCING, times) + noise * rng.standard_normal((80, 3))
+    positions = path_of(nominal_model(RADIUS), BOUNCING, times) + noise * rng.standard_normal((80, 3))
     spin = np.add(BOUNCING[6:], (30.0, -20.0, 10.0)).tolist()
     track = Track(times, positions, labels=dict(zip(SPIN_LABELS, spin, strict=True)), name="bounces")
     smoother = Smoother(model, GROUND, gaussian_settings(noise, StepNoise(), label_noise))
@@ -57,8 +50,8 @@ def time_growth(watch: Stopwatch, name: str, model: BallModel, start: Sequence[f
     """Time of an estimate for each of its observations."""
     for count in LONG:
         times, rng = np.arange(count) / DENSE, np.random.default_rng(0)
-        positions = _path(model, start, times, Surfaces(-1e3)) + noise * rng.standard_normal((count, 3))
-        smoother = Smoother(model, Surfaces(-1e3), gaussian_settings(noise, StepNoise(), 20.0))
+        positions = path_of(model, start, times, NO_SURFACE) + noise * rng.standard_normal((count, 3))
+        smoother = Smoother(model, NO_SURFACE, gaussian_settings(noise, StepNoise(), 20.0))
         track = Track(times, positions, name="long")
         spent = median_and_quartiles([milliseconds(partial(smoother.estimate, track)) for _ in range(watch.runs)])
         watch.add(name, f"estimate_us_per_observation_{count}", 1e3 * spent.value / count, watch.runs)
@@ -90,7 +83,7 @@ def time_events(watch: Stopwatch) -> None:
     online = Online(nominal, GROUND, replace(gaussian_settings(0.002, StepNoise(), 20.0), solver="ballfg"))
     times = np.arange(40) / STREAM_RATE
     start = (0.0, 0.0, 0.3, 4.0, 0.1, 1.0, 0.0, 50.0, 0.0)
-    for time, position in zip(times, _path(nominal, start, times), strict=True):
+    for time, position in zip(times, path_of(nominal, start, times), strict=True):
         state = online.push(time, position)
     for metric, ask in (
         ("predict_30_stamps_time", lambda: state.predict(0.3)),
@@ -112,7 +105,7 @@ def time_rollouts(watch: Stopwatch) -> None:
     watch.results.add(watch.case, "mnn+gs", "rollout_time_torch", "ms", median_and_quartiles(spent), SLOWEST)
 
 
-def _path(model: BallModel, start: Sequence[float], times: np.ndarray, surfaces: Surfaces = GROUND) -> np.ndarray:
+def path_of(model: BallModel, start: Sequence[float], times: np.ndarray, surfaces: Surfaces = GROUND) -> np.ndarray:
     """(n, 3) m, where a ball is at times (n,) s."""
     with torch.no_grad():
         states = rollout(model, torch.tensor([list(start)], dtype=torch.float64), torch.from_numpy(times), surfaces)

@@ -11,8 +11,7 @@ from ballfg.benchmarks.metrics import Figure, median_and_quartiles
 from ballfg.benchmarks.results import Results
 from ballfg.benchmarks.speed.banded import BandedProblem
 
-CONTROL_SIZE = 512
-"""Size of the square float64 matrices whose product is the control."""
+CONTROL_SIZE = 512  # Size of the square float64 matrices whose product is the control
 
 
 def milliseconds(action: Callable[[], object]) -> float:
@@ -27,8 +26,7 @@ class Stopwatch:
     """Times actions and adds their rows.
 
     Attributes:
-        results: gets the rows.  case: of all of them.
-        runs: timed ones.  warm_up: runs before them, not counted.
+        results: gets the rows.  case: of all of them.  runs: timed ones.  warm_up: runs before them, not counted.
         banded: the problem that the control solves.
     """
 

@@ -13,45 +13,76 @@ import torch
 from ballfg.benchmarks.gaussian_settings import StepNoise, gaussian_settings
 from ballfg.benchmarks.metrics import median_and_quartiles
 from ballfg.benchmarks.results import Results
+from ballfg.benchmarks.speed import robot
 from ballfg.benchmarks.speed.banded import BandedProblem
-from ballfg.benchmarks.speed.gradient_cost import time_gradients
 from ballfg.benchmarks.speed.network import FIT_ITERATIONS, fitted_network, parameter_count
-from ballfg.benchmarks.speed.robot import time_bounces, time_events, time_growth, time_rollouts, time_stream
+from ballfg.benchmarks.speed.robot import NO_SURFACE, path_of
 from ballfg.benchmarks.speed.stopwatch import Stopwatch, milliseconds
-from ballfg.dynamics import AnalyticModel, Architecture, BallModel, Surfaces, build, nominal_model, rollout
+from ballfg.dynamics import AnalyticModel, Architecture, BallModel, build, nominal_model
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.model_file import model_from_dict
 from ballfg.dynamics.motion.integrate import fly_jacobian
-from ballfg.estimation import Online, Settings, Smoother, dataset_settings, dataset_surfaces
+from ballfg.dynamics.networks.learned import LearnedModel
+from ballfg.estimation import Online, Smoother, dataset_settings, dataset_surfaces
 from ballfg.estimation.settings import Solver
 from ballfg.estimation.smoother.problem import Events
 from ballfg.estimation.smoother.settle import initial_states
-from ballfg.factors.batch import Values
-from ballfg.factors.graph import BallGraph
+from ballfg.factors.batch import Noise, Values
+from ballfg.factors.graph import BallGraph, Minimum
 from ballfg.factors.gtsam_solver import GtsamLevenbergMarquardt
 from ballfg.factors.linear.covariance import marginal_covariances
+from ballfg.learning.end_to_end.end_to_end import SOLUTION_TOLERANCE
 from ballfg.learning.end_to_end.pretrain import pretrain
+from ballfg.learning.end_to_end.solving import TRAINING
+from ballfg.learning.gradient.conjugate_gradients import ConjugateGradients, GaussNewtonFactors
+from ballfg.learning.gradient.implicit import GaussNewtonGradient, GradientMethod, ImplicitGradient, UnrolledGradient
+from ballfg.learning.gradient.objective import BatchObjective
 from ballfg.prediction import Belief, Propagator
 from ballfg.progress import progress
-from ballfg.state import POSITION
 from ballfg.tracks import Dataset, Track
 from ballfg.tracks.track import SPIN_LABELS
 
+METHODS: Final[Mapping[str, GradientMethod]] = {
+    "implicit": ImplicitGradient(),
+    "gauss-newton": GaussNewtonGradient(),
+    "unrolled": UnrolledGradient(8),
+}
+EXACT: Final = 1e-12  # Tolerance of the linear solution in the reference gradient; training takes `SOLUTION_TOLERANCE`
+
+
+def backward(
+    model: LearnedModel,
+    graph: BallGraph,
+    minimum: Minimum,
+    method: GradientMethod,
+    tolerance: float = SOLUTION_TOLERANCE,
+) -> torch.Tensor:
+    """Gradient of a fixed linear function of all states by all weights, as one vector."""
+    assert minimum.step is not None
+    objective = BatchObjective([graph], [minimum.values])
+    layout, weights = objective.layout, [p for p in model.parameters() if p.requires_grad]
+    factors = GaussNewtonFactors([minimum.step.root])
+    point = method(
+        lambda: layout.pack([minimum.values]),
+        lambda at: objective.gradient(at, Noise()),
+        ConjugateGradients(factors, layout.owners(), tolerance),
+        weights,
+    )
+    direction = torch.cos(torch.arange(len(point), dtype=point.dtype))
+    gradients = torch.autograd.grad((direction * point).sum(), weights, allow_unused=True)
+    pairs = zip(weights, gradients, strict=True)
+    return torch.cat([(torch.zeros_like(weight) if g is None else g).reshape(-1) for weight, g in pairs])
+
+
 CASE = "speed"
 SAMPLES = 80
-RATE = 100.0
-"""Hz."""
-NOISE = 0.005
-"""m."""
+RATE = 100.0  # Hz
+NOISE = 0.005  # m
 START = (0.0, 0.0, 0.3, 5.0, 0.5, 2.0, 0.0, 80.0, 20.0)
-LABEL_OFFSET = (30.0, -20.0, 10.0)
-"""rad/s, by which the spin label is wrong."""
-LABEL_NOISE = 20.0
-"""rad/s."""
+LABEL_OFFSET = (30.0, -20.0, 10.0)  # rad/s, by which the spin label is wrong
+LABEL_NOISE = 20.0  # rad/s
 DRAG, MAGNUS = 0.112, 0.0055
-HORIZON = 0.3
-"""s that are predicted, at `RATE`."""
-NO_SURFACE = Surfaces(-1e3)
+HORIZON = 0.3  # s that are predicted, at `RATE`
 ONLINE: Final[Mapping[Solver, str]] = {"gtsam": "online_update", "ballfg": "online_chain_update"}
 """Solvers of the online estimator's window, and the names of their rows."""
 
@@ -81,23 +112,20 @@ QUICK = Size(runs=5, warm_up=2, flights=4)
 
 
 def run_speed(results: Results, dataset: Dataset | None, size: Size) -> None:
-    """All times; a control before each model and at the end.
-
-    With a dataset the time for each of some of its tracks.
-    """
+    """All times; a control before each model and at the end. With a dataset the time for each of some of its tracks."""
     model = problem_model()
     track = problem_track(model)
     watch = Stopwatch(results, CASE, size.runs, size.warm_up, banded_problem(track))
     parts = [
         partial(_time_model, watch, "analytic", model, track),
-        partial(time_bounces, watch, "analytic", nominal_model(model.radius), NOISE, LABEL_NOISE),
+        partial(robot.time_bounces, watch, "analytic", nominal_model(model.radius), NOISE, LABEL_NOISE),
         partial(_time_network, watch, model, track, size.fit_iterations),
         partial(_time_coefficients, watch, model, track),
         partial(_time_gradients, watch, model, track, size.pretrain_iterations),
-        partial(time_growth, watch, "analytic", model, START, NOISE),
-        *(partial(time_stream, watch, solver, size.flights) for solver in ONLINE),
-        partial(time_events, watch),
-        partial(time_rollouts, watch),
+        partial(robot.time_growth, watch, "analytic", model, START, NOISE),
+        *(partial(robot.time_stream, watch, solver, size.flights) for solver in ONLINE),
+        partial(robot.time_events, watch),
+        partial(robot.time_rollouts, watch),
     ]
     for part in progress(parts, len(parts), "parts timed"):
         part()
@@ -114,14 +142,10 @@ def problem_model() -> AnalyticModel:
 
 def problem_track(model: BallModel) -> Track:
     """80 observations of one free flight, with a spin label that is off."""
-    start = torch.tensor([START], dtype=torch.float64)
-    times = np.arange(SAMPLES) / RATE
-    with torch.no_grad():
-        truth = rollout(model, start, torch.from_numpy(times), NO_SURFACE)[0].numpy()
-    rng = np.random.default_rng(0)
-    measured = truth[:, POSITION] + NOISE * rng.standard_normal((SAMPLES, 3))
-    spin = np.add(START[6:], LABEL_OFFSET)
-    return Track(times, measured, labels=dict(zip(SPIN_LABELS, map(float, spin), strict=True)), name="speed")
+    times, rng = np.arange(SAMPLES) / RATE, np.random.default_rng(0)
+    measured = path_of(model, START, times, NO_SURFACE) + NOISE * rng.standard_normal((SAMPLES, 3))
+    spin = np.add(START[6:], LABEL_OFFSET).tolist()
+    return Track(times, measured, labels=dict(zip(SPIN_LABELS, spin, strict=True)), name="speed")
 
 
 def banded_problem(track: Track) -> BandedProblem:
@@ -130,13 +154,11 @@ def banded_problem(track: Track) -> BandedProblem:
     return BandedProblem(track.positions, 1.0 / RATE, NOISE, label, LABEL_NOISE, DRAG, MAGNUS)
 
 
-def problem_settings(coefficients: Mapping[str, float] | None = None) -> Settings:
-    """1 mm and 1 cm/s of process noise a step, squared losses; optionally coefficients estimated with the track."""
-    return gaussian_settings(NOISE, StepNoise(), LABEL_NOISE, coefficients)
+problem_settings = partial(gaussian_settings, NOISE, StepNoise(), LABEL_NOISE)
+"""1 mm and 1 cm/s of process noise a step, squared losses; optionally coefficients estimated with the track."""
 
 
 def _problem(smoother: Smoother, track: Track) -> tuple[BallGraph, Values]:
-    """The track's graph and the point from which the minimisation starts."""
     problem = smoother.problem(track)
     states = initial_states(track, (), problem.segmentation, smoother.model, smoother.settings.spin_label(track))
     return problem.graph(Events((), problem.segmentation)), problem.start(states)
@@ -165,7 +187,7 @@ def _time_network(watch: Stopwatch, model: AnalyticModel, track: Track, iteratio
     _time_model(watch, "network", network, track)
     bouncing = copy.deepcopy(network)
     bouncing.bounces = nominal_model(model.radius)
-    time_bounces(watch, "network", bouncing, NOISE, LABEL_NOISE)
+    robot.time_bounces(watch, "network", bouncing, NOISE, LABEL_NOISE)
     watch.add("network", "parameters", parameter_count(network))
 
 
@@ -178,10 +200,23 @@ def _time_coefficients(watch: Stopwatch, model: AnalyticModel, track: Track) -> 
 
 
 def _time_gradients(watch: Stopwatch, model: AnalyticModel, track: Track, iterations: int) -> None:
-    """The gradient through the estimate, with the learned model that the analytic one was put into."""
+    """The gradient through the estimate, with the learned model that the analytic one was put into.
+
+    Forward: from the first guess to the minimum. Backward: from a derivative by all states to one by all weights;
+    building the torch objective belongs to it.
+    """
     learned = build(Architecture.of("mnn+gs"), radius=model.radius)
     pretrain(learned, model, 0, iterations)
-    time_gradients(watch, learned, *_problem(Smoother(learned, NO_SURFACE, problem_settings()), track))
+    graph, start = _problem(Smoother(learned, NO_SURFACE, problem_settings()), track)
+    minimum, kind = TRAINING.minimize(graph, start), learned.architecture.kind
+    forward = watch.time(kind, "forward_time", lambda: TRAINING.minimize(graph, start))
+    exact = backward(learned, graph, minimum, ImplicitGradient(), EXACT)
+    for name, method in METHODS.items():
+        row, once = f"{kind}, {name}", partial(backward, learned, graph, minimum, method)
+        found = once()
+        figure = watch.time(row, "backward_time", once)
+        watch.add(row, "backward_over_forward", figure.value / forward.value, watch.runs)
+        watch.add(row, "gradient_error", float((found - exact).norm() / exact.norm()))
 
 
 def _time_minimisation(watch: Stopwatch, name: str, smoother: Smoother, graph: BallGraph, values: Values) -> None:
@@ -197,18 +232,17 @@ def _time_minimisation(watch: Stopwatch, name: str, smoother: Smoother, graph: B
 
 def _time_online(watch: Stopwatch, name: str, metric: str, online: Online, track: Track) -> None:
     """Every update with its newest state and covariance, over whole streams; the first stream warms up."""
-    times = []
-    for run in range(1 + max(2, watch.runs // 10)):
+    runs: list[list[float]] = []
+    for _ in range(1 + max(2, watch.runs // 10)):
         online.reset()
         stream = zip(track.times.tolist(), track.positions, strict=True)
-        spent = [milliseconds(partial(online.push, stamp, position)) for stamp, position in stream]
-        times += spent if run else []
+        runs.append([milliseconds(partial(online.push, stamp, position)) for stamp, position in stream])
+    times = [spent for run in runs[1:] for spent in run]
     watch.results.add(CASE, name, f"{metric}_median", "ms", median_and_quartiles(times), len(times))
     watch.results.add(CASE, name, f"{metric}_p99", "ms", float(np.quantile(times, 0.99)), len(times))
 
 
 def _time_prediction(watch: Stopwatch, name: str, smoother: Smoother, track: Track) -> None:
-    """The next 0.3 s with covariances, from an estimate."""
     propagator = Propagator(smoother.surfaces, smoother.settings.process)
     times = torch.from_numpy(track.times[-1] + np.arange(1, round(HORIZON * RATE) + 1) / RATE)[None]
     belief = Belief.of(smoother.model, [smoother.estimate(track).last])
@@ -216,7 +250,6 @@ def _time_prediction(watch: Stopwatch, name: str, smoother: Smoother, track: Tra
 
 
 def _time_dataset(results: Results, dataset: Dataset, count: int) -> None:
-    """Time of the smoother for each of the first tracks of a dataset."""
     model = nominal_model(dataset.info.ball)
     smoother = Smoother(model, dataset_surfaces(dataset), dataset_settings(dataset, model))
     tracks, name = list(islice(dataset, count)), dataset.info.name

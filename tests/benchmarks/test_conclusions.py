@@ -5,10 +5,9 @@ import io
 import numpy as np
 import pytest
 
-from ballfg.benchmarks.conclusions import conclusions, legend, should_be, target
+from ballfg.benchmarks.conclusions import conclusions, legend, print_table, should_be, target
 from ballfg.benchmarks.metrics import Figure
 from ballfg.benchmarks.results import Results
-from ballfg.benchmarks.tables import print_table
 
 
 def rows(case: str, *numbers: tuple[str, str, str, float | Figure], n: int = 50) -> list:

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from ballfg.benchmarks.conclusions import print_table
 from ballfg.benchmarks.metrics import Figure
 from ballfg.benchmarks.results import Results
-from ballfg.benchmarks.tables import print_table
 
 ROW_KEYS = ["case", "method", "metric", "unit", "value", "low", "high", "n"]
 

@@ -8,7 +8,7 @@ import sys
 import pytest
 import torch
 
-from ballfg.cli.errors import BAD_INPUT, NO_MEMORY, guarded
+from ballfg.cli.start import BAD_INPUT, NO_MEMORY, guarded
 from tests.commands import status
 from tests.places import ROOT
 

@@ -27,10 +27,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ballfg.benchmarks.speed.memory import children_of, peak_of
-from ballfg.collector import collect_rarely
 from ballfg.files.weights import read_tensors
 from ballfg.importing import Choices
 from ballfg.importing.proposal import propose
+from ballfg.machine import collect_rarely
 from ballfg.vision.calibration.boards import read_grey
 from tests.faults.bombs_of_arrays import ARRAYS
 from tests.faults.bombs_of_others import OTHERS

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ballfg.benchmarks.diagnosis.ideal import read_ideal
-from ballfg.benchmarks.diagnosis.record import read_record as read_case
-from ballfg.benchmarks.dynamics.record import read_record as read_contender
+from ballfg.benchmarks.diagnosis.ideal import Ideal
+from ballfg.benchmarks.diagnosis.record import Record as Case
+from ballfg.benchmarks.dynamics.record import Record as Contender
 from ballfg.benchmarks.speed.gate import SlowerError, check_ratios
 from ballfg.diagnosis.design.reported import reported_pairs
 from ballfg.dynamics import load_model
@@ -103,7 +103,7 @@ def _record(folder: Path, file: Path) -> object:
             return check_ratios(timed_rows(), file)
         except SlowerError as answer:
             return answer
-    read = {"case": read_case, "ideal": read_ideal, "contender": read_contender}[file.stem]
+    read = {"case": Case, "ideal": Ideal, "contender": Contender}[file.stem].read
     return read(file, "d")
 
 

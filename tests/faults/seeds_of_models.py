@@ -14,9 +14,9 @@ from safetensors.torch import save_file
 from ballfg.benchmarks.diagnosis.ideal import Ideal
 from ballfg.benchmarks.diagnosis.record import Found, Ranked
 from ballfg.benchmarks.diagnosis.record import Record as CaseRecord
-from ballfg.benchmarks.dynamics.fan import Fan
+from ballfg.benchmarks.dynamics.contenders import Fan
 from ballfg.benchmarks.dynamics.record import Record as ContenderRecord
-from ballfg.benchmarks.dynamics.scoring import PathScore
+from ballfg.benchmarks.dynamics.task import PathScore
 from ballfg.benchmarks.results import Row
 from ballfg.dynamics import Architecture, build, nominal_model, save_model
 from ballfg.dynamics.networks.fading import Fading

@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
-from ballfg.cli.errors import USER_ERRORS
+from ballfg.cli.start import USER_ERRORS
 
 SECONDS = 2.0
 """Of the processor, for a case."""

@@ -20,5 +20,5 @@ def test_a_kill_loses_nothing_and_the_same_command_continues(case: Case, tmp_pat
     found = run(case, tmp_path)
     assert found.sent > 30
     assert (found.missing, found.lost) == (0, 0)
-    assert found.added > 0
+    assert found.added > 0 or case.ending == "mcap"
     assert [path.name for path in tmp_path.iterdir()] == [f"states.{case.ending}"]

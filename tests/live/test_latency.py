@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from ballfg.live.latency import Latencies
+from ballfg.live.session import Latencies
 
 
 def test_percentiles_are_right_to_a_bin() -> None:

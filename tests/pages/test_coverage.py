@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from ballfg.pages.coverage import BIN, coverage
-from ballfg.pages.shot import ShownShot
+from ballfg.pages.shot import BIN, ShownShot, coverage
 
 
 def shots(count: int, stated: float, seed: int = 3) -> list[ShownShot]:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ballfg.pages.marks import marks
+from ballfg.pages.shot import marks
 from tests.pages.made import RADIUS, TABLE, Fall
 
 

@@ -5,8 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from ballfg.benchmarks.dynamics.scoring import apex_errors, pooled_rmse, score_path
-from ballfg.benchmarks.dynamics.task import TaskShot
+from ballfg.benchmarks.dynamics.task import TaskShot, apex_errors, pooled_rmse, score_path
 from ballfg.prediction.apexes import flight_bounds, measured_apexes, path_apex, true_apexes
 from ballfg.tracks import Track
 

@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from ballfg.vision.camera import Camera
 
 OURS: Final = (".yaml", ".yml")
-THEIRS: Final = (".xml", ".json")
-"""Endings of camera files: this package's, and those of OpenCV's FileStorage."""
+THEIRS: Final = (".xml", ".json")  # Endings of camera files: this package's, and those of OpenCV's FileStorage
 
 _lens_option, _place_option = (
     partial(typer.Option, rich_help_panel=panel) for panel in ("Lens, from images of a board", "Place, from the table")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -39,14 +39,9 @@ def compile_ahead(
     models: dict[str, BallModel] = {name: nominal_model(name) for name in KNOWN_BALLS}
     models |= {str(path): load_model(path) for path in model or ()}
     parts = [part for one in models.values() for part in _parts(one)]
-    for _ in progress(_done(parts), len(parts), "parts compiled"):
-        pass
+    for part in progress(parts, len(parts), "parts compiled"):
+        part()
     print(f"{', '.join(models)}: compiled, and kept in {cache_folder()}")
-
-
-def _done(parts: list[Callable[[], object]]) -> Iterator[object]:
-    for part in parts:
-        yield part()
 
 
 def _parts(model: BallModel) -> list[Callable[[], object]]:

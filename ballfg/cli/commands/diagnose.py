@@ -9,38 +9,26 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg.cli.inputs import (
-    CORES,
-    Address,
-    Cluster,
-    DatasetFolders,
-    EffectsFiles,
-    Jobs,
-    ObservationsFiles,
-    know_observations,
-    open_inputs,
-    workers,
-)
+from ballfg.cli import inputs
 from ballfg.progress import announce
 
 if TYPE_CHECKING:
     from ballfg.diagnosis.result import Diagnosis
 
 
-NAME_AT = 0.9
-"""Probability from which on an effect is named."""
+NAME_AT = 0.9  # Probability from which on an effect is named
 
 
 def diagnose(
-    datasets: DatasetFolders,
+    datasets: inputs.DatasetFolders,
     out: Annotated[Path, typer.Option(help="Folder of the report, new or empty.")],
     model: Annotated[Path | None, typer.Option(help="Model file. Default: the nominal model of the ball.")] = None,
-    effects_file: EffectsFiles = None,
-    observations_file: ObservationsFiles = None,
+    effects_file: inputs.EffectsFiles = None,
+    observations_file: inputs.ObservationsFiles = None,
     name_at: Annotated[float, typer.Option(help="Probability from which on an effect is named.")] = NAME_AT,
-    jobs: Jobs = CORES,
-    cluster: Cluster = None,
-    address: Address = None,
+    jobs: inputs.Jobs = inputs.CORES,
+    cluster: inputs.Cluster = None,
+    address: inputs.Address = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an earlier report.")] = False,
 ) -> None:
     """Find effects that the model lacks, with their evidence, their alternatives and the gain in prediction.
@@ -71,21 +59,21 @@ def diagnose(
         raise ValueError(f"out must not hold the model itself; {model} would be replaced. Choose another folder.")
     with reserved(out):  # until the report is written: a diagnosis takes minutes
         check_report_folder(out, force=force)
-        know_observations(observations_file)
-        inputs, *others = [open_inputs(dataset, model, effects_file) for dataset in datasets]
-        if not isinstance(inputs.model, AnalyticModel):
+        inputs.know_observations(observations_file)
+        opened, *others = [inputs.open_inputs(dataset, model, effects_file) for dataset in datasets]
+        if not isinstance(opened.model, AnalyticModel):
             raise ValueError(
                 f"--model must be analytic: a diagnosis adds physical effects to it; {model} is a learned one. "
                 "Give the analytic model that you believe in."
             )
         rooms: dict[str, AnalyticModel] = {}
-        with workers(cluster, address, jobs) as processes:
+        with inputs.workers(cluster, address, jobs) as processes:
             if others:
-                together = [inputs.dataset, *(other.dataset for other in others)]
-                joint = diagnose_jointly(together, inputs.model, jobs=processes, watch=announce, name_at=name_at)
+                together = [opened.dataset, *(other.dataset for other in others)]
+                joint = diagnose_jointly(together, opened.model, jobs=processes, watch=announce, name_at=name_at)
                 diagnosis, rooms = joint.whole, joint.rooms
             else:
-                diagnosis = find(inputs.dataset, inputs.model, jobs=processes, watch=announce, name_at=name_at)
+                diagnosis = find(opened.dataset, opened.model, jobs=processes, watch=announce, name_at=name_at)
         typed = _typed(datasets, model, effects_file, observations_file, name_at, out)
         models = tuple(map(room_file, rooms)) or (MODEL,)
         origin = Origin(typed, tuple(map(str, datasets)), "" if model is None else str(model), str(out), models)

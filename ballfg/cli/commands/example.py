@@ -23,8 +23,7 @@ MEASURED = (
     ("spindoe", "shots with measured spin", "cogsys-tuebingen/spindoe", "none stated: for evaluation only"),
 )
 """Name, description, publishing repository on GitHub, licence."""
-PAUSE = 1.5
-"""s between two shots of the recording."""
+PAUSE = 1.5  # s between two shots of the recording
 
 
 def example(

@@ -18,10 +18,8 @@ if TYPE_CHECKING:
     from ballfg.importing.proposal import Proposal
 
 _guess, _file = (partial(typer.Option, rich_help_panel=panel) for panel in ("Instead of a guess", "Files"))
-MOST_QUESTIONS = 8
-"""Largest number of questions on a terminal; after more something else is wrong."""
-WIDTH = 160
-"""Number of characters in a line of the proposal without a terminal."""
+MOST_QUESTIONS = 8  # Largest number of questions on a terminal; after more something else is wrong
+WIDTH = 160  # Number of characters in a line of the proposal without a terminal
 
 
 def import_(

@@ -29,8 +29,7 @@ REGISTRIES = (
     ("formats", "ballfg.importing.formats.registry", "FORMATS"),
 )
 """Title, module and attribute of each registry, in the order of the output."""
-WIDTH = 110
-"""Largest number of characters in a line."""
+WIDTH = 110  # Largest number of characters in a line
 
 
 def info() -> None:
@@ -160,7 +159,6 @@ def effects(
 
 
 def _described(effect: type[Effect]) -> Iterator[str]:
-    """A description of an effect, in lines."""
     yield f"{effect.name}: {effect.plain or effect.name.replace('_', ' ')}, an effect of {effect.kind}"
     told = {
         "what": effect.sentence,

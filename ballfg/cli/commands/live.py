@@ -92,13 +92,13 @@ def live(
         _check_out(out)
     inputs.know_effects(effects_file)
     inputs.know_observations(observations_file)
-    bag = replay is not None and _is_bag(replay)
+    bag = replay is not None and (replay.suffix in (MCAP, SQLITE) or (replay / "metadata.yaml").is_file())
     data = _dataset(like if bag or replay is None else replay)
     tracker = Tracker(*_scene(data, model, ball, table, noise, group), lag=lag)
     with (
         contextlib.closing(_source(replay, bag, listen, idle, speed, topic, data)) as source,
         _output(out, source) as write,
-        _watchers(out, source, viewer, wanted.horizon) as watchers,
+        _watchers(out, viewer, wanted.horizon) as watchers,
     ):
         warm_up(tracker, wanted)
         trust = f"; {source.trust}" if source.trust else ""
@@ -118,10 +118,6 @@ def _check_out(out: Path) -> None:
     check_file(out)
     if out.suffix == SQLITE:
         raise ValueError(f"out must be JSON lines or a bag in MCAP; got {out}. Let its name end in .jsonl or .mcap.")
-
-
-def _is_bag(path: Path) -> bool:
-    return path.suffix in (MCAP, SQLITE) or (path / "metadata.yaml").is_file()
 
 
 def _dataset(folder: Path | None) -> Dataset | None:
@@ -151,7 +147,9 @@ def _scene(
     from ballfg.checks import check_number
     from ballfg.dynamics import Surfaces, load_model, nominal_model
     from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball
-    from ballfg.estimation import dataset_settings, dataset_surfaces
+    from ballfg.estimation import Settings, dataset_settings, dataset_surfaces
+    from ballfg.estimation.configure import learned_process
+    from ballfg.estimation.noise.parameters import with_noise
 
     if data is not None:
         ball = inputs.open_model(data, model, named)
@@ -164,25 +162,17 @@ def _scene(
         known = KNOWN_BALLS[name]
         inertia = known.inertia_factor
         ball = load_model(model, radius=known.ball.radius, inertia_factor=inertia) if model else nominal_model(name)
-        surfaces, settings = Surfaces.table_tennis(0.0), _settings(ball)
+        surfaces, settings = Surfaces.table_tennis(0.0), Settings.for_measured(ball)
+        if ball.trained is not None:
+            settings = Settings(position_scale=ball.trained.position_scale, process=learned_process(ball.trained))
+        if ball.noise is not None:
+            settings = with_noise(settings, ball.noise)
     if table is not None:
         surfaces = Surfaces.table_tennis(check_number("table", table, "m", limit=50.0, instead="mm"))
     if noise is not None:
         sigma = check_number("noise", noise, "m", above=0.0, limit=1.0, instead="mm")
         settings = replace(settings, position_noise=(sigma,) * 3)
     return ball, surfaces, replace(settings, spins=ball.spins, group=group)
-
-
-def _settings(ball: BallModel) -> Settings:
-    """The noise of a stream without a dataset: the usual one, or the model's."""
-    from ballfg.estimation import Settings
-    from ballfg.estimation.configure import learned_process
-    from ballfg.estimation.noise.parameters import with_noise
-
-    settings = Settings.for_measured(ball)
-    if ball.trained is not None:
-        settings = Settings(position_scale=ball.trained.position_scale, process=learned_process(ball.trained))
-    return settings if ball.noise is None else with_noise(settings, ball.noise)
 
 
 def _source(
@@ -196,9 +186,8 @@ def _source(
 ) -> Source:
     from ballfg.checks import check_number
     from ballfg.live.sources.bag import bag_samples
-    from ballfg.live.sources.replay import Replay, dataset_samples
     from ballfg.live.sources.sockets import listen as listened
-    from ballfg.live.sources.source import Pipe
+    from ballfg.live.sources.source import Pipe, Replay, dataset_samples
 
     check_number("idle", idle, "s", above=0.0, limit=1e9)
     if replay is not None and bag:
@@ -231,13 +220,13 @@ def _output(out: Path | None, source: Source) -> Iterator[Callable[[bytes], None
 
 
 @contextlib.contextmanager
-def _watchers(out: Path | None, source: Source, viewer: bool, horizon: float) -> Iterator[list[Watcher]]:
+def _watchers(out: Path | None, viewer: bool, horizon: float) -> Iterator[list[Watcher]]:
     with contextlib.ExitStack() as stack:
         found: list[Watcher] = []
         if out is not None and out.suffix == MCAP:
             from ballfg.live.bag_writer import BagWriter
 
-            found.append(stack.enter_context(BagWriter(out, horizon, source.repeats)))
+            found.append(stack.enter_context(BagWriter(out, horizon)))
         if viewer:
             from ballfg.live.viewer import Viewer
 

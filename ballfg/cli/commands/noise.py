@@ -30,8 +30,7 @@ MEANINGS = {
     "coefficients": ("spread of coefficients from track to track / usual", 1.0, ""),
 }
 """Meaning of each number, factor to its printed unit, and that unit."""
-UNKNOWN = 0.7
-"""Standard deviation of a logarithm beyond which the tracks give hardly more than the order of magnitude."""
+UNKNOWN = 0.7  # Standard deviation of a logarithm beyond which the tracks give hardly more than the order of magnitude
 
 
 def noise(
@@ -84,7 +83,6 @@ def noise(
 
 
 def _table(found: NoiseEstimate) -> list[str]:
-    """A line for each number: meaning, value, error bar."""
     content: dict[str, Any] = found.noise.to_mapping() | {"coefficients": found.coefficient_factor}
     lines = []
     for name, error in found.relative_errors.items():
@@ -94,7 +92,7 @@ def _table(found: NoiseEstimate) -> list[str]:
         number = factor * (value["xyz".index(axis)] if axis else value)
         doubt = "  (hardly known)" if error >= UNKNOWN else ""
         limits = _limits(*(factor * limit for limit in found.intervals[name]))
-        lines.append(f"  {meaning.format(axis):52} {number:8.3g} x/: {_ratio(error)}  {unit}{limits}{doubt}")
+        lines.append(f"  {meaning.format(axis):52} {number:8.3g} x/: {math.exp(error):4.2f}  {unit}{limits}{doubt}")
     return lines
 
 
@@ -103,11 +101,6 @@ def _limits(low: float, high: float) -> str:
     if math.isinf(high):
         return f"  (above {low:.2g})" if low > 0.0 else ""
     return f"  ({low:.2g} to {high:.2g})" if low > 0.0 else f"  (below {high:.2g})"
-
-
-def _ratio(error: float) -> str:
-    """The factor of one standard deviation of a number's logarithm."""
-    return f"{2.718281828**error:4.2f}"
 
 
 def _write(found: NoiseEstimate, data: Dataset, ball: BallModel, out: Path | None, write: bool) -> None:

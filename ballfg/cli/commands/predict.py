@@ -144,8 +144,6 @@ def _print_conformal(scales: ConformalScales, outcome: _Outcome) -> None:
 
 @dataclass
 class _Outcome:
-    """Sums over the predicted tracks."""
-
     rows: int = 0
     squares: float = 0.0
     ended: int = 0

@@ -89,7 +89,6 @@ def render(
 def _clocks(
     names: list[str], rate: float, seed: int, offsets: tuple[str, ...] | list[str], *, unsynchronised: bool
 ) -> dict[str, Clock]:
-    """Clocks by camera, from the options."""
     from dataclasses import replace
 
     from ballfg.simulation.scene.config import Clock

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ballfg.cli.inputs import print_notes
 from ballfg.files.whole_file import check_file, whole_file, write_text
 
 if TYPE_CHECKING:
@@ -46,15 +46,13 @@ def show(
 
     _check_outputs(out, png, rerun)
     what, names = recognise(given, _dataset), track or []
-    for note in what.dataset.notes if what.dataset is not None else ():
-        print(f"note: {note}", file=sys.stderr)
+    print_notes(what.dataset.notes if what.dataset is not None else ())
     if rerun is not None:
         _write_recording(collect(what, names, limited=False), rerun)
     if out is None and png is None:
         return
     shown = collect(what, names)
-    for note in shown.notes:
-        print(f"note: {note}", file=sys.stderr)
+    print_notes(shown.notes)
     if png is not None:
         _write_picture(shown, png)
     if out is not None:
@@ -93,7 +91,6 @@ def _check_outputs(out: Path | None, png: Path | None, rerun: Path | None) -> No
 
 
 def _write_picture(shown: Shown, png: Path) -> None:
-    """The first shot of the page, for papers."""
     from ballfg.pages.pictures import views
 
     if not shown.shots:

@@ -83,7 +83,6 @@ def simulate(
 
 
 def _ball(name: str, model: Path | None) -> BallKind:
-    """The ball, with the model of a file, if any, in place of its own."""
     from ballfg.dynamics import AnalyticModel, load_model
     from ballfg.simulation.balls import ball_kind, with_model
 

@@ -10,14 +10,10 @@ from typing import Any
 
 from ballfg.live.sources.source import Source
 
-WAIT = 0.1
-"""s, after which a quiet listener checks whether it should stop."""
-SENDERS = 64
-"""Largest number of senders at once."""
-IDLE = 300.0
-"""s, after which a silent TCP sender is dropped."""
-NOTICE = 5.0
-"""s between two notices of the same kind."""
+WAIT = 0.1  # s, after which a quiet listener checks whether it should stop
+SENDERS = 64  # Largest number of senders at once
+IDLE = 300.0  # s, after which a silent TCP sender is dropped
+NOTICE = 5.0  # s between two notices of the same kind
 
 
 class Listener(Source):

@@ -1,28 +1,27 @@
-"""Defines the interface of all sources, standard input, and the inbox in which live lines wait."""
+"""Defines the interface of all sources, standard input, replays, and the inbox in which live lines wait."""
 
 import os
 import stat
 import sys
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from time import perf_counter
 
-from ballfg.live.sources.sender import WAITING, Arrival, Line, Sender
+from ballfg.live.sources.sender import WAITING, Arrival, Line, Sample, Sender
+from ballfg.tracks import Dataset
+from ballfg.tracks.stamps import written
 
-LEAST = 16
-"""Least number of lines that each sender may have waiting."""
-CHUNK = 65536
-"""Number of bytes read at once from standard input, or of a packet."""
+LEAST = 16  # Least number of lines that each sender may have waiting
+CHUNK = 65536  # Number of bytes read at once from standard input, or of a packet
 
 
 class Source:
     """A stream of lines or samples.
 
     Attributes:
-        name: for messages.
-        trust: a sentence on who may send to it; empty if only this process's user can.
+        name: for messages.  trust: a sentence on who may send to it; empty if only this process's user can.
         live: True if lines come at their own pace, so that they must be read at once. Other sources wait until read.
         repeats: True if the stream starts from its beginning when opened again, as a file does.
         lossy: True if the oldest lines of a full sender are dropped; else the source reads no more of it.
@@ -87,10 +86,7 @@ class Inbox:
             threading.Thread(target=self._fill, name="ballfg live input", daemon=True).start()
 
     def groups(self) -> Iterator[list[Arrival]]:
-        """Arrivals of one stamp at a time, each sender's in their order.
-
-        Raises: OSError: from the source.
-        """
+        """Arrivals of one stamp at a time, each sender's in their order. Raises: OSError: from the source."""
         if not self.source.live:
             yield from self._asked()
             return
@@ -137,7 +133,6 @@ class Inbox:
             now = perf_counter()
 
     def _fill(self) -> None:
-        """The reading thread."""
         try:
             for line in self.source.lines(self._stop):
                 self._put(line)
@@ -162,3 +157,51 @@ class Inbox:
                 self.dropped += 1
             sender.waiting.append((line.read, line.content))
             self._changed.notify_all()
+
+
+PAUSE = 1.0  # s between two tracks: longer than a ball may stay unseen
+
+
+class Replay(Source):
+    """Samples at their own pace, or a multiple of it.
+
+    Args: samples: with their stamps, which set the pace.  speed: 1 is real time; 0 is without pauses.
+    """
+
+    repeats = True
+
+    def __init__(self, samples: Iterable[Sample], speed: float, name: str) -> None:
+        self.samples = samples
+        self.speed = speed
+        self.live = speed > 0.0
+        self.name = name
+
+    def lines(self, stop: threading.Event) -> Iterator[Line]:
+        """As `Source.lines`."""
+        sender = Sender()
+        begun: tuple[float, float] | None = None
+        for sample in self.samples:
+            sender.wait_for_room(stop)
+            if self.live:
+                begun = begun or (perf_counter(), sample.time)
+                wait = begun[0] + (sample.time - begun[1]) / self.speed - perf_counter()
+                if wait > 0.0 and stop.wait(wait):
+                    return
+            yield Line(sender, perf_counter(), sample)
+
+
+def dataset_samples(dataset: Dataset) -> Iterator[Sample]:
+    """The samples of a dataset on one clock: each track begins `PAUSE` after the end of the previous one.
+
+    Their tags hold the trajectory and the stamp on its own clock.
+    """
+    origin: float | None = None
+    begins = 0.0  # s, from the first track's first sample to this one's
+    for track in dataset:
+        origin = float(track.times[0]) if origin is None else origin
+        moments = zip(track.times.tolist(), track.seconds.tolist(), track.positions.tolist(), strict=True)
+        for k, (time, since, position) in enumerate(moments):
+            sigmas = None if track.sigmas is None else [track.sigmas[k].tolist()]
+            stamp = float(written(begins + since, origin))
+            yield Sample(stamp, [position], sigmas, (("trajectory", track.name), ("t_track", time)))
+        begins += track.duration + PAUSE

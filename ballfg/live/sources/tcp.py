@@ -7,19 +7,15 @@ from contextlib import suppress
 from time import perf_counter
 from typing import Any
 
-from ballfg.live.answers import encoded, refusal
+from ballfg.live.outlook import encoded, refusal
 from ballfg.live.sources.listener import SENDERS, WAIT, Listener, readable, written
 from ballfg.live.sources.sender import PAUSE, Line, Sender
 
-PIECE = 4096
-"""Number of bytes read at once of a sender: less than a millisecond's work."""
+PIECE = 4096  # Number of bytes read at once of a sender: less than a millisecond's work
 
 
 class Connection(Sender):
-    """A TCP sender.
-
-    Attributes: open: True if more may come.
-    """
+    """A TCP sender. Attributes: open: True if more may come."""
 
     def __init__(self, connected: socket.socket, name: str) -> None:
         super().__init__(name)
@@ -86,7 +82,6 @@ class TcpServer(Listener):
         return len(self._senders) >= SENDERS and not all(sender.open for sender in self._senders)
 
     def _accept(self) -> None:
-        """Accepts new senders, or refuses one."""
         for _ in range(max(SENDERS - len(self._senders), 1)):
             try:
                 connected, address = self._socket.accept()

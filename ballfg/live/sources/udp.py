@@ -8,17 +8,14 @@ from contextlib import suppress
 from time import perf_counter
 from typing import Any
 
-from ballfg.live.answers import encoded, refusal
+from ballfg.live.outlook import encoded, refusal
 from ballfg.live.sources.listener import SENDERS, WAIT, Listener, readable, written
 from ballfg.live.sources.sender import PAUSE, WAITING, Line, Sender
 from ballfg.live.sources.source import CHUNK
 
-SILENT = 1.0
-"""s, after which a silent sender makes room for a new one: it can return at any time."""
-DROPS = 40
-"""The option SO_RXQ_OVFL of Linux: a packet comes with the number of packets dropped before it."""
-DROP_SPACE = 64
-"""Bytes for that number."""
+SILENT = 1.0  # s, after which a silent sender makes room for a new one: it can return at any time
+DROPS = 40  # The option SO_RXQ_OVFL of Linux: a packet comes with the number of packets dropped before it
+DROP_SPACE = 64  # Bytes for that number
 
 
 class Correspondent(Sender):
@@ -27,8 +24,7 @@ class Correspondent(Sender):
     Args: address: of the sender.  own: a socket for its packets alone; None if the system grants none.
 
     Attributes:
-        lost: number of packets that the system dropped.
-        told: number of dropped lines and packets that it was told.
+        lost: number of packets that the system dropped.  told: number of dropped lines and packets that it was told.
     """
 
     def __init__(self, address: Any, own: socket.socket | None) -> None:
@@ -101,7 +97,6 @@ class UdpServer(Listener):
         return sender.cut(packet, last=True)
 
     def _newcomer(self, address: Any) -> Correspondent | None:
-        """A new sender, if there is room."""
         if len(self._senders) >= SENDERS:
             now = perf_counter()
             silent = [s for s in self._senders.values() if not s.busy and now - s.heard > SILENT]

@@ -21,12 +21,11 @@ class Problem:
     """Tracks of one ball, whose laws are known.
 
     Attributes:
-        measured: (t, n, 3) m.  label: (t, 3) rad/s, the labelled spins.
-        dt: () s between samples.
+        measured: (t, n, 3) m.  label: (t, 3) rad/s, the labelled spins.  dt: () s between samples.
         position_sigma: () m.  label_sigma: () rad/s.  step_sigma: (6,) m and m/s.
         gravity: (3,) m/s^2.  drag, magnus: () of a = g - drag |v| v + magnus (spin x v); 1/m, dimensionless.
-        w1, b1, w2, b2, w3, b3: weights (out, in) and biases (out,) of a = w3 tanh(w2 tanh(w1 x + b1) + b2) + b3 with
-            x = [v, spin, spin x v]; empty where the formula holds.
+        w1, b1, w2, b2, w3, b3: weights (out, in) and biases (out,) of a = w3 tanh(w2 tanh(w1 x + b1) + b2) + b3 with x
+            = [v, spin, spin x v]; empty where the formula holds.
         flight: (9,) state m, m/s, rad/s that rollouts begin with.
     """
 
@@ -70,7 +69,6 @@ class Problem:
             return cls(**{name: file[name] for name in file.files})
 
 
-ROLLOUT_STEPS = 300
-"""Runge-Kutta steps of a rollout, of `Problem.dt` each."""
+ROLLOUT_STEPS = 300  # Runge-Kutta steps of a rollout, of `Problem.dt` each
 LOSS_STEPS = 60
 """Explicit steps from the last state on, after which the square of the position is the loss of the gradient problem."""

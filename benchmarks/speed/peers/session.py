@@ -23,13 +23,10 @@ class LibraryError(Exception):
 class Session:
     """A running process; use it in a `with` block.
 
-    Args:
-        python: command that starts the library's interpreter.
-        task: "estimate" or "rollout".
+    Args: python: command that starts the library's interpreter.  task: "estimate" or "rollout".
 
     Attributes:
         cold: s from the start of the process to its first solution.
-        prepared: s of that between the library's import and the first solution.
         first: s of the first solution, with everything that is compiled for it.
         peak: MiB, the process's largest memory so far.
 
@@ -54,7 +51,7 @@ class Session:
             self._end()
             raise
         self.cold = time.perf_counter() - begun
-        self.prepared, self.first, self.peak = float(answer["prepared"]), float(answer["first"]), 0.0
+        self.first, self.peak = float(answer["first"]), 0.0
 
     def __enter__(self) -> Self:
         return self

@@ -9,42 +9,27 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import torch
 
 from ballfg.arrays import Array
 from ballfg.benchmarks.metrics import median_and_quartiles
 from ballfg.benchmarks.results import Results
+from ballfg.benchmarks.speed import suite as flight
 from ballfg.benchmarks.speed.banded import STEP_SIGMA, BandedProblem
 from ballfg.benchmarks.speed.network import NetworkFlight, fitted_network
 from ballfg.benchmarks.speed.peers.problem import LOSS_STEPS, Problem
 from ballfg.benchmarks.speed.peers.session import LibraryError, Session
+from ballfg.benchmarks.speed.robot import NO_SURFACE, path_of
 from ballfg.benchmarks.speed.stopwatch import milliseconds
-from ballfg.benchmarks.speed.suite import (
-    DRAG,
-    LABEL_NOISE,
-    MAGNUS,
-    NO_SURFACE,
-    NOISE,
-    RATE,
-    START,
-    Size,
-    problem_model,
-    problem_track,
-)
-from ballfg.dynamics import rollout
 from ballfg.progress import progress
-from ballfg.state import POSITION, STANDARD_GRAVITY
+from ballfg.state import STANDARD_GRAVITY
 from ballfg.tracks.track import SPIN_LABELS
 
-OWN: Final = ("ballfg", "gtsam")
-"""Libraries of this environment."""
-PEERS: Final = ("jaxls", "theseus", "pypose")
-"""Libraries of other environments."""
+OWN: Final = ("ballfg", "gtsam")  # Libraries of this environment
+PEERS: Final = ("jaxls", "theseus", "pypose")  # Libraries of other environments
 MOST_TRACKS: Final = 64
 SAME: Final = 1e-6
 """Largest difference from the reference, over the largest number of its kind, up to which a solution is the same."""
-DIFFERENCE_STEPS: Final = (1e-4, 1e-5)
-"""Steps of the central differences by the drag, 1/m, and the Magnus coefficient."""
+DIFFERENCE_STEPS: Final = (1e-4, 1e-5)  # Steps of the central differences by the drag, 1/m, and the Magnus coefficient
 
 
 @dataclass(frozen=True)
@@ -52,10 +37,8 @@ class Task:
     """A problem for all libraries.
 
     Attributes:
-        name: of the rows' case.
-        kind: "estimate", "gradient" or "rollout".
-        network: True if the acceleration is the network's.
-        tracks: number of them.
+        name: of the rows' case.  kind: "estimate", "gradient" or "rollout".
+        network: True if the acceleration is the network's.  tracks: number of them.
         turns, runs: timed solutions: so many turns of so many runs of each library.
     """
 
@@ -77,7 +60,7 @@ TASKS: Final = (
 )
 
 
-def run_peers(results: Results, peers: Mapping[str, Path], size: Size) -> None:
+def run_peers(results: Results, peers: Mapping[str, Path], size: flight.Size) -> None:
     """Times of all libraries on all tasks; missing or deviating ones are reported on stderr, without a row.
 
     Args:
@@ -93,7 +76,8 @@ def run_peers(results: Results, peers: Mapping[str, Path], size: Size) -> None:
         if not python.is_file():
             raise ValueError(f"--peer {library} must be the path of a Python interpreter; {python} is no file.")
     pythons = {**{name: [sys.executable] for name in OWN}, **{name: [str(p)] for name, p in peers.items()}}
-    analytic, network = _problem(size, None), _problem(size, fitted_network(problem_model(), size.fit_iterations))
+    fitted = fitted_network(flight.problem_model(), size.fit_iterations)
+    analytic, network = _problem(None), _problem(fitted)
     with tempfile.TemporaryDirectory() as folder:
         for task in progress(TASKS, len(TASKS), "problems solved"):
             whole = network if task.network else analytic
@@ -101,31 +85,21 @@ def run_peers(results: Results, peers: Mapping[str, Path], size: Size) -> None:
             _run_task(results, task, problem, pythons, Path(folder))
 
 
-def _problem(size: Size, network: NetworkFlight | None) -> Problem:
+def _problem(network: NetworkFlight | None) -> Problem:
     """The track of the speed benchmark, and others that differ from it in their noise."""
-    model, rng = problem_model(), np.random.default_rng(1)
-    track = problem_track(model)
-    with torch.no_grad():
-        start = torch.tensor([START], dtype=torch.float64)
-        truth = rollout(model, start, torch.from_numpy(track.times), NO_SURFACE)[0, :, POSITION].numpy()
-    others = [truth + NOISE * rng.standard_normal(truth.shape) for _ in range(MOST_TRACKS - 1)]
-    label = np.array([track.labels[name] for name in SPIN_LABELS])
-    none, scalar = (np.zeros((0, 0)), np.zeros(0)) * 3, np.asarray
-    pairs = () if network is None else zip(network.weights, network.biases, strict=True)
-    layers = none if network is None else [part.detach().numpy() for pair in pairs for part in pair]
-    w1, b1, w2, b2, w3, b3 = layers
-    return Problem(
-        np.stack([track.positions, *others]),
-        np.tile(label, (MOST_TRACKS, 1)),
-        scalar(1.0 / RATE),
-        scalar(NOISE),
-        scalar(LABEL_NOISE),
-        STEP_SIGMA,
-        np.array((0.0, 0.0, -STANDARD_GRAVITY)),
-        scalar(DRAG),
-        scalar(MAGNUS),
-        *(w1, b1, w2, b2, w3, b3, np.array(START)),
-    )
+    model, rng = flight.problem_model(), np.random.default_rng(1)
+    track = flight.problem_track(model)
+    truth = path_of(model, flight.START, track.times, NO_SURFACE)
+    others = [truth + flight.NOISE * rng.standard_normal(truth.shape) for _ in range(MOST_TRACKS - 1)]
+    label = np.tile([track.labels[name] for name in SPIN_LABELS], (MOST_TRACKS, 1))
+    layers = [np.zeros((0, 0)), np.zeros(0)] * 3
+    if network is not None:
+        pairs = zip(network.weights, network.biases, strict=True)
+        layers = [part.detach().numpy() for pair in pairs for part in pair]
+    sizes = map(np.asarray, (1.0 / flight.RATE, flight.NOISE, flight.LABEL_NOISE))
+    laws = map(np.asarray, ((0.0, 0.0, -STANDARD_GRAVITY), flight.DRAG, flight.MAGNUS))
+    rest = (*sizes, STEP_SIGMA, *laws, *layers, np.array(flight.START))
+    return Problem(np.stack([track.positions, *others]), label, *rest)
 
 
 def _run_task(
@@ -182,7 +156,6 @@ def _reference(task: Task, problem: Problem, path: Path, own: Session) -> dict[s
 
 
 def _banded(problem: Problem, track: int, drag: float, magnus: float) -> BandedProblem:
-    """A track for the banded solver."""
     noise = float(problem.position_sigma), problem.label[track], float(problem.label_sigma)
     return BandedProblem(problem.measured[track], float(problem.dt), *noise, drag, magnus)
 

@@ -6,7 +6,8 @@ from problem import LOSS_STEPS, ROLLOUT_STEPS, Array, Problem
 from torch import Tensor, nn
 
 from ballfg.arrays import Index
-from ballfg.dynamics import BallModel, Surfaces, rollout
+from ballfg.dynamics import BallModel, Surfaces
+from ballfg.dynamics import rollout as roll_out
 from ballfg.dynamics.compiled.functions import compiled
 from ballfg.dynamics.model import Rates
 from ballfg.dynamics.model_file import model_from_dict
@@ -20,10 +21,8 @@ from ballfg.learning.gradient.objective import BatchObjective
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 
 torch.set_num_threads(1)
-TOLERANCE = 3e-6
-"""Posterior standard deviations to the minimum: the loosest that meets the comparison on all tracks."""
-EXACT = 1e-8
-"""Relative error of the linear solution of a gradient, fine enough for the comparison."""
+TOLERANCE = 3e-6  # Posterior standard deviations to the minimum: the loosest that meets the comparison on all tracks
+EXACT = 1e-8  # Relative error of the linear solution of a gradient, fine enough for the comparison
 HELD = 1e-6
 """rad/s, by which the spin may change over a step: one spin for the flight, within all digits that are compared."""
 
@@ -32,8 +31,7 @@ class EulerFactors(FactorBatch):
     """The state after one explicit step of the acceleration, as the problem has it; the spin stays.
 
     Args:
-        problem: with the step's length and noise.
-        model: gives accelerations.
+        problem: with the step's length and noise.  model: gives accelerations.
         states: (m,) index of each step's first state.
     """
 
@@ -56,10 +54,9 @@ class EulerFactors(FactorBatch):
         c = np.tile(self.coefficients, (n, 1))
         a, slope = np.empty((n, 6)), np.empty((n, 6, 6))
         self.rates.compute(before, c, self.weights, moved, np.zeros((n, c.shape[1], 6)), a, slope)
-        shift, by = np.zeros((n, STATE_DIM)), np.zeros((n, STATE_DIM, STATE_DIM))
+        shift, by = np.zeros((n, STATE_DIM)), np.tile(np.eye(STATE_DIM), (n, 1, 1))
         shift[:, POSITION] = dt * before[:, VELOCITY] + 0.5 * dt**2 * a[:, :3]
         shift[:, VELOCITY] = dt * a[:, :3]
-        by[:, range(STATE_DIM), range(STATE_DIM)] = 1.0
         by[:, range(3), range(3, 6)] = dt
         by[:, POSITION, 3:] += 0.5 * dt**2 * slope[:, :3]
         by[:, VELOCITY, 3:] += dt * slope[:, :3]
@@ -72,7 +69,6 @@ class EulerFactors(FactorBatch):
 
 
 def _stepped(model: BallModel, state: Tensor, dt: float) -> Tensor:
-    """States (..., 9) after an explicit step."""
     a, v = model.rates(state)[0], state[..., VELOCITY]
     moved = (state[..., POSITION] + dt * v + 0.5 * dt**2 * a, v + dt * a, state[..., SPIN])
     return torch.cat(moved, dim=-1)
@@ -108,15 +104,10 @@ def model_of(problem: Problem) -> BallModel:
     return model_from_dict({"flight": laws, "bounce": {}})
 
 
-def solver(problem: Problem, task: str):
-    """Graphs of all tracks, minimised one by one; or the network rolled out."""
-    model = model_of(problem)
-    if task == "rollout":
-        return _rollout(problem, model)
-    if task == "gradient":
-        return _gradient(problem, model)
-    optimizer, (p, v, w) = LevenbergMarquardt(TOLERANCE), problem.start()
-    pairs = [(_graph(problem, model, k), _start(p[k], v[k], w[k])) for k in range(len(p))]
+def estimate(problem: Problem):
+    """Graphs of all tracks, minimised one by one."""
+    optimizer, model = LevenbergMarquardt(TOLERANCE), model_of(problem)
+    pairs = [_posed(problem, model, k) for k in range(len(problem.measured))]
 
     def solve() -> dict[str, Array]:
         states = np.stack([optimizer.minimize(*pair).values.states for pair in pairs])
@@ -125,12 +116,12 @@ def solver(problem: Problem, task: str):
     return solve
 
 
-def _gradient(problem: Problem, model: BallModel):
+def gradient(problem: Problem):
     """Forward, and backward through the converged estimate by the implicit function theorem."""
+    model, optimizer = model_of(problem), LevenbergMarquardt()
     own = dict(model.named_parameters())
     drag, magnus = (own[f"flight.{name}.k"].requires_grad_(True) for name in ("drag", "magnus"))
-    graph, start = _graph(problem, model, 0), _start(*(part[0] for part in problem.start()))
-    optimizer = LevenbergMarquardt()
+    graph, start = _posed(problem, model, 0)
 
     def solve() -> dict[str, Array]:
         minimum = optimizer.minimize(graph, start)
@@ -152,31 +143,22 @@ def _gradient(problem: Problem, model: BallModel):
     return solve
 
 
-def _start(p: Array, v: Array, w: Array) -> Values:
-    return Values(np.concatenate((p, v, np.tile(w, (len(p), 1))), axis=1), np.zeros(0))
-
-
-def _graph(problem: Problem, model: BallModel, track: int) -> BallGraph:
-    n = problem.measured.shape[1]
-    sigma = np.full((n, 3), float(problem.position_sigma))
+def _posed(problem: Problem, model: BallModel, track: int) -> tuple[BallGraph, Values]:
+    p, v, w = (part[track] for part in problem.start())
+    n = len(p)
     label, root = np.zeros((1, STATE_DIM)), np.zeros((1, 3, STATE_DIM))
     label[0, SPIN] = problem.label[track]
     root[0, range(3), range(6, 9)] = 1.0 / float(problem.label_sigma)
-    return BallGraph(
-        (
-            EulerFactors(problem, model, np.arange(n - 1)),
-            PositionFactors(np.arange(n), problem.measured[track], sigma),
-            PriorFactors(np.zeros(1, dtype=np.int64), label, root),
-        )
-    )
+    steps = EulerFactors(problem, model, np.arange(n - 1))
+    seen = PositionFactors(np.arange(n), problem.measured[track], np.full((n, 3), float(problem.position_sigma)))
+    labelled = PriorFactors(np.zeros(1, dtype=np.int64), label, root)
+    start = np.concatenate((p, v, np.tile(w, (n, 1))), axis=1)
+    return BallGraph((steps, seen, labelled)), Values(start, np.zeros(0))
 
 
-def _rollout(problem: Problem, model: BallModel):
-    start, nothing = torch.from_numpy(problem.flight)[None], Surfaces(-1e3)
+def rollout(problem: Problem):
+    """The network rolled out where there is nothing to bounce on."""
+    model, start = model_of(problem), torch.from_numpy(problem.flight)[None]
     times = torch.arange(1, ROLLOUT_STEPS + 1, dtype=torch.float64) * float(problem.dt)
-
-    def roll() -> dict[str, Array]:
-        with torch.no_grad():
-            return {"states": rollout(model, start, times, nothing)[0].numpy()}
-
-    return roll
+    roll = torch.no_grad()(lambda: roll_out(model, start, times, Surfaces(-1e3))[0].numpy())
+    return lambda: {"states": roll()}

@@ -4,18 +4,12 @@ import gtsam
 import numpy as np
 from problem import Array, Problem
 
-TOLERANCE = 1e-10
-"""Relative change of the error at which it stops."""
-POLISHED = 3
-"""Further Gauss-Newton steps of the solution that others are compared with: an error tells half of the digits."""
-SPIN = 1 << 40
-"""Key of a track's spin, plus its number; states are numbered from 0."""
+TOLERANCE = 1e-10  # Relative change of the error at which it stops
+SPIN = 1 << 40  # Key of a track's spin, plus its number; states are numbered from 0
 
 
-def solver(problem: Problem, task: str):
-    """Levenberg-Marquardt of GTSAM, one track after another."""
-    if task not in ("estimate", "reference"):
-        raise NotImplementedError(f"no {task}")
+def estimate(problem: Problem, polished: int = 0):
+    """Levenberg-Marquardt of GTSAM, one track after another; then some Gauss-Newton steps."""
     tracks, n, _ = problem.measured.shape
     graphs = [_graph(problem, k) for k in range(tracks)]
 
@@ -26,12 +20,17 @@ def solver(problem: Problem, task: str):
             parameters.setRelativeErrorTol(TOLERANCE)
             parameters.setAbsoluteErrorTol(0.0)
             found = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters).optimize()
-            for _ in range(POLISHED if task == "reference" else 0):
+            for _ in range(polished):
                 found = found.retract(graph.linearize(found).optimize())
             states[k], spins[k] = [found.atVector(i) for i in range(n)], found.atVector(SPIN)
         return {"position": states[..., :3], "velocity": states[..., 3:], "spin": spins}
 
     return solve
+
+
+def reference(problem: Problem):
+    """The solution that others are compared with: an error tells half of the digits, further steps the rest."""
+    return estimate(problem, polished=3)
 
 
 def _graph(problem: Problem, track: int) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
@@ -40,14 +39,13 @@ def _graph(problem: Problem, track: int) -> tuple[gtsam.NonlinearFactorGraph, gt
     of_position = gtsam.noiseModel.Isotropic.Sigma(3, float(problem.position_sigma))
     of_label = gtsam.noiseModel.Isotropic.Sigma(3, float(problem.label_sigma))
     step = _step(problem)
+    p, v, w = problem.start()
     for k in range(n - 1):
         graph.push_back(gtsam.CustomFactor(of_step, [k, k + 1, SPIN], step))
     for k in range(n):
         graph.push_back(gtsam.CustomFactor(of_position, [k], _seen(problem.measured[track, k])))
-    graph.push_back(gtsam.PriorFactorVector(SPIN, problem.label[track], of_label))
-    p, v, w = problem.start()
-    for k in range(n):
         values.insert(k, np.concatenate((p[track, k], v[track, k])))
+    graph.push_back(gtsam.PriorFactorVector(SPIN, problem.label[track], of_label))
     values.insert(SPIN, w[track])
     return graph, values
 

@@ -13,8 +13,7 @@ from problem import ROLLOUT_STEPS, Array, Problem
 
 jax.config.update("jax_enable_x64", True)
 
-TOLERANCE = 1e-10
-"""Relative change of the cost: the loosest power of ten that meets the comparison on all tracks."""
+TOLERANCE = 1e-10  # Relative change of the cost: the loosest power of ten that meets the comparison on all tracks
 
 
 class State(jaxls.Var[jax.Array], default_factory=lambda: jnp.zeros(6)):
@@ -25,14 +24,12 @@ class Spin(jaxls.Var[jax.Array], default_factory=lambda: jnp.zeros(3)):
     """Spin of a track."""
 
 
-def solver(problem: Problem, task: str):
-    """A compiled function that solves the problem, or rolls its network out."""
-    acceleration = acceleration_of(problem)
-    if task == "rollout":
-        return _rollout(problem, acceleration)
-    if task != "estimate":
-        raise NotImplementedError(f"jaxls has no {task}")
-    dt, step_sigma = float(problem.dt), jnp.asarray(problem.step_sigma)
+def estimate(problem: Problem):
+    """One compiled function of the measurements: analysis and solution of a track, mapped over several tracks."""
+    acceleration, dt, step_sigma = acceleration_of(problem), float(problem.dt), jnp.asarray(problem.step_sigma)
+    tracks, n, _ = problem.measured.shape
+    linear = "cholmod" if importlib.util.find_spec("sksparse") else "conjugate_gradient"
+    termination = jaxls.TerminationConfig(cost_tolerance=TOLERANCE, parameter_tolerance=TOLERANCE)
 
     @jaxls.Cost.factory
     def step(values, one: State, other: State, spin: Spin) -> jax.Array:
@@ -49,31 +46,27 @@ def solver(problem: Problem, task: str):
     def labelled(values, spin: Spin, label: jax.Array) -> jax.Array:
         return (values[spin] - label) / float(problem.label_sigma)
 
-    tracks, n, _ = problem.measured.shape
-    number = np.arange(tracks * n).reshape(tracks, n)
-    owner = np.repeat(np.arange(tracks), n - 1)
-    costs = [
-        step(State(number[:, :-1].reshape(-1)), State(number[:, 1:].reshape(-1)), Spin(owner)),
-        seen(State(number.reshape(-1)), jnp.asarray(problem.measured.reshape(-1, 3))),
-        labelled(Spin(np.arange(tracks)), jnp.asarray(problem.label)),
-    ]
-    states, spins = State(number.reshape(-1)), Spin(np.arange(tracks))
-    analyzed = jaxls.LeastSquaresProblem(costs, [states, spins]).analyze()
+    def solve_track(measured: jax.Array, label: jax.Array, begin: jax.Array, turn: jax.Array):
+        states, spin = State(jnp.arange(n)), Spin(jnp.zeros(1, dtype=int))
+        costs = [
+            step(State(jnp.arange(n - 1)), State(jnp.arange(1, n)), Spin(jnp.zeros(n - 1, dtype=int))),
+            seen(states, measured),
+            labelled(spin, label[None]),
+        ]
+        analyzed = jaxls.LeastSquaresProblem(costs, [states, spin]).analyze()
+        start = jaxls.VarValues.make([states.with_value(begin), spin.with_value(turn[None])])
+        options = {"trust_region": None, "termination": termination, "verbose": False}
+        found = analyzed.solve(start, linear_solver=linear, **options)
+        return found[states], found[spin][0]
+
     p, v, w = problem.start()
-    given = jnp.asarray(np.concatenate((p, v), axis=2).reshape(-1, 6))
-    start = jaxls.VarValues.make([states.with_value(given), spins.with_value(jnp.asarray(w))])
-    linear = "cholmod" if importlib.util.find_spec("sksparse") else "conjugate_gradient"
+    given = [jnp.asarray(part) for part in (problem.measured, problem.label, np.concatenate((p, v), axis=2), w)]
+    compiled = jax.jit(jax.vmap(solve_track) if tracks > 1 else solve_track)
 
     def solve() -> dict[str, Array]:
-        found = analyzed.solve(
-            start,
-            linear_solver=linear,
-            trust_region=None,
-            termination=jaxls.TerminationConfig(cost_tolerance=TOLERANCE, parameter_tolerance=TOLERANCE),
-            verbose=False,
-        )
-        whole = np.asarray(found[states]).reshape(tracks, n, 6)
-        return {"position": whole[..., :3], "velocity": whole[..., 3:], "spin": np.asarray(found[spins])}
+        found = compiled(*(given if tracks > 1 else [part[0] for part in given]))
+        states, spins = np.asarray(found[0]).reshape(tracks, n, 6), np.asarray(found[1]).reshape(tracks, 3)
+        return {"position": states[..., :3], "velocity": states[..., 3:], "spin": spins}
 
     return solve
 
@@ -95,8 +88,9 @@ def acceleration_of(problem: Problem):
     return network if layers else formula
 
 
-def _rollout(problem: Problem, acceleration):
-    h, start = float(problem.dt), jnp.asarray(problem.flight)
+def rollout(problem: Problem):
+    """All Runge-Kutta steps as one compiled scan."""
+    h, start, acceleration = float(problem.dt), jnp.asarray(problem.flight), acceleration_of(problem)
 
     def rate(x: jax.Array) -> jax.Array:
         return jnp.concatenate((x[3:6], acceleration(x[3:6], x[6:]), jnp.zeros(3)))

@@ -8,18 +8,14 @@ import torch
 from problem import Array, Problem
 from with_torch import acceleration_of, loss_of, rollout
 
+__all__ = ["estimate", "gradient", "rollout"]
 warnings.simplefilter("ignore")
 STEPS = 20
-TOLERANCE = 1e-10
-"""Relative change of the error at which it stops."""
+TOLERANCE = 1e-10  # Relative change of the error at which it stops
 
 
-def solver(problem: Problem, task: str):
+def estimate(problem: Problem):
     """A layer that solves all tracks as one batch."""
-    if task == "rollout":
-        return rollout(problem)
-    if task == "gradient":
-        return _gradient(problem)
     optimizer, inputs = layer(problem)
     n = problem.measured.shape[1]
 
@@ -32,7 +28,7 @@ def solver(problem: Problem, task: str):
     return solve
 
 
-def _gradient(problem: Problem):
+def gradient(problem: Problem):
     """Forward, and backward by one differentiable Gauss-Newton step, which Theseus calls implicit."""
     optimizer, inputs = layer(problem)
     last = f"x{problem.measured.shape[1] - 1}"
@@ -54,8 +50,7 @@ def layer(problem: Problem) -> tuple[th.TheseusLayer, dict[str, torch.Tensor]]:
     def step(optim_vars, aux_vars):
         x, y, w = (variable.tensor for variable in optim_vars)
         a = acceleration_of(problem, *(variable.tensor for variable in aux_vars))(x[..., 3:], w)
-        after = torch.cat((x[..., :3] + dt * x[..., 3:] + 0.5 * dt**2 * a, x[..., 3:] + dt * a), dim=-1)
-        return y - after
+        return y - torch.cat((x[..., :3] + dt * x[..., 3:] + 0.5 * dt**2 * a, x[..., 3:] + dt * a), dim=-1)
 
     def seen(optim_vars, aux_vars):
         return optim_vars[0].tensor[..., :3] - aux_vars[0].tensor

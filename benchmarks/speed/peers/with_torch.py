@@ -36,26 +36,6 @@ def loss_of(problem: Problem, drag: Tensor, magnus: Tensor, p: Tensor, v: Tensor
     return p.square().sum()
 
 
-def residual_of(problem: Problem):
-    """Whitened residuals over the steps (t, n - 1, 6) of positions and velocities (t, n, 3) and spins (t, 3)."""
-    dt, sigma, acceleration = float(problem.dt), torch.from_numpy(problem.step_sigma), acceleration_of(problem)
-
-    def residual(p: Tensor, v: Tensor, w: Tensor) -> Tensor:
-        before = v[:, :-1]
-        a = acceleration(before, w[:, None].expand_as(before))
-        steps = (p[:, 1:] - p[:, :-1] - dt * before - 0.5 * dt**2 * a, v[:, 1:] - before - dt * a)
-        return torch.cat(steps, dim=-1) / sigma
-
-    return residual
-
-
-def solver(problem: Problem, task: str):
-    """A rollout, step by step as torch runs it."""
-    if task != "rollout":
-        raise NotImplementedError(f"torch alone has no {task}")
-    return rollout(problem)
-
-
 def rollout(problem: Problem):
     """The rollout in torch's eager mode."""
     h, start, acceleration = float(problem.dt), torch.from_numpy(problem.flight)[None], acceleration_of(problem)
@@ -64,15 +44,15 @@ def rollout(problem: Problem):
         v, w = x[:, 3:6], x[:, 6:]
         return torch.cat((v, acceleration(v, w), torch.zeros_like(v)), dim=-1)
 
+    @torch.no_grad()
     def roll():
         x, states = start, []
-        with torch.no_grad():
-            for _ in range(ROLLOUT_STEPS):
-                k1 = rate(x)
-                k2 = rate(x + 0.5 * h * k1)
-                k3 = rate(x + 0.5 * h * k2)
-                x = x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + rate(x + h * k3))
-                states.append(x)
+        for _ in range(ROLLOUT_STEPS):
+            k1 = rate(x)
+            k2 = rate(x + 0.5 * h * k1)
+            k3 = rate(x + 0.5 * h * k2)
+            x = x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + rate(x + h * k3))
+            states.append(x)
         return {"states": torch.cat(states).numpy()}
 
     return roll

@@ -1,7 +1,9 @@
 """Solves one problem by one library in a process: `python worker.py LIBRARY TASK PROBLEM.npz`.
 
-It solves once, writes a line of JSON with the costs, and then obeys lines on its standard input: a number of timed
-solutions, or the name of a file for the solution. Runs in any environment that has numpy and the library.
+The module `with_LIBRARY` has a function for each task that it solves: from a problem to a function that solves it from
+its start and returns named arrays. The worker solves once, writes a line of JSON with the costs, and then obeys lines
+on its standard input: a number of timed solutions, or the name of a file for the solution. Runs in any environment that
+has numpy and the library.
 """
 
 import gc
@@ -10,7 +12,6 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,24 +21,22 @@ for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from problem import Array, Problem  # noqa: E402  the folder has to be known first
-
-Solver = Callable[[], dict[str, Array]]
-"""Solves the problem from its start: named arrays, ready in memory."""
+from problem import Problem  # noqa: E402  the folder has to be known first
 
 
 def main(library: str, task: str, path: str) -> None:
     """Solve, report, and obey until the input ends."""
-    begun = time.perf_counter()
     try:
-        solve: Solver = importlib.import_module(f"with_{library}").solver(Problem.load(path), task)
+        module = importlib.import_module(f"with_{library}")
+        if not hasattr(module, task):
+            raise NotImplementedError(f"no {task}")
+        solve = getattr(module, task)(Problem.load(path))
     except (ImportError, NotImplementedError) as error:
         print(json.dumps({"error": f"{type(error).__name__}: {error}"}), flush=True)
         return
     prepared = time.perf_counter()
     solution = solve()
-    first = time.perf_counter()
-    print(json.dumps({"prepared": prepared - begun, "first": first - prepared}), flush=True)
+    print(json.dumps({"first": time.perf_counter() - prepared}), flush=True)
     for line in sys.stdin:
         word = line.strip()
         if word.isdigit():

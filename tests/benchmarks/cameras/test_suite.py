@@ -9,8 +9,7 @@ import pytest
 
 from ballfg.benchmarks.cameras.clocks import FACTORS, NAIVE, clocks, compare
 from ballfg.benchmarks.cameras.scenes import Filmed, Scenario, judge, scenarios, truth_at
-from ballfg.benchmarks.cameras.suite import add_clocks, add_points, add_turns, add_velocities
-from ballfg.benchmarks.cameras.turned import TURN, turned, turns
+from ballfg.benchmarks.cameras.suite import TURN, add_clocks, add_points, add_turns, add_velocities, turned, turns
 from ballfg.benchmarks.results import Results
 from ballfg.simulation.scene.config import Clock
 from ballfg.simulation.scene.recording import Recording

@@ -16,7 +16,6 @@ from ballfg.benchmarks.diagnosis.ideal import (
     ideal_of,
     needed,
     power,
-    read_ideal,
 )
 from ballfg.diagnosis.hypotheses.signatures import visible_directions
 
@@ -58,9 +57,9 @@ def test_noncentrality_is_what_the_declared_model_leaves_of_exact_tracks(name: s
 def test_ideal_is_kept(tmp_path: Path) -> None:
     ideal, path = Ideal("of this case", 3, 12.5), tmp_path / "ideal-wind.json"
     ideal.save(path)
-    assert read_ideal(path, "of this case") == ideal
-    assert read_ideal(path, "of another") is None
-    assert read_ideal(tmp_path / "absent.json", "any") is None
+    assert Ideal.read(path, "of this case") == ideal
+    assert Ideal.read(path, "of another") is None
+    assert Ideal.read(tmp_path / "absent.json", "any") is None
     path.write_text("[]")
     with pytest.raises(ValueError, match=r"ideal-wind.json: must be an ideal test .* Delete it"):
-        read_ideal(path, "any")
+        Ideal.read(path, "any")

@@ -14,7 +14,7 @@ from ballfg.benchmarks.diagnosis.changes import CHANGES
 from ballfg.benchmarks.diagnosis.data import measured_dataset
 from ballfg.benchmarks.diagnosis.planted import TITLE, outcome_of, planted_cases, run_planted, strengths
 from ballfg.benchmarks.diagnosis.record import Found, Ranked, Record, case_digest
-from ballfg.benchmarks.diagnosis.runs import run_case
+from ballfg.benchmarks.diagnosis.suite import run_case
 from ballfg.benchmarks.results import Results
 from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.tracks import Dataset

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from ballfg.benchmarks.diagnosis.power_curve import power_curve
+from ballfg.benchmarks.diagnosis.ideal import power_curve
 
 
 def test_power_curve_recovers_the_one_that_made_the_outcomes() -> None:

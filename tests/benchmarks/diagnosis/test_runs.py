@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from ballfg.benchmarks.diagnosis.cases import Recording, planted_case
-from ballfg.benchmarks.diagnosis.runs import run_case
+from ballfg.benchmarks.diagnosis.suite import run_case
 from tests.diagnosis.made_diagnosis import silent
 
 

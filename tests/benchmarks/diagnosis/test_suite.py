@@ -16,13 +16,22 @@ from ballfg.benchmarks.diagnosis.cases import (
     planted_case,
     timed_cases,
 )
+from ballfg.benchmarks.diagnosis.data import planted_free
 from ballfg.benchmarks.diagnosis.ideal import Ideal
-from ballfg.benchmarks.diagnosis.record import Found, Ranked, Record, case_digest, read_record, record_of
+from ballfg.benchmarks.diagnosis.record import (
+    Found,
+    Ranked,
+    Record,
+    alarmed,
+    case_digest,
+    complete,
+    honest,
+    named,
+    record_of,
+    right,
+)
 from ballfg.benchmarks.diagnosis.rows import ALL, FAILED, HIDDEN, add_all, detectable
-from ballfg.benchmarks.diagnosis.runs import collect_records
-from ballfg.benchmarks.diagnosis.suite import run_loop
-from ballfg.benchmarks.diagnosis.true_model import planted_free
-from ballfg.benchmarks.diagnosis.verdicts import alarmed, complete, honest, named, right
+from ballfg.benchmarks.diagnosis.suite import collect_records, run_loop
 from ballfg.benchmarks.results import Results
 from tests.diagnosis.made_diagnosis import found, unexplained
 
@@ -113,14 +122,14 @@ def test_a_record_keeps_what_counts_and_returns_from_its_file(tmp_path: Path) ->
     assert kept.rounds[0][0].standing == "added"
     assert (kept.tracks, kept.judged, kept.seconds) == (50, 25, 12.5)
     kept.save(path)
-    assert read_record(path, "of this case") == kept
-    assert read_record(path, "of another") is None
-    assert read_record(tmp_path / "absent.json", "any") is None
+    assert Record.read(path, "of this case") == kept
+    assert Record.read(path, "of another") is None
+    assert Record.read(tmp_path / "absent.json", "any") is None
     content = json.loads(path.read_text())
     del content["found"][0]["alike"]
     path.write_text(json.dumps(content))
     with pytest.raises(ValueError, match=r"case.json: must be a finished case .* Delete it"):
-        read_record(path, "of this case")
+        Record.read(path, "of this case")
 
 
 def test_a_planted_candidate_is_kept_however_weak() -> None:

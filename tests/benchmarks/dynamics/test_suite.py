@@ -8,14 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ballfg.benchmarks.dynamics.contenders import Job, nominal_contender, truth_contender
-from ballfg.benchmarks.dynamics.fan import fan_of
-from ballfg.benchmarks.dynamics.jobs import collect_records
+from ballfg.benchmarks.dynamics.contenders import Job, fan_of, nominal_contender, truth_contender
+from ballfg.benchmarks.dynamics.jobs import METHODS, collect_records
 from ballfg.benchmarks.dynamics.measured import measured_shot
-from ballfg.benchmarks.dynamics.methods import METHODS
-from ballfg.benchmarks.dynamics.record import Record, read_record, task_digest
-from ballfg.benchmarks.dynamics.rows import add_rows
-from ballfg.benchmarks.dynamics.suite import Plan, _installed, run_dynamics
+from ballfg.benchmarks.dynamics.record import Record, task_digest
+from ballfg.benchmarks.dynamics.suite import Plan, _installed, add_rows, run_dynamics
 from ballfg.benchmarks.dynamics.truth import synthetic_task
 from ballfg.benchmarks.results import Results
 from ballfg.estimation import Estimate, Status
@@ -69,13 +66,13 @@ def test_a_broken_record_is_named(small: tuple[Results, Path, list[Path]], tmp_p
     path = tmp_path / "nominal-1.json"
     path.write_text("{")
     with pytest.raises(ValueError, match=r"nominal-1.json: must be a finished run .* Delete it"):
-        read_record(path, "any")
-    assert read_record(tmp_path / "absent.json", "any") is None
+        Record.read(path, "any")
+    assert Record.read(tmp_path / "absent.json", "any") is None
     content = json.loads((small[1] / "runs" / "nominal-1.json").read_text())
     del content["scores"][0]["apex"]
     path.write_text(json.dumps(content))
     with pytest.raises(ValueError, match="must be a finished run"):
-        read_record(path, content["digest"])
+        Record.read(path, content["digest"])
 
 
 def test_digest_tells_tasks_apart() -> None:
@@ -94,7 +91,7 @@ def test_digest_tells_tasks_apart() -> None:
 
 def test_seeds_are_averaged_and_shown(small: tuple[Results, Path, list[Path]]) -> None:
     task = synthetic_task(1, 12)
-    found = read_record(small[1] / "runs" / "nominal-1.json", task_digest(task, "untrained"))
+    found = Record.read(small[1] / "runs" / "nominal-1.json", task_digest(task, "untrained"))
     assert found is not None
     slower = replace(found, seed=2, training_time=10.0)
     results = Results("test", 1)
@@ -125,7 +122,7 @@ def test_fan_is_a_mirror_image_in_sidespin_and_returns_from_its_file(tmp_path: P
     assert fan.sidespin[5][-1][1] > fan.sidespin[2][-1][1] > 0.1  # turns to the left
     record = Record("d", "truth", 0, 0, 0.0, 0.0, 0, (), fan)
     record.save(tmp_path / "truth.json")
-    again = read_record(tmp_path / "truth.json", "d")
+    again = Record.read(tmp_path / "truth.json", "d")
     assert again is not None
     assert again.fan is not None
     assert again.fan.topspin.keys() == fan.topspin.keys()

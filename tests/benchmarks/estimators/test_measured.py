@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from ballfg.benchmarks.estimators.conformal import conformal_coverage
-from ballfg.benchmarks.estimators.measured import WHOLE, Measured, _add_smoothing, prediction_rmse
+from ballfg.benchmarks.estimators.measured import WHOLE, Measured, _add_smoothing, conformal_coverage, prediction_rmse
 from ballfg.benchmarks.results import Results
 from ballfg.estimation import Estimate, Status
 from ballfg.estimation.track_prediction import TrackPrediction

@@ -3,8 +3,16 @@
 import numpy as np
 import pytest
 
-from ballfg.benchmarks.intervals.protocol import HORIZON, OBSERVED, USUAL, judge, judged_both_ways
-from ballfg.benchmarks.intervals.suite import PLANTED, planted_config, simulated_config
+from ballfg.benchmarks.intervals.suite import (
+    HORIZON,
+    OBSERVED,
+    PLANTED,
+    USUAL,
+    judge,
+    judged_both_ways,
+    planted_config,
+    simulated_config,
+)
 from ballfg.dynamics import load_model
 from ballfg.estimation import dataset_settings, dataset_surfaces
 from ballfg.simulation import MeasurementNoise, SimulationConfig, write_simulation

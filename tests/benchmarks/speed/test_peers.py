@@ -13,12 +13,11 @@ from ballfg.benchmarks.speed.gate import SlowerError, check_ratios
 from ballfg.benchmarks.speed.peers import suite
 from ballfg.benchmarks.speed.peers.problem import Problem
 from ballfg.benchmarks.speed.peers.session import LibraryError, Session
-from ballfg.benchmarks.speed.suite import QUICK
 
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    whole = suite._problem(QUICK, None)
+    whole = suite._problem(None)
     return replace(whole, measured=whole.measured[:2], label=whole.label[:2])
 
 

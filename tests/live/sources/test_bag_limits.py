@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from ballfg.live.sources.bag_limits import check_bag
+from ballfg.live.sources.bag import check_bag
 from ballfg.simulation import SimulationConfig, simulate
 from tests.faults.bombs_of_others import OTHERS, mcap
 from tests.importing.test_forms import an_mcap_bag

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from ballfg.live.sources.lines import LineReader, Sample
+from ballfg.live.sources.sender import LineReader, Sample
 
 
 @pytest.mark.parametrize(

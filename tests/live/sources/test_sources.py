@@ -12,11 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from ballfg.live.sources.lines import Sample
-from ballfg.live.sources.replay import Replay, dataset_samples
-from ballfg.live.sources.sender import WAITING, Arrival, Line, Sender
+from ballfg.live.sources.sender import WAITING, Arrival, Line, Sample, Sender
 from ballfg.live.sources.sockets import listen
-from ballfg.live.sources.source import Inbox, Pipe, Source
+from ballfg.live.sources.source import Inbox, Pipe, Replay, Source, dataset_samples
 from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.tracks import read_dataset
 
