@@ -25,11 +25,8 @@ class CameraFactors(FactorBatch):
     micrometres, unless the ball bounces meanwhile.
 
     Args:
-        states: (m,) indices of the observed states.
-        camera: (m,) numbers of the cameras in the bank.
-        pixels: (m, 2) px.
-        covariances: (m, 2, 2) px^2.
-        bank: the cameras.
+        states: (m,) indices of the observed states.  camera: (m,) numbers of the cameras in the bank.
+        pixels: (m, 2) px.  covariances: (m, 2, 2) px^2.  bank: the cameras.
         delay: (m,) s, true time of each sighting minus that of its state; None: zeros.
         columns: (c,) index of the coefficient that is each camera's d, or `FIXED`. None: the factors do not depend on
             coefficients.

@@ -18,8 +18,7 @@ class BlockError:
 
     Attributes:
         row: of the batch.  column: which variable of the factor.  variable: its number.
-        entry: (i, j) of the worst element.
-        given: value of `compute` there.  difference: value of the differences.
+        entry: (i, j) of the worst element.  given: value of `compute` there.  difference: value of the differences.
         relative: their distance over the block's largest element.
     """
 

@@ -26,8 +26,7 @@ def bias_step(dt: Array, sigma: Array, memory_time: float) -> tuple[Array, Array
     """Decay of a bias over dt: b' = a b + noise, with a = exp(-dt / memory time).
 
     Args:
-        dt: (m,) s.
-        sigma: (3,) m, standard deviation s of the bias per axis.
+        dt: (m,) s.  sigma: (3,) m, standard deviation s of the bias per axis.
         memory_time: s, over which the bias falls to 1 / e.
     Returns: a (m,), dimensionless; the noise's standard deviations s sqrt(1 - a^2), (m, 3) m.
     """
@@ -38,12 +37,10 @@ class BiasedPositionFactors(FactorBatch):
     """r = W (p_i + b_i - z_i): a measured position is the state's position plus the tracker's bias plus noise.
 
     Args:
-        states: (m,) indices of the observed states.
-        measured: (m, 3) m.
+        states: (m,) indices of the observed states.  measured: (m, 3) m.
         sigma: (m, 3) m, standard deviation per axis of the white error.
         stamps: (m, 3, 3) m^2, covariance of the displacement by the stamps' errors; None if stamps are exact.
-        loss: a robust one if tracks have outliers.
-        biased: True if the graph has biases; without them b is zero.
+        loss: a robust one if tracks have outliers.  biased: True if the graph has biases; without them b is zero.
 
     Raises: ValueError: a wrong shape, or a position that is not finite.
     """
@@ -113,10 +110,8 @@ class BiasFactors(FactorBatch):
     """r = (b_{i+1} - a_i b_i) / (s sqrt(1 - a_i^2)), a_i = exp(-dt_i / memory time): the bias decays and is renewed.
 
     Args:
-        states: (m,) index i; each factor ties the bias at state i to that at state i + 1.
-        dt: (m,) s.
-        sigma: (3,) m, standard deviation s of the bias per axis.
-        memory_time: s, over which the bias falls to 1 / e.
+        states: (m,) index i; each factor ties the bias at state i to that at state i + 1.  dt: (m,) s.
+        sigma: (3,) m, standard deviation s of the bias per axis.  memory_time: s, over which the bias falls to 1 / e.
 
     Raises: ValueError: if a dt, a sigma or the memory time is not positive.
     """
@@ -155,9 +150,7 @@ class BiasFactors(FactorBatch):
 class BiasStartFactors(FactorBatch):
     """r = b_i / s: the prior of the first bias, about zero.
 
-    Args:
-        states: (m,) indices of states without an earlier bias.
-        sigma: (3,) m, standard deviation s per axis.
+    Args: states: (m,) indices of states without an earlier bias.  sigma: (3,) m, standard deviation s per axis.
     """
 
     sees_biases: ClassVar[bool] = True

@@ -43,8 +43,7 @@ class DynamicsFactors(FactorBatch):
     Args:
         model: an `AugmentedModel` adds the coefficients as a third variable of every factor. Its own come first; the
             motion does not depend on the others, which are unknowns of observations.
-        states: (m,) index i; each factor ties state i to state i + 1.
-        dt: (m,) s.
+        states: (m,) index i; each factor ties state i to state i + 1.  dt: (m,) s.
         covariance: (m, 9, 9) m, m/s, rad/s and their products, of the process noise over dt; or (m, 3, 3) of position,
             velocity and spin along any axis, if all axes are alike and independent.
         kicks: the contacts and hits in that covariance, for learning it; free flight by default.
@@ -162,11 +161,8 @@ class SurfaceFactors(DynamicsFactors):
     """Motion in contact with surfaces.
 
     Args:
-        model: as for `DynamicsFactors`, like the others except for the heights.
-        states: (m,) index i.
-        dt: (m,) s.
-        covariance: (m, 9, 9) m, m/s, rad/s and their products.
-        heights: (m, ...) m, of the surfaces.
+        model: as for `DynamicsFactors`, like the others except for the heights.  states: (m,) index i.  dt: (m,) s.
+        covariance: (m, 9, 9) m, m/s, rad/s and their products.  heights: (m, ...) m, of the surfaces.
         kicks: the contacts and hits in the covariance.
     """
 

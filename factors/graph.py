@@ -57,8 +57,7 @@ class Minimum:
         values: the point.
         error: objective there; the predicted one if the last step was taken without another linearisation.
         step: the last undamped linear solution, there or one step before, whose triangle gives the covariances.
-        convergence: the reason for the end.
-        iterations: number of linear solutions.
+        convergence: the reason for the end.  iterations: number of linear solutions.
         linearized: the factors, linearised at the point or, if it is `beyond` them, one step before.
         beyond: True if the last step was taken without another linearisation.
         distance: approximate distance to the exact minimum, in posterior standard deviations; infinite if unknown.

@@ -30,8 +30,7 @@ class GtsamLevenbergMarquardt(LevenbergMarquardt):
 
     Attributes:
         tolerance: the search ends when the distance to the minimum, in posterior standard deviations, is shorter.
-        max_iterations: largest number of GTSAM's iterations.
-        first_damping: GTSAM's first lambda.
+        max_iterations: largest number of GTSAM's iterations.  first_damping: GTSAM's first lambda.
     """
 
     tolerance: float = 2e-6
@@ -88,12 +87,9 @@ class GtsamLevenbergMarquardt(LevenbergMarquardt):
 class Marginals:
     """GTSAM's marginals of states and coefficients, by QR; `gtsam.Marginals` offers Python Cholesky only.
 
-    Args:
-        linear: factors, linearised at a minimum.
-        values: the minimum.
+    Args: linear: factors, linearised at a minimum.  values: the minimum.
 
-    Attributes:
-        distance: to the minimum of the linearised problem, in posterior standard deviations.
+    Attributes: distance: to the minimum of the linearised problem, in posterior standard deviations.
 
     Raises: RuntimeError: GTSAM's, of a graph that leaves a variable undetermined.
     """

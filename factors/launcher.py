@@ -22,8 +22,7 @@ class LauncherSpinFactors(FactorBatch):
     Args:
         states: (m,) indices of the states at which the ball leaves the launcher.
         settings: (m, k) of the launcher, in the launcher's own units.
-        embedding: from settings to spin; its weights may be learned.
-        sigma: (m, 3) rad/s.
+        embedding: from settings to spin; its weights may be learned.  sigma: (m, 3) rad/s.
         loss: a robust one if some settings are wrong.
 
     Raises: ValueError: a wrong shape, or a sigma that is not positive.

@@ -18,8 +18,7 @@ class PriorFactors(FactorBatch):
     """r = W (x_i - mean_i), W (r, d): rows of W may use a part of the variable only.
 
     Args:
-        variables: (m,) index of each state, or `COEFFICIENTS`.
-        mean: (m, d) in the variable's own units.
+        variables: (m,) index of each state, or `COEFFICIENTS`.  mean: (m, d) in the variable's own units.
         information_root: (m, r, d) matrices W, one over the variable's own units.
         loss: on the norm of a whitened residual.
     """
@@ -60,8 +59,7 @@ class CoefficientPriorFactors(PriorFactors):
     """Priors on the coefficients of a track, with the model's own values as means.
 
     Args:
-        model: with the coefficients.
-        sigma: (p,) standard deviations, in the coefficients' own units.
+        model: with the coefficients.  sigma: (p,) standard deviations, in the coefficients' own units.
         others: number of unknowns of observations that follow the model's coefficients; these factors ignore them.
 
     Raises: ValueError: if a sigma is not positive and finite.
@@ -138,8 +136,7 @@ def coefficient_prior(mean: Array, sigma: Array, before: int = 0) -> PriorFactor
     """A prior on shared coefficients.
 
     Args:
-        mean: (p,) in the coefficients' own units.
-        sigma: (p,) standard deviations, in the same units.
+        mean: (p,) in the coefficients' own units.  sigma: (p,) standard deviations, in the same units.
         before: number of coefficients before these p, which the prior ignores.
     Raises: ValueError: if a sigma is not positive and finite.
     """

@@ -17,12 +17,9 @@ from ballfg.state import STATE_DIM
 class AugmentedModel(BallModel):
     """A model with some of its scalar parameters read from columns 9, 10, ... of the state.
 
-    Args:
-        model: any ball model.
-        names: parameter names as in `model.named_parameters()`, for instance `flight.drag.k`.
+    Args: model: any ball model.  names: parameter names as in `model.named_parameters()`, for instance `flight.drag.k`.
 
-    Attributes:
-        names: of the parameters.
+    Attributes: names: of the parameters.
 
     Raises: ValueError: if a name is not a scalar parameter of the model.
     """

@@ -261,8 +261,7 @@ def take_rows(module: M, rows: Tensor, count: int) -> M:
 
     Args:
         module: for instance a `BallModel`; returned itself if nothing was substituted.
-        rows: boolean mask (n,) or indices.
-        count: n, the size of the whole batch.
+        rows: boolean mask (n,) or indices.  count: n, the size of the whole batch.
     """
     names = module.__dict__.get(_SUBSTITUTED)
     children = {name: child for name, child in module._modules.items() if child is not None}

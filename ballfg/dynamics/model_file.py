@@ -90,8 +90,7 @@ def model_from_dict(
 
     Args:
         content: the sections `flight`, `bounce`, `measurement`, `variations` and `populations` (docs/models.md).
-        radius: m, of the ball.
-        inertia_factor: moment of inertia divided by m R^2.
+        radius: m, of the ball.  inertia_factor: moment of inertia divided by m R^2.
         where: start of the error messages.
     Raises: ValueError: if it names a section, effect or coefficient that does not exist, or a value out of its bounds.
     """

@@ -28,8 +28,7 @@ class SpinGroup:
     Across is z x forward: topspin turns about it.
 
     Attributes:
-        mean: (3,) rad/s.
-        sigma: (3,) rad/s, standard deviations of a new shot about the mean.
+        mean: (3,) rad/s.  sigma: (3,) rad/s, standard deviations of a new shot about the mean.
         tracks: number of tracks behind both, the weight in the mixture.
 
     Raises: ValueError: a number that is not finite, a sigma that is not positive, no track. TypeError: no number.

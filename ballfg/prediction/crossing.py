@@ -41,8 +41,7 @@ class Crossing:
     """One event of one ball.
 
     Attributes:
-        time: s, on the ball's clock.  time_sigma: s.
-        state: (9,) at the event.
+        time: s, on the ball's clock.  time_sigma: s.  state: (9,) at the event.
         covariance: (9, 9) of the state at the event, at the event's own uncertain time.
     """
 

@@ -25,11 +25,8 @@ def edge_doubt(model: BallModel, mean: Tensor, covariance: Tensor, h: Tensor, su
     """Covariance at the end of a step from the balls that take the other way than the mean.
 
     Args:
-        model: of the ball.
-        mean: (1, d) state at the start of the step.
-        covariance: (1, d, d) of it.
-        h: (1,) s, the step; at most one contact with the table.
-        surfaces: table and floor.
+        model: of the ball.  mean: (1, d) state at the start of the step.  covariance: (1, d, d) of it.
+        h: (1,) s, the step; at most one contact with the table.  surfaces: table and floor.
     Returns: (9, 9); 0 if the ball does not come down to the table's level in the step, or far from every edge.
     """
     height = mean.new_tensor([surfaces.table_height])

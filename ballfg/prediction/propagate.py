@@ -42,8 +42,7 @@ class Prediction:
     """Future states. Near a contact they include the balls that have bounced and those that have not.
 
     Attributes:
-        times: (n, k) s, on each track's clock.
-        states: (n, k, 9) position m, velocity m/s, spin rad/s.
+        times: (n, k) s, on each track's clock.  states: (n, k, 9) position m, velocity m/s, spin rad/s.
         covariances: (n, k, 9, 9) of the states, in the products of those units; without measurement noise.
     """
 
@@ -72,9 +71,7 @@ class Found:
 
     Attributes:
         end: `events.NONE`, `FOUND`, or `HARD` before a step of rest, several bounces, or a bounce at a table's edge.
-        belief: at the end.
-        gradient: (9 + p,) of the event there.
-        rate: (9 + p,) 1/s, the state's rate of change.
+        belief: at the end.  gradient: (9 + p,) of the event there.  rate: (9 + p,) 1/s, the state's rate of change.
     """
 
     end: float

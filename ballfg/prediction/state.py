@@ -21,10 +21,7 @@ if TYPE_CHECKING:
 class World:
     """The model, surfaces and noise for predictions from a state.
 
-    Attributes:
-        model: of the ball.
-        surfaces: table and floor.
-        process: noise of the motion.
+    Attributes: model: of the ball.  surfaces: table and floor.  process: noise of the motion.
     """
 
     model: BallModel

@@ -30,16 +30,12 @@ class BallKind:
 
     name: str
     """Part of the dataset's name."""
-
     ball: Ball
     """Radius m, mass kg."""
-
     model: AnalyticModel
     """Model of its motion, with the radius."""
-
     surfaces: Surfaces
     """Its surfaces; z of the table's or the court's surface in `table_height`, m."""
-
     launcher: SimulatedLauncher = field(default=TABLE_LAUNCHER)
     """Place and speed of its start, and the end of its track."""
 

@@ -78,11 +78,8 @@ def looking_at(
     """A camera at one point, directed at another and level.
 
     Args:
-        centre: (3,) m, its place.
-        target: (3,) m, the point at the principal point.
-        focal: px.
-        size: width and height of the image, px.
-        distortion: in OpenCV's order.
+        centre: (3,) m, its place.  target: (3,) m, the point at the principal point.  focal: px.
+        size: width and height of the image, px.  distortion: in OpenCV's order.
         off_centre: px, from the middle of the image to the principal point.
     Raises: ValueError: centre and target on a vertical line, or arguments that `Camera` refuses.
     """

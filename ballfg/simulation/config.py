@@ -24,25 +24,18 @@ class MeasurementNoise:
 
     position: float = bounded(0.003, 0.0, 1.0)
     """m, standard deviation of each measured coordinate."""
-
     dropout: float = bounded(0.0, 0.0, 0.95)
     """Probability that a frame is missing, for each frame by itself. Two frames of a track always remain."""
-
     jitter: float = bounded(0.0, 0.0, 1.0)
     """s, standard deviation of the recorded stamp about the true time; cut off at 3 sigma. At most 0.15 frames."""
-
     outliers: float = bounded(0.0, 0.0, 1.0)
     """Probability that a position is an outlier."""
-
     outlier_size: float = bounded(0.1, 0.0, 10.0)
     """m, typical distance of an outlier: in any direction, uniform between half and one and a half times this."""
-
     spin: float = bounded(4.0, 0.0, 1000.0)
     """rad/s, standard deviation of each component of the spin labels."""
-
     memory: float = bounded(0.0, 0.0, 1.0)
     """m, standard deviation of an error of each coordinate that lasts from frame to frame; files do not state it."""
-
     memory_time: float = bounded(0.015, 1e-4, 10.0)
     """s, over which the correlation of that error falls to 1 / e."""
 
@@ -59,13 +52,10 @@ class MotionNoise:
 
     acceleration: float = bounded(0.0, 0.0, 10.0)
     """m/s^1.5, white-noise density of the acceleration: over dt the variance of a velocity grows by its square dt."""
-
     spin: float = bounded(0.0, 0.0, 1000.0)
     """rad/s^1.5, the same for the angular acceleration."""
-
     contact_velocity: float = bounded(0.0, 0.0, 2.0)
     """m/s, standard deviation of a kick to each velocity component after a contact; the ball always leaves upwards."""
-
     contact_spin: float = bounded(0.0, 0.0, 1000.0)
     """rad/s, standard deviation of a kick to each spin component after a contact."""
 
@@ -92,31 +82,22 @@ class SimulationConfig:
 
     tracks: int = bounded(717, 1, MAX_TRACKS)
     """Number of tracks; the paper has 717."""
-
     rate: float = bounded(100.0, 5.0, 10_000.0)
     """Hz, frames per second."""
-
     seed: int = bounded(0, 0, MAX_SEED)
     """Seed of all random numbers."""
-
     ball: BallKind = field(default_factory=table_tennis)
     """The ball, the model declared for it, its surface and its launcher."""
-
     settings: Mapping[str, Sequence[int]] = field(default_factory=dict)
     """Levels by launcher setting (topspin, sidespin, speed), for restricted settings."""
-
     noise: MeasurementNoise = field(default_factory=MeasurementNoise)
     """Noise of the measurement."""
-
     process: MotionNoise = field(default_factory=MotionNoise)
     """Noise of the motion."""
-
     undeclared: tuple[Effect, ...] = ()
     """Effects that act although no model file declares them; applied in this order."""
-
     spin_labels: bool = True
     """True to write the spin at the first sample as a label; the launcher's settings always are."""
-
     block: int = bounded(256, 1, MAX_TRACKS)
     """Number of tracks computed at once; 256 take 4 MB of states. Another number gives another dataset for one seed."""
 

@@ -28,10 +28,8 @@ class SimulatedTrack:
 
     track: Track
     """Stamps, positions and labels with all their noise."""
-
     true_times: Array
     """(n,) s, true times of the frames."""
-
     true_states: Array
     """(n, 9) the ball's state at those times."""
 
@@ -43,10 +41,8 @@ def measure(
     """The tracks of a block of shots.
 
     Args:
-        model: the true ball without random kicks, with its measurement effects.
-        motion: (n, k) true frames.
-        settings: (n, 3) of the launcher.
-        block: number of the block, which picks the random streams.
+        model: the true ball without random kicks, with its measurement effects.  motion: (n, k) true frames.
+        settings: (n, 3) of the launcher.  block: number of the block, which picks the random streams.
         first: number of its first shot, for the names.
     """
     noise, shape = config.noise, motion.states.shape[:2]

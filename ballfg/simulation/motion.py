@@ -30,7 +30,6 @@ class TrueMotion:
 
     states: NDArray[np.float64]
     """(n, k, 9); undefined after the end of a track."""
-
     lengths: NDArray[np.int64]
     """(n,) frames of each track."""
 
@@ -48,11 +47,8 @@ def simulate_motion(
     """Follows shots until they leave the launcher's view or last too long.
 
     Args:
-        start: (n, 9) first states.
-        rate: Hz.
-        launcher: determines the end of a track.
-        noise: process noise of the flight; that of contacts is in `model`.
-        rng: draws the process noise.
+        start: (n, 9) first states.  rate: Hz.  launcher: determines the end of a track.
+        noise: process noise of the flight; that of contacts is in `model`.  rng: draws the process noise.
     Returns: the frames; the first is `start`.
     """
     frames = max(MIN_FRAMES, math.floor(launcher.duration * rate + 1e-9) + 1)

@@ -45,8 +45,7 @@ class NeighbourCovariances:
     """Covariances of n states of w numbers (biases among them) and p coefficients, those of neighbours among them.
 
     Attributes:
-        states: (n, w, w).
-        cross: (n, w, w + p), of each state with the next one and with the coefficients.
+        states: (n, w, w).  cross: (n, w, w + p), of each state with the next one and with the coefficients.
         coefficients: (p, p).
     """
 

@@ -221,8 +221,7 @@ def eliminate(system: Array, start: Index, width: int, held: int, root: Root) ->
 
     Args:
         system, start, width: as above, with the rows of the coefficients alone behind those of the last state.
-        held: number of the last coefficients that fade along the chain.
-        root: written.
+        held: number of the last coefficients that fade along the chain.  root: written.
     """
     n, columns, p = len(start) - 2, system.shape[1], len(root.coefficients)
     carries, shared = np.zeros((BLOCK + 1, width, columns)), np.zeros((BLOCK + 1, p, columns))

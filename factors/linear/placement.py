@@ -34,8 +34,7 @@ def place_residuals(system: Array, free: Index, variables: Index, residual: Arra
 
     Args:
         system: (r, k) rows of all factors, zeros to begin with; whitened, each column per unit of its number.
-        free: (n + 1,) the next free row of each state; updated.
-        variables: (m, a).  residual: (m, d) whitened.
+        free: (n + 1,) the next free row of each state; updated.  variables: (m, a).  residual: (m, d) whitened.
         rows, firsts: (m,) written: the first row of each factor, and its first state.
     """
     n, end = len(free) - 1, system.shape[1] - 1

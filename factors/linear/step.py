@@ -29,8 +29,7 @@ class Step:
 
     Attributes:
         states: (n, 9 + b) m, m/s, rad/s, and m of biases: part of the step d that minimises |r + J d|^2 (+ damping).
-        coefficients: (p,) in their own units, the other part of it.
-        root: the triangle of the elimination.
+        coefficients: (p,) in their own units, the other part of it.  root: the triangle of the elimination.
         decrease: half of |r|^2 - |r + J d|^2, the decrease of the objective predicted by the linear model.
     """
 
@@ -44,10 +43,8 @@ class Step:
         """The step R d = y with its predicted decrease; None if it is not finite.
 
         Args:
-            root: R and y.
-            states: (n, 9 + b) m, m/s, rad/s, m, and
-            coefficients: (p,) in their own units: d.
-            damping: Marquardt's lambda.
+            root: R and y.  states: (n, 9 + b) m, m/s, rad/s, m, and
+            coefficients: (p,) in their own units: d.  damping: Marquardt's lambda.
             diagonal: (n + 1, w + p) of `damped_rows`, each in the inverse square of its unit.
         """
         if not (np.isfinite(states).all() and np.isfinite(coefficients).all()):
@@ -81,8 +78,7 @@ def solve(linearized: Sequence[Rows], values: Values, damping: float = 0.0) -> S
     """Minimises the linearised, reweighted objective.
 
     Args:
-        linearized: all batches of a graph at `values`.
-        values: the point; its shapes give the variables.
+        linearized: all batches of a graph at `values`.  values: the point; its shapes give the variables.
         damping: Marquardt's lambda, relative to the diagonal of J^T J.
     Returns: None if the system is singular or its solution is not finite.
     Raises: ValueError: if a factor links states that are not neighbours.

@@ -43,8 +43,7 @@ class Function:
     Attributes:
         compute: `compute(x, c, w, xt, ct, y, yt)`: n states x (n, 9), their coefficients c (n, p), weights w (k,),
             tangents xt (n, 9, d) and ct (n, p, d); writes the results y (n, m) and their tangents yt (n, m, d).
-        names: of the p coefficients that the function uses, as in `model.named_parameters()`.
-        size: m.
+        names: of the p coefficients that the function uses, as in `model.named_parameters()`.  size: m.
         weigh: computes the weights from a model's tables; None if there are none.
     """
 
@@ -59,8 +58,7 @@ class CompiledModel:
     """The functions of a ball model.
 
     Attributes:
-        rates: of the velocity, then of the spin, (6,).
-        impact: state after an impact, (9,).
+        rates: of the velocity, then of the spin, (6,).  impact: state after an impact, (9,).
         surface: offset of surfaces above their declared heights in m, and their slopes along x and y, (3,).
         radius: m, of the ball.
     """

@@ -25,14 +25,11 @@ class Moving:
     """Balls that machine code moves, with the derivatives of their states by the initial ones.
 
     Args:
-        model: the ball; coefficients that travel with the states are columns of the states.
-        functions: of the model.
-        states: (n, 9 + p).
-        width: d, 9 + p, or 0 for no derivatives.
+        model: the ball; coefficients that travel with the states are columns of the states.  functions: of the model.
+        states: (n, 9 + p).  width: d, 9 + p, or 0 for no derivatives.
 
     Attributes:
-        states: (n, 9) where the balls are.
-        moved: (n, 9, d) derivatives by the initial states.
+        states: (n, 9) where the balls are.  moved: (n, 9, d) derivatives by the initial states.
         elapsed, slower: (n,) s so far, and (n, d) its derivatives: contacts come sooner or later.
     """
 

@@ -131,9 +131,7 @@ def fly_through(
     caller to see in the returned times.
 
     Args:
-        model: the ball.
-        state: (n, 9).
-        dt: (n,) s.
+        model: the ball.  state: (n, 9).  dt: (n,) s.
         heights: for each contact, in order, the surface's height in m, scalar or (n,).
     Returns: state after dt (n, 9), contact times since the start (n, len(heights)) s. NaN in rows in which a contact
         never comes; they have no part in any gradient.

@@ -112,8 +112,7 @@ class _Work:
     """The values that all derivatives of a step share.
 
     Attributes:
-        after: (n, 9) the state after the step.
-        parameters: of the model, those that are learned.
+        after: (n, 9) the state after the step.  parameters: of the model, those that are learned.
         shares: (4, n, 1) s, the part of the step for which each stage's slope counts.
     """
 

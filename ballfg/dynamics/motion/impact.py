@@ -32,8 +32,7 @@ def apply_impulse(impact: Impact, radius: float, inertia_factor: float) -> tuple
     """Velocity and spin after an impact.
 
     Args:
-        impact: incoming motion and coefficients; shapes in `Impact`.
-        radius: m.
+        impact: incoming motion and coefficients; shapes in `Impact`.  radius: m.
         inertia_factor: moment of inertia divided by m R^2; 2/3 for a thin shell.
     Returns: velocity (..., 3) m/s and spin (..., 3) rad/s after the impact. The spin about the normal stays.
     """

@@ -15,10 +15,7 @@ from ballfg.dynamics.motion.limits import step_count
 def fly(model: BallModel, state: Tensor, dt: Tensor) -> Tensor:
     """The state after `dt` of free flight, without surfaces.
 
-    Args:
-        model: the ball.
-        state: (..., 9).
-        dt: (...) s, broadcast against the batch; negative goes back in time.
+    Args: model: the ball.  state: (..., 9).  dt: (...) s, broadcast against the batch; negative goes back in time.
     Returns: (..., 9), differentiable in the state, in dt and in the model's parameters.
     """
     if not followed(state, dt):
@@ -75,8 +72,7 @@ def batch_jacobian(
     """A row-wise function and its derivative, in one autograd call on the batch repeated once per output.
 
     Args:
-        function: maps (..., n, 9) to (..., n, m), each row by itself.
-        state: (n, 9).
+        function: maps (..., n, 9) to (..., n, m), each row by itself.  state: (n, 9).
         outputs: m, where it is known; else one more call finds it.
     Returns: value (n, m) and Jacobian (n, m, 9); both detached.
     """

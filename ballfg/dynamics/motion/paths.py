@@ -31,9 +31,7 @@ def paths(model: BallModel, state: Tensor, times: Tensor, surfaces: Surfaces) ->
     """The states at a sequence of times.
 
     Args:
-        model: the ball.
-        state: (n, 9) at time 0.
-        times: (k,) or (n, k) s since then, not decreasing, not negative.
+        model: the ball.  state: (n, 9) at time 0.  times: (k,) or (n, k) s since then, not decreasing, not negative.
         surfaces: table and floor.
     Returns: (n, k, 9), differentiable once in the states and the parameters, through the contact times too.
     Raises: ValueError: if the times are negative or decrease.
@@ -71,10 +69,8 @@ class _Arc:
 
     Attributes:
         nodes: (j + 1, m, 9) states, `MAX_STEP` apart; a ball that has landed stays where it was.
-        slopes: (j + 1, m, 9) their derivatives by time.
-        landed: (m,) bool, the ball came down on a surface.
-        step: (m,) the step in which it did.
-        height: (m,) m, of that surface.
+        slopes: (j + 1, m, 9) their derivatives by time.  landed: (m,) bool, the ball came down on a surface.
+        step: (m,) the step in which it did.  height: (m,) m, of that surface.
         resting: (m,) bool, the ball lay on a surface from the start.
     """
 

@@ -27,8 +27,7 @@ class FeatureDensity(nn.Module):
     """The weight p / (p + edge) of the density p of Gaussian kernels; without kernels it is zero everywhere.
 
     Attributes:
-        centres: (c, f) features over their spreads.
-        spread: (f,) unit of each feature.
+        centres: (c, f) features over their spreads.  spread: (f,) unit of each feature.
         width: () standard deviation of a kernel in these units.
         edge: () density at which the weight is one half; the peak of a kernel counts as one.
     """
@@ -60,9 +59,7 @@ class FeatureDensity(nn.Module):
 
         Every track counts the same, however many samples it has.
 
-        Args:
-            groups: (n, f) features of each track.
-            features: f.
+        Args: groups: (n, f) features of each track.  features: f.
         """
         groups = [group for group in groups if len(group)]
         if len(groups) < LEAST_GROUPS:

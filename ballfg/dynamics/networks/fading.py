@@ -31,8 +31,7 @@ class Fading(nn.Module):
 
     Attributes:
         flying, bouncing: densities of the features of flights and of contacts.
-        flight, contact: () the unknown shares; zero.
-        acceleration: () m/s^2, usual size of the correction of a flight.
+        flight, contact: () the unknown shares; zero.  acceleration: () m/s^2, usual size of the correction of a flight.
         velocity: () m/s, of the correction of a contact; that of the spin counts as velocity of the ball's surface.
         strength: share of the correction that is used at weight one; 1, in a foreign room `abroad`.
         abroad: () that share: `ABROAD` if held-out training tracks are predicted better with it, else 0.
@@ -62,8 +61,7 @@ class Fading(nn.Module):
         """Fits the densities to training tracks.
 
         Args:
-            flights: (n, 9) states of each track in flight.
-            contacts: (n, 9) states of each track before its contacts.
+            flights: (n, 9) states of each track in flight.  contacts: (n, 9) states of each track before its contacts.
             radius: m.
         """
         seen = [flight_frame(states).features.numpy() for states in flights]

@@ -44,9 +44,7 @@ class FlightFrame:
     Attributes:
         features: (..., 3) invariants in (0, 1]: 1 / (1 + x^2) of the speed, the spin along the flight and the spin
             across it, each over its scale.
-        velocity: (..., 3) m/s.
-        spin: (..., 3) over `SPIN_SCALE`.
-        cross: (..., 3) m/s, spin x velocity.
+        velocity: (..., 3) m/s.  spin: (..., 3) over `SPIN_SCALE`.  cross: (..., 3) m/s, spin x velocity.
         helicity: (..., 1) m/s, spin . velocity: a pseudoscalar.
     """
 
@@ -91,10 +89,8 @@ class ContactFrame:
     Attributes:
         features: (..., 6) invariants in (-1, 1): lengths of slip, of v_xy across the slip, and of radius w_z, then
             v_xy along the slip, v_z, and `twist` times `turn`, each squashed by x / sqrt(1 + x^2).
-        direction: (..., 2) of the slip, shorter than one where there is little.
-        velocity: (..., 2) v_xy.
-        side: (..., 2) `twist` z x direction.
-        turn: (..., 1) z . (direction x v_xy): a pseudoscalar.
+        direction: (..., 2) of the slip, shorter than one where there is little.  velocity: (..., 2) v_xy.
+        side: (..., 2) `twist` z x direction.  turn: (..., 1) z . (direction x v_xy): a pseudoscalar.
         twist: (..., 1) radius times w_z: a pseudoscalar.
     """
 

@@ -34,8 +34,7 @@ class LearnedModel(BallModel):
     tangential change in a bounce. With a base it starts as the base.
 
     Attributes:
-        architecture: kind and sizes of the networks.
-        flight: network of the rates.  contact: network of the bounce.
+        architecture: kind and sizes of the networks.  flight: network of the rates.  contact: network of the bounce.
         base: the model to correct, or None.
         offset: () m by which surfaces lie above their declared heights; the base's where there is one.
         fading: how the correction fades outside of the training data; None without a base, and before the training.

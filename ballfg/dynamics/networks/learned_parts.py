@@ -26,8 +26,7 @@ class GramSchmidtFlight(nn.Module):
     """Rates in free flight: a network's coefficients on Gram-Schmidt vectors, plus a vertical bias.
 
     Args:
-        kind, width, depth: of the network.
-        spin_rate: give the angular acceleration too.
+        kind, width, depth: of the network.  spin_rate: give the angular acceleration too.
         falls: start from free fall; else from no acceleration at all, for a correction.
         generator: of the first weights.
 
@@ -80,10 +79,8 @@ class GramSchmidtContact(nn.Module):
     """A bounce: a network's coefficients of Gram-Schmidt vectors in the plane change a first guess of it.
 
     Args:
-        kind, width, depth: of the network.
-        radius: m.
-        first: restitution of the guess; 1 where the guess is another model's bounce.
-        generator: of the first weights.
+        kind, width, depth: of the network.  radius: m.
+        first: restitution of the guess; 1 where the guess is another model's bounce.  generator: of the first weights.
     """
 
     def __init__(

@@ -30,9 +30,7 @@ class SpinEmbedding(nn.Module):
         categories: the values that each text label takes.
         initial: (k, 3) rad/s, local spin (forward, across, up) per unit of each setting; none: zero.
 
-    Attributes:
-        names: one for each setting: `topspin`, `group=backspin`.
-        weight: (3, k), in units of `SPIN_UNIT`.
+    Attributes: names: one for each setting: `topspin`, `group=backspin`.  weight: (3, k), in units of `SPIN_UNIT`.
 
     Raises: ValueError: if labels or the values of a category repeat, a category has no label, or `initial` has another
         shape.

@@ -50,7 +50,6 @@ class Backdrop:
 
     image: Image
     """(h, w, 3) blue, green, red, grey levels."""
-
     distance: Image
     """(h, w) m, from the camera to the visible surface."""
 
@@ -95,10 +94,8 @@ class _Seen:
 
     colours: Image
     """(n, 3)."""
-
     distance: Image
     """(n,) m."""
-
     faces: NDArray[np.uint8]
     """(n,) numbers of faces, including the white lines of the table."""
 

@@ -32,10 +32,8 @@ class BallImage:
 
     rect: Rect
     """Its part of the image."""
-
     cover: Array
     """(h, w) share of the exposure and of the pixel that the ball covers, 0 to 1."""
-
     light: Array
     """(h, w) light from the ball: `cover` times the shading, at most `cover`."""
 
@@ -43,9 +41,7 @@ class BallImage:
 def ball_image(camera: Camera, path: Array, radius: float) -> BallImage | None:
     """The image of a ball that moves along a path while the shutter is open.
 
-    Args:
-        path: (m, 3) m, its centre, evenly in time from the opening to the closing.
-        radius: m.
+    Args: path: (m, 3) m, its centre, evenly in time from the opening to the closing.  radius: m.
     Returns: None if no pixel of the camera sees it.
     """
     pixels = camera.project(path)

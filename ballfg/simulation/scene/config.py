@@ -28,7 +28,6 @@ class Clock:
 
     phase: float = bounded(0.0, 0.0, 1.0)
     """s, true time of the middle of its first exposure."""
-
     offset: float = bounded(0.0, -1.0, 1.0)
     """s, undeclared delay of its stamps, on top of the camera's `time_offset`."""
 
@@ -45,43 +44,30 @@ class SceneConfig:
 
     shots: int = bounded(6, 1, MAX_SHOTS)
     """Balls launched one after the other: the first shots of `ballfg simulate` with the same seed and settings."""
-
     interval: float = bounded(2.0, 0.1, 60.0)
     """s from one launch to the next, give or take 25 ms. A ball flies for up to 1.32 s: with less, two fly at once."""
-
     seed: int = bounded(0, 0, MAX_SEED)
     """Seed of all random numbers."""
-
     settings: Mapping[str, Sequence[int]] = field(default_factory=dict)
     """Levels by launcher setting (topspin, sidespin, speed), for restricted settings."""
-
     undeclared: tuple[Effect, ...] = ()
     """Effects that act on the ball although no model file declares them."""
-
     rate: float = bounded(120.0, 5.0, 2000.0)
     """Hz, frames per second of every camera."""
-
     exposure: float = bounded(0.002, 1e-5, 0.1)
     """s, duration of the open shutter; a frame's stamp is its middle."""
-
     clocks: Mapping[str, Clock] = field(default_factory=dict)
     """By camera; all unnamed cameras have `Clock()` and expose at once."""
-
     dropout: float = bounded(0.0, 0.0, 0.95)
     """Probability that a frame is missing, for each frame by itself."""
-
     jitter: float = bounded(0.0, 0.0, 1.0)
     """s, standard deviation of the recorded stamp about the true time; cut off at 3 sigma. At most 0.15 frames."""
-
     colour: Literal["white", "orange"] = "white"
     """Colour of the ball."""
-
     noise: float = bounded(2.0, 0.0, 50.0)
     """Grey levels, standard deviation of a dark pixel; it grows with the light, by sqrt(2) at middle grey."""
-
     flicker: float = bounded(0.03, 0.0, 0.5)
     """Relative amplitude of the lamps' flicker at 100 Hz, from the mains."""
-
     distractors: bool = True
     """True to draw other moving objects: people in white shirts who swing an arm, a gliding reflection."""
 

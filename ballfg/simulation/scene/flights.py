@@ -36,16 +36,12 @@ class Flight:
 
     name: str
     """Of the track."""
-
     start: float
     """s, true time of the launch."""
-
     knots: Array
     """(k, 9) states every 1 / `KNOT_RATE` s from the launch on."""
-
     model: AnalyticModel = field(repr=False)
     """Model of its motion."""
-
     surfaces: Surfaces = field(repr=False)
     """Its surfaces."""
 

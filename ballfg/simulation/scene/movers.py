@@ -43,13 +43,10 @@ class Capsule:
 
     ends: Array
     """(2, 3) m."""
-
     radius: float
     """m."""
-
     colour: Colour
     """Grey levels, blue green red."""
-
     velocity: Array
     """(2, 3) m/s of the ends, for the blur of the outline."""
 
@@ -96,8 +93,7 @@ def draw(
     """Draws a capsule where the still room is not nearer.
 
     Args:
-        image: (h, w, 3) grey levels, changed in place.
-        distance: (h, w) m, of the room.
+        image: (h, w, 3) grey levels, changed in place.  distance: (h, w) m, of the room.
         exposure: s, for the blur of its motion.
     Returns: the changed part of the image, or None.
     """

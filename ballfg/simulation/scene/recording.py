@@ -22,16 +22,12 @@ class Recording:
 
     config: SceneConfig
     """The settings."""
-
     cameras: tuple[Camera, ...]
     """The rig."""
-
     flights: tuple[Flight, ...]
     """The balls, in the order of their launches."""
-
     frames: tuple[Frames, ...]
     """Frames of each camera."""
-
     passages: tuple[tuple[Passage, ...], ...]
     """Passages of each camera, in the order of `flights`."""
 

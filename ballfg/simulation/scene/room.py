@@ -37,13 +37,10 @@ class Box:
 
     low: Array
     """(3,) m."""
-
     high: Array
     """(3,) m."""
-
     colour: Colour
     """Of its sides, and of its top unless `lined`."""
-
     lined: bool = False
     """True if its top is the playing surface."""
 

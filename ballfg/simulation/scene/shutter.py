@@ -25,7 +25,6 @@ class Frames:
 
     times: Array
     """(f,) s, true time of the middle of each exposure."""
-
     stamps: Array
     """(f,) s, stamps recorded by the camera."""
 
@@ -36,10 +35,8 @@ class Passage:
 
     name: str
     """Of the ball's track."""
-
     frames: NDArray[np.int64]
     """(n,) numbers of the frames whose whole exposure lies within the flight; in no other frame is the ball there."""
-
     paths: Array
     """(n, `PATH_POINTS`, 3) m, its centre from the opening of the shutter to its closing, evenly in time."""
 
@@ -53,8 +50,7 @@ def free_running(names: Sequence[str], rate: float, seed: int) -> dict[str, Cloc
     """Clocks of unsynchronised cameras: first exposures are spread over one frame interval, never together.
 
     Args:
-        names: of the cameras.
-        rate: Hz.
+        names: of the cameras.  rate: Hz.
         seed: draws the order of cameras, each within the middle half of its own share of the interval.
     """
     rng = generator(seed, Purpose.SCENE_PHASE)
@@ -66,10 +62,8 @@ def frames_of(config: SceneConfig, camera: Camera, number: int, until: float) ->
     """The frames of a camera from its first one on.
 
     Args:
-        config: rate, clocks, dropped frames, jitter.
-        camera: for its name and its known time offset.
-        number: of the camera in its rig; it picks the random streams.
-        until: s, true time of the end of the recording.
+        config: rate, clocks, dropped frames, jitter.  camera: for its name and its known time offset.
+        number: of the camera in its rig; it picks the random streams.  until: s, true time of the end of the recording.
     """
     clock = config.clocks.get(camera.name, Clock())
     count = int(np.floor((until - clock.phase) * config.rate)) + 1

@@ -71,8 +71,7 @@ class Carrier:
 
     Args:
         model: of the balls; coefficients that travel with the states are columns of theirs.
-        mean: (n, 9 + p) at the start.
-        surfaces: table and floor.
+        mean: (n, 9 + p) at the start.  surfaces: table and floor.
         noise: (5,) densities of the acceleration, m/s^2/sqrt(Hz), and of the spin, rad/s/sqrt(s); of an impact along
             the vertical and along the surface, m/s, and of its spin, rad/s.
     """

@@ -28,10 +28,8 @@ class View:
     """An array: where its numbers lie, in a block or among the weights.
 
     Attributes:
-        block: its number; None for an array among the weights.
-        shape: of the array.
-        strides: how many numbers further the next entry along each dimension lies.
-        offset: of the first number.
+        block: its number; None for an array among the weights.  shape: of the array.
+        strides: how many numbers further the next entry along each dimension lies.  offset: of the first number.
     """
 
     block: int | None
@@ -110,8 +108,7 @@ class Each:
     """An elementwise operation on views of one shape, written as a small program.
 
     Attributes:
-        program, inputs, result: the operation, its operands and its result.
-        operands: views, as many as inputs.
+        program, inputs, result: the operation, its operands and its result.  operands: views, as many as inputs.
     """
 
     program: Program
@@ -158,8 +155,7 @@ class Arrays:
     """The blocks of a program.
 
     Attributes:
-        program: that reads them.
-        makings: how each is made.  sizes: of each.
+        program: that reads them.  makings: how each is made.  sizes: of each.
         asked: places of a block that are read, where their derivatives run backward.
     """
 

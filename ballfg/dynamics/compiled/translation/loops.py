@@ -21,9 +21,7 @@ class Entries:
     """Names of the entries of blocks: values, or derivatives of which every state has `count`.
 
     Attributes:
-        arrays: all of them.
-        kind: what the names of the blocks begin with.
-        count: of derivatives; None for values.
+        arrays: all of them.  kind: what the names of the blocks begin with.  count: of derivatives; None for values.
     """
 
     arrays: Arrays

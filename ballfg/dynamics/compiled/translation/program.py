@@ -36,8 +36,7 @@ class Operation:
     """One operation.
 
     Attributes:
-        name: what it does.
-        operands: the numbers it takes.
+        name: what it does.  operands: the numbers it takes.
         constant: a number of the operation itself, such as an exponent or a value.
         where: for a number read from an array or its derivatives: the array, the place in it, the number of operands by
             which derivatives are taken (0: they run backward, to each operand), and the operand.

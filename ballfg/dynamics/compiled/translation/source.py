@@ -49,9 +49,7 @@ class _Writer:
     """Writes lines that compute numbers, after lines that fill the arrays they are read from.
 
     Attributes:
-        traced: the program.
-        names: of its numbers.  inputs: how its inputs are called.
-        lines: written so far.
+        traced: the program.  names: of its numbers.  inputs: how its inputs are called.  lines: written so far.
         done: blocks that are filled, or whose derivatives are, by their names.
         kinds: names of derivatives, by the numbers with respect to which they are taken.
     """

@@ -33,9 +33,7 @@ class Traced:
     """A function as a program.
 
     Attributes:
-        program, arrays: all of it.
-        inputs: of the program, vector by vector.
-        outputs: numbers of the program.
+        program, arrays: all of it.  inputs: of the program, vector by vector.  outputs: numbers of the program.
         weights: gives the weights (k,) that the program takes, from the function's tables; None: it takes none.
     """
 
@@ -50,8 +48,7 @@ def trace(function: Callable[..., Tensor], lengths: Sequence[int], tables: Seque
     """The program of a function of vectors and of tables.
 
     Args:
-        function: of float64 vectors and tables; its branches must not depend on their values.
-        lengths: of the vectors.
+        function: of float64 vectors and tables; its branches must not depend on their values.  lengths: of the vectors.
         tables: of any shape; no derivatives by them.
     Raises: UnknownOperationError: if no rule covers an operation of the function.
     """

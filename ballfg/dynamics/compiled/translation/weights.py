@@ -22,8 +22,7 @@ class Known:
     """A tensor that does not depend on the vectors of a function.
 
     Attributes:
-        node: where it stands in the graph.
-        example: its value for the tables that were traced.
+        node: where it stands in the graph.  example: its value for the tables that were traced.
         varies: whether other tables give other values.
     """
 
