@@ -1,7 +1,6 @@
 """Builds a model of the dynamics from a config, for training through the estimator."""
 
 import copy
-from collections.abc import Mapping
 from typing import ClassVar
 
 from ballfg.dynamics import AnalyticModel, BallModel
@@ -12,24 +11,17 @@ from ballfg.learning.end_to_end.end_to_end import EndToEnd
 from ballfg.learning.end_to_end.first_spins import begin_with_tracks
 from ballfg.learning.end_to_end.learnables import Learnables, NoiseScales
 from ballfg.learning.end_to_end.pretrain import Anchor, pretrain
-from ballfg.learning.gradient.implicit import GaussNewtonGradient, GradientMethod, ImplicitGradient, UnrolledGradient
+from ballfg.learning.gradient.implicit import GaussNewtonGradient, ImplicitGradient, UnrolledGradient
 from ballfg.learning.registry import NETWORKS, TraineeKind
 from ballfg.learning.trainee import Prepared
 from ballfg.learning.training_data import read_training_data
 from ballfg.progress import doing
 
-GRADIENTS: Mapping[str, type[GradientMethod]] = {
-    "implicit": ImplicitGradient,
-    "gauss-newton": GaussNewtonGradient,
-    "unrolled": UnrolledGradient,
-}
+GRADIENTS = {"implicit": ImplicitGradient, "gauss-newton": GaussNewtonGradient, "unrolled": UnrolledGradient}
 
 
 def build_end_to_end(config: TrainConfig) -> Prepared:
-    """The trainee of the kinds a-tune, mlp, mlp+gs, skip+gs and mnn+gs.
-
-    Raises: ValueError, FileNotFoundError: bad input.
-    """
+    """The trainee of the kinds that fly a model. Raises: ValueError, FileNotFoundError: bad input."""
     data = read_training_data(config)
     if data.embedding is not None and config.launcher.start == "tracks":
         begin_with_tracks(data.embedding, [data.shots[k] for k in data.train], data.analytic)

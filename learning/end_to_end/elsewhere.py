@@ -57,26 +57,29 @@ def fading_of(model: LearnedModel, tracks: Sequence[Tensor]) -> Fading:
 def noise_elsewhere(base: BallModel, shots: Sequence[TrainingShot]) -> TrackNoise | None:
     """The noise of motion, bounces and spins that whole tracks of the training rooms show about the analytic model.
 
-    Acceleration is the least of the rooms: undetected hits raise it. Others are means.
+    Acceleration is the least of the rooms: undetected hits raise it. Others are geometric means.
 
     Returns: its coefficients as the learned model names them; None where no track is long enough.
     """
     found = []
     for members in by_room(shots):
-        first = members[0]
-        settings = replace(first.settings, coefficients=coefficient_sigmas(base), launcher=None)
+        settings = replace(members[0].settings, coefficients=coefficient_sigmas(base), launcher=None)
         tracks = [shot.track for shot in members]
-        estimate = estimate_noise(base, first.surfaces, settings, tracks, errors=False)
+        estimate = estimate_noise(base, members[0].surfaces, settings, tracks, errors=False)
         if estimate is not None:
             found.append(estimate.settings)
     if not found:
         return None
+
+    def mean(values: Sequence[float]) -> float:
+        return float(np.exp(np.mean(np.log(values)))) if min(values) > 0.0 else 0.0
+
     process = [settings.process for settings in found]
-    values: dict[str, Any] = {name: _mean([getattr(p, name) for p in process]) for name in AVERAGED}
+    values: dict[str, Any] = {name: mean([getattr(p, name) for p in process]) for name in AVERAGED}
     return TrackNoise(
         acceleration=min(p.acceleration for p in process),
-        spin_prior=_mean([settings.spin_prior for settings in found]),
-        coefficients={BASE + n: _mean([s.coefficients[n] for s in found]) for n in found[0].coefficients},
+        spin_prior=mean([settings.spin_prior for settings in found]),
+        coefficients={BASE + n: mean([s.coefficients[n] for s in found]) for n in found[0].coefficients},
         **values,
     )
 
@@ -115,14 +118,6 @@ def by_room(shots: Sequence[TrainingShot]) -> list[list[TrainingShot]]:
 def _log_errors(smoother: Smoother, shots: Sequence[TrainingShot]) -> Array:
     """(n,) logarithms of the root mean square errors over the next 0.3 s; NaN where there is nothing to predict."""
     seconds = {shot.name: float(shot.track.times[shot.observed - 1] - shot.track.times[0]) for shot in shots}
-    results = predict_tracks(
-        smoother, (shot.track for shot in shots), len(shots), lambda track: seconds[track.name], horizon=HORIZON
-    )
-    return np.array(
-        [0.5 * np.log(np.mean((r.positions - r.measured) ** 2)) if len(r.times) else np.nan for r in results]
-    )
-
-
-def _mean(values: Sequence[float]) -> float:
-    """Geometric mean; 0 if a value is."""
-    return float(np.exp(np.mean(np.log(values)))) if min(values) > 0.0 else 0.0
+    tracks = (shot.track for shot in shots)
+    found = predict_tracks(smoother, tracks, len(shots), lambda track: seconds[track.name], horizon=HORIZON)
+    return np.array([0.5 * np.log(np.mean((r.positions - r.measured) ** 2)) if len(r.times) else np.nan for r in found])

@@ -80,13 +80,13 @@ class EndToEnd(Trainee):
 
     Args:
         shots: all of them; batches are numbers of shots.
-        method: of the gradient through the estimate; by default `ImplicitGradient`.
+        method: of the gradient through the estimate.
         augment: True to rotate and shift shots in training.
         optimizer: solves the estimates, with its tolerance.
         linear_solver: for the Hessians of a batch.
         anchor: distance of the model from the analytic one; None if it is not part of the loss.
-        coefficient_step: scale of the learning rate of declared coefficients, in their prior standard deviations.
-        noise_step: scale of the learning rate of the noise's logarithms.
+        coefficient_step, noise_step: scales of the learning rate, `COEFFICIENT_STEP` and `NOISE_STEP`.
+        fades, held_out: shots that trained and that did not, for the use of the model in other rooms.
         untrained: the same shots with the model that one has without a training; None if there is no other.
     """
 
@@ -96,7 +96,7 @@ class EndToEnd(Trainee):
         learnables: Learnables,
         loss: LossConfig,
         *,
-        method: GradientMethod | None = None,
+        method: GradientMethod = ImplicitGradient(),  # noqa: B008 - it has no state
         seed: int = 0,
         augment: bool = False,
         optimizer: LevenbergMarquardt = TRAINING,
@@ -108,31 +108,20 @@ class EndToEnd(Trainee):
         held_out: Sequence[int] = (),
         untrained: EndToEnd | None = None,
     ) -> None:
-        self.module = learnables
-        self.learnables = learnables
-        self.shots = shots
+        self.module = self.learnables = learnables
+        self.shots, self.settings, self.seed, self.augment = shots, loss, seed, augment
         self.solver = BatchSolver(shots, learnables, optimizer)
-        self.settings = loss
-        self.method = method or ImplicitGradient()
-        self.seed = seed
-        self.augment = augment
-        self.linear_solver = linear_solver
-        self.anchor = anchor
-        self.coefficient_step = coefficient_step
-        self.noise_step = noise_step
-        self.fades = tuple(fades)
-        self.held_out = tuple(held_out)
-        self.untrained = untrained
-        scale = None if loss.position_scale is None else loss.position_scale / LOSS_UNIT
+        self.method, self.linear_solver, self.anchor = method, linear_solver, anchor
+        self.coefficient_step, self.noise_step = coefficient_step, noise_step
+        self.fades, self.held_out, self.untrained = tuple(fades), tuple(held_out), untrained
         self.before = self._numbers()
-        self.point_loss = Loss() if scale is None else Loss("huber", scale)
+        self.point_loss = Loss() if loss.position_scale is None else Loss("huber", loss.position_scale / LOSS_UNIT)
 
     def groups(self) -> list[dict[str, Any]]:
         """Noise, embedding, coefficients and the rest of the model, each with its scale on the learning rate."""
         declared = self.learnables.model.declared_coefficients()
-        own = tuple((f"model.{name}", self.coefficient_step * c.sigma) for name, c in declared.items())
-        rest = (("noise.", self.noise_step), ("embedding.", EMBEDDING_STEP), ("model.", 1.0))
-        return self.learnables.groups((*own, *rest))
+        scales = {f"model.{name}": self.coefficient_step * c.sigma for name, c in declared.items()}
+        return self.learnables.groups(scales | {"noise.": self.noise_step, "embedding.": EMBEDDING_STEP, "model.": 1.0})
 
     def after_step(self) -> None:
         """Clip coefficients and noise to their bounds."""
@@ -193,8 +182,7 @@ class EndToEnd(Trainee):
         if not solved:
             return BatchLoss.none(failed)
         with torch.no_grad():
-            states = [s.solution.minimum.values.states[0] for s in solved]
-            prediction = self.predict(solved, torch.stack([torch.from_numpy(s) for s in states]), None)
+            prediction = self._judged(solved)
             good = prediction.finite()
             names = [self.shots[s.number].name for s, ok in zip(solved, good.tolist(), strict=True) if not ok]
             failed += [(name, "the predicted track is not finite") for name in names]
@@ -206,14 +194,18 @@ class EndToEnd(Trainee):
         solved, _ = self.solver([track], {})
         if not solved:
             return None
-        shot, one = self.shots[track], solved[0]
-        with torch.no_grad():
-            prediction = self.predict(solved, torch.from_numpy(one.solution.minimum.values.states[0])[None], None)
+        shot, one, prediction = self.shots[track], solved[0], self._judged(solved)
         counted = prediction.counts[0, : len(one.positions)].numpy()
         measured = np.asarray(one.positions)[counted]
         times = (shot.track.times - shot.track.times[shot.observed - 1])[: len(counted)][counted]
         error = prediction.error[0, : len(counted)].numpy()[counted]
         return PredictedShot(shot.name, times, measured, measured + error)
+
+    @torch.no_grad()
+    def _judged(self, solved: Sequence[Solved]) -> ShotPrediction:
+        """Predictions to the full horizon from the estimated first states."""
+        states = [torch.from_numpy(s.solution.minimum.values.states[0]) for s in solved]
+        return self.predict(solved, torch.stack(states), None)
 
     def without_training(self, tracks: Sequence[int]) -> BatchLoss | None:
         """The loss of the analytic model on tracks, where a network is trained."""
@@ -236,12 +228,17 @@ class EndToEnd(Trainee):
             return found
         found |= {name: (value, *NOISE_WORDS[name]) for name, value in noise.values().items()}
         found["position noise"] = (noise.position_scale(), "", "as a multiple of what the dataset states")
-        settings = self.shots[0].settings
-        launched = settings.launcher
-        spin = settings.spin_label_noise if launched is None else launched.sigma
-        words = "uncertainty of spin labels" if launched is None else "scatter of the spin about the launcher's setting"
-        found["spin noise"] = (spin * noise.spin_scale(), "rad/s", words)
+        spin, launched = self._spin_noise()
+        words = "scatter of the spin about the launcher's setting" if launched else "uncertainty of spin labels"
+        found["spin noise"] = (spin, "rad/s", words)
         return found
+
+    def _spin_noise(self) -> tuple[float, bool]:
+        """rad/s, present noise of the first spin, and whether it is that about a launcher's setting."""
+        settings, scale = self.shots[0].settings, self.learnables.noise.spin_scale()
+        if settings.launcher is None:
+            return settings.spin_label_noise * scale, False
+        return settings.launcher.sigma * scale, True
 
     def predict(self, solved: Sequence[Solved], first: Tensor, epoch: int | None) -> ShotPrediction:
         """Rollouts over the whole tracks from their first states.
@@ -254,19 +251,15 @@ class EndToEnd(Trainee):
         groups: defaultdict[Surfaces, list[int]] = defaultdict(list)
         for k, one in enumerate(solved):
             groups[self.shots[one.number].surfaces].append(k)
-            counts[k, : len(one.positions)] = self._counted(self.shots[one.number], epoch)
+            shot = self.shots[one.number]
+            times, last = shot.track.times, shot.track.times[shot.observed - 1]
+            horizon = self.settings.horizon_at(2**62 if epoch is None else epoch, float(times[-1] - last))
+            counts[k, : len(times)] = torch.from_numpy(shot.usable & (times <= last + horizon + 1e-9))
         for surfaces, members in groups.items():
             rows = torch.tensor(members)
             difference = self._roll([solved[k] for k in members], first[rows], counts[rows], surfaces)
             error = error.index_put((rows[:, None], torch.arange(difference.shape[1])), difference)
         return ShotPrediction(error, counts)
-
-    def _counted(self, shot: TrainingShot, epoch: int | None) -> Tensor:
-        """(n,) bool: the usable samples up to the horizon."""
-        times = shot.track.times
-        left = float(times[-1] - times[shot.observed - 1])
-        horizon = self.settings.horizon_at(2**62 if epoch is None else epoch, left)
-        return torch.from_numpy(shot.usable & (times <= times[shot.observed - 1] + horizon + 1e-9))
 
     def _roll(self, solved: Sequence[Solved], first: Tensor, counts: Tensor, surfaces: Surfaces) -> Tensor:
         """(t, k, 3) m, predicted less measured positions; zero at points that do not count."""
@@ -296,15 +289,13 @@ class EndToEnd(Trainee):
 
     def trained_model(self) -> BallModel:
         """The model with the noise and the launcher that were learned with it, and what it needs in other rooms."""
-        elsewhere = self._faded()
-        noise, settings = self.learnables.noise, self.shots[0].settings
-        launcher = settings.launcher
-        first_spin = settings.spin_label_noise if launcher is None else launcher.sigma
+        elsewhere, noise = self._faded(), self.learnables.noise
+        spin, launched = self._spin_noise()
         self.learnables.model.trained = Trained(
             process_noise={**vars(noise.start), **noise.values()},
             position_scale=noise.position_scale(),
             launcher=self.learnables.embedding,
-            spin_noise=first_spin * noise.spin_scale() if noise.learned or launcher is not None else None,
+            spin_noise=spin if noise.learned or launched else None,
             rooms=tuple(dict.fromkeys(self.shots[number].room for number in self.fades)) if elsewhere else (),
             elsewhere=elsewhere,
         )

@@ -1,6 +1,7 @@
 """Holds the learnable parameters of an estimator: the ball's model, the launcher's embedding, the noise."""
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -96,17 +97,13 @@ class Learnables(nn.Module):
         """All trainable parameters."""
         return [p for p in self.parameters() if p.requires_grad]
 
-    def groups(self, scales: Sequence[tuple[str, float]]) -> list[dict[str, Any]]:
-        """Parameter groups by prefix of the name, each with its scale on the learning rate.
-
-        Args: scales: (prefix, scale); the first prefix that matches a name decides.
-        """
-        groups = [{"name": name or "all", "params": [], "scale": scale} for name, scale in scales]
+    def groups(self, scales: Mapping[str, float]) -> list[dict[str, Any]]:
+        """Parameter groups by prefix of the name, with scales on the learning rate; the first that fits decides."""
+        members = defaultdict[str, list[Tensor]](list)
         for name, parameter in self.named_parameters():
             if parameter.requires_grad:
-                k = next(k for k, (prefix, _) in enumerate(scales) if name.startswith(prefix))
-                groups[k]["params"].append(parameter)  # type: ignore[attr-defined]
-        return [group for group in groups if group["params"]]
+                members[next(prefix for prefix in scales if name.startswith(prefix))].append(parameter)
+        return [{"name": p, "params": members[p], "scale": scale} for p, scale in scales.items() if p in members]
 
     @torch.no_grad()
     def bound(self) -> None:

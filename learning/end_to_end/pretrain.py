@@ -35,9 +35,10 @@ SPIN_UNIT: Final = 10.0
 
 
 def pretrain(model: LearnedModel, teacher: BallModel, seed: int, iterations: int, *, samples: int = SAMPLES) -> float:
-    """Fit a model, in place, to a teacher on random states by L-BFGS; the same seed gives the same weights.
+    """Fit a model, in place, to a teacher on so many random flights and bounces by L-BFGS.
 
-    Args: samples: number of flights, and of bounces.
+    The same seed gives the same weights.
+
     Returns: the root mean square of the remaining errors, in their units.
     """
     flying, bouncing = random_states(seed, samples)
@@ -62,7 +63,7 @@ class Anchor:
     def __init__(self, model: BallModel, start: BallModel, seed: int) -> None:
         self.model = model
         self.flying, self.bouncing = random_states(seed, ANCHORS)
-        fixed = copy.deepcopy(start)
+        fixed = copy.deepcopy(start)  # rates may be views of parameters, which training changes
         with torch.no_grad():
             self.rates, self.after = fixed.rates(self.flying), fixed.after_bounce(self.bouncing)
 
@@ -91,13 +92,9 @@ def difference(model: BallModel, flying: Tensor, bouncing: Tensor, rates: Rates,
 def random_states(seed: int, count: int) -> tuple[Tensor, Tensor]:
     """States (n, 9) of flying and of falling balls, with velocities and spins in all directions."""
     generator = torch.Generator().manual_seed(seed)
-    flying, falling = _states(generator, count), _states(generator, count)
+    flying, falling = torch.zeros((2, count, STATE_DIM), dtype=torch.float64)
+    for states in (flying, falling):
+        states[:, VELOCITY] = SPEED * torch.randn((count, 3), generator=generator, dtype=torch.float64)
+        states[:, SPIN] = SPIN_SPREAD * torch.randn((count, 3), generator=generator, dtype=torch.float64)
     falling[:, VZ] = -LEAST_FALL - falling[:, VZ].abs()
     return flying, falling
-
-
-def _states(generator: torch.Generator, count: int) -> Tensor:
-    state = torch.zeros((count, STATE_DIM), dtype=torch.float64)
-    state[:, VELOCITY] = SPEED * torch.randn((count, 3), generator=generator, dtype=torch.float64)
-    state[:, SPIN] = SPIN_SPREAD * torch.randn((count, 3), generator=generator, dtype=torch.float64)
-    return state

@@ -26,22 +26,17 @@ TENSORS = ("weights", "optimizer", "memory", "best")
 
 
 class RunProgress(BaseModel):
-    """The progress of a run, in plain numbers."""
+    """Numbers of finished epochs, of the best epoch, of steps skipped in a row up to now, and of tracks."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
     epoch: int
-    """Number of finished epochs."""
     best_epoch: int
-    """The epoch with the best weights."""
     best_rmse: float | None
-    """m, RMSE of these weights on the validation tracks; null: none was judged."""
+    """m, RMSE of the best weights on the validation tracks; null: none was judged."""
     skipped_in_row: int
-    """Steps that were skipped in a row up to the end."""
     train: int
-    """Number of training tracks."""
     validation: int
-    """Number of validation tracks."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +73,7 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
             owned = {key: tensor.detach().contiguous().clone() for key, tensor in tensors.items()}
             (part / f"{name}.safetensors").write_bytes(save(owned))
         state = checkpoint.progress.model_dump() | {DIGESTS: _digests(part)}
-        text = yaml.safe_dump(state, sort_keys=False)
-        (part / STATE).write_text(text, encoding="utf-8")
+        (part / STATE).write_text(yaml.safe_dump(state, sort_keys=False), encoding="utf-8")
 
 
 def read_checkpoint(folder: Path) -> Checkpoint | None:

@@ -23,13 +23,13 @@ MOST_JUDGED: Final = 25
 
 def finish(training: Training, record: Record, command: str) -> int:
     """Write the model with the best weights and the page, and print whether it helped. Returns: the exit status."""
-    folder, progress, epochs = record.folder, training.progress, record.epochs
-    model = training.task.trainee.export(folder)
+    folder, progress, epochs, task = record.folder, training.progress, record.epochs, training.task
+    model = task.trainee.export(folder)
     if progress is None:
         return 0
-    shot = median_shot(training.task)
-    untrained = _untrained(training.task)
-    _write_page(training, record, model, command, shot, untrained)
+    judged = task.trainee.without_training(task.validation) if task.validation else None
+    untrained = math.sqrt(judged.squared_error / judged.points) if judged is not None and judged.points else None
+    _write_page(training, record, model, command, median_shot(task), untrained)
     better = improved(epochs, progress.best_epoch)
     print(verdict(epochs, progress.best_epoch))
     beside = beside_untrained(epochs, progress.best_epoch, untrained)
@@ -52,35 +52,19 @@ def stop(training: Training, record: Record, command: str) -> None:
         return
     training.take_best()
     model = training.task.trainee.export(record.folder)
-    _write_page(training, record, model, command, None)
+    _write_page(training, record, model, command, None, None)
     print(f"{model}: the best model so far, of epoch {training.progress.best_epoch}", file=sys.stderr)
 
 
-def _untrained(task: Task) -> float | None:
-    """RMSE of the model that one has without a training on the validation tracks, m; None where there is no other."""
-    judged = task.trainee.without_training(task.validation) if task.validation else None
-    return math.sqrt(judged.squared_error / judged.points) if judged is not None and judged.points else None
-
-
 def _write_page(
-    training: Training,
-    record: Record,
-    model: Path,
-    command: str,
-    shot: PredictedShot | None,
-    untrained: float | None = None,
+    training: Training, record: Record, model: Path, command: str, shot: PredictedShot | None, untrained: float | None
 ) -> None:
     best = 0 if training.progress is None else training.progress.best_epoch
-    data = training.task.config.data
-    dataset = data[0] if data else "DATASET"
-    following = (
-        shlex.join(
-            ["ballfg", "predict", dataset, "--model", str(model), "--observe", "0.3", "--out", "predictions.csv"]
-        )
-        if model.is_file()
-        else ""
-    )
-    origin = {"made on": date()} | ({"command": command} if command else {}) | {"data": ", ".join(data or ())}
+    data = training.task.config.data or ()
+    words = ["ballfg", "predict", *(data[:1] or ["DATASET"]), "--model", str(model)]
+    words += ["--observe", "0.3", "--out", "predictions.csv"]
+    following = shlex.join(words) if model.is_file() else ""
+    origin = {"made on": date()} | ({"command": command} if command else {}) | {"data": ", ".join(data)}
     origin["with"] = ", ".join(f"{name} {version}" for name, version in versions(files.PACKAGES).items())
     drawn, learned = curves(record.epochs, record.title), training.task.trainee.learned()
     text = page(record.title, record.epochs, best, drawn, learned, shot, following, origin, untrained)

@@ -55,12 +55,7 @@ def launch(processes: int, work: Callable[..., int], *arguments: Any) -> int:
 
 
 def _take_part(
-    rank: int,
-    processes: int,
-    port: int,
-    status: c_int,
-    work: Callable[..., int],
-    arguments: tuple[Any, ...],
+    rank: int, processes: int, port: int, status: c_int, work: Callable[..., int], arguments: tuple[Any, ...]
 ) -> None:
     """Set the environment as torchrun does, then work."""
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
@@ -96,10 +91,9 @@ def _wait(group: ProcessContext) -> None:
         try:
             left = None if deadline is None else deadline - time.monotonic()
             if left is not None and left <= 0.0:
-                _kill(group)
-                return
+                return _kill(group)
             if group.join(left, grace_period=LAST_WORDS):
-                return
+                return None
         except KeyboardInterrupt:
             if deadline is not None:
                 _kill(group)

@@ -28,9 +28,9 @@ class TrainingStoppedError(ValueError):
 
 @dataclass(frozen=True)
 class Task:
-    """A training: a model with its data, numbers of the tracks that train and validate, processes that share the work.
+    """A model with its data, the tracks that train and that validate (maybe none), processes that share the work.
 
-    There may be no validation tracks. `watch` sees the batches pass in the first process, to show progress.
+    `watch` sees the batches pass in the first process, to show progress.
     """
 
     trainee: Trainee
@@ -62,15 +62,13 @@ class _Tally:
 
 
 class Training:
-    """A run: its model, its optimizer and its progress.
+    """A run from its start or from a checkpoint. Every rank of `task.ranks` calls the same methods in the same order.
 
-    Every rank of `task.ranks` calls the same methods in the same order.
+    Raises: ValueError: a checkpoint of another run.
     """
 
     def __init__(self, task: Task, checkpoint: Checkpoint | None = None) -> None:
-        """Start, or continue from a checkpoint. Raises: ValueError: a checkpoint of another run."""
-        self.task = task
-        self.module = task.trainee.module
+        self.task, self.module = task, task.trainee.module
         self.optimizer = make_optimizer(task.trainee, task.config.optimizer)
         self.parameters = [parameter for group in self.optimizer.param_groups for parameter in group["params"]]
         self.progress: RunProgress | None = None
@@ -122,12 +120,10 @@ class Training:
 
     def _learn(self, number: int) -> _Tally:
         """One pass over the training tracks, in the random order of the epoch."""
-        config, epoch = self.task.config, number - 1
-        order = np.random.default_rng((config.seed, epoch)).permutation(np.array(self.task.train)).tolist()
-        size = config.optimizer.batch
-        batches = [order[i : i + size] for i in range(0, len(order), size)]
-        tally = _Tally()
-        for index, batch in enumerate(self._shown(batches, f"batches of epoch {number}")):
+        tally, epoch = _Tally(), number - 1
+        rng = np.random.default_rng((self.task.config.seed, epoch))
+        order = rng.permutation(np.array(self.task.train)).tolist()
+        for index, batch in enumerate(self._batches_of(order, f"batches of epoch {number}")):
             for group in self.optimizer.param_groups:
                 group["lr"] = group["scale"] * self._rate(epoch, index)
             self._step(batch, epoch, tally)
@@ -143,7 +139,13 @@ class Training:
         if not tracks:
             return
         if not bool(summed.isfinite().all()):
-            self._skip(tally)
+            tally.skipped += 1
+            self.skipped_in_row += 1
+            if self.skipped_in_row > task.config.diverged_limit:
+                raise TrainingStoppedError(
+                    f"training diverged: loss or gradient was not finite in {self.skipped_in_row} steps in a row. "
+                    "Set optimizer.learning_rate lower, or loss.horizon shorter."
+                )
             return
         self.skipped_in_row = 0
         tally.loss += loss
@@ -154,7 +156,12 @@ class Training:
         norm = float(gradient.norm())
         tally.norms.append(norm)
         clip = task.config.optimizer.clip
-        self._apply(gradient * (clip / norm) if clip is not None and norm > clip else gradient)
+        gradient = gradient * (clip / norm) if clip is not None and norm > clip else gradient
+        parts = gradient.split([parameter.numel() for parameter in self.parameters])
+        for parameter, part in zip(self.parameters, parts, strict=True):
+            parameter.grad = part.view_as(parameter).to(parameter.dtype)
+        self.optimizer.step()
+        task.trainee.after_step()
 
     def _gradients(self, batch: Sequence[int], epoch: int, tally: _Tally) -> Tensor:
         """The gradient of this rank's share of a batch as a flat vector, followed by the five sums of the share."""
@@ -166,22 +173,6 @@ class Training:
         tally.reasons += found.failed
         flat = [p.new_zeros(p.numel()) if p.grad is None else p.grad.reshape(-1) for p in self.parameters]
         return torch.cat([part.double() for part in flat] + [_sums(found)])
-
-    def _apply(self, gradient: Tensor) -> None:
-        parts = gradient.split([parameter.numel() for parameter in self.parameters])
-        for parameter, part in zip(self.parameters, parts, strict=True):
-            parameter.grad = part.view_as(parameter).to(parameter.dtype)
-        self.optimizer.step()
-        self.task.trainee.after_step()
-
-    def _skip(self, tally: _Tally) -> None:
-        tally.skipped += 1
-        self.skipped_in_row += 1
-        if self.skipped_in_row > self.task.config.diverged_limit:
-            raise TrainingStoppedError(
-                f"training diverged: loss or gradient was not finite in {self.skipped_in_row} steps in a row. "
-                "Set optimizer.learning_rate lower, or loss.horizon shorter."
-            )
 
     def _check_failures(self, tally: _Tally) -> None:
         """Stop as soon as more tracks of the epoch have failed than the config allows."""
@@ -195,18 +186,15 @@ class Training:
         )
 
     def _judge(self, number: int) -> _Tally:
-        ranks, size = self.task.ranks, self.task.config.optimizer.batch
-        own = ranks.own(self.task.validation)
-        parts = [own[i : i + size] for i in range(0, len(own), size)]
+        ranks = self.task.ranks
 
         def work() -> Tensor:
             sums = torch.zeros(5, dtype=torch.float64)
-            for part in self._shown(parts, f"batches judged after epoch {number}"):
+            for part in self._batches_of(ranks.own(self.task.validation), f"batches judged after epoch {number}"):
                 sums += _sums(self.task.trainee.judge(part))
             return sums
 
-        loss, tracks, squared_error, points, failed = ranks.sum(ranks.together(work)).tolist()
-        return _Tally(loss, tracks, squared_error, points, failed)
+        return _Tally(*ranks.sum(ranks.together(work)).tolist())
 
     def _note(self, number: int, judged: _Tally) -> None:
         """Keep the weights if they are the best so far. An epoch in which too many tracks failed does not count."""
@@ -229,8 +217,11 @@ class Training:
         settings = self.task.config.optimizer
         return settings.learning_rate * rate_factor(settings, epoch * self._batches + index, self._batches)
 
-    def _shown(self, items: list[list[int]], what: str) -> Iterator[list[int]]:
-        return self.task.watch(items, len(items), what) if self.task.ranks.first else iter(items)
+    def _batches_of(self, tracks: list[int], what: str) -> Iterator[list[int]]:
+        """Batches of tracks, whose progress the first process shows."""
+        size = self.task.config.optimizer.batch
+        batches = [tracks[i : i + size] for i in range(0, len(tracks), size)]
+        return self.task.watch(batches, len(batches), what) if self.task.ranks.first else iter(batches)
 
     def _restore(self, checkpoint: Checkpoint) -> None:
         """Restore a checkpoint. Raises: ValueError: if it is of another model or other tracks."""

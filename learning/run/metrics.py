@@ -40,10 +40,6 @@ class Epoch:
     seconds: float
 
 
-INTEGERS = ("epoch", "skipped", "failed", "validation_failed")
-"""Columns that are counts."""
-
-
 def write_metrics(path: Path, epochs: Sequence[Epoch]) -> None:
     """Write the table; an empty cell stands for None. Floats are read back bit for bit."""
     text = io.StringIO()
@@ -79,7 +75,7 @@ def epoch_line(epoch: Epoch, last: int, seconds_left: float) -> str:
 
 
 def _number(name: str, text: str) -> Any:
-    if name in INTEGERS:
+    if name in ("epoch", "skipped", "failed", "validation_failed"):
         return int(text)
     return float(text) if text else None
 

@@ -30,7 +30,6 @@ SCALARS = {
 """Name of each TensorBoard curve, the number of an epoch that it shows, and its scale."""
 Points = list[tuple[int, float]]
 """Epochs and values."""
-DPI = 130
 TRAIN, VALIDATION, BEST = "#3b4cc0", "#d95f02", "#7f7f7f"
 
 
@@ -77,13 +76,8 @@ class Record:
         """Draw the curves and close the event files."""
         self.tensorboard.close()
         if self.epochs:
-            draw_curves(self.epochs, self.title, self.folder / files.CURVES)
-
-
-def draw_curves(epochs: Sequence[Epoch], title: str, path: Path) -> None:
-    """Write loss and RMSE of the predicted positions over the epochs as a PNG file."""
-    with whole_file(path) as temporary:
-        curves(epochs, title).savefig(temporary, dpi=DPI, format="png")
+            with whole_file(self.folder / files.CURVES) as temporary:
+                curves(self.epochs, self.title).savefig(temporary, dpi=130, format="png")
 
 
 def curves(epochs: Sequence[Epoch], title: str) -> Figure:
@@ -93,9 +87,13 @@ def curves(epochs: Sequence[Epoch], title: str) -> Figure:
     losses = [(e.epoch, e.loss) for e in epochs if e.loss is not None]
     trained = [(e.epoch, 1e3 * e.train_rmse) for e in epochs if e.train_rmse is not None]
     judged = [(e.epoch, 1e3 * e.validation_rmse) for e in epochs if e.validation_rmse is not None]
-    _curve(left, losses, TRAIN, "training tracks")
-    _curve(right, trained, TRAIN, "training tracks")
-    _curve(right, judged, VALIDATION, "validation tracks")
+    for axes, points, colour, label in (
+        (left, losses, TRAIN, "training tracks"),
+        (right, trained, TRAIN, "training tracks"),
+        (right, judged, VALIDATION, "validation tracks"),
+    ):
+        if points:
+            axes.plot(*zip(*points, strict=True), ".-", color=colour, linewidth=1.2, markersize=4, label=label)
     if judged:
         best, least = min(judged, key=itemgetter(1))
         right.axhline(least, color=BEST, linewidth=0.8, linestyle="--", label=f"{least:.3g} mm at epoch {best}")
@@ -103,11 +101,6 @@ def curves(epochs: Sequence[Epoch], title: str) -> Figure:
     _finish(right, "RMSE of predicted positions, mm", trained + judged)
     figure.suptitle(title, size=11)
     return figure
-
-
-def _curve(axes: Axes, points: Points, colour: str, label: str) -> None:
-    if points:
-        axes.plot(*zip(*points, strict=True), ".-", color=colour, linewidth=1.2, markersize=4, label=label)
 
 
 def _finish(axes: Axes, what: str, points: Points) -> None:

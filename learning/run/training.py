@@ -33,22 +33,17 @@ def build(config: TrainConfig) -> Prepared:
 def run_training(
     config: TrainConfig, folder: Path, *, resume: bool = False, watch: Watch = unwatched, command: str = ""
 ) -> int:
-    """Train a model and write the folder of the run.
-
-    Every process of a group calls this; the first one writes and prints.
-
-    Returns: the exit status of `ballfg-train`: 0, or 1 if no epoch predicts the validation tracks better than the model
-        before the first step.
+    """Train a model and write the folder of the run. Every process of a group calls this; the first one writes.
 
     Args:
-        folder: to write; that of the earlier run if it is to `resume`.
-        resume: continue from the last checkpoint.
+        folder: to write; that of the earlier run to `resume` from its last checkpoint.
         watch: sees the batches pass in the first process, for instance to show progress.
         command: as it was typed, for the page; empty where it is not known.
+    Returns: the exit status of `ballfg-train`: 0, or 1 if no epoch predicts the validation tracks better than the model
+        before the first step.
     Raises:
         ValueError, FileNotFoundError: bad input, or a training that cannot go on (`TrainingStoppedError`).
-        KeyboardInterrupt: after Ctrl-C; the epochs up to the last checkpoint are kept, and the best model so far is
-            written.
+        KeyboardInterrupt: after Ctrl-C; epochs up to the last checkpoint are kept, the best model so far is written.
         SystemExit: in the other processes, where the first one raises.
     """
     with join_ranks() as ranks, ExitStack() as stack:

@@ -78,9 +78,7 @@ def page(
     """The whole page.
 
     Args:
-        title: kind of the model and number of its tracks.
         best_epoch: whose weights were written.
-        curves: loss and errors over the epochs.
         learned: coefficients and noise before and after.
         shot: a validation track predicted by the written model; None where there is none.
         next_command: the command to type next, or empty.
@@ -88,26 +86,20 @@ def page(
         untrained: RMSE of the analytic model on the validation tracks, m; None where it is not known.
     """
     first = f"{verdict(epochs, best_epoch)} {beside_untrained(epochs, best_epoch, untrained)}".strip()
+    caption = "Loss (a pure number) and root mean square errors (mm) after each epoch. An axis of powers of ten is "
+    made = [(name, typed(said) if name == "command" else said) for name, said in origin.items()]
+    made.append(("config", "config.yaml beside this page, with every default"))
+    rows = [(o.name, f"{o.before:.4g}", f"{o.after:.4g}", o.unit or "a pure number", o.meaning) for o in learned]
+    head = ("number", "before", "after", "unit", "what it is")
     return whole_page(
         f"training: {title}",
-        tag(
-            "header",
-            tag("p", title),
-            tag("h1", first),
-        ),
+        tag("header", tag("p", title), tag("h1", first)),
         section("What to do next", *_next(improved(epochs, best_epoch), next_command)),
         _numbers(epochs, best_epoch),
-        section(
-            "The course of the training",
-            picture(
-                curves,
-                "Loss (a pure number) and root mean square errors (mm) after each epoch. An axis of powers of ten is "
-                "logarithmic.",
-            ),
-        ),
+        section("The course of the training", picture(curves, f"{caption}logarithmic.")),
         _shot(shot),
-        _learned(learned),
-        section("Where this page comes from", _origin(origin)),
+        section("What was learned of noise, spin and coefficients", table(head, rows)),
+        section("Where this page comes from", table(("", ""), made)),
         section("What the words mean", meanings(TERMS)),
     )
 
@@ -130,12 +122,11 @@ def _next(better: bool | None, command: str) -> list[Html]:
 def _numbers(epochs: Sequence[Epoch], best_epoch: int) -> Html:
     chosen = dict.fromkeys((epochs[0].epoch, best_epoch, epochs[-1].epoch))
     names = {epochs[-1].epoch: "last", best_epoch: "best, written", epochs[0].epoch: "before the first step"}
-    by_number = {e.epoch: e for e in epochs}
-    rows = [
-        (f"{n}: {names[n]}", _mm(by_number[n].train_rmse), _mm(by_number[n].validation_rmse), _plain(by_number[n].loss))
-        for n in chosen
-        if n in by_number
-    ]
+    by_number, rows = {e.epoch: e for e in epochs}, []
+    for number in (n for n in chosen if n in by_number):
+        one = by_number[number]
+        errors = ["–" if rmse is None else f"{1e3 * rmse:.1f} mm" for rmse in (one.train_rmse, one.validation_rmse)]
+        rows.append((f"{number}: {names[number]}", *errors, "–" if one.loss is None else f"{one.loss:.4g}"))
     head = (
         explained("epoch", TERMS["epoch"]),
         explained("RMSE, training tracks", TERMS["RMSE"]),
@@ -143,12 +134,6 @@ def _numbers(epochs: Sequence[Epoch], best_epoch: int) -> Html:
         explained("loss", TERMS["loss"]),
     )
     return section("How good the model is", table(head, rows))
-
-
-def _origin(origin: Mapping[str, str]) -> Html:
-    """The inputs of the page; commands stay as they were typed."""
-    rows = [(name, typed(said) if name == "command" else said) for name, said in origin.items()]
-    return table(("", ""), [*rows, ("config", "config.yaml beside this page, with every default")])
 
 
 def _shot(shot: PredictedShot | None) -> Html:
@@ -175,10 +160,8 @@ def _drawn(shot: PredictedShot, error: Array) -> Figure:
     figure = Figure(figsize=(7.4, 8.0), layout="constrained")
     panels = figure.subplots(4, 1, sharex=True)
     for i, axes in enumerate(panels[:3]):
-        for part, marker, label in (
-            (shot.times <= 0.0, "x", "measured, observed"),
-            (shot.times > 0.0, "o", "measured"),
-        ):
+        ahead = shot.times > 0.0
+        for part, marker, label in ((~ahead, "x", "measured, observed"), (ahead, "o", "measured")):
             if part.any():
                 where, place = shot.times[part], shot.measured[part, i]
                 axes.plot(where, place, marker, color=MEASURED, markersize=4, fillstyle="none", label=label)
@@ -191,19 +174,3 @@ def _drawn(shot: PredictedShot, error: Array) -> Figure:
         axes.axvline(0.0, color="black", linestyle="--", linewidth=0.8)
         axes.grid(visible=True, alpha=0.25)
     return figure
-
-
-def _learned(learned: Sequence[Learned]) -> Html:
-    rows = [
-        (one.name, f"{one.before:.4g}", f"{one.after:.4g}", one.unit or "a pure number", one.meaning) for one in learned
-    ]
-    head = ("number", "before", "after", "unit", "what it is")
-    return section("What was learned of noise, spin and coefficients", table(head, rows))
-
-
-def _mm(value: float | None) -> str:
-    return "–" if value is None else f"{1e3 * value:.1f} mm"
-
-
-def _plain(value: float | None) -> str:
-    return "–" if value is None else f"{value:.4g}"

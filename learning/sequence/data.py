@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -34,16 +35,16 @@ class LauncherSettings:
     @property
     def size(self) -> int:
         """Number of numbers."""
-        return len(self._reader().names) if self.labels else 0
+        return 0 if self.reader is None else len(self.reader.names)
 
     def of(self, track: Track) -> Tensor:
         """(k,) the settings of a track, in the units of their labels.
 
         Raises: ValueError: if a label is missing, or is not a number or one of the known categories.
         """
-        if not self.labels:
+        if self.reader is None:
             return torch.zeros(0, dtype=torch.float64)
-        settings = self._reader().settings(track.labels)
+        settings = self.reader.settings(track.labels)
         if settings is None:
             got = {name: track.labels.get(name) for name in self.labels}
             raise ValueError(
@@ -52,9 +53,10 @@ class LauncherSettings:
             )
         return settings
 
-    def _reader(self) -> SpinEmbedding:
+    @cached_property
+    def reader(self) -> SpinEmbedding | None:
         """Reads labels by the rules of the dynamics models; its weights are not used."""
-        return SpinEmbedding(self.labels, self.categories)
+        return SpinEmbedding(self.labels, self.categories) if self.labels else None
 
 
 @dataclass(frozen=True)
@@ -115,14 +117,9 @@ class Batch:
 
 
 def example(track: Track, observed: int, settings: Tensor, times: ArrayLike | None = None) -> Example:
-    """Cut a track after its first `observed` samples.
+    """Cut a track after its first `observed` samples, two or more; settings: (k,) of its launcher.
 
-    Args:
-        track: at least `observed` samples.
-        observed: >= 2.
-        settings: (k,) of this track's launcher.
-        times: (m,) s in the track's own time, increasing, later than the last observed sample; None: the stamps of
-            the rest, with their measurements.
+    Args: times: (m,) s in the track's own time; None: the stamps of the rest, with their measurements.
     Raises: ValueError: too few samples, nothing to predict, or times that do not increase from the last observed one.
     """
     if not LEAST_OBSERVED <= observed <= len(track):
@@ -136,7 +133,18 @@ def example(track: Track, observed: int, settings: Tensor, times: ArrayLike | No
     else:
         asked = np.asarray(times, dtype=np.float64)
         rest = np.full((*asked.shape, 3), np.nan)
-    _check_asked(track.name, asked, origin)
+    if asked.ndim != 1 or len(asked) == 0:
+        raise ValueError(
+            f"times of track {shown(track.name)} must have shape (m,) with m >= 1; got {asked.shape}. "
+            "Ask for a time after the observed part, or observe fewer samples."
+        )
+    late = np.diff(asked, prepend=origin) > 0
+    if not late.all():
+        at = int(np.argmin(late))
+        raise ValueError(
+            f"times of track {shown(track.name)} must increase from the last observed stamp {origin:g} s; times[{at}]="
+            f"{asked[at]:g}. Sort them and drop what is observed."
+        )
     return Example(
         observed_times=torch.from_numpy(track.times[:observed] - origin),
         observed=torch.from_numpy(track.positions[:observed]),
@@ -146,34 +154,16 @@ def example(track: Track, observed: int, settings: Tensor, times: ArrayLike | No
     )
 
 
-def _check_asked(name: str, asked: np.ndarray, origin: float) -> None:
-    if asked.ndim != 1 or len(asked) == 0:
-        raise ValueError(
-            f"times of track {shown(name)} must have shape (m,) with m >= 1; got {asked.shape}. "
-            "Ask for a time after the observed part, or observe fewer samples."
-        )
-    steps = np.diff(asked, prepend=origin)
-    if not (steps > 0).all():
-        at = int(np.flatnonzero(~(steps > 0))[0])
-        raise ValueError(
-            f"times of track {shown(name)} must increase from the last observed stamp {origin:g} s; times[{at}]="
-            f"{asked[at]:g}. Sort them and drop what is observed."
-        )
-
-
 def collate(examples: Sequence[Example]) -> Batch:
     """Examples as one batch, in their order. At least one; all with settings of the same length."""
+    padded = {
+        name: pad_sequence([getattr(item, name) for item in examples], batch_first=True)
+        for name in ("observed_times", "observed", "times", "rest")
+    }
     counts = torch.tensor([len(item.observed_times) for item in examples])
-    asked = torch.tensor([len(item.times) for item in examples])
-    times = pad_sequence([item.times for item in examples], batch_first=True)
-    mask = torch.arange(times.shape[1]) < asked[:, None]
-    last = times.gather(1, asked[:, None] - 1)
+    asked = torch.tensor([len(item.times) for item in examples])[:, None]
+    mask = torch.arange(padded["times"].shape[1]) < asked
+    padded["times"] = torch.where(mask, padded["times"], padded["times"].gather(1, asked - 1))
     return Batch(
-        observed_times=pad_sequence([item.observed_times for item in examples], batch_first=True),
-        observed=pad_sequence([item.observed for item in examples], batch_first=True),
-        observed_count=counts,
-        settings=torch.stack([item.settings for item in examples]),
-        times=torch.where(mask, times, last),
-        rest=pad_sequence([item.rest for item in examples], batch_first=True),
-        asked=mask,
+        observed_count=counts, settings=torch.stack([item.settings for item in examples]), asked=mask, **padded
     )

@@ -18,8 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from ballfg.learning.sequence.data import Batch
-from ballfg.learning.sequence.frame import Frame
-from ballfg.learning.sequence.model import Draw, SequenceModel
+from ballfg.learning.sequence.model import Draw, Frame, SequenceModel
 
 LEVELS = 1000
 """Noise levels; the last is pure noise."""
@@ -47,15 +46,15 @@ DILATIONS = (1, 2, 4, 8, 16, 32, 1, 2)
 """Dilations of the blocks; together they look back 132 grid steps."""
 
 
+PLACE = 2 * WAVES + 1
+"""Length of `place_features`."""
+
+
 def place_features(steps: Tensor) -> Tensor:
-    """(..., 2 WAVES + 1) features of places in time (...), in grid steps: the place itself, sines and cosines of it."""
+    """(..., PLACE) features of places in time (...), in grid steps: the place itself, sines and cosines of it."""
     frequency = (2 * math.pi / SHORTEST_PERIOD) * torch.logspace(0, -math.log10(PERIOD_RANGE), WAVES, dtype=steps.dtype)
     phase = steps[..., None] * frequency
     return torch.cat([steps[..., None] / LONG, phase.sin(), phase.cos()], dim=-1)
-
-
-PLACE = 2 * WAVES + 1
-"""Length of `place_features`."""
 
 
 class Encoder(nn.Module):
@@ -73,10 +72,9 @@ class Encoder(nn.Module):
 
     def forward(self, batch: Batch, frame: Frame) -> Tensor:
         """(b, width) of the observed parts; the padding has no influence."""
-        seen = frame.inward(batch.observed, batch)
+        seen, padding = frame.inward(batch.observed, batch), ~batch.seen
         place = place_features(batch.observed_times / frame.step)
         settings = frame.settings(batch)[:, None].expand(-1, seen.shape[1], -1)
-        padding = ~batch.seen
         tokens = self.inward(torch.cat([seen, place, settings], dim=-1).float())
         tokens = self.layers(tokens, src_key_padding_mask=padding)
         weights = self.score(tokens).masked_fill(padding[..., None], -torch.inf).softmax(dim=1)
@@ -84,10 +82,7 @@ class Encoder(nn.Module):
 
 
 class Block(nn.Module):
-    """One gated causal convolution with a skip; the condition scales and shifts its normalised input.
-
-    Its three taps lie `dilation` grid steps apart.
-    """
+    """A gated causal convolution with a skip, its taps `dilation` steps apart; the condition modulates its input."""
 
     def __init__(self, width: int, dilation: int, condition: int) -> None:
         super().__init__()
@@ -147,9 +142,7 @@ class DiffusionModel(SequenceModel):
     """Encoder, denoiser of `width` channels, and noise schedule; encoder and condition are wider in proportion."""
 
     def __init__(self, settings: int, points: int, width: int) -> None:
-        super().__init__()
-        self.points = points
-        self.frame = Frame(settings)
+        super().__init__(settings, points)
         condition = 2 * width
         self.encoder = Encoder(settings, 3 * width // 2, layers=2)
         inward = nn.Linear(3 * width // 2 + settings, condition)
@@ -164,8 +157,7 @@ class DiffusionModel(SequenceModel):
         clean = clean.float()
         levels, noise = self._draw(draws, points)
         noisy = self.schedule.add_noise(clean.repeat_interleave(DRAWS, dim=0), noise, levels)
-        told = self._condition(batch).repeat_interleave(DRAWS, dim=0)
-        denoised = self.denoiser(noisy, levels, told).unflatten(0, (-1, DRAWS))
+        denoised = self.denoiser(noisy, levels, self._condition(batch, DRAWS)).unflatten(0, (-1, DRAWS))
         error = (denoised - clean[:, None]).square().sum(-1).mean(dim=1) * known
         losses = error.sum(1) / known.sum(1).clamp(min=1)
         return losses, self.path(denoised.detach().mean(dim=1), batch)
@@ -174,19 +166,18 @@ class DiffusionModel(SequenceModel):
         """The mean of the paths that sampling gives from fixed starts; see `SequenceModel`."""
         generator = torch.Generator().manual_seed(START_SEED)
         starts = torch.randn(SAMPLES, self.points, 3, generator=generator)[:, : self.points_asked(batch)]
-        told = self._condition(batch).repeat_interleave(SAMPLES, dim=0)
-        path = starts.repeat(len(batch.times), 1, 1)
+        told, path = self._condition(batch, SAMPLES), starts.repeat(len(batch.times), 1, 1)
         self.schedule.set_timesteps(STEPS)
         for level in self.schedule.timesteps:
             clean = self.denoiser(path, level.expand(len(told)), told)
             path = self.schedule.step(clean, level, path, eta=0.0).prev_sample
         return self.path(path.unflatten(0, (-1, SAMPLES)).mean(dim=1), batch)
 
-    def _condition(self, batch: Batch) -> Tensor:
-        """(b, c) condition from observations and launcher settings."""
-        read = self.encoder(batch, self.frame)
-        told: Tensor = self.bridge(torch.cat([read, self.frame.settings(batch).float()], dim=-1))
-        return told
+    def _condition(self, batch: Batch, times: int) -> Tensor:
+        """(b times, c) condition from observations and launcher settings, each so many times."""
+        settings = self.frame.settings(batch).float()
+        told: Tensor = self.bridge(torch.cat([self.encoder(batch, self.frame), settings], dim=-1))
+        return told.repeat_interleave(times, dim=0)
 
     def _draw(self, draws: Sequence[Draw], points: int) -> tuple[Tensor, Tensor]:
         """Levels (b DRAWS,) and noise (b DRAWS, points, 3), the draws of a track side by side."""

@@ -6,7 +6,6 @@ import torch
 from torch import Tensor, nn
 
 from ballfg.learning.sequence.data import Batch
-from ballfg.learning.sequence.frame import Frame
 from ballfg.learning.sequence.model import Draw, SequenceModel
 
 STRIDE = 0.05
@@ -23,9 +22,7 @@ class LstmModel(SequenceModel):
     """
 
     def __init__(self, settings: int, points: int, width: int) -> None:
-        super().__init__()
-        self.points = points
-        self.frame = Frame(settings)
+        super().__init__(settings, points)
         self.encoder = nn.LSTM(7 + settings, width, num_layers=2, batch_first=True)
         self.bridge = nn.Linear(width, 2 * width)
         self.cell = nn.LSTMCell(6 + settings, width)
@@ -34,8 +31,7 @@ class LstmModel(SequenceModel):
     def losses(self, batch: Batch, draws: Sequence[Draw]) -> tuple[Tensor, Tensor]:
         """Mean squared error over the rest of each track; nothing is drawn."""
         positions = self.predict(batch)
-        error = ((positions - batch.rest) / self.frame.units).square().sum(-1) * batch.asked
-        return error.sum(1) / batch.asked.sum(1), positions.detach()
+        return self.errors(positions, batch), positions.detach()
 
     def predict(self, batch: Batch) -> Tensor:
         """See `SequenceModel`."""

@@ -1,10 +1,10 @@
-"""Predicts tracks by a trained sequence model, and saves and loads it as a folder."""
+"""Builds sequence models of a kind and size, predicts tracks with them, and saves and loads them as folders."""
 
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self, get_args
 
 import numpy as np
 import torch
@@ -18,40 +18,80 @@ from ballfg.checks import short_text, shown
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.files.weights import read_tensors
 from ballfg.files.whole_folder import of_one_state, whole_folder
-from ballfg.learning.sequence.architecture import SequenceArchitecture
-from ballfg.learning.sequence.data import LauncherSettings, collate, example
-from ballfg.learning.sequence.model import SequenceModel
+from ballfg.learning.sequence.data import Example, LauncherSettings, collate, example
+from ballfg.learning.sequence.diffusion import DiffusionModel
+from ballfg.learning.sequence.lstm import LstmModel
+from ballfg.learning.sequence.model import Frame, SequenceModel
 from ballfg.tracks import Track
 
+SequenceKind = Literal["lstm", "diffusion"]
+DEFAULT_WIDTH: dict[SequenceKind, int] = {"lstm": 96, "diffusion": 64}
+"""Chosen by validation on simulated tracks."""
+_MODELS: dict[SequenceKind, type[LstmModel] | type[DiffusionModel]] = {"lstm": LstmModel, "diffusion": DiffusionModel}
 CHUNK = 64
 """Tracks that are predicted at once, which bounds the memory."""
 CONFIG, WEIGHTS = "config.yaml", "weights.safetensors"
 
 
+@dataclass(frozen=True)
+class SequenceArchitecture:
+    """Kind and size.
+
+    Attributes:
+        kind: lstm or diffusion.
+        width: of the hidden states; diffusion: channels of the denoiser. A multiple of 8, for the attention heads.
+    Raises: ValueError: an unknown kind, or a width that is not a positive multiple of 8.
+    """
+
+    kind: SequenceKind
+    width: int
+
+    def __post_init__(self) -> None:
+        if self.kind not in _MODELS:
+            raise ValueError(
+                f"kind must be one of {', '.join(get_args(SequenceKind))}; got {shown(self.kind)}. Rename it."
+            )
+        if isinstance(self.width, bool) or not isinstance(self.width, int) or self.width < 8 or self.width % 8:
+            raise ValueError(f"width must be a positive multiple of 8; got {shown(self.width)}. Round it.")
+
+    @classmethod
+    def of(cls, kind: SequenceKind) -> Self:
+        """The default of a kind. Raises: ValueError: an unknown kind."""
+        return cls(kind, DEFAULT_WIDTH.get(kind, 0))
+
+    def empty(self, settings: int, points: int) -> SequenceModel:
+        """A model before its weights and scales are loaded."""
+        return _MODELS[self.kind](settings, points, self.width)
+
+    def untrained(self, examples: Sequence[Example], seed: int) -> SequenceModel:
+        """A model with the scales of some examples and weights drawn by the seed; torch's generator is unchanged."""
+        settings = len(examples[0].settings)
+        points = Frame(settings).fit(examples)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            model = self.empty(settings, points)
+        model.frame.fit(examples)
+        return model
+
+
 class FolderConfig(BaseModel):
-    """The content of `config.yaml`."""
+    """The content of `config.yaml`: architecture, points of the grid, labels of settings, values of textual ones."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
-    kind: Literal["lstm", "diffusion"]
-    """Kind of the model."""
+    kind: SequenceKind
     width: Annotated[int, Field(ge=1, le=2048)]
-    """Width of its hidden states."""
     points: Annotated[int, Field(ge=1, le=100_000)]
-    """Number of points of its grid."""
     labels: Annotated[tuple[str, ...], Field(strict=False)]
-    """Labels that are launcher settings."""
     categories: dict[str, Annotated[tuple[str, ...], Field(strict=False)]]
-    """Values of the textual labels."""
     digest: str | None = None
     """SHA-256 of the weights; null in folders of earlier versions."""
 
 
 @dataclass(eq=False)
 class SequencePredictor:
-    """Predicts the rest of tracks from their first samples.
+    """Predicts the rest of tracks from their first samples; beyond the longest rest in training it goes straight on.
 
-    A prediction reaches as far as the longest rest in training; beyond that it goes straight on.
     Frames may be dropped, but the observed part should last as long as in training: a model has learned no other.
     """
 
@@ -79,15 +119,7 @@ class SequencePredictor:
     def predict_many(
         self, tracks: Sequence[Track], observed: Sequence[int], times: Sequence[ArrayLike]
     ) -> list[NDArray[np.float64]]:
-        """Positions of many tracks, as `predict` gives them.
-
-        Args:
-            tracks: as for `predict`.
-            observed: one number per track.
-            times: (k,) s, one array per track.
-        Returns: (k, 3) m, one array per track.
-        Raises: ValueError: as `predict`.
-        """
+        """Positions of many tracks, (k, 3) m each; arguments and errors as those of `predict`, for each track."""
         examples = [
             example(track, count, self.launcher.of(track), asked)
             for track, count, asked in zip(tracks, observed, times, strict=True)
@@ -96,8 +128,8 @@ class SequencePredictor:
         for first in range(0, len(examples), CHUNK):
             batch = collate(examples[first : first + CHUNK])
             with torch.no_grad():
-                positions = self.model.predict(batch)
-            predicted += [row[mask].numpy() for row, mask in zip(positions, batch.asked, strict=True)]
+                rows = zip(self.model.predict(batch), batch.asked, strict=True)
+            predicted += [row[mask].numpy() for row, mask in rows]
         return predicted
 
     def save(self, folder: str | Path) -> None:
@@ -113,17 +145,17 @@ class SequencePredictor:
 
     def replace(self, folder: Path) -> None:
         """Write as `save`, in the place of an earlier model of that folder; its parent must exist."""
-        config: dict[str, Any] = {
-            "kind": self.architecture.kind,
-            "width": self.architecture.width,
-            "points": self.model.points,
-            "labels": list(self.launcher.labels),
-            "categories": {label: list(values) for label, values in self.launcher.categories.items()},
-        }
         weights = save({name: value.contiguous() for name, value in self.model.state_dict().items()})
-        config["digest"] = hashlib.sha256(weights).hexdigest()
+        config = FolderConfig(
+            kind=self.architecture.kind,
+            width=self.architecture.width,
+            points=self.model.points,
+            labels=self.launcher.labels,
+            categories=dict(self.launcher.categories),
+            digest=hashlib.sha256(weights).hexdigest(),
+        )
         with whole_folder(folder, earlier=(CONFIG, WEIGHTS)) as part:
-            text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True)
+            text = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
             (part / CONFIG).write_text(text, encoding="utf-8")
             (part / WEIGHTS).write_bytes(weights)
 
@@ -142,8 +174,10 @@ class SequencePredictor:
             raise ValueError(f"{Path(folder) / CONFIG}: {error}") from None
         launcher = LauncherSettings(config.labels, config.categories)
         model = architecture.empty(launcher.size, config.points)
-        expected = {name: (tuple(value.shape), value.dtype) for name, value in model.state_dict().items()}
-        got = {name: (tuple(value.shape), value.dtype) for name, value in weights.items()}
+        expected, got = (
+            {name: (tuple(value.shape), value.dtype) for name, value in tensors.items()}
+            for tensors in (model.state_dict(), weights)
+        )
         wrong = sorted(name for name in expected.keys() | got.keys() if expected.get(name) != got.get(name))
         if wrong:
             raise ValueError(

@@ -1,6 +1,6 @@
 """Adapts a sequence model with its tracks to the training loop."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar, cast
@@ -11,11 +11,9 @@ from torch import Tensor
 from ballfg.learning.augment import augmentation
 from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.registry import TraineeKind
-from ballfg.learning.sequence.architecture import SequenceArchitecture, SequenceKind
 from ballfg.learning.sequence.data import Batch, Example, LauncherSettings, collate, example
 from ballfg.learning.sequence.model import SequenceModel
-from ballfg.learning.sequence.predictor import SequencePredictor
-from ballfg.learning.shots import TrainingShot
+from ballfg.learning.sequence.predictor import SequenceArchitecture, SequenceKind, SequencePredictor
 from ballfg.learning.trainee import BatchLoss, PredictedShot, Prepared, Trainee
 from ballfg.learning.training_data import read_training_data
 from ballfg.tracks import Track
@@ -66,35 +64,44 @@ class SequenceTrainee(Trainee):
             raise ValueError(f"train must hold a track with observations and a rest; got none ({reason})")
         self.module = architecture.untrained(usable, seed)
         self._architecture, self._launcher = architecture, launcher
-        self._seed = seed
-        self._augment = augment
+        self._seed, self._augment = seed, augment
 
     def loss(self, tracks: Sequence[int], epoch: int) -> BatchLoss:
         """Sum of the tracks' losses, in squared units of the frame; lstm: squared error, diffusion: denoising.
 
         `squared_error` is that of the positions predicted in training; diffusion: of the denoised paths.
         """
-        numbers = [number for number in tracks if number in self._examples]
-        if not numbers:
-            return BatchLoss.none(self._failed(tracks))
-        examples = [self._examples[number] for number in numbers]
+        examples = self._usable(tracks)
         if self._augment:
-            poses = [augmentation(self._seed, epoch, number) for number in numbers]
-            examples = [one.seen_from(*pose) for one, pose in zip(examples, poses, strict=True)]
-        batch = collate(examples)
-        losses, positions = self.module.losses(batch, [(self._seed, epoch, number) for number in numbers])
-        return self._batch_loss(tracks, losses.double(), positions, batch)
+            poses = {number: augmentation(self._seed, epoch, number) for number in examples}
+            examples = {number: one.seen_from(*poses[number]) for number, one in examples.items()}
+        draws = [(self._seed, epoch, number) for number in examples]
+        return self._batch_loss(tracks, examples, lambda batch: self.module.losses(batch, draws))
 
     def judge(self, tracks: Sequence[int]) -> BatchLoss:
         """Mean squared error of true predictions, diffusion: sampled; the sum over tracks, in squared units."""
-        numbers = [number for number in tracks if number in self._examples]
-        if not numbers:
-            return BatchLoss.none(self._failed(tracks))
-        batch = collate([self._examples[number] for number in numbers])
-        with torch.no_grad():
+
+        def judged(batch: Batch) -> tuple[Tensor, Tensor]:
             positions = self.module.predict(batch)
-        error = ((positions - batch.rest) / self.module.frame.units).square().sum(-1) * batch.asked
-        return self._batch_loss(tracks, error.sum(1) / batch.asked.sum(1), positions, batch)
+            return self.module.errors(positions, batch), positions
+
+        with torch.no_grad():
+            return self._batch_loss(tracks, self._usable(tracks), judged)
+
+    def _usable(self, tracks: Sequence[int]) -> dict[int, Example]:
+        return {number: self._examples[number] for number in tracks if number in self._examples}
+
+    def _batch_loss(
+        self, tracks: Sequence[int], examples: dict[int, Example], losses: Callable[[Batch], tuple[Tensor, Tensor]]
+    ) -> BatchLoss:
+        """The sums over tracks; losses: (b,) of a batch, and the positions (b, m, 3) m predicted in it."""
+        failed = tuple((self._names[n], self._unusable[n]) for n in tracks if n in self._unusable)
+        if not examples:
+            return BatchLoss.none(failed)
+        batch = collate(list(examples.values()))
+        each, positions = losses(batch)
+        squares = float((positions - batch.rest)[batch.asked].square().sum())
+        return BatchLoss(each.double().sum(), len(each), squares, int(batch.asked.sum()), failed)
 
     def shown(self, track: int) -> PredictedShot | None:
         """The unobserved rest of a track."""
@@ -115,54 +122,33 @@ class SequenceTrainee(Trainee):
         self.predictor().replace(path)  # that of a run that was stopped while it ended
         return path
 
-    def _batch_loss(self, tracks: Sequence[int], losses: Tensor, positions: Tensor, batch: Batch) -> BatchLoss:
-        squares = float((positions - batch.rest)[batch.asked].square().sum())
-        return BatchLoss(losses.sum(), len(losses), squares, int(batch.asked.sum()), self._failed(tracks))
-
-    def _failed(self, tracks: Sequence[int]) -> tuple[tuple[str, str], ...]:
-        return tuple((self._names[number], self._unusable[number]) for number in tracks if number in self._unusable)
-
-
-def build_sequence(config: TrainConfig) -> Prepared:
-    """The trainee of the kinds lstm and diffusion, on the same shots as a model of the dynamics would have.
-
-    Raises: ValueError, FileNotFoundError: bad input.
-    """
-    data = read_training_data(config)
-    launcher = LauncherSettings()
-    if data.embedding is not None:
-        launcher = LauncherSettings(data.embedding.labels, data.embedding.categories)
-    usable = [_usable(shot) for shot in data.shots]
-    trainee = SequenceTrainee(
-        [track for track, _ in usable],
-        [observed for _, observed in usable],
-        data.train,
-        architecture=SequenceArchitecture.of(cast(SequenceKind, config.kind)),
-        launcher=launcher,
-        seed=config.seed,
-        augment=config.augmented,
-    )
-    return Prepared(trainee, data.train, data.validation)
-
-
-def _usable(shot: TrainingShot) -> tuple[Track, int]:
-    """The usable samples of a shot, and the number of observed ones."""
-    keep, track = shot.usable, shot.track
-    sigmas = None if track.sigmas is None else track.sigmas[keep]
-    kept = replace(track, times=track.times[keep], positions=track.positions[keep], sigmas=sigmas)
-    return kept, int(keep[: shot.observed].sum())
-
 
 class SequenceModelKind(TraineeKind):
-    """A network from observations to the rest of a track."""
+    """A network from observations to the rest of a track, on the same shots as a model of the dynamics would have."""
 
     unused: ClassVar[tuple[str, ...]] = ("architecture", "model", "noise", "gradient", "options")
     augmented = True
 
     @classmethod
     def build(cls, config: TrainConfig) -> Prepared:
-        """The model with its data, ready to train."""
-        return build_sequence(config)
+        """The model with its data, ready to train. Raises: ValueError, FileNotFoundError: bad input."""
+        data, kept, observed = read_training_data(config), list[Track](), list[int]()
+        for shot in data.shots:
+            usable, track = shot.usable, shot.track
+            sigmas = None if track.sigmas is None else track.sigmas[usable]
+            kept.append(replace(track, times=track.times[usable], positions=track.positions[usable], sigmas=sigmas))
+            observed.append(int(usable[: shot.observed].sum()))
+        known = data.embedding
+        trainee = SequenceTrainee(
+            kept,
+            observed,
+            data.train,
+            architecture=SequenceArchitecture.of(cast(SequenceKind, config.kind)),
+            launcher=LauncherSettings() if known is None else LauncherSettings(known.labels, known.categories),
+            seed=config.seed,
+            augment=config.augmented,
+        )
+        return Prepared(trainee, data.train, data.validation)
 
 
 class Lstm(SequenceModelKind):

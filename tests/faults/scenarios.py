@@ -20,9 +20,8 @@ from ballfg.dynamics.networks.learned import LearnedModel, build
 from ballfg.learning.config.training import OptimizerConfig, TrainConfig
 from ballfg.learning.run.checkpoint import Checkpoint, RunProgress, read_checkpoint, write_checkpoint
 from ballfg.learning.run.training import run_training
-from ballfg.learning.sequence.architecture import SequenceArchitecture
 from ballfg.learning.sequence.data import LauncherSettings
-from ballfg.learning.sequence.predictor import SequencePredictor
+from ballfg.learning.sequence.predictor import SequenceArchitecture, SequencePredictor
 from ballfg.tracks import read_dataset
 from ballfg.vision import Camera
 from ballfg.vision.calibration.table_points import table_points

@@ -124,7 +124,7 @@ def posed() -> Problem:
 
 
 def write_sequence(folder: Path) -> None:
-    from ballfg.learning.sequence.architecture import SequenceArchitecture
+    from ballfg.learning.sequence.predictor import SequenceArchitecture
 
     model = SequenceArchitecture("lstm", 8).empty(0, 5)
     (folder / "config.yaml").write_text("kind: lstm\nwidth: 8\npoints: 5\nlabels: []\ncategories: {}\n")

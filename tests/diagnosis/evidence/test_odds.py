@@ -21,6 +21,32 @@ from ballfg.dynamics import EFFECTS
 WIND = Hypothesis(EFFECTS["wind"], {}, ("x", "y", "z"))
 
 
+@pytest.fixture(scope="module")
+def calm(calm_fit):
+    return weigh(calm_fit)
+
+
+@pytest.fixture(scope="module")
+def calm_with_wind(calm_fit):
+    return weigh(refit(calm_fit, Scored(WIND, None, 0.0)).fit, [WIND])
+
+
+@pytest.fixture(scope="module")
+def windy_declared(windy_fit):
+    return weigh(windy_fit)
+
+
+@pytest.fixture(scope="module")
+def refitted(windy_fit):
+    """The windy shots with wind in the model."""
+    return refit(windy_fit, Scored(WIND, None, 0.0)).fit
+
+
+@pytest.fixture(scope="module")
+def windy_with_wind(refitted):
+    return weigh(refitted, [WIND])
+
+
 def model(names, evidence, held_out=None):
     named = [Hypothesis(EFFECTS[name], {}, ("x",)) for name in names]
     gains = np.full(10, evidence / 10.0) if held_out is None else np.asarray(held_out)
@@ -75,13 +101,10 @@ def test_an_effect_whose_strength_is_nothing_is_not_believed():
     assert odds.of("wind") > 0.99
 
 
-def test_the_evidence_without_an_effect_is_that_of_its_columns_left_out(calm_fit, windy_fit):
+def test_the_evidence_without_an_effect_is_that_of_its_columns_left_out(calm, calm_with_wind, windy_with_wind):
     """On a calm day that of the declared model; in wind far below that of the model with wind."""
-    windy = refit(calm_fit, Scored(WIND, None, 0.0)).fit
-    with_wind = weigh(windy, [WIND])
-    assert with_wind.nested[frozenset()] == pytest.approx(weigh(calm_fit).score, abs=1.0)
-    needed = weigh(refit(windy_fit, Scored(WIND, None, 0.0)).fit, [WIND])
-    assert needed.nested[frozenset()] < needed.score - 20.0
+    assert calm_with_wind.nested[frozenset()] == pytest.approx(calm.score, abs=1.0)
+    assert windy_with_wind.nested[frozenset()] < windy_with_wind.score - 20.0
 
 
 def test_a_choice_among_shapes_is_paid_for():
@@ -90,10 +113,9 @@ def test_a_choice_among_shapes_is_paid_for():
     np.testing.assert_array_equal(scales(WIND), 0.2)
 
 
-def test_what_is_foretold_is_what_a_refit_gains(windy_fit):
-    before, motion = weigh(windy_fit), random_motion(windy_fit)
-    (gain,) = foretold(before, motion, [WIND], columns_of(windy_fit, [WIND]))
-    after = weigh(refit(windy_fit, Scored(WIND, None, 0.0)).fit, [WIND])
+def test_what_is_foretold_is_what_a_refit_gains(windy_fit, windy_declared, windy_with_wind):
+    before, after = windy_declared, windy_with_wind
+    (gain,) = foretold(before, random_motion(windy_fit), [WIND], columns_of(windy_fit, [WIND]))
     assert gain > 20.0
     assert after.evidence - before.evidence > 0.8 * gain  # with noise of its own it gains more
     strengths = after.strengths["wind"]
@@ -102,12 +124,13 @@ def test_what_is_foretold_is_what_a_refit_gains(windy_fit):
     assert (after.held_out - before.held_out).sum() > 0.5 * (after.evidence - before.evidence)
 
 
-def test_patterns_lose_against_an_effect_that_is_there(windy_fit, calm_fit):
-    windy = refit(windy_fit, Scored(WIND, None, 0.0)).fit
-    declared, named = weigh(windy_fit), weigh(windy, [WIND])
-    patterns, both = weigh(windy_fit, nameless=True), weigh(windy, [WIND], nameless=True)
+def test_patterns_lose_against_an_effect_that_is_there(
+    windy_fit, calm_fit, calm, windy_declared, refitted, windy_with_wind
+):
+    declared, named = windy_declared, windy_with_wind
+    patterns, both = weigh(windy_fit, nameless=True), weigh(refitted, [WIND], nameless=True)
     assert named.score > max(patterns.score, both.score) + 2.0
-    assert weigh(calm_fit, nameless=True).score < weigh(calm_fit).score
+    assert weigh(calm_fit, nameless=True).score < calm.score
     assert patterns.names == {NAMELESS}
     assert both.names == {"wind", NAMELESS}
     odds = odds_of([declared, named, patterns, both], declared)
@@ -118,8 +141,8 @@ def test_patterns_lose_against_an_effect_that_is_there(windy_fit, calm_fit):
 
 def test_a_name_that_explains_a_part_is_not_believed_beside_patterns(make_ball, make_launches, make_shots, make_fit):
     """Wind that grows with the height: an even wind explains most of it, on both halves."""
-    sheared = make_ball(wind_shear={"x": 5.0, "y": -3.0})
-    declared = make_fit(make_ball(), make_shots(sheared, make_launches(30, 5), 5).stretches)
+    sheared = make_ball(wind_shear={"x": 8.0, "y": -5.0})
+    declared = make_fit(make_ball(), make_shots(sheared, make_launches(16, 5), 5, rate=40.0).stretches)
     windy = refit(declared, Scored(WIND, None, 0.0)).fit
     without = [weigh(declared), weigh(windy, [WIND])]
     assert odds_of(without, without[0]).of("wind") > 0.95
@@ -129,9 +152,7 @@ def test_a_name_that_explains_a_part_is_not_believed_beside_patterns(make_ball, 
     assert odds.nameless > 0.95
 
 
-def test_an_effect_that_is_not_there_costs_its_prior(calm_fit):
-    before, motion = weigh(calm_fit), random_motion(calm_fit)
-    (gain,) = foretold(before, motion, [WIND], columns_of(calm_fit, [WIND]))
-    after = weigh(refit(calm_fit, Scored(WIND, None, 0.0)).fit, [WIND])
+def test_an_effect_that_is_not_there_costs_its_prior(calm_fit, calm, calm_with_wind):
+    (gain,) = foretold(calm, random_motion(calm_fit), [WIND], columns_of(calm_fit, [WIND]))
     assert gain < 1.0
-    assert after.evidence - before.evidence == pytest.approx(gain, abs=1.0)
+    assert calm_with_wind.evidence - calm.evidence == pytest.approx(gain, abs=1.0)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.learning.sequence.architecture import SequenceArchitecture, SequenceKind
 from ballfg.learning.sequence.data import collate, example
+from ballfg.learning.sequence.predictor import SequenceArchitecture, SequenceKind
 from ballfg.tracks import Track
 
 G, RESTITUTION, START = 9.81, 0.9, 0.5

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ballfg.learning.sequence.data import Batch, Example, collate, example
-from ballfg.learning.sequence.frame import Frame
+from ballfg.learning.sequence.model import Frame
 from ballfg.tracks import Track
 
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.learning.sequence.architecture import SequenceArchitecture, SequenceKind
 from ballfg.learning.sequence.data import Example, LauncherSettings, collate, example
 from ballfg.learning.sequence.model import SequenceModel
+from ballfg.learning.sequence.predictor import SequenceArchitecture, SequenceKind
 from ballfg.tracks import Track
 
 LABELS = ("topspin", "sidespin", "speed")

@@ -8,9 +8,8 @@ import torch
 import yaml
 from safetensors.torch import load_file, save_file
 
-from ballfg.learning.sequence.architecture import SequenceArchitecture, SequenceKind
 from ballfg.learning.sequence.data import LauncherSettings, example
-from ballfg.learning.sequence.predictor import SequencePredictor
+from ballfg.learning.sequence.predictor import SequenceArchitecture, SequenceKind, SequencePredictor
 from ballfg.tracks import Track
 
 LABELS = ("topspin", "sidespin", "speed")

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.learning.sequence.architecture import SequenceArchitecture, SequenceKind
 from ballfg.learning.sequence.data import LauncherSettings
-from ballfg.learning.sequence.predictor import SequencePredictor
+from ballfg.learning.sequence.predictor import SequenceArchitecture, SequenceKind, SequencePredictor
 from ballfg.learning.sequence.trainee import SequenceTrainee
 from ballfg.tracks import Track
 
