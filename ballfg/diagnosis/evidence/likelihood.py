@@ -8,13 +8,13 @@ approximation.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from scipy import linalg, optimize
 
 from ballfg.arrays import Array, Index, Mask
-from ballfg.diagnosis.evidence.rows import KINDS, Rows
+from ballfg.diagnosis.evidence.rows import Rows
 from ballfg.diagnosis.fit.problem import LABEL_LOSS, POSITION_LOSS
 from ballfg.diagnosis.fit.system import by_track
 from ballfg.state import STATE_DIM
@@ -73,7 +73,7 @@ class Local:
 
     Attributes:
         lower: (n, l, l) triangle of the information on first states and random motion.
-        solved: (n, l, c + 1) its inverse times their inner products with common columns and the residual.
+        solved: (n, c + 1, l) inner products of common columns and the residual with them, over the triangle.
     """
 
     lower: Array
@@ -127,7 +127,8 @@ class Likelihood:
     def inner(self, noise: Noise) -> tuple[Array, Array]:
         """(n, d, d) information with priors of the random columns, and (n,) logarithms of the sizes."""
         of_samples, of_spins = self.grams
-        total = of_samples * np.exp(-2.0 * noise.white) + of_spins * np.exp(-2.0 * noise.spin)
+        total = of_samples * np.exp(-2.0 * noise.white)
+        total += of_spins * np.exp(-2.0 * noise.spin)
         kinds, first = self.rows.motion.kinds, np.arange(STATE_DIM)
         sizes = np.append(noise.random, 0.0)[kinds]
         place = STATE_DIM + np.arange(kinds.shape[1])
@@ -140,11 +141,13 @@ class Likelihood:
         """First states and random motion integrated out."""
         total, logs = self.inner(noise)
         end = STATE_DIM + self.rows.motion.kinds.shape[1]
-        lower = np.asarray(np.linalg.cholesky(total[:, :end, :end]), dtype=np.float64)
-        solved = solve_lower(lower, total[:, :end, end:])
-        gram = total[:, end:, end:] - solved.swapaxes(1, 2) @ solved
+        gram, kept = total[:, end:, end:].copy(), np.arange(end, total.shape[-1])
+        # its triangle below the eliminated rows is the same whatever these hold; large, they stay definite
+        total[:, kept, kept] += 1.0 + total[:, kept, kept]
+        triangle = np.linalg.cholesky(total)
+        lower, solved = triangle[:, :end, :end], triangle[:, end:, :end]
         narrow = np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)
-        return Reduced(logs - narrow - self.penalty, gram), Local(lower, solved)
+        return Reduced(logs - narrow - self.penalty, gram - solved @ solved.swapaxes(1, 2)), Local(lower, solved)
 
     def slope(self, noise: Noise, local: Local, found: Posterior, precision: Array, away: Array) -> Array:
         """(6,) derivative of the evidence by the logarithms of the sizes: expected squares less their number.
@@ -154,8 +157,8 @@ class Likelihood:
         """
         kinds = self.rows.motion.kinds
         end = STATE_DIM + kinds.shape[1]
-        upper = inverses(local.lower).swapaxes(1, 2)
-        solved = upper @ local.solved  # (n, l, c + 1), what local unknowns absorb of each column
+        upper = inverses(local.lower)
+        solved = upper @ local.solved.swapaxes(1, 2)  # (n, l, c + 1), what local unknowns absorb of each column
         step, root = np.append(-found.mean, 1.0), np.linalg.cholesky(found.covariance)
         mean, moved = solved @ step, solved[..., :-1] @ root
         squares = mean**2 + (upper**2).sum(axis=-1) + (moved**2).sum(axis=-1)
@@ -171,8 +174,7 @@ class Likelihood:
         unseen = int((of_samples + of_spins == 0.0).sum()) + int((kinds < 0).sum())  # `inner` gives them a prior
         unknowns = mean.shape[0] * end - unseen + len(found.mean)
         white = found.square + float(unknowns) - sum(shown) - spin - prior
-        counts = [3.0 * self.rows.used.sum(), 3.0 * len(mean), *(float(o.size) for o in own)]
-        return np.array([white, spin, *shown]) - counts
+        return np.array([white, spin, *shown]) - self.rows.counts
 
     def local_step(self, noise: Noise, common: Array) -> Array:
         """(n, l) first states and random motion that follow a step (c,) of the common unknowns."""
@@ -222,29 +224,27 @@ def settled(rows: Rows, precision: Array, away: Array, start: Noise | None = Non
     now = start or Noise()
     likelihood = weighted(rows, np.zeros_like(rows.residual), np.zeros((len(rows.residual), 3)))
     step = np.zeros(len(precision))
-    bounds = [(LEAST, MOST)] * (2 + KINDS)
     options = {"maxiter": MOST_STEPS, "ftol": TOLERANCE}
+    # sizes in units of their error, as if all that they scale were known: the search then needs a third of the steps
+    unit = np.sqrt(2.0 * np.maximum(rows.counts, 1.0))
     for turn in range(1 if start else 0, ROUNDS):
         likelihood = likelihood.reweighted(now, step) if turn else likelihood
 
-        def missing(vector: Array, likelihood: Likelihood = likelihood) -> tuple[float, Array]:
-            noise = Noise.of(vector)
+        def missing(scaled: Array, likelihood: Likelihood = likelihood) -> tuple[float, Array]:
+            noise = Noise.of(scaled / unit)
             reduced, local = likelihood.reduced(noise)
             found = posterior(reduced, precision, away)
-            return -found.evidence, -likelihood.slope(noise, local, found, precision, away)
+            return -found.evidence, -likelihood.slope(noise, local, found, precision, away) / unit
 
-        found = optimize.minimize(missing, now.vector, method="L-BFGS-B", jac=True, bounds=bounds, options=options)
-        now = Noise.of(found.x)
+        bounds = optimize.Bounds(LEAST * unit, MOST * unit)
+        found = optimize.minimize(
+            missing, now.vector * unit, method="L-BFGS-B", jac=True, bounds=bounds, options=options
+        )
+        now = Noise.of(found.x / unit)
         step = posterior(likelihood.reduced(now)[0], precision, away).mean
     return likelihood, now
 
 
-def solve_lower(lower: Array, right: Array) -> Array:
-    """Solutions (n, l, c) with triangles (n, l, l)."""
-    solve = partial(linalg.solve_triangular, lower=True, check_finite=False)
-    return np.stack([solve(one, other) for one, other in zip(lower, right, strict=True)])
-
-
 def inverses(lower: Array) -> Array:
-    """(n, l, l) of triangles (n, l, l)."""
-    return np.stack([linalg.lapack.dtrtri(one, lower=1)[0] for one in lower])
+    """(n, l, l) transposed inverses of triangles (n, l, l)."""
+    return np.stack([linalg.lapack.dtrtri(one.T)[0] for one in lower])

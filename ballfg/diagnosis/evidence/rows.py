@@ -61,6 +61,13 @@ class Rows:
     labelled: Mask
     track: Index
 
+    @property
+    def counts(self) -> Array:
+        """(2 + KINDS,) numbers that each size scales: coordinates of samples and spins, random columns of each kind."""
+        kinds = self.motion.kinds
+        random = [(kinds == kind).sum() for kind in range(KINDS)]
+        return np.array([3 * self.used.sum(), 3 * len(kinds), *random], dtype=np.float64)
+
     def with_common(self, by_common: Array) -> Rows:
         """The rows with other common unknowns; by_common: (n, m, q)."""
         return replace(self, by_common=by_common)

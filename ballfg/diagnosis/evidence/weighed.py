@@ -10,10 +10,10 @@ import numpy as np
 from scipy import special
 
 from ballfg.arrays import Array, Index, Mask
-from ballfg.diagnosis.evidence.likelihood import Noise, Posterior, Reduced, posterior, settled
+from ballfg.diagnosis.evidence.likelihood import Noise, Posterior, Reduced, posterior, settled, weighted
 from ballfg.diagnosis.evidence.nameless import NAMELESS, USUAL, Patterns
 from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, log_odds, scales
-from ballfg.diagnosis.evidence.rows import Motion, random_motion, rows_of
+from ballfg.diagnosis.evidence.rows import Motion, Rows, random_motion, rows_of
 from ballfg.diagnosis.fit.problem import Fit, Unknowns
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.state import STATE_DIM
@@ -25,6 +25,8 @@ WIDTH_ROUNDS = 2
 """Number of turns in which each effect gets its most probable width."""
 MOST_STEPS = 4
 """Largest number of steps from a deterministic fit to the most probable unknowns."""
+SHARES = (1.0, 0.5, 0.25, 0.125)
+"""Shares of a step that are tried: far from a minimum the linearisation promises too much."""
 WORTH_A_STEP = 0.5
 """Least expected gain of a step, natural units."""
 
@@ -187,8 +189,8 @@ def weighed(
     for number in range(MOST_STEPS):
         if step.gain < WORTH_A_STEP and (number or not nameless):  # noise and widths of patterns need a second turn
             break
-        moved = step.taken(found.fit)
-        if not np.isfinite(moved.cost):
+        moved = question.moved(found, step)
+        if moved is None:
             break
         again, after = question.at(moved, found.noise, found.widths)
         # patterns take the place of strengths far from the fit: there the foretold gain is only believed if it comes
@@ -209,15 +211,15 @@ class _Step:
     common: Array
     gain: float
 
-    def taken(self, fit: Fit) -> Fit:
-        """The fit after the step; coefficients stay within their bounds."""
-        unknowns, free = fit.unknowns, fit.problem.free
+    def taken(self, fit: Fit, share: float) -> Fit:
+        """The fit after a share of the step; coefficients stay within their bounds."""
+        unknowns, free, common = fit.unknowns, fit.problem.free, share * self.common
         values = {
             name: float(np.clip(unknowns.values[name] + step, c.low, c.high))
-            for (name, c), step in zip(free.items(), self.common[: len(free)].tolist(), strict=True)
+            for (name, c), step in zip(free.items(), common[: len(free)].tolist(), strict=True)
         }
-        launcher = unknowns.launcher + self.common[len(free) :].reshape(-1, 3)
-        return Fit.at(fit.problem, Unknowns(unknowns.starts + self.starts, values, launcher), fit.noise, fit.steps)
+        launcher, starts = unknowns.launcher + common[len(free) :].reshape(-1, 3), unknowns.starts + share * self.starts
+        return Fit.at(fit.problem, Unknowns(starts, values, launcher), fit.noise, fit.steps)
 
 
 @dataclass(frozen=True)
@@ -234,9 +236,8 @@ class _Question:
 
         Args: start, widths: noise, and widths of the patterns after those of the effects, of a similar model.
         """
-        rows, patterns = rows_of(fit, self.motion), Patterns.of(fit) if self.nameless else None
-        own, effects = rows.by_common.shape[-1], [h for h in self.named if h.strengths]
-        rows, priors = rows if patterns is None else patterns.beside(rows), Priors.of(fit, self.named, patterns)
+        rows, priors = self._rows(fit)
+        own, effects = len(fit.problem.free) + fit.unknowns.launcher.size, [h for h in self.named if h.strengths]
         of_patterns = list(widths[len(effects) :]) or [0] * (len(priors.places) - len(effects))
         first = priors.precision([len(WIDTHS) - 1] * len(effects) + of_patterns)
         likelihood, noise = settled(rows, first, priors.away, start)
@@ -264,6 +265,28 @@ class _Question:
             self._nested(priors, whole, best, mixed),
         )
         return found, _Step(likelihood.local_step(noise, result.mean)[:, :STATE_DIM], away, gain)
+
+    def moved(self, model: Weighed, step: _Step) -> Fit | None:
+        """The fit after the largest share of a step that raises the evidence at the same noise; None if none does."""
+        least = self._evidence(model.fit, model)
+        for share in SHARES:
+            fit = step.taken(model.fit, share)
+            if np.isfinite(fit.cost) and self._evidence(fit, model) > least:
+                return fit
+        return None
+
+    def _evidence(self, fit: Fit, model: Weighed) -> float:
+        """The evidence at a fit's unknowns, with noise and widths of a model."""
+        rows, priors = self._rows(fit)
+        start = np.zeros(rows.by_common.shape[-1])
+        plain = weighted(rows, np.zeros_like(rows.residual), np.zeros((len(rows.residual), 3)))
+        reduced, _ = plain.reweighted(model.noise, start).reduced(model.noise)
+        return priors.posterior(reduced, model.widths).evidence
+
+    def _rows(self, fit: Fit) -> tuple[Rows, Priors]:
+        """The rows of a fit, beside patterns without a name if the question has them, and the priors."""
+        rows, patterns = rows_of(fit, self.motion), Patterns.of(fit) if self.nameless else None
+        return rows if patterns is None else patterns.beside(rows), Priors.of(fit, self.named, patterns)
 
     def _nested(
         self, priors: Priors, whole: Reduced, widths: Sequence[int], mixed: Sequence[float]
