@@ -11,6 +11,7 @@ from . import simulation as simulation
 from . import tracks as tracks
 from . import vision as vision
 from .diagnosis import Diagnosis as Diagnosis
+from .diagnosis import ErrorBudget as ErrorBudget
 from .dynamics import AnalyticModel as AnalyticModel
 from .dynamics import Surfaces as Surfaces
 from .dynamics import load_model as load_model
@@ -30,6 +31,7 @@ from .estimation import read as read
 from .estimation import register_estimator as register_estimator
 from .estimation import register_observation as register_observation
 from .front import diagnose as diagnose
+from .front import error_budget as error_budget
 from .front import estimate as estimate
 from .front import graph as graph
 from .front import predict as predict

@@ -22,7 +22,7 @@ from ballfg.tracks import TABLE_TENNIS, Ball, Track
 from ballfg.tracks.info import TrackFolder
 
 if TYPE_CHECKING:
-    from ballfg.diagnosis import Diagnosis
+    from ballfg.diagnosis import Diagnosis, ErrorBudget
     from ballfg.estimation import ConformalScales, TrackGraph
     from ballfg.estimation.observations.sighted_dataset import SightedDataset
     from ballfg.estimation.track_prediction import TrackPrediction
@@ -199,8 +199,38 @@ def diagnose(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) 
         FileNotFoundError: a folder or model file that is not there.
     """
     check_count("jobs", jobs, 1, MOST_JOBS)
-    from ballfg.estimation.observations.sighted_dataset import SightedDataset
+    data = _table_of_positions(measured)
+    from ballfg.diagnosis import diagnose as diagnose_dataset  # half of the package, which estimates do not need
     from ballfg.parallel.work import on_one_thread
+
+    # as in the commands: threads gain nothing on such small batches, and slow each other down
+    return on_one_thread(partial(diagnose_dataset, data, jobs=jobs), _model(model, data))
+
+
+def error_budget(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) -> ErrorBudget:
+    """The parts of the prediction error of a dataset: noise, spins, coefficients, bounces, open motion, the rest.
+
+    No effect is searched: the budget is that of the model as it is, with its coefficients and noise fitted to one half
+    of the tracks. `diagnose` gives the budget with the effects that it finds as `budget`.
+
+    Args: measured, model, jobs: as for `diagnose`.
+    Returns: the parts in mm; their squares add up to that of the measured error (docs/diagnose.md).
+    Raises:
+        TypeError: as `diagnose`.
+        ValueError: as `diagnose`, or if the model sees a hit in each predicted track.
+        FileNotFoundError: as `diagnose`.
+    """
+    check_count("jobs", jobs, 1, MOST_JOBS)
+    data = _table_of_positions(measured)
+    from ballfg.diagnosis import error_budget as budget_of_dataset
+    from ballfg.parallel.work import on_one_thread
+
+    return on_one_thread(partial(budget_of_dataset, data, jobs=jobs), _model(model, data))
+
+
+def _table_of_positions(measured: object) -> Dataset:
+    """A dataset with a table of positions, or its folder, opened; errors as of `diagnose`."""
+    from ballfg.estimation.observations.sighted_dataset import SightedDataset
     from ballfg.tracks import Dataset
 
     data = _opened(measured) if isinstance(measured, str | PathLike) else measured
@@ -212,10 +242,7 @@ def diagnose(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) 
             f"measured must be a dataset or its folder; got {what}. Read one with bf.read, or make one of tracks with "
             "bf.import_tracks or ballfg.tracks.dataset_in_memory."
         )
-    from ballfg.diagnosis import diagnose as diagnose_dataset  # half of the package, which estimates do not need
-
-    # as in the commands: threads gain nothing on such small batches, and slow each other down
-    return on_one_thread(partial(diagnose_dataset, data, jobs=jobs), _model(model, data))
+    return data
 
 
 def graph(

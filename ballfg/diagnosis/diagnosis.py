@@ -8,7 +8,7 @@ import numpy as np
 
 from ballfg.checks import check_range
 from ballfg.diagnosis.fit.fit import noise_by_axis, values_of
-from ballfg.diagnosis.fit.holdout import Holdout, hold_out
+from ballfg.diagnosis.fit.holdout import Holdout, analytic, hold_out
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.generic_test import ALARM, GenericTest
 from ballfg.diagnosis.label_verdicts import LabelCheck
@@ -19,7 +19,8 @@ from ballfg.diagnosis.residual_tests.label_check import check_labels, label_test
 from ballfg.diagnosis.residual_tests.residuals import residuals_of
 from ballfg.diagnosis.residual_tests.tracker_errors import look_at_tracker
 from ballfg.diagnosis.result import Diagnosis, Errors, Fallback, Unexplained, Value, Verdict
-from ballfg.diagnosis.search.evaluation import prediction_errors, prediction_floor
+from ballfg.diagnosis.search.error_budget import budget_of
+from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.diagnosis.search.loop import NAMED, Search, SearchLoop
 from ballfg.diagnosis.search.plausible import at_bound, implausible
 from ballfg.diagnosis.search.process_noise import Predicting, calibrated_model, noise_about
@@ -60,11 +61,7 @@ def diagnose(
         ValueError: if there are too few tracks, or none with a flight that is long enough.
     """
     check_range("name_at", name_at, 0.0, 1.0)
-    if not isinstance(model, AnalyticModel):
-        raise TypeError(
-            f"model must be an AnalyticModel, to which effects can be added; got {type(model).__name__}. "
-            "Diagnose its analytic part."
-        )
+    model = analytic(model)
     tell = watch or (lambda line: None)
     holdout = hold_out(dataset, model, jobs, tell)
     evaluate = partial(_errors, holdout, jobs)
@@ -87,8 +84,8 @@ def diagnose(
     calibrated = values_of(search.whole, [name for name in search.whole.problem.free if name in declared], declared)
     whole = calibrated_model(search.whole, holdout.launcher.embedding)
     whole.noise = corrected.noise
-    settings = dataset_settings(dataset, corrected)
-    floor = prediction_floor(corrected, holdout.held_out_tracks, holdout.surfaces, settings, jobs)
+    after = search.judged if helped is None else helped.after
+    budget = budget_of(corrected, holdout, search.before.prediction_rmse_mm, after.prediction_rmse_mm, jobs)
     return Diagnosis(
         dataset=dataset.info.name,
         verdict=verdict,
@@ -96,7 +93,7 @@ def diagnose(
         findings=search.findings,
         rounds=search.rounds,
         before=search.before,
-        after=search.judged if helped is None else helped.after,
+        after=after,
         tracks_found_on=len(np.unique(holdout.search.track)),
         tracks_judged_on=len(search.before.by_track),
         calibrated=calibrated,
@@ -107,11 +104,12 @@ def diagnose(
         residuals_after=residuals if search.fit is search.first else residuals_of(search.fit),
         excluded=holdout.excluded,
         remarks=tuple(strange(search.whole, calibrated, model.radius)),
-        floor_mm=floor,
+        floor_mm=float("nan") if budget is None else budget.exact,
         labels=labels,
         probabilities=search.odds.effects(),
         nothing_lacking=search.odds.nothing,
         nameless=search.odds.nameless,
+        budget=budget,
     )
 
 

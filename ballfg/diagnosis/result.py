@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from ballfg.arrays import Array, Index
+from ballfg.diagnosis.budget import ErrorBudget
 from ballfg.diagnosis.generic_test import GenericTest
 from ballfg.diagnosis.label_verdicts import LabelCheck
 from ballfg.dynamics import BallModel
@@ -281,10 +282,11 @@ class Diagnosis:
         excluded: sentences on unused tracks.
         remarks: sentences on implausible fitted values.
         floor_mm: prediction error of the held-out tracks for an exact corrected model, from measurement noise and the
-            unknown release alone; NaN if unknown.
+            unknown release alone: `budget.exact`; NaN if unknown.
         labels: verdicts on the spin labels; None without labels.
         probabilities: that an effect is there, by name, over all models that were compared; the most probable first.
         nothing_lacking: probability that nothing is lacking, neither an effect of the catalogue nor something nameless.
+        budget: parts of the prediction error; None for several datasets, or if the model sees a hit in each track.
         nameless: probability that forces, kicks or position errors remain that no effect of the catalogue describes.
     """
 
@@ -310,6 +312,7 @@ class Diagnosis:
     probabilities: Mapping[str, float] = field(default_factory=dict)
     nothing_lacking: float = float("nan")
     nameless: float = float("nan")
+    budget: ErrorBudget | None = None
 
     def __repr__(self) -> str:
         effects = ", ".join(finding.name for finding in self.findings) or "none"

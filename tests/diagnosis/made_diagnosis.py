@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
+from ballfg.diagnosis.budget import EXPECTED, ErrorBudget
 from ballfg.diagnosis.result import (
     Candidate,
     ContactResiduals,
@@ -132,9 +133,15 @@ def rounds() -> tuple[tuple[Candidate, ...], ...]:
     return first, second
 
 
+def budget(before: float, after: float) -> ErrorBudget:
+    """Parts of errors of 10 to 20 mm, mm; the floor is 9.0 mm."""
+    squares = dict(zip(EXPECTED, (16.0, 9.0, 2.0, 0.0, 25.0, 15.0, 14.0), strict=True))
+    return ErrorBudget.of(squares, 24, before, after)
+
+
 def found() -> Diagnosis:
     """A wind, found."""
-    model = nominal_model()
+    model, before, after = nominal_model(), errors(20.0, 1), errors(10.0, 2)
     finding = Finding(
         name="wind",
         kind="flight",
@@ -164,8 +171,8 @@ def found() -> Diagnosis:
         sentence="The model lacks wind: 0.20 m/s along x. With it the prediction error falls from 20.1 to 10.2 mm.",
         findings=(finding,),
         rounds=rounds(),
-        before=errors(20.0, 1),
-        after=replace(errors(10.0, 2), apex_rmse_mm=math.nan),
+        before=before,
+        after=replace(after, apex_rmse_mm=math.nan),
         tracks_found_on=25,
         tracks_judged_on=25,
         calibrated={
@@ -179,6 +186,7 @@ def found() -> Diagnosis:
         residuals_before=residuals(WIND, 3),
         residuals_after=residuals(0.0, 4),
         excluded=("shot 7 has no free flight of 10 samples.",),
+        budget=budget(before.prediction_rmse_mm, after.prediction_rmse_mm),
     )
 
 
@@ -196,6 +204,7 @@ def silent() -> Diagnosis:
         findings=(),
         rounds=(quiet,),
         after=found().before,
+        budget=None,
         residuals_before=same,
         residuals_after=same,
         excluded=(),

@@ -54,15 +54,23 @@ def test_the_whole_from_python(here: Path, monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr("ballfg.diagnosis.diagnose", answer)
     monkeypatch.setattr("ballfg.diagnosis.report.report.page", lambda diagnosis, origin: "<html></html>")
     write_simulation("windy", SimulationConfig(tracks=6, rate=30.0))
-    exec(compile(blocks("diagnose.md", "python")[0], "diagnose.md", "exec"), {})
+    exec(compile(blocks("diagnose.md", "python")[1], "diagnose.md", "exec"), {})
     assert asked == [(6, ["gravity", "drag", "magnus"], 2)]
     assert json.loads((here / "diagnosis" / "report.json").read_text(encoding="utf-8"))["effects"]
+
+
+def test_a_budget_from_python(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_simulation("windy", SimulationConfig(tracks=8, rate=60.0, seed=1))
+    exec(compile(blocks("diagnose.md", "python")[0], "diagnose.md", "exec"), {})
+    said = capsys.readouterr().out
+    assert "noise of the observed part" in said
+    assert "mm that the model with its noise expects" in said
 
 
 @pytest.mark.thorough
 def test_the_pieces_from_python(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     names: dict = {}
-    exec(compile(blocks("diagnose.md", "python")[1], "diagnose.md", "exec"), names)
+    exec(compile(blocks("diagnose.md", "python")[2], "diagnose.md", "exec"), names)
     assert names["scored"][0].hypothesis.name == "wind"
     assert names["after"].fit.unknowns.values["flight.wind.y"] == pytest.approx(0.5, abs=0.15)
     assert names["after"].delta_bic < -50.0

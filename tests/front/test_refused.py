@@ -101,7 +101,7 @@ def test_a_model_beside_the_data_is_offered_where_it_is_another(
 @pytest.mark.parametrize("jobs", [0, -1, 10_001])
 def test_fewer_processes_than_one_are_refused_everywhere(jobs: int, tmp_path: Path) -> None:
     """Before anything is read: the folder is not there."""
-    for call in (bf.estimate, bf.predict, bf.diagnose):
+    for call in (bf.estimate, bf.predict, bf.diagnose, bf.error_budget):
         with pytest.raises(ValueError, match=rf"jobs must lie in 1 .. 10000; got {jobs}"):
             call(tmp_path / "nowhere", jobs=jobs)
 
@@ -118,7 +118,7 @@ def test_what_cannot_be_diagnosed_is_told_as_what_it_is(measured: object, got: s
     with pytest.raises(TypeError, match=f"measured must be a dataset or its folder; got {got}. Read one with bf.read"):
         bf.diagnose(measured)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="got one Track; effects show in many of them"):
-        bf.diagnose(_fall())  # type: ignore[arg-type]
+        bf.error_budget(_fall())  # type: ignore[arg-type]
 
 
 def _fall() -> bf.Track:

@@ -84,6 +84,16 @@ def test_diagnosis_finds_a_model_that_can_be_saved(tmp_path: Path) -> None:
         assert float(value.detach()) == pytest.approx(float(expected[name].detach()), rel=1e-9)
 
 
+def test_an_error_budget_of_a_folder_adds_up(tmp_path: Path) -> None:
+    budget = bf.error_budget(written(tmp_path / "shots", 8))
+    assert isinstance(budget, bf.ErrorBudget)
+    assert budget.named == 0.0
+    assert budget.total**2 == pytest.approx(budget.floor**2 + budget.left * abs(budget.left), rel=1e-12)
+    assert budget.floor > budget.samples > 3.0
+    with pytest.raises(TypeError, match="model must be an AnalyticModel"):
+        bf.error_budget(tmp_path / "shots", bf.dynamics.build(bf.dynamics.Architecture.of("mlp"), radius=0.02))
+
+
 def test_tennis_balls_get_their_own_model(tmp_path: Path) -> None:
     shots = bf.read(written(tmp_path / "serves", 1, ball=tennis()))
     (track,) = shots

@@ -9,7 +9,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.stamps import Stamps, look_at_stamps
 from ballfg.diagnosis.fit.stretches import LEAST_SAMPLES, Stretches, stretches_of
-from ballfg.dynamics import AnalyticModel, Surfaces
+from ballfg.dynamics import AnalyticModel, BallModel, Surfaces
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.estimation import Settings, Smoother, dataset_settings, dataset_surfaces
 from ballfg.estimation.batch import map_tracks
@@ -64,6 +64,16 @@ class Holdout:
     tracks: tuple[Track, ...]
     stamps: Stamps
     excluded: tuple[str, ...]
+
+
+def analytic(model: BallModel) -> AnalyticModel:
+    """The model itself. Raises: TypeError: if it is a learned one."""
+    if not isinstance(model, AnalyticModel):
+        raise TypeError(
+            f"model must be an AnalyticModel, to which effects can be added; got {type(model).__name__}. "
+            "Diagnose its analytic part."
+        )
+    return model
 
 
 def hold_out(

@@ -28,6 +28,8 @@ TERMS: Final = {
     "as gravity or the drag of a group, it is the change of it.",
     "floor": "The prediction error of a model that is exact, foretold from its covariance: the noise of the "
     "measurements and what the observed part leaves open of speed and spin at the release.",
+    "error budget": "The prediction error in parts whose squares add up: what each source of noise and random motion "
+    "adds to predictions, what the named effects took away, and what is left.",
     "trace": "The pattern in the residuals that an effect would leave.",
     "residual": "Measured minus predicted.",
     "squared residual": "Squared residuals in units of their noise, summed. Under independent errors chance explains "

@@ -13,7 +13,7 @@ from ballfg.diagnosis.report.glossary import glossary, term
 from ballfg.diagnosis.report.headline import advice, answer, certainty, further, headline, where
 from ballfg.diagnosis.report.origin import Origin, packages
 from ballfg.diagnosis.report.plain_effects import in_plain_words, plain_name
-from ballfg.diagnosis.report.predictions import errors, one_shot
+from ballfg.diagnosis.report.predictions import errors, one_shot, parts_of_error
 from ballfg.diagnosis.report.wording import NONE, capital, fixed, joined, number, odds, plus_minus, probability
 from ballfg.diagnosis.result import Diagnosis, Finding, Residuals, Value, Verdict
 from ballfg.dynamics import EFFECTS
@@ -37,6 +37,7 @@ def page(diagnosis: Diagnosis, origin: Origin | None = None) -> str:
         tag("header", question, tag("h1", headline(diagnosis)), _in_short(diagnosis)),
         section("What to do next", *_next(diagnosis, origin)),
         errors(diagnosis),
+        parts_of_error(diagnosis),
         one_shot(diagnosis),
         section("What was added to the model", *(_finding(f) for f in diagnosis.findings)),
         _alike(diagnosis),

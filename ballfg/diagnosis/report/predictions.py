@@ -3,12 +3,13 @@
 import math
 from typing import Final
 
+from ballfg.diagnosis.budget import EXPECTED, PARTS
 from ballfg.diagnosis.report import pictures, shots
 from ballfg.diagnosis.report.glossary import term
 from ballfg.diagnosis.report.headline import skewed_medians
 from ballfg.diagnosis.report.wording import NONE, change, fixed
 from ballfg.diagnosis.result import Diagnosis, Errors
-from ballfg.pages.html import Html, items, picture, section, table, tag, text
+from ballfg.pages.html import Html, bar, items, picture, section, table, tag, text
 
 BY_CHANCE: Final = 2.0
 """Standard errors within which a NIS counts as 1."""
@@ -129,6 +130,29 @@ def _changed(was: float, now: float, unit: str) -> str:
     if not math.isfinite(was + now):
         return "nothing to compare"
     return change(was, now) if unit == " mm" else ""
+
+
+def parts_of_error(diagnosis: Diagnosis) -> Html:
+    """The parts of the prediction error, as a table and bars; empty without a budget."""
+    budget = diagnosis.budget
+    if budget is None:
+        return Html()
+    whole = max(budget.total**2, sum(budget.squares[name] for name in EXPECTED))
+    rows = []
+    for name, words in PARTS.items():
+        share = budget.squares[name] / whole
+        length = bar(min(max(share, 0.0), 1.0), "added" if name in EXPECTED else "alike")
+        rows.append((words, fixed(getattr(budget, name), 2), tag("span", length, f"{100 * share:.0f} %")))
+    rows += [
+        (text("sum: the declared model's error"), fixed(budget.total, 2), ""),
+        (text("sum without the last two parts: the floor of this model"), fixed(budget.floor, 2), ""),
+    ]
+    words = (
+        "The squares of the parts add up to the square of the measured error. A negative part takes away: the named "
+        "effects made predictions worse, or errors are smaller than the model with its noise expects."
+    )
+    head = (term("error budget", "part"), "mm", "share of the square")
+    return section("What the error consists of", tag("p", budget.sentence), table(head, rows), tag("p", words))
 
 
 def one_shot(diagnosis: Diagnosis) -> Html:

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from ballfg.diagnosis.budget import ErrorBudget
 from ballfg.diagnosis.label_verdicts import LabelCheck
 from ballfg.diagnosis.report.headline import headline
 from ballfg.diagnosis.report.origin import Origin
@@ -145,6 +146,7 @@ def content(diagnosis: Diagnosis) -> dict[str, Any]:
             "probabilities": diagnosis.probabilities,
             "nothing_lacking": diagnosis.nothing_lacking,
             "nameless": diagnosis.nameless,
+            "budget": None if diagnosis.budget is None else _budget(diagnosis.budget),
             "labels": None if diagnosis.labels is None else _labels(diagnosis.labels),
         }
     )
@@ -155,6 +157,12 @@ def _labels(check: LabelCheck) -> dict[str, Any]:
     verdicts = [vars(verdict) for verdict in check.verdicts]
     contradicted = [verdict.track for verdict in check.contradicted]
     return {"p_all_right": check.p_all_right, "contradicted": contradicted, "verdicts": verdicts}
+
+
+def _budget(budget: ErrorBudget) -> dict[str, Any]:
+    """Parts in mm, with their sums."""
+    sums = {"floor": budget.floor, "measured": budget.measured, "total": budget.total, "sentence": budget.sentence}
+    return vars(budget) | sums
 
 
 def _candidate(candidate: Candidate) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
 
 import numpy as np
 
@@ -13,11 +12,10 @@ from ballfg.diagnosis.fit.problem import Fit, Noise
 from ballfg.diagnosis.fit.stretches import Stretches, joined
 from ballfg.diagnosis.result import Errors, PredictedPath
 from ballfg.dynamics import BallModel, Surfaces
-from ballfg.estimation import Settings, Status, predict_tracks
+from ballfg.estimation import Settings, predict_tracks
 from ballfg.estimation.noise.forecasts import NINETY
 from ballfg.estimation.registry import make_estimator
 from ballfg.estimation.track_prediction import TrackPrediction
-from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction.apexes import measured_apexes, path_apex
 from ballfg.tracks import Track
 
@@ -25,10 +23,6 @@ OBSERVED = 0.4
 """Observed share of each track; the rest is predicted."""
 LEAST_PREDICTED = 3
 """Least number of predicted samples."""
-QUIET: Final = ProcessNoise(acceleration=1e-3, spin=0.05, contact_velocity=1e-3, contact_spin=0.1)
-"""Process noise of an almost exact model: it changes predictions by less than a millimetre."""
-MOST_FORETOLD = 3.0
-"""Ratio of a track's expected error to the median beyond which a false hit is assumed."""
 
 
 def prediction_errors(
@@ -69,29 +63,6 @@ def prediction_errors(
         tuple(_path(t.track, p) for t, p in pairs),
         error_of_mean([((p.positions - p.measured) / p.sigmas) ** 2 for _, p in pairs]),
     )
-
-
-def prediction_floor(
-    model: BallModel, tracks: Sequence[EvaluationTrack], surfaces: Surfaces, settings: Settings, jobs: int = 1
-) -> float:
-    """mm, expected prediction error of an exact model.
-
-    It is the covariance for almost zero process noise: the noise of the measurements, and the uncertainty of the
-    release after the observed part. Such a model explains the bends of a few tracks by false hits, after which the
-    flight is unknown; tracks with far more than the median are left out.
-
-    Args: as `prediction_errors`.
-    Returns: NaN if fewer than half of the tracks could be estimated so: the model does not fit them.
-    """
-    quiet = replace(settings, process=QUIET, coefficients={})
-    estimator, observed = make_estimator("smoother", model, surfaces, quiet), [t.track for t in tracks]
-    predictions = predict_tracks(estimator, observed, len(observed), lambda t: OBSERVED * t.duration, jobs=jobs)
-    judged = [p for p in predictions if len(p.times) >= LEAST_PREDICTED]
-    squares = [(p.sigmas**2).sum(axis=-1) for p in judged if p.status is Status.OK]
-    if not squares or 2 * len(squares) < len(judged):
-        return float("nan")
-    most = MOST_FORETOLD**2 * float(np.median([s.mean() for s in squares]))
-    return 1e3 * float(np.sqrt(np.concatenate([s for s in squares if s.mean() <= most]).mean()))
 
 
 def error_of_mean(by_track: Sequence[Array]) -> float:

@@ -42,6 +42,23 @@ class Noise:
 
 
 @dataclass(frozen=True)
+class Variances:
+    """The variances of all sources of error of t tracks of n samples.
+
+    Attributes:
+        process: (t, 7) squares of the numbers of `PROCESS_NOISE`.
+        memory: (t, 3) m^2.
+        prior: (t, d) of the first state and the coefficients, in the squares of their units.
+        measured: (t, n, 3, 3) m^2, of the white error of a measured position.
+    """
+
+    process: Tensor
+    memory: Tensor
+    prior: Tensor
+    measured: Tensor
+
+
+@dataclass(frozen=True)
 class Filtered:
     """The filter's results for t tracks of n samples.
 
@@ -81,8 +98,12 @@ class LinearFilter:
         """(t, n, 3, 3) m^2, covariance of the white error of a measured position."""
         way = self.tracks.velocities
         along = noise.stamp_jitter[:, None, None, None] * way[..., :, None] * way[..., None, :]
-        white = (noise.position[:, None, :] * self.tracks.white).clamp_min(LEAST_NOISE)  # an axis may have no noise
-        return along + torch.diag_embed(white.square())
+        return along + torch.diag_embed(self.white(noise))
+
+    def white(self, noise: Noise) -> Tensor:
+        """(t, n, 3) m^2, variances of the samples' white errors without those of the stamps."""
+        white = noise.position[:, None, :] * self.tracks.white
+        return white.clamp_min(LEAST_NOISE).square()  # an axis may have no noise
 
     def losses(self, noise: Noise) -> Tensor:
         """(t,) negative logarithms of the marginal likelihood of each track."""
@@ -96,13 +117,24 @@ class LinearFilter:
             measured: (t, n, 3, 3) m^2, the result of `measured`.
         Raises: torch.linalg.LinAlgError: the covariance of an innovation is not positive definite.
         """
+        return self.run_with(self.variances(noise, measured), noise.memory_time)
+
+    def variances(self, noise: Noise, measured: Tensor) -> Variances:
+        """The variances of all sources of error under some noise; arguments as those of `run`."""
         tracks, count = self.tracks, self.count
-        memory = noise.memory.expand(count, -1)
-        decays = torch.exp(-torch.diff(tracks.times, dim=1) / noise.memory_time[:, None])
         prior = tracks.prior_variances(noise.spin_prior, noise.spin_label, noise.coefficients, self.velocity_prior)
-        prior = torch.cat((prior, memory[:, : self.biases]), dim=1)
-        process = noise.process.square().expand(count, -1)
-        means, covariances, nll = _Run.apply(self, process, decays, memory, prior, measured)
+        return Variances(noise.process.square().expand(count, -1), noise.memory.expand(count, -1), prior, measured)
+
+    def run_with(self, variances: Variances, memory_time: Tensor) -> Filtered:
+        """The filter for the variances of all sources of error, differentiable by them.
+
+        Args: variances: of all sources.  memory_time: (r,) s.
+        Raises: torch.linalg.LinAlgError: as `run`.
+        """
+        decays = torch.exp(-torch.diff(self.tracks.times, dim=1) / memory_time[:, None])
+        memory = variances.memory
+        prior = torch.cat((variances.prior, memory[:, : self.biases]), dim=1)
+        means, covariances, nll = _Run.apply(self, variances.process, decays, memory, prior, variances.measured)
         return Filtered(means, covariances, nll, self._scored)
 
 

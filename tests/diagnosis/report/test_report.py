@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from ballfg.diagnosis.budget import PARTS
 from ballfg.diagnosis.report import report
 from ballfg.diagnosis.report.headline import headline
 from ballfg.diagnosis.report.origin import Origin
@@ -58,6 +59,11 @@ def test_json_has_the_agreed_keys_and_numbers() -> None:
     assert before["by_track_mm"] == diagnosis.before.by_track.tolist()
     assert read["error"]["after"]["apex_rmse_mm"] is None
     assert read["error"]["tracks_judged_on"] == 25
+    squares = [read["budget"][name] * abs(read["budget"][name]) for name in PARTS]
+    assert sum(squares) == pytest.approx(before["prediction_rmse_mm"] ** 2, rel=1e-12)
+    assert read["budget"]["measured"] == pytest.approx(read["error"]["after"]["prediction_rmse_mm"], rel=1e-12)
+    assert (read["budget"]["floor"], read["budget"]["tracks"]) == (pytest.approx(9.0), 24)
+    assert content(silent())["budget"] is None
     assert read["unexplained"]["where"] == ""
     assert read["unexplained"]["share_of_residual"] == 0.02
     assert read["calibrated"]["flight.drag.k"] == {"value": 0.1213, "sigma": 0.0011, "unit": "1/m", "declared": 0.12}
@@ -103,6 +109,15 @@ def test_the_page_says_what_was_found(found_page: HtmlPage) -> None:
         < shown.index("a wind that grows with height")
         < shown.index("Coefficients and noise")
     )
+
+
+def test_the_page_shows_the_parts_of_the_error(found_page: HtmlPage) -> None:
+    budget = found().budget
+    assert budget is not None
+    assert budget.sentence in found_page.text
+    for name, words in PARTS.items():
+        assert f"{words}{getattr(budget, name):.2f}".replace("-", "−") in found_page.text
+    assert "What the error consists of" not in HtmlPage(page(silent())).text
 
 
 @pytest.mark.usefixtures("blank_pictures")

@@ -12,12 +12,10 @@ from ballfg.diagnosis.fit.holdout import EvaluationTrack
 from ballfg.diagnosis.fit.stretches import joined
 from ballfg.diagnosis.search.evaluation import (
     OBSERVED,
-    QUIET,
     error_of_mean,
     on_all,
     on_others,
     prediction_errors,
-    prediction_floor,
 )
 from ballfg.estimation.settings import Settings
 from ballfg.tracks import Track
@@ -64,18 +62,6 @@ def evaluated(data):
         )
         for i, name in enumerate(data.names)
     ]
-
-
-def test_the_floor_is_what_an_exact_model_gets(make_ball, make_launches, make_shots, surfaces):
-    """Flights without any process noise, predicted by the model that made them and by a wrong one."""
-    tracks = evaluated(make_shots(make_ball(), make_launches(24, 54), 54, duration=0.5).stretches)
-    settings = Settings(position_noise=(0.003,) * 3, spin_label_noise=4.0)
-    exact = prediction_errors(make_ball(), tracks, surfaces, replace(settings, process=QUIET), 1)
-    floor = prediction_floor(make_ball(), tracks, surfaces, settings)
-    assert floor == pytest.approx(exact.prediction_rmse_mm, rel=0.25)
-    wrong = make_ball(drag={"k": 0.3})
-    assert prediction_floor(wrong, tracks, surfaces, settings) == pytest.approx(floor, rel=0.25)
-    assert prediction_errors(wrong, tracks, surfaces, settings, 1).prediction_rmse_mm > 1.5 * floor
 
 
 def test_the_error_of_a_nis_is_its_scatter_over_repeated_recordings():
