@@ -1,7 +1,5 @@
 """Linear factors keep the information of removed states and of a tracker's bias."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Self
 
