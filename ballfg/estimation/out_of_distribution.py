@@ -1,7 +1,5 @@
 """Measures how much of a track lies outside of the training data of a learned model."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

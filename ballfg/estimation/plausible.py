@@ -1,7 +1,5 @@
 """Replaces impossible estimates (not numbers, out of bounds) by the measured positions with wide covariances."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

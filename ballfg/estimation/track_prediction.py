@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import torch
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 BLOCK = 64
 """Number of tracks that are propagated together in one process; memory grows with it."""
+Observed: TypeAlias = float | Callable[[Track], float]
+"""s from a track's first stamp; or a function that gives each track its own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +80,7 @@ def predict_tracks(
     estimator: Estimator,
     tracks: Iterable[Track],
     count: int,
-    observe: float | Callable[[Track], float],
+    observe: Observed,
     *,
     horizon: float = np.inf,
     jobs: int = 1,
@@ -100,7 +102,12 @@ def predict_tracks(
     horizon = as_float("horizon", horizon, "s")
     if not horizon > 0.0:
         raise ValueError(f"horizon must be a positive number of seconds; got {horizon:g}. Leave it out for all stamps.")
-    return _predictions(estimator, tracks, count, observe, horizon, jobs)
+    work = partial(_block, estimator, Propagator(estimator.surfaces, estimator.settings.process), observe, horizon)
+    made = map_blocks(work, tracks, count, jobs, BLOCK)
+    return (
+        replace(one, estimate=replace(one.estimate, world=estimator.world)) if one.estimate.world is None else one
+        for one in made
+    )
 
 
 def check_observe(observe: float) -> None:
@@ -116,27 +123,8 @@ def check_observe(observe: float) -> None:
         )
 
 
-def _predictions(
-    estimator: Estimator,
-    tracks: Iterable[Track],
-    count: int,
-    observe: float | Callable[[Track], float],
-    horizon: float,
-    jobs: int,
-) -> Iterator[TrackPrediction]:
-    propagator = Propagator(estimator.surfaces, estimator.settings.process)
-    work = partial(_block, estimator, propagator, observe, horizon)
-    for one in map_blocks(work, tracks, count, jobs, BLOCK):
-        plain = one.estimate.world is None
-        yield replace(one, estimate=replace(one.estimate, world=estimator.world)) if plain else one
-
-
 def _block(
-    estimator: Estimator,
-    propagator: Propagator,
-    observe: float | Callable[[Track], float],
-    horizon: float,
-    tracks: Sequence[Track],
+    estimator: Estimator, propagator: Propagator, observe: Observed, horizon: float, tracks: Sequence[Track]
 ) -> list[TrackPrediction]:
     """Predictions of a block, without a model that all tracks share, so that processes need not send it."""
     for track in tracks:
@@ -165,10 +153,8 @@ def _predict_alike(
     estimator: Estimator, propagator: Propagator, estimates: list[Estimate], tracks: list[Track], horizon: float
 ) -> Iterator[TrackPrediction]:
     begun = [float(e.times[-1]) for e in estimates]
-    later = [
-        (t.times > begin) & (t.times <= begin + horizon + STAMP_TOLERANCE)
-        for t, begin in zip(tracks, begun, strict=True)
-    ]
+    pairs = zip(tracks, begun, strict=True)
+    later = [(t.times > begin) & (t.times <= begin + horizon + STAMP_TOLERANCE) for t, begin in pairs]
     clocks = [true_times(estimator.model, t.times) for t in tracks]
     ends = [float(clock[len(e.times) - 1]) for clock, e in zip(clocks, estimates, strict=True)]
     times = _padded([clock[mask] for clock, mask in zip(clocks, later, strict=True)], ends)

@@ -1,7 +1,5 @@
 """Extends filterpy's extended Kalman filter by the ball's own prediction."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from filterpy.kalman import ExtendedKalmanFilter as FilterpyEKF

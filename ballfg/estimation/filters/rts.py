@@ -4,8 +4,6 @@ Source: H. E. Rauch, F. Tung, C. T. Striebel, "Maximum likelihood estimates of l
 3(8), 1965, equations 3.30 and 3.31; the covariance in the form that stays positive definite under rounding.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from numpy.typing import NDArray

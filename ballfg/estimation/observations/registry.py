@@ -20,6 +20,9 @@ from ballfg.registry import Registry
 from ballfg.tracks import TableWriter, Track, csv_files
 from ballfg.tracks.rows import KEY
 
+LONGEST_HEADER: Final = 4096
+"""Largest number of bytes read from a table's first line."""
+
 OBSERVATIONS: Final[Registry[Observation]] = Registry(
     "observation", group="ballfg.observations", base=Observation, remedy="docs/custom_factors.md has an example."
 )
@@ -39,10 +42,6 @@ def load_observations(path: str | Path) -> tuple[type[Observation], ...]:
         ValueError: if it is no Python, does not run, defines no observation, or one that cannot be registered.
     """
     return load_classes(OBSERVATIONS, path)
-
-
-LONGEST_HEADER: Final = 4096
-"""Largest number of bytes read from a table's first line."""
 
 
 @dataclass

@@ -31,6 +31,10 @@ MOVE_MARGIN = 0.02
 """Share of an interval by which the estimated contact must lie outside before it moves, against oscillation."""
 MOST_MOVES = 6
 """Largest number of moves of one contact."""
+LATEST_CHANGE = 80
+"""Samples. The segmenter's events are final after 64; older states are never rebuilt."""
+YOUNG = 20
+"""Number of samples after a contact in which the estimate may still move it to another interval."""
 
 
 class EventTracker:
@@ -134,12 +138,6 @@ def first_difference(samples: Sequence[Sample], motions: Sequence[Motion], facto
         if (sample.factor >= UNUSABLE) != (factors[k] >= UNUSABLE):
             return k
     return None
-
-
-LATEST_CHANGE = 80
-"""Samples. The segmenter's events are final after 64; older states are never rebuilt."""
-YOUNG = 20
-"""Number of samples after a contact in which the estimate may still move it to another interval."""
 
 
 def path_of(samples: Sequence[Sample]) -> tuple[Array, Array]:

@@ -1,7 +1,5 @@
 """Measurements and samples of a stream, the record of an update, and the belief after it."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field

@@ -67,7 +67,7 @@ def start(work: Work, tip: int, score: float, sample: Sample, scene: Record, sur
 
 @machine_code(NOTHING(WORK, BANK, SAMPLE, REAL, SCENE, SURFACES))
 def hit(work: Work, before: Records, sample: Sample, dt: float, scene: Record, surfaces: Records) -> None:
-    """Adds the best past, its velocity forgotten: in the air, and on a surface if near one; anywhere after a gap."""
+    """Adds the best hypothesis without its velocity, in the air and on a near surface; after a gap it is anywhere."""
     row = add(work, before, 0)
     h = work.bank[row]
     at = h.mean[:, 0].copy() if dt < scene.short_gap else sample.position

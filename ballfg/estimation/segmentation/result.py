@@ -154,7 +154,7 @@ class Node:
 
 
 def copied(node: Node | None, known: dict[int, Node]) -> Node | None:
-    """An independent chain with the same events, except for nodes `known` by the identity of their original."""
+    """An independent chain with the same events; `known` holds the copies so far by the identity of the original."""
     if node is None:
         return None
     chain = [node]

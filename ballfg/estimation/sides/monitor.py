@@ -22,6 +22,14 @@ from ballfg.estimation.sides.hypotheses import ContactHypotheses, HypothesisMode
 from ballfg.factors.linear.definite import compatible, definite, variances_positive
 from ballfg.state import STATE_DIM, VZ
 
+NEGLIGIBLE: Final = 1e-6
+"""Probability below which a side is neglected."""
+LONGEST: Final = 8
+"""Number of samples within which the estimator must have found the contact."""
+MOST_REJECTED: Final = 2
+"""Number of consecutive samples without a fitting hypothesis after which another event is assumed."""
+GATE_CHANCE: Final = 1e-6
+"""Share of good positions that are rejected."""
 FAR: Final = 4.0
 """Standard deviations of a contact's time beyond which a stamp lies on one side of it."""
 LEAST_SPEED: Final = 1e-3
@@ -120,16 +128,6 @@ def _carried(model: BallModel, state: Array, dt: float) -> Array:
     with torch.no_grad():
         after = fly(model, torch.from_numpy(state[None]), torch.tensor([dt], dtype=torch.float64))
     return np.asarray(after[0, :STATE_DIM])
-
-
-NEGLIGIBLE: Final = 1e-6
-"""Probability below which a side is neglected."""
-LONGEST: Final = 8
-"""Number of samples within which the estimator must have found the contact."""
-MOST_REJECTED: Final = 2
-"""Number of consecutive samples without a fitting hypothesis after which another event is assumed."""
-GATE_CHANCE: Final = 1e-6
-"""Share of good positions that are rejected."""
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,6 @@ search then ends in another minimum, or on a slope. In that case convex losses l
 search starts again; the lower minimum is the result.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

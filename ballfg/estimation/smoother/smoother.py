@@ -46,6 +46,8 @@ from ballfg.tracks import Ball, Track
 
 MAX_UNSEEN_HITS = 8
 """Largest number of hits that the estimate adds to the segmentation's; measured logs needed three at most."""
+LONG: Final = 10_000
+"""Number of samples from which a track is smoothed in pieces that are then joined (docs/derivations/long_tracks.md)."""
 AT_MINIMUM = (Convergence.CONVERGED, Convergence.AT_KINK)
 OFFSET_ROUNDS = 6
 """Largest number of corrections of stamps by estimated time offsets; 4 ms need three."""
@@ -251,10 +253,6 @@ class Smoother(Estimator):
         estimate = plausible(estimate, track, problem.sigma, self.settings)
         estimate = replace(estimate, notes=estimate.notes + rival_note(solution, estimate.covariances[0]))
         return widened_near_contacts(estimate, problem.ball)
-
-
-LONG: Final = 10_000
-"""Number of samples from which a track is smoothed in pieces that are then joined (docs/derivations/long_tracks.md)."""
 
 
 class PiecewiseSmoother(Smoother):

@@ -51,7 +51,7 @@ def test_the_grid_is_the_average_over_all_hops() -> None:
 
 
 def test_before_the_first_sample_each_hop_is_as_probable_and_rest_has_its_share() -> None:
-    shares = HopGrid(NEARLY_EXACT, 48, 1e-4)._first()
+    shares = HopGrid(NEARLY_EXACT, 48, 1e-4)._first
     assert shares.sum() == pytest.approx(1.0)
     assert shares[-1] == RESTS
     assert np.ptp(shares[:-1]) == 0.0

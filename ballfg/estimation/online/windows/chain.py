@@ -6,8 +6,6 @@ earlier states. The same factors at the same points have the same solution as in
 without its objects.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Sequence

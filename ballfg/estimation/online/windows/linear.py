@@ -1,7 +1,5 @@
 """Linear factors keep the information of removed states and of a tracker's bias."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Self
 
@@ -23,8 +21,9 @@ def linear_factor(
 
     Args: blocks: (r, w) each, A_k whitened.  right: (r,) b, whitened.  point: p_k of all states; None: zero.
     """
-    pairs: list[Any] = [part for pair in zip(keys, blocks, strict=False) for part in pair]
-    factor = gtsam.JacobianFactor(*pairs, right, gtsam.noiseModel.Unit.Create(len(right)))
+    parts: list[Any] = [part for pair in zip(keys, blocks, strict=False) for part in pair]
+    parts += [right, gtsam.noiseModel.Unit.Create(len(right))]
+    factor = gtsam.JacobianFactor(*parts)
     if point is None:
         point = gtsam.Values()
         for key, block in zip(keys, blocks, strict=True):

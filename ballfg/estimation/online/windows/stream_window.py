@@ -6,8 +6,6 @@ keep and solve the linear system: iSAM2 (`window.py`) or a chain of triangles (`
 docs/derivations/online.md explains the choices.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass

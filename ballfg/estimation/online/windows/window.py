@@ -3,8 +3,6 @@
 The window evaluates factors ahead in batches; when GTSAM asks for one, its callback returns the stored result.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 from typing import Self

@@ -168,7 +168,7 @@ def _section(
 
 
 def _assembled(track: Track, parts: Iterator[Estimate]) -> Estimate:
-    """One estimate from those of all sections; `np.zeros` of `other_sides` takes memory for few of them."""
+    """One estimate from those of all sections; `other_sides` is nearly empty, and `np.zeros` takes no memory for it."""
     n, first = len(track), next(parts)
     p = first.cross_covariances.shape[2]
     states, covariances = np.empty((n, STATE_DIM)), np.empty((n, STATE_DIM, STATE_DIM))

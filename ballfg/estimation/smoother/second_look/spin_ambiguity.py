@@ -8,8 +8,6 @@ A search of a whole long chain for every bounce would take a time that grows wit
 samples around a bounce decide first, and only spins that are clearly worse there are skipped.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
