@@ -38,9 +38,8 @@ def read_cameras(path: str | PathLike[str], *, posed: bool = True) -> list[Camer
         path: our YAML, or a FileStorage file of OpenCV (`.xml`, `.json`, or YAML that begins with `%YAML`) with one
             camera (named as the file) or a map for each.
         posed: False: `rvec` and `tvec` may be missing; the camera then stands at the world's origin, unturned.
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError, TypeError: a field that is missing, not known or wrong; the message names file, camera and field.
+    Raises: FileNotFoundError: there is no such file. ValueError, TypeError: a field that is missing, not known or
+        wrong; the message names file, camera and field.
     """
     path = check_path("path", path)
     if not path.is_file():

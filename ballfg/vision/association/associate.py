@@ -34,10 +34,7 @@ _DISPUTED: Final = 2  # most frames in which two parts of one flight both have a
 
 @dataclass(frozen=True)
 class AssociationSettings:
-    """How candidates become balls.
-
-    Raises: ValueError: a number out of its range.
-    """
+    """How candidates become balls. Raises: ValueError: a number out of its range."""
 
     least_score: float = 0.3
     """In [0, 1]; candidates with a lower score are not used."""
@@ -58,9 +55,7 @@ def associate(
     at those; otherwise at the stamps of the camera that saw most of the ball, and the other cameras are interpolated.
     A ball is one track through bounces and short gaps.
 
-    Args:
-        detections: one for each camera, in any order.
-        cameras: at least two, with the detections' names.
+    Args: detections: one for each camera, in any order.  cameras: at least two, with the detections' names.
         settings: the default ones if None.
     Raises: ValueError: cameras and detections that do not go together.
     """

@@ -70,9 +70,7 @@ def triangulate(cameras: Sequence[Camera], pixels: ArrayLike, covariances: Array
     Gauss-Newton on the weighted reprojection error. There is no point where no pair agrees, where two proposals of two
     views each agree equally well but not with each other, or where the rays are nearly parallel (`MAX_SIGMA`).
 
-    Args:
-        cameras: c of them, at least two.
-        pixels: (n, c, 2) px, where each camera saw it; NaN where it did not.
+    Args: cameras: c of them, at least two.  pixels: (n, c, 2) px, where each camera saw it; NaN where it did not.
         covariances: (n, c, 2, 2) px^2 of `pixels`; not read where those are NaN.
     Raises: ValueError: shapes that do not fit, fewer than two cameras, covariances that are not positive definite.
     Source: docs/derivations/triangulation.md; Hartley, Zisserman, Multiple View Geometry (2004), sections 12.2 and 5.2.

@@ -75,8 +75,7 @@ def load_detector(text: str) -> Maker:
 def detect(video: Video, camera: str, detector: Detector, watch: Watch = unwatched) -> Detections:
     """All candidates of a video.
 
-    Args:
-        detector: called with each frame in order; for instance `learn_detector(video)`, or one of your own.
+    Args: detector: called with each frame in order; for instance `learn_detector(video)`, or one of your own.
         watch: sees the numbers of the frames that are done.
     Raises: ValueError: a video that turns out unreadable, see `Video.frames`. TypeError: a detector that does not give
         `Candidates`.

@@ -149,8 +149,7 @@ def open_video(path: str | PathLike[str], stamps: str | PathLike[str] | None = N
         path: a file that FFmpeg decodes, or a folder.
         stamps: a CSV file with a column `t` (s), one row a frame, optionally a column `frame` that counts from 0.
             Without it the container's stamps count: mp4 and avi keep them, webm rounds to ms. A folder needs it.
-    Raises:
-        FileNotFoundError: nothing is there. ValueError: it cannot be decoded, is empty, or the stamps do not fit.
+    Raises: FileNotFoundError: nothing is there. ValueError: it cannot be decoded, is empty, or the stamps do not fit.
     """
     place = check_path("video", path)
     if not place.exists():

@@ -115,9 +115,7 @@ def track_detections(
 ) -> Tracking:
     """Balls from the candidates of a rig.
 
-    Args:
-        detections: one for each of the cameras, in any order.
-        cameras: at least two, with names of their own.
+    Args: detections: one for each of the cameras, in any order.  cameras: at least two, with names of their own.
     Raises: ValueError: a camera without detections or detections without a camera, too few cameras, or recordings
         that do not overlap in time.
     """
