@@ -65,17 +65,15 @@ def associate(
     for number, (camera, seen) in enumerate(zip(footage.cameras, footage.detections, strict=True)):
         focal = float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
         pieces += [Piece(number, rows, footage.path(number, rows)) for rows in find_tracklets(seen, focal)]
-    matching = match(pieces, footage.cameras)
-    footage = replace(footage, offset=matching.offset)
-    balls = []
-    for group in matching.groups:
+    groups, offset = match(pieces, footage.cameras)
+    footage, balls = replace(footage, offset=offset), []
+    for group in groups:
         rows = [[pieces[i].rows for i in group if pieces[i].camera == c] for c in range(len(cameras))]
         balls.append(gather(footage, [np.sort(np.concatenate([_NONE, *own])) for own in rows]))
     balls = _joined(footage, [ball for ball in balls if len(ball.track.times) >= 2])
     balls = _joined(footage, complete(footage, balls))
     balls = [ball for ball in balls if len(ball.track.times) >= settings.least_points and is_ball(ball.track)]
-    seen = [_seen_ball(footage, ball) for ball in balls]
-    return sorted(seen, key=lambda ball: float(ball.times[0]))
+    return sorted((_seen_ball(footage, ball) for ball in balls), key=lambda ball: float(ball.times[0]))
 
 
 def _footage(detections: Sequence[Detections], cameras: Sequence[Camera], settings: AssociationSettings) -> Footage:
@@ -138,12 +136,9 @@ def _seen_ball(footage: Footage, ball: Gathered) -> SeenBall:
     since = np.concatenate([seen.times[rows] for seen, rows in pairs])
     order = np.argsort(since - np.array([c.time_offset for c in footage.cameras])[camera], kind="stable")
     stamps = np.concatenate([own[seen.frame[rows]] for own, (seen, rows) in zip(footage.stamps, pairs, strict=True)])
-    sightings = Sightings(
-        tuple(c.name for c in footage.cameras),
-        camera[order],
-        stamps[order],
-        np.concatenate([seen.pixels[rows] for seen, rows in pairs])[order],
-        np.concatenate([seen.covariances[rows] for seen, rows in pairs])[order],
-    )
+    pixels = np.concatenate([seen.pixels[rows] for seen, rows in pairs])
+    spread = np.concatenate([seen.covariances[rows] for seen, rows in pairs])
+    names = tuple(c.name for c in footage.cameras)
+    sightings = Sightings(names, camera[order], stamps[order], pixels[order], spread[order])
     times = written(ball.track.times, footage.origin)
     return SeenBall(times, ball.track.values, ball.covariances, sightings, ball.views)

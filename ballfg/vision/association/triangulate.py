@@ -28,12 +28,9 @@ _AROUND: Final = 0.5 * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0
 class Triangulated:
     """Points with their support. A row without a point has NaN there and in its covariance, and uses no view."""
 
-    points: Array
-    """(n, 3) m, world."""
-    covariances: Array
-    """(n, 3, 3) m^2."""
-    used: Mask
-    """(n, c) True for views that took part; wrong ones do not."""
+    points: Array  # (n, 3) m, world
+    covariances: Array  # (n, 3, 3) m^2
+    used: Mask  # (n, c) True for views that took part; wrong ones do not
     residuals: Array
     """(n, c, 2) px, seen minus projected, including views that did not take part; NaN without a sighting."""
 

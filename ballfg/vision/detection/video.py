@@ -34,11 +34,8 @@ class Video(ABC):
     """
 
     def __init__(self, path: Path, size: tuple[int, int], count: int, stamps: Array | None) -> None:
-        self.name = path.stem if path.is_file() else path.name
-        self.path = path
-        self.size = size
-        self.count = count
-        self._stamps = stamps
+        self.name, self.path = path.stem if path.is_file() else path.name, path
+        self.size, self.count, self._stamps = size, count, stamps
 
     def frames(self) -> Iterator[tuple[float, Image]]:
         """Stamp (s) and image (h, w, 3), BGR, of each frame in turn.

@@ -36,14 +36,10 @@ class Seen:
 class Tracking:
     """The balls of a recording."""
 
-    cameras: tuple[Camera, ...]
-    """The rig."""
-    detections: tuple[Detections, ...]
-    """All candidates of each camera, in the order of `cameras`."""
-    balls: tuple[SeenBall, ...]
-    """In the order of their first points."""
-    agreement: Agreement | None
-    """The agreement of the cameras; None without a ball."""
+    cameras: tuple[Camera, ...]  # the rig
+    detections: tuple[Detections, ...]  # all candidates of each camera, in the order of `cameras`
+    balls: tuple[SeenBall, ...]  # in the order of their first points
+    agreement: Agreement | None  # the agreement of the cameras; None without a ball
 
     @property
     def names(self) -> list[str]:
