@@ -82,7 +82,6 @@ def blamed(path: Path, doing: str) -> Iterator[None]:
 
 
 def _where(error: BaseException, path: Path) -> str:
-    """The error, and its line in the file."""
     lines = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == str(path)]
     if not lines and isinstance(error, SyntaxError) and error.filename == str(path):
         lines = [error.lineno]

@@ -139,7 +139,6 @@ def _ratio(option: str, best: Scale, found: Sequence[Scale]) -> float:
 
 
 def _decide(option: str, best: Scale, found: Sequence[Scale]) -> None:
-    """Refuses a reading that is hardly better than another one."""
     ratio = _ratio(option, best, found)
     if ratio >= _LIKELY and best.score >= _LEAST_SCORE:
         return

@@ -49,7 +49,6 @@ def propose(data: Any, choices: Choices) -> Proposal:
 
 
 def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
-    """The interpretation of tables."""
     chosen, roles, beside = understood(tables, choices)
     counts = Counts()
     shots = shots_of(chosen, roles, choices, counts)

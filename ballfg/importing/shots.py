@@ -192,7 +192,6 @@ def _lone_zeros(positions: Array, counts: Counts) -> NDArray[np.bool_]:
 def _labels(
     table: RawTable, names: Iterable[str], parts: list[NDArray[np.intp]], counts: Counts
 ) -> dict[str, list[Label | None]]:
-    """Columns with a constant value in every shot."""
     found: dict[str, list[Label | None]] = {}
     for name in names:
         column = table.columns.get(name)

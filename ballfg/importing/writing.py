@@ -56,7 +56,6 @@ def page(proposal: Proposal) -> str:
 
 
 def _drawing(tracks: Sequence[Track], height: float) -> Html:
-    """The shots from the side and from above, as SVG."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
 

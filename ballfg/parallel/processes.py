@@ -186,8 +186,6 @@ class _Crew:
 
 
 class _Process:
-    """An interpreter that computes one chunk after another."""
-
     def __init__(self) -> None:
         self._calls, theirs = Pipe()
         # Ctrl-C at the terminal is for this process alone; the other one ignores it as soon as it can

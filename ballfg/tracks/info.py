@@ -213,7 +213,6 @@ def _section(content: Mapping[str, Any], key: str, fields: Mapping[str, str], pr
 
 
 def _stated_extent(frame: Mapping[str, Any]) -> tuple[Any, ...] | None:
-    """The table's ends in `frame`, checked only for their number."""
     if frame.get("table") is None:
         return None
     table = _section(frame, "table", {"x": "[0.0, 2.74]", "y": "[-0.76, 0.76]"}, "frame.")

@@ -129,7 +129,6 @@ def _from_storage(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def _check_names(cameras: Iterable[Camera]) -> Sequence[Camera]:
-    """The cameras. Raises: ValueError: if there are none, or two of one name."""
     cameras = list(cameras)
     if not cameras:
         raise ValueError("cameras must hold at least one camera; got none. Pass the cameras to write.")
@@ -140,7 +139,6 @@ def _check_names(cameras: Iterable[Camera]) -> Sequence[Camera]:
 
 
 def _camera(name: str, content: Any, posed: bool) -> Camera:
-    """A camera from its fields. Raises: ValueError, TypeError: names camera and field."""
     where = f"camera {shown(name)}"
     fields = mapping(where, content)
     check_keys(where, fields, FIELDS, LENS)

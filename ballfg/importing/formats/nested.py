@@ -27,8 +27,6 @@ def nested_tables(content: Any, name: str, source: str) -> list[RawTable]:
 
 @dataclass
 class _Source:
-    """The searched file, and the number of its parts so far."""
-
     name: str
     parts: int = 0
 

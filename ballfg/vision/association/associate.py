@@ -77,7 +77,6 @@ def associate(
 
 
 def _footage(detections: Sequence[Detections], cameras: Sequence[Camera], settings: AssociationSettings) -> Footage:
-    """The recording without candidates of low score."""
     names = [camera.name for camera in cameras]
     by_name = {seen.camera: seen for seen in detections}
     if len(names) < 2 or len(set(names)) < len(names):
@@ -97,7 +96,6 @@ def _footage(detections: Sequence[Detections], cameras: Sequence[Camera], settin
 
 
 def _joined(footage: Footage, balls: list[Gathered]) -> list[Gathered]:
-    """The balls, those of one flight joined."""
     following = dict(successions([ball.track for ball in balls]))
     later = set(following.values())
     joined = []

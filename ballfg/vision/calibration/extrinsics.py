@@ -101,7 +101,6 @@ def _check_points(lens: Camera, marked: Marked) -> bool:
 
 
 def _poses(lens: Camera, marked: Marked, flat: bool) -> list[Camera]:
-    """Refined poses, those of the camera in front of the points."""
     points, pixels = np.ascontiguousarray(marked.points), np.ascontiguousarray(marked.pixels)
     given = (points, pixels, lens.matrix, lens.distortion)
     method = cv2.SOLVEPNP_IPPE if flat else cv2.SOLVEPNP_SQPNP

@@ -178,7 +178,6 @@ def _fitted(camera: Camera, view: View, rvec: Array, tvec: Array) -> FittedView:
 
 
 def _outlying(fitted: Intrinsics) -> int | None:
-    """The view that disagrees most with the others, or None."""
     errors = np.array([view.rms for view in fitted.views])
     worst = int(errors.argmax())
     return worst if errors[worst] > max(OUTLYING * float(np.median(errors)), MIN_OUTLYING) else None

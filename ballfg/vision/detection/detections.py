@@ -149,7 +149,6 @@ class Detections:
 
 
 def _numbers(what: str, field: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """A read-only copy in float64."""
     array = check_array(f"{what}: {field}", value, shape, "Pass one row per candidate.")
     array.setflags(write=False)
     return array

@@ -188,7 +188,6 @@ def fit_streak(patch: Patch, values: Array, look: Look) -> StreakFit:
 
 
 def _fitted(patch: Patch, values: Array, look: Look) -> StreakFit:
-    """The fit to the pixels around the first values."""
     values = values.copy()
     near = _near(patch, values)
     close = patch.at(near[:: 1 + int(len(near) * _nodes(values[HALF]) / MOST_WORK)])
