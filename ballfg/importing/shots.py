@@ -88,10 +88,8 @@ def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list
         parts, names = _by_name(column, stamps, rows, counts)
         for name, part in zip(names, parts, strict=True):
             if not is_name(name):
-                raise ValueError(
-                    f"{table.where}, row {part[0] + 1}, column {shown(roles.trajectory)}: must be {NAME_RULE}; got "
-                    f"{shown(name)}. Rename the shot."
-                )
+                rule = f"{table.where}, row {part[0] + 1}, column {shown(roles.trajectory)}: must be {NAME_RULE}"
+                raise ValueError(f"{rule}; got {shown(name)}. Rename the shot.")
     found = []
     labels = _labels(table, roles.others, parts, counts)
     for i, (name, part) in enumerate(zip(names, parts, strict=True)):

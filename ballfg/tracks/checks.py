@@ -151,10 +151,8 @@ def check_scale(label: str, times: Array, positions: Array, sigmas: Array | None
             "The unit of x, y, z is probably mm or cm: convert it to m."
         )
     if sigmas is not None and np.median(sigmas) > MAX_MEDIAN_SIGMA:
-        raise ValueError(
-            f"{label}: sigmas must be in m, their median at most {MAX_MEDIAN_SIGMA:g}; got {np.median(sigmas):.4g}. "
-            "The unit is probably mm: divide by 1000."
-        )
+        rule = f"{label}: sigmas must be in m, their median at most {MAX_MEDIAN_SIGMA:g}"
+        raise ValueError(f"{rule}; got {np.median(sigmas):.4g}. The unit is probably mm: divide by 1000.")
 
 
 def doubts_about(times: Array, positions: Array, surfaces: Sequence[float], radius: float) -> tuple[str, ...]:

@@ -235,10 +235,8 @@ def _checked_extent(extent: Any) -> tuple[float, ...]:
         if not low < high:
             raise ValueError(f"{label} must increase; got [{low:g}, {high:g}]. Give the lower end first.")
         if not _TABLE_SIZES[0] <= high - low <= _TABLE_SIZES[1]:
-            raise ValueError(
-                f"{label} must be in m, its ends {_TABLE_SIZES[0]:g} to {_TABLE_SIZES[1]:g} m apart; got "
-                f"[{low:g}, {high:g}]. Convert it to m."
-            )
+            rule = f"{label} must be in m, its ends {_TABLE_SIZES[0]:g} to {_TABLE_SIZES[1]:g} m apart"
+            raise ValueError(f"{rule}; got [{low:g}, {high:g}]. Convert it to m.")
         ends += [low, high]
     return tuple(ends)
 

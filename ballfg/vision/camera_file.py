@@ -92,10 +92,8 @@ def write_opencv(path: str | PathLike[str], cameras: Iterable[Camera], *, posed:
     for camera in cameras:
         plain = camera.name.replace("_", "a").replace("-", "0")
         if not (plain.isascii() and plain.isalnum() and plain[0].isalpha()):
-            raise ValueError(
-                f"names of cameras must be letters, digits, - and _, a letter first, in OpenCV's files; "
-                f"got {shown(camera.name)}. Rename it, or write cameras.yaml."
-            )
+            rule = "names of cameras must be letters, digits, - and _, a letter first, in OpenCV's files"
+            raise ValueError(f"{rule}; got {shown(camera.name)}. Rename it, or write cameras.yaml.")
     with whole_file(path) as temporary:
         storage = cv2.FileStorage(str(temporary), cv2.FILE_STORAGE_WRITE)
         for camera in cameras:

@@ -40,10 +40,8 @@ def learn_detector(video: Video, settings: DetectorSettings | None = None) -> Ba
     """
     images = video.sample(SAMPLE)
     if len(images) < FEWEST:
-        raise ValueError(
-            f"video {shown(video.name)} must have at least {FEWEST} frames to learn a background; got {len(images)}. "
-            "Record longer, or leave the camera out."
-        )
+        rule = f"video {shown(video.name)} must have at least {FEWEST} frames to learn a background"
+        raise ValueError(f"{rule}; got {len(images)}. Record longer, or leave the camera out.")
     return BallDetector.learn(images, settings)
 
 
