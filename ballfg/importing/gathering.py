@@ -22,11 +22,7 @@ _INTERRUPTED: Final = 0.5  # share of files with gaps, above which a gap ends a 
 
 
 def understood(tables: Sequence[RawTable], choices: Choices) -> tuple[list[RawTable], Roles, list[RawTable]]:
-    """Determines the role of each table of a source.
-
-    Returns: the tables of positions, with equal columns; their roles; and the other tables.
-    Raises: UndecidedError: no positions, or positions in different columns.
-    """
+    """Tables of positions with equal columns; their roles; others. Raises: UndecidedError: none, or several."""
     kinds: dict[tuple[Any, ...], list[RawTable]] = {}
     for table in tables:
         kinds.setdefault((table.named, *table.columns), []).append(table)

@@ -33,11 +33,7 @@ class Proposal:
 
 
 def propose(data: Any, choices: Choices) -> Proposal:
-    """Reads a source and guesses the open choices.
-
-    Args: data: as for `import_tracks`.  choices: of the user.
-    Raises: UndecidedError: an unsafe guess. FileNotFoundError: no such file. ValueError: unreadable input.
-    """
+    """Reads a source and guesses open choices. Raises: UndecidedError. FileNotFoundError. ValueError: unreadable."""
     tables = tables_of(data, choices.topic, choices.key)
     try:
         return _proposed(tables, choices)

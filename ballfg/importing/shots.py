@@ -60,10 +60,7 @@ class Counts:
 
 
 def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list[SourceShot]:
-    """The shots of a table, cut at its trajectory column or else where time restarts.
-
-    Raises: UndecidedError: no time and no rate. ValueError: text for a time, or no row with a position.
-    """
+    """A table's shots, by the trajectory column or where time restarts. Raises: UndecidedError, ValueError."""
     alone = (name for name in (roles.frame, roles.trajectory) if name is not None)
     needed = (*roles.time, *roles.places, *alone, *(roles.sigmas or ()))
     lacking = [name for name in needed if name not in table.columns]

@@ -159,11 +159,7 @@ def _texts(path: Path, name: str, column: pa.ChunkedArray) -> Texts:
 def check_values(
     path: Path, values: Mapping[str, Array], lines: NDArray[np.int64], rules: Mapping[str, Rule] = RULES
 ) -> None:
-    """Refuses cells out of their range; in columns without a rule, numbers that are not finite.
-
-    Args: values: (n,) of each column.  lines: (n,) numbers of their rows in the file.
-    Raises: ValueError: naming line and column.
-    """
+    """Refuses cells of columns (n,), of rows with these numbers in the file, out of their range. Raises: ValueError."""
     for name, column in values.items():
         rule, holds = rules.get(name, (f"finite, at most {LARGEST:g} in size", np.isfinite))
         wrong = ~((np.abs(column) <= LARGEST) & holds(column))
@@ -175,11 +171,7 @@ def check_values(
 def check_cameras(
     path: Path, names: Texts, lines: NDArray[np.int64], cameras: Sequence[str], ignored: Sequence[str] = ()
 ) -> None:
-    """Refuses a row of a camera that is neither one of `cameras` nor `ignored`.
-
-    Args: names: (n,) of the cameras.  lines: (n,) numbers of their rows in the file.
-    Raises: ValueError: naming the line.
-    """
+    """Refuses rows of a camera, names (n,), neither in `cameras` nor `ignored`. Raises: ValueError: with the line."""
     strange = ~np.isin(names, [*cameras, *ignored])
     if strange.any():
         got = str(names[int(np.argmax(strange))])

@@ -59,11 +59,7 @@ class TrackNoise:
 
     @classmethod
     def from_mapping(cls, content: Any) -> TrackNoise:
-        """The noise in a file.
-
-        Args: content: the parsed section; its keys are the fields of this class.
-        Raises: ValueError: an unknown key, or a number out of its range.
-        """
+        """The noise in a parsed section of a file. Raises: ValueError: an unknown key, or a number out of its range."""
         if not isinstance(content, Mapping):
             raise ValueError(f"noise must be a mapping such as {{memory_time: 0.02}}; got {type_name(content)}.")
         known = [f.name for f in fields(cls)]

@@ -189,10 +189,7 @@ class Region:
 
 
 def find_regions(background: Background, image: Image, widest: float, longest: float, most: int) -> list[Region]:
-    """Regions of one frame, the heaviest first; the background follows the frame.
-
-    Args: image: (h, w, 3).  widest, longest: px, of a ball and of its streak.  most: how many at most.
-    """
+    """Regions of a frame (h, w, 3), at most so many, the heaviest first; widest ball and longest streak in px."""
     small = shrunk(image)
     change = background.follow(small)
     found = cv2.compare(change, background.threshold, cv2.CMP_GT)

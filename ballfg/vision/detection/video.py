@@ -160,11 +160,7 @@ def open_video(path: str | PathLike[str], stamps: str | PathLike[str] | None = N
 
 
 def read_stamps(path: Path) -> Array:
-    """(f,) s, strictly increasing, one a frame.
-
-    Args: path: a CSV file with a header; column `t` (s), optionally `frame`, which then counts from 0.
-    Raises: FileNotFoundError: no such file. ValueError: no column `t`, no rows, or a row that breaks a rule.
-    """
+    """(f,) s of column `t` of a CSV file; `frame` counts from 0. Raises: FileNotFoundError. ValueError: a bad row."""
     if not path.is_file():
         raise FileNotFoundError(f"file of stamps {path} does not exist. Check the path.")
     names = [name.strip() for name in csv_files.read_header(path)]
