@@ -76,15 +76,13 @@ def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
 
 def _tracks(shots: Sequence[SourceShot], frame: Frame) -> tuple[list[Track], list[str]]:
     """Tracks in m and s with z up, and notes on their repairs."""
-    stamps = [shot.stamps for shot in shots]
-    far = [origin_of(one, frame.time) for one in stamps]
+    far = [origin_of(shot.stamps, frame.time) for shot in shots]
     origin = min(far, key=abs) if all(far) else 0
     findings = Findings()
     tracks = []
     for shot in shots:
         times = in_seconds(shot.stamps, frame.time, origin)
-        positions = frame.turned(frame.metres(shot.positions))
-        parts = [times[:, None], positions]
+        parts = [times[:, None], frame.turned(frame.metres(shot.positions))]
         if shot.sigmas is not None:
             parts.append(frame.turned_sizes(frame.metres(shot.sigmas)))
 

@@ -51,8 +51,7 @@ class Dataset(TrackFolder):
         for group in groups(self._source, self._index):
             values = tidy(group, self._source.where)
             sigmas = values[:, 4:] if self.has_sigmas else None
-            labels = self._labels.of(group.name)
-            track = Track(values[:, 0], values[:, 1:4], sigmas, labels, name=group.name)
+            track = Track(values[:, 0], values[:, 1:4], sigmas, self._labels.of(group.name), name=group.name)
             yield replace(track if self._attached is None else self._attached(track), dataset=self)
 
     def __repr__(self) -> str:

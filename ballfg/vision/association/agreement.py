@@ -120,8 +120,7 @@ def _scene(balls: Sequence[SeenBall], cameras: list[Camera]) -> _Scene:
     rows, points = rows[np.isfinite(points).all(axis=1)], points[np.isfinite(points).all(axis=1)]
     weights = np.zeros(covariances[rows].shape)
     weights[seen[rows]] = np.linalg.inv(covariances[rows][seen[rows]])
-    expected = chi2.median(2 * seen[rows].sum(axis=1) - 3)
-    return _Scene(pixels[rows], weights, points, expected)
+    return _Scene(pixels[rows], weights, points, chi2.median(2 * seen[rows].sum(axis=1) - 3))
 
 
 def _errors(scene: _Scene, cameras: list[Camera], points: Array) -> Array:

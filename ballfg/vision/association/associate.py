@@ -123,9 +123,8 @@ def _joined(footage: Footage, balls: list[Gathered]) -> list[Gathered]:
 
 def _may_follow(footage: Footage, one: Gathered, other: Gathered) -> bool:
     """True if hardly any camera saw both in one frame; where one did, one of the candidates is wrong."""
-    frames = [seen.frame for seen in footage.detections]
-    pairs = zip(frames, one.rows, other.rows, strict=True)
-    return all(np.isin(frame[mine], frame[theirs]).sum() <= _DISPUTED for frame, mine, theirs in pairs)
+    pairs = zip(footage.detections, one.rows, other.rows, strict=True)
+    return all(np.isin(seen.frame[mine], seen.frame[theirs]).sum() <= _DISPUTED for seen, mine, theirs in pairs)
 
 
 def _seen_ball(footage: Footage, ball: Gathered) -> SeenBall:

@@ -156,8 +156,7 @@ def _grouped(
             one.extend(other)
             for number in other:
                 group_of[number] = one
-    groups = {id(group): sorted(group) for group in group_of.values() if len(group) > 1}
-    return sorted(groups.values())
+    return sorted({id(group): sorted(group) for group in group_of.values() if len(group) > 1}.values())
 
 
 def _may_join(pieces: Sequence[Piece], a: int, b: int, against: set[tuple[int, int]]) -> bool:
