@@ -23,11 +23,7 @@ _SAID: Final = 160  # largest number of characters of a library's own words
 
 @contextmanager
 def library_reads(path: Path, kind: str, remedy: str = "Copy or export it again.") -> Iterator[None]:
-    """Turns any exception of a library at a damaged file into one line with the file's name.
-
-    Args: path: of the file.  kind: required type of the file.  remedy: last sentence of the message.
-    Raises: ValueError: for any exception; one that names the file already stays as it is.
-    """
+    """Turns any exception of a library at a damaged file into one line with its name. Raises: ValueError."""
     try:
         yield
     except Exception as error:

@@ -75,10 +75,7 @@ def held(target: Path, argument: str = "out") -> Iterator[None]:
 
 @contextmanager
 def hidden(parent: Path, target: Path, path: Path) -> Iterator[Path]:
-    """A new folder for this user alone, removed at the end.
-
-    Args: parent: of the new folder.  target: the result, held.  path: name in messages about the disk.
-    """
+    """A new folder in `parent` for this user alone, removed at the end; errors of the disk name `path`."""
     place, record = parent / f"{MARK}{secrets.token_hex(8)}", _records.get()[target]
     if record is not None:
         _write(record, str(place))

@@ -29,10 +29,7 @@ def state_folder(name: str) -> Path:
 
 
 def own_folder(folder: Path) -> Path:
-    """The folder itself, created for this user alone if missing.
-
-    Raises: OSError: it cannot be made or written to. ValueError: others may change its content.
-    """
+    """The folder, made for this user alone if missing. Raises: OSError: unusable. ValueError: others may change it."""
     folder.mkdir(parents=True, exist_ok=True, mode=PRIVATE)
     if not is_own(folder):
         raise ValueError(f"{folder} must be a folder that only this user may write to. Change its owner and its mode.")
@@ -41,10 +38,7 @@ def own_folder(folder: Path) -> Path:
 
 
 def temporary_folder(name: str) -> Path:
-    """A folder among the temporary files that later processes of this user find again.
-
-    Returns: the folder; if another user has made one of that name, a folder of this process, removed at its end.
-    """
+    """A temporary folder that later processes of this user find; of this process if another user has the name."""
     folder = Path(tempfile.gettempdir()) / f"ballfg-{os.getuid()}" / name
     with suppress(OSError):
         for each in (folder.parent, folder):

@@ -17,11 +17,7 @@ T = TypeVar("T")
 
 
 def run_file(path: Path, what: str) -> ModuleType:
-    """The module of a file, under a name that no import finds, so that worker processes get its whole content.
-
-    Args: path: of a trusted file: all of its code runs.  what: kind of content, for the module's name.
-    Raises: ValueError: if it does not run; the message has the line.
-    """
+    """The module of a trusted file, under a name that no import finds. Raises: ValueError: with the line."""
     module = ModuleType(f"ballfg {what} {path}")
     sys.modules[module.__name__] = module  # dataclasses look their module up
     try:
@@ -67,11 +63,7 @@ def defined_classes(module: ModuleType, base: type[Any] | tuple[type[Any], ...])
 
 @contextmanager
 def blamed(path: Path, doing: str) -> Iterator[None]:
-    """Turns any exception of the user's code into one line.
-
-    Args: path: of the file.  doing: present task of its code; empty while the file runs.
-    Raises: ValueError: with the line.
-    """
+    """Turns any exception of the user's code into one line, with what it was doing. Raises: ValueError."""
     try:
         yield
     except BaseException as error:  # sys.exit in it would end the command
@@ -82,7 +74,6 @@ def blamed(path: Path, doing: str) -> Iterator[None]:
 
 
 def _where(error: BaseException, path: Path) -> str:
-    """The error, and its line in the file."""
     lines = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == str(path)]
     if not lines and isinstance(error, SyntaxError) and error.filename == str(path):
         lines = [error.lineno]

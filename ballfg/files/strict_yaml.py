@@ -58,11 +58,7 @@ def read_yaml(path: Path) -> Any:
 
 
 def parse_yaml(text: str, where: str, *, text_only: bool = False) -> Any:
-    """The content of YAML text; None if it is empty.
-
-    Args: where: start of an error message.  text_only: keep each value as text.
-    Raises: ValueError: as `read_yaml`.
-    """
+    """The content of YAML text, None if empty; `text_only` keeps values as text. Raises: YamlError: by `where`."""
     try:
         sizes = _Sizes()  # refuses deep nesting, aliases that multiply or contain themselves, tags
         for event in yaml.parse(text, Loader=_PARSER):

@@ -91,11 +91,7 @@ def _arc(times: Array, heights: Array, origin: float) -> tuple[float, float, flo
 
 
 def ball_of(choices: Choices, frame: Frame) -> tuple[Ball, Guess]:
-    """The ball, and the confidence in it.
-
-    Args: choices: of the user.  frame: with the drag (1/m) of the flights.
-    Raises: FileNotFoundError, ValueError: an unknown chosen ball, or a file that cannot be read.
-    """
+    """The ball, by its drag, and the confidence in it. Raises: FileNotFoundError, ValueError: an unknown ball."""
     if choices.ball is not None:
         from ballfg.simulation.balls import ball_kind
 
@@ -110,11 +106,7 @@ def ball_of(choices: Choices, frame: Frame) -> tuple[Ball, Guess]:
 
 
 def table_of(tracks: Sequence[Track], ball: Ball, choices: Choices) -> tuple[float, Guess]:
-    """The height of the table's surface in m, and the confidence in it.
-
-    Args: tracks: in m and s with z up.  ball: its radius lies between a bounce and the surface.  choices: of the user.
-    Raises: UndecidedError: no bounce shows it.
-    """
+    """The height of the table's surface in m, and the confidence in it. Raises: UndecidedError: no bounce shows it."""
     if choices.table_height is not None:
         height = choices.table_height
         return height, Guess("table height", f"{height:g} m", "as given", "stated", f"--table-height {height:g}")

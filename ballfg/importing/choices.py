@@ -27,10 +27,7 @@ class UndecidedError(ValueError):
 
 @dataclass(frozen=True)
 class Choices:
-    """The user's choices; None for a guess.
-
-    Raises: ValueError: an option with an impossible value.
-    """
+    """The user's choices; None for a guess. Raises: ValueError: an option with an impossible value."""
 
     columns: Mapping[str, str] = field(default_factory=dict)
     """Role -> name of the column."""

@@ -65,8 +65,7 @@ def scales(
                 misses = [np.sum((a - gravity - k * drag) ** 2, axis=1) for k in _DRAGS]
                 fits = [float(np.exp(-0.5 * miss / (_WIDTH * STANDARD_GRAVITY) ** 2).mean()) for miss in misses]
                 best = int(np.argmax(fits))
-                score = fits[best] if flying else 0.0
-                found.append(Scale(length, time, up, score, len(v), float(_DRAGS[best])))
+                found.append(Scale(length, time, up, fits[best] if flying else 0.0, len(v), float(_DRAGS[best])))
     return sorted(found, key=lambda scale: -scale.score)
 
 

@@ -108,11 +108,7 @@ def find_frame(
 
 
 def likely_rate(shots: Sequence[Shot], length: str | None) -> int | None:
-    """The usual camera rate at which balls fall with gravity; stamps are numbers of frames.
-
-    Args: shots: frames (n,) and positions (n, 3).  length: their unit if known; else m, cm or mm, which no usual rates
-        confuse.
-    """
+    """The usual camera rate at which balls fall with gravity, of frames (n,) and positions (n, 3) in a unit."""
     lengths = (length,) if length in LENGTHS else _DECIMAL
     found = {rate: scales([(t / rate, p) for t, p in shots], lengths, ("s",)) for rate in RATES}
     score, rate = max(((best[0].score, rate) for rate, best in found.items() if best), default=(0.0, 0))
@@ -139,7 +135,6 @@ def _ratio(option: str, best: Scale, found: Sequence[Scale]) -> float:
 
 
 def _decide(option: str, best: Scale, found: Sequence[Scale]) -> None:
-    """Refuses a reading that is hardly better than another one."""
     ratio = _ratio(option, best, found)
     if ratio >= _LIKELY and best.score >= _LEAST_SCORE:
         return

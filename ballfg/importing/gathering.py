@@ -22,11 +22,7 @@ _INTERRUPTED: Final = 0.5  # share of files with gaps, above which a gap ends a 
 
 
 def understood(tables: Sequence[RawTable], choices: Choices) -> tuple[list[RawTable], Roles, list[RawTable]]:
-    """Determines the role of each table of a source.
-
-    Returns: the tables of positions, with equal columns; their roles; and the other tables.
-    Raises: UndecidedError: no positions, or positions in different columns.
-    """
+    """Tables of positions with equal columns; their roles; others. Raises: UndecidedError: none, or several."""
     kinds: dict[tuple[Any, ...], list[RawTable]] = {}
     for table in tables:
         kinds.setdefault((table.named, *table.columns), []).append(table)
@@ -53,8 +49,7 @@ def understood(tables: Sequence[RawTable], choices: Choices) -> tuple[list[RawTa
     if len(signatures) > 1 and len(read) > 1:
         names = [same[0].name or same[0].source for same, _ in read]
         raise UndecidedError(f"{' and '.join(names[:4])} hold positions in different columns", "key", names)
-    chosen = [table for same, _ in read for table in same]
-    return chosen, read[0][1], beside
+    return [table for same, _ in read for table in same], read[0][1], beside
 
 
 def shots_of(tables: Sequence[RawTable], roles: Roles, choices: Choices, counts: Counts) -> list[SourceShot]:

@@ -55,10 +55,8 @@ def import_tracks(
         file_format: "csv" or "parquet".
         force: replace a dataset in `out`.
     Returns: the dataset; it goes into `bf.estimate` as it is.
-    Raises:
-        UndecidedError: an unsafe guess, a ValueError that names the argument (as a command's option).
-        ValueError: unreadable data, or an argument that breaks its rule.
-        FileNotFoundError: a missing file.
+    Raises: UndecidedError: an unsafe guess, a ValueError that names the argument (as a command's option). ValueError:
+        unreadable data, or an argument that breaks its rule. FileNotFoundError: a missing file.
     """
     check_choice("file_format", file_format, ("csv", "parquet"))
     check_flag("force", force)

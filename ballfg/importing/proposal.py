@@ -33,11 +33,7 @@ class Proposal:
 
 
 def propose(data: Any, choices: Choices) -> Proposal:
-    """Reads a source and guesses the open choices.
-
-    Args: data: as for `import_tracks`.  choices: of the user.
-    Raises: UndecidedError: an unsafe guess. FileNotFoundError: no such file. ValueError: unreadable input.
-    """
+    """Reads a source and guesses open choices. Raises: UndecidedError. FileNotFoundError. ValueError: unreadable."""
     tables = tables_of(data, choices.topic, choices.key)
     try:
         return _proposed(tables, choices)
@@ -49,7 +45,6 @@ def propose(data: Any, choices: Choices) -> Proposal:
 
 
 def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
-    """The interpretation of tables."""
     chosen, roles, beside = understood(tables, choices)
     counts = Counts()
     shots = shots_of(chosen, roles, choices, counts)
@@ -81,15 +76,13 @@ def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
 
 def _tracks(shots: Sequence[SourceShot], frame: Frame) -> tuple[list[Track], list[str]]:
     """Tracks in m and s with z up, and notes on their repairs."""
-    stamps = [shot.stamps for shot in shots]
-    far = [origin_of(one, frame.time) for one in stamps]
+    far = [origin_of(shot.stamps, frame.time) for shot in shots]
     origin = min(far, key=abs) if all(far) else 0
     findings = Findings()
     tracks = []
     for shot in shots:
         times = in_seconds(shot.stamps, frame.time, origin)
-        positions = frame.turned(frame.metres(shot.positions))
-        parts = [times[:, None], positions]
+        parts = [times[:, None], frame.turned(frame.metres(shot.positions))]
         if shot.sigmas is not None:
             parts.append(frame.turned_sizes(frame.metres(shot.sigmas)))
 

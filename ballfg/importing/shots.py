@@ -60,10 +60,7 @@ class Counts:
 
 
 def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list[SourceShot]:
-    """The shots of a table, cut at its trajectory column or else where time restarts.
-
-    Raises: UndecidedError: no time and no rate. ValueError: text for a time, or no row with a position.
-    """
+    """A table's shots, by the trajectory column or where time restarts. Raises: UndecidedError, ValueError."""
     alone = (name for name in (roles.frame, roles.trajectory) if name is not None)
     needed = (*roles.time, *roles.places, *alone, *(roles.sigmas or ()))
     lacking = [name for name in needed if name not in table.columns]
@@ -88,10 +85,8 @@ def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list
         parts, names = _by_name(column, stamps, rows, counts)
         for name, part in zip(names, parts, strict=True):
             if not is_name(name):
-                raise ValueError(
-                    f"{table.where}, row {part[0] + 1}, column {shown(roles.trajectory)}: must be {NAME_RULE}; got "
-                    f"{shown(name)}. Rename the shot."
-                )
+                rule = f"{table.where}, row {part[0] + 1}, column {shown(roles.trajectory)}: must be {NAME_RULE}"
+                raise ValueError(f"{rule}; got {shown(name)}. Rename the shot.")
     found = []
     labels = _labels(table, roles.others, parts, counts)
     for i, (name, part) in enumerate(zip(names, parts, strict=True)):
@@ -192,7 +187,6 @@ def _lone_zeros(positions: Array, counts: Counts) -> NDArray[np.bool_]:
 def _labels(
     table: RawTable, names: Iterable[str], parts: list[NDArray[np.intp]], counts: Counts
 ) -> dict[str, list[Label | None]]:
-    """Columns with a constant value in every shot."""
     found: dict[str, list[Label | None]] = {}
     for name in names:
         column = table.columns.get(name)

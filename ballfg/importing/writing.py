@@ -21,11 +21,7 @@ _MOST_POINTS: Final = 300  # largest number of drawn samples of a shot
 
 
 def write_import(folder: Path, proposal: Proposal, file_format: Literal["csv", "parquet"], force: bool) -> None:
-    """Writes the dataset and its page as a whole, or nothing.
-
-    Args: folder: new, empty, or with `force` an existing dataset, including the truth of a simulated one.
-    Raises: ValueError: a folder with other content. FileNotFoundError: its parent does not exist.
-    """
+    """Writes the dataset and its page, or nothing. Raises: ValueError: a folder of others. FileNotFoundError."""
     simulated = (folder / TRUTH_FILE).is_file()
     with whole_folder(folder, earlier=(*DATASET_FILES, PAGE, *(TRUTH_FILES if simulated else ()))) as stage:
         check_replaceable(folder, mark=INFO_FILE, what="a dataset", force=force)
@@ -56,7 +52,6 @@ def page(proposal: Proposal) -> str:
 
 
 def _drawing(tracks: Sequence[Track], height: float) -> Html:
-    """The shots from the side and from above, as SVG."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
 

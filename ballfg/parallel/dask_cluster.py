@@ -113,8 +113,6 @@ class DaskCluster:
 
 
 class _Chunk:
-    """A chunk on the cluster."""
-
     def __init__(self, cluster: DaskCluster, future: Any, chunk: Sequence[Any]) -> None:
         self._cluster, self._future, self._first = cluster, future, repr(chunk[0])
 

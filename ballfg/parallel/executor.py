@@ -78,10 +78,9 @@ def on_cluster(kind: str | None, address: str | None = None) -> Iterator[int | N
         address: of dask's scheduler, such as tcp://10.0.0.1:8786, or of a ray cluster; by default this machine's ray
             cluster.
     Returns: the number of workers; None without a cluster.
-    Raises:
-        ValueError: another kind, an address without a kind or the reverse, a library that is not installed, or workers
-            with other versions of ballfg, torch or numpy.
-        ConnectionError: nothing answers at the address, or no workers are there.
+    Raises: ValueError: another kind, an address without a kind or the reverse, a library that is not installed, or
+        workers with other versions of ballfg, torch or numpy. ConnectionError: nothing answers at the address, or no
+        workers are there.
     """
     if kind is None:
         if address is not None:

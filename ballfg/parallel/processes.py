@@ -38,27 +38,19 @@ class Processes:
 
     def __init__(self, jobs: int, *, helped: bool = True) -> None:
         self.helped = helped
-        self._others = jobs - 1 if helped else jobs
-
-    @property
-    def slots(self) -> int:
-        """Number of chunks that others compute at the same time."""
-        return self._others
+        self.slots = jobs - 1 if helped else jobs  # chunks that others compute at the same time
 
     @property
     def started(self) -> bool:
         """True if this number of processes was started before; they may still exist."""
-        return _crew.size >= self._others
+        return _crew.size >= self.slots
 
     def sender(
         self, function: Callable[[Sequence[Any]], Any], told: Told | None = None
     ) -> Callable[[Sequence[Any]], "_Chunk"]:
-        """Submits a function of a chunk; see Executor.
-
-        Args: told: called, in another thread, with the messages that the function sends by `worker.tell`.
-        """
+        """Submits a function of a chunk; see Executor. `told` gets, in another thread, what `worker.tell` sends."""
         work = Work.of(function)
-        return lambda chunk: _Chunk(_crew.line(self._others), work, chunk, told)
+        return lambda chunk: _Chunk(_crew.line(self.slots), work, chunk, told)
 
     def stop(self) -> None:
         """Ends all processes at once."""
@@ -186,8 +178,6 @@ class _Crew:
 
 
 class _Process:
-    """An interpreter that computes one chunk after another."""
-
     def __init__(self) -> None:
         self._calls, theirs = Pipe()
         # Ctrl-C at the terminal is for this process alone; the other one ignores it as soon as it can

@@ -77,8 +77,6 @@ class RayCluster:
 
 
 class _Chunk:
-    """A chunk on the cluster."""
-
     def __init__(self, ray: Any, sent: Any, chunk: Sequence[Any]) -> None:
         self._ray, self._sent, self._first = ray, sent, repr(chunk[0])
 

@@ -58,11 +58,7 @@ def in_order(
 
 
 def finished(function: Callable[[T], R], items: Sequence[T], executor: Executor) -> Iterator[tuple[int, R]]:
-    """The number and the result of each item, as they finish; this process waits.
-
-    Args: function: of an item; takes seconds or more.  items: submitted at once.  executor: computes them.
-    Raises: the function's exceptions.
-    """
+    """The number and the result of each item, as they finish; this process waits. Raises: the function's exceptions."""
     send = executor.sender(partial(_of_one, function))
     pending = {number: send([item]) for number, item in enumerate(items)}
     try:
@@ -79,11 +75,7 @@ def finished(function: Callable[[T], R], items: Sequence[T], executor: Executor)
 
 
 def shared(function: Callable[[T], R], items: Sequence[T], executor: Executor) -> list[R]:
-    """The results of items that take seconds or more, in their order; this process computes some of them too.
-
-    Args: function: of an item.  items: its arguments.  executor: whose free processes take the next item.
-    Raises: the function's exceptions.
-    """
+    """The results of items in order; this process computes some of them too. Raises: the function's exceptions."""
     send = executor.sender(partial(_of_one, function))
     waiting, found, errors = deque(enumerate(items)), dict[int, R](), list[Exception]()
 

@@ -66,11 +66,7 @@ class Findings:
 
 
 def check_step(label: str, stamps: Array) -> None:
-    """Refuses stamps that cannot be seconds of a camera.
-
-    Args: label: name of the stamps in an error.  stamps: (n,) s, increasing; fewer than three are not checked.
-    Raises: ValueError: a median step out of `MIN_STEP` to `MAX_STEP`.
-    """
+    """Refuses stamps (n,) s, increasing, with a median step out of `MIN_STEP` to `MAX_STEP`. Raises: ValueError."""
     step = float(np.median(np.diff(stamps))) if len(stamps) > 2 else MIN_STEP
     if not MIN_STEP <= step <= MAX_STEP:
         problem = f"{label}: t must be in s, with a median step of {MIN_STEP:g} to {MAX_STEP:g} s; got {step:.4g} s"
@@ -120,11 +116,7 @@ def fuse(values: Array) -> Array:
 
 
 def check_scale(label: str, times: Array, positions: Array, sigmas: Array | None, rate: float | None) -> None:
-    """Refuses a track whose numbers cannot be metres and seconds.
-
-    Args: times: (n,) s, n >= 2, increasing.  positions: (n, 3) m.  sigmas: (n, 3) m.  rate: as declared, Hz.
-    Raises: ValueError: with the likely unit.
-    """
+    """Refuses times (n,) s and positions (n, 3) m that cannot be in these units. Raises: ValueError: the likely one."""
     steps = np.diff(times)
     step = float(np.median(steps))
     misses_rate = rate is not None and not 1 / MAX_RATE_RATIO <= step * rate <= MAX_RATE_RATIO
@@ -151,18 +143,12 @@ def check_scale(label: str, times: Array, positions: Array, sigmas: Array | None
             "The unit of x, y, z is probably mm or cm: convert it to m."
         )
     if sigmas is not None and np.median(sigmas) > MAX_MEDIAN_SIGMA:
-        raise ValueError(
-            f"{label}: sigmas must be in m, their median at most {MAX_MEDIAN_SIGMA:g}; got {np.median(sigmas):.4g}. "
-            "The unit is probably mm: divide by 1000."
-        )
+        rule = f"{label}: sigmas must be in m, their median at most {MAX_MEDIAN_SIGMA:g}"
+        raise ValueError(f"{rule}; got {np.median(sigmas):.4g}. The unit is probably mm: divide by 1000.")
 
 
 def doubts_about(times: Array, positions: Array, surfaces: Sequence[float], radius: float) -> tuple[str, ...]:
-    """Doubts that a ball falls along -z and bounces on the declared surfaces.
-
-    Args: times: (n,) s.  positions: (n, 3) m.  surfaces: heights, m.  radius: m, of the ball.
-    Returns: one sentence for each doubt.
-    """
+    """Doubts that a ball, of times (n,) s and positions (n, 3) m, falls along -z and bounces on the surfaces (m)."""
     step = float(np.median(np.diff(times))) if len(times) > 1 else np.inf
     reach = max(round(BASELINE / step), 1) if np.isfinite(step) else 1
     if len(times) < 4 * reach:

@@ -44,11 +44,7 @@ def read_header(path: Path) -> list[str]:
 
 
 def check_header(path: Path, header: Sequence[str], required: Sequence[str], known: Collection[str]) -> None:
-    """Refuses a header without a required column or with a repeated known one.
-
-    Args: path: of the table.  header: its columns.  required: columns.  known: columns with a meaning.
-    Raises: ValueError: naming the column.
-    """
+    """Refuses a header without a required column or with a known one repeated. Raises: ValueError: naming it."""
     text = ",".join(header)
     got = repr(text if len(text) <= 120 else text[:117] + "...")
     for name in required:
@@ -76,11 +72,7 @@ def convert_options(texts: Sequence[str], numbers: Sequence[str]) -> pa_csv.Conv
 
 
 def records(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """The rows of data with the line number of each; empty lines are skipped.
-
-    Raises: ValueError: text that is not UTF-8, a line of more than `MAX_LINE` characters, or a quote that is never
-        closed.
-    """
+    """The rows of data that are not empty, with their lines. Raises: ValueError: no UTF-8, a long line, a quote."""
     with path.open(encoding="utf-8-sig", errors="surrogateescape", newline="") as file:
         reader = csv.reader(_lines(path, file), strict=True)
         line = 1
@@ -118,11 +110,7 @@ def lines_of_rows(path: Path, rows: Sequence[int]) -> list[int]:
 
 
 def explain(path: Path, numeric: Sequence[str], reason: str) -> ValueError:
-    """The error for the first bad row of a file that the fast reader refused.
-
-    Args: path: the file.  numeric: the columns that must hold numbers.
-        reason: the fast reader's own message, used if the second pass finds nothing.
-    """
+    """The error for the first bad row of a file that the fast reader refused, or else its own reason."""
     header = read_header(path)
     line = 1
     try:

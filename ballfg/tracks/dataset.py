@@ -51,8 +51,7 @@ class Dataset(TrackFolder):
         for group in groups(self._source, self._index):
             values = tidy(group, self._source.where)
             sigmas = values[:, 4:] if self.has_sigmas else None
-            labels = self._labels.of(group.name)
-            track = Track(values[:, 0], values[:, 1:4], sigmas, labels, name=group.name)
+            track = Track(values[:, 0], values[:, 1:4], sigmas, self._labels.of(group.name), name=group.name)
             yield replace(track if self._attached is None else self._attached(track), dataset=self)
 
     def __repr__(self) -> str:
@@ -113,12 +112,10 @@ def read_dataset(folder: str | PathLike[str]) -> Dataset:
     The table is read twice in blocks (cells first, then whole trajectories); memory does not grow with the number
     of tracks, apart from their names and labels.
 
-    Args:
-        folder: holds `dataset.yaml`, `tracks.csv` or `tracks.parquet`, and optionally `labels.csv`; docs/tracks.md.
+    Args: folder: holds `dataset.yaml`, `tracks.csv` or `tracks.parquet`, and optionally `labels.csv`; docs/tracks.md.
     Returns: the dataset; its `notes` list ignored and repaired entries.
-    Raises:
-        FileNotFoundError: the folder or one of its files is missing.
-        ValueError: the content breaks a rule; the message names file, line, column and remedy.
+    Raises: FileNotFoundError: the folder or one of its files is missing. ValueError: the content breaks a rule; the
+        message names file, line, column and remedy.
     """
     path = check_path("folder", folder)
     source = _open_source(path)

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -11,7 +10,7 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 from numpy.typing import ArrayLike, NDArray
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Index
 from ballfg.checks import LARGEST, NAME_RULE, did_you_mean, is_name, shown
 from ballfg.files.damaged import check_unpacked
 from ballfg.files.spreadsheet import bare
@@ -44,17 +43,6 @@ DETECTIONS_FILE: Final = "detections.csv"
 REQUIRED: Final = (KEY, "t", CAMERA, "u", "v")
 
 
-@dataclass(frozen=True)
-class _Table:
-    """The rows of the file with a ball's name."""
-
-    path: Path
-    lines: NDArray[np.int64]  # (n,) row numbers in the file, from 0
-    names: Texts  # (n,) of the balls
-    camera: NDArray[np.int64]  # (n,) numbers of the cameras
-    values: dict[str, Array]  # (n,) of each numeric column
-
-
 def read_sightings(
     path: str | os.PathLike[str], time_offsets: Mapping[str, float]
 ) -> tuple[dict[str, Sightings], list[str]]:
@@ -81,23 +69,23 @@ def read_sightings(
     values |= {name: np.full(len(lines), value) for name, value in UNSTATED.items() if name not in values}
     number_of = {name: number for number, name in enumerate(time_offsets)}
     seen_by = np.array([number_of[name] for name in texts[CAMERA][lines].tolist()], dtype=np.int64)
-    table = _Table(path, lines, texts[KEY][lines], seen_by, values)
+    names = texts[KEY][lines]
     notes = [f"{path.name}: column {shown(name)} ignored" for name in header if name not in (*REQUIRED, *OPTIONAL)]
     if nameless := len(texts[KEY]) - len(lines):
         notes.append(f"{path.name}: {nameless} rows without a trajectory left out")
-    rows, doubles = _chosen(table)
+    rows, doubles = _chosen(path, lines, names, seen_by, values)
     if doubles:
         notes.append(f"{path.name}: {doubles} candidates with a lower score than another of the same ball left out")
     for number, camera in enumerate(time_offsets):
-        check_step(f"{path}, camera {shown(camera)}", np.unique(table.values["t"][rows][table.camera[rows] == number]))
+        check_step(f"{path}, camera {shown(camera)}", np.unique(values["t"][rows][seen_by[rows] == number]))
     offsets = np.array(list(time_offsets.values()))
-    rows = rows[np.argsort((table.values["t"] - offsets[table.camera])[rows], kind="stable")]
+    rows = rows[np.argsort((values["t"] - offsets[seen_by])[rows], kind="stable")]
     found = {}
-    for name in dict.fromkeys(table.names.tolist()):
-        mine = rows[table.names[rows] == name]
-        own = {column: numbers[mine] for column, numbers in table.values.items()}
+    for name in dict.fromkeys(names.tolist()):
+        mine = rows[names[rows] == name]
+        own = {column: cells[mine] for column, cells in values.items()}
         pixels = np.column_stack((own["u"], own["v"]))
-        found[name] = Sightings(tuple(time_offsets), table.camera[mine], own["t"], pixels, covariances(own))
+        found[name] = Sightings(tuple(time_offsets), seen_by[mine], own["t"], pixels, covariances(own))
     return found, notes
 
 
@@ -113,19 +101,19 @@ def write_sightings(path: str | os.PathLike[str], balls: Iterable[tuple[str, Sig
             table.write({KEY: name} | seen_columns(seen.times, camera, seen.pixels, seen.covariances))
 
 
-def _chosen(table: _Table) -> tuple[NDArray[np.int64], int]:
+def _chosen(path: Path, lines: Index, names: Texts, camera: Index, values: Mapping[str, Array]) -> tuple[Index, int]:
     """The best scored row for each ball, camera and stamp; the number of others. Raises: ValueError: equal scores."""
-    score = table.values.get(SCORE, np.zeros(len(table.lines)))
-    order = np.lexsort((-score, table.values["t"], table.camera, table.names))
+    score = values.get(SCORE, np.zeros(len(lines)))
+    order = np.lexsort((-score, values["t"], camera, names))
     same = np.ones(max(len(order) - 1, 0), dtype=bool)
-    for column in (table.names, table.camera, table.values["t"]):
+    for column in (names, camera, values["t"]):
         same &= column[order[1:]] == column[order[:-1]]
     tied = same & (score[order[1:]] == score[order[:-1]])
     if tied.any():
-        pair = np.sort(table.lines[order[int(np.argmax(tied)) :][:2]])
-        one, other = csv_files.lines_of_rows(table.path, pair.tolist())
+        pair = np.sort(lines[order[int(np.argmax(tied)) :][:2]])
+        one, other = csv_files.lines_of_rows(path, pair.tolist())
         raise ValueError(
-            f"{table.path}, lines {one} and {other}: one ball must be seen once in a frame, or the scores must tell "
+            f"{path}, lines {one} and {other}: one ball must be seen once in a frame, or the scores must tell "
             "which candidate it is; they do not. Delete one of them."
         )
     return np.sort(order[np.append(True, ~same)]) if len(order) else order, int(same.sum())
@@ -171,11 +159,7 @@ def _texts(path: Path, name: str, column: pa.ChunkedArray) -> Texts:
 def check_values(
     path: Path, values: Mapping[str, Array], lines: NDArray[np.int64], rules: Mapping[str, Rule] = RULES
 ) -> None:
-    """Refuses cells out of their range; in columns without a rule, numbers that are not finite.
-
-    Args: values: (n,) of each column.  lines: (n,) numbers of their rows in the file.
-    Raises: ValueError: naming line and column.
-    """
+    """Refuses cells of columns (n,), of rows with these numbers in the file, out of their range. Raises: ValueError."""
     for name, column in values.items():
         rule, holds = rules.get(name, (f"finite, at most {LARGEST:g} in size", np.isfinite))
         wrong = ~((np.abs(column) <= LARGEST) & holds(column))
@@ -187,11 +171,7 @@ def check_values(
 def check_cameras(
     path: Path, names: Texts, lines: NDArray[np.int64], cameras: Sequence[str], ignored: Sequence[str] = ()
 ) -> None:
-    """Refuses a row of a camera that is neither one of `cameras` nor `ignored`.
-
-    Args: names: (n,) of the cameras.  lines: (n,) numbers of their rows in the file.
-    Raises: ValueError: naming the line.
-    """
+    """Refuses rows of a camera, names (n,), neither in `cameras` nor `ignored`. Raises: ValueError: with the line."""
     strange = ~np.isin(names, [*cameras, *ignored])
     if strange.any():
         got = str(names[int(np.argmax(strange))])
@@ -216,6 +196,5 @@ def seen_columns(times: Array, camera: ArrayLike, pixels: Array, spread: Array) 
 
 
 def _place(path: Path, lines: NDArray[np.int64], column: str) -> str:
-    """The first of some rows of the file, and the column, for a message."""
     (line,) = csv_files.lines_of_rows(path, [int(lines[0])])
     return f"{path}, line {line}, column {shown(column)}:"

@@ -101,7 +101,6 @@ def _global_codes(block: Block, codes_of: dict[str, int]) -> NDArray[np.int32]:
 
 
 def _runs(codes: NDArray[np.int32]) -> list[tuple[int, int]]:
-    """Start and end of each run of equal codes."""
     edges = [0, *(np.flatnonzero(np.diff(codes)) + 1).tolist(), len(codes)]
     return list(pairwise(edges)) if len(codes) else []
 

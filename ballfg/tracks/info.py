@@ -213,7 +213,6 @@ def _section(content: Mapping[str, Any], key: str, fields: Mapping[str, str], pr
 
 
 def _stated_extent(frame: Mapping[str, Any]) -> tuple[Any, ...] | None:
-    """The table's ends in `frame`, checked only for their number."""
     if frame.get("table") is None:
         return None
     table = _section(frame, "table", {"x": "[0.0, 2.74]", "y": "[-0.76, 0.76]"}, "frame.")
@@ -236,10 +235,8 @@ def _checked_extent(extent: Any) -> tuple[float, ...]:
         if not low < high:
             raise ValueError(f"{label} must increase; got [{low:g}, {high:g}]. Give the lower end first.")
         if not _TABLE_SIZES[0] <= high - low <= _TABLE_SIZES[1]:
-            raise ValueError(
-                f"{label} must be in m, its ends {_TABLE_SIZES[0]:g} to {_TABLE_SIZES[1]:g} m apart; got "
-                f"[{low:g}, {high:g}]. Convert it to m."
-            )
+            rule = f"{label} must be in m, its ends {_TABLE_SIZES[0]:g} to {_TABLE_SIZES[1]:g} m apart"
+            raise ValueError(f"{rule}; got [{low:g}, {high:g}]. Convert it to m.")
         ends += [low, high]
     return tuple(ends)
 

@@ -58,8 +58,7 @@ def dataset_in_memory(info: DatasetInfo, tracks: Sequence[Track], notes: Sequenc
         raise ValueError("tracks must hold at least one track; got none. Pass the tracks.")
     if len({track.sigmas is None for track in tracks}) > 1:
         raise ValueError("tracks must have sigmas all or none; some have them. Set sigmas=None in all, or give them.")
-    names = Counter(track.name for track in tracks)
-    name, count = names.most_common(1)[0]
+    name, count = Counter(track.name for track in tracks).most_common(1)[0]
     if count > 1:
         raise ValueError(f"track names must be unique; got {shown(name)} twice. Rename one of them.")
     source = MemoryRows(tracks)

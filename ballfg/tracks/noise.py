@@ -34,26 +34,17 @@ class TrackNoise:
     Raises: ValueError: a number that is negative, not finite, or cannot be in SI units; the message names it.
     """
 
-    position: tuple[float, float, float] | None = None
-    """m, of the white error of a measured x, y, z."""
+    position: tuple[float, float, float] | None = None  # m, of the white error of a measured x, y, z
     memory: tuple[float, float, float] | None = None
     """m, of the tracker's error along x, y, z that lasts from sample to sample."""
-    memory_time: float | None = None
-    """s, over which the correlation of that error falls to 1 / e."""
-    stamp_jitter: float | None = None
-    """s, of the error of a stamp."""
-    spin_label: float | None = None
-    """rad/s, of one component of a spin label."""
-    spin_prior: float | None = None
-    """rad/s, of one component of the spin of a ball without a label, about zero."""
-    acceleration: float | None = None
-    """m/s^2/sqrt(Hz), density of the unmodelled acceleration."""
-    contact_velocity: float | None = None
-    """m/s, of each component of the velocity after a bounce."""
-    contact_tangential: float | None = None
-    """m/s, in addition, of its two components along the surface."""
-    contact_spin: float | None = None
-    """rad/s, of each component of the spin after a bounce."""
+    memory_time: float | None = None  # s, over which the correlation of that error falls to 1 / e
+    stamp_jitter: float | None = None  # s, of the error of a stamp
+    spin_label: float | None = None  # rad/s, of one component of a spin label
+    spin_prior: float | None = None  # rad/s, of one component of the spin of a ball without a label, about zero
+    acceleration: float | None = None  # m/s^2/sqrt(Hz), density of the unmodelled acceleration
+    contact_velocity: float | None = None  # m/s, of each component of the velocity after a bounce
+    contact_tangential: float | None = None  # m/s, in addition, of its two components along the surface
+    contact_spin: float | None = None  # rad/s, of each component of the spin after a bounce
     coefficients: Mapping[str, float] = field(default_factory=dict)
     """Spread of coefficients between tracks, by the name of the parameter, in its own unit."""
 
@@ -68,11 +59,7 @@ class TrackNoise:
 
     @classmethod
     def from_mapping(cls, content: Any) -> TrackNoise:
-        """The noise in a file.
-
-        Args: content: the parsed section; its keys are the fields of this class.
-        Raises: ValueError: an unknown key, or a number out of its range.
-        """
+        """The noise in a parsed section of a file. Raises: ValueError: an unknown key, or a number out of its range."""
         if not isinstance(content, Mapping):
             raise ValueError(f"noise must be a mapping such as {{memory_time: 0.02}}; got {type_name(content)}.")
         known = [f.name for f in fields(cls)]

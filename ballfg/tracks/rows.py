@@ -132,11 +132,7 @@ def _block(batch: pa.RecordBatch, start: int) -> Block:
 
 
 def distinct(column: pa.Array) -> tuple[list[str | None], NDArray[np.int32]]:
-    """The distinct texts of a column, in the order in which they first appear.
-
-    Args: column: (n,) of any type that converts to text.
-    Returns: the texts, None for missing ones, and (n,) the number of each row's text.
-    """
+    """The distinct texts of a column (n,), as they first appear, None for missing ones; (n,) the number of each."""
     if not pa.types.is_dictionary(column.type):
         column = column.cast(pa.string()).dictionary_encode()
     words = column.dictionary.cast(pa.string())

@@ -24,16 +24,11 @@ class Sightings:
         that do not increase, a covariance that is not symmetric and positive definite; the message names the row.
     """
 
-    cameras: tuple[str, ...]
-    """Names of the rig's cameras, including those without a sighting."""
-    camera: NDArray[np.int64]
-    """(m,) number of each sighting's camera: an index into `cameras`."""
-    times: Array
-    """(m,) s, stamps as recorded by the camera."""
-    pixels: Array
-    """(m, 2) px, place of the ball's centre in the middle of the exposure."""
-    covariances: Array
-    """(m, 2, 2) px^2."""
+    cameras: tuple[str, ...]  # names of the rig's cameras, including those without a sighting
+    camera: NDArray[np.int64]  # (m,) number of each sighting's camera: an index into `cameras`
+    times: Array  # (m,) s, stamps as recorded by the camera
+    pixels: Array  # (m, 2) px, place of the ball's centre in the middle of the exposure
+    covariances: Array  # (m, 2, 2) px^2
 
     def __post_init__(self) -> None:
         check_iterable("cameras", self.cameras)

@@ -31,11 +31,7 @@ def elapsed(times: ArrayLike, origin: float) -> Array:
 
 
 def written(seconds: ArrayLike, origin: float) -> Array:
-    """The stamps on the data's clock for times that `elapsed` has computed.
-
-    Args: seconds: (...) s since the origin.  origin: s.
-    Returns: (...) s; the doubles of whole microseconds if `elapsed` used those.
-    """
+    """The stamps (...) s on the data's clock for seconds (...) since an origin, as `elapsed` has computed them."""
     since = np.asarray(seconds, dtype=np.float64)
     ticks, first = np.rint(since * TICKS), np.rint(origin * TICKS)
     with np.errstate(invalid="ignore"):  # a stamp that is not finite stays as it is

@@ -49,7 +49,7 @@ class TableWriter:
         self._parquet: pq.ParquetWriter | None = None
         self._schema: pa.Schema | None = None
         self._pending: list[pa.RecordBatch] = []
-        self._has_header, self._pending_rows = False, 0
+        self._pending_rows = 0
 
     def __enter__(self) -> "TableWriter":
         self._context = self._opened()
@@ -98,11 +98,10 @@ class TableWriter:
         table = pa.Table.from_batches(self._pending, self._schema).combine_chunks()
         if self.path.suffix.lower() == ".csv":
             # The library quotes the header and, if one text needs quotes, all texts; simple readers expect neither.
-            if not self._has_header:
+            if self._file.tell() == 0:
                 header = io.StringIO()
                 csv.writer(header, lineterminator="\n").writerow(map(guarded, table.column_names))
                 self._file.write(header.getvalue().encode())
-                self._has_header = True
             for place, field in enumerate(table.schema):
                 if pa.types.is_string(field.type):
                     text = table.column(place)  # formulas get quoted; see `ballfg.files.spreadsheet`

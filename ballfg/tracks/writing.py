@@ -43,8 +43,7 @@ def write_dataset(
         info: the content of `dataset.yaml`.
         tracks: at least one; each with at least two samples and a unique name; sigmas for all or for none.
         file_format: "csv" (floats keep all their digits) or "parquet".
-    Raises:
-        ValueError: another format, no tracks, or a track that breaks a rule; the message names it.
+    Raises: ValueError: another format, no tracks, or a track that breaks a rule; the message names it.
         FileNotFoundError: the folder's parent does not exist.
     """
     check_choice("file_format", file_format, ("csv", "parquet"))

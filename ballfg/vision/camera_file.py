@@ -38,9 +38,8 @@ def read_cameras(path: str | PathLike[str], *, posed: bool = True) -> list[Camer
         path: our YAML, or a FileStorage file of OpenCV (`.xml`, `.json`, or YAML that begins with `%YAML`) with one
             camera (named as the file) or a map for each.
         posed: False: `rvec` and `tvec` may be missing; the camera then stands at the world's origin, unturned.
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError, TypeError: a field that is missing, not known or wrong; the message names file, camera and field.
+    Raises: FileNotFoundError: there is no such file. ValueError, TypeError: a field that is missing, not known or
+        wrong; the message names file, camera and field.
     """
     path = check_path("path", path)
     if not path.is_file():
@@ -93,10 +92,8 @@ def write_opencv(path: str | PathLike[str], cameras: Iterable[Camera], *, posed:
     for camera in cameras:
         plain = camera.name.replace("_", "a").replace("-", "0")
         if not (plain.isascii() and plain.isalnum() and plain[0].isalpha()):
-            raise ValueError(
-                f"names of cameras must be letters, digits, - and _, a letter first, in OpenCV's files; "
-                f"got {shown(camera.name)}. Rename it, or write cameras.yaml."
-            )
+            rule = "names of cameras must be letters, digits, - and _, a letter first, in OpenCV's files"
+            raise ValueError(f"{rule}; got {shown(camera.name)}. Rename it, or write cameras.yaml.")
     with whole_file(path) as temporary:
         storage = cv2.FileStorage(str(temporary), cv2.FILE_STORAGE_WRITE)
         for camera in cameras:
@@ -130,7 +127,6 @@ def _from_storage(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def _check_names(cameras: Iterable[Camera]) -> Sequence[Camera]:
-    """The cameras. Raises: ValueError: if there are none, or two of one name."""
     cameras = list(cameras)
     if not cameras:
         raise ValueError("cameras must hold at least one camera; got none. Pass the cameras to write.")
@@ -141,7 +137,6 @@ def _check_names(cameras: Iterable[Camera]) -> Sequence[Camera]:
 
 
 def _camera(name: str, content: Any, posed: bool) -> Camera:
-    """A camera from its fields. Raises: ValueError, TypeError: names camera and field."""
     where = f"camera {shown(name)}"
     fields = mapping(where, content)
     check_keys(where, fields, FIELDS, LENS)

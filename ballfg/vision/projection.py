@@ -37,11 +37,7 @@ class CameraBank:
             self._tilt = torch.stack([_tilt(*bent[12:]) for bent in distortions])
 
     def project(self, points: Tensor, camera: Tensor) -> Tensor:
-        """Pixels of points, each in the camera of its row; NaN for those that are behind it or beyond its lens.
-
-        Args: points: (n, 3) m.  camera: (n,) int64, numbers of cameras.
-        Returns: (n, 2) pixels, differentiable in the points.
-        """
+        """Pixels (n, 2) of points (n, 3) m in the cameras (n,) of their rows; NaN behind one or beyond its lens."""
         local = (self._rotation[camera] @ points.unsqueeze(-1)).squeeze(-1) + self._tvec[camera]
         depth = local[:, 2:]
         seen = (depth > 0.0) & (local[:, :2].detach().norm(dim=-1, keepdim=True) <= self._widest[camera, None] * depth)
@@ -53,11 +49,7 @@ class CameraBank:
         return bent * self._focal[camera] + self._principal[camera]
 
     def jacobian(self, points: Tensor, camera: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels of points and their derivatives by the points.
-
-        Args: points: (n, 3) m.  camera: (n,) int64, numbers of cameras.
-        Returns: (n, 2) px; (n, 2, 3) px/m.
-        """
+        """Pixels (n, 2) of points (n, 3) m in the cameras (n,) of their rows, and derivatives (n, 2, 3) px/m."""
         points = points.detach().requires_grad_()
         with torch.enable_grad():
             pixels = self.project(points, camera)

@@ -249,7 +249,6 @@ def _array_bytes(path: Path) -> int:
 
 
 def _header_bytes(file: IO[bytes]) -> int:
-    """Number of bytes of an npy file's array, by its header."""
     version = np.lib.format.read_magic(file)
     header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, kind = header(file)

@@ -14,11 +14,7 @@ MAX_PARTS: Final = 100_000  # largest number of searched lists and mappings; eac
 
 
 def nested_tables(content: Any, name: str, source: str) -> list[RawTable]:
-    """All tables in nested dicts, lists and arrays. A scalar beside a table becomes a constant column.
-
-    Args: content: to search.  name: of the whole.  source: the file, for messages.
-    Raises: ValueError: lists nested more than some hundred levels deep, or more than `MAX_PARTS`.
-    """
+    """All tables in nested data; a scalar beside one is a constant column. Raises: ValueError: too deep or many."""
     try:
         return _tables(content, name, _Source(source), {})
     except RecursionError:
@@ -27,8 +23,6 @@ def nested_tables(content: Any, name: str, source: str) -> list[RawTable]:
 
 @dataclass
 class _Source:
-    """The searched file, and the number of its parts so far."""
-
     name: str
     parts: int = 0
 

@@ -76,7 +76,6 @@ def _of_path(path: Path, topic: str | None) -> list[RawTable]:
 
 
 def _added() -> dict[str, type[Format]]:
-    """The formats of users and other packages by the endings of their files."""
     return {ending: added for added in FORMATS.values() for ending in added.endings}
 
 

@@ -129,7 +129,6 @@ def _cells(lines: Sequence[str], separator: str) -> list[list[str]]:
 
 
 def _first_data_row(rows: Sequence[Sequence[str]]) -> int | None:
-    """The first row with three numbers or more."""
     for i, row in enumerate(rows):
         if sum(bool(_NUMBER.match(cell) or WITH_UNIT.match(cell)) for cell in row) >= min(3, max(2, len(row) - 1)):
             return i

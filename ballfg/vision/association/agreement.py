@@ -42,12 +42,9 @@ class CameraAgreement:
     """px, median distance of its sightings from the points of the others; NaN if fewer than two others saw them."""
     explained: float
     """Share of the disagreement beyond noise that a correction of this camera removes; NaN without disagreement."""
-    rotation: float
-    """Degrees, turn of that correction."""
-    shift: float
-    """m, shift of its centre in that correction."""
-    corrected: float
-    """px, the median distance with the corrected camera; NaN where `residual` is."""
+    rotation: float  # degrees, turn of that correction
+    shift: float  # m, shift of its centre in that correction
+    corrected: float  # px, the median distance with the corrected camera; NaN where `residual` is
 
 
 @dataclass(frozen=True)
@@ -60,8 +57,7 @@ class Agreement:
     """By name, in the rig's order; empty where too little was seen by three cameras."""
     misfit: float
     """Median squared reprojection error over that of the noise: about 1 where cameras agree; NaN if not known."""
-    sentence: str
-    """A summary for readers."""
+    sentence: str  # a summary for readers
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,8 +120,7 @@ def _scene(balls: Sequence[SeenBall], cameras: list[Camera]) -> _Scene:
     rows, points = rows[np.isfinite(points).all(axis=1)], points[np.isfinite(points).all(axis=1)]
     weights = np.zeros(covariances[rows].shape)
     weights[seen[rows]] = np.linalg.inv(covariances[rows][seen[rows]])
-    expected = chi2.median(2 * seen[rows].sum(axis=1) - 3)
-    return _Scene(pixels[rows], weights, points, expected)
+    return _Scene(pixels[rows], weights, points, chi2.median(2 * seen[rows].sum(axis=1) - 3))
 
 
 def _errors(scene: _Scene, cameras: list[Camera], points: Array) -> Array:

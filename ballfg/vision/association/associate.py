@@ -34,10 +34,7 @@ _DISPUTED: Final = 2  # most frames in which two parts of one flight both have a
 
 @dataclass(frozen=True)
 class AssociationSettings:
-    """How candidates become balls.
-
-    Raises: ValueError: a number out of its range.
-    """
+    """How candidates become balls. Raises: ValueError: a number out of its range."""
 
     least_score: float = 0.3
     """In [0, 1]; candidates with a lower score are not used."""
@@ -58,9 +55,7 @@ def associate(
     at those; otherwise at the stamps of the camera that saw most of the ball, and the other cameras are interpolated.
     A ball is one track through bounces and short gaps.
 
-    Args:
-        detections: one for each camera, in any order.
-        cameras: at least two, with the detections' names.
+    Args: detections: one for each camera, in any order.  cameras: at least two, with the detections' names.
         settings: the default ones if None.
     Raises: ValueError: cameras and detections that do not go together.
     """
@@ -70,21 +65,18 @@ def associate(
     for number, (camera, seen) in enumerate(zip(footage.cameras, footage.detections, strict=True)):
         focal = float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
         pieces += [Piece(number, rows, footage.path(number, rows)) for rows in find_tracklets(seen, focal)]
-    matching = match(pieces, footage.cameras)
-    footage = replace(footage, offset=matching.offset)
-    balls = []
-    for group in matching.groups:
+    groups, offset = match(pieces, footage.cameras)
+    footage, balls = replace(footage, offset=offset), []
+    for group in groups:
         rows = [[pieces[i].rows for i in group if pieces[i].camera == c] for c in range(len(cameras))]
         balls.append(gather(footage, [np.sort(np.concatenate([_NONE, *own])) for own in rows]))
     balls = _joined(footage, [ball for ball in balls if len(ball.track.times) >= 2])
     balls = _joined(footage, complete(footage, balls))
     balls = [ball for ball in balls if len(ball.track.times) >= settings.least_points and is_ball(ball.track)]
-    seen = [_seen_ball(footage, ball) for ball in balls]
-    return sorted(seen, key=lambda ball: float(ball.times[0]))
+    return sorted((_seen_ball(footage, ball) for ball in balls), key=lambda ball: float(ball.times[0]))
 
 
 def _footage(detections: Sequence[Detections], cameras: Sequence[Camera], settings: AssociationSettings) -> Footage:
-    """The recording without candidates of low score."""
     names = [camera.name for camera in cameras]
     by_name = {seen.camera: seen for seen in detections}
     if len(names) < 2 or len(set(names)) < len(names):
@@ -104,7 +96,6 @@ def _footage(detections: Sequence[Detections], cameras: Sequence[Camera], settin
 
 
 def _joined(footage: Footage, balls: list[Gathered]) -> list[Gathered]:
-    """The balls, those of one flight joined."""
     following = dict(successions([ball.track for ball in balls]))
     later = set(following.values())
     joined = []
@@ -132,9 +123,8 @@ def _joined(footage: Footage, balls: list[Gathered]) -> list[Gathered]:
 
 def _may_follow(footage: Footage, one: Gathered, other: Gathered) -> bool:
     """True if hardly any camera saw both in one frame; where one did, one of the candidates is wrong."""
-    frames = [seen.frame for seen in footage.detections]
-    pairs = zip(frames, one.rows, other.rows, strict=True)
-    return all(np.isin(frame[mine], frame[theirs]).sum() <= _DISPUTED for frame, mine, theirs in pairs)
+    pairs = zip(footage.detections, one.rows, other.rows, strict=True)
+    return all(np.isin(seen.frame[mine], seen.frame[theirs]).sum() <= _DISPUTED for seen, mine, theirs in pairs)
 
 
 def _seen_ball(footage: Footage, ball: Gathered) -> SeenBall:
@@ -143,12 +133,9 @@ def _seen_ball(footage: Footage, ball: Gathered) -> SeenBall:
     since = np.concatenate([seen.times[rows] for seen, rows in pairs])
     order = np.argsort(since - np.array([c.time_offset for c in footage.cameras])[camera], kind="stable")
     stamps = np.concatenate([own[seen.frame[rows]] for own, (seen, rows) in zip(footage.stamps, pairs, strict=True)])
-    sightings = Sightings(
-        tuple(c.name for c in footage.cameras),
-        camera[order],
-        stamps[order],
-        np.concatenate([seen.pixels[rows] for seen, rows in pairs])[order],
-        np.concatenate([seen.covariances[rows] for seen, rows in pairs])[order],
-    )
+    pixels = np.concatenate([seen.pixels[rows] for seen, rows in pairs])
+    spread = np.concatenate([seen.covariances[rows] for seen, rows in pairs])
+    names = tuple(c.name for c in footage.cameras)
+    sightings = Sightings(names, camera[order], stamps[order], pixels[order], spread[order])
     times = written(ball.track.times, footage.origin)
     return SeenBall(times, ball.track.values, ball.covariances, sightings, ball.views)

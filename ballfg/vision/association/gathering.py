@@ -62,16 +62,12 @@ class Gathered:
 class SeenBall:
     """One ball's track, in order of time."""
 
-    times: Array
-    """(n,) s, true time."""
-    points: Array
-    """(n, 3) m, world."""
+    times: Array  # (n,) s, true time
+    points: Array  # (n, 3) m, world
     covariances: Array
     """(n, 3, 3) m^2, of each point by itself; interpolated points share samples and so a little of their error."""
-    sightings: Sightings
-    """The sightings behind the points, each at its own camera's stamp."""
-    views: Index
-    """(n,) number of cameras that made each point."""
+    sightings: Sightings  # the sightings behind the points, each at its own camera's stamp
+    views: Index  # (n,) number of cameras that made each point
 
     def __len__(self) -> int:
         return len(self.times)

@@ -64,17 +64,12 @@ class _Pair:
         return float((1.0 - square / _GATE).sum())
 
 
-@dataclass(frozen=True)
-class Matching:
-    """The result of a matching."""
+def match(pieces: Sequence[Piece], cameras: Sequence[Camera]) -> tuple[list[list[int]], float]:
+    """Groups the pieces of the same object. A group holds no two pieces of a camera at the same time.
 
-    groups: list[list[int]]
-    """Numbers of pieces of the same object, in the order of the first; unmatched pieces are left out."""
-    offset: float  # px, excess miss of rays of one object beyond noise, in the worst pair of cameras; 0 without any
-
-
-def match(pieces: Sequence[Piece], cameras: Sequence[Camera]) -> Matching:
-    """Groups the pieces of the same object. A group holds no two pieces of a camera at the same time."""
+    Returns: numbers of the pieces of each group, unmatched ones left out, in the order of the first; px, excess miss of
+        rays of one object beyond noise, in the worst pair of cameras; 0 without any.
+    """
     pairs = _pairs(pieces, cameras)
     offsets = _offsets(pieces, pairs, len(cameras))
     supported = []
@@ -85,7 +80,7 @@ def match(pieces: Sequence[Piece], cameras: Sequence[Camera]) -> Matching:
             supported.append((support, pair.first, pair.second))
     supported.sort(key=lambda link: (-link[0], link[1], link[2]))
     against = {(pair.first, pair.second) for pair in pairs} - {(first, second) for _, first, second in supported}
-    return Matching(_grouped(pieces, supported, against), max(offsets.values(), default=0.0))
+    return _grouped(pieces, supported, against), max(offsets.values(), default=0.0)
 
 
 def _pairs(pieces: Sequence[Piece], cameras: Sequence[Camera]) -> list[_Pair]:
@@ -161,8 +156,7 @@ def _grouped(
             one.extend(other)
             for number in other:
                 group_of[number] = one
-    groups = {id(group): sorted(group) for group in group_of.values() if len(group) > 1}
-    return sorted(groups.values())
+    return sorted({id(group): sorted(group) for group in group_of.values() if len(group) > 1}.values())
 
 
 def _may_join(pieces: Sequence[Piece], a: int, b: int, against: set[tuple[int, int]]) -> bool:

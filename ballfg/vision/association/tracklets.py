@@ -47,11 +47,7 @@ class _Piece:
 
 
 def find_tracklets(detections: Detections, focal: float) -> list[Index]:
-    """The pieces of one camera's candidates, by the row of their first candidate.
-
-    Args: focal: px, of the camera: turns speeds across the view into pixels.
-    Returns: for each piece the rows (k,) of its candidates, k >= 3, in order of time.
-    """
+    """The pieces of a camera of that focal length (px): rows (k,) of each, k >= 3, in time, by their first ones."""
     open_pieces: list[_Piece] = []
     done: list[_Piece] = []
     recent: list[list[_Seen]] = []

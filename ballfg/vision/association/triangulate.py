@@ -28,12 +28,9 @@ _AROUND: Final = 0.5 * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0
 class Triangulated:
     """Points with their support. A row without a point has NaN there and in its covariance, and uses no view."""
 
-    points: Array
-    """(n, 3) m, world."""
-    covariances: Array
-    """(n, 3, 3) m^2."""
-    used: Mask
-    """(n, c) True for views that took part; wrong ones do not."""
+    points: Array  # (n, 3) m, world
+    covariances: Array  # (n, 3, 3) m^2
+    used: Mask  # (n, c) True for views that took part; wrong ones do not
     residuals: Array
     """(n, c, 2) px, seen minus projected, including views that did not take part; NaN without a sighting."""
 
@@ -70,9 +67,7 @@ def triangulate(cameras: Sequence[Camera], pixels: ArrayLike, covariances: Array
     Gauss-Newton on the weighted reprojection error. There is no point where no pair agrees, where two proposals of two
     views each agree equally well but not with each other, or where the rays are nearly parallel (`MAX_SIGMA`).
 
-    Args:
-        cameras: c of them, at least two.
-        pixels: (n, c, 2) px, where each camera saw it; NaN where it did not.
+    Args: cameras: c of them, at least two.  pixels: (n, c, 2) px, where each camera saw it; NaN where it did not.
         covariances: (n, c, 2, 2) px^2 of `pixels`; not read where those are NaN.
     Raises: ValueError: shapes that do not fit, fewer than two cameras, covariances that are not positive definite.
     Source: docs/derivations/triangulation.md; Hartley, Zisserman, Multiple View Geometry (2004), sections 12.2 and 5.2.

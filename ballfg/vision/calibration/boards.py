@@ -30,8 +30,6 @@ _TRIED: Final = 3  # images without a board in which other numbers of squares ar
 
 @dataclass(frozen=True)
 class _Squares:
-    """Squares of a board."""
-
     least: ClassVar[int]  # fewest squares in a row and in a column
     columns: int  # squares in a row, the outermost ones too: one more than there are inner corners
     rows: int  # rows of squares

@@ -101,7 +101,6 @@ def _check_points(lens: Camera, marked: Marked) -> bool:
 
 
 def _poses(lens: Camera, marked: Marked, flat: bool) -> list[Camera]:
-    """Refined poses, those of the camera in front of the points."""
     points, pixels = np.ascontiguousarray(marked.points), np.ascontiguousarray(marked.pixels)
     given = (points, pixels, lens.matrix, lens.distortion)
     method = cv2.SOLVEPNP_IPPE if flat else cv2.SOLVEPNP_SQPNP
@@ -147,7 +146,8 @@ def _culprit(found: Extrinsics) -> str:
     marked = found.marked
     for i in range(len(marked.names) if len(marked.names) > MIN_POINTS + 1 else 0):
         names = (*marked.names[:i], *marked.names[i + 1 :])
-        rest = Marked(names, *(np.delete(a, i, axis=0) for a in (marked.points, marked.pixels)), marked.sigma)
+        points, pixels = (np.delete(array, i, axis=0) for array in (marked.points, marked.pixels))
+        rest = Marked(names, points, pixels, marked.sigma)
         cameras = _poses(found.camera, rest, _check_points(found.camera, rest))
         if min(_rms(camera.project(rest.points) - rest.pixels) for camera in cameras) <= MAX_RMS / 3 * marked.sigma:
             return f"Without {shown(marked.names[i])} the others agree. "

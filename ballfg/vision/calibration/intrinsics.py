@@ -113,9 +113,10 @@ def calibrate_intrinsics(name: str, views: Sequence[View], distortion: int = 5) 
             )
         fitted = _fit(name, used, distortion)
     _check_fit(name, fitted)
-    given = [(view.points, view.pixels, fitted.camera.matrix, fitted.camera.distortion) for view in left_out]
-    poses = [cv2.solvePnP(*one)[1:] for one in given]
-    outside = [_fitted(fitted.camera, view, *map(np.ravel, pose)) for view, pose in zip(left_out, poses, strict=True)]
+    outside = []  # views that had no part in the calibration, with the poses that suit them best
+    for view in left_out:
+        _, rvec, tvec = cv2.solvePnP(view.points, view.pixels, fitted.camera.matrix, fitted.camera.distortion)
+        outside.append(_fitted(fitted.camera, view, np.ravel(rvec), np.ravel(tvec)))
     return replace(fitted, left_out=tuple(outside), missed=missed)
 
 
@@ -178,7 +179,6 @@ def _fitted(camera: Camera, view: View, rvec: Array, tvec: Array) -> FittedView:
 
 
 def _outlying(fitted: Intrinsics) -> int | None:
-    """The view that disagrees most with the others, or None."""
     errors = np.array([view.rms for view in fitted.views])
     worst = int(errors.argmax())
     return worst if errors[worst] > max(OUTLYING * float(np.median(errors)), MIN_OUTLYING) else None

@@ -108,7 +108,6 @@ def _view(fitted: FittedView) -> dict[str, Any]:
 
 
 def _lens_numbers(lens: Intrinsics) -> tuple[dict[str, float], dict[str, float]]:
-    """Values and standard deviations by name."""
     matrix, bent = lens.camera.matrix, lens.camera.distortion
     names = ("fx", "fy", "cx", "cy", *COEFFICIENTS[: len(bent)])
     values = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *bent]

@@ -62,11 +62,7 @@ class TableFile:
 
 
 def read_table(path: str | PathLike[str]) -> TableFile:
-    """Reads the pixels of table points; docs/calibrate.md shows such a file.
-
-    Raises: FileNotFoundError: no such file. ValueError: a field that is missing, not known or wrong; the message
-        names file, camera and point.
-    """
+    """The pixels of table points (docs/calibrate.md). Raises: FileNotFoundError. ValueError: a bad field, named."""
     path = Path(path)
     content = read_mapping(path)
     check_keys(str(path), content, _FIELDS, ("cameras",))

@@ -169,24 +169,16 @@ def _blotches(images: Sequence[NDArray], mean: Array32, noise: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """A connected change.
+    """A connected change."""
 
-    Attributes:
-        rows, columns: of the image, with a margin.
-        free: (rows, columns) True for pixels of this region or the background, not of another; None if all are.
-        mass: grey levels x small pixels, the change summed.
-    """
-
-    rows: slice
+    rows: slice  # of the image, with a margin
     columns: slice
-    free: Mask | None
-    mass: float
+    free: Mask | None  # (rows, columns) True for pixels of this region or the background; None if all are
+    mass: float  # grey levels x small pixels, the change summed
 
     def free_of(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """(m, ...) the values (rows, columns, ...) of free pixels."""
-        if self.free is None:
-            return values.reshape(-1, *values.shape[2:])
-        return values[self.free]
+        return values.reshape(-1, *values.shape[2:]) if self.free is None else values[self.free]
 
     def places(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """(m,) px, x and y of the free pixels."""
@@ -197,10 +189,7 @@ class Region:
 
 
 def find_regions(background: Background, image: Image, widest: float, longest: float, most: int) -> list[Region]:
-    """Regions of one frame, the heaviest first; the background follows the frame.
-
-    Args: image: (h, w, 3).  widest, longest: px, of a ball and of its streak.  most: how many at most.
-    """
+    """Regions of a frame (h, w, 3), at most so many, the heaviest first; widest ball and longest streak in px."""
     small = shrunk(image)
     change = background.follow(small)
     found = cv2.compare(change, background.threshold, cv2.CMP_GT)

@@ -40,10 +40,8 @@ def learn_detector(video: Video, settings: DetectorSettings | None = None) -> Ba
     """
     images = video.sample(SAMPLE)
     if len(images) < FEWEST:
-        raise ValueError(
-            f"video {shown(video.name)} must have at least {FEWEST} frames to learn a background; got {len(images)}. "
-            "Record longer, or leave the camera out."
-        )
+        rule = f"video {shown(video.name)} must have at least {FEWEST} frames to learn a background"
+        raise ValueError(f"{rule}; got {len(images)}. Record longer, or leave the camera out.")
     return BallDetector.learn(images, settings)
 
 
@@ -75,8 +73,7 @@ def load_detector(text: str) -> Maker:
 def detect(video: Video, camera: str, detector: Detector, watch: Watch = unwatched) -> Detections:
     """All candidates of a video.
 
-    Args:
-        detector: called with each frame in order; for instance `learn_detector(video)`, or one of your own.
+    Args: detector: called with each frame in order; for instance `learn_detector(video)`, or one of your own.
         watch: sees the numbers of the frames that are done.
     Raises: ValueError: a video that turns out unreadable, see `Video.frames`. TypeError: a detector that does not give
         `Candidates`.

@@ -103,10 +103,8 @@ class Detections:
         if frame.shape != (len(self.pixels),):
             raise ValueError(f"{what}: frame must have shape ({len(self.pixels)},); got {frame.shape}.")
         if len(frame) and not (frame[0] >= 0 and frame[-1] < len(self.frames) and (np.diff(frame) >= 0).all()):
-            raise ValueError(
-                f"{what}: frame must be numbers from 0 to {len(self.frames) - 1} in order; got {frame.tolist()[:8]}. "
-                "Sort the candidates by frame."
-            )
+            rule = f"{what}: frame must be numbers from 0 to {len(self.frames) - 1} in order"
+            raise ValueError(f"{rule}; got {frame.tolist()[:8]}. Sort the candidates by frame.")
         frame.setflags(write=False)
         object.__setattr__(self, "frame", frame)
 
@@ -149,7 +147,6 @@ class Detections:
 
 
 def _numbers(what: str, field: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """A read-only copy in float64."""
     array = check_array(f"{what}: {field}", value, shape, "Pass one row per candidate.")
     array.setflags(write=False)
     return array

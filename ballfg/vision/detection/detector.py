@@ -72,12 +72,7 @@ class BallDetector:
 
     @classmethod
     def learn(cls, images: Sequence[Image], settings: DetectorSettings | None = None) -> BallDetector:
-        """A detector with the background that frames of the recording show.
-
-        Args: images: at least three, (h, w, 3) grey levels, spread over the recording; see `Background`.
-            settings: assumptions on the ball; None: the default ones.
-        Raises: ValueError: too few images, or of several sizes.
-        """
+        """A detector with the background of frames (h, w, 3). Raises: ValueError: too few, or of several sizes."""
         return cls(Background(images), settings)
 
     def __call__(self, image: Image) -> Candidates:

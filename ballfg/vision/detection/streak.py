@@ -43,14 +43,12 @@ CENTRE, HALF, RADIUS, CONTRAST, LOOK = slice(0, 2), slice(2, 4), 4, 5, slice(6, 
 class Look:
     """Expected edge and shading of a ball: they depend on camera, lens and lamps, not on the frame.
 
-    Attributes:
-        mean: (3,) softness e of the edge (px): coverage falls as tanh(distance / e); shading in x and in y, from the
-            middle to the rim, relative to the ball's brightness: that is what lamps change.
-        information: (3, 3), inverse of the covariance of these.
+    The mean (3,) is the softness e of the edge (px), so that coverage falls as tanh(distance / e), and the shading in x
+    and in y, from the middle to the rim, relative to the ball's brightness: that is what lamps change.
     """
 
     mean: Array
-    information: Array
+    information: Array  # (3, 3), inverse of the covariance of these
 
     @classmethod
     def unknown(cls) -> Look:
@@ -64,22 +62,14 @@ class Look:
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """Pixels around a candidate, in the form for the fit.
+    """Pixels around a candidate, in the form for the fit."""
 
-    Attributes:
-        x, y: (m,) px, where the pixels are.
-        change: (m,) grey levels by which each differs from the background, along the candidate's colour.
-        background: (m,) grey levels of the background along that colour, less their mean.
-        level: grey levels, that mean.
-        noise: grey levels, sigma of `change`.
-    """
-
-    x: Array32
+    x: Array32  # (m,) px, where the pixels are
     y: Array32
-    change: Array32
-    background: Array32
-    level: float
-    noise: float
+    change: Array32  # (m,) grey levels by which each differs from the background, along the candidate's colour
+    background: Array32  # (m,) grey levels of the background along that colour, less their mean
+    level: float  # grey levels, that mean
+    noise: float  # grey levels, sigma of `change`
 
     def at(self, rows: NDArray[np.intp]) -> Patch:
         """A part of the pixels."""
@@ -90,24 +80,17 @@ class Patch:
 class StreakFit:
     """A disc swept along a segment.
 
-    Attributes:
-        values: (9,) centre x, y (px); half the streak (px, a vector); radius (px); contrast against the background's
-            mean (grey levels); the three of a `Look`.
-        covariance: (9, 9) of these, for the noise that the residuals show, expectations included.
-        tells: (3, 3) information that these pixels alone bring about the look, taking their noise as known.
-        unexplained: share of the change's energy beyond the noise that the fit leaves over, 0 to 1 or more.
-        strength: signal to noise of the whole change: root of its energy beyond the noise, over the noise.
-        scatter: residual's root mean square over the noise.
-        settled: True if the steps converged.
+    The values (9,) are the centre x, y (px), half the streak (px, a vector), the radius (px), the contrast against the
+    background's mean (grey levels), and the three of a `Look`.
     """
 
     values: Array
-    covariance: Array
-    tells: Array
-    unexplained: float
-    strength: float
-    scatter: float
-    settled: bool
+    covariance: Array  # (9, 9) of these, for the noise that the residuals show, expectations included
+    tells: Array  # (3, 3) information that these pixels alone bring about the look, taking their noise as known
+    unexplained: float  # share of the change's energy beyond the noise that the fit leaves over, 0 to 1 or more
+    strength: float  # signal to noise of the whole change: root of its energy beyond the noise, over the noise
+    scatter: float  # residual's root mean square over the noise
+    settled: bool  # True if the steps converged
 
     @property
     def centre(self) -> Array:
@@ -205,7 +188,6 @@ def fit_streak(patch: Patch, values: Array, look: Look) -> StreakFit:
 
 
 def _fitted(patch: Patch, values: Array, look: Look) -> StreakFit:
-    """The fit to the pixels around the first values."""
     values = values.copy()
     near = _near(patch, values)
     close = patch.at(near[:: 1 + int(len(near) * _nodes(values[HALF]) / MOST_WORK)])

@@ -34,11 +34,8 @@ class Video(ABC):
     """
 
     def __init__(self, path: Path, size: tuple[int, int], count: int, stamps: Array | None) -> None:
-        self.name = path.stem if path.is_file() else path.name
-        self.path = path
-        self.size = size
-        self.count = count
-        self._stamps = stamps
+        self.name, self.path = path.stem if path.is_file() else path.name, path
+        self.size, self.count, self._stamps = size, count, stamps
 
     def frames(self) -> Iterator[tuple[float, Image]]:
         """Stamp (s) and image (h, w, 3), BGR, of each frame in turn.
@@ -149,8 +146,7 @@ def open_video(path: str | PathLike[str], stamps: str | PathLike[str] | None = N
         path: a file that FFmpeg decodes, or a folder.
         stamps: a CSV file with a column `t` (s), one row a frame, optionally a column `frame` that counts from 0.
             Without it the container's stamps count: mp4 and avi keep them, webm rounds to ms. A folder needs it.
-    Raises:
-        FileNotFoundError: nothing is there. ValueError: it cannot be decoded, is empty, or the stamps do not fit.
+    Raises: FileNotFoundError: nothing is there. ValueError: it cannot be decoded, is empty, or the stamps do not fit.
     """
     place = check_path("video", path)
     if not place.exists():
@@ -164,11 +160,7 @@ def open_video(path: str | PathLike[str], stamps: str | PathLike[str] | None = N
 
 
 def read_stamps(path: Path) -> Array:
-    """(f,) s, strictly increasing, one a frame.
-
-    Args: path: a CSV file with a header; column `t` (s), optionally `frame`, which then counts from 0.
-    Raises: FileNotFoundError: no such file. ValueError: no column `t`, no rows, or a row that breaks a rule.
-    """
+    """(f,) s of column `t` of a CSV file; `frame` counts from 0. Raises: FileNotFoundError. ValueError: a bad row."""
     if not path.is_file():
         raise FileNotFoundError(f"file of stamps {path} does not exist. Check the path.")
     names = [name.strip() for name in csv_files.read_header(path)]

@@ -157,10 +157,9 @@ class ContactSheet:
         panels[1].set_title(f"from above: {len(ball.times)} points", size=8)
         sigmas = np.sqrt(np.diagonal(ball.covariances, axis1=1, axis2=2))
         for panel, up in zip(panels, (2, 1), strict=True):
-            style = {"color": hexadecimal(track), "ecolor": "#777777", "elinewidth": 0.6, "linewidth": 0.6}
-            panel.errorbar(
-                *ball.points[:, (0, up)].T, sigmas[:, up], sigmas[:, 0], fmt="o-", markersize=2.6, zorder=2, **style
-            )
+            x, y = ball.points[:, 0], ball.points[:, up]
+            panel.errorbar(x, y, sigmas[:, up], sigmas[:, 0], fmt="none", ecolor="#777777", elinewidth=0.6)
+            panel.plot(x, y, "o-", color=hexadecimal(track), markersize=2.6, linewidth=0.6)
             middle, half = (low[up] + high[up]) / 2, max(high[up] - low[up], (high[0] - low[0]) / PROPORTION) / 2
             panel.set(xlim=(low[0], high[0]), ylim=(middle - half, middle + half), aspect="equal")
             panel.set_ylabel(f"{'xyz'[up]}, m", size=8)

@@ -136,10 +136,7 @@ class ViewPainter:
                 self._used.setdefault(int(frame), []).append((track, pixel))
 
     def paint(self, image: Image | None, frame: int, time: float) -> Image:
-        """The view (h, w, 3) of one moment.
-
-        Args: image: (h, w, 3) as filmed, or None where the camera has none.  frame: its number.  time: s, true time.
-        """
+        """The view (h, w, 3) at a true time, s, of an image (h, w, 3), None without one, and its frame's number."""
         if image is None:
             view = np.zeros((self.size[1], self.size[0], 3), np.uint8)
             caption(view, f"{self._camera.name}   no frame")

@@ -36,14 +36,10 @@ class Seen:
 class Tracking:
     """The balls of a recording."""
 
-    cameras: tuple[Camera, ...]
-    """The rig."""
-    detections: tuple[Detections, ...]
-    """All candidates of each camera, in the order of `cameras`."""
-    balls: tuple[SeenBall, ...]
-    """In the order of their first points."""
-    agreement: Agreement | None
-    """The agreement of the cameras; None without a ball."""
+    cameras: tuple[Camera, ...]  # the rig
+    detections: tuple[Detections, ...]  # all candidates of each camera, in the order of `cameras`
+    balls: tuple[SeenBall, ...]  # in the order of their first points
+    agreement: Agreement | None  # the agreement of the cameras; None without a ball
 
     @property
     def names(self) -> list[str]:
@@ -115,9 +111,7 @@ def track_detections(
 ) -> Tracking:
     """Balls from the candidates of a rig.
 
-    Args:
-        detections: one for each of the cameras, in any order.
-        cameras: at least two, with names of their own.
+    Args: detections: one for each of the cameras, in any order.  cameras: at least two, with names of their own.
     Raises: ValueError: a camera without detections or detections without a camera, too few cameras, or recordings
         that do not overlap in time.
     """
