@@ -193,7 +193,10 @@ class Tracker:
             self._to_balls(frame, GATE, hit=False)
             self._to_newcomers(frame)
             self._to_balls(frame, HIT_GATE, hit=True)
-            self._begin_newcomers(frame)
+            for k in frame.open:
+                self._newcomers.append(Newcomer(frame.kept(k), self.gate))
+                frame.updates[k] = self._grown(self._newcomers[-1], frame, k)
+            del self._newcomers[:-MOST_NEWCOMERS]
         return [self._dated(update) for update in (*gone, *frame.updates) if update is not None]
 
     def _dated(self, what: T) -> T:
@@ -250,7 +253,11 @@ class Tracker:
             gone = self._undo_after(self._clock.newest)
         frame.late = stamp is Stamp.LATE
         self.counts.late += len(frame.open) if frame.late else 0
-        return gone + self._drop_unseen()
+        now = self._clock.safe
+        unseen = [ball for ball in self._balls if ball.last < now - self.gap]
+        self._balls = [ball for ball in self._balls if ball not in unseen] if unseen else self._balls
+        self._newcomers = [newcomer for newcomer in self._newcomers if newcomer.last >= now - newcomer.patience]
+        return [*gone, *map(self._lost, unseen)]
 
     def _undo_after(self, time: float) -> list[BallUpdate]:
         """Reverts the effect of a wrong stamp; a ball without other samples is lost."""
@@ -268,14 +275,6 @@ class Tracker:
                 self._balls.remove(ball)
                 gone.append(farewell)
         return gone
-
-    def _drop_unseen(self) -> list[BallUpdate]:
-        now = self._clock.safe
-        gone = [ball for ball in self._balls if ball.last < now - self.gap]
-        if gone:
-            self._balls = [ball for ball in self._balls if ball not in gone]
-        self._newcomers = [newcomer for newcomer in self._newcomers if newcomer.last >= now - newcomer.patience]
-        return [self._lost(ball) for ball in gone]
 
     def _lost(self, ball: Ball) -> BallUpdate:
         self.counts.lost += 1
@@ -363,10 +362,3 @@ class Tracker:
             if update.kind == "refused":
                 break
         return update
-
-    def _begin_newcomers(self, frame: _Frame) -> None:
-        for k in frame.open:
-            newcomer = Newcomer(frame.kept(k), self.gate)
-            self._newcomers.append(newcomer)
-            frame.updates[k] = self._grown(newcomer, frame, k)
-        del self._newcomers[:-MOST_NEWCOMERS]

@@ -59,15 +59,14 @@ class BandedProblem:
 
     def residuals(self, states: Array, spin: Array) -> tuple[Array, Array, Array]:
         """Whitened residuals: (n - 1, 6) of the steps, (n, 3) of the positions, (3,) of the spin."""
-        acceleration = self._acceleration(states[:-1, 3:], spin)
-        position = states[:-1, :3] + self.dt * states[:-1, 3:] + 0.5 * self.dt**2 * acceleration
-        after = np.concatenate((position, states[:-1, 3:] + self.dt * acceleration), axis=1)
+        v = states[:-1, 3:]
+        speed = np.sqrt(np.einsum("ni,ni->n", v, v))[:, None]
+        gravity = np.array((0.0, 0.0, -STANDARD_GRAVITY))
+        acceleration = gravity - self.drag * speed * v + self.magnus * np.cross(spin, v)
+        position = states[:-1, :3] + self.dt * v + 0.5 * self.dt**2 * acceleration
+        after = np.concatenate((position, v + self.dt * acceleration), axis=1)
         steps = (states[1:] - after) / STEP_SIGMA
         return steps, (states[:, :3] - self.positions) / self.noise, (spin - self.spin) / self.spin_noise
-
-    def _acceleration(self, v: Array, spin: Array) -> Array:
-        speed = np.sqrt(np.einsum("ni,ni->n", v, v))[:, None]
-        return np.array((0.0, 0.0, -STANDARD_GRAVITY)) - self.drag * speed * v + self.magnus * np.cross(spin, v)
 
     def _step(self, states: Array, spin: Array) -> tuple[Array, Array]:
         steps, seen, labelled = self.residuals(states, spin)
