@@ -28,7 +28,8 @@ MEASURED = Path("../shared/data")  # Folder of the measured sets unless BALLFG_D
 
 app = typer.Typer(name="ballfg-bench", add_completion=False, pretty_exceptions_enable=False)
 
-Names, Paths = list[str] | None, list[Path] | None
+Names = list[str] | None
+Paths = list[Path] | None
 _data = partial(typer.Option, "--data")
 Data = Annotated[Path | None, _data(help="Dataset of measured tracks; synthetic tracks by default.")]
 Datasets = Annotated[Paths, _data(help="Dataset of measured tracks; may be repeated; synthetic tracks by default.")]

@@ -203,8 +203,8 @@ class Tracker:
         """A state, an event or an update on the sender's clock."""
         dated = replace(what, time=self._origin.written(what.time))
         if isinstance(dated, BallUpdate):
-            state, events = dated.state and self._dated(dated.state), tuple(map(self._dated, dated.events))
-            return replace(dated, state=state, events=events)
+            state = None if dated.state is None else self._dated(dated.state)
+            return replace(dated, state=state, events=tuple(self._dated(event) for event in dated.events))
         return dated
 
     def tidy(self) -> None:
