@@ -338,8 +338,8 @@ def speed(
 
     Example: ballfg-bench speed --out results/speed
     """
-    from ballfg.benchmarks.speed.gate import SlowerError, check_ratios
     from ballfg.benchmarks.speed.peers.suite import run_peers
+    from ballfg.benchmarks.speed.stopwatch import SlowerError, check_ratios
     from ballfg.benchmarks.speed.suite import FULL, QUICK, run_speed
 
     pairs = [word.partition("=") for word in peer or ()]

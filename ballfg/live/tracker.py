@@ -1,5 +1,6 @@
 """Tracks any number of balls: positions come in, states go out, one stamp at a time."""
 
+from bisect import insort
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
@@ -13,7 +14,7 @@ from ballfg.dynamics import BallModel, Surfaces
 from ballfg.estimation.online.online import Online
 from ballfg.estimation.online.state import OnlineState
 from ballfg.estimation.settings import Settings
-from ballfg.live.ball import Ball, BallEvent, Kept, Newcomer
+from ballfg.live.ball import PATIENCE, Ball, BallEvent, Kept, Newcomer
 from ballfg.live.clock import Clock, Stamp
 from ballfg.live.gate import FAR, GATE, HIT_GATE, Gate, assign
 from ballfg.tracks import Ball as BallKind
@@ -256,7 +257,7 @@ class Tracker:
         now = self._clock.safe
         unseen = [ball for ball in self._balls if ball.last < now - self.gap]
         self._balls = [ball for ball in self._balls if ball not in unseen] if unseen else self._balls
-        self._newcomers = [newcomer for newcomer in self._newcomers if newcomer.last >= now - newcomer.patience]
+        self._newcomers = [newcomer for newcomer in self._newcomers if newcomer.last >= now - PATIENCE]
         return [*gone, *map(self._lost, unseen)]
 
     def _undo_after(self, time: float) -> list[BallUpdate]:
@@ -338,7 +339,7 @@ class Tracker:
             costs[:, j] = newcomer.distances(t, frame.positions[rows])
         for i, j in assign(costs, GATE):
             k, newcomer = rows[i], newcomers[j]
-            newcomer.take(frame.kept(k))
+            insort(newcomer.samples, frame.kept(k))
             frame.updates[k] = self._grown(newcomer, frame, k)
         for k in frame.open:
             if any(newcomer.repeats(t, frame.positions[k]) for newcomer in self._newcomers):

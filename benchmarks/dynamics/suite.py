@@ -10,9 +10,9 @@ from typing import Final
 
 import numpy as np
 
+from ballfg.benchmarks.dynamics.contenders import Record
 from ballfg.benchmarks.dynamics.jobs import METHODS, TIMED, collect_records
 from ballfg.benchmarks.dynamics.measured import Measured, measured_tasks
-from ballfg.benchmarks.dynamics.record import Record
 from ballfg.benchmarks.dynamics.task import APEXES, Task, pooled_rmse
 from ballfg.benchmarks.dynamics.truth import TRACKS, synthetic_task
 from ballfg.benchmarks.metrics import Figure

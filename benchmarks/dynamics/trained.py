@@ -13,8 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.benchmarks.dynamics.contenders import Contender, GraphContender, Job
-from ballfg.benchmarks.dynamics.record import task_digest
+from ballfg.benchmarks.dynamics.contenders import Contender, GraphContender, Job, task_digest
 from ballfg.benchmarks.dynamics.task import Task
 from ballfg.benchmarks.estimators.measured import HORIZON
 from ballfg.dynamics import load_model
