@@ -199,10 +199,7 @@ def _opening_of(read: Read) -> tuple[bytes, int] | None:
 
 
 def _chunk_at(read: Read, offset: int, channels: int) -> Chunk | None:
-    """The chunk at an offset; None if the file ends before its indexes do, or at the ending.
-
-    Raises: ValueError: another record at the offset.
-    """
+    """The chunk at an offset; None if the file ends before its indexes do, or at the ending."""
     head = read(offset, RECORD.size + SPAN.size)
     if head[:1] in (b"", bytes([DATA_END])) or (head[0] == CHUNK and len(head) < RECORD.size + SPAN.size):
         return None

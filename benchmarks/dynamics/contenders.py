@@ -157,10 +157,7 @@ def adapting_contender(job: Job, task: Task) -> GraphContender:
 
 
 def truth_contender(job: Job, task: Task) -> GraphContender:
-    """The true dynamics, with next to no process noise: what noise and spread of the launches leave unknown.
-
-    Raises: ValueError: if the task is of measured tracks, whose truth is unknown.
-    """
+    """The true dynamics, with next to no process noise: what noise and spread of the launches leave unknown."""
     if task.truth is None:
         raise ValueError(
             f"method '{job.method}' needs simulated tracks; got measured ones ({task.case}). Leave it out."

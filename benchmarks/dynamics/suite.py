@@ -94,7 +94,6 @@ def run_dynamics(
 
     Args: methods: names in `METHODS`, None for all; those that do not take part on such tracks are passed over.
     Returns: the pictures written.
-    Raises: ValueError: if a method's name is unknown.
     """
     from ballfg.benchmarks.dynamics.pictures import apex_picture, fan_picture, rmse_picture
 
@@ -121,10 +120,7 @@ def run_dynamics(
 
 
 def _installed(asked: Sequence[str] | None) -> tuple[str, ...]:
-    """The methods to compare; of all of them those that are installed.
-
-    Raises: ValueError: if one that was asked for needs a package that is not there.
-    """
+    """The methods to compare; of all of them those that are installed."""
     missing = {name: METHODS[name].package for name in asked or METHODS if not METHODS[name].installed}
     for name, package in missing.items():
         remedy = f"it needs the package {package}. Install it: pip install 'ballfg[diffusion]'."

@@ -44,10 +44,7 @@ class BandedProblem:
         return np.concatenate((self.positions, velocity), axis=1), self.spin.copy()
 
     def solve(self) -> tuple[Array, Array, int]:
-        """States (n, 6) m and m/s, spin (3,) rad/s at the minimum, and the Gauss-Newton steps that it took.
-
-        Raises: RuntimeError: if it does not converge.
-        """
+        """States (n, 6) m and m/s, spin (3,) rad/s at the minimum, and the Gauss-Newton steps that it took."""
         states, spin = self.start()
         for count in range(1, MOST_STEPS + 1):
             step, turn = self._step(states, spin)

@@ -80,9 +80,6 @@ def check_ratios(rows: Sequence[Row], baseline: Path) -> list[str]:
     """One line for each time of the baseline: its ratio to the control then and now.
 
     Args: baseline: the `results.json` of an earlier run.
-    Raises:
-        SlowerError: if a ratio has grown by more than `SLOWER`; it names all of them.
-        ValueError: if the file holds no times that this run has too.
     """
     try:
         earlier = _ROWS.validate_python(read_json(baseline)["rows"])

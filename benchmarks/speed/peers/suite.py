@@ -66,7 +66,6 @@ def run_peers(results: Results, peers: Mapping[str, Path], size: flight.Size) ->
     Args:
         peers: interpreters of other environments, by library.
         size: how well the network is fitted, and whether this is a quick look.
-    Raises: ValueError: if an interpreter is of no library that is compared, or not there.
     """
     for library, python in peers.items():
         if library not in PEERS:
