@@ -3,7 +3,6 @@
 from bisect import insort
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -54,9 +53,6 @@ class BallUpdate:
     events: tuple[BallEvent, ...] = ()
     late: bool = False
     reason: str = ""
-
-
-T = TypeVar("T", OnlineState, BallEvent, BallUpdate)
 
 
 @dataclass
@@ -162,7 +158,7 @@ class Tracker:
     @property
     def balls(self) -> dict[int, OnlineState]:
         """The newest state of every ball by its number."""
-        return {ball.number: self._dated(ball.states[-1]) for ball in self._balls}
+        return {ball.number: self._dated_state(ball.states[-1]) for ball in self._balls}
 
     def push(self, time: float, positions: ArrayLike, sigmas: ArrayLike | None = None) -> list[BallUpdate]:
         """Takes in the positions of one stamp.
@@ -200,13 +196,16 @@ class Tracker:
             del self._newcomers[:-MOST_NEWCOMERS]
         return [self._dated(update) for update in (*gone, *frame.updates) if update is not None]
 
-    def _dated(self, what: T) -> T:
-        """A state, an event or an update on the sender's clock."""
-        dated = replace(what, time=self._origin.written(what.time))
-        if isinstance(dated, BallUpdate):
-            state = None if dated.state is None else self._dated(dated.state)
-            return replace(dated, state=state, events=tuple(self._dated(event) for event in dated.events))
-        return dated
+    def _dated_state(self, state: OnlineState) -> OnlineState:
+        return replace(state, time=self._origin.written(state.time))
+
+    def _dated(self, update: BallUpdate) -> BallUpdate:
+        return replace(
+            update,
+            time=self._origin.written(update.time),
+            state=None if update.state is None else self._dated_state(update.state),
+            events=tuple(replace(event, time=self._origin.written(event.time)) for event in update.events),
+        )
 
     def tidy(self) -> None:
         """Does the deferrable work: call it after the updates were used, for a quicker next push."""
