@@ -237,12 +237,9 @@ def check_count(label: str, value: Any, low: int, high: int | None = None) -> in
 def check_instance(label: str, value: Any, kind: type[Any], remedy: str) -> Any:
     """The value, if it is of a type. Raises: TypeError: naming both types."""
     if not isinstance(value, kind):
-        raise TypeError(f"{label} must be {_article(kind)}; got {type_name(value)} {shown(value)}. {remedy}")
+        article = "an" if kind.__name__[0] in "AEIOaeio" else "a"
+        raise TypeError(f"{label} must be {article} {kind.__name__}; got {type_name(value)} {shown(value)}. {remedy}")
     return value
-
-
-def _article(kind: type) -> str:
-    return f"{'an' if kind.__name__[0] in 'AEIOaeio' else 'a'} {kind.__name__}"
 
 
 def as_float(label: str, value: Any, unit: str = "") -> float:

@@ -28,7 +28,8 @@ MEASURED = Path("../shared/data")  # Folder of the measured sets unless BALLFG_D
 
 app = typer.Typer(name="ballfg-bench", add_completion=False, pretty_exceptions_enable=False)
 
-Names, Paths = list[str] | None, list[Path] | None
+Names = list[str] | None
+Paths = list[Path] | None
 _data = partial(typer.Option, "--data")
 Data = Annotated[Path | None, _data(help="Dataset of measured tracks; synthetic tracks by default.")]
 Datasets = Annotated[Paths, _data(help="Dataset of measured tracks; may be repeated; synthetic tracks by default.")]
@@ -337,11 +338,14 @@ def speed(
 
     Example: ballfg-bench speed --out results/speed
     """
-    from ballfg.benchmarks.speed.gate import SlowerError, check_ratios
     from ballfg.benchmarks.speed.peers.suite import run_peers
+    from ballfg.benchmarks.speed.stopwatch import SlowerError, check_ratios
     from ballfg.benchmarks.speed.suite import FULL, QUICK, run_speed
 
-    interpreters = _interpreters(peer or [])
+    pairs = [word.partition("=") for word in peer or ()]
+    if any(not (library and path) for library, _, path in pairs):
+        raise typer.BadParameter("it is LIBRARY=PATH_TO_PYTHON.", param_hint="--peer")
+    interpreters = {library: Path(path) for library, _, path in pairs}
     if peer and not peers:
         raise typer.BadParameter("it is for --peers. Give that too, or leave both out.", param_hint="--peer")
     if peers and data is not None:
@@ -363,14 +367,6 @@ def speed(
         except SlowerError as error:
             print(f"ballfg: {error}", file=sys.stderr)
             raise typer.Exit(1) from None
-
-
-def _interpreters(words: Sequence[str]) -> dict[str, Path]:
-    pairs = [word.partition("=") for word in words]
-    for library, sign, path in pairs:
-        if not (library and sign and path):
-            raise typer.BadParameter("it is LIBRARY=PATH_TO_PYTHON.", param_hint="--peer")
-    return {library: Path(path) for library, _, path in pairs}
 
 
 def _open(data: Path) -> Dataset:

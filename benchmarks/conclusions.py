@@ -104,24 +104,18 @@ def target(metric: str, unit: str, case: str = "") -> float | None:
     Where the spin is given, three of the nine components of a state have no error: the NEES is that of six, and the
     intervals of three always hold.
     """
-    value = _of_estimated(metric, unit)
+    level = COVERAGE.fullmatch(metric)
+    value = RIGHT["nees"] if NEES_PLACE.fullmatch(metric) else None
+    if level is not None:
+        value = float(level[1]) / (1.0 if unit == "%" else 100.0)
+    value = RIGHT.get(metric, value)  # where all components of the state are estimated
     if value is None or case not in GIVEN_SPIN:
         return value
     if metric.startswith("nees") and metric != "nees_velocity":
         return value * 6.0 / 9.0
-    if COVERAGE.fullmatch(metric) and metric.endswith("_state"):
+    if level is not None and metric.endswith("_state"):
         return (6.0 * value + 3.0 * (100.0 if unit == "%" else 1.0)) / 9.0
     return value
-
-
-def _of_estimated(metric: str, unit: str) -> float | None:
-    """The same where all components of the state are estimated."""
-    if metric in RIGHT:
-        return RIGHT[metric]
-    if NEES_PLACE.fullmatch(metric):
-        return RIGHT["nees"]
-    level = COVERAGE.fullmatch(metric)
-    return None if level is None else float(level[1]) / (1.0 if unit == "%" else 100.0)
 
 
 def conclusions(case: str, rows: Sequence[Row]) -> list[str]:

@@ -79,10 +79,7 @@ def median_and_quartiles(values: Sequence[float]) -> Figure:
 
 
 def bootstrap(statistic: Statistic, count: int, rng: np.random.Generator) -> Figure:
-    """A figure over `count` tracks, with its percentile interval when tracks are drawn with replacement.
-
-    Raises: ValueError: if there is no track.
-    """
+    """A figure over `count` tracks, with its percentile interval when tracks are drawn with replacement."""
     if count < 1:
         raise ValueError("a figure needs at least one track; got none")
     value = float(statistic(np.arange(count)[None])[0])

@@ -3,6 +3,7 @@
 import json
 import math
 import platform
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -83,13 +84,8 @@ def _finite(value: float) -> float | None:
 
 def machine() -> dict[str, Any]:
     """Processor, usable cores and system; nothing that identifies a user's machine."""
-    return {"cpu": _cpu_model(), "cores": usable_cores(), "system": f"{platform.system()} {platform.machine()}"}
-
-
-def _cpu_model() -> str:
-    try:
+    cpu = platform.processor() or "unknown"
+    with suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor() or "unknown"
-    found = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    return next(found, platform.processor() or "unknown")
+        cpu = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), cpu)
+    return {"cpu": cpu, "cores": usable_cores(), "system": f"{platform.system()} {platform.machine()}"}

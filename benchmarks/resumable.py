@@ -60,10 +60,7 @@ class Kept:
 
     @classmethod
     def read(cls, path: Path, digest: str) -> Self | None:
-        """The record in a file; None if there is no file, or its `digest` is another.
-
-        Raises: ValueError: if the file holds something else.
-        """
+        """The record in a file; None if there is no file, or its `digest` is another."""
         if not path.is_file():
             return None
         try:

@@ -54,12 +54,10 @@ EffectsFiles = Annotated[
     list[Path] | None,
     typer.Option("--effects-file", help="Trusted Python file that defines custom effects; may be repeated."),
 ]
-"""The option of every command that uses effects."""
 ObservationsFiles = Annotated[
     list[Path] | None,
     typer.Option("--observations-file", help="Trusted Python file that defines custom observations; may be repeated."),
 ]
-"""The option of every command that reads a dataset's tables."""
 MethodName = Annotated[
     str,
     typer.Option(

@@ -192,8 +192,6 @@ BEND = 12.0  # m/s^2, deviation of a path from a line through two positions
 class Newcomer:
     """The first positions of a possible ball."""
 
-    patience = PATIENCE
-
     def __init__(self, first: Kept, gate: Gate) -> None:
         self.samples = [first]
         self.gate = gate
@@ -210,10 +208,6 @@ class Newcomer:
     def repeats(self, time: float, position: Array) -> bool:
         """True if it has exactly that sample."""
         return any(kept.time == time and np.array_equal(kept.position, position) for kept in self.samples)
-
-    def take(self, kept: Kept) -> None:
-        """Takes in a sample."""
-        insort(self.samples, kept)
 
     def distances(self, time: float, positions: Array) -> Array:
         """(n,) squared Mahalanobis distances of positions (n, 3) m from its region at a time."""

@@ -124,7 +124,13 @@ def ending(begin: bytes, chunks: Sequence[Chunk], channels: int) -> bytes:
     totals = struct.pack("<QHIIIIQQ", sum(counts), channels, channels, 0, 0, len(chunks), first, last)
     each = b"".join(struct.pack("<HQ", number, count) for number, count in enumerate(counts, start=1))
     declared = begin[len(opening(())) :]  # schemas and channels again
-    parts = [end, declared, *map(_chunk_index, chunks)]
+    parts = [end, declared]
+    for chunk in chunks:
+        places = b"".join(struct.pack("<HQ", n, place) for n, place in enumerate(chunk.indexes[:-1], start=1))
+        begun = chunk.indexes[0]
+        head = struct.pack("<QQQQI", chunk.first, chunk.last, chunk.offset, begun - chunk.offset, len(places))
+        tail = struct.pack("<QIQQ", chunk.end - begun, 0, chunk.content, chunk.content)
+        parts.append(_record(CHUNK_INDEX, head + places + tail))
     parts.append(_record(STATISTICS, totals + struct.pack("<I", len(each)) + each))
     return b"".join([*parts, _record(FOOTER, struct.pack("<QQI", offset, 0, 0)), MAGIC])
 
@@ -193,10 +199,7 @@ def _opening_of(read: Read) -> tuple[bytes, int] | None:
 
 
 def _chunk_at(read: Read, offset: int, channels: int) -> Chunk | None:
-    """The chunk at an offset; None if the file ends before its indexes do, or at the ending.
-
-    Raises: ValueError: another record at the offset.
-    """
+    """The chunk at an offset; None if the file ends before its indexes do, or at the ending."""
     head = read(offset, RECORD.size + SPAN.size)
     if head[:1] in (b"", bytes([DATA_END])) or (head[0] == CHUNK and len(head) < RECORD.size + SPAN.size):
         return None
@@ -216,14 +219,6 @@ def _chunk_at(read: Read, offset: int, channels: int) -> Chunk | None:
             raise ValueError(f"no index of channel {number} at byte {chunk.end}")
         chunk = Chunk(first, last, offset, content, (*chunk.counts, entries // ENTRY.size))
     return chunk
-
-
-def _chunk_index(chunk: Chunk) -> bytes:
-    places = b"".join(struct.pack("<HQ", n, place) for n, place in enumerate(chunk.indexes[:-1], start=1))
-    begin = chunk.indexes[0]
-    head = struct.pack("<QQQQI", chunk.first, chunk.last, chunk.offset, begin - chunk.offset, len(places))
-    tail = struct.pack("<QIQQ", chunk.end - begin, 0, chunk.content, chunk.content)
-    return _record(CHUNK_INDEX, head + places + tail)
 
 
 def _record(kind: int, content: bytes | bytearray) -> bytes:

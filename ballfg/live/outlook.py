@@ -82,7 +82,7 @@ def look_out(state: OnlineState, horizon: float, plane: Plane | None) -> Outlook
         bounce = _tried(partial(next_contact, *carried, horizon), "bounce", notes)
         top = _tried(partial(apex, *carried, horizon), "apex", notes)
         across = None if plane is None else partial(plane_crossing, *carried, plane.normal, plane.place, horizon)
-        crossing = across and _tried(across, "crossing", notes)
+        crossing = None if across is None else _tried(across, "crossing", notes)
     return Outlook(bounce, top, crossing, "; ".join(notes))
 
 

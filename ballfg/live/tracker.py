@@ -1,8 +1,8 @@
 """Tracks any number of balls: positions come in, states go out, one stamp at a time."""
 
+from bisect import insort
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,7 +13,7 @@ from ballfg.dynamics import BallModel, Surfaces
 from ballfg.estimation.online.online import Online
 from ballfg.estimation.online.state import OnlineState
 from ballfg.estimation.settings import Settings
-from ballfg.live.ball import Ball, BallEvent, Kept, Newcomer
+from ballfg.live.ball import PATIENCE, Ball, BallEvent, Kept, Newcomer
 from ballfg.live.clock import Clock, Stamp
 from ballfg.live.gate import FAR, GATE, HIT_GATE, Gate, assign
 from ballfg.tracks import Ball as BallKind
@@ -53,9 +53,6 @@ class BallUpdate:
     events: tuple[BallEvent, ...] = ()
     late: bool = False
     reason: str = ""
-
-
-T = TypeVar("T", OnlineState, BallEvent, BallUpdate)
 
 
 @dataclass
@@ -161,7 +158,7 @@ class Tracker:
     @property
     def balls(self) -> dict[int, OnlineState]:
         """The newest state of every ball by its number."""
-        return {ball.number: self._dated(ball.states[-1]) for ball in self._balls}
+        return {ball.number: self._dated_state(ball.states[-1]) for ball in self._balls}
 
     def push(self, time: float, positions: ArrayLike, sigmas: ArrayLike | None = None) -> list[BallUpdate]:
         """Takes in the positions of one stamp.
@@ -193,16 +190,22 @@ class Tracker:
             self._to_balls(frame, GATE, hit=False)
             self._to_newcomers(frame)
             self._to_balls(frame, HIT_GATE, hit=True)
-            self._begin_newcomers(frame)
+            for k in frame.open:
+                self._newcomers.append(Newcomer(frame.kept(k), self.gate))
+                frame.updates[k] = self._grown(self._newcomers[-1], frame, k)
+            del self._newcomers[:-MOST_NEWCOMERS]
         return [self._dated(update) for update in (*gone, *frame.updates) if update is not None]
 
-    def _dated(self, what: T) -> T:
-        """A state, an event or an update on the sender's clock."""
-        dated = replace(what, time=self._origin.written(what.time))
-        if isinstance(dated, BallUpdate):
-            state, events = dated.state and self._dated(dated.state), tuple(map(self._dated, dated.events))
-            return replace(dated, state=state, events=events)
-        return dated
+    def _dated_state(self, state: OnlineState) -> OnlineState:
+        return replace(state, time=self._origin.written(state.time))
+
+    def _dated(self, update: BallUpdate) -> BallUpdate:
+        return replace(
+            update,
+            time=self._origin.written(update.time),
+            state=None if update.state is None else self._dated_state(update.state),
+            events=tuple(replace(event, time=self._origin.written(event.time)) for event in update.events),
+        )
 
     def tidy(self) -> None:
         """Does the deferrable work: call it after the updates were used, for a quicker next push."""
@@ -250,7 +253,11 @@ class Tracker:
             gone = self._undo_after(self._clock.newest)
         frame.late = stamp is Stamp.LATE
         self.counts.late += len(frame.open) if frame.late else 0
-        return gone + self._drop_unseen()
+        now = self._clock.safe
+        unseen = [ball for ball in self._balls if ball.last < now - self.gap]
+        self._balls = [ball for ball in self._balls if ball not in unseen] if unseen else self._balls
+        self._newcomers = [newcomer for newcomer in self._newcomers if newcomer.last >= now - PATIENCE]
+        return [*gone, *map(self._lost, unseen)]
 
     def _undo_after(self, time: float) -> list[BallUpdate]:
         """Reverts the effect of a wrong stamp; a ball without other samples is lost."""
@@ -268,14 +275,6 @@ class Tracker:
                 self._balls.remove(ball)
                 gone.append(farewell)
         return gone
-
-    def _drop_unseen(self) -> list[BallUpdate]:
-        now = self._clock.safe
-        gone = [ball for ball in self._balls if ball.last < now - self.gap]
-        if gone:
-            self._balls = [ball for ball in self._balls if ball not in gone]
-        self._newcomers = [newcomer for newcomer in self._newcomers if newcomer.last >= now - newcomer.patience]
-        return [self._lost(ball) for ball in gone]
 
     def _lost(self, ball: Ball) -> BallUpdate:
         self.counts.lost += 1
@@ -339,7 +338,7 @@ class Tracker:
             costs[:, j] = newcomer.distances(t, frame.positions[rows])
         for i, j in assign(costs, GATE):
             k, newcomer = rows[i], newcomers[j]
-            newcomer.take(frame.kept(k))
+            insort(newcomer.samples, frame.kept(k))
             frame.updates[k] = self._grown(newcomer, frame, k)
         for k in frame.open:
             if any(newcomer.repeats(t, frame.positions[k]) for newcomer in self._newcomers):
@@ -363,10 +362,3 @@ class Tracker:
             if update.kind == "refused":
                 break
         return update
-
-    def _begin_newcomers(self, frame: _Frame) -> None:
-        for k in frame.open:
-            newcomer = Newcomer(frame.kept(k), self.gate)
-            self._newcomers.append(newcomer)
-            frame.updates[k] = self._grown(newcomer, frame, k)
-        del self._newcomers[:-MOST_NEWCOMERS]

@@ -44,20 +44,18 @@ class Viewer:
             return
         show.log(f"{name}/state", self._rerun.Points3D([state.position], radii=0.02))
         show.log(f"{name}/velocity", self._rerun.Arrows3D(origins=[state.position], vectors=[0.05 * state.velocity]))
-        for event in update.events:
-            show.log(f"{name}/events", self._rerun.TextLog(f"{event.kind} at {event.time:.4f} s"))
+        for one in update.events:
+            show.log(f"{name}/events", self._rerun.TextLog(f"{one.kind} at {one.time:.4f} s"))
         if outlook is not None and not outlook.note and update.samples % EVERY == 0 and not unusable(state):
             path = np.vstack((state.position, state.predict(self.horizon, step=0.02).positions))
             show.log(f"{name}/path", self._rerun.LineStrips3D([path]))
             for what in ("bounce", "apex", "crossing"):
-                self._show_event(f"{name}/{what}", getattr(outlook, what))
-
-    def _show_event(self, name: str, event: Crossing | None) -> None:
-        if event is None:
-            self._recording.log(name, self._rerun.Clear(recursive=False))
-            return
-        radius = SIGMAS * float(np.sqrt(np.trace(event.covariance[:3, :3]) / 3))
-        self._recording.log(name, self._rerun.Points3D([event.state[:3]], radii=max(radius, 0.005)))
+                event: Crossing | None = getattr(outlook, what)
+                drawn = self._rerun.Clear(recursive=False)
+                if event is not None:
+                    radius = SIGMAS * float(np.sqrt(np.trace(event.covariance[:3, :3]) / 3))
+                    drawn = self._rerun.Points3D([event.state[:3]], radii=max(radius, 0.005))
+                show.log(f"{name}/{what}", drawn)
 
     def close(self) -> None:
         """Flushes the pending drawings."""

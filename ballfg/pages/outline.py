@@ -39,16 +39,17 @@ class Outline:
 
 def outline(info: DatasetInfo, positions: Array) -> Outline:
     """The table of a dataset. Args: info: of the dataset. positions: (n, 3) m, samples above the table, n >= 1."""
+    low, high = positions[:, :2].min(axis=0), positions[:, :2].max(axis=0)
+    seen = (low[0] - MARGIN, high[0] + MARGIN, low[1] - MARGIN, high[1] + MARGIN)
     small = info.ball.radius < SMALL_BALL
     floor = info.table_height - TABLE_ABOVE_FLOOR if small else None
     if info.table_extent is not None:
         words = "The ends of the table are those of dataset.yaml."
-        return Outline(info.table_height, _finite(info.table_extent, positions), small, floor, words)
-    low, high = positions[:, :2].min(axis=0), positions[:, :2].max(axis=0)
+        ends = tuple(e if np.isfinite(e) else other for e, other in zip(info.table_extent, seen, strict=True))
+        return Outline(info.table_height, _numbers(ends), small, floor, words)
     if not small:
-        ends = (low[0] - MARGIN, high[0] + MARGIN, low[1] - MARGIN, high[1] + MARGIN)
         words = "dataset.yaml does not state where the surface ends: it is drawn under all samples."
-        return Outline(info.table_height, _numbers(ends), False, floor, words)
+        return Outline(info.table_height, _numbers(seen), False, floor, words)
     middle = 0.5 * (low + high)
     along_x = high[0] - low[0] >= high[1] - low[1]
     half = 0.5 * np.array((TABLE_LENGTH, TABLE_WIDTH) if along_x else (TABLE_WIDTH, TABLE_LENGTH))
@@ -58,13 +59,6 @@ def outline(info: DatasetInfo, positions: Array) -> Outline:
         "of the samples. Only its height is known."
     )
     return Outline(info.table_height, _numbers(ends), False, floor, words)
-
-
-def _finite(extent: tuple[float, float, float, float], positions: Array) -> tuple[float, float, float, float]:
-    """The extent, with infinite ends replaced by the samples' own."""
-    low, high = positions[:, :2].min(axis=0) - MARGIN, positions[:, :2].max(axis=0) + MARGIN
-    seen = (low[0], high[0], low[1], high[1])
-    return _numbers(tuple(end if np.isfinite(end) else other for end, other in zip(extent, seen, strict=True)))
 
 
 def _numbers(ends: tuple[float, ...]) -> tuple[float, float, float, float]:

@@ -31,7 +31,10 @@ def whole_page(
     parts += [f"<title>{html.escape(title)}</title>", f"<style>\n{own('style.css')}{style}</style>"]
     end = []
     if data is not None:
-        end.append(f'<script type="application/json" id="data">{_inside_script(data)}</script>')
+        plain = json.dumps(data, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
+        for sign in "<>&\u2028\u2029":  # a name such as `</script>` must not end the element
+            plain = plain.replace(sign, f"\\u{ord(sign):04x}")
+        end.append(f'<script type="application/json" id="data">{plain}</script>')
     if plotly:
         from plotly.offline import get_plotlyjs
 
@@ -44,11 +47,3 @@ def whole_page(
 def own(name: str) -> str:
     """The text of a style or a script of this room."""
     return files(__package__).joinpath(name).read_text(encoding="utf-8")
-
-
-def _inside_script(data: Mapping[str, Any]) -> str:
-    """JSON that cannot end the script element, even with a name such as `</script>`."""
-    plain = json.dumps(data, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
-    for sign in "<>&\u2028\u2029":
-        plain = plain.replace(sign, f"\\u{ord(sign):04x}")
-    return plain

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from ballfg.pages.outline import Outline
 from ballfg.pages.shot import ShownShot
 from ballfg.pages.shown import Shown
 
@@ -24,7 +23,9 @@ def record(shown: Shown, path: Path) -> None:
     recording = rerun.RecordingStream("ballfg show")
     recording.save(str(path))
     if shown.table is not None:
-        _table(rerun, recording, shown.table)
+        (x0, x1, y0, y1), height = shown.table.extent, shown.table.height
+        middle, half = [(x0 + x1) / 2, (y0 + y1) / 2, height - FLAT], [(x1 - x0) / 2, (y1 - y0) / 2, FLAT]
+        recording.log("table", rerun.Boxes3D(centers=[middle], half_sizes=[half]), static=True)
     for shot in shown.shots:
         _shot(rerun, recording, shot)
     recording.flush()
@@ -40,12 +41,6 @@ def check_rerun(option: str = "rerun") -> Any:
             f"{option} must have the package rerun-sdk; got {error}. Install it: pip install 'ballfg[viewer]'."
         ) from None
     return rerun
-
-
-def _table(rerun: Any, recording: Any, table: Outline) -> None:
-    x0, x1, y0, y1 = table.extent
-    middle, half = [(x0 + x1) / 2, (y0 + y1) / 2, table.height - FLAT], [(x1 - x0) / 2, (y1 - y0) / 2, FLAT]
-    recording.log("table", rerun.Boxes3D(centers=[middle], half_sizes=[half]), static=True)
 
 
 def _shot(rerun: Any, recording: Any, shot: ShownShot) -> None:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ballfg.arrays import Array
 from ballfg.benchmarks.cameras.scenes import Filmed, truth_at
@@ -14,7 +13,6 @@ from ballfg.estimation import Estimate, Online, Settings, Smoother, estimate_tim
 from ballfg.estimation.measurement.position_noise import estimate_position_noise
 from ballfg.estimation.smoother.time_offsets import TimeOffsets
 from ballfg.progress import progress
-from ballfg.simulation.scene.flights import Flight
 from ballfg.state import POSITION, VELOCITY, VZ
 from ballfg.tracks import Track
 from ballfg.vision import Camera, triangulate
@@ -112,16 +110,13 @@ def _judged(filmed: Filmed, estimates: Sequence[Estimate]) -> Velocities:
     step = 1.0 / filmed.recording.config.rate
     sums = np.zeros((3, len(filmed.recording.flights)))
     for number, flight in enumerate(filmed.recording.flights):
+        knots = flight.start + np.arange(len(flight.knots)) * (flight.end - flight.start) / (len(flight.knots) - 1)
+        bounces = knots[1:][np.diff(flight.knots[:, VZ]) > 0.5]
+        margin = NEAR_BOUNCE * step + np.diff(knots[:2])
         for estimate in estimates:
             error = estimate.states - truth_at(flight, estimate.times)
             far = np.nan_to_num(np.linalg.norm(error[:, POSITION], axis=1), nan=np.inf)
-            error = error[(far < OTHER_BALL) & _apart_from_bounces(flight, estimate.times, step)]
+            apart = (np.abs(estimate.times[:, None] - bounces) > margin).all(axis=1)
+            error = error[(far < OTHER_BALL) & apart]
             sums[:, number] += (error[:, VELOCITY] ** 2).sum(), len(error), (error[:, POSITION] ** 2).sum()
     return Velocities(*sums)
-
-
-def _apart_from_bounces(flight: Flight, times: Array, step: float) -> NDArray[np.bool_]:
-    jump = np.diff(flight.knots[:, VZ])
-    knots = flight.start + np.arange(len(flight.knots)) * (flight.end - flight.start) / (len(flight.knots) - 1)
-    bounces = knots[1:][jump > 0.5]
-    return np.asarray((np.abs(times[:, None] - bounces) > NEAR_BOUNCE * step + np.diff(knots[:2])).all(axis=1))

@@ -158,7 +158,11 @@ QUICK: Final = Size(shots=2, late=1)
 def run_cameras(results: Results, out: Path, size: Size, jobs: int) -> list[Path]:
     """Film, track, judge, and add the rows. Returns: the pictures written to the existing folder `out`."""
     ways = scenarios(size.shots, results.seed)
-    late = [_late(ways[1], number) for number in range(size.late)]
+    clocks_late = {name: Clock(offset=offset) for name, offset in LATE.items()}
+    late = []
+    for number in range(size.late):  # other shots, with a camera whose stamps are late
+        config = replace(ways[1].config, seed=ways[1].config.seed + 10 + number, clocks=clocks_late)
+        late.append(replace(ways[1], name=f"4 ms late, {number + 1}", config=config))
     filmed = in_processes(film, [*ways, *late], jobs, "recordings drawn and tracked")
     shown, off = filmed[: len(ways)], filmed[len(ways) :]
     judged = {one.scenario.name: judge(one) for one in shown}
@@ -174,13 +178,6 @@ def run_cameras(results: Results, out: Path, size: Size, jobs: int) -> list[Path
         errors_picture({name: found.errors for name, found in judged.items()}, out / "cameras_errors.png"),
         turns_picture(turned, out / "cameras_turned.png"),
     ]
-
-
-def _late(scenario: Scenario, number: int) -> Scenario:
-    """The scenario with a camera whose stamps are late, and other shots."""
-    late = {name: Clock(offset=offset) for name, offset in LATE.items()}
-    config = replace(scenario.config, seed=scenario.config.seed + 10 + number, clocks=late)
-    return replace(scenario, name=f"4 ms late, {number + 1}", config=config)
 
 
 def add_points(results: Results, name: str, found: Judged) -> None:

@@ -134,7 +134,6 @@ def power_curve(sizes: Sequence[float], outcomes: Sequence[bool]) -> Curve:
     """The most probable curve through outcomes at sizes.
 
     Args: sizes: (n,) positive.  outcomes: (n,) whether the effect was named.
-    Raises: ValueError: if there is none.
     """
     if not outcomes:
         raise ValueError("outcomes must not be empty; got none. Run some sizes first.")

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import binom
 
 from ballfg.benchmarks.diagnosis.cases import Case, Recording
-from ballfg.benchmarks.diagnosis.effects import PLANTS, Plant
+from ballfg.benchmarks.diagnosis.effects import PLANTS
 from ballfg.benchmarks.diagnosis.record import Record
 from ballfg.benchmarks.diagnosis.suite import collect_records, run_case
 from ballfg.benchmarks.metrics import CONFIDENCE, Figure
@@ -28,18 +28,14 @@ def reliability_cases(count: int, seed: int) -> Iterator[Case]:
     for number in range(count):
         rng = np.random.default_rng([seed, number])
         labels = bool(rng.random() < LABELLED)
-        offered = [plant for plant in PLANTS.values() if _offered(plant, labels)]
+        lacked = [plant for plant in PLANTS.values() if plant.sized and not plant.left_out]
+        offered = [plant for plant in lacked if labels or not plant.name.startswith("spin_label")]
         chosen = rng.choice(len(offered), rng.integers(MOST_PLANTED + 1), replace=False)
         plants = [offered[place] for place in chosen.tolist()]
         sizes = np.exp(rng.uniform(np.log(SMALLEST), np.log(LARGEST), len(plants))).tolist()
         texts = tuple(text for plant, size in zip(plants, sizes, strict=True) for text in plant.texts(size))
         names = tuple(plant.name for plant in plants)
         yield Case(TITLE, f"set-{seed}", 1.0, number, names, sessions=(texts,), recording=Recording(labels=labels))
-
-
-def _offered(plant: Plant, labels: bool) -> bool:
-    """True for effects with a size that the declared model lacks and that can act: those of labels need labels."""
-    return plant.sized and not plant.left_out and (labels or not plant.name.startswith("spin_label"))
 
 
 def run_reliability(

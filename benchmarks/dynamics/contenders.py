@@ -1,7 +1,9 @@
-"""Defines the contenders of the dynamics comparison, and the fan of paths that each predicts for one launch."""
+"""Defines the contenders of the dynamics comparison, the paths that each predicts for one launch, and their records."""
 
+import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from importlib import metadata
 from pathlib import Path
 from typing import Final, Protocol
 
@@ -9,7 +11,8 @@ import numpy as np
 import torch
 
 from ballfg.arrays import Array
-from ballfg.benchmarks.dynamics.task import Task
+from ballfg.benchmarks.dynamics.task import PathScore, Task
+from ballfg.benchmarks.resumable import Kept
 from ballfg.dynamics import BallModel, Surfaces, nominal_model
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.motion.paths import paths
@@ -154,10 +157,7 @@ def adapting_contender(job: Job, task: Task) -> GraphContender:
 
 
 def truth_contender(job: Job, task: Task) -> GraphContender:
-    """The true dynamics, with next to no process noise: what noise and spread of the launches leave unknown.
-
-    Raises: ValueError: if the task is of measured tracks, whose truth is unknown.
-    """
+    """The true dynamics, with next to no process noise: what noise and spread of the launches leave unknown."""
     if task.truth is None:
         raise ValueError(
             f"method '{job.method}' needs simulated tracks; got measured ones ({task.case}). Leave it out."
@@ -224,3 +224,47 @@ def _spin(contender: GraphContender, start: Array, settings: dict[str, float]) -
 def fan_of(contender: GraphContender) -> Fan:
     """The paths of all levels of topspin, and of all levels of sidespin, from the launcher's middle shot."""
     return Fan(_paths(contender, "topspin"), _paths(contender, "sidespin"))
+
+
+@dataclass(frozen=True)
+class Record(Kept):
+    """A finished contender.
+
+    Attributes:
+        method, seed: which contender.  parameters: numbers learned.  training_time: s, wall clock.
+        inference_time: s, median over single tracks.  not_converged: estimates among the validation tracks.
+        scores: one a validation track.  fan: paths for the picture; None for methods that have no dynamics.
+    """
+
+    what = "a finished run"
+    method: str
+    seed: int
+    parameters: int
+    training_time: float
+    inference_time: float
+    not_converged: int
+    scores: tuple[PathScore, ...]
+    fan: Fan | None
+
+
+def task_digest(task: Task, recipe: str) -> str:
+    """Digest of the task and the training, which together with method and seed determine a contender's errors."""
+    digest = hashlib.sha256(repr((metadata.version("ballfg"), task.case, recipe, task.settings)).encode())
+    for part in (task.train, task.validation):
+        for shot in part:
+            labels = sorted(shot.track.labels.items())
+            digest.update(repr((shot.track.name, shot.observed, shot.judged, labels)).encode())
+            for values in (shot.track.times, shot.track.positions, shot.reference, shot.bounces, shot.apexes):
+                digest.update(values.tobytes())
+        digest.update(b"|")
+    return digest.hexdigest()
+
+
+def job_digest(task: Task, tasks: Sequence[Task], recipe: str) -> str:
+    """Digest of the settings that determine the errors on one of several tasks of a common training.
+
+    Args: task: that is judged by.  tasks: that are learned from, where they hold shots for it.
+    """
+    own = task_digest(task, recipe)
+    others = [task_digest(other, recipe) for other in tasks if other.train and other is not task]
+    return hashlib.sha256("|".join([own, *others]).encode()).hexdigest() if others else own

@@ -11,8 +11,7 @@ from typing import Final, Literal
 import numpy as np
 
 from ballfg.benchmarks.dynamics import contenders
-from ballfg.benchmarks.dynamics.contenders import Contender, GraphContender, Job, fan_of
-from ballfg.benchmarks.dynamics.record import Record, job_digest
+from ballfg.benchmarks.dynamics.contenders import Contender, GraphContender, Job, Record, fan_of, job_digest
 from ballfg.benchmarks.dynamics.task import Task, score_path
 from ballfg.benchmarks.dynamics.trained import RESIDUAL, recipe, trained_contender
 from ballfg.benchmarks.resumable import collect

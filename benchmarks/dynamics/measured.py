@@ -39,10 +39,7 @@ class Measured:
 
 
 def measured_tasks(data: Measured, jobs: int, most: int | None) -> list[Task]:
-    """A task for each dataset, of at most so many of its first tracks (None: all).
-
-    Raises: ValueError: if two have the same name, or they are of different balls, or have too few tracks.
-    """
+    """A task for each dataset, of at most so many of its first tracks (None: all)."""
     every = [*data.datasets, *([] if data.transfer is None else [data.transfer])]
     names, radii = [d.info.name for d in every], {d.info.ball.radius for d in every}
     if len(set(names)) < len(names):
@@ -64,7 +61,6 @@ def measured_task(dataset: Dataset, jobs: int, tracks: int | None = None, *, lea
     out.
 
     Args: tracks: how many of the first ones; None for all.  learn: False: all shots are to judge by.
-    Raises: ValueError: if too few tracks are left.
     """
     model = nominal_model(dataset.info.ball)
     given, surfaces = dataset_settings(dataset, model), dataset_surfaces(dataset)

@@ -11,7 +11,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 
 from ballfg.arrays import Array
-from ballfg.benchmarks.dynamics.record import Record
+from ballfg.benchmarks.dynamics.contenders import Record
 from ballfg.benchmarks.dynamics.task import APEXES, Task
 from ballfg.benchmarks.estimators.measured import HORIZON
 from ballfg.benchmarks.pictures import BLUE, GREY, ORANGE, curve, save

@@ -10,10 +10,10 @@ from typing import Final
 
 import numpy as np
 
+from ballfg.benchmarks.dynamics.contenders import Record
 from ballfg.benchmarks.dynamics.jobs import METHODS, TIMED, collect_records
 from ballfg.benchmarks.dynamics.measured import Measured, measured_tasks
-from ballfg.benchmarks.dynamics.record import Record
-from ballfg.benchmarks.dynamics.task import APEXES, PathScore, Task, pooled_rmse
+from ballfg.benchmarks.dynamics.task import APEXES, Task, pooled_rmse
 from ballfg.benchmarks.dynamics.truth import TRACKS, synthetic_task
 from ballfg.benchmarks.metrics import Figure
 from ballfg.benchmarks.results import CURVE_MARK, Results
@@ -55,22 +55,17 @@ def figures(record: Record, measured: bool) -> Iterator[tuple[str, str, float, i
         yield "rest_rmse_median", "m", median, len(ahead)
         if measured:
             yield "prediction_rmse_median", "mm", 1e3 * median, len(ahead)
-    yield from _apex_figures(scores)
-    yield "parameters", "1", record.parameters, 1
-    yield "training_time", "s", record.training_time, 1
-    yield "inference_time", "s", record.inference_time, min(TIMED, n)
-    yield "not_converged", "1", record.not_converged, n
-
-
-def _apex_figures(scores: Sequence[PathScore]) -> Iterator[tuple[str, str, float, int]]:
-    """Mean and standard deviation of apex errors by flight: of all, and of those after the observed part."""
-    errors, ahead = np.array([s.apex for s in scores], dtype=np.float64), np.array([s.apex_ahead for s in scores])
-    for suffix, counted in (("", np.isfinite(errors)), ("_ahead", np.isfinite(errors) & ahead)):
-        for flight, name in enumerate(APEXES):
+    errors, later = np.array([s.apex for s in scores], dtype=np.float64), np.array([s.apex_ahead for s in scores])
+    for suffix, counted in (("", np.isfinite(errors)), ("_ahead", np.isfinite(errors) & later)):
+        for flight, name in enumerate(APEXES):  # of all, and of those after the observed part
             found = errors[counted[:, flight], flight]
             if len(found):
                 yield f"apex_{name}{suffix}_mean", "m", float(found.mean()), len(found)
                 yield f"apex_{name}{suffix}_std", "m", float(found.std()), len(found)
+    yield "parameters", "1", record.parameters, 1
+    yield "training_time", "s", record.training_time, 1
+    yield "inference_time", "s", record.inference_time, min(TIMED, n)
+    yield "not_converged", "1", record.not_converged, n
 
 
 @dataclass(frozen=True)
@@ -99,7 +94,6 @@ def run_dynamics(
 
     Args: methods: names in `METHODS`, None for all; those that do not take part on such tracks are passed over.
     Returns: the pictures written.
-    Raises: ValueError: if a method's name is unknown.
     """
     from ballfg.benchmarks.dynamics.pictures import apex_picture, fan_picture, rmse_picture
 
@@ -126,10 +120,7 @@ def run_dynamics(
 
 
 def _installed(asked: Sequence[str] | None) -> tuple[str, ...]:
-    """The methods to compare; of all of them those that are installed.
-
-    Raises: ValueError: if one that was asked for needs a package that is not there.
-    """
+    """The methods to compare; of all of them those that are installed."""
     missing = {name: METHODS[name].package for name in asked or METHODS if not METHODS[name].installed}
     for name, package in missing.items():
         remedy = f"it needs the package {package}. Install it: pip install 'ballfg[diffusion]'."

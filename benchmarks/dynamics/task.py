@@ -126,7 +126,6 @@ def score_path(shot: TaskShot, predicted: Array) -> PathScore:
 
     Args:
         predicted: (n, 3) m at the shot's stamps; NaN at observed stamps by methods that predict only what comes after.
-    Raises: ValueError: if the shape is another, or an unobserved position is not finite.
     """
     if predicted.shape != shot.reference.shape:
         raise ValueError(f"predicted must have shape {shot.reference.shape}; got {predicted.shape}.")

@@ -13,12 +13,10 @@ from typing import Any, Final
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.benchmarks.dynamics.contenders import Contender, GraphContender, Job
-from ballfg.benchmarks.dynamics.record import task_digest
+from ballfg.benchmarks.dynamics.contenders import Contender, GraphContender, Job, task_digest
 from ballfg.benchmarks.dynamics.task import Task
 from ballfg.benchmarks.estimators.measured import HORIZON
-from ballfg.dynamics import BallModel, load_model
-from ballfg.estimation import Settings
+from ballfg.dynamics import load_model
 from ballfg.estimation.configure import launcher_of, learned_process
 from ballfg.files.whole_file import write_text
 from ballfg.learning.config.training import TrainConfig
@@ -104,14 +102,26 @@ def trained_contender(job: Job, task: Task) -> Contender:
         predictor = SequencePredictor.load(folder / FOLDER)
         return SequenceContender(job.method, predictor.parameter_count, seconds, predictor)
     model = load_model(folder / MODEL, radius=task.info.ball.radius)
-    launcher = None if model.trained is None else model.trained.launcher
+    trained = model.trained
+    assert trained is not None
+    # with the noise and the launcher that were learned together with the model; the scale of the position noise too,
+    # although a simulation's noise is known: without it the errors of mlp+gs were three times as large
+    settings = replace(
+        task.settings,
+        position_scale=trained.position_scale,
+        process=learned_process(trained),
+        launcher=launcher_of(task.info, model),
+        coefficients={},
+    )
     return GraphContender(
         name=job.method,
         model=model,
         surfaces=task.surfaces,
-        settings=learned_settings(task, model),
+        settings=settings,
         onward=job.measured,
-        parameter_count=sum(p.numel() for part in (model, launcher) if part is not None for p in part.parameters()),
+        parameter_count=sum(
+            p.numel() for part in (model, trained.launcher) if part is not None for p in part.parameters()
+        ),
         training_seconds=seconds,
     )
 
@@ -162,23 +172,6 @@ def config_of(job: Job, data: Sequence[Path]) -> TrainConfig:
         "launcher": content.get("launcher", {}) | {"labels": first.launcher_labels},
     }
     return TrainConfig.model_validate(content | given)
-
-
-def learned_settings(task: Task, model: BallModel) -> Settings:
-    """The task's settings with the noise and the launcher that were learned together with a model.
-
-    The scale of the position noise too, although a simulation's noise is known: weights and process noise were learned
-    for it. Without it the errors of mlp+gs were three times as large.
-    """
-    trained = model.trained
-    assert trained is not None
-    return replace(
-        task.settings,
-        position_scale=trained.position_scale,
-        process=learned_process(trained),
-        launcher=launcher_of(task.info, model),
-        coefficients={},
-    )
 
 
 @dataclass

@@ -1,6 +1,6 @@
 """Compares estimators on measured tracks without known truth, by predictions of later samples."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice, pairwise
@@ -138,7 +138,11 @@ def _add_predictions(results: Results, measured: Measured) -> None:
             add("nis_median", "1", float(np.median(nis)), len(nis))
             add("nis_mean", "1", float(nis.mean()), len(nis))
         add("not_converged", "1", sum(p.status is not Status.OK for p in predictions), n)
-        _add_growth(add, predictions)
+        for low, high in pairwise(BINS):
+            errors = [error for p in predictions if np.isfinite(error := prediction_rmse(p, low, high))]
+            for name, q in QUARTILES.items() if errors else ():
+                metric = f"prediction_error_{name}{CURVE_MARK}{(low + high) / 2:.4g}"
+                add(metric, "mm", float(1e3 * np.quantile(errors, q)), len(errors))
 
 
 def _statistics(predictions: Sequence[TrackPrediction]) -> list[tuple[str, str, Statistic, int]]:
@@ -156,16 +160,6 @@ def _statistics(predictions: Sequence[TrackPrediction]) -> list[tuple[str, str, 
             share = pooled_mean(*covered(predictions, level, slice(i, i + 1)))
             found.append((f"{metric}_{axis}", "1", share, n))
     return found
-
-
-def _add_growth(add: Callable[..., None], predictions: Sequence[TrackPrediction]) -> None:
-    """Median and quartiles over tracks of the error in each bin of the horizon."""
-    for low, high in pairwise(BINS):
-        errors = [error for p in predictions if np.isfinite(error := prediction_rmse(p, low, high))]
-        for name, q in QUARTILES.items():
-            if errors:
-                metric = f"prediction_error_{name}{CURVE_MARK}{(low + high) / 2:.4g}"
-                add(metric, "mm", float(1e3 * np.quantile(errors, q)), len(errors))
 
 
 def _add_smoothing(results: Results, measured: Measured) -> None:

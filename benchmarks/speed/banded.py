@@ -44,10 +44,7 @@ class BandedProblem:
         return np.concatenate((self.positions, velocity), axis=1), self.spin.copy()
 
     def solve(self) -> tuple[Array, Array, int]:
-        """States (n, 6) m and m/s, spin (3,) rad/s at the minimum, and the Gauss-Newton steps that it took.
-
-        Raises: RuntimeError: if it does not converge.
-        """
+        """States (n, 6) m and m/s, spin (3,) rad/s at the minimum, and the Gauss-Newton steps that it took."""
         states, spin = self.start()
         for count in range(1, MOST_STEPS + 1):
             step, turn = self._step(states, spin)
@@ -59,15 +56,14 @@ class BandedProblem:
 
     def residuals(self, states: Array, spin: Array) -> tuple[Array, Array, Array]:
         """Whitened residuals: (n - 1, 6) of the steps, (n, 3) of the positions, (3,) of the spin."""
-        acceleration = self._acceleration(states[:-1, 3:], spin)
-        position = states[:-1, :3] + self.dt * states[:-1, 3:] + 0.5 * self.dt**2 * acceleration
-        after = np.concatenate((position, states[:-1, 3:] + self.dt * acceleration), axis=1)
+        v = states[:-1, 3:]
+        speed = np.sqrt(np.einsum("ni,ni->n", v, v))[:, None]
+        gravity = np.array((0.0, 0.0, -STANDARD_GRAVITY))
+        acceleration = gravity - self.drag * speed * v + self.magnus * np.cross(spin, v)
+        position = states[:-1, :3] + self.dt * v + 0.5 * self.dt**2 * acceleration
+        after = np.concatenate((position, v + self.dt * acceleration), axis=1)
         steps = (states[1:] - after) / STEP_SIGMA
         return steps, (states[:, :3] - self.positions) / self.noise, (spin - self.spin) / self.spin_noise
-
-    def _acceleration(self, v: Array, spin: Array) -> Array:
-        speed = np.sqrt(np.einsum("ni,ni->n", v, v))[:, None]
-        return np.array((0.0, 0.0, -STANDARD_GRAVITY)) - self.drag * speed * v + self.magnus * np.cross(spin, v)
 
     def _step(self, states: Array, spin: Array) -> tuple[Array, Array]:
         steps, seen, labelled = self.residuals(states, spin)

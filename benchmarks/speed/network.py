@@ -69,7 +69,12 @@ def fitted_network(model: AnalyticModel, iterations: int = FIT_ITERATIONS) -> Ne
     An unfitted network would make an ill-posed problem, on which a solver's time says nothing.
     """
     generator = torch.Generator().manual_seed(0)
-    first, second, last = layers = _random_layers(generator)
+    first, second, last = layers = [nn.Linear(i, o, dtype=torch.float64) for i, o in pairwise((9, HIDDEN, HIDDEN, 3))]
+    with torch.no_grad():
+        for layer in layers:
+            spread = 1.0 / math.sqrt(layer.in_features)
+            layer.weight.copy_(spread * torch.randn(layer.weight.shape, generator=generator, dtype=torch.float64))
+            layer.bias.zero_()
     network = nn.Sequential(first, nn.Tanh(), second, nn.Tanh(), last)
     state = torch.zeros((FIT_SAMPLES, STATE_DIM), dtype=torch.float64)
     state[:, VELOCITY] = SPEED_SCALE * torch.randn((FIT_SAMPLES, 3), generator=generator, dtype=torch.float64)
@@ -89,16 +94,6 @@ def fitted_network(model: AnalyticModel, iterations: int = FIT_ITERATIONS) -> Ne
 
     optimizer.step(loss)
     return NetworkFlight(model, layers)
-
-
-def _random_layers(generator: torch.Generator) -> list[nn.Linear]:
-    layers = [nn.Linear(i, o, dtype=torch.float64) for i, o in pairwise((9, HIDDEN, HIDDEN, 3))]
-    with torch.no_grad():
-        for layer in layers:
-            spread = 1.0 / math.sqrt(layer.in_features)
-            layer.weight.copy_(spread * torch.randn(layer.weight.shape, generator=generator, dtype=torch.float64))
-            layer.bias.zero_()
-    return layers
 
 
 def parameter_count(network: NetworkFlight) -> int:

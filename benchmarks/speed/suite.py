@@ -178,7 +178,10 @@ def _time_model(watch: Stopwatch, name: str, model: BallModel, track: Track) -> 
     watch.time(name, "jacobian_time_1", lambda: fly_jacobian(model, states[:1], dt[:1]))
     for solver, metric in ONLINE.items():
         _time_online(watch, name, metric, Online(model, NO_SURFACE, replace(settings, solver=solver)), track)
-    _time_prediction(watch, name, smoother, track)
+    propagator = Propagator(smoother.surfaces, settings.process)
+    times = torch.from_numpy(track.times[-1] + np.arange(1, round(HORIZON * RATE) + 1) / RATE)[None]
+    belief = Belief.of(model, [smoother.estimate(track).last])
+    watch.time(name, "prediction_time", lambda: propagator.rollout(belief, times))
 
 
 def _time_network(watch: Stopwatch, model: AnalyticModel, track: Track, iterations: int) -> None:
@@ -240,13 +243,6 @@ def _time_online(watch: Stopwatch, name: str, metric: str, online: Online, track
     times = [spent for run in runs[1:] for spent in run]
     watch.results.add(CASE, name, f"{metric}_median", "ms", median_and_quartiles(times), len(times))
     watch.results.add(CASE, name, f"{metric}_p99", "ms", float(np.quantile(times, 0.99)), len(times))
-
-
-def _time_prediction(watch: Stopwatch, name: str, smoother: Smoother, track: Track) -> None:
-    propagator = Propagator(smoother.surfaces, smoother.settings.process)
-    times = torch.from_numpy(track.times[-1] + np.arange(1, round(HORIZON * RATE) + 1) / RATE)[None]
-    belief = Belief.of(smoother.model, [smoother.estimate(track).last])
-    watch.time(name, "prediction_time", lambda: propagator.rollout(belief, times))
 
 
 def _time_dataset(results: Results, dataset: Dataset, count: int) -> None:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from ballfg.benchmarks.diagnosis.ideal import Ideal
 from ballfg.benchmarks.diagnosis.record import Record as Case
-from ballfg.benchmarks.dynamics.record import Record as Contender
-from ballfg.benchmarks.speed.gate import SlowerError, check_ratios
+from ballfg.benchmarks.dynamics.contenders import Record as Contender
+from ballfg.benchmarks.speed.stopwatch import SlowerError, check_ratios
 from ballfg.diagnosis.design.reported import reported_pairs
 from ballfg.dynamics import load_model
 from ballfg.estimation.conformal import load_conformal

@@ -75,7 +75,15 @@ def design(
     print(*_lines(plan), sep="\n")
     inputs.print_notes(plan.remarks)
     if out is not None:
-        _write(plan, out)
+        columns: Mapping[str, ArrayLike] = {
+            "shot": list(range(1, len(plan.settings) + 1)),
+            **dict(zip(plan.setting_names, plan.settings.T, strict=True)),
+            **{f"sigma_{name}": column for name, column in zip(plan.names, plan.sigmas[1:].T, strict=True)},
+            "error": plan.error[1:],
+            "error_random": plan.random[1:],
+        }
+        with TableWriter(out) as table:
+            table.write(columns)
         print(f"{out}: {len(plan.settings)} shots")
 
 
@@ -124,17 +132,3 @@ def _lines(plan: ShotPlan) -> Iterator[str]:
         yield "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True))
     yield "below coefficients: standard deviations, all else unknown; error: their mean as a share of the fit's priors"
     yield f"{plan.as_random:.0f} random shots would bring as much as these {len(plan.settings)}"
-
-
-def _write(plan: ShotPlan, out: Path) -> None:
-    from ballfg.tracks import TableWriter
-
-    columns: Mapping[str, ArrayLike] = {
-        "shot": list(range(1, len(plan.settings) + 1)),
-        **dict(zip(plan.setting_names, plan.settings.T, strict=True)),
-        **{f"sigma_{name}": column for name, column in zip(plan.names, plan.sigmas[1:].T, strict=True)},
-        "error": plan.error[1:],
-        "error_random": plan.random[1:],
-    }
-    with TableWriter(out) as table:
-        table.write(columns)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from ballfg.dynamics import BallModel
-    from ballfg.estimation import Estimate, Status
+    from ballfg.estimation import Status
     from ballfg.estimation.estimator import Estimator
     from ballfg.tracks import Track
 
@@ -102,12 +102,15 @@ class _Estimated:
 
 def _estimated(model: BallModel, estimator: Estimator, track: Track) -> _Estimated:
     from ballfg.estimation.out_of_distribution import out_of_distribution
+    from ballfg.state import SIGMA_NAMES, STATE_NAMES
 
     columns, shares, notes, rows, hits = [], list[float](), list[str](), 0, 0
     status = None
     for part in estimator.in_sections(track):
         share = out_of_distribution(model, part.states)
-        columns.append(_columns(part) | ({} if share is None else {"outside": share}))
+        own: dict[str, str | np.ndarray] = {"trajectory": part.name, "t": part.times}
+        own |= dict(zip(STATE_NAMES, part.states.T, strict=True)) | dict(zip(SIGMA_NAMES, part.sigmas.T, strict=True))
+        columns.append(own if share is None else own | {"outside": share})
         shares += [] if share is None else [float(share.sum())]
         notes += part.notes
         rows, hits = rows + len(part.times), hits + len(part.hits)
@@ -115,12 +118,3 @@ def _estimated(model: BallModel, estimator: Estimator, track: Track) -> _Estimat
     outside = sum(shares) / rows if shares else None
     assert status is not None
     return _Estimated(part.name, columns, status, tuple(notes), outside, rows, hits)
-
-
-def _columns(result: Estimate) -> dict[str, str | np.ndarray]:
-    from ballfg.state import SIGMA_NAMES, STATE_NAMES
-
-    columns: dict[str, str | np.ndarray] = {"trajectory": result.name, "t": result.times}
-    columns |= dict(zip(STATE_NAMES, result.states.T, strict=True))
-    columns |= dict(zip(SIGMA_NAMES, result.sigmas.T, strict=True))
-    return columns

@@ -77,7 +77,10 @@ def predict(
         predictions = predict_tracks(estimator, opened.dataset, count, observe, jobs=workers)
         for plain in progress(predictions, count, "tracks predicted"):
             result = plain if scales is None else scales.scaled(plain)
-            table.write(_columns(result))
+            columns: dict[str, str | np.ndarray] = {"trajectory": result.name, "t": result.times}
+            columns |= dict(zip(("x", "y", "z"), result.positions.T, strict=True))
+            columns |= dict(zip(("sigma_x", "sigma_y", "sigma_z"), result.sigmas.T, strict=True))
+            table.write(columns if result.outside is None else columns | {"outside": result.outside})
             outcome.add(result, plain.sigmas)
     print(f"{out}: {outcome.rows} positions of {count} tracks, from the first {observe:g} s of each by {method}")
     outcome.print(observe)
@@ -177,10 +180,3 @@ class _Outcome:
             print(f"  RMSE against what was measured there: {rmse:.1f} mm over all stamps")
         if self.ended:
             print(f"  {self.ended} of the tracks end within {observe:g} s: nothing to predict")
-
-
-def _columns(result: TrackPrediction) -> dict[str, str | np.ndarray]:
-    columns: dict[str, str | np.ndarray] = {"trajectory": result.name, "t": result.times}
-    columns |= dict(zip(("x", "y", "z"), result.positions.T, strict=True))
-    columns |= dict(zip(("sigma_x", "sigma_y", "sigma_z"), result.sigmas.T, strict=True))
-    return columns if result.outside is None else columns | {"outside": result.outside}

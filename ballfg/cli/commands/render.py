@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -62,7 +63,10 @@ def render(
 
     know_effects(effects_file)
     check_scene_folder(out, force=force)
-    cameras = table_rig(_size(size), distance)
+    parts = re.fullmatch(r"\s*([+-]?\d+)\s*x\s*([+-]?\d+)\s*", size)
+    if parts is None:
+        raise ValueError(f"--size must read WIDTHxHEIGHT; got {size!r}. Write 1280x720.")
+    cameras = table_rig((int(parts[1]), int(parts[2])), distance)
     names = [camera.name for camera in cameras]
     look: dict[str, Any] = {"colour": colour, "noise": noise, "flicker": flicker, "distractors": distractors}
     config = SceneConfig(
@@ -107,12 +111,3 @@ def _clocks(
             raise ValueError(f"--offset must read CAMERA=SECONDS; got {text!r}. Write left=0.004.") from None
         clocks[name] = replace(clocks[name], offset=late)
     return clocks
-
-
-def _size(text: str) -> tuple[int, int]:
-    """Width and height from a text such as 1280x720."""
-    width, _, height = text.partition("x")
-    try:
-        return int(width), int(height)
-    except ValueError:
-        raise ValueError(f"--size must read WIDTHxHEIGHT; got {text!r}. Write 1280x720.") from None

@@ -48,7 +48,12 @@ def show(
     what, names = recognise(given, _dataset), track or []
     print_notes(what.dataset.notes if what.dataset is not None else ())
     if rerun is not None:
-        _write_recording(collect(what, names, limited=False), rerun)
+        from ballfg.pages.recording import record
+
+        all_shots = collect(what, names, limited=False)
+        with whole_file(rerun, "rerun") as temporary:
+            record(all_shots, temporary)
+        print(f"{rerun}: {len(all_shots.shots)} shots")
     if out is None and png is None:
         return
     shown = collect(what, names)
@@ -98,11 +103,3 @@ def _write_picture(shown: Shown, png: Path) -> None:
     with whole_file(png, "png") as temporary:
         views(shown.shots[0], shown.table).savefig(temporary, dpi=200)
     print(f"{png}: shot {shown.shots[0].name}")
-
-
-def _write_recording(shown: Shown, rerun: Path) -> None:
-    from ballfg.pages.recording import record
-
-    with whole_file(rerun, "rerun") as temporary:
-        record(shown, temporary)
-    print(f"{rerun}: {len(shown.shots)} shots")

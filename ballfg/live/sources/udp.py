@@ -100,21 +100,17 @@ class UdpServer(Listener):
         if len(self._senders) >= SENDERS:
             now = perf_counter()
             silent = [s for s in self._senders.values() if not s.busy and now - s.heard > SILENT]
-            if not silent:
-                self._refuse(address)
+            if not silent:  # told once for each notice
+                if self.say("refused", f"{SENDERS} senders are heard: the packets of {written(address)} are refused"):
+                    self._refused.clear()
+                if address not in self._refused and len(self._refused) < SENDERS:
+                    self._refused.add(address)
+                    self._tell(address, f"{SENDERS} senders are heard; no more are. Come back when one has gone.")
                 return None
             oldest = min(silent, key=lambda sender: sender.heard)
             _close(self._senders.pop(oldest.address).socket)
         sender = self._senders[address] = Correspondent(address, self._own_socket(address))
         return sender
-
-    def _refuse(self, address: Any) -> None:
-        """Tells a sender that there are too many, once for each notice."""
-        if self.say("refused", f"{SENDERS} senders are heard: the packets of {written(address)} are refused"):
-            self._refused.clear()
-        if address not in self._refused and len(self._refused) < SENDERS:
-            self._refused.add(address)
-            self._tell(address, f"{SENDERS} senders are heard; no more are. Come back when one has gone.")
 
     def _own_socket(self, address: Any) -> socket.socket | None:
         own = socket.socket(self._socket.family, self.kind)

@@ -66,7 +66,6 @@ def run_peers(results: Results, peers: Mapping[str, Path], size: flight.Size) ->
     Args:
         peers: interpreters of other environments, by library.
         size: how well the network is fitted, and whether this is a quick look.
-    Raises: ValueError: if an interpreter is of no library that is compared, or not there.
     """
     for library, python in peers.items():
         if library not in PEERS:
@@ -96,8 +95,8 @@ def _problem(network: NetworkFlight | None) -> Problem:
     if network is not None:
         pairs = zip(network.weights, network.biases, strict=True)
         layers = [part.detach().numpy() for pair in pairs for part in pair]
-    sizes = map(np.asarray, (1.0 / flight.RATE, flight.NOISE, flight.LABEL_NOISE))
-    laws = map(np.asarray, ((0.0, 0.0, -STANDARD_GRAVITY), flight.DRAG, flight.MAGNUS))
+    sizes = [np.asarray(size) for size in (1.0 / flight.RATE, flight.NOISE, flight.LABEL_NOISE)]
+    laws = [np.array((0.0, 0.0, -STANDARD_GRAVITY)), np.asarray(flight.DRAG), np.asarray(flight.MAGNUS)]
     rest = (*sizes, STEP_SIGMA, *laws, *layers, np.array(flight.START))
     return Problem(np.stack([track.positions, *others]), label, *rest)
 

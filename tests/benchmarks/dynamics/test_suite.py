@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ballfg.benchmarks.dynamics.contenders import Job, fan_of, nominal_contender, truth_contender
+from ballfg.benchmarks.dynamics.contenders import Job, Record, fan_of, nominal_contender, task_digest, truth_contender
 from ballfg.benchmarks.dynamics.jobs import METHODS, collect_records
 from ballfg.benchmarks.dynamics.measured import measured_shot
-from ballfg.benchmarks.dynamics.record import Record, task_digest
 from ballfg.benchmarks.dynamics.suite import Plan, _installed, add_rows, run_dynamics
 from ballfg.benchmarks.dynamics.truth import synthetic_task
 from ballfg.benchmarks.results import Results

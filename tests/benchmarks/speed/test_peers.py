@@ -9,10 +9,10 @@ import pytest
 
 from ballfg.benchmarks.cli import run
 from ballfg.benchmarks.results import Results
-from ballfg.benchmarks.speed.gate import SlowerError, check_ratios
 from ballfg.benchmarks.speed.peers import suite
 from ballfg.benchmarks.speed.peers.problem import Problem
 from ballfg.benchmarks.speed.peers.session import LibraryError, Session
+from ballfg.benchmarks.speed.stopwatch import SlowerError, check_ratios
 
 
 @pytest.fixture(scope="module")
