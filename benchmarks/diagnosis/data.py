@@ -12,7 +12,7 @@ from ballfg.diagnosis.hypotheses.hypothesis import has_effect, with_effects, wit
 from ballfg.dynamics import AnalyticModel, nominal_model
 from ballfg.estimation.noise.estimate import spread_over
 from ballfg.simulation import MeasurementNoise, SimulationConfig, parse_effects, simulate, table_tennis
-from ballfg.simulation.composition import true_model
+from ballfg.simulation.motion import true_model
 from ballfg.simulation.synthetic import dataset_info
 from ballfg.tracks import Dataset, read_dataset, write_dataset
 from ballfg.tracks.memory import dataset_in_memory

@@ -34,7 +34,7 @@ def contact_time(
 ) -> Tensor:
     """Time until the falling ball touches a surface, on the branch on which it moves down.
 
-    Args: model: the ball.  state: (..., 9).  height: m, scalar or (...).  longest: s, scalar or (...), how far to look.
+    Args: state: (..., 9).  height: m, scalar or (...).  longest: s, scalar or (...), how far to look.
     Returns: (...) s; negative when the ball is already below the surface on its way down. NaN where the ball,
         in free flight, does not come down to that height within `longest`. Differentiable in the state and the
         parameters.
@@ -43,7 +43,9 @@ def contact_time(
         tau = _found(model, state, height, longest)
     if torch.is_grad_enabled():
         for _ in range(2):
-            tau = tau + _newton_step(model, state, height, tau)
+            at = fly(model, state, torch.nan_to_num(tau))
+            speed = model.gap_rate(at).clamp_max(-MIN_SPEED)
+            tau = tau + (-model.gap(at, height) / speed + 0.0 * tau)  # keeps NaN
     return tau
 
 
@@ -115,12 +117,6 @@ def _scan(model: BallModel, state: Tensor, height: Tensor | float, wanted: Tenso
     return found
 
 
-def _newton_step(model: BallModel, state: Tensor, height: Tensor | float, tau: Tensor) -> Tensor:
-    at = fly(model, state, torch.nan_to_num(tau))
-    speed = model.gap_rate(at).clamp_max(-MIN_SPEED)
-    return -model.gap(at, height) / speed + 0.0 * tau  # keeps NaN
-
-
 def fly_through(
     model: BallModel, state: Tensor, dt: Tensor, heights: tuple[Tensor | float, ...]
 ) -> tuple[Tensor, Tensor]:
@@ -130,9 +126,7 @@ def fly_through(
     interval is a smooth continuation, so that an estimator can move through it. Whether it lies inside is for the
     caller to see in the returned times.
 
-    Args:
-        model: the ball.  state: (n, 9).  dt: (n,) s.
-        heights: for each contact, in order, the surface's height in m, scalar or (n,).
+    Args: state: (n, 9).  dt: (n,) s.  heights: for each contact, in order, the surface's height in m, scalar or (n,).
     Returns: state after dt (n, 9), contact times since the start (n, len(heights)) s. NaN in rows in which a contact
         never comes; they have no part in any gradient.
     """

@@ -59,26 +59,16 @@ class LearnedModel(BallModel):
             )
         if base is not None and base.radius != radius:
             raise ValueError(f"base must be a ball of the same radius; got {base.radius:g} m and {radius:g} m.")
-        raw = architecture.kind == "mlp"
-        kind: NetworkKind = "mlp" if raw else architecture.kind.removesuffix("+gs")  # type: ignore[assignment]
-        generator = torch.Generator().manual_seed(seed)
+        kind: NetworkKind = architecture.kind.removesuffix("+gs")  # type: ignore[assignment]
+        flight, contact = (
+            (RawFlight, RawContact) if architecture.kind == "mlp" else (GramSchmidtFlight, GramSchmidtContact)
+        )
+        generator, wide, depth = torch.Generator().manual_seed(seed), architecture.width_flight, architecture.depth
+        turns, falls, first = architecture.spin_rate, base is None, START_RESTITUTION if base is None else 1.0
         self.architecture = architecture
-        self.flight = (RawFlight if raw else GramSchmidtFlight)(
-            kind,
-            architecture.width_flight,
-            architecture.depth,
-            spin_rate=architecture.spin_rate,
-            falls=base is None,
-            generator=generator,
-        )
-        self.contact = (RawContact if raw else GramSchmidtContact)(
-            kind,
-            architecture.width_contact,
-            architecture.depth,
-            radius=radius,
-            first=START_RESTITUTION if base is None else 1.0,
-            generator=generator,
-        )
+        self.flight = flight(kind, wide, depth, spin_rate=turns, falls=falls, generator=generator)
+        wide = architecture.width_contact
+        self.contact = contact(kind, wide, depth, radius=radius, first=first, generator=generator)
         self.base = base
         self.fading: Fading | None = None
         if base is None:
