@@ -1,5 +1,6 @@
 """The learned model computes flight and bounce by networks, alone or as a correction of another model."""
 
+from functools import partial
 from typing import Final
 
 import torch
@@ -10,7 +11,7 @@ from ballfg.dynamics.effects.bounce import TableHeight
 from ballfg.dynamics.model import THIN_SHELL, BallModel, Rates
 from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.dynamics.networks.fading import DOUBT, DOUBTS, Fading
-from ballfg.dynamics.networks.layers import NetworkKind
+from ballfg.dynamics.networks.layers import NETWORKS, NetworkKind
 from ballfg.dynamics.networks.learned_parts import (
     START_RESTITUTION,
     GramSchmidtContact,
@@ -60,15 +61,13 @@ class LearnedModel(BallModel):
         if base is not None and base.radius != radius:
             raise ValueError(f"base must be a ball of the same radius; got {base.radius:g} m and {radius:g} m.")
         kind: NetworkKind = architecture.kind.removesuffix("+gs")  # type: ignore[assignment]
-        flight, contact = (
-            (RawFlight, RawContact) if architecture.kind == "mlp" else (GramSchmidtFlight, GramSchmidtContact)
-        )
-        generator, wide, depth = torch.Generator().manual_seed(seed), architecture.width_flight, architecture.depth
-        turns, falls, first = architecture.spin_rate, base is None, START_RESTITUTION if base is None else 1.0
+        raw, first = architecture.kind == "mlp", START_RESTITUTION if base is None else 1.0
+        make = partial(NETWORKS[kind], depth=architecture.depth, generator=torch.Generator().manual_seed(seed))
         self.architecture = architecture
-        self.flight = flight(kind, wide, depth, spin_rate=turns, falls=falls, generator=generator)
-        wide = architecture.width_contact
-        self.contact = contact(kind, wide, depth, radius=radius, first=first, generator=generator)
+        flying, bouncing = (partial(make, width=w) for w in (architecture.width_flight, architecture.width_contact))
+        flight = RawFlight if raw else GramSchmidtFlight
+        self.flight = flight(flying, spin_rate=architecture.spin_rate, falls=base is None)
+        self.contact = (RawContact if raw else GramSchmidtContact)(bouncing, radius=radius, first=first)
         self.base = base
         self.fading: Fading | None = None
         if base is None:
