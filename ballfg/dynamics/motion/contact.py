@@ -43,9 +43,7 @@ def contact_time(
         tau = _found(model, state, height, longest)
     if torch.is_grad_enabled():
         for _ in range(2):
-            at = fly(model, state, torch.nan_to_num(tau))
-            speed = model.gap_rate(at).clamp_max(-MIN_SPEED)
-            tau = tau + (-model.gap(at, height) / speed + 0.0 * tau)  # keeps NaN
+            tau = tau + _newton_step(model, state, height, tau)
     return tau
 
 
@@ -115,6 +113,12 @@ def _scan(model: BallModel, state: Tensor, height: Tensor | float, wanted: Tenso
         state = torch.where(open_.unsqueeze(-1), after, state)
         h = model.gap(state, height)
     return found
+
+
+def _newton_step(model: BallModel, state: Tensor, height: Tensor | float, tau: Tensor) -> Tensor:
+    at = fly(model, state, torch.nan_to_num(tau))
+    speed = model.gap_rate(at).clamp_max(-MIN_SPEED)
+    return -model.gap(at, height) / speed + 0.0 * tau  # keeps NaN
 
 
 def fly_through(
