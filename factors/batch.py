@@ -216,7 +216,10 @@ class FactorBatch(ABC):
 
 
 class DiagonalFactors(FactorBatch):
-    """Factors whose numbers have independent noise; `information_root` (m, dim) holds one over standard deviations."""
+    """Factors whose numbers have independent noise.
+
+    Attributes: information_root: (m, dim) one over the standard deviations, one over the numbers' own units.
+    """
 
     information_root: Array
 
