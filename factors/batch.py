@@ -220,6 +220,27 @@ class FactorBatch(ABC):
         return Rows(self.variables, residual, jacobians, self.loss)
 
 
+class DiagonalFactors(FactorBatch):
+    """Factors whose numbers have independent noise.
+
+    Attributes: information_root: (m, dim) one over the standard deviations, one over the numbers' own units.
+    """
+
+    information_root: Array
+
+    def log_spread(self) -> float:
+        """Sum of the logarithms of all standard deviations."""
+        return -float(np.log(self.information_root).sum())
+
+
+def check_measured(count: int, measured: Array, sigma: Array) -> None:
+    """Refuses measured positions or standard deviations, (m, 3) m each, of a wrong shape or without use."""
+    if measured.shape != (count, 3) or sigma.shape != (count, 3):
+        raise ValueError(f"measured and sigma must have shape ({count}, 3); got {measured.shape} and {sigma.shape}")
+    if not (np.isfinite(measured).all() and (sigma > 0).all()):
+        raise ValueError("measured must be finite and sigma positive; remove the samples that are not")
+
+
 B = TypeVar("B", bound=FactorBatch)
 
 

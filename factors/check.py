@@ -41,7 +41,7 @@ class BlockError:
 def jacobian_errors(batch: FactorBatch, values: Values, step: float = STEP) -> list[BlockError]:
     """One entry per row and block: `compute`'s Jacobians against five-point central differences of its residuals.
 
-    Args: batch: any.  values: a point, preferably with nonzero residuals.  step: see `STEP`.
+    Args: values: a point, preferably with nonzero residuals.  step: see `STEP`.
     """
     inputs = tuple(np.array(values.gather(column)) for column in batch.variables.T)
     _, jacobians = batch.compute(slice(None), inputs)
@@ -52,18 +52,9 @@ def jacobian_errors(batch: FactorBatch, values: Values, step: float = STEP) -> l
         off = np.abs(given - difference) / scale[:, None, None]
         off = np.where(np.isfinite(off), off, np.inf)
         for row in range(len(batch)):
-            i, j = np.unravel_index(int(off[row].argmax()), off[row].shape)
-            errors.append(
-                BlockError(
-                    row,
-                    column,
-                    int(batch.variables[row, column]),
-                    (int(i), int(j)),
-                    float(given[row, i, j]),
-                    float(difference[row, i, j]),
-                    float(off[row, i, j]),
-                )
-            )
+            i, j = map(int, np.unravel_index(int(off[row].argmax()), off[row].shape))
+            found = (float(array[row, i, j]) for array in (given, difference, off))
+            errors.append(BlockError(row, column, int(batch.variables[row, column]), (i, j), *found))
     return errors
 
 

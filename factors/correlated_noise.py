@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ballfg.arrays import Array, Index
-from ballfg.factors.batch import FactorBatch, Noise
+from ballfg.factors.batch import DiagonalFactors, FactorBatch, Noise, check_measured
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import whitening_tensor
 from ballfg.state import POSITION, STATE_DIM
@@ -57,12 +57,7 @@ class BiasedPositionFactors(FactorBatch):
         biased: bool = True,
     ) -> None:
         super().__init__(np.asarray(states)[:, None], 3, loss)
-        if measured.shape != (len(self), 3) or sigma.shape != (len(self), 3):
-            raise ValueError(
-                f"measured and sigma must have shape ({len(self)}, 3); got {measured.shape} and {sigma.shape}"
-            )
-        if not (np.isfinite(measured).all() and (sigma > 0).all()):
-            raise ValueError("measured must be finite and sigma positive; remove the samples that are not")
+        check_measured(len(self), measured, sigma)
         self.measured, self.sigma = measured, sigma
         self.stamps = np.zeros((len(self), 3, 3)) if stamps is None else stamps
         covariance = sigma[:, :, None] ** 2 * np.eye(3) + self.stamps
@@ -106,7 +101,7 @@ class BiasedPositionFactors(FactorBatch):
         return -float(np.log(np.diagonal(self.information_root, axis1=1, axis2=2)).sum())
 
 
-class BiasFactors(FactorBatch):
+class BiasFactors(DiagonalFactors):
     """r = (b_{i+1} - a_i b_i) / (s sqrt(1 - a_i^2)), a_i = exp(-dt_i / memory time): the bias decays and is renewed.
 
     Args:
@@ -142,12 +137,8 @@ class BiasFactors(FactorBatch):
         before, after = (state[:, _BIAS] for state in inputs)
         return torch.from_numpy(self.information_root) * (after - torch.from_numpy(self.decay)[:, None] * before)
 
-    def log_spread(self) -> float:
-        """Sum of the logarithms of all standard deviations."""
-        return -float(np.log(self.information_root).sum())
 
-
-class BiasStartFactors(FactorBatch):
+class BiasStartFactors(DiagonalFactors):
     """r = b_i / s: the prior of the first bias, about zero.
 
     Args: states: (m,) indices of states without an earlier bias.  sigma: (3,) m, standard deviation s per axis.
@@ -171,7 +162,3 @@ class BiasStartFactors(FactorBatch):
     def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
         """(m, 3) whitened residuals in torch."""
         return torch.from_numpy(self.information_root.copy()) * inputs[0][:, _BIAS]
-
-    def log_spread(self) -> float:
-        """Sum of the logarithms of all standard deviations."""
-        return -float(np.log(self.information_root).sum())

@@ -7,7 +7,6 @@ a surface. A hit is a flight whose process noise contains the hit.
 import copy
 from abc import abstractmethod
 from collections.abc import Hashable
-from functools import partial
 from typing import ClassVar, Self
 
 import numpy as np
@@ -30,11 +29,6 @@ from ballfg.state import STATE_DIM
 def model_width(model: BallModel) -> int:
     """Number of a model's coefficients that travel with the state: those of an `AugmentedModel`."""
     return model.width if isinstance(model, AugmentedModel) else 0
-
-
-def _identity(model: BallModel) -> tuple[Hashable, ...]:
-    """The identity of a model: the `AugmentedModel`s of all tracks share that of their base."""
-    return (id(model.model), model.names) if isinstance(model, AugmentedModel) else (id(model), ())
 
 
 class DynamicsFactors(FactorBatch):
@@ -88,8 +82,10 @@ class DynamicsFactors(FactorBatch):
 
     @property
     def group(self) -> Hashable:
-        """Further entries of the group: the model, and the numbers of contacts and kicks in an interval."""
-        return (*super().group, *_identity(self.model), self.kick_times.shape[1])  # type: ignore[misc]
+        """Further entries: the model (one for all `AugmentedModel`s of a base), the number of contacts."""
+        model = self.model
+        own = (id(model.model), model.names) if isinstance(model, AugmentedModel) else (id(model), ())
+        return (*super().group, *own, self.kick_times.shape[1])  # type: ignore[misc]
 
     def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
         """(m, 9) whitened residuals in torch."""
@@ -169,13 +165,7 @@ class SurfaceFactors(DynamicsFactors):
     row_arrays: ClassVar[tuple[str, ...]] = (*DynamicsFactors.row_arrays, "heights")
 
     def __init__(
-        self,
-        model: BallModel,
-        states: Index,
-        dt: Array,
-        covariance: Array,
-        heights: Array,
-        kicks: Kicks | None = None,
+        self, model: BallModel, states: Index, dt: Array, covariance: Array, heights: Array, kicks: Kicks | None = None
     ) -> None:
         super().__init__(model, states, dt, covariance, kicks)
         self.heights = heights
@@ -219,12 +209,8 @@ class RestFactors(SurfaceFactors):
     def propagate(self, state: Tensor, rows: Index | slice) -> tuple[Tensor, Tensor]:
         """Rolling over dt; the surface holds the ball's height and stops its vertical motion."""
         dt, height = self._tensor(self.dt[rows]), self._tensor(self.heights[rows])
-        return batch_jacobian(partial(_rolled, self.model, dt, height), state)
+        return batch_jacobian(lambda at: roll(self.model, at, dt, height), state)
 
     def transition(self, state: Tensor) -> Tensor:
         """Rolling over dt."""
-        return _rolled(self.model, torch.from_numpy(self.dt), torch.from_numpy(self.heights), state)
-
-
-def _rolled(model: BallModel, dt: Tensor, height: Tensor, state: Tensor) -> Tensor:
-    return roll(model, state, dt, height)
+        return roll(self.model, state, torch.from_numpy(self.dt), torch.from_numpy(self.heights))

@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 
 from ballfg.arrays import Array, Index
-from ballfg.factors.batch import FactorBatch, Noise
+from ballfg.factors.batch import DiagonalFactors, Noise, check_measured
 from ballfg.factors.loss import Loss
 from ballfg.state import POSITION, STATE_DIM
 
 
-class PositionFactors(FactorBatch):
+class PositionFactors(DiagonalFactors):
     """r = (p_i - z_i) / sigma_i.
 
     Args:
@@ -28,12 +28,7 @@ class PositionFactors(FactorBatch):
 
     def __init__(self, states: Index, measured: Array, sigma: Array, loss: Loss | None = None) -> None:
         super().__init__(np.asarray(states)[:, None], 3, loss)
-        if measured.shape != (len(self), 3) or sigma.shape != (len(self), 3):
-            raise ValueError(
-                f"measured and sigma must have shape ({len(self)}, 3); got {measured.shape} and {sigma.shape}"
-            )
-        if not (np.isfinite(measured).all() and (sigma > 0).all()):
-            raise ValueError("measured must be finite and sigma positive; remove the samples that are not")
+        check_measured(len(self), measured, sigma)
         self.measured = measured
         self.information_root = 1.0 / sigma
         self._jacobian = np.zeros((len(self), 3, STATE_DIM))
@@ -51,7 +46,3 @@ class PositionFactors(FactorBatch):
     def noise_scale(self, noise: Noise) -> Tensor | None:
         """One factor for all axes of all samples."""
         return None if noise.position is None else 1.0 / noise.position
-
-    def log_spread(self) -> float:
-        """Sum of the logarithms of all standard deviations."""
-        return -float(np.log(self.information_root).sum())

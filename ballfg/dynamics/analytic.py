@@ -44,13 +44,8 @@ class AnalyticModel(BallModel):
 
     def declared_coefficients(self) -> dict[str, Coefficient]:
         """The coefficients of all effects, for instance under `flight.drag.k`."""
-        groups = {"flight": self.flight, "bounce": self.bounce, "measurement": self.measurement}
-        return {
-            f"{section}.{name}.{c.name}": c
-            for section, group in groups.items()
-            for name, effect in group.items()
-            for c in cast(Effect, effect).coefficients
-        }
+        effects = [cast(Effect, e) for group in (self.flight, self.bounce, self.measurement) for e in group.values()]
+        return {f"{effect.kind}.{effect.name}.{c.name}": c for effect in effects for c in effect.coefficients}
 
     def rates(self, state: Tensor) -> Rates:
         """Acceleration (..., 3) m/s^2 and angular acceleration (..., 3) rad/s^2, or None, in free flight."""

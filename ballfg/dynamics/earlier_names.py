@@ -19,10 +19,7 @@ def todays_name(name: str, known: Container[str] = ()) -> str:
 
 
 def todays_names(names: Iterable[str], known: Container[str] = ()) -> tuple[str, ...]:
-    """Today's names of parameters, with a `DeprecationWarning` for each earlier name.
-
-    Args: names, known: as for `todays_name`.
-    """
+    """Today's names of parameters, with a `DeprecationWarning` for each earlier name."""
     pairs = [(name, todays_name(name, known)) for name in names]
     for earlier, name in pairs:
         if earlier != name:

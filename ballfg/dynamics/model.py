@@ -210,7 +210,6 @@ def substitute(module: M, values: Mapping[str, Tensor]) -> M:
     """A copy of a module with some parameters or buffers replaced by tensors; everything else is shared.
 
     Args:
-        module: for instance a `BallModel`.
         values: tensors by parameter name as in `named_parameters()`. A tensor of shape (n, 1) in place of a scalar
             gives each of n states in a batch (n, 9) its own value.
     Raises: KeyError: if the module has no parameter of that name.

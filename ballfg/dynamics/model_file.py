@@ -60,7 +60,8 @@ def load_model(
     learned = content.get("learned") if isinstance(content, Mapping) else None
     if learned is None:
         return model_from_dict(content, radius=radius, inertia_factor=inertia_factor, where=str(path))
-    if not isinstance(learned, str) or not 0 < len(learned) <= LONGEST_NAME or not _is_plain(learned):
+    beside = isinstance(learned, str) and learned not in (".", "..") and Path(learned).name == learned
+    if not beside or not 0 < len(learned) <= LONGEST_NAME:
         raise ValueError(
             f"{path}: section 'learned' must be null or the name of a folder beside the file; got {shown(learned)}. "
             "Copy the folder there."
@@ -76,11 +77,6 @@ def load_model(
     if abroad and isinstance(model, LearnedModel) and model.fading is not None:
         model.fading.strength = float(model.fading.get_buffer("abroad"))
     return model
-
-
-def _is_plain(name: str) -> bool:
-    """True if a name does not lead to another folder."""
-    return name not in (".", "..") and Path(name).name == name
 
 
 def model_from_dict(

@@ -81,11 +81,7 @@ class SpinPopulation:
         return mean, np.diag(share @ sigmas**2) + (share * away.T) @ away
 
     def check(self, group: str) -> None:
-        """Refuses an unknown group.
-
-        Args: group: its name.
-        Raises: ValueError: if there is no such group.
-        """
+        """Refuses an unknown group. Raises: ValueError: if there is no such group."""
         if group not in self.groups:
             raise ValueError(
                 f"group must be one of the model's, {listed(self.groups)}; got {shown(group)}. Leave it out for the "
@@ -94,10 +90,7 @@ class SpinPopulation:
 
     @classmethod
     def from_mapping(cls, content: Any) -> SpinPopulation:
-        """The population in a model file.
-
-        Raises: ValueError: an entry is missing, unknown, or of another kind.
-        """
+        """The population in a model file. Raises: ValueError: an entry is missing, unknown, or of another kind."""
         if not isinstance(content, Mapping) or set(content) != set(_FIELDS):
             raise ValueError(f"must be a mapping with 'by' and 'groups'; got {shown(content)}")
         by, groups = (content[name] for name in _FIELDS)

@@ -64,7 +64,10 @@ class Belief:
         bounded = AugmentedModel(model, names) if names else model
         parameters = dict(model.named_parameters())
         prior_mean = np.array([float(parameters[name].detach()) for name in names])
-        low, high = _bounds(model, names)
+        known = model.declared_coefficients()
+        declared = [known.get(name) for name in names]
+        low = np.array([-np.inf if c is None else c.low for c in declared])
+        high = np.array([np.inf if c is None else c.high for c in declared])
         joints = [_joint(state, names, prior_mean, np.array(list(prior.values()))) for state in states]
         mean = np.stack([_held(m, covariance, low, high) for m, covariance in joints])
         return cls(
@@ -125,11 +128,3 @@ def _held(mean: Array, covariance: Array, low: Array, high: Array) -> Array:
     held = mean + covariance[:, out] @ np.linalg.solve(covariance[np.ix_(out, out)], change[out - STATE_DIM])
     held[STATE_DIM:] = np.clip(held[STATE_DIM:], low, high)  # others may have been pulled along
     return np.asarray(held)
-
-
-def _bounds(model: BallModel, names: tuple[str, ...]) -> tuple[Array, Array]:
-    """(p,) smallest and (p,) largest values of coefficients, by a model's effects; infinite without a declaration."""
-    declared = model.declared_coefficients()
-    low = [declared[name].low if name in declared else -np.inf for name in names]
-    high = [declared[name].high if name in declared else np.inf for name in names]
-    return np.array(low), np.array(high)

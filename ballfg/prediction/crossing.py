@@ -7,6 +7,7 @@ g = 0: a ball that is late is further back but crosses at the same place (docs/d
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -24,11 +25,13 @@ from ballfg.dynamics.motion.limits import MAX_STEP
 from ballfg.dynamics.motion.rollout import advance, is_resting
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.prediction.belief import Belief
-from ballfg.prediction.propagate import Propagator
+from ballfg.prediction.propagate import Found, Propagator
 from ballfg.state import POSITION, STATE_DIM, VZ
 
 EventFunction = Callable[[Tensor], Tensor]
 """(..., d) states to (..., 1) values; the event is where the value falls through zero."""
+SearchStep = Callable[[Belief, float, float], tuple["Crossing | None", Belief]]
+"""From a belief, the end of a search and the time (s) from which events count to an event and the belief then."""
 
 VALUE_JUMP = 1e-6
 """Largest value, in the event's own unit, of a crossing; a larger one jumped through zero in a bounce."""
@@ -84,18 +87,7 @@ def next_contact(
     Returns: None if there is none within the horizon. A ball that rests or rolls has none until it falls.
     Raises: ValueError: as `next_crossing`.
     """
-    end, earliest = _span(belief, horizon, after)
-    start, belief = float(belief.time), belief.from_zero()
-    while (left := end - float(belief.time)) > 0.0:
-        found = propagator.search(belief, left, earliest - float(belief.time))
-        if found.end == FOUND:
-            return _projected(found.belief, found.gradient, found.rate).later(start)
-        if found.end == NONE:
-            return None
-        crossing, belief = _contact_step(propagator, found.belief, end, earliest)
-        if crossing is not None:
-            return crossing.later(start)
-    return None
+    return _first(belief, horizon, after, partial(_contact_step, propagator), propagator.search)
 
 
 def plane_crossing(
@@ -141,18 +133,8 @@ def _line_crossing(
     def event(state: Tensor) -> Tensor:
         return (state[..., :STATE_DIM] * normal).sum(-1, keepdim=True) - offset
 
-    end, earliest = _span(belief, horizon, after)
-    start, belief = float(belief.time), belief.from_zero()
-    while (left := end - float(belief.time)) > 0.0:
-        found = propagator.search(belief, left, earliest - float(belief.time), line, either_way=either_way)
-        if found.end == FOUND:
-            return _projected(found.belief, found.gradient, found.rate).later(start)
-        if found.end == NONE:
-            return None
-        crossing, belief = _crossing_step(propagator, found.belief, event, end, earliest, either_way)
-        if crossing is not None:
-            return crossing.later(start)
-    return None
+    step = partial(_crossing_step, propagator, event, either_way)
+    return _first(belief, horizon, after, step, partial(propagator.search, line=line, either_way=either_way))
 
 
 def next_crossing(
@@ -175,10 +157,27 @@ def next_crossing(
     Returns: None if there is no crossing within the horizon.
     Raises: ValueError: if the belief does not hold exactly one ball, or the horizon is not a positive number of s.
     """
-    end, earliest = _span(belief, horizon, after)
-    start, belief = float(belief.time), belief.from_zero()
-    while end - float(belief.time) > 0.0:
-        crossing, belief = _crossing_step(propagator, belief, event, end, earliest, either_way)
+    return _first(belief, horizon, after, partial(_crossing_step, propagator, event, either_way))
+
+
+def _first(
+    belief: Belief, horizon: float, after: float, step: SearchStep, search: Callable[..., Found] | None = None
+) -> Crossing | None:
+    """The first event: found by machine code, `search`, where there is any; by a `step` in torch where that ends."""
+    if len(belief) != 1:
+        raise ValueError(f"belief must hold one ball; got {len(belief)}. Take them one by one.")
+    end, start = check_number("horizon", horizon, "s", above=0.0), float(belief.time)
+    earliest = max(after - start, 0.0) + JUST_NOW + float(np.spacing(abs(start)))  # as `after` was rounded
+    belief = belief.from_zero()
+    while (left := end - float(belief.time)) > 0.0:
+        if search is not None:
+            found = search(belief, left, earliest - float(belief.time))
+            if found.end == FOUND:
+                return _projected(found.belief, found.gradient, found.rate).later(start)
+            if found.end == NONE:
+                return None
+            belief = found.belief
+        crossing, belief = step(belief, end, earliest)
         if crossing is not None:
             return crossing.later(start)
     return None
@@ -201,7 +200,7 @@ def _contact_step(
 
 
 def _crossing_step(
-    propagator: Propagator, belief: Belief, event: EventFunction, end: float, earliest: float, either_way: bool
+    propagator: Propagator, event: EventFunction, either_way: bool, belief: Belief, end: float, earliest: float
 ) -> tuple[Crossing | None, Belief]:
     """A crossing within one step, and the belief after the step."""
     h = torch.tensor([min(end - float(belief.time), MAX_STEP - JUST_NOW)], dtype=torch.float64)
@@ -210,15 +209,6 @@ def _crossing_step(
             there = propagator.forward(belief, torch.tensor([tau], dtype=torch.float64))
             return _at_event(there, event, _rates(propagator, there)), there
     return None, propagator.forward(belief, h)
-
-
-def _span(belief: Belief, horizon: float, after: float) -> tuple[float, float]:
-    """End of a search, and the time after which events count, s since the belief's; checks the arguments."""
-    if len(belief) != 1:
-        raise ValueError(f"belief must hold one ball; got {len(belief)}. Take them one by one.")
-    horizon = check_number("horizon", horizon, "s", above=0.0)
-    start = float(belief.time)
-    return horizon, max(after - start, 0.0) + JUST_NOW + float(np.spacing(abs(start)))  # as `after` was rounded
 
 
 def _contact_within(model: BallModel, mean: Tensor, h: Tensor, surfaces: Surfaces) -> tuple[Tensor, float] | None:

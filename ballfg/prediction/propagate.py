@@ -19,16 +19,18 @@ from torch import Tensor
 
 from ballfg.arrays import Array
 from ballfg.dynamics.compiled.beliefs.course import BOUNCES, Carrier, Course, density_of
+from ballfg.dynamics.compiled.beliefs.edges import share_over_table
+from ballfg.dynamics.compiled.motion import world_of
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.advance_jacobian import advance_jacobian
-from ballfg.dynamics.motion.integrate import fly_jacobian
-from ballfg.dynamics.motion.limits import steps_over_each
-from ballfg.dynamics.motion.rollout import LONGEST_MOTION
+from ballfg.dynamics.motion.contact import contact_time
+from ballfg.dynamics.motion.integrate import fly, fly_jacobian
+from ballfg.dynamics.motion.limits import LONGEST_MOTION, NEGLIGIBLE, steps_over_each
+from ballfg.dynamics.motion.rollout import advance
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction.belief import Belief
-from ballfg.prediction.edges import edge_doubt
-from ballfg.state import POSITION, STATE_DIM
+from ballfg.state import POSITION, STATE_DIM, VZ
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -183,7 +185,9 @@ class Propagator:
                 course = flown.at(slice(-1, None))
                 asked = (done < ends) & (ends <= done + len(flown))
                 if bool((staying[:, last] > 0).any()) and done + len(flown) == steps.shape[1]:
-                    course = self._stay(course, staying[:, last].numpy())
+                    covariance = course.covariance[-1].copy()
+                    covariance[:, :STATE_DIM, :STATE_DIM] += self.noise.flight(staying[:, last].numpy())
+                    course = Course.start(course.mean[-1], covariance)
                     flown = Course.joined([flown.at(slice(-1)), course])
                 if asked.any():
                     columns = first + asked.nonzero()[0]
@@ -191,21 +195,13 @@ class Propagator:
                 done += len(flown)
             first = last + 1
 
-    def _stay(self, course: Course, dt: Array) -> Course:
-        """The last belief of a course after dt (n,) s without motion."""
-        covariance = course.covariance[-1].copy()
-        covariance[:, :STATE_DIM, :STATE_DIM] += self.noise.flight(dt)
-        return Course.start(course.mean[-1], covariance)
-
     def _steps(self, carrier: Carrier, model: BallModel, start: Course, h: Array) -> Course:
         """The beliefs after one or more of some steps h (n, k) s of at most `MAX_STEP`."""
         course, hard = carrier.carry(start, h)
         rows, k = hard.nonzero()[0], len(course) - 1
         for r in rows:
-            one = slice(r, r + 1)
-            mean, covariance = (
-                torch.from_numpy(array[k - 1, one].copy()) for array in (course.mean, course.covariance)
-            )
+            before = (array[k - 1, r : r + 1].copy() for array in (course.mean, course.covariance))
+            mean, covariance = map(torch.from_numpy, before)
             touched, height = self._touch(model, mean, covariance, float(h[r, k - 1]))
             course.mean[k, r], course.covariance[k, r] = touched
             if hard[r] == BOUNCES:
@@ -223,7 +219,7 @@ class Propagator:
         if motion.contacts:
             times = mean.new_tensor([[time for time, _ in motion.contacts]])
             noise = self._bounce_noise(model, mean, dt, times, motion.jacobian[None])
-        noise = noise + edge_doubt(model, mean, covariance, dt, self.surfaces)
+        noise = noise + _edge_doubt(model, mean, covariance, dt, self.surfaces)
         spread = _carried(motion.jacobian, covariance, noise)
         height = motion.contacts[0][1] if len(motion.contacts) == 1 else math.nan
         return (motion.after[0].numpy(), spread[0].numpy()), height
@@ -262,3 +258,30 @@ def _carried(jacobian: Tensor, covariance: Tensor, noise: Tensor) -> Tensor:
     after = jacobian @ covariance @ jacobian.transpose(-1, -2)
     after[:, :STATE_DIM, :STATE_DIM] += noise
     return (after + after.transpose(-1, -2)) / 2  # rounding would add up
+
+
+@torch.no_grad()
+def _edge_doubt(model: BallModel, mean: Tensor, covariance: Tensor, h: Tensor, surfaces: Surfaces) -> Tensor | float:
+    """Covariance at the end of a step from the balls that take the other way than the mean.
+
+    Near the edge of a table one ball bounces and its neighbour within the uncertainty falls past. The mean takes one of
+    the two ways; the covariance gets the second moment, about the mean, of the share that takes the other.
+
+    Args:
+        mean: (1, d) state at the start of the step.  covariance: (1, d, d) of it.
+        h: (1,) s, the step; at most one contact with the table.
+    Returns: (9, 9); 0 if the ball does not come down to the table's level in the step, or far from every edge.
+    """
+    height = mean.new_tensor([surfaces.table_height])
+    beside = fly(model, mean, h)
+    if surfaces.extent is None or not float(model.gap(mean, height)) >= 0.0 > float(model.gap(beside, height)):
+        return 0.0
+    touch = fly(model, mean, contact_time(model, mean, height))
+    if not float(touch[0, VZ]) < 0.0:
+        return 0.0
+    over = share_over_table(touch[0].numpy(), covariance[0].numpy(), world_of(surfaces, model.radius))
+    other = 1.0 - over if bool(surfaces.over_table(touch)) else over
+    if other < NEGLIGIBLE:
+        return 0.0
+    difference = (advance(model, mean, h, replace(surfaces, extent=None)) - beside)[0, :STATE_DIM]
+    return other * torch.outer(difference, difference)

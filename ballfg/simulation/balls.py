@@ -12,8 +12,7 @@ from ballfg.dynamics.model import THIN_SHELL
 from ballfg.dynamics.model_file import model_from_dict
 from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR, TABLE_LENGTH, TABLE_WIDTH
 from ballfg.files.strict_yaml import read_yaml
-from ballfg.simulation.launcher import TABLE_LAUNCHER, SimulatedLauncher
-from ballfg.simulation.launchers import LAUNCHERS
+from ballfg.simulation.launcher import LAUNCHERS, TABLE_LAUNCHER, SimulatedLauncher
 from ballfg.tracks import Ball
 
 TABLE: Final = Surfaces(TABLE_ABOVE_FLOOR, 0.0, (0.0, TABLE_LENGTH, -TABLE_WIDTH / 2, TABLE_WIDTH / 2))
@@ -110,21 +109,13 @@ def ball_from_mapping(content: Any, default_name: str = "ball") -> BallKind:
     surface = content.get("surface", "table")
     if surface not in ("table", "court"):
         raise ValueError(f"surface must be 'table' or 'court'; got {shown(surface)}. Choose one of them.")
-    launcher = LAUNCHERS["table_tennis" if surface == "table" else "tennis"]
-    return BallKind(
-        str(content.get("name", default_name)),
-        ball,
-        model,
-        TABLE if surface == "table" else COURT,
-        launcher.with_fields(content.get("launcher", {})),
-    )
+    surfaces, near = (TABLE, "table_tennis") if surface == "table" else (COURT, "tennis")
+    launcher = LAUNCHERS[near].with_fields(content.get("launcher", {}))
+    return BallKind(str(content.get("name", default_name)), ball, model, surfaces, launcher)
 
 
 def with_model(kind: BallKind, model: AnalyticModel) -> BallKind:
-    """The same ball with another declared model.
-
-    Raises: ValueError: if the model was made for another radius.
-    """
+    """The same ball with another declared model. Raises: ValueError: if the model was made for another radius."""
     if model.radius != kind.ball.radius:
         raise ValueError(
             f"model must have the ball's radius {kind.ball.radius:g} m; got {model.radius:g} m. "

@@ -17,11 +17,7 @@ TARGET: Final = (TABLE_LENGTH / 2, 0.0, TABLE_ABOVE_FLOOR + 0.2)
 """m, target of the rig: the middle of the flights, 0.2 m over the middle of the table."""
 _UP: Final = (0.0, 0.0, 1.0)
 
-_PLACES: Final = {
-    "left": (116.0, 18.0),
-    "right": (-98.0, 27.0),
-    "far": (64.0, 23.0),
-}
+_PLACES: Final = {"left": (116.0, 18.0), "right": (-98.0, 27.0), "far": (64.0, 23.0)}
 """Degrees: azimuth about the vertical from +x, and elevation, of each camera as seen from the target. No two are
 opposite, the three have different heights, and each sees all four corners of the table from 3 m."""
 _LENSES: Final = {
@@ -52,17 +48,9 @@ def table_rig(size: tuple[int, int] = (1280, 720), distance: float = 3.0) -> lis
     for name, (azimuth, elevation) in _PLACES.items():
         turn, rise = np.deg2rad((azimuth, elevation))
         towards = np.array([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)])
-        cameras.append(
-            looking_at(
-                name,
-                np.array(TARGET) + distance * towards,
-                TARGET,
-                FOCAL_BY_WIDTH * size[0],
-                size,
-                distortion=_LENSES[name],
-                off_centre=(_OFF_CENTRE[name][0] * size[0], _OFF_CENTRE[name][1] * size[0]),
-            )
-        )
+        centre, (right, down) = np.array(TARGET) + distance * towards, _OFF_CENTRE[name]
+        off_centre = (right * size[0], down * size[0])
+        cameras.append(looking_at(name, centre, TARGET, FOCAL_BY_WIDTH * size[0], size, _LENSES[name], off_centre))
     return cameras
 
 

@@ -5,10 +5,9 @@ from collections.abc import Iterator
 
 from ballfg.checks import check_instance
 from ballfg.dynamics import AnalyticModel, BallModel
-from ballfg.simulation.composition import KickedModel, true_model
 from ballfg.simulation.config import SimulationConfig
 from ballfg.simulation.measure import SimulatedTrack, measure
-from ballfg.simulation.motion import simulate_motion
+from ballfg.simulation.motion import KickedModel, simulate_motion, true_model
 from ballfg.simulation.settings import settings_of_shots
 from ballfg.simulation.streams import Purpose, generator
 from ballfg.tracks.info import DatasetInfo
@@ -29,22 +28,14 @@ def simulate(config: SimulationConfig) -> Iterator[SimulatedTrack]:
 
 
 def _block(config: SimulationConfig, model: AnalyticModel, block: int, first: int) -> list[SimulatedTrack]:
-    kind, seed = config.ball, config.seed
-    count = min(config.block, config.tracks - first)
-    settings = settings_of_shots(config.combinations(), first, count, seed)
-    start = kind.launcher.launch(settings, kind.surfaces.table_height, generator(seed, Purpose.LAUNCH, block))
-    moving: BallModel = model
-    if config.process.in_contact:
-        moving = KickedModel(model, config.process, generator(seed, Purpose.CONTACT, block))
-    motion = simulate_motion(
-        moving,
-        start,
-        config.rate,
-        kind.surfaces,
-        kind.launcher,
-        config.process,
-        generator(seed, Purpose.PROCESS, block),
+    kind, noise = config.ball, config.process
+    launching, moving, kicking = (
+        generator(config.seed, purpose, block) for purpose in (Purpose.LAUNCH, Purpose.PROCESS, Purpose.CONTACT)
     )
+    settings = settings_of_shots(config.combinations(), first, min(config.block, config.tracks - first), config.seed)
+    start = kind.launcher.launch(settings, kind.surfaces.table_height, launching)
+    ball: BallModel = KickedModel(model, noise, kicking) if noise.in_contact else model
+    motion = simulate_motion(ball, start, config.rate, kind.surfaces, kind.launcher, noise, moving)
     return measure(config, model, motion, settings, block, first)
 
 

@@ -66,10 +66,7 @@ def simulation_files() -> tuple[str, ...]:
 
 
 def check_format(name: str) -> FileFormat:
-    """Checks the name of a file format and returns it.
-
-    Raises: ValueError: if there is no such format.
-    """
+    """Checks the name of a file format and returns it. Raises: ValueError: if there is no such format."""
     if name not in ("csv", "parquet"):
         raise ValueError(f"format must be 'csv' or 'parquet'; got {shown(name)}. Choose one of them.")
     return cast(FileFormat, name)

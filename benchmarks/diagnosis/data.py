@@ -25,7 +25,7 @@ from ballfg.estimation import Smoother, dataset_settings
 from ballfg.estimation.measurement.as_measured import plainly_measured
 from ballfg.estimation.noise.estimate import spread_over
 from ballfg.simulation import MeasurementNoise, SimulationConfig, parse_effects, simulate, table_tennis
-from ballfg.simulation.composition import true_model
+from ballfg.simulation.motion import true_model
 from ballfg.simulation.synthetic import dataset_info
 from ballfg.state import SPIN
 from ballfg.tracks import Dataset, read_dataset, write_dataset

@@ -18,10 +18,7 @@ def solution_of(root: Root) -> tuple[Array, Array]:
 
 @machine_code(NOTHING(ROOT, TWO, ONE))
 def substitute_back(triangle: Root, states: Array, coefficients: Array) -> None:
-    """Solve R x = y.
-
-    Args: triangle: R.  states: (n, w) and coefficients: (p,), y, which become x.
-    """
+    """Solve R x = y. Args: states: (n, w) and coefficients: (p,), y, which become x."""
     root, last = triangle.states, triangle.coefficients
     n, w = root.shape[:2]
     p = len(coefficients)
@@ -44,10 +41,7 @@ def substitute_back(triangle: Root, states: Array, coefficients: Array) -> None:
 
 @machine_code(NOTHING(ROOT, TWO, ONE))
 def substitute_forward(triangle: Root, states: Array, coefficients: Array) -> None:
-    """Solve R^T y = x.
-
-    Args: triangle: R.  states: (n, w) and coefficients: (p,), x, which become y.
-    """
+    """Solve R^T y = x. Args: states: (n, w) and coefficients: (p,), x, which become y."""
     root, last = triangle.states, triangle.coefficients
     n, w = root.shape[:2]
     p = len(coefficients)
@@ -98,7 +92,6 @@ def covariances_of(triangle: Root, states: Array, cross: Array, coefficients: Ar
     covariance of x_i follows from that of y.
 
     Args:
-        triangle: R.
         states: (n, w, w), cross: (n, w, w + p) of each state with the next one and the coefficients, coefficients:
             (p, p); written, in the products of the unknowns' units.
     """

@@ -28,10 +28,9 @@ from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.motion.rollout import advance
 from ballfg.estimation.settings import MEASURED
 from ballfg.simulation import SimulationConfig
-from ballfg.simulation.composition import KickedModel
 from ballfg.simulation.config import MeasurementNoise, MotionNoise
 from ballfg.simulation.measure import measure
-from ballfg.simulation.motion import MIN_FRAMES, NOISE_STEP, TrueMotion, process_noise
+from ballfg.simulation.motion import MIN_FRAMES, NOISE_STEP, KickedModel, TrueMotion, process_noise
 from ballfg.simulation.settings import settings_of_shots
 from ballfg.simulation.synthetic import dataset_info
 from ballfg.state import STATE_DIM

@@ -10,6 +10,7 @@ from scipy.stats import norm
 from ballfg.dynamics import Surfaces, rollout
 from ballfg.dynamics.compiled.beliefs.course import Course
 from ballfg.dynamics.compiled.beliefs.edges import come_down, falls_past
+from ballfg.dynamics.compiled.signatures import Law, Laws
 from ballfg.dynamics.motion.integrate import fly
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction import Propagator, apex
@@ -104,18 +105,18 @@ def test_the_spread_of_both_ways_is_that_of_the_states(uncertain, beliefs):
     belief = beliefs(uncertain, STEPS["falls past, some bounce"])
     propagator, h = Propagator(with_end(0.925), NOISY), 0.02
     carrier = propagator._carrier(belief)
-    rates, impact, surface, c, _, b, _, s, _, *weights = carrier._given
+    rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws = carrier._given
+    laws = Laws(Law(rates, c, ct, w), Law(impact, b, bt, wb), Law(surface, s, st, ws))
     covariance, spread, after, touch = np.zeros((18, 18)), np.zeros((18, 18)), np.ones(18), np.empty(9)
     covariance[:9, :9] = belief.covariance[0, :9, :9]
     start = belief.mean[0, :9].numpy().copy()
-    tau = come_down(rates, surface, start, c, s, weights[0], weights[2], 0.0, carrier._world, touch)
+    tau = come_down(laws, start, 0.0, carrier._world, touch)
     with torch.no_grad():
         end = torch.tensor([h], dtype=torch.float64)
         after[:9] = fly(uncertain, belief.mean, end)[0, :9]
         bounced = rollout(uncertain, belief.mean, end, Surfaces(0.0))[0, 0, :9].numpy()
-    functions, values = (rates, impact, surface), (c, b, s)
     args = (covariance, touch, tau, h, carrier._world, after, spread)
-    assert falls_past(functions, values, tuple(weights), *args)
+    assert falls_past(laws, *args)
     assert not spread[9:].any()
     assert not spread[:, 9:].any()
     share = norm.cdf((0.925 - touch[0]) / np.sqrt(along(touch) @ covariance[:9, :9] @ along(touch)))

@@ -5,29 +5,21 @@ import math
 import numpy as np
 
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.flight import evaluate, fly_one, put, put_all
-from ballfg.dynamics.compiled.signatures import COUNT, FUNCTION, NOTHING, ONE, REAL, THREE, TWO, several
-from ballfg.dynamics.motion.limits import (
-    GAP_TOLERANCE,
-    LEAST_FALL,
-    MAX_STEP,
-    MIN_SPEED,
-    SEARCH_STEPS,
-    TIME_TOLERANCE,
-    TYPICAL_JERK,
-    steps_over,
-)
+from ballfg.dynamics.compiled.flight import evaluate, fly_one, glide, laws_of, only, put, put_all, value_of
+from ballfg.dynamics.compiled.signatures import COUNT, GIVEN, LAW, LAWS, NOTHING, ONE, REAL, THREE, TWO, Law, several
+from ballfg.dynamics.motion import limits
+from ballfg.dynamics.motion.limits import LEAST_FALL, MAX_STEP, MIN_SPEED, SEARCH_STEPS, TYPICAL_JERK, steps_over
 
 LEAST = 1e-300
 """Keeps a division by zero away."""
 
 
-@machine_code(several(REAL, 3)(FUNCTION, FUNCTION, ONE, ONE, ONE, ONE, ONE, REAL, REAL))
-def _approach(rates, surface, x, c, s, w, ws, height, radius):
+@machine_code(several(REAL, 3)(LAW, LAW, ONE, REAL, REAL))
+def _approach(rates, surface, x, height, radius):
     """Gap (m) of a state to a surface, its rate (m/s) and the acceleration (m/s^2) with which it closes."""
-    none, a, o = np.empty((9, 0)), np.empty(6), np.empty(3)
-    evaluate(rates, x, c, w, none, np.empty((len(c), 0)), a, np.empty((6, 0)))
-    evaluate(surface, x, s, ws, none, np.empty((len(s), 0)), o, np.empty((3, 0)))
+    a, o = np.empty(6), np.empty(3)
+    value_of(rates, x, a)
+    value_of(surface, x, o)
     gap = x[2] - height - o[0] - radius
     rate = x[5] - o[1] * x[3] - o[2] * x[4]
     return gap, rate, -(a[2] - o[1] * a[0] - o[2] * a[1])
@@ -43,15 +35,14 @@ def _common_steps(durations):
     return steps_over(longest)
 
 
-@machine_code(NOTHING(FUNCTION, FUNCTION, TWO, TWO, TWO, ONE, ONE, ONE, REAL, ONE, ONE))
-def _search(rates, surface, state, c, s, w, ws, heights, radius, longest, tau):
+@machine_code(NOTHING(LAW, LAW, TWO, ONE, REAL, ONE, ONE))
+def _search(rates, surface, state, heights, radius, longest, tau):
     """Times (s) of contacts near tau, in place: each step solves the parabola through the motion there. NaN: none.
 
     All rows take the same number of integration steps, as they do in torch: a time is exact for its steps.
     """
     m = len(tau)
-    lost, arrived, none = np.empty(m, dtype=np.bool_), np.zeros(m, dtype=np.bool_), np.empty((9, 0))
-    nonec, at, still = np.empty((c.shape[1], 0)), np.empty(9), np.empty(0)
+    lost, arrived, at = np.empty(m, dtype=np.bool_), np.zeros(m, dtype=np.bool_), np.empty(9)
     for r in range(m):
         lost[r] = math.isnan(tau[r])
         tau[r] = 0.0 if lost[r] else tau[r]
@@ -60,16 +51,16 @@ def _search(rates, surface, state, c, s, w, ws, heights, radius, longest, tau):
         for r in range(m):
             put(at, state[r])
             if tau[r] != 0.0:
-                fly_one(rates, at, c[r], w, none, nonec, tau[r], still, steps)
-            gap, rate, fall = _approach(rates, surface, at, c[r], s[r], w, ws, heights[r], radius)
+                glide(only(rates, r), at, tau[r], steps)
+            gap, rate, fall = _approach(only(rates, r), only(surface, r), at, heights[r], radius)
             used = max(fall, LEAST_FALL)
             square = rate * rate + 2.0 * used * gap
             root = math.sqrt(max(square, 0.0))
             comes = rate < 0.0 and square > 0.0
             move = 2.0 * gap / max(root - rate, LEAST) if comes else (rate + root) / used
             error = (TYPICAL_JERK / 6.0 * abs(move) + abs(used - fall) / 2.0) * move * move
-            settled = abs(gap) < GAP_TOLERANCE and abs(move) < MIN_SPEED
-            arrived[r] = (comes and error < TIME_TOLERANCE * abs(rate)) or settled
+            settled = abs(gap) < limits.GAP_TOLERANCE and abs(move) < MIN_SPEED
+            arrived[r] = (comes and error < limits.TIME_TOLERANCE * abs(rate)) or settled
             if lost[r] or not abs(tau[r] + move) <= longest[r]:
                 lost[r], tau[r] = True, 0.0
             else:
@@ -82,17 +73,17 @@ def _search(rates, surface, state, c, s, w, ws, heights, radius, longest, tau):
             tau[r] = np.nan
 
 
-@machine_code(REAL(FUNCTION, FUNCTION, ONE, ONE, ONE, ONE, ONE, REAL, REAL, REAL))
-def _scan(rates, surface, state, c, s, w, ws, height, radius, longest):
+@machine_code(REAL(LAW, LAW, ONE, REAL, REAL, REAL))
+def _scan(rates, surface, state, height, radius, longest):
     """Time (s) of the contact within one step, by small steps; NaN if the ball turns before it touches."""
-    none, nonec, at, still = np.empty((9, 0)), np.empty((len(c), 0)), state.copy(), np.empty(0)
-    gap, rate, _ = _approach(rates, surface, at, c, s, w, ws, height, radius)
+    at = state.copy()
+    gap, rate, _ = _approach(rates, surface, at, height, radius)
     forward = not (gap < 0.0 and rate < 0.0)
     step = MAX_STEP if forward else -MAX_STEP
     for i in range(math.ceil(longest / MAX_STEP)):
         before = gap
-        fly_one(rates, at, c, w, none, nonec, step, still, 1)
-        gap, rate, _ = _approach(rates, surface, at, c, s, w, ws, height, radius)
+        glide(rates, at, step, 1)
+        gap, rate, _ = _approach(rates, surface, at, height, radius)
         if not math.isfinite(gap + rate):
             return np.nan
         if (before >= 0.0 and gap < 0.0) if forward else gap >= 0.0:
@@ -102,12 +93,12 @@ def _scan(rates, surface, state, c, s, w, ws, height, radius, longest):
     return np.nan
 
 
-@machine_code(NOTHING(FUNCTION, FUNCTION, TWO, TWO, TWO, ONE, ONE, ONE, ONE, REAL, ONE))
-def contact_times(rates, surface, start, c, s, w, ws, heights, longest, radius, tau):
-    """Times tau (m,) s to the next contacts of m falling balls; NaN where there is none. Arguments as `contacts`."""
+@machine_code(NOTHING(LAW, LAW, TWO, ONE, ONE, REAL, ONE))
+def times_of(rates, surface, start, heights, longest, radius, tau):
+    """Times tau (m,) s to the next contacts of m falling balls; NaN where there is none. Arguments as `meet`."""
     near = np.zeros(len(tau))
     for attempt in range(2):  # the second for those that the first does not find
-        _search(rates, surface, start, c, s, w, ws, heights, radius, longest, near)
+        _search(rates, surface, start, heights, radius, longest, near)
         missing = False
         for r in range(len(tau)):
             if attempt == 0 or math.isnan(tau[r]):
@@ -118,72 +109,31 @@ def contact_times(rates, surface, start, c, s, w, ws, heights, longest, radius, 
         for r in range(len(tau)):
             near[r] = np.nan
             if attempt == 0 and math.isnan(tau[r]):
-                near[r] = _scan(rates, surface, start[r], c[r], s[r], w, ws, heights[r], radius, longest[r])
+                near[r] = _scan(only(rates, r), only(surface, r), start[r], heights[r], radius, longest[r])
 
 
-@machine_code(
-    NOTHING(
-        FUNCTION,
-        FUNCTION,
-        FUNCTION,
-        TWO,
-        THREE,
-        TWO,
-        THREE,
-        TWO,
-        THREE,
-        TWO,
-        THREE,
-        ONE,
-        ONE,
-        ONE,
-        ONE,
-        ONE,
-        REAL,
-        ONE,
-        TWO,
-        TWO,
-        THREE,
-    ),
-)
-def contacts(
-    rates,
-    impact,
-    surface,
-    start,
-    startt,
-    c,
-    ct,
-    b,
-    bt,
-    s,
-    st,
-    w,
-    wb,
-    ws,
-    heights,
-    longest,
-    radius,
-    tau,
-    taut,
-    after,
-    aftert,
-):
+@machine_code(NOTHING(*GIVEN[:2], TWO, TWO, TWO, ONE, ONE, ONE, ONE, REAL, ONE))
+def contact_times(rates, surface, start, c, s, w, ws, heights, longest, radius, tau):
+    """`times_of` for Python."""
+    none, nones = np.empty((len(c), c.shape[1], 0)), np.empty((len(s), s.shape[1], 0))
+    times_of(Law(rates, c, none, w), Law(surface, s, nones, ws), start, heights, longest, radius, tau)
+
+
+@machine_code(NOTHING(LAWS, TWO, THREE, ONE, ONE, REAL, ONE, TWO, TWO, THREE))
+def meet(laws, start, startt, heights, longest, radius, tau, taut, after, aftert):
     """The next contacts of m falling balls, near their states (m, 9).
 
     Args:
         start (m, 9), startt (m, 9, d): states and tangents.
-        c, b, s: coefficients of rates, impact and surface, (m, p) with tangents (m, p, d).
-        w, wb, ws: weights of the three.
         heights (m,) m, longest (m,) s: of the surfaces, and how far to look.  radius: m, of the ball.
     Writes: time to the contact tau (m,) s and the state after it (m, 9), with tangents; NaN where there is none.
     """
-    d = startt.shape[2]
+    d, (rates, impact, surface) = startt.shape[2], laws
     x, later, xt, o = np.empty(9), np.empty((9, d + 1)), np.empty((9, d)), np.empty(3)
-    moved, ct1, st1 = np.empty((3, d + 1)), np.zeros((ct.shape[1], d + 1)), np.zeros((st.shape[1], d + 1))
+    moved, ct, st = np.empty((3, d + 1)), np.zeros((rates.c.shape[1], d + 1)), np.zeros((surface.c.shape[1], d + 1))
     by_time = np.zeros(d + 1)  # the last direction is that of the contact's time
     by_time[d] = 1.0
-    contact_times(rates, surface, start, c, s, w, ws, heights, longest, radius, tau)
+    times_of(rates, surface, start, heights, longest, radius, tau)
     steps = _common_steps(tau)
     for r in range(len(start)):
         found = tau[r]
@@ -195,15 +145,27 @@ def contacts(
             continue
         put(x, start[r])
         put_all(later, startt[r])
-        put_all(ct1, ct[r])
-        put_all(st1, st[r])
+        put_all(ct, rates.ct[r])
+        put_all(st, surface.ct[r])
         for i in range(9):
             later[i, d] = 0.0
-        fly_one(rates, x, c[r], w, later, ct1, found, by_time, steps)
-        evaluate(surface, x, s[r], ws, later, st1, o, moved)
+        fly_one(
+            Law(rates.compute, rates.c[r : r + 1], ct.reshape(1, *ct.shape), rates.w), x, later, found, by_time, steps
+        )
+        evaluate(Law(surface.compute, surface.c[r : r + 1], st.reshape(1, *st.shape), surface.w), x, later, o, moved)
         speed = min(later[2, d] - moved[0, d], -MIN_SPEED)
         for q in range(d):  # at the contact the gap is zero: d gap + d gap / d tau d tau = 0
             taut[r, q] = -(later[2, q] - moved[0, q]) / speed
             for i in range(9):
                 xt[i, q] = later[i, q] + later[i, d] * taut[r, q]
-        evaluate(impact, x, b[r], wb, xt, bt[r], after[r], aftert[r])
+        evaluate(only(impact, r), x, xt, after[r], aftert[r])
+
+
+@machine_code(NOTHING(*GIVEN[:3], TWO, THREE, *GIVEN[3:], ONE, ONE, REAL, ONE, TWO, TWO, THREE))
+def contacts(
+    rates, impact, surface, start, startt, c, ct, b, bt, s, st, w, wb, ws,
+    heights, longest, radius, tau, taut, after, aftert,
+):  # fmt: skip
+    """`meet` for Python."""
+    laws = laws_of(rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws)
+    meet(laws, start, startt, heights, longest, radius, tau, taut, after, aftert)

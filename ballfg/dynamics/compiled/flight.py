@@ -9,7 +9,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.signatures import COUNT, FOUR, FUNCTION, LAW, NOTHING, ONE, REAL, THREE, TWO, Law
+from ballfg.dynamics.compiled.signatures import COUNT, FOUR, FUNCTION, LAW, NOTHING, ONE, REAL, THREE, TWO, Law, Laws
 from ballfg.dynamics.motion.limits import STAGES
 
 TOGETHER = 96
@@ -43,12 +43,41 @@ def put_all(target, source):
             target[i, j] = source[i, j]
 
 
-@machine_code(NOTHING(FUNCTION, ONE, ONE, ONE, TWO, TWO, ONE, TWO))
-def evaluate(function, x, c, w, xt, ct, y, yt):
-    """A model's function of one state x (9,) with coefficients c (p,): y (m,); tangents (9, d), (p, d), (m, d)."""
-    p, m, d = len(c), len(y), xt.shape[1]
-    one, moved = (x.reshape(1, 9), c.reshape(1, p)), (xt.reshape(1, 9, d), ct.reshape(1, p, d))
-    function(one[0], one[1], w, moved[0], moved[1], y.reshape(1, m), yt.reshape(1, m, d))
+@register_jitable
+def laws_of(rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws):
+    """The `Laws` from arguments as in `signatures.GIVEN`."""
+    return Laws(Law(rates, c, ct, w), Law(impact, b, bt, wb), Law(surface, s, st, ws))
+
+
+@register_jitable
+def only(law, r):
+    """A law of ball r alone."""
+    return Law(law.compute, law.c[r : r + 1], law.ct[r : r + 1], law.w)
+
+
+@register_jitable
+def laws_of_one(laws, r):
+    """The laws of ball r alone."""
+    return Laws(only(laws.rates, r), only(laws.impact, r), only(laws.surface, r))
+
+
+@register_jitable
+def still(law):
+    """A law without tangents."""
+    return Law(law.compute, law.c, np.empty((law.c.shape[0], law.c.shape[1], 0)), law.w)
+
+
+@machine_code(NOTHING(LAW, ONE, TWO, ONE, TWO))
+def evaluate(law, x, xt, y, yt):
+    """A law of one ball at a state x (9,) with tangents (9, d): writes y (m,) and yt (m, d)."""
+    m, d = len(y), xt.shape[1]
+    law.compute(x.reshape(1, 9), law.c, law.w, xt.reshape(1, 9, d), law.ct, y.reshape(1, m), yt.reshape(1, m, d))
+
+
+@machine_code(NOTHING(LAW, ONE, ONE))
+def value_of(law, x, y):
+    """`evaluate` without tangents."""
+    evaluate(still(law), x, np.empty((9, 0)), y, np.empty((len(y), 0)))
 
 
 @machine_code(NOTHING(LAW, TWO, THREE, TWO, THREE, TWO, THREE))
@@ -98,14 +127,14 @@ def fly_arcs(rates, start, startt, c, ct, w, step, count, nodes, nodest, slopes,
     """
     d = startt.shape[2]
     x, xt, k, kt = np.empty((1, 9)), np.empty((1, 9, d)), np.empty((1, 9)), np.empty((1, 9, d))
-    a, at, still = np.empty((1, 6)), np.empty((1, 6, d)), np.zeros((1, d))
+    a, at, fixed, law = np.empty((1, 6)), np.empty((1, 6, d)), np.zeros((1, d)), Law(rates, c, ct, w)
     for r in range(len(start)):
-        own = Law(rates, c[r : r + 1], ct[r : r + 1], w)
+        own = only(law, r)
         put(x[0], start[r])
         put_all(xt[0], startt[r])
         for s in range(count + 1):
             if s:
-                step_on(own, x, xt, step[r : r + 1], still, k, kt)
+                step_on(own, x, xt, step[r : r + 1], fixed, k, kt)
             slopes_at(own, x, xt, k, kt, a, at)
             put(nodes[r, s], x[0])
             put_all(nodest[r, s], xt[0])
@@ -130,16 +159,22 @@ def fly_together(rates, state, statet, c, ct, w, dt, dtt, steps):
             step_on(own, x, xt, h, ht, k, kt)
 
 
-@machine_code(NOTHING(FUNCTION, ONE, ONE, ONE, TWO, TWO, REAL, ONE, COUNT))
-def fly_one(rates, x, c, w, xt, ct, duration, durationt, steps):
-    """`fly_together` of one ball: x (9,), c (p,), tangents (9, d), (p, d) and (d,)."""
-    p, d = len(c), xt.shape[1]
-    one, moved, own = x.reshape(1, 9), xt.reshape(1, 9, d), Law(rates, c.reshape(1, p), ct.reshape(1, p, d), w)
+@machine_code(NOTHING(LAW, ONE, TWO, REAL, ONE, COUNT))
+def fly_one(rates, x, xt, duration, durationt, steps):
+    """`fly_together` of one ball: x (9,), tangents (9, d) and (d,)."""
+    d = xt.shape[1]
+    one, moved = x.reshape(1, 9), xt.reshape(1, 9, d)
     k, kt, a, at = np.empty((1, 9)), np.empty((1, 9, d)), np.empty((1, 6)), np.empty((1, 6, d))
     h, ht = np.empty(1), np.empty((1, d))
     h[0] = duration / steps
     for q in range(d):
         ht[0, q] = durationt[q] / steps
     for _ in range(steps):
-        slopes_at(own, one, moved, k, kt, a, at)
-        step_on(own, one, moved, h, ht, k, kt)
+        slopes_at(rates, one, moved, k, kt, a, at)
+        step_on(rates, one, moved, h, ht, k, kt)
+
+
+@machine_code(NOTHING(LAW, ONE, REAL, COUNT))
+def glide(rates, x, duration, steps):
+    """`fly_one` without tangents."""
+    fly_one(still(rates), x, np.empty((9, 0)), duration, np.empty(0), steps)

@@ -70,37 +70,25 @@ class CompiledModel:
 
     def weights(self, model: BallModel) -> tuple[Array, Array, Array]:
         """Weights of rates, impact and surface from a model's present tables."""
-        if all(part.weigh is None for part in (self.rates, self.impact, self.surface)):
+        parts = (self.rates, self.impact, self.surface)
+        if all(part.weigh is None for part in parts):
             return NONE, NONE, NONE
         numbers = numbers_of(model)
         tables, now = numbers.tables(), numbers.stamp()
         known = _weights.get(model)
-        if known is None or known.stamp != now:
+        if known is None or known[0] != now:
             plain = [table.detach() for table in tables]
-            parts = (self.rates, self.impact, self.surface)
             rates, impact, surface = (NONE if p.weigh is None else p.weigh(*plain).numpy() for p in parts)
-            known = _weights[model] = Weights(now, tables, (rates, impact, surface))
-        return known.of_parts
-
-
-@dataclass(frozen=True)
-class Weights:
-    """Weights that were computed from a model's tables.
-
-    Attributes:
-        stamp: identifies the state of the tables; it changes when they do.
-        tables: kept alive, so that no others get their place in memory, and with it their stamp.
-        of_parts: of rates, impact and surface, (k,) each.
-    """
-
-    stamp: Hashable
-    tables: Sequence[Tensor]
-    of_parts: tuple[Array, Array, Array]
+            known = _weights[model] = (now, tables, (rates, impact, surface))
+        return known[2]
 
 
 NONE: Final = np.zeros(0)
 """The weights of a function without tables."""
-_weights: weakref.WeakKeyDictionary[BallModel, Weights] = weakref.WeakKeyDictionary()
+_Weighed = tuple[Hashable, Sequence[Tensor], tuple[Array, Array, Array]]
+"""Stamp of a model's tables; the tables, kept so that no others get their place in memory and with it their stamp; the
+weights of rates, impact and surface that were computed from them."""
+_weights: weakref.WeakKeyDictionary[BallModel, _Weighed] = weakref.WeakKeyDictionary()
 _OF_TORCH: Final = frozenset(vars(nn.Module()))
 """Attributes of every module; its parameters, buffers and parts are compared by themselves."""
 _BESIDE: Final = frozenset({"trained", "noise", "variations", "measurement"})
@@ -271,10 +259,7 @@ def _traced(model: BallModel, function: Callable[[BallModel, Tensor], Tensor]) -
 
 
 def _compare(model: BallModel, function: Callable[[BallModel, Tensor], Tensor], made: Function) -> None:
-    """Compares a compiled function with torch at a few states.
-
-    Raises: NotTheSameError: if they differ.
-    """
+    """Compares a compiled function with torch at a few states. Raises: NotTheSameError: if they differ."""
     rng, p = np.random.default_rng(0), len(made.names)
     parameters = dict(model.named_parameters())
     if not parameters.keys() >= set(made.names):

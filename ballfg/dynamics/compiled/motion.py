@@ -39,6 +39,7 @@ class Moving:
         inner = model.model if isinstance(model, AugmentedModel) else model
         self.weights = functions.weights(inner)
         self.functions, self.travelling = functions, states.numpy()[:, STATE_DIM:]
+        self.computes = (functions.rates.compute, functions.impact.compute, functions.surface.compute)
         self.states = np.array(states.numpy()[:, :STATE_DIM], order="C")  # moved in place
         self.moved = np.zeros((n, STATE_DIM, width))
         own = range(min(STATE_DIM, width))
@@ -59,26 +60,10 @@ class Moving:
     def bounce(self, height: Array, longest: Array) -> None:
         """Moves on through the next contact with surfaces at some heights (n,) m; NaN if there is none."""
         n, _, width = self.moved.shape
-        functions = (self.functions.rates, self.functions.impact, self.functions.surface)
-        given = [array for function in functions for array in self.coefficients(function)]
         tau, slower = np.empty(n), np.empty((n, width))
         after, moved = np.empty_like(self.states), np.empty_like(self.moved)
-        computes = (function.compute for function in functions)
-        radius = self.functions.radius
-        contacts(
-            *computes,
-            self.states,
-            self.moved,
-            *given,
-            *self.weights,
-            height,
-            longest,
-            radius,
-            tau,
-            slower,
-            after,
-            moved,
-        )
+        given = (*self.computes, self.states, self.moved, *self.all_coefficients(), *self.weights)
+        contacts(*given, height, longest, self.functions.radius, tau, slower, after, moved)
         self.states, self.moved = after, moved
         self.elapsed, self.slower = self.elapsed + tau, self.slower + slower
 
@@ -103,6 +88,11 @@ class Moving:
         own = np.arange(STATE_DIM, width)
         jacobian[:, own, own] = 1.0
         return self.whole(), torch.from_numpy(jacobian)
+
+    def all_coefficients(self) -> list[Array]:
+        """`coefficients` of rates, impact and surface, one behind another."""
+        parts = (self.functions.rates, self.functions.impact, self.functions.surface)
+        return [array for part in parts for array in self.coefficients(part)]
 
     def coefficients(self, function: Function) -> tuple[Array, Array]:
         """(n, p) coefficients of a function for each ball, and their tangents (n, p, d)."""
@@ -157,12 +147,10 @@ def roll_out(
     """
     n, width = state.shape
     moving = Moving(model, functions, state.detach(), 0)
-    parts = (functions.rates, functions.impact, functions.surface)
-    values = tuple(moving.coefficients(part)[0] for part in parts)
     states, reached = np.empty((n, steps.shape[1], STATE_DIM)), np.empty(n, dtype=np.int64)
-    computes, world = (part.compute for part in parts), world_of(surfaces, functions.radius)
-    durations = np.ascontiguousarray(steps.detach().numpy())
-    roll_out_rows(*computes, values, moving.weights, moving.states, durations, world, states, reached)
+    durations, world = np.ascontiguousarray(steps.detach().numpy()), world_of(surfaces, functions.radius)
+    given = (*moving.computes, *moving.all_coefficients(), *moving.weights)
+    roll_out_rows(*given, moving.states, durations, world, states, reached)
     travelling = np.broadcast_to(moving.travelling[:, None], (n, steps.shape[1], width - STATE_DIM))
     return torch.from_numpy(np.concatenate((states, travelling), axis=2)), torch.from_numpy(reached)
 

@@ -53,10 +53,7 @@ _numbers: weakref.WeakKeyDictionary[BallModel, Numbers] = weakref.WeakKeyDiction
 
 
 def numbers_of(model: BallModel) -> Numbers:
-    """References to the numbers of a model.
-
-    Args: model: without substituted parameters.
-    """
+    """References to the numbers of a model. Args: model: without substituted parameters."""
     known = _numbers.get(model)
     if known is None or not known.are_of(model):
         parameters, buffers = dict(model.named_parameters()), dict(model.named_buffers())

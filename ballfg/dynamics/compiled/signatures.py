@@ -29,19 +29,20 @@ class Law(NamedTuple):
     """(k,) weights."""
 
 
+class Laws(NamedTuple):
+    """Rates, impact and surface of a model, of n balls."""
+
+    rates: Law
+    impact: Law
+    surface: Law
+
+
 LAW: Final[Any] = types.NamedTuple((FUNCTION, TWO, THREE, ONE), Law)
+LAWS: Final[Any] = types.NamedUniTuple(LAW, 3, Laws)
+GIVEN: Final = (*[FUNCTION] * 3, *[TWO, THREE] * 3, *[ONE] * 3)
+"""`Laws` as Python passes them, since numba is slow to see what a tuple is: functions, coefficients, weights."""
 
 
 def several(kind: Any, count: int) -> Any:
     """A tuple of `count` equal types."""
     return types.UniTuple(kind, count)
-
-
-THREE_FUNCTIONS: Final[Any] = several(FUNCTION, 3)
-"""Rates, impact and surface of a model."""
-THREE_VALUES: Final[Any] = several(TWO, 3)
-"""The coefficients of these, one row per ball."""
-THREE_TANGENTS: Final[Any] = several(THREE, 3)
-"""The tangents of these coefficients."""
-THREE_WEIGHTS: Final[Any] = several(ONE, 3)
-"""The weights of the three functions."""

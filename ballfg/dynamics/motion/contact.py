@@ -34,7 +34,7 @@ def contact_time(
 ) -> Tensor:
     """Time until the falling ball touches a surface, on the branch on which it moves down.
 
-    Args: model: the ball.  state: (..., 9).  height: m, scalar or (...).  longest: s, scalar or (...), how far to look.
+    Args: state: (..., 9).  height: m, scalar or (...).  longest: s, scalar or (...), how far to look.
     Returns: (...) s; negative when the ball is already below the surface on its way down. NaN where the ball,
         in free flight, does not come down to that height within `longest`. Differentiable in the state and the
         parameters.
@@ -130,9 +130,7 @@ def fly_through(
     interval is a smooth continuation, so that an estimator can move through it. Whether it lies inside is for the
     caller to see in the returned times.
 
-    Args:
-        model: the ball.  state: (n, 9).  dt: (n,) s.
-        heights: for each contact, in order, the surface's height in m, scalar or (n,).
+    Args: state: (n, 9).  dt: (n,) s.  heights: for each contact, in order, the surface's height in m, scalar or (n,).
     Returns: state after dt (n, 9), contact times since the start (n, len(heights)) s. NaN in rows in which a contact
         never comes; they have no part in any gradient.
     """

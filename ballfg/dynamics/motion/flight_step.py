@@ -100,7 +100,7 @@ def rate_jacobian(rates: RateFunction, state: Tensor, *, heavy: bool = False) ->
 def flight_step(model: BallModel, state: Tensor, h: Tensor) -> Tensor:
     """`rk4_step` of a model's rates, to be differentiated up to twice by the state and the parameters.
 
-    Args: model: the ball.  state: (n, 9).  h: (n, 1) s, a constant.
+    Args: state: (n, 9).  h: (n, 1) s, a constant.
     Returns: (n, 9).
     """
     work = _Work(model, state.detach(), h)

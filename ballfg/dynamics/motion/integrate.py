@@ -15,7 +15,7 @@ from ballfg.dynamics.motion.limits import step_count
 def fly(model: BallModel, state: Tensor, dt: Tensor) -> Tensor:
     """The state after `dt` of free flight, without surfaces.
 
-    Args: model: the ball.  state: (..., 9).  dt: (...) s, broadcast against the batch; negative goes back in time.
+    Args: state: (..., 9).  dt: (...) s, broadcast against the batch; negative goes back in time.
     Returns: (..., 9), differentiable in the state, in dt and in the model's parameters.
     """
     if not followed(state, dt):
@@ -48,7 +48,7 @@ def is_plain(tensor: Tensor) -> bool:
 def fly_jacobian(model: BallModel, state: Tensor, dt: Tensor) -> tuple[Tensor, Tensor]:
     """`fly` and its derivative by the state.
 
-    Args: model: the ball.  state: (..., 9).  dt: (...) s.
+    Args: state: (..., 9).  dt: (...) s.
     Returns: state after dt (..., 9) and Jacobian (..., 9, 9); both detached from any graph.
     """
     if is_plain(state):

@@ -30,9 +30,7 @@ MOST_ARCS = 40
 def paths(model: BallModel, state: Tensor, times: Tensor, surfaces: Surfaces) -> Tensor:
     """The states at a sequence of times.
 
-    Args:
-        model: the ball.  state: (n, 9) at time 0.  times: (k,) or (n, k) s since then, not decreasing, not negative.
-        surfaces: table and floor.
+    Args: state: (n, 9) at time 0.  times: (k,) or (n, k) s since then, not decreasing, not negative.
     Returns: (n, k, 9), differentiable once in the states and the parameters, through the contact times too.
     Raises: ValueError: if the times are negative or decrease.
     """

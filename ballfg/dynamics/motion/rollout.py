@@ -54,7 +54,7 @@ def roll(model: BallModel, state: Tensor, dt: Tensor, height: Tensor | float) ->
 def advance(model: BallModel, state: Tensor, dt: Tensor, surfaces: Surfaces) -> Tensor:
     """The state after `dt`, through all contacts on the way.
 
-    Args: model: the ball.  state: (n, 9).  dt: (n,) s, not negative.  surfaces: table and floor.
+    Args: state: (n, 9).  dt: (n,) s, not negative.
     Returns: (n, 9), differentiable in the state and the parameters, through the contact times too.
     Raises: ValueError: if a dt is negative or not a number.
     """

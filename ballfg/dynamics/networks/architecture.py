@@ -52,12 +52,7 @@ class Architecture(BaseModel):
         spin_rate: bool = False,
     ) -> Architecture:
         """An architecture with the kind's default for each size that is not given."""
-        flight, contact, steps = DEFAULT_SIZES[kind]
-        return cls(
-            kind=kind,
-            width_flight=flight if width_flight is None else width_flight,
-            width_contact=contact if width_contact is None else width_contact,
-            depth=steps if depth is None else depth,
-            residual=residual,
-            spin_rate=spin_rate,
-        )
+        given = (width_flight, width_contact, depth)
+        sizes = (size if own is None else own for own, size in zip(given, DEFAULT_SIZES[kind], strict=True))
+        named = dict(zip(("width_flight", "width_contact", "depth"), sizes, strict=True))
+        return cls(kind=kind, **named, residual=residual, spin_rate=spin_rate)

@@ -1,5 +1,6 @@
 """The learned model computes flight and bounce by networks, alone or as a correction of another model."""
 
+from functools import partial
 from typing import Final
 
 import torch
@@ -10,7 +11,7 @@ from ballfg.dynamics.effects.bounce import TableHeight
 from ballfg.dynamics.model import THIN_SHELL, BallModel, Rates
 from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.dynamics.networks.fading import DOUBT, DOUBTS, Fading
-from ballfg.dynamics.networks.layers import NetworkKind
+from ballfg.dynamics.networks.layers import NETWORKS, NetworkKind
 from ballfg.dynamics.networks.learned_parts import (
     START_RESTITUTION,
     GramSchmidtContact,
@@ -59,26 +60,14 @@ class LearnedModel(BallModel):
             )
         if base is not None and base.radius != radius:
             raise ValueError(f"base must be a ball of the same radius; got {base.radius:g} m and {radius:g} m.")
-        raw = architecture.kind == "mlp"
-        kind: NetworkKind = "mlp" if raw else architecture.kind.removesuffix("+gs")  # type: ignore[assignment]
-        generator = torch.Generator().manual_seed(seed)
+        kind: NetworkKind = architecture.kind.removesuffix("+gs")  # type: ignore[assignment]
+        raw, first = architecture.kind == "mlp", START_RESTITUTION if base is None else 1.0
+        make = partial(NETWORKS[kind], depth=architecture.depth, generator=torch.Generator().manual_seed(seed))
         self.architecture = architecture
-        self.flight = (RawFlight if raw else GramSchmidtFlight)(
-            kind,
-            architecture.width_flight,
-            architecture.depth,
-            spin_rate=architecture.spin_rate,
-            falls=base is None,
-            generator=generator,
-        )
-        self.contact = (RawContact if raw else GramSchmidtContact)(
-            kind,
-            architecture.width_contact,
-            architecture.depth,
-            radius=radius,
-            first=START_RESTITUTION if base is None else 1.0,
-            generator=generator,
-        )
+        flying, bouncing = (partial(make, width=w) for w in (architecture.width_flight, architecture.width_contact))
+        flight = RawFlight if raw else GramSchmidtFlight
+        self.flight = flight(flying, spin_rate=architecture.spin_rate, falls=base is None)
+        self.contact = (RawContact if raw else GramSchmidtContact)(bouncing, radius=radius, first=first)
         self.base = base
         self.fading: Fading | None = None
         if base is None:

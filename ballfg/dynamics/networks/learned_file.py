@@ -128,24 +128,18 @@ def _check_digest(folder: Path) -> None:
 
 
 def _config(model: BallModel) -> _Config:
-    trained = model.trained
-    launcher = None if trained is None else trained.launcher
-    return _Config(
-        architecture=model.architecture if isinstance(model, LearnedModel) else None,
-        fading=_fading(model),
-        trained=None
-        if trained is None
-        else _TrainedConfig(
+    architecture, noted = model.architecture if isinstance(model, LearnedModel) else None, None
+    if (trained := model.trained) is not None:
+        own = trained.launcher
+        noted = _TrainedConfig(
             process_noise=dict(trained.process_noise),
             position_scale=trained.position_scale,
             spin_noise=trained.spin_noise,
-            launcher=None
-            if launcher is None
-            else _LauncherConfig(labels=launcher.labels, categories=launcher.categories),
+            launcher=None if own is None else _LauncherConfig(labels=own.labels, categories=own.categories),
             rooms=trained.rooms,
             elsewhere=None if trained.elsewhere is None else trained.elsewhere.to_mapping(),
-        ),
-    )
+        )
+    return _Config(architecture=architecture, fading=_fading(model), trained=noted)
 
 
 def _fading(model: BallModel) -> _FadingConfig | None:

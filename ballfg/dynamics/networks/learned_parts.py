@@ -1,5 +1,6 @@
 """Computes flight and contact of a learned ball, from Gram-Schmidt features or from raw velocity and spin."""
 
+from collections.abc import Callable
 from typing import Final
 
 import torch
@@ -8,13 +9,16 @@ from torch import Tensor, nn
 from ballfg.dynamics.model import Rates
 from ballfg.dynamics.networks import gram_schmidt
 from ballfg.dynamics.networks.gram_schmidt import SPEED_SCALE, SPIN_SCALE
-from ballfg.dynamics.networks.layers import NETWORKS, NetworkKind
+from ballfg.dynamics.networks.layers import MLP, MNN, Skip
 from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, VELOCITY, VZ
 
 HIGHEST_RESTITUTION: Final = 1.2
 """Largest restitution of a network: above one, so that a fit can pass through unphysical values."""
 START_RESTITUTION: Final = 0.85
 """Restitution of an untrained model."""
+
+Maker = Callable[[int, int], MLP | Skip | MNN]
+"""From the numbers of inputs and outputs to a network."""
 
 _UP = torch.tensor((0.0, 0.0, 1.0), dtype=torch.float64)
 _RAW_SCALES = torch.tensor([1 / SPEED_SCALE] * 3 + [1 / SPIN_SCALE] * 3, dtype=torch.float64)
@@ -26,20 +30,17 @@ class GramSchmidtFlight(nn.Module):
     """Rates in free flight: a network's coefficients on Gram-Schmidt vectors, plus a vertical bias.
 
     Args:
-        kind, width, depth: of the network.  spin_rate: give the angular acceleration too.
+        make: the network.  spin_rate: give the angular acceleration too.
         falls: start from free fall; else from no acceleration at all, for a correction.
-        generator: of the first weights.
 
     Attributes: bias: () m/s^2, upwards.
     """
 
-    def __init__(
-        self, kind: NetworkKind, width: int, depth: int, *, spin_rate: bool, falls: bool, generator: torch.Generator
-    ) -> None:
+    def __init__(self, make: Maker, *, spin_rate: bool, falls: bool) -> None:
         super().__init__()
         self.spin_rate = spin_rate
         outputs = gram_schmidt.FLIGHT_TERMS * (2 if spin_rate else 1)
-        self.network = NETWORKS[kind](gram_schmidt.FLIGHT_FEATURES, outputs, width, depth, generator)
+        self.network = make(gram_schmidt.FLIGHT_FEATURES, outputs)
         self.bias = nn.Parameter(torch.tensor(-STANDARD_GRAVITY if falls else 0.0, dtype=torch.float64))
 
     def forward(self, state: Tensor) -> Rates:
@@ -59,12 +60,10 @@ class RawFlight(nn.Module):
     Args: as for `GramSchmidtFlight`. The bias of the last layer is the gravity.
     """
 
-    def __init__(
-        self, kind: NetworkKind, width: int, depth: int, *, spin_rate: bool, falls: bool, generator: torch.Generator
-    ) -> None:
+    def __init__(self, make: Maker, *, spin_rate: bool, falls: bool) -> None:
         super().__init__()
         self.spin_rate = spin_rate
-        self.network = NETWORKS[kind](6, 6 if spin_rate else 3, width, depth, generator)
+        self.network = make(6, 6 if spin_rate else 3)
         if falls:
             self.network.last.bias.data[2] = -STANDARD_GRAVITY / SPEED_SCALE
 
@@ -78,18 +77,14 @@ class RawFlight(nn.Module):
 class GramSchmidtContact(nn.Module):
     """A bounce: a network's coefficients of Gram-Schmidt vectors in the plane change a first guess of it.
 
-    Args:
-        kind, width, depth: of the network.  radius: m.
-        first: restitution of the guess; 1 where the guess is another model's bounce.  generator: of the first weights.
+    Args: make: the network.  radius: m.  first: restitution of the guess; 1 if that is another model's bounce.
     """
 
-    def __init__(
-        self, kind: NetworkKind, width: int, depth: int, *, radius: float, first: float, generator: torch.Generator
-    ) -> None:
+    def __init__(self, make: Maker, *, radius: float, first: float) -> None:
         super().__init__()
         self.radius, self.first = radius, first
         outputs = gram_schmidt.CONTACT_TERMS + 1
-        self.network = NETWORKS[kind](gram_schmidt.CONTACT_FEATURES, outputs, width, depth, generator)
+        self.network = make(gram_schmidt.CONTACT_FEATURES, outputs)
 
     def forward(self, state: Tensor, guess: Tensor) -> Tensor:
         """(..., 9) after the contact, from the states before it and a guess of those after it."""
@@ -106,12 +101,10 @@ class RawContact(nn.Module):
     Args: as for `GramSchmidtContact`. The radius is unused: the network sees raw velocity and spin only.
     """
 
-    def __init__(
-        self, kind: NetworkKind, width: int, depth: int, *, radius: float, first: float, generator: torch.Generator
-    ) -> None:
+    def __init__(self, make: Maker, *, radius: float, first: float) -> None:
         super().__init__()
         self.first = first
-        self.network = NETWORKS[kind](6, 6, width, depth, generator)
+        self.network = make(6, 6)
 
     def forward(self, state: Tensor, guess: Tensor) -> Tensor:
         """(..., 9) after the contact, from the states before it and a guess of those after it."""

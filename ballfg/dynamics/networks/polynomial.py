@@ -62,8 +62,7 @@ class _Tables:
     Attributes:
         raised: for degree k = 1, 2, ...: (variables, m_k), number of each monomial times each variable in degree k + 1,
             and how many monomials there are in degree k + 1.
-        powers: for degree k = 2, 3, ...: the monomial of degree k - 1 and the variable whose product gives each of
-            powers: for degree k = 2, 3, ...: the monomial of degree k - 1 and the variable whose product each is.
+        powers: for degree k = 2, 3, ...: the monomial of degree k - 1 and the variable whose product each is.
         pairs: (left, right), number of their product in the full degree.
         shares: (left, right), one over the number of pairs that give the same product.
     """
@@ -80,13 +79,11 @@ def _tables(variables: int, depth: int, device: torch.device) -> _Tables:
     indices = functools.partial(torch.tensor, device=device)
     monomials = [combinations_with_replacement(range(variables), k) for k in range(depth + 2)]
     number = [{m: i for i, m in enumerate(of_degree)} for of_degree in monomials]
-    raised = tuple(
-        (
-            indices([[number[k + 1][tuple(sorted((*m, v)))] for m in number[k]] for v in range(variables)]),
-            len(number[k + 1]),
-        )
+    products = [
+        [[number[k + 1][tuple(sorted((*m, v)))] for m in number[k]] for v in range(variables)]
         for k in range(1, depth + 1)
-    )
+    ]
+    raised = tuple((indices(table), len(number[k])) for k, table in enumerate(products, start=2))
     degree = depth + 1
     high = (degree + 1) // 2
     powers = tuple(

@@ -50,15 +50,12 @@ class SpinEmbedding(nn.Module):
                 raise ValueError(f"categories['{label}'] must be values that differ, at least one; got {values}.")
         self.labels = tuple(labels)
         self.categories = {label: tuple(categories[label]) for label in labels if label in categories}
-        self.names = tuple(name for label in labels for name in self._names_of(label))
+        choices = {label: [f"{label}={value}" for value in known] for label, known in self.categories.items()}
+        self.names = tuple(name for label in labels for name in choices.get(label, [label]))
         start = torch.zeros(len(self.names), 3, dtype=torch.float64) if initial is None else initial
         if start.shape != (len(self.names), 3):
             raise ValueError(f"initial must have shape ({len(self.names)}, 3); got {tuple(start.shape)}.")
         self.weight = nn.Parameter(start.to(torch.float64).T.clone() / SPIN_UNIT)
-
-    def _names_of(self, label: str) -> tuple[str, ...]:
-        values = self.categories.get(label)
-        return (label,) if values is None else tuple(f"{label}={value}" for value in values)
 
     def settings(self, labels: Mapping[str, object]) -> Tensor | None:
         """(k,) the settings of a track with these labels, each in its own unit; None if one is missing or unknown.

@@ -1,6 +1,7 @@
 """Draws a camera's view of the still room by following every ray of the image."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import cv2
@@ -65,17 +66,17 @@ def backdrop(camera: Camera, kind: BallKind, rng: np.random.Generator) -> Backdr
             f"camera {shown(camera.name)} must stand in the room, {WALLS[0].tolist()} to {WALLS[1].tolist()} m; "
             f"it stands at {np.round(camera.centre, 2).tolist()} m. Lower the distance."
         )
-    room = _Room(camera, kind, furniture(kind), _texture(rng))
+    look = partial(_look, camera, kind, furniture(kind), _texture(rng))
     width, height = camera.size
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
-    seen = room.look(pixels.reshape(-1, 2))
-    image = seen.colours.reshape(height, width, 3)
-    edges = _edges(seen.faces.reshape(height, width), camera.project(middle_line(kind)))
+    colours, distance, faces = look(pixels.reshape(-1, 2))
+    image = colours.reshape(height, width, 3)
+    edges = _edges(faces.reshape(height, width), camera.project(middle_line(kind)))
     places = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
     within = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
-    fine = room.look((pixels[edges][:, None] + within).reshape(-1, 2))
-    image[edges] = fine.colours.reshape(-1, SAMPLES**2, 3).mean(axis=1)
-    return Backdrop(image, seen.distance.reshape(height, width))
+    fine, _, _ = look((pixels[edges][:, None] + within).reshape(-1, 2))
+    image[edges] = fine.reshape(-1, SAMPLES**2, 3).mean(axis=1)
+    return Backdrop(image, distance.reshape(height, width))
 
 
 def _edges(faces: NDArray[np.uint8], thin: Array) -> NDArray[np.bool_]:
@@ -88,48 +89,28 @@ def _edges(faces: NDArray[np.uint8], thin: Array) -> NDArray[np.bool_]:
     return np.asarray((cv2.dilate(faces, around) != cv2.erode(faces, around)) | (cv2.dilate(line, around) > 0))
 
 
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """Colours, distances and faces that n rays hit."""
-
-    colours: Image
-    """(n, 3)."""
-    distance: Image
-    """(n,) m."""
-    faces: NDArray[np.uint8]
-    """(n,) numbers of faces, including the white lines of the table."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Room:
-    """The room in the view of one camera."""
-
-    camera: Camera
-    kind: BallKind
-    boxes: list[Box]
-    texture: Image
-
-    def look(self, pixels: Array) -> _Seen:
-        """The visible surfaces at pixels (n, 2)."""
-        camera = self.camera
-        rays = (camera.normalized(pixels) @ camera.rotation[:2] + camera.rotation[2]).astype(np.float32)
-        start = camera.centre.astype(np.float32)
-        length, axis = _exit(start, rays, *WALLS)
-        points = start + rays * length[:, None]
-        colours = _walls(points, axis, self.texture)
-        faces = axis.astype(np.uint8)
-        for number, box in enumerate(self.boxes, start=1):
-            window = np.flatnonzero(_may_show(camera, box, pixels))
-            near, across, hits = _entry(start, rays[window], box.low, box.high)
-            hits &= near < length[window]
-            if hits.any():
-                hit = window[hits]
-                points = start + rays[hit] * near[hits][:, None]
-                lines = box.lined & (across[hits] == 2) & is_line(self.kind, points[:, 0], points[:, 1])
-                colours[hit] = _box_colour(box, points, across[hits], lines, self.texture)
-                faces[hit] = FACES * number + across[hits] + 3 * lines
-                length[hit] = near[hits]
-        return _Seen(colours, length * np.linalg.norm(rays, axis=-1), faces)
+def _look(
+    camera: Camera, kind: BallKind, boxes: list[Box], texture: Image, pixels: Array
+) -> tuple[Image, Image, NDArray[np.uint8]]:
+    """Colours (n, 3), distance (n,) m and faces (n,), white lines among them, of what is visible at pixels (n, 2)."""
+    rays = (camera.normalized(pixels) @ camera.rotation[:2] + camera.rotation[2]).astype(np.float32)
+    start = camera.centre.astype(np.float32)
+    length, axis = _exit(start, rays, *WALLS)
+    points = start + rays * length[:, None]
+    colours = _walls(points, axis, texture)
+    faces = axis.astype(np.uint8)
+    for number, box in enumerate(boxes, start=1):
+        window = np.flatnonzero(_may_show(camera, box, pixels))
+        near, across, hits = _entry(start, rays[window], box.low, box.high)
+        hits &= near < length[window]
+        if hits.any():
+            hit = window[hits]
+            points = start + rays[hit] * near[hits][:, None]
+            lines = box.lined & (across[hits] == 2) & is_line(kind, points[:, 0], points[:, 1])
+            colours[hit] = _box_colour(box, points, across[hits], lines, texture)
+            faces[hit] = FACES * number + across[hits] + 3 * lines
+            length[hit] = near[hits]
+    return colours, length * np.linalg.norm(rays, axis=-1), faces
 
 
 def _may_show(camera: Camera, box: Box, pixels: Array) -> NDArray[np.bool_]:

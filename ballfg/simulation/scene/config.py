@@ -9,8 +9,8 @@ from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.effect import Effect
 from ballfg.simulation.balls import BallKind, table_tennis
 from ballfg.simulation.bounded import bounded, check_bounds
-from ballfg.simulation.composition import true_model
 from ballfg.simulation.config import MAX_SEED, check_jitter
+from ballfg.simulation.motion import true_model
 from ballfg.simulation.settings import Settings, all_settings
 
 MAX_SHOTS: Final = 10_000

@@ -81,20 +81,10 @@ def visible_columns(recording: Recording, number: int) -> dict[str, Any]:
         pixels, frame = pixels[seen], passage.frames[seen]
         focal = np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])
         radius = focal * recording.config.ball.ball.radius / camera.depth(passage.centres[seen])
-        rows.append(
-            {
-                "frame": frame,
-                "t": frames.stamps[frame],
-                "t_true": frames.times[frame],
-                "trajectory": np.full(len(frame), passage.name),
-                "u": pixels[:, PATH_POINTS // 2, 0],
-                "v": pixels[:, PATH_POINTS // 2, 1],
-                "u_open": pixels[:, 0, 0],
-                "v_open": pixels[:, 0, 1],
-                "u_close": pixels[:, -1, 0],
-                "v_close": pixels[:, -1, 1],
-                "radius": radius,
-                "whole": inside(camera, pixels, radius[:, None]).all(axis=1).astype(np.int64),
-            }
-        )
+        ends = {"": PATH_POINTS // 2, "_open": 0, "_close": -1}
+        places = {f"{axis}{end}": pixels[:, place, k] for end, place in ends.items() for k, axis in enumerate("uv")}
+        row = {"frame": frame, "t": frames.stamps[frame], "t_true": frames.times[frame]}
+        whole = inside(camera, pixels, radius[:, None]).all(axis=1).astype(np.int64)
+        row |= {"trajectory": np.full(len(frame), passage.name), **places, "radius": radius, "whole": whole}
+        rows.append(row)
     return {"camera": camera.name} | {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}

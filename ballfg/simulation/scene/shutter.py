@@ -49,9 +49,7 @@ class Passage:
 def free_running(names: Sequence[str], rate: float, seed: int) -> dict[str, Clock]:
     """Clocks of unsynchronised cameras: first exposures are spread over one frame interval, never together.
 
-    Args:
-        names: of the cameras.  rate: Hz.
-        seed: draws the order of cameras, each within the middle half of its own share of the interval.
+    Args: rate: Hz.  seed: draws the order of cameras, each within the middle half of its own share of the interval.
     """
     rng = generator(seed, Purpose.SCENE_PHASE)
     place = rng.permutation(len(names)) + rng.uniform(0.25, 0.75, len(names))

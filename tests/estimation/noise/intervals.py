@@ -26,9 +26,8 @@ from ballfg.estimation import Settings, estimate_noise
 from ballfg.estimation.measurement.position_noise import estimate_position_noise
 from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.simulation import MotionNoise, table_tennis
-from ballfg.simulation.composition import KickedModel
 from ballfg.simulation.launcher import SimulatedLauncher
-from ballfg.simulation.motion import simulate_motion
+from ballfg.simulation.motion import KickedModel, simulate_motion
 from ballfg.state import POSITION, VELOCITY
 from ballfg.tracks import Track
 from ballfg.tracks.track import SPIN_LABELS

@@ -16,23 +16,9 @@ from ballfg.dynamics.compiled.beliefs.edges import (
     share_over_table,
 )
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.contacts import contact_times, contacts
-from ballfg.dynamics.compiled.flight import fly_one, white_acceleration
-from ballfg.dynamics.compiled.signatures import (
-    COUNT,
-    FLAG,
-    FOUR,
-    FUNCTION,
-    NOTHING,
-    ONE,
-    REAL,
-    THREE,
-    THREE_FUNCTIONS,
-    THREE_TANGENTS,
-    THREE_VALUES,
-    THREE_WEIGHTS,
-    TWO,
-)
+from ballfg.dynamics.compiled.contacts import meet, times_of
+from ballfg.dynamics.compiled.flight import fly_one, glide, laws_of, laws_of_one, white_acceleration
+from ballfg.dynamics.compiled.signatures import COUNT, FLAG, FOUR, GIVEN, LAW, LAWS, NOTHING, ONE, REAL, THREE, TWO
 from ballfg.dynamics.motion.limits import BEYOND, NEGLIGIBLE, REST_SPEED
 
 
@@ -82,32 +68,26 @@ def add_impact(covariance, since, noise):
         covariance[6 + i, 6 + i] += noise[4] ** 2
 
 
-@machine_code(
-    FLAG(THREE_FUNCTIONS, THREE_VALUES, THREE_TANGENTS, THREE_WEIGHTS, ONE, TWO, REAL, REAL, ONE, ONE, ONE, TWO)
-)
-def bounce(functions, values, tangents, weights, start, covariance, h, level, world, noise, x, after):
+@machine_code(FLAG(LAWS, ONE, TWO, REAL, REAL, ONE, ONE, ONE, TWO))
+def bounce(laws, start, covariance, h, level, world, noise, x, after):
     """One ball (9,), with its covariance, that comes down on a level within h s, or has done so just before.
 
     Writes: its state x (9,) and covariance after (d, d) at the end.
     Returns: whether this is a plain bounce: one, within the table's ends, after which the ball rises. The covariance
-        has the share of balls that fall past an end instead, as `prediction.edges` has it.
+        has the share of balls that fall past an end instead, as `prediction.propagate` has it.
     """
-    d, radius = len(covariance), world[2]
+    d, radius, rates = len(covariance), world[2], laws.rates
     tau, taut, there, moved = np.empty(1), np.empty((1, d)), np.empty((1, 9)), np.zeros((1, 9, d))
     touch, jacobian, gathered = start.copy().reshape((1, 9)), np.zeros((1, 9, d)), np.empty((d, d))
-    levels, longest, still = np.full(1, level), np.full(1, BEYOND), np.zeros(d)
-    rates, impact, surface = functions
-    c, b, s = values
-    ct, bt, st = tangents
-    w, wb, ws = weights
-    contact_times(rates, surface, touch, c, s, w, ws, levels, longest, radius, tau)
+    levels, longest = np.full(1, level), np.full(1, BEYOND)
+    times_of(rates, laws.surface, touch, levels, longest, radius, tau)
     if not -BEYOND <= tau[0] <= h:
         return False
     elapsed = tau[0]
     for i in range(9):
         jacobian[0, i, i] = 1.0
     moved[:] = jacobian
-    fly_one(rates, touch[0], c[0], w, jacobian[0], ct[0], elapsed, still, 1)
+    fly_one(rates, touch[0], jacobian[0], elapsed, np.zeros(d), 1)
     if not touch[0, 5] < 0.0:
         return False
     past = 0.0  # share of balls that miss the table
@@ -118,91 +98,44 @@ def bounce(functions, values, tangents, weights, start, covariance, h, level, wo
     through(jacobian[0], covariance, gathered)
     add_flight(gathered, max(elapsed, 0.0), noise)
     jacobian[:] = moved
-    contacts(
-        rates,
-        impact,
-        surface,
-        touch,
-        jacobian,
-        c,
-        ct,
-        b,
-        bt,
-        s,
-        st,
-        w,
-        wb,
-        ws,
-        levels,
-        longest,
-        radius,
-        tau,
-        taut,
-        there,
-        moved,
-    )
+    meet(laws, touch, jacobian, levels, longest, radius, tau, taut, there, moved)
     if not there[0, 5] >= REST_SPEED:
         return False
     left = h - (elapsed + tau[0])
-    fly_one(rates, there[0], c[0], w, moved[0], ct[0], left, -taut[0], 1)
+    fly_one(rates, there[0], moved[0], left, -taut[0], 1)
     x[:] = there[0]
-    if x[5] < 0.0 and not gap_of(surface, x, s[0], ws, level, radius) >= 0.0:
+    if x[5] < 0.0 and not gap_of(laws.surface, x, level, radius) >= 0.0:
         return False
     through(moved[0], gathered, after)
     add_flight(after, min(left, h), noise)
     add_impact(after, min(left, h), noise)
     if not past < NEGLIGIBLE:
-        beside, none = start.copy(), np.empty((9, 0))
-        fly_one(rates, beside, c[0], w, none, np.empty((c.shape[1], 0)), h, np.empty(0), 1)
+        beside = start.copy()
+        glide(rates, beside, h, 1)
         for i in range(9):
             for j in range(9):
                 after[i, j] += past * (x[i] - beside[i]) * (x[j] - beside[j])
     return True
 
 
-@machine_code(NOTHING(FUNCTION, ONE, TWO, ONE, TWO, ONE, REAL, ONE, ONE, TWO))
-def fly_belief(rates, mean, covariance, c, ct, w, h, noise, after, spread):
+@machine_code(NOTHING(LAW, ONE, TWO, REAL, ONE, ONE, TWO))
+def fly_belief(rates, mean, covariance, h, noise, after, spread):
     """Free flight of one ball over h s. Writes its mean (d,) and covariance (d, d)."""
     d = len(mean)
-    jacobian, still = np.zeros((9, d)), np.zeros(d)
+    jacobian = np.zeros((9, d))
     for i in range(9):
         jacobian[i, i] = 1.0
     after[:] = mean
-    fly_one(rates, after[:9], c, w, jacobian, ct, h, still, 1)
+    fly_one(rates, after[:9], jacobian, h, np.zeros(d), 1)
     through(jacobian, covariance, spread)
     add_flight(spread, h, noise)
 
 
-@machine_code(
-    COUNT(
-        *(FUNCTION, FUNCTION, FUNCTION, TWO, THREE, TWO, THREE, TWO, THREE, ONE, ONE, ONE),
-        *(TWO, ONE, ONE, THREE, FOUR, THREE, FOUR, TWO, TWO, ONE),
-    )
-)
+@machine_code(COUNT(*GIVEN, TWO, ONE, ONE, THREE, FOUR, THREE, FOUR, TWO, TWO, ONE))
 def carry(
-    rates,
-    impact,
-    surface,
-    c,
-    ct,
-    b,
-    bt,
-    s,
-    st,
-    w,
-    wb,
-    ws,
-    h,
-    world,
-    noise,
-    mean,
-    covariance,
-    beside,
-    besides,
-    level,
-    age,
-    hard,
-):
+    rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws,
+    h, world, noise, mean, covariance, beside, besides, level, age, hard,
+):  # fmt: skip
     """Carry n balls on by k steps of at most `MAX_STEP`, from the first row of each array to the next ones.
 
     Args:
@@ -217,39 +150,31 @@ def carry(
     Returns: the number of steps done. Where that is less than k, hard (n,) tells which balls have not done the next
         one: 1 if their bounce is not a plain one, 2 if they rest.
     """
-    n, touch = mean.shape[1], np.empty(9)
+    n, touch, all_laws = mean.shape[1], np.empty(9), laws_of(rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws)
     for k in range(h.shape[1]):
         stop = False
         for r in range(n):
-            x, step = mean[k, r], h[r, k]
-            fly_belief(rates, x, covariance[k, r], c[r], ct[r], w, step, noise, mean[k + 1, r], covariance[k + 1, r])
+            x, step, laws = mean[k, r], h[r, k], laws_of_one(all_laws, r)
+            fly_belief(laws.rates, x, covariance[k, r], step, noise, mean[k + 1, r], covariance[k + 1, r])
             age[k + 1, r] = age[k, r] + step
             if age[k + 1, r] < BEYOND:
-                at, spread = beside[k + 1, r], besides[k + 1, r]
-                fly_belief(rates, beside[k, r], besides[k, r], c[r], ct[r], w, step, noise, at, spread)
+                fly_belief(laws.rates, beside[k, r], besides[k, r], step, noise, beside[k + 1, r], besides[k + 1, r])
                 level[k + 1, r] = level[k, r]
             else:
                 age[k + 1, r] = np.nan
-            low = level_below(x[2], world)
-            after = mean[k + 1, r]
-            if at_rest(x[:9], gap_of(surface, x[:9], s[r], ws, low, world[2]), low, world):
+            low, after = level_below(x[2], world), mean[k + 1, r]
+            if at_rest(x[:9], gap_of(laws.surface, x[:9], low, world[2]), low, world):
                 hard[r], stop = 2.0, True
                 continue
-            if after[5] >= 0.0 or gap_of(surface, after[:9], s[r], ws, low, world[2]) >= 0.0:
+            if after[5] >= 0.0 or gap_of(laws.surface, after[:9], low, world[2]) >= 0.0:
                 continue
-            one = slice(r, r + 1)
-            functions, values, weights = (rates, impact, surface), (c[one], b[one], s[one]), (w, wb, ws)
-            if low == world[0] and gap_of(surface, after[:9], s[r], ws, world[1], world[2]) >= 0.0:
-                tau = come_down(rates, surface, x[:9], c[one], s[one], w, ws, low, world, touch)
-                before, spread = covariance[k, r], covariance[k + 1, r]
-                if falls_past(functions, values, weights, before, touch, tau, step, world, after, spread):
+            if low == world[0] and gap_of(laws.surface, after[:9], world[1], world[2]) >= 0.0:
+                tau = come_down(laws, x[:9], low, world, touch)
+                if falls_past(laws, covariance[k, r], touch, tau, step, world, after, covariance[k + 1, r]):
                     continue
             beside[k + 1, r], besides[k + 1, r] = after, covariance[k + 1, r]
             level[k + 1, r], age[k + 1, r] = low, 0.0
-            if not bounce(
-                *(functions, values, (ct[one], bt[one], st[one]), weights),
-                *(x[:9], covariance[k, r], step, low, world, noise, after[:9], covariance[k + 1, r]),
-            ):
+            if not bounce(laws, x[:9], covariance[k, r], step, low, world, noise, after[:9], covariance[k + 1, r]):
                 hard[r], stop = 1.0, True
         if stop:
             return k

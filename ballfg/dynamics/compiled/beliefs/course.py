@@ -14,7 +14,6 @@ from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.compiled.beliefs.carry import carry
 from ballfg.dynamics.compiled.beliefs.events import find
 from ballfg.dynamics.compiled.beliefs.mixture import mix
-from ballfg.dynamics.compiled.flight import evaluate
 from ballfg.dynamics.compiled.functions import compiled
 from ballfg.dynamics.compiled.in_torch import in_torch, raise_errors
 from ballfg.dynamics.compiled.motion import Moving, world_of
@@ -80,9 +79,7 @@ class Carrier:
         inner = model.model if isinstance(model, AugmentedModel) else model
         functions = compiled(inner) or in_torch(inner)
         moving = Moving(model, functions, torch.from_numpy(mean), mean.shape[1])
-        parts = (functions.rates, functions.impact, functions.surface)
-        coefficients = [array for part in parts for array in moving.coefficients(part)]
-        self._given: tuple[Any, ...] = (*(part.compute for part in parts), *coefficients, *moving.weights)
+        self._given: tuple[Any, ...] = (*moving.computes, *moving.all_coefficients(), *moving.weights)
         self._world, self._noise = world_of(surfaces, functions.radius), noise
         self._keeps = inner  # what torch computes is found by the model as long as it is there
 
@@ -115,36 +112,25 @@ class Carrier:
         """
         mean, covariance = course.mean[-1, 0].copy(), course.covariance[-1, 0].copy()
         normal, offset = (np.zeros(STATE_DIM), 0.0) if line is None else line
-        end, time = find(
-            *self._given,
-            line is None,
-            either_way,
-            normal,
-            offset,
-            earliest,
-            horizon,
-            self._world,
-            self._noise,
-            mean,
-            covariance,
-        )
+        how = (line is None, either_way, normal, offset, earliest, horizon)
+        end, time = find(*self._given, *how, self._world, self._noise, mean, covariance)
         raise_errors()
         return end, time, Course.start(mean[None], covariance[None])
 
     def slopes(self, mean: Array, line: tuple[Array, float] | None) -> tuple[Array, Array]:
         """Gradient (9 + p,) of the event of `find` at a mean (9 + p,), and the mean's rate of change in flight."""
-        width = len(mean)
-        gradient, rate, moved = np.zeros(width), np.zeros(width), np.zeros((3, width))
+        width, x = len(mean), mean[None, :STATE_DIM].copy()
+        gradient, rate, moved = np.zeros(width), np.zeros(width), np.zeros((1, 3, width))
         rates, _, surface, c, _, _, _, s, st, w, _, ws = self._given
         if line is None:
-            evaluate(surface, mean[:STATE_DIM].copy(), s[0], ws, np.eye(STATE_DIM, width), st[0], np.empty(3), moved)
+            surface(x, s[:1], ws, np.eye(STATE_DIM, width)[None], st[:1], np.empty((1, 3)), moved)
             gradient[Z] = 1.0
-            gradient -= moved[0]
+            gradient -= moved[0, 0]
         else:
             gradient[:STATE_DIM] = line[0]
-        change, nothing = np.empty(6), np.empty((STATE_DIM, 0))
-        evaluate(rates, mean[:STATE_DIM].copy(), c[0], w, nothing, np.empty((c.shape[1], 0)), change, np.empty((6, 0)))
-        rate[POSITION], rate[VELOCITY], rate[SPIN] = mean[VELOCITY], change[:3], change[3:]
+        change = np.empty((1, 6))
+        rates(x, c[:1], w, np.empty((1, STATE_DIM, 0)), np.empty((1, c.shape[1], 0)), change, np.empty((1, 6, 0)))
+        rate[POSITION], rate[VELOCITY], rate[SPIN] = mean[VELOCITY], change[0, :3], change[0, 3:]
         return gradient, rate
 
     def mixed(self, course: Course) -> Course:

@@ -5,27 +5,18 @@ import math
 import numpy as np
 
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.contacts import contact_times, contacts
-from ballfg.dynamics.compiled.flight import evaluate, fly_one, put
-from ballfg.dynamics.compiled.signatures import (
-    FLAG,
-    FUNCTION,
-    ONE,
-    REAL,
-    THREE_FUNCTIONS,
-    THREE_VALUES,
-    THREE_WEIGHTS,
-    TWO,
-)
+from ballfg.dynamics.compiled.contacts import meet, times_of
+from ballfg.dynamics.compiled.flight import glide, put, still, value_of
+from ballfg.dynamics.compiled.signatures import FLAG, LAW, LAWS, ONE, REAL, TWO, Laws
 from ballfg.dynamics.motion.limits import BEYOND, DEEPEST, LEAST_SIGMA, NEGLIGIBLE, REST_GAP, REST_SPEED
 from ballfg.dynamics.surfaces import within
 
 
-@machine_code(REAL(FUNCTION, ONE, ONE, ONE, REAL, REAL))
-def gap_of(surface, x, s, ws, level, radius):
+@machine_code(REAL(LAW, ONE, REAL, REAL))
+def gap_of(surface, x, level, radius):
     """Gap (m) of a state to a surface."""
     offset = np.empty(3)
-    evaluate(surface, x, s, ws, np.empty((9, 0)), np.empty((len(s), 0)), offset, np.empty((3, 0)))
+    value_of(surface, x, offset)
     return x[2] - level - offset[0] - radius
 
 
@@ -70,47 +61,43 @@ def share_over_table(touch, covariance, world):
     return within
 
 
-@machine_code(REAL(FUNCTION, FUNCTION, ONE, TWO, TWO, ONE, ONE, REAL, ONE, ONE))
-def come_down(rates, surface, x, c, s, w, ws, level, world, touch):
+@machine_code(REAL(LAWS, ONE, REAL, ONE, ONE))
+def come_down(laws, x, level, world, touch):
     """Time (s) at which a falling ball x (9,) reaches a level; writes its state there to touch (9,).
 
     NaN, with its state unchanged, if it was never above that level.
     """
     tau, state = np.empty(1), x.copy().reshape((1, 9))
-    contact_times(rates, surface, state, c, s, w, ws, np.full(1, level), np.full(1, BEYOND), world[2], tau)
+    times_of(laws.rates, laws.surface, state, np.full(1, level), np.full(1, BEYOND), world[2], tau)
     put(touch, x)
     if math.isfinite(tau[0]):
-        fly_one(rates, touch, c[0], w, np.empty((9, 0)), np.empty((c.shape[1], 0)), tau[0], np.empty(0), 1)
+        glide(laws.rates, touch, tau[0], 1)
     return tau[0]
 
 
-@machine_code(FLAG(THREE_FUNCTIONS, THREE_VALUES, THREE_WEIGHTS, TWO, ONE, REAL, REAL, ONE, ONE, TWO))
-def falls_past(functions, values, weights, covariance, touch, tau, h, world, after, spread):
+@machine_code(FLAG(LAWS, TWO, ONE, REAL, REAL, ONE, ONE, TWO))
+def falls_past(laws, covariance, touch, tau, h, world, after, spread):
     """True if a ball's mean falls past the table whose level it reaches at `touch` (9,) after tau s.
 
     Args: covariance (d, d): before the step of h s.  after (9,): its mean after the step.
     Adds: to the covariance `spread` (d, d) after the step the share of balls that bounce on the table instead, as
-        `prediction.edges` has it. False also where their bounce is not a plain one.
+        `prediction.propagate` has it. False also where their bounce is not a plain one.
     """
     if over_table(touch, world):
         return False
     share = share_over_table(touch, covariance, world) if tau >= 0.0 else 0.0
     if share < NEGLIGIBLE:
         return True
-    rates, impact, surface = functions
-    c, b, s = values
-    w, wb, ws = weights
-    none, nonec, level = np.empty((1, 9, 0)), np.empty((1, c.shape[1], 0)), world[0]
-    noneb, nones, still = np.empty((1, b.shape[1], 0)), np.empty((1, s.shape[1], 0)), np.empty((1, 0))
-    at, sooner, there = touch.copy().reshape((1, 9)), np.empty(1), np.empty((1, 9))
-    contacts(
-        rates, impact, surface, at, none, c, nonec, b, noneb, s, nones, w, wb, ws, np.full(1, level),
-        np.full(1, BEYOND), world[2], sooner, still, there, none.copy(),
-    )  # fmt: skip
+    none, level, sooner, there = np.empty((1, 9, 0)), world[0], np.empty(1), np.empty((1, 9))
+    without = Laws(still(laws.rates), still(laws.impact), still(laws.surface))
+    levels, longest = np.full(1, level), np.full(1, BEYOND)
+    meet(
+        without, touch.copy().reshape((1, 9)), none, levels, longest, world[2], sooner, none[0, :1], there, none.copy()
+    )
     if not there[0, 5] >= REST_SPEED:
         return False
-    fly_one(rates, there[0], c[0], w, none[0], nonec[0], h - tau - sooner[0], np.empty(0), 1)
-    if there[0, 5] < 0.0 and not gap_of(surface, there[0], s[0], ws, level, world[2]) >= 0.0:
+    glide(laws.rates, there[0], h - tau - sooner[0], 1)
+    if there[0, 5] < 0.0 and not gap_of(laws.surface, there[0], level, world[2]) >= 0.0:
         return False
     for i in range(9):
         for j in range(9):

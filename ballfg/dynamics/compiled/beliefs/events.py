@@ -7,8 +7,8 @@ import numpy as np
 from ballfg.dynamics.compiled.beliefs.carry import bounce, fly_belief
 from ballfg.dynamics.compiled.beliefs.edges import at_rest, come_down, falls_past, gap_of, level_below, over_table
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.flight import evaluate, fly_one
-from ballfg.dynamics.compiled.signatures import FLAG, FUNCTION, ONE, REAL, THREE, TWO, several
+from ballfg.dynamics.compiled.flight import glide, laws_of, value_of
+from ballfg.dynamics.compiled.signatures import FLAG, GIVEN, LAW, LAWS, ONE, REAL, TWO, several
 from ballfg.dynamics.motion.limits import MAX_STEP
 
 LOOKS = 16
@@ -23,26 +23,25 @@ NONE, FOUND, HARD = 0.0, 1.0, 2.0
 """Ends of a search: nothing within the horizon; the event; a step other than flight or a plain bounce."""
 
 
-@machine_code(several(REAL, 2)(FUNCTION, ONE, ONE, ONE, ONE, REAL))
-def _value(rates, x, c, w, normal, offset):
+@machine_code(several(REAL, 2)(LAW, ONE, ONE, REAL))
+def _value(rates, x, normal, offset):
     """Normal . x - offset of a state (9,), and its time derivative."""
     a, value, rate = np.empty(6), -offset, 0.0
-    evaluate(rates, x, c, w, np.empty((9, 0)), np.empty((len(c), 0)), a, np.empty((6, 0)))
+    value_of(rates, x, a)
     for i in range(9):
         value += normal[i] * x[i]
         rate += normal[i] * (x[3 + i] if i < 3 else a[i - 3])
     return value, rate
 
 
-@machine_code(REAL(FUNCTION, ONE, ONE, ONE, ONE, REAL, REAL, REAL))
-def _exact(rates, x, c, w, normal, offset, low, high):
+@machine_code(REAL(LAW, ONE, ONE, REAL, REAL, REAL))
+def _exact(rates, x, normal, offset, low, high):
     """The time (s) between two others at which the value is zero in flight from x; NaN where Newton leaves them."""
-    at, none, nonec, still = np.empty(9), np.empty((9, 0)), np.empty((len(c), 0)), np.empty(0)
-    tau, margin = 0.5 * (low + high), 0.5 * (high - low)
+    at, tau, margin = np.empty(9), 0.5 * (low + high), 0.5 * (high - low)
     for _ in range(NEWTON_STEPS):
         at[:] = x
-        fly_one(rates, at, c, w, none, nonec, tau, still, 1)
-        value, rate = _value(rates, at, c, w, normal, offset)
+        glide(rates, at, tau, 1)
+        value, rate = _value(rates, at, normal, offset)
         move = -value / rate
         tau += move
         if not low - margin <= tau <= high + margin:
@@ -52,80 +51,55 @@ def _exact(rates, x, c, w, normal, offset, low, high):
     return tau if abs(move) < 1e3 * TIME_TOLERANCE else np.nan
 
 
-@machine_code(REAL(FUNCTION, ONE, ONE, ONE, ONE, REAL, REAL, REAL, FLAG))
-def _zero(rates, x, c, w, normal, offset, h, earliest, either_way):
+@machine_code(REAL(LAW, ONE, ONE, REAL, REAL, REAL, FLAG))
+def _zero(rates, x, normal, offset, h, earliest, either_way):
     """The first time after `earliest` in h s of free flight at which the value goes through zero; NaN: it does not.
 
     Looks are at the cubic through the values and their rates at both ends, which is right to a micrometre.
     """
     end = x.copy()
-    fly_one(rates, end, c, w, np.empty((9, 0)), np.empty((len(c), 0)), h, np.empty(0), 1)
-    low, low_rate = _value(rates, x, c, w, normal, offset)
-    high, high_rate = _value(rates, end, c, w, normal, offset)
+    glide(rates, end, h, 1)
+    low, low_rate = _value(rates, x, normal, offset)
+    high, high_rate = _value(rates, end, normal, offset)
     before = low
     for look in range(1, LOOKS + 1):
         t = look / LOOKS
         bend = (1.0 - t) * (low_rate * h - (high - low)) - t * (high_rate * h - (high - low))
         value = low + t * (high - low) + t * (1.0 - t) * bend
         if (before > 0.0 and value <= 0.0) or (either_way and before < 0.0 and value >= 0.0):
-            tau = _exact(rates, x, c, w, normal, offset, (look - 1) * h / LOOKS, look * h / LOOKS)
+            tau = _exact(rates, x, normal, offset, (look - 1) * h / LOOKS, look * h / LOOKS)
             if tau > earliest:
                 return tau
         before = value
     return np.nan
 
 
-@machine_code(several(REAL, 3)(FUNCTION, FUNCTION, ONE, TWO, TWO, ONE, ONE, REAL, ONE, ONE))
-def _contact_within(rates, surface, x, c, s, w, ws, h, world, touch):
+@machine_code(several(REAL, 3)(LAWS, ONE, REAL, ONE, ONE))
+def _contact_within(laws, x, h, world, touch):
     """The level (m) that a ball (9,) comes down on within h s and when; h if it does not, NaN if that is unclear.
 
     It is unclear if the ball rests there, or falls past the table to the floor within the step. The third number is the
     time at which it falls past the table, else NaN; writes its state there to touch (9,).
     """
     low, after = level_below(x[2], world), x.copy()
-    if at_rest(x, gap_of(surface, x, s[0], ws, low, world[2]), low, world):
+    if at_rest(x, gap_of(laws.surface, x, low, world[2]), low, world):
         return low, np.nan, np.nan
-    fly_one(rates, after, c[0], w, np.empty((9, 0)), np.empty((c.shape[1], 0)), h, np.empty(0), 1)
-    if after[5] >= 0.0 or gap_of(surface, after, s[0], ws, low, world[2]) >= 0.0:
+    glide(laws.rates, after, h, 1)
+    if after[5] >= 0.0 or gap_of(laws.surface, after, low, world[2]) >= 0.0:
         return np.nan, h, np.nan
-    tau = come_down(rates, surface, x, c, s, w, ws, low, world, touch)
+    tau = come_down(laws, x, low, world, touch)
     if low == world[0] and not over_table(touch, world):
-        if gap_of(surface, after, s[0], ws, world[1], world[2]) >= 0.0:
+        if gap_of(laws.surface, after, world[1], world[2]) >= 0.0:
             return np.nan, h, tau
         return world[1], np.nan, tau
     return low, tau, np.nan
 
 
-@machine_code(
-    several(REAL, 2)(
-        *(FUNCTION, FUNCTION, FUNCTION, TWO, THREE, TWO, THREE, TWO, THREE, ONE, ONE, ONE),
-        *(FLAG, FLAG, ONE, REAL, REAL, REAL, ONE, ONE, ONE, TWO),
-    )
-)
+@machine_code(several(REAL, 2)(*GIVEN, FLAG, FLAG, ONE, REAL, REAL, REAL, ONE, ONE, ONE, TWO))
 def find(
-    rates,
-    impact,
-    surface,
-    c,
-    ct,
-    b,
-    bt,
-    s,
-    st,
-    w,
-    wb,
-    ws,
-    contact,
-    either_way,
-    normal,
-    offset,
-    earliest,
-    horizon,
-    world,
-    noise,
-    mean,
-    covariance,
-):
+    rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws,
+    contact, either_way, normal, offset, earliest, horizon, world, noise, mean, covariance,
+):  # fmt: skip
     """Carries one ball to an event, in place: its next contact, or the time when normal . x falls through an offset.
 
     Args:
@@ -136,36 +110,30 @@ def find(
     Writes: mean (d,) and covariance (d, d) at the event, or where the search ended.
     Returns: `NONE`, `FOUND` or `HARD`, and the time (s) since the start.
     """
-    d, passed = len(mean), 0.0
+    d, passed, laws = len(mean), 0.0, laws_of(rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws)
     after, spread, x, touch = np.empty(d), np.empty((d, d)), mean[:9], np.empty(9)
-    functions, values, weights = (rates, impact, surface), (c, b, s), (w, wb, ws)
     while passed < horizon:
         h = min(MAX_STEP, horizon - passed)
-        low, tau, past = _contact_within(rates, surface, x, c, s, w, ws, h, world, touch)
+        low, tau, past = _contact_within(laws, x, h, world, touch)
         touched = tau < 0.0 and math.isfinite(low)  # before this moment: it bounces at once
         if not (touched or 0.0 <= tau <= h):
             return HARD, passed
         h, event = INSTANT if touched else tau, np.nan
         if not touched:
             if not contact:
-                event = _zero(rates, x, c[0], w, normal, offset, h, earliest - passed, either_way)
+                event = _zero(laws.rates, x, normal, offset, h, earliest - passed, either_way)
             elif math.isfinite(low) and passed + h > earliest:
                 event = h
         if math.isfinite(low) and not math.isfinite(event):
-            if not bounce(
-                *(functions, values, (ct, bt, st), weights),
-                *(x, covariance, h, low, world, noise, after[:9], spread),
-            ):
+            if not bounce(laws, x, covariance, h, low, world, noise, after[:9], spread):
                 return HARD, passed
             after[9:] = mean[9:]
         else:
             h = event if math.isfinite(event) else h
-            fly_belief(rates, mean, covariance, c[0], ct[0], w, h, noise, after, spread)
+            fly_belief(laws.rates, mean, covariance, h, noise, after, spread)
             if contact and low == world[0] and not over_table(after[:9], world):
                 return HARD, passed
-            if past <= h and not falls_past(
-                functions, values, weights, covariance, touch, past, h, world, after, spread
-            ):
+            if past <= h and not falls_past(laws, covariance, touch, past, h, world, after, spread):
                 return HARD, passed
         mean[:] = after
         covariance[:] = spread

@@ -11,22 +11,9 @@ import numpy as np
 from ballfg.dynamics.compiled.beliefs.carry import add_impact, through
 from ballfg.dynamics.compiled.beliefs.edges import gap_of, level_below, over_table
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.contacts import contacts
-from ballfg.dynamics.compiled.flight import evaluate, fly_one
-from ballfg.dynamics.compiled.signatures import (
-    FLAG,
-    FOUR,
-    FUNCTION,
-    NOTHING,
-    ONE,
-    REAL,
-    THREE,
-    THREE_FUNCTIONS,
-    THREE_TANGENTS,
-    THREE_VALUES,
-    THREE_WEIGHTS,
-    TWO,
-)
+from ballfg.dynamics.compiled.contacts import meet
+from ballfg.dynamics.compiled.flight import evaluate, fly_one, laws_of, laws_of_one
+from ballfg.dynamics.compiled.signatures import FLAG, FOUR, GIVEN, LAW, LAWS, NOTHING, ONE, REAL, THREE, TWO, Law, Laws
 from ballfg.dynamics.motion.limits import BEYOND, LEAST_SIGMA
 
 FAR = 4.5
@@ -35,14 +22,14 @@ FAR = 4.5
 At 4 it would be 28 mm/s, as much as a usual sigma."""
 
 
-@machine_code(REAL(FUNCTION, ONE, TWO, ONE, TWO, ONE, REAL, REAL, ONE))
-def _below(surface, mean, covariance, s, st, ws, level, radius, k):
+@machine_code(REAL(LAW, ONE, TWO, REAL, REAL, ONE))
+def _below(surface, mean, covariance, level, radius, k):
     """Writes k (d,) and returns c: a ball at k u off its mean (u standard normal) is below the surface where u < c."""
     d = len(mean)
     xt, offset, moved, gradient = np.zeros((9, d)), np.empty(3), np.empty((3, d)), np.empty(d)
     for i in range(9):
         xt[i, i] = 1.0
-    evaluate(surface, mean[:9], s, ws, xt, st, offset, moved)
+    evaluate(surface, mean[:9], xt, offset, moved)
     for q in range(d):
         gradient[q] = xt[2, q] - moved[0, q]
     variance = 0.0
@@ -69,60 +56,34 @@ def _one_side(mean, covariance, c, k, u, part, spread):
             spread[i, j] = covariance[i, j] + u * (c - u) * k[i] * k[j]
 
 
-@machine_code(TWO(TWO, THREE, ONE))
-def _moved(values, tangents, change):
-    """Coefficients (1, p) after a change (d,) of state and coefficients."""
-    moved = values.copy()
-    for i in range(values.shape[1]):
+@machine_code(LAW(LAW, ONE))
+def _moved(law, change):
+    """The law of one ball after a change (d,) of state and coefficients."""
+    moved = law.c.copy()
+    for i in range(moved.shape[1]):
         for q in range(len(change)):
-            moved[0, i] += tangents[0, i, q] * change[q]
-    return moved
+            moved[0, i] += law.ct[0, i, q] * change[q]
+    return Law(law.compute, moved, law.ct, law.w)
 
 
-@machine_code(FLAG(THREE_FUNCTIONS, THREE_VALUES, THREE_TANGENTS, THREE_WEIGHTS, ONE, ONE, TWO, REAL, ONE, ONE))
-def _bounced(functions, values, tangents, weights, change, mean, covariance, level, world, noise):
+@machine_code(FLAG(LAWS, ONE, ONE, TWO, REAL, ONE, ONE))
+def _bounced(of_mean, change, mean, covariance, level, world, noise):
     """Moves balls below the surface through their past bounce, linear about their mean.
 
-    Args: values: coefficients of the mean on both sides, from which theirs differ by a change (d,).
+    Args: of_mean: laws of the mean on both sides, from which theirs differ by a change (d,).
     Returns: False if this does not describe them: they would bounce a second time, or never came down.
     """
     d, radius = len(mean), world[2]
-    rates, impact, surface = functions
-    ct, bt, st = tangents
-    c, b, s = _moved(values[0], ct, change), _moved(values[1], bt, change), _moved(values[2], st, change)
-    w, wb, ws = weights
+    laws = Laws(_moved(of_mean.rates, change), _moved(of_mean.impact, change), _moved(of_mean.surface, change))
     tau, taut, there, moved = np.empty(1), np.empty((1, d)), np.empty((1, 9)), np.zeros((1, 9, d))
     start, still = mean[:9].copy().reshape((1, 9)), np.zeros((1, 9, d))
     for i in range(9):
         still[0, i, i] = 1.0
-    levels, longest = np.full(1, level), np.full(1, BEYOND)
-    contacts(
-        rates,
-        impact,
-        surface,
-        start,
-        still,
-        c,
-        ct,
-        b,
-        bt,
-        s,
-        st,
-        w,
-        wb,
-        ws,
-        levels,
-        longest,
-        radius,
-        tau,
-        taut,
-        there,
-        moved,
-    )
+    meet(laws, start, still, np.full(1, level), np.full(1, BEYOND), radius, tau, taut, there, moved)
     if not tau[0] <= 0.0:
         return False
-    fly_one(rates, there[0], c[0], w, moved[0], ct[0], -tau[0], -taut[0], 1)
-    if not gap_of(surface, there[0], s[0], ws, level, radius) >= 0.0:
+    fly_one(laws.rates, there[0], moved[0], -tau[0], -taut[0], 1)
+    if not gap_of(laws.surface, there[0], level, radius) >= 0.0:
         return False
     mean[:9] = there[0]
     spread = np.empty((d, d))
@@ -149,12 +110,7 @@ def _join(share, above, aboves, below, belows, mean, covariance):
             covariance[i, j] = (belows[i, j] + belows[j, i]) / 2.0
 
 
-@machine_code(
-    NOTHING(
-        *(FUNCTION, FUNCTION, FUNCTION, TWO, THREE, TWO, THREE, TWO, THREE, ONE, ONE, ONE),
-        *(ONE, ONE, THREE, FOUR, THREE, FOUR, TWO, TWO),
-    )
-)
+@machine_code(NOTHING(*GIVEN, ONE, ONE, THREE, FOUR, THREE, FOUR, TWO, TWO))
 def mix(
     rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws, world, noise, mean, covariance, beside, besides, level, age
 ):
@@ -162,19 +118,19 @@ def mix(
 
     Args: as `carry`, of any number of times.
     """
-    d = mean.shape[2]
+    d, all_laws = mean.shape[2], laws_of(rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws)
     k, own = np.empty(d), np.empty(d)
     above, aboves, below, belows = np.empty(d), np.empty((d, d)), np.empty(d), np.empty((d, d))
     for time in range(mean.shape[0]):
         for r in range(mean.shape[1]):
-            at, spread, c0, low = mean[time, r], covariance[time, r], np.inf, np.nan
+            at, spread, c0, low, laws = mean[time, r], covariance[time, r], np.inf, np.nan, laws_of_one(all_laws, r)
             if age[time, r] >= 0.0:
                 low = level[time, r]
                 below[:], belows[:] = beside[time, r], besides[time, r]
-                c0 = _below(surface, below, belows, s[r], st[r], ws, low, world[2], k)
+                c0 = _below(laws.surface, below, belows, low, world[2], k)
             under = level_below(at[2], world)
             if at[5] < 0.0 and math.isfinite(under) and (under != world[0] or over_table(at, world)):
-                c1 = _below(surface, at, spread, s[r], st[r], ws, under, world[2], own)
+                c1 = _below(laws.surface, at, spread, under, world[2], own)
                 if abs(c1) < abs(c0):  # of two contacts of a ball the nearer one
                     c0, low = c1, under
                     k[:], below[:], belows[:] = own, at, spread
@@ -186,12 +142,5 @@ def mix(
             _one_side(below, belows, c0, k, -density / share, below, belows)
             for i in range(d):
                 own[i] = -density / share * k[i]
-            one = slice(r, r + 1)
-            if _bounced(
-                (rates, impact, surface),
-                (c[one], b[one], s[one]),
-                (ct[one], bt[one], st[one]),
-                (w, wb, ws),
-                *(own, below, belows, low, world, noise),
-            ):
+            if _bounced(laws, own, below, belows, low, world, noise):
                 _join(share, above, aboves, below, belows, at, spread)

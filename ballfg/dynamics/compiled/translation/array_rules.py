@@ -9,7 +9,15 @@ import numpy as np
 
 from ballfg.dynamics.compiled.translation.arrays import Arrays, Each, Product, Total, View
 from ballfg.dynamics.compiled.translation.program import Program
-from ballfg.dynamics.compiled.translation.rules import EACH, Rules, UnknownOperationError, aten
+from ballfg.dynamics.compiled.translation.rules import (
+    COPIES,
+    EACH,
+    RESHAPES,
+    SQUEEZES,
+    Rules,
+    UnknownOperationError,
+    aten,
+)
 
 
 def each_of(arrays: Arrays, target: Any, args: Sequence[Any], kwargs: Mapping[str, Any]) -> View:
@@ -68,33 +76,19 @@ def _mean(arrays: Arrays, view: View, dims: Sequence[int] | None = None, keep: b
     return each_of(arrays, aten.mul.Scalar, [total, total.size / view.size], {})
 
 
-def _transposed(view: View, a: int, b: int) -> View:
-    dims = list(range(len(view.shape)))
-    dims[a], dims[b] = dims[b], dims[a]
-    return view.permuted(dims)
-
-
 ARRAY_RULES: Final[dict[Any, Callable[..., View]]] = {
     aten.mm.default: _product,
     aten.addmm.default: _linear,
-    aten.sum.dim_IntList: _total,
-    aten.sum.default: _total,
-    aten.mean.dim: _mean,
-    aten.mean.default: _mean,
-    aten.view.default: _reshaped,
-    aten.reshape.default: _reshaped,
-    aten._unsafe_view.default: _reshaped,
+    **dict.fromkeys((aten.sum.dim_IntList, aten.sum.default), _total),
+    **dict.fromkeys((aten.mean.dim, aten.mean.default), _mean),
+    **dict.fromkeys(RESHAPES, _reshaped),
     aten.unsqueeze.default: lambda _, view, dim: view.unsqueezed(dim),
-    aten.squeeze.dim: lambda _, view, dim: view.squeezed(dim),
-    aten.squeeze_.dim: lambda _, view, dim: view.squeezed(dim),
+    **dict.fromkeys(SQUEEZES, lambda _, view, dim: view.squeezed(dim)),
     aten.expand.default: lambda _, view, shape, **__: view.broadcast(_full(view, shape)),
     aten.permute.default: lambda _, view, dims: view.permuted(dims),
-    aten.transpose.int: lambda _, view, a, b: _transposed(view, a, b),
+    aten.transpose.int: lambda _, view, a, b: view.swapped(a, b),
     aten.t.default: lambda _, view: view.permuted((1, 0)) if len(view.shape) == 2 else view,
-    aten.clone.default: lambda _, view, **__: view,
-    aten.alias.default: lambda _, view: view,
-    aten.detach.default: lambda _, view: view,
-    aten._to_copy.default: lambda _, view, **__: view,
+    **dict.fromkeys(COPIES, lambda _, view, **__: view),
 }
 """Rules of further operations by operation."""
 

@@ -70,23 +70,21 @@ class View:
         """With its dimensions in another order."""
         return replace(self, shape=tuple(self.shape[d] for d in dims), strides=tuple(self.strides[d] for d in dims))
 
+    def swapped(self, a: int, b: int) -> View:
+        """With two dimensions exchanged."""
+        dims = list(range(len(self.shape)))
+        dims[a], dims[b] = dims[b], dims[a]
+        return self.permuted(dims)
+
     def unsqueezed(self, dim: int) -> View:
         """With a further dimension of length one."""
-        at = dim % (len(self.shape) + 1)
-        return replace(
-            self,
-            shape=(*self.shape[:at], 1, *self.shape[at:]),
-            strides=(*self.strides[:at], 0, *self.strides[at:]),
-        )
+        at, (shape, strides) = dim % (len(self.shape) + 1), (self.shape, self.strides)
+        return replace(self, shape=(*shape[:at], 1, *shape[at:]), strides=(*strides[:at], 0, *strides[at:]))
 
     def squeezed(self, dim: int) -> View:
-        """Without a dimension of length one."""
+        """Without a dimension, if its length is one."""
         at = dim % len(self.shape)
-        if self.shape[at] != 1:
-            return self
-        return replace(
-            self, shape=self.shape[:at] + self.shape[at + 1 :], strides=self.strides[:at] + self.strides[at + 1 :]
-        )
+        return self if self.shape[at] != 1 else self.permuted([d for d in range(len(self.shape)) if d != at])
 
     def broadcast(self, shape: Sequence[int]) -> View:
         """Repeated to a larger shape."""

@@ -16,6 +16,9 @@ from ballfg.dynamics.compiled.translation.program import Program
 Numbers = NDArray[np.object_]
 """A tensor of numbers of a program."""
 aten: Any = torch.ops.aten
+SQUEEZES: Final = (aten.squeeze.dim, aten.squeeze_.dim)
+RESHAPES: Final = (aten.view.default, aten.reshape.default, aten._unsafe_view.default)
+COPIES: Final = (aten.clone.default, aten.alias.default, aten.detach.default, aten._to_copy.default)
 
 
 class UnknownOperationError(Exception):
@@ -139,26 +142,15 @@ def _new(rules: Rules, _: Numbers, shape: Sequence[int], value: float = 0.0, **_
 
 
 EACH: Final[dict[Any, Callable[..., Numbers]]] = {
-    aten.add.Tensor: _add,
-    aten.add.Scalar: _add,
-    aten.sub.Tensor: _sub,
-    aten.sub.Scalar: _sub,
+    **{getattr(aten, name).default: _each(name) for name in ("neg", "sqrt", "exp", "tanh", "abs", "sin", "cos", "log")},
+    **dict.fromkeys((aten.add.Tensor, aten.add.Scalar), _add),
+    **dict.fromkeys((aten.sub.Tensor, aten.sub.Scalar), _sub),
     aten.rsub.Scalar: lambda r, a, b, alpha=1: _sub(r, b, a, alpha),
-    aten.mul.Tensor: _each("mul"),
-    aten.mul.Scalar: _each("mul"),
-    aten.div.Tensor: _each("div"),
-    aten.div.Scalar: _each("div"),
+    **dict.fromkeys((aten.mul.Tensor, aten.mul.Scalar), _each("mul")),
+    **dict.fromkeys((aten.div.Tensor, aten.div.Scalar), _each("div")),
     aten.addcmul.default: lambda r, a, b, c: r.each("add", a, r.each("mul", b, c)),
-    aten.neg.default: _each("neg"),
-    aten.sqrt.default: _each("sqrt"),
-    aten.exp.default: _each("exp"),
-    aten.tanh.default: _each("tanh"),
-    aten.abs.default: _each("abs"),
     aten.reciprocal.default: lambda r, x: r.each("div", 1.0, x),
     aten.rsqrt.default: lambda r, x: r.each("div", 1.0, r.each("sqrt", x)),
-    aten.sin.default: _each("sin"),
-    aten.cos.default: _each("cos"),
-    aten.log.default: _each("log"),
     aten.square.default: lambda r, x: r.each("mul", x, x),
     aten.pow.Tensor_Scalar: _pow,
     aten.clamp.default: _clamp,
@@ -169,25 +161,18 @@ EACH: Final[dict[Any, Callable[..., Numbers]]] = {
 
 RULES: Final[dict[Any, Callable[..., Any]]] = {
     **EACH,
-    aten.tan.default: _each("tan"),
-    aten.minimum.default: _each("minimum"),
-    aten.maximum.default: _each("maximum"),
-    aten.sign.default: _each("sign"),
+    **{getattr(aten, name).default: _each(name) for name in ("tan", "minimum", "maximum", "sign")},
     aten.where.self: _each("where"),
-    aten.lt.Scalar: _each("lt"),
-    aten.lt.Tensor: _each("lt"),
-    aten.gt.Scalar: _each("gt"),
-    aten.gt.Tensor: _each("gt"),
+    **dict.fromkeys((aten.lt.Scalar, aten.lt.Tensor), _each("lt")),
+    **dict.fromkeys((aten.gt.Scalar, aten.gt.Tensor), _each("gt")),
     aten.le.Scalar: _each("le"),
     aten.ge.Scalar: _each("ge"),
     aten.sum.dim_IntList: lambda r, x, dims, keep=False, **_: r.total(x, dims, keep),
     aten.sum.default: lambda r, x, **_: r.total(x, None, keep=False),
-    aten.mean.dim: _mean,
-    aten.mean.default: _mean,
+    **dict.fromkeys((aten.mean.dim, aten.mean.default), _mean),
     aten.linalg_vector_norm.default: _norm,
     aten.linalg_cross.default: lambda r, a, b, dim=-1: _cross(r, a, b, dim),
-    aten.mm.default: lambda r, a, b: r.matmul(a, b),
-    aten.bmm.default: lambda r, a, b: r.matmul(a, b),
+    **dict.fromkeys((aten.mm.default, aten.bmm.default), Rules.matmul),
     aten.addmm.default: lambda r, plus, a, b: r.each("add", plus, r.matmul(a, b)),
     aten.constant_pad_nd.default: _padded,
     aten.index_select.default: lambda r, x, dim, index: np.asarray(np.take(x, index.numpy(), axis=dim), dtype=object),
@@ -203,25 +188,15 @@ RULES: Final[dict[Any, Callable[..., Any]]] = {
         x, [x.shape[i - len(shape)] if n == -1 else n for i, n in enumerate(shape)]
     ),
     aten.unsqueeze.default: lambda r, x, dim: np.expand_dims(x, dim),
-    aten.squeeze_.dim: lambda r, x, dim: np.squeeze(x, dim) if x.shape[dim] == 1 else x,
-    aten.squeeze.dim: lambda r, x, dim: np.squeeze(x, dim) if x.shape[dim] == 1 else x,
-    aten.view.default: lambda r, x, shape: x.reshape(shape),
-    aten.reshape.default: lambda r, x, shape: x.reshape(shape),
-    aten._unsafe_view.default: lambda r, x, shape: x.reshape(shape),
+    **dict.fromkeys(SQUEEZES, lambda r, x, dim: np.squeeze(x, dim) if x.shape[dim] == 1 else x),
+    **dict.fromkeys(RESHAPES, lambda r, x, shape: x.reshape(shape)),
     aten.permute.default: lambda r, x, dims: np.transpose(x, dims),
     aten.transpose.int: lambda r, x, a, b: np.swapaxes(x, a, b),
     aten.t.default: lambda r, x: x.T,
-    aten.zeros_like.default: _filled(0.0),
-    aten.ones_like.default: _filled(1.0),
-    aten.new_zeros.default: _new,
-    aten.new_full.default: _new,
-    aten.zeros.default: _filled(0.0),
-    aten.ones.default: _filled(1.0),
-    aten.clone.default: lambda r, x, **_: x,
-    aten.alias.default: lambda r, x: x,
-    aten.detach.default: lambda r, x: x,
-    aten.lift_fresh_copy.default: lambda r, x: x,
-    aten._to_copy.default: lambda r, x, **_: x,
+    **dict.fromkeys((aten.zeros_like.default, aten.zeros.default), _filled(0.0)),
+    **dict.fromkeys((aten.ones_like.default, aten.ones.default), _filled(1.0)),
+    **dict.fromkeys((aten.new_zeros.default, aten.new_full.default), _new),
+    **dict.fromkeys((*COPIES, aten.lift_fresh_copy.default), lambda r, x, **_: x),
     operator.getitem: lambda r, parts, i: parts[i],
 }
 """Rules by operation."""

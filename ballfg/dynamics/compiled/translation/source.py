@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 
 from ballfg.dynamics.compiled.translation.adjoints import carried_back
 from ballfg.dynamics.compiled.translation.arrays import Load
-from ballfg.dynamics.compiled.translation.expression import expression
-from ballfg.dynamics.compiled.translation.loops import EACH_STATE, Entries, filled, indented, moved
+from ballfg.dynamics.compiled.translation.loops import EACH_STATE, Entries, expression, filled, indented, moved
 from ballfg.dynamics.compiled.translation.program import Number, Operation
 from ballfg.dynamics.compiled.translation.trace import Traced
 
