@@ -33,11 +33,6 @@ class Layout:
     width: int = STATE_DIM
 
     @property
-    def states(self) -> int:
-        """Number of states of all tracks."""
-        return sum(self.lengths)
-
-    @property
     def starts(self) -> tuple[int, ...]:
         """Index of each track's first state."""
         return tuple(np.concatenate(([0], np.cumsum(self.lengths[:-1]))).astype(int).tolist())
@@ -49,8 +44,8 @@ class Layout:
 
     def unpack(self, point: Tensor) -> tuple[Tensor, Tensor]:
         """States with their biases (n, w) and coefficients (t, p) of a vector."""
-        states = point[: self.states * self.width].view(-1, self.width)
-        return states, point[self.states * self.width :].view(len(self.lengths), self.coefficients)
+        states, coefficients = point.split((sum(self.lengths) * self.width, len(self.lengths) * self.coefficients))
+        return states.view(-1, self.width), coefficients.view(len(self.lengths), self.coefficients)
 
     def owners(self) -> Tensor:
         """Track number of each entry of the vector."""
@@ -124,12 +119,9 @@ def rewhitened(residual: Tensor, change: Tensor | None) -> Tensor:
 
 def _block(members: Sequence[tuple[int, FactorBatch]], starts: Sequence[int]) -> _Block:
     """The kinds of one group as one kind, its variables numbered through all tracks."""
-    moved = []
-    for track, kind in members:
-        shifted = copy.copy(kind)
-        shared = kind.variables == COEFFICIENTS
-        shifted.variables = np.where(shared, track, kind.variables + starts[track])
-        moved.append(shifted)
+    moved = [copy.copy(kind) for _, kind in members]
+    for (track, kind), shifted in zip(members, moved, strict=True):
+        shifted.variables = np.where(kind.variables == COEFFICIENTS, track, kind.variables + starts[track])
     whole = merge(moved)
     is_shared = (members[0][1].variables == COEFFICIENTS).all(axis=0)
     columns = [torch.from_numpy(column.copy()) for column in whole.variables.T]
