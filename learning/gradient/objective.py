@@ -33,6 +33,11 @@ class Layout:
     width: int = STATE_DIM
 
     @property
+    def states(self) -> int:
+        """Number of states of all tracks."""
+        return sum(self.lengths)
+
+    @property
     def starts(self) -> tuple[int, ...]:
         """Index of each track's first state."""
         return tuple(np.concatenate(([0], np.cumsum(self.lengths[:-1]))).astype(int).tolist())
@@ -44,8 +49,8 @@ class Layout:
 
     def unpack(self, point: Tensor) -> tuple[Tensor, Tensor]:
         """States with their biases (n, w) and coefficients (t, p) of a vector."""
-        states, coefficients = point.split((sum(self.lengths) * self.width, len(self.lengths) * self.coefficients))
-        return states.view(-1, self.width), coefficients.view(len(self.lengths), self.coefficients)
+        states = point[: self.states * self.width].view(-1, self.width)
+        return states, point[self.states * self.width :].view(len(self.lengths), self.coefficients)
 
     def owners(self) -> Tensor:
         """Track number of each entry of the vector."""
