@@ -59,7 +59,7 @@ class Hypothesis:
     def reported(self, fit: Fit, values: Mapping[str, Value]) -> dict[str, Value]:
         """Coefficients for a report; values: fitted ones, by coefficient."""
         shape = {c: Value(v, 0.0, self.coefficients[c].unit) for c, v in self.shape.items() if c not in values}
-        return values | shape
+        return {**values, **shape}
 
     @cached_property
     def coefficients(self) -> dict[str, Coefficient]:

@@ -142,9 +142,9 @@ def _left_over(diagnosis: Diagnosis) -> Html:
     if left.fallback is not None:
         without, within = (fixed(e.prediction_rmse_mm, 1) for e in (left.fallback.before, left.fallback.after))
         purpose = "It describes the rest without naming a cause. Prediction error on the held-out tracks:"
-        head, described = tag("h3", "A stopgap: ", left.fallback.kind), tag("code", left.fallback.description)
+        title, described = tag("h3", "A stopgap: ", left.fallback.kind), tag("code", left.fallback.description)
         helps = tag("p", f"{purpose} {without} mm without, {within} mm with it.")
-        rest = tag("article", head, tag("p", described), helps, kind="card")
+        rest = tag("article", title, tag("p", described), helps, kind="card")
     counted = tag("p", share) if share else ""
     return section("What is left unexplained", tag("p", words), counted, tests, quietly, _labels(diagnosis), rest)
 
