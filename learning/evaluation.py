@@ -19,7 +19,6 @@ class TrackScore(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     name: str
-    """Name of the track."""
     samples: int = Field(ge=1)
     """Number of predicted samples."""
     rmse: float = Field(ge=0.0, le=1e9)
@@ -38,7 +37,6 @@ class Summary(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
     tracks: int
-    """Number of tracks."""
     rmse_median: float
     """m, median over tracks."""
     rmse_pooled: float
@@ -82,14 +80,15 @@ def summary(scores: Sequence[TrackScore]) -> Summary | None:
     """The summary of some scores; None for no tracks."""
     if not scores:
         return None
-    samples = np.array([s.samples for s in scores], dtype=np.float64)
+    samples, rmse, covered, prediction_nis, nis = np.array(
+        [(s.samples, s.rmse, s.covered, s.prediction_nis, s.nis) for s in scores], dtype=np.float64
+    ).T.copy()
     share = samples / samples.sum()
-    rmse = np.array([s.rmse for s in scores])
     return Summary(
         tracks=len(scores),
         rmse_median=float(np.median(rmse)),
         rmse_pooled=float(np.sqrt(share @ rmse**2)),
-        coverage_90=float(share @ np.array([s.covered for s in scores])),
-        prediction_nis=float(share @ np.array([s.prediction_nis for s in scores])),
-        nis=float(np.mean([s.nis for s in scores])),
+        coverage_90=float(share @ covered),
+        prediction_nis=float(share @ prediction_nis),
+        nis=float(np.mean(nis)),
     )

@@ -40,15 +40,10 @@ NETWORKS = {"mlp": "Mlp", "mlp+gs": "MlpGramSchmidt", "skip+gs": "SkipGramSchmid
 SEQUENCES = {"lstm": "Lstm", "diffusion": "Diffusion"}
 """Kinds that map observations to the rest of a track, without estimator and dynamics."""
 
+_OWN = {name: f"ballfg.learning.end_to_end.build:{cls}" for name, cls in {"a-tune": "ATune", **NETWORKS}.items()}
+_OWN |= {name: f"ballfg.learning.sequence.trainee:{cls}" for name, cls in SEQUENCES.items()}
 TRAINEES: Registry[TraineeKind] = Registry(
-    "trainee",
-    group="ballfg.trainees",
-    base=TraineeKind,
-    remedy="docs/learn.md has an example.",
-    own={
-        **{name: f"ballfg.learning.end_to_end.build:{cls}" for name, cls in {"a-tune": "ATune", **NETWORKS}.items()},
-        **{name: f"ballfg.learning.sequence.trainee:{cls}" for name, cls in SEQUENCES.items()},
-    },
+    "trainee", group="ballfg.trainees", base=TraineeKind, remedy="docs/learn.md has an example.", own=_OWN
 )
 """All kinds by name."""
 

@@ -28,7 +28,6 @@ class TrainingShot:
         usable: (n,) bool, samples that measure the ball.
         segmentation: events of the observed part.
         settings: of the estimator, before anything is learned.
-        surfaces: table and floor.
         room: name of the dataset.
     """
 
@@ -70,20 +69,18 @@ def shots_of(
     The model finds the events; an analytic one will do.
     """
     smoother = Smoother(model, surfaces, settings)
-    for track in tracks:
-        yield track, _shot(track, smoother, samples, seconds)
-
-
-def _shot(track: Track, smoother: Smoother, samples: int | None, seconds: float | None) -> TrainingShot | str:
-    track = track.since_first()
-    whole = smoother.segment(track)
-    end = int(whole.hits[0]) + 1 if len(whole.hits) else len(track)
-    track, usable = part(track, end), whole.usable[:end]
-    observed = samples if seconds is None else len(track.opening(seconds))
-    assert observed is not None
-    if observed < LEAST_OBSERVED or usable[:observed].sum() < LEAST_OBSERVED:
-        return f"fewer than {LEAST_OBSERVED} usable samples are observed"
-    if usable[observed:].sum() < LEAST_PREDICTED:
-        return f"fewer than {LEAST_PREDICTED} usable samples follow the observed part before the ball is hit"
-    seen = part(track, observed)
-    return TrainingShot(track, observed, usable, smoother.segment(seen), smoother.settings, smoother.surfaces)
+    for given in tracks:
+        track = given.since_first()
+        whole = smoother.segment(track)
+        end = int(whole.hits[0]) + 1 if len(whole.hits) else len(track)
+        track, usable = part(track, end), whole.usable[:end]
+        observed = samples if seconds is None else len(track.opening(seconds))
+        assert observed is not None
+        if observed < LEAST_OBSERVED or usable[:observed].sum() < LEAST_OBSERVED:
+            yield given, f"fewer than {LEAST_OBSERVED} usable samples are observed"
+        elif usable[observed:].sum() < LEAST_PREDICTED:
+            least = f"fewer than {LEAST_PREDICTED} usable samples"
+            yield given, f"{least} follow the observed part before the ball is hit"
+        else:
+            events = smoother.segment(part(track, observed))
+            yield given, TrainingShot(track, observed, usable, events, smoother.settings, smoother.surfaces)

@@ -38,12 +38,10 @@ class BatchLoss:
 
 @dataclass(frozen=True)
 class PredictedShot:
-    """The predicted and measured positions of a track.
+    """The predicted and measured positions (k, 3) m of a track.
 
     Attributes:
-        name: of the track.
         times: (k,) s since the last observed sample; those of observed samples are not positive.
-        measured, predicted: (k, 3) m.
     """
 
     name: str
@@ -121,13 +119,7 @@ class Trainee(ABC):
 
 
 class Prepared(NamedTuple):
-    """A trainee that is ready to train.
-
-    Attributes:
-        trainee: the model with its data.
-        train: numbers of the tracks that train.
-        validation: numbers of the tracks that validate.
-    """
+    """A trainee that is ready to train, and the numbers of the tracks that train and that validate."""
 
     trainee: Trainee
     train: Sequence[int]

@@ -30,9 +30,7 @@ class TrainingData:
     """The data of a training.
 
     Attributes:
-        shots: the tracks, each cut into an observed part and a rest to predict.
-        train: numbers of the shots that train.
-        validation: numbers of the shots that validate.
+        train, validation: numbers of the shots that train and that validate.
         analytic: the analytic model that is tuned, corrected, or where networks start.
         embedding: the spin that the launcher's settings mean; None without settings.
     """
@@ -55,7 +53,12 @@ def read_training_data(config: TrainConfig) -> TrainingData:
         for number, dataset in enumerate(datasets)
         for track in dataset
     ]
-    analytic = _analytic(config, datasets)
+    radii = {dataset.info.ball.radius for dataset in datasets}
+    if len(radii) > 1:
+        raise ValueError(f"data must be of one kind of ball; got radii {sorted(radii)} m. Train a model for each.")
+    analytic = analytic_model(config.model, datasets[0].info.ball)
+    if not analytic.measures_plainly:
+        raise ValueError("model must have no measurement effects; got some, which training does not know. Remove them.")
     train, validation = training_split(tracks, config.split, config.seed)
     embedding = _embedding(config, [tracks[k][1] for k in train])
     settings = [_settings(config, dataset, analytic, embedding) for dataset in datasets]
@@ -82,11 +85,9 @@ def analytic_model(path: str | None, ball: Ball) -> AnalyticModel:
 
     Raises: ValueError: if the file's model has a learned part, or coefficients that differ between tracks.
     """
-    model = (
-        nominal_model(ball)
-        if path is None
-        else load_model(path, radius=ball.radius, inertia_factor=inertia_factor(ball))
-    )
+    if path is None:
+        return nominal_model(ball)
+    model = load_model(path, radius=ball.radius, inertia_factor=inertia_factor(ball))
     if not isinstance(model, AnalyticModel):
         raise ValueError(f"model must be analytic; {path} has a learned part. Give its base, or leave it out.")
     if model.variations:
@@ -107,26 +108,13 @@ def categories_of(labels: Sequence[str], tracks: Sequence[Track]) -> dict[str, t
     return categories
 
 
-def _analytic(config: TrainConfig, datasets: Sequence[Dataset]) -> AnalyticModel:
-    balls = [dataset.info.ball for dataset in datasets]
-    radii = {ball.radius for ball in balls}
-    if len(radii) > 1:
-        raise ValueError(f"data must be of one kind of ball; got radii {sorted(radii)} m. Train a model for each.")
-    model = analytic_model(config.model, balls[0])
-    if not model.measures_plainly:
-        raise ValueError("model must have no measurement effects; got some, which training does not know. Remove them.")
-    return model
-
-
 def _embedding(config: TrainConfig, tracks: Sequence[Track]) -> SpinEmbedding | None:
     """The meaning of the launcher's settings before anything is learned."""
-    labels = config.launcher.labels
-    if labels is None:
+    if config.launcher.labels is None:
         return None
-    categories = categories_of(labels, tracks)
-    names = SpinEmbedding(labels, categories).names
-    rows = [FIRST_SPIN.get(name, (0.0, 0.0, 0.0)) for name in names]
-    return SpinEmbedding(labels, categories, torch.tensor(rows, dtype=torch.float64))
+    embedding = SpinEmbedding(config.launcher.labels, categories_of(config.launcher.labels, tracks))
+    rows = [FIRST_SPIN.get(name, (0.0, 0.0, 0.0)) for name in embedding.names]
+    return SpinEmbedding(embedding.labels, embedding.categories, torch.tensor(rows, dtype=torch.float64))
 
 
 def _settings(
@@ -135,8 +123,7 @@ def _settings(
     """The estimator's settings for a dataset, with the noise of the config; the model counts as exact."""
     given = config.noise.model_dump(exclude_none=True, exclude={"position_scale"})
     spin = given.pop("spin_label", None)
-    settings = dataset_settings(dataset, analytic)
-    launcher = None
+    settings, launcher = dataset_settings(dataset, analytic), None
     if embedding is not None:
         launcher = Launcher(embedding, spin or FIRST_SPIN_NOISE, {"group": dataset.info.name})
     return replace(
@@ -161,14 +148,8 @@ def _shots(
     reasons: Counter[str] = Counter()
     for number, dataset in enumerate(datasets):
         mine = [k for k, (owner, _) in enumerate(tracks) if owner == number]
-        made = shots_of(
-            (tracks[k][1] for k in mine),
-            analytic,
-            dataset_surfaces(dataset),
-            settings[number],
-            samples=config.observe.samples,
-            seconds=config.observe.seconds,
-        )
+        own, observed = (tracks[k][1] for k in mine), config.observe.model_dump()
+        made = shots_of(own, analytic, dataset_surfaces(dataset), settings[number], **observed)
         for k, (_, shot) in zip(mine, made, strict=True):
             if isinstance(shot, str):
                 reasons[f"{dataset.info.name}: {shot}"] += 1

@@ -14,12 +14,11 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import torch
 
-from ballfg.arrays import Array
 from ballfg.checks import check_range
 from ballfg.diagnosis.diagnosis import in_order, strange, verdict_of, what_is_left
 from ballfg.diagnosis.fit.fit import first_guess, fit_model, fit_problem, reachable, values_of
 from ballfg.diagnosis.fit.free import LOOSE, Deviation, declared_free
-from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout, hold_out
+from ballfg.diagnosis.fit.holdout import Holdout, hold_out
 from ballfg.diagnosis.fit.patterns import DRIFT
 from ballfg.diagnosis.fit.problem import Fit, Noise, Problem
 from ballfg.diagnosis.fit.stretches import Stretches, joined
@@ -49,16 +48,12 @@ MOST_TRACKS: Final = 60
 
 @dataclass(frozen=True)
 class Room:
-    """One room: its name, its tracks in two halves, and the noise about a fit of its own."""
+    """One room: its name, its tracks in two halves, the noise about a fit of its own, and the place of its settings."""
 
     name: str
     holdout: Holdout
     noise: Noise
-
-    @property
-    def settings(self) -> int:
-        """Number of its launcher's settings."""
-        return self.holdout.search.settings.shape[1]
+    settings: slice
 
 
 @dataclass(frozen=True)
@@ -102,8 +97,8 @@ def diagnose_jointly(
     search_half, held_out = (_together(rooms, half) for half in ("search", "held_out"))
     halves = replace(rooms[0].holdout, search=search_half, held_out=held_out, tracks=())
     tell(f"fitting the ball to {len(halves.search)} flights of {len(rooms)} rooms")
-    way = _way(rooms)
-    first = _first_fit(model, halves, way)
+    names = {room.name: (*room.holdout.search.names, *room.holdout.held_out.names) for room in rooms}
+    way = Grouping(ROOM, {room: {f"{room}/{name}": 1.0 for name in own} for room, own in names.items()})
     predicting = _Predicting(rooms, jobs)
     effects = tuple(catalogue or EFFECTS.values())
     of_ball = tuple(e for e in effects if e.belongs_to == "ball")
@@ -118,7 +113,7 @@ def diagnose_jointly(
         ways=lambda searched: [way],
         name_at=name_at,
     )
-    search = loop.run(model, first)
+    search = loop.run(model, _first_fit(model, halves, way))
     tell("looking at what is left")
     models = predicting.models(predicting(search.whole).model)
     labels = _labels(rooms, models, model, jobs)
@@ -174,7 +169,7 @@ def _rooms(datasets: Sequence[Dataset], model: AnalyticModel, jobs: int, tell: C
             f"datasets must be two or more, each with a name of its own; got {', '.join(names)}. Correct 'name' in "
             "dataset.yaml."
         )
-    rooms = []
+    rooms, column = [], 0
     for name, dataset in zip(names, datasets, strict=True):
         tell(f"room {name}")
         holdout = hold_out(dataset, model, jobs, tell, most_tracks=MOST_TRACKS)
@@ -183,28 +178,23 @@ def _rooms(datasets: Sequence[Dataset], model: AnalyticModel, jobs: int, tell: C
                 f"stamps of {name} must be times; they show {' and '.join(holdout.stamps.found)}. Diagnose it by "
                 "itself, correct its stamps, and come back."
             )
-        rooms.append(Room(name, holdout, fit_model(model, holdout.search, holdout.settings).noise))
+        place = slice(column, column := column + holdout.search.settings.shape[1])
+        rooms.append(Room(name, holdout, fit_model(model, holdout.search, holdout.settings).noise, place))
     return rooms
 
 
 def _together(rooms: Sequence[Room], half: str) -> Stretches:
     """The stretches of all rooms, each with the noise about its own fit and its launcher's own settings."""
-    parts, track, column = [], 0, 0
+    parts, track = [], 0
     for room in rooms:
         own: Stretches = getattr(room.holdout, half)
-        settings = np.zeros((len(own), sum(other.settings for other in rooms)))
-        settings[:, column : column + room.settings] = own.settings
+        settings = np.zeros((len(own), rooms[-1].settings.stop))
+        settings[:, room.settings] = own.settings
         names = tuple(f"{room.name}/{name}" for name in own.names)
         sigmas = own.sigmas * torch.from_numpy(room.noise.position)
         parts.append(replace(own, names=names, track=own.track + track, settings=settings, sigmas=sigmas))
-        track, column = int(parts[-1].track.max()) + 1, column + room.settings
+        track = int(parts[-1].track.max()) + 1
     return joined(parts)
-
-
-def _way(rooms: Sequence[Room]) -> Grouping:
-    """Rooms as groups of tracks."""
-    names = {room.name: (*room.holdout.search.names, *room.holdout.held_out.names) for room in rooms}
-    return Grouping(ROOM, {room: {f"{room}/{name}": 1.0 for name in own} for room, own in names.items()})
 
 
 def _first_fit(model: AnalyticModel, halves: Holdout, way: Grouping) -> Fit:
@@ -243,11 +233,7 @@ class _Predicting:
 
     def __call__(self, fit: Fit) -> PredictiveModel:
         """The model with its rooms' models attached, and the errors on the search half of each."""
-        models, column = {}, 0
-        for room in self.rooms:
-            launcher = fit.unknowns.launcher[column : column + room.settings]
-            column += room.settings
-            models[room.name] = self._model(fit, room, launcher)
+        models = {room.name: self._model(fit, room) for room in self.rooms}
         model = with_effects(fit.problem.model)
         self._models[model] = models
         return PredictiveModel(model, _pooled(self._errors(models, "search_tracks")))
@@ -271,28 +257,26 @@ class _Predicting:
             for room in self.rooms
         ]
 
-    def _model(self, fit: Fit, room: Room, launcher: Array) -> AnalyticModel:
+    def _model(self, fit: Fit, room: Room) -> AnalyticModel:
         rows = np.array([name.startswith(f"{room.name}/") for name in fit.problem.stretches.names])
         stretches = fit.problem.stretches.take(rows)
         found = fit.problem.by_stretch(fit.unknowns.values, stretches)
         values = {name: float(np.ravel(value)[0]) for name, value in found.items()}
         noise = replace(fit.noise, position=fit.noise.position * room.noise.position)
-        own = replace(fit.problem, stretches=stretches, deviations={})
-        unknowns = replace(fit.unknowns, values=values, launcher=launcher)
-        model = calibrated_model(Fit(own, unknowns, noise, fit.predicted), room.holdout.launcher.embedding)
+        own, holdout = replace(fit.problem, stretches=stretches, deviations={}), room.holdout
+        unknowns = replace(fit.unknowns, values=values, launcher=fit.unknowns.launcher[room.settings])
+        model = calibrated_model(Fit(own, unknowns, noise, fit.predicted), holdout.launcher.embedding)
         if room.name not in self._noise:
-            self._noise[room.name] = noise_about(
-                model, room.holdout.search_tracks, room.holdout.dataset, jobs=self.jobs
-            )
+            self._noise[room.name] = noise_about(model, holdout.search_tracks, holdout.dataset, jobs=self.jobs)
         model.noise = self._noise[room.name]
         return model
 
     def _errors(self, models: dict[str, AnalyticModel], half: str) -> dict[str, Errors]:
         found = {}
         for room in self.rooms:
-            tracks: Sequence[EvaluationTrack] = getattr(room.holdout, half)
-            settings = dataset_settings(room.holdout.dataset, models[room.name])
-            found[room.name] = prediction_errors(models[room.name], tracks, room.holdout.surfaces, settings, self.jobs)
+            model, holdout = models[room.name], room.holdout
+            settings = dataset_settings(holdout.dataset, model)
+            found[room.name] = prediction_errors(model, getattr(holdout, half), holdout.surfaces, settings, self.jobs)
         return found
 
 

@@ -47,19 +47,16 @@ class Value:
 
 @dataclass(frozen=True)
 class Finding:
-    """An effect that was added to the model.
+    """An effect that was added to the model, of the kind `flight`, `bounce` or `measurement`.
 
     Attributes:
-        name: of the effect.
-        kind: of the effect: `flight`, `bounce` or `measurement`.
         parameters: its coefficients fitted to the tracks of both halves, at the end of the search.
         p_value: of its score test, corrected for the number of candidates tested.
         delta_bic: BIC of the model with it minus BIC without; negative is better.
         indistinguishable_from: candidates that would have explained as much.
         held_out_gain: increase of the log likelihood per track on the held-out half, natural units.
         held_out_p: probability of such a gain there by chance.
-        sentence: describes the effect.
-        decide: the measurement that tells the effect from others.
+        sentence, decide: what the effect is, and the measurement that tells it from others.
         probability: that the effect is there, over all models that were compared.
         evidence: logarithm of the density of the tracks with it over that without it, natural units.
         usual: words on a strength outside of the usual range; empty inside.
@@ -85,8 +82,7 @@ class Candidate:
     """One row of a round's ranking.
 
     Attributes:
-        name, kind: of the effect.
-        estimate: its coefficients after one step from absent.
+        estimate: the effect's coefficients after one step from absent.
         explained: squared whitened residual that it would explain.
         p_value: of its score test, corrected for the number of candidates.
         delta_bic: after a full refit; None if the score was too low for one.
@@ -112,7 +108,6 @@ class PredictedPath:
     """The prediction of one held-out track, for pictures.
 
     Attributes:
-        name: of the track.
         seen: (m, 3) m, measured positions of the observed part.
         times: (k,) s since the end of the observed part, of the predicted samples.
         predicted, measured: (k, 3) m at these times.
@@ -154,11 +149,9 @@ class Errors:
 
 @dataclass(frozen=True)
 class Fallback:
-    """A description of the remaining pattern without a name.
+    """A description of the remaining pattern without a name, `sparse terms` or `learned residual`, in words.
 
     Attributes:
-        kind: `sparse terms` or `learned residual`.
-        description: the terms, or the network.
         before, after: errors on the held-out half without and with it, named effects in both.
         model: the model with it.
     """
@@ -172,13 +165,11 @@ class Fallback:
 
 @dataclass(frozen=True)
 class Unexplained:
-    """The remaining pattern at the end.
+    """The remaining pattern at the end, with all generic tests and the fallback, if one was needed and helped.
 
     Attributes:
         where: one sentence; empty without a remaining pattern.
         share_of_residual: remaining part of the initial pattern, 0 to 1.
-        tests: all generic tests at the end.
-        fallback: None if none was needed or none helped.
     """
 
     where: str
@@ -189,14 +180,11 @@ class Unexplained:
 
 @dataclass(frozen=True)
 class FlightResiduals:
-    """Unmodelled accelerations in flight, one for each bin of time of each stretch.
+    """Unmodelled accelerations (m, 3) m/s^2 in flight and their covariances, one for each bin of time of each stretch.
 
     Attributes:
-        stretch: (m,) number of the stretch.
-        times: (m,) s since its first sample.
+        stretch, times: (m,) number of the stretch, and s since its first sample.
         states: (m, 9) at these times.
-        acceleration: (m, 3) m/s^2.
-        covariance: (m, 3, 3) of it.
     """
 
     stretch: Index
@@ -211,9 +199,7 @@ class ContactResiduals:
     """Outgoing minus predicted motion at each contact.
 
     Attributes:
-        stretch: (m,) number of the stretch.
-        number: (m,) of the contact in its stretch.
-        times: (m,) s since the stretch's first sample.
+        stretch, number, times: (m,) of the stretch, of the contact in it, and s since the stretch's first sample.
         incoming: (m, 9) state before it.
         velocity, spin: (m, 3) m/s and (m, 3) rad/s.
         covariance: (m, 6, 6) of both.
@@ -230,15 +216,12 @@ class ContactResiduals:
 
 @dataclass(frozen=True)
 class MeasurementResiduals:
-    """Measured minus fitted positions.
+    """Measured minus fitted positions (m, 3) m, and their noise.
 
     Attributes:
-        stretch: (m,) number of the stretch.
-        times: (m,) s since the stretch's first sample.
+        stretch, times: (m,) number of the stretch, and s since its first sample.
         states: (m, 9) at these times.
         since_contact: (m,) s since the last contact, NaN before the first one.
-        position: (m, 3) m.
-        sigma: (m, 3) m, noise.
     """
 
     stretch: Index
@@ -264,21 +247,16 @@ class Diagnosis:
     """The result of a diagnosis.
 
     Attributes:
-        dataset: its name.
-        verdict: the answer.
-        sentence: the answer in one sentence with numbers.
+        verdict, sentence: the answer, and the answer in one sentence with numbers.
         findings: effects in the order added.
         rounds: the ranking of all candidates in each round, best first.
         before: errors on the held-out half with the declared model as calibrated.
         after: the same with the corrected model: named effects, and the fallback where there is one.
-        tracks_found_on: tracks of the search half.
-        tracks_judged_on: tracks of the held-out half.
+        tracks_found_on, tracks_judged_on: numbers of tracks of the search half and of the held-out half.
         calibrated: declared coefficients fitted with the corrected model to the tracks of both halves.
         noise: position noise along x, y, z as estimated (m), and as stated.
-        unexplained: the remaining pattern.
         model: the corrected model. Without a fallback it is fitted to the tracks of both halves after its evaluation.
-        residuals_before: of the search half with the declared model.
-        residuals_after: of the search half with the corrected model.
+        residuals_before, residuals_after: of the search half with the declared and with the corrected model.
         excluded: sentences on unused tracks.
         remarks: sentences on implausible fitted values.
         floor_mm: prediction error of the held-out tracks for an exact corrected model, from measurement noise and the
@@ -305,8 +283,8 @@ class Diagnosis:
     model: BallModel
     residuals_before: Residuals
     residuals_after: Residuals
-    excluded: tuple[str, ...] = field(default=())
-    remarks: tuple[str, ...] = field(default=())
+    excluded: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
     floor_mm: float = float("nan")
     labels: LabelCheck | None = None
     probabilities: Mapping[str, float] = field(default_factory=dict)

@@ -38,7 +38,13 @@ def read_config(path: str | Path, overrides: Iterable[str] = (), options: Mappin
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     for (first, *others), value in replacing:
-        _put(content, [config.EARLIER.get(first, first), *others], value)
+        *sections, last = config.EARLIER.get(first, first), *others
+        place = content
+        for key in sections:  # those on the way are made
+            below = place.get(key)
+            place[key] = dict(below) if isinstance(below, dict) else {}
+            place = place[key]
+        place[last] = value
     return checked_config(content | dict(options or {}), f"{path} with overrides" if replacing else str(path))
 
 
@@ -77,26 +83,12 @@ def _override(override: str) -> tuple[list[str], Any]:
     parts = [part.strip() for part in key.split(".")]
     if not separator or not all(parts):
         raise ValueError(f"overrides must be key=value; got '{override}'. Write for instance seed=3.")
-    return parts, _parse(override, text)
-
-
-def _put(content: dict[str, Any], keys: list[str], value: Any) -> None:
-    """Put a value in its place; sections on the way are made."""
-    for key in keys[:-1]:
-        below = content.get(key)
-        content[key] = dict(below) if isinstance(below, dict) else {}
-        content = content[key]
-    content[keys[-1]] = value
-
-
-def _parse(override: str, text: str) -> Any:
-    """A value of the command line: JSON first, since YAML takes 1e-3 for text."""
     try:
-        return json.loads(text)
-    except json.JSONDecodeError:
+        return parts, json.loads(text)
+    except json.JSONDecodeError:  # JSON first, since YAML takes 1e-3 for text
         pass
     try:
-        return parse_yaml(text, f"override {shown(override)}")
+        return parts, parse_yaml(text, f"override {shown(override)}")
     except YamlError as error:
         raise ValueError(f"{error}. Quote the value.") from None
 

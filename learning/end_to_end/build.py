@@ -17,36 +17,11 @@ from ballfg.learning.trainee import Prepared
 from ballfg.learning.training_data import read_training_data
 from ballfg.progress import doing
 
-GRADIENTS = {"implicit": ImplicitGradient, "gauss-newton": GaussNewtonGradient, "unrolled": UnrolledGradient}
-
-
-def build_end_to_end(config: TrainConfig) -> Prepared:
-    """The trainee of the kinds that fly a model. Raises: ValueError, FileNotFoundError: bad input."""
-    data = read_training_data(config)
-    if data.embedding is not None and config.launcher.start == "tracks":
-        begin_with_tracks(data.embedding, [data.shots[k] for k in data.train], data.analytic)
-    process, scale = data.shots[0].settings.process, config.noise.position_scale or 1.0
-    noise = NoiseScales(process, position=scale, learned=config.loss.likelihood > 0.0)
-    untrained = None
-    if config.kind in NETWORKS:
-        alone = Learnables(*copy.deepcopy((data.analytic, data.embedding, noise)))
-        untrained = EndToEnd(data.shots, alone, config.loss)
-    model = _model(config, data.analytic)
-    trainee = EndToEnd(
-        data.shots,
-        Learnables(model, data.embedding, noise),
-        config.loss,
-        method=GRADIENTS[config.gradient](),
-        seed=config.seed,
-        augment=config.augmented,
-        anchor=Anchor(model, data.analytic, config.seed) if config.loss.anchor > 0.0 else None,
-        coefficient_step=config.optimizer.coefficient_step,
-        noise_step=config.optimizer.noise_step,
-        fades=data.train,
-        held_out=data.validation,
-        untrained=untrained,
-    )
-    return Prepared(trainee, data.train, data.validation)
+GRADIENTS: dict[str, type[ImplicitGradient | UnrolledGradient]] = {
+    "implicit": ImplicitGradient,
+    "gauss-newton": GaussNewtonGradient,
+    "unrolled": UnrolledGradient,
+}
 
 
 def _model(config: TrainConfig, analytic: AnalyticModel) -> BallModel:
@@ -70,8 +45,32 @@ class Network(TraineeKind):
 
     @classmethod
     def build(cls, config: TrainConfig) -> Prepared:
-        """The model with its data, ready to train."""
-        return build_end_to_end(config)
+        """The model with its data, ready to train. Raises: ValueError, FileNotFoundError: bad input."""
+        data = read_training_data(config)
+        if data.embedding is not None and config.launcher.start == "tracks":
+            begin_with_tracks(data.embedding, [data.shots[k] for k in data.train], data.analytic)
+        process, scale = data.shots[0].settings.process, config.noise.position_scale or 1.0
+        noise = NoiseScales(process, position=scale, learned=config.loss.likelihood > 0.0)
+        untrained = None
+        if config.kind in NETWORKS:
+            alone = Learnables(*copy.deepcopy((data.analytic, data.embedding, noise)))
+            untrained = EndToEnd(data.shots, alone, config.loss)
+        model = _model(config, data.analytic)
+        trainee = EndToEnd(
+            data.shots,
+            Learnables(model, data.embedding, noise),
+            config.loss,
+            method=GRADIENTS[config.gradient](),
+            seed=config.seed,
+            augment=config.augmented,
+            anchor=Anchor(model, data.analytic, config.seed) if config.loss.anchor > 0.0 else None,
+            coefficient_step=config.optimizer.coefficient_step,
+            noise_step=config.optimizer.noise_step,
+            fades=data.train,
+            held_out=data.validation,
+            untrained=untrained,
+        )
+        return Prepared(trainee, data.train, data.validation)
 
 
 class ATune(Network):

@@ -28,8 +28,7 @@ class NoiseScales(nn.Module):
         position: starting value, as a multiple of the noise that datasets and tracks state.
         learned: False keeps all of them fixed.
     Attributes:
-        process: (q,) logarithms of the numbers `names`.
-        position, spin: () logarithms of the scales of measured positions and of spin labels.
+        process, position, spin: (q,), (), () logarithms of the numbers `names`, of the scales of positions and labels.
     """
 
     def __init__(self, process: ProcessNoise, *, position: float = 1.0, learned: bool) -> None:

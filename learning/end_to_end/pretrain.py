@@ -75,9 +75,7 @@ class Anchor:
 def difference(model: BallModel, flying: Tensor, bouncing: Tensor, rates: Rates, after: Tensor) -> Tensor:
     """() sum of the mean square differences of a model's flight and bounce from given ones, in their units.
 
-    Args:
-        flying: (n, 9) states.  rates: the given ones there.
-        bouncing: (n, 9) states before a bounce.  after: (n, 9), the given states after it.
+    Given are the rates of flying states (n, 9), and the states (n, 9) after those before a bounce (n, 9).
     """
     acceleration, spin_rate = model.rates(flying)
     bounced = model.after_bounce(bouncing)

@@ -122,10 +122,7 @@ class BatchSolver:
     warm: WarmStarts = field(default_factory=WarmStarts)
 
     def __call__(self, numbers: Sequence[int], poses: Mapping[int, Pose]) -> tuple[list[Solved], list[tuple[str, str]]]:
-        """Estimates of some shots; name and reason of each failure to converge.
-
-        Args: numbers: of the shots.  poses: for those that are not seen as measured.
-        """
+        """Estimates of some shots, in other poses if given; name and reason of each failure to converge."""
         smoothers: dict[tuple[int, Surfaces, bool], Smoother] = {}
         solved, failed = [], []
         for number in numbers:

@@ -20,11 +20,7 @@ Product = Callable[[Tensor], Tensor]
 
 
 class NotAMinimum(ValueError):  # noqa: N818 - the name is the statement
-    """The objective is not at a minimum that a gradient could pass through.
-
-    Attributes:
-        tracks: numbers within the batch of the tracks without a minimum.
-    """
+    """The objective is not at a minimum that a gradient could pass through, for tracks given by number in the batch."""
 
     def __init__(self, message: str, tracks: Sequence[int]) -> None:
         super().__init__(message)
@@ -34,11 +30,7 @@ class NotAMinimum(ValueError):  # noqa: N818 - the name is the statement
 class GaussNewtonFactors:
     """The factorisations R^T R of the Gauss-Newton matrices of several tracks, which solves all of them at once.
 
-    Args: roots: the triangle R of each track, all with as many coefficients.
-
-    Attributes:
-        tracks: their number t.  lengths: (t,) number of states of each.
-        width: numbers w of a state, biases among them.  coefficients: number p of them.
+    Args: roots: the triangle R of each of t tracks, all with p coefficients; w is the width of a state with biases.
     """
 
     def __init__(self, roots: Sequence[Root]) -> None:
@@ -101,7 +93,12 @@ class ConjugateGradients:
             image = product(direction)
             bend = self._dot(direction, image)
             active = size > goal
-            self._check_bend(bend, active)
+            if wrong := (~(bend > 0.0) & active).nonzero()[:, 0].tolist():
+                raise NotAMinimum(
+                    f"the objective of {len(wrong)} tracks bends downwards where the estimate stands: it is no "
+                    "minimum. Leave these tracks out, or solve from another start.",
+                    wrong,
+                )
             step = torch.where(active, size / bend.where(active, torch.ones_like(bend)), 0.0)[self.owners]
             solution = solution + step * direction
             residual = residual - step * image
@@ -119,12 +116,3 @@ class ConjugateGradients:
     def _dot(self, a: Tensor, b: Tensor) -> Tensor:
         """(t,) inner product of each block."""
         return a.new_zeros(self.factors.tracks).index_add(0, self.owners, a * b)
-
-    def _check_bend(self, bend: Tensor, active: Tensor) -> None:
-        wrong = (~(bend > 0.0) & active).nonzero()[:, 0].tolist()
-        if wrong:
-            raise NotAMinimum(
-                f"the objective of {len(wrong)} tracks bends downwards where the estimate stands: it is no minimum. "
-                "Leave these tracks out, or solve from another start.",
-                wrong,
-            )

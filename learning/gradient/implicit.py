@@ -136,9 +136,7 @@ class _Solution(torch.autograd.Function):
             (image,) = torch.autograd.grad(condition, leaf, vector, retain_graph=True)
             return image
 
-        if ctx.exact:
-            multiplier = ctx.linear_solver(product, upstream[0])
-        else:
-            multiplier = ctx.linear_solver.precondition(upstream[0])
+        solver = ctx.linear_solver
+        multiplier = solver(product, upstream[0]) if ctx.exact else solver.precondition(upstream[0])
         gradients = torch.autograd.grad(condition, parameters, -multiplier, allow_unused=True)
         return None, None, None, None, *gradients

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ballfg.arrays import Array
 from ballfg.factors.batch import FactorBatch, Noise, Rows, Values
 from ballfg.factors.graph import BallGraph
 from ballfg.factors.linear.covariance import NeighbourCovariances
@@ -50,19 +49,15 @@ def negative_log_likelihood(
 
 def _expected(kind: FactorBatch, rows: Rows, posterior: NeighbourCovariances, change: Tensor) -> Tensor:
     """Expected negative log density of a kind's factors, as a function of the change that rewhitens them."""
-    square = torch.from_numpy(_mean_square(rows, posterior))
-    if change.dim():
-        spread = -change.diagonal(dim1=-2, dim2=-1).log().sum()
-        return 0.5 * (change * (change @ square)).sum() + spread
-    return 0.5 * change.square() * torch.einsum("nii->", square) - len(kind) * kind.dim * change.log()
-
-
-def _mean_square(rows: Rows, posterior: NeighbourCovariances) -> Array:
-    """(m, r, r) r r^T + J C J^T of each factor; residuals and Jacobians weighted as those of C."""
+    # (m, r, r) r r^T + J C J^T of each factor; residuals and Jacobians weighted as those of C
     weight = rows.loss.weight(np.linalg.norm(rows.residual, axis=-1))
     total = weight[:, None, None] * rows.residual[:, :, None] * rows.residual[:, None, :]
     _, jacobians = weighted(rows)
     for a, left in enumerate(jacobians):
         for b, right in enumerate(jacobians):
             total += left @ posterior.joint(rows.variables[:, a], rows.variables[:, b]) @ right.swapaxes(-1, -2)
-    return np.asarray(total)
+    square = torch.from_numpy(total)
+    if change.dim():
+        spread = -change.diagonal(dim1=-2, dim2=-1).log().sum()
+        return 0.5 * (change * (change @ square)).sum() + spread
+    return 0.5 * change.square() * torch.einsum("nii->", square) - len(kind) * kind.dim * change.log()

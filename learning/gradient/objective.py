@@ -124,12 +124,9 @@ def rewhitened(residual: Tensor, change: Tensor | None) -> Tensor:
 
 def _block(members: Sequence[tuple[int, FactorBatch]], starts: Sequence[int]) -> _Block:
     """The kinds of one group as one kind, its variables numbered through all tracks."""
-    moved = []
-    for track, kind in members:
-        shifted = copy.copy(kind)
-        shared = kind.variables == COEFFICIENTS
-        shifted.variables = np.where(shared, track, kind.variables + starts[track])
-        moved.append(shifted)
+    moved = [copy.copy(kind) for _, kind in members]
+    for (track, kind), shifted in zip(members, moved, strict=True):
+        shifted.variables = np.where(kind.variables == COEFFICIENTS, track, kind.variables + starts[track])
     whole = merge(moved)
     is_shared = (members[0][1].variables == COEFFICIENTS).all(axis=0)
     columns = [torch.from_numpy(column.copy()) for column in whole.variables.T]

@@ -41,12 +41,9 @@ class RunProgress(BaseModel):
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A run after an epoch. There is no random state: random numbers derive from seed, epoch and track.
+    """A run after an epoch: the module now and at the best epoch, its optimizer (`moments`), memory of the trainee.
 
-    Attributes:
-        weights, best: state of the module now and at the best epoch.
-        optimizer: its state, as `<parameter>/<moment>`.
-        memory: further state of the trainee (`Trainee.memory`).
+    There is no random state: random numbers derive from seed, epoch and track.
     """
 
     progress: RunProgress

@@ -91,9 +91,10 @@ def _wait(group: ProcessContext) -> None:
         try:
             left = None if deadline is None else deadline - time.monotonic()
             if left is not None and left <= 0.0:
-                return _kill(group)
+                _kill(group)
+                return
             if group.join(left, grace_period=LAST_WORDS):
-                return None
+                return
         except KeyboardInterrupt:
             if deadline is not None:
                 _kill(group)

@@ -6,17 +6,16 @@ checkpoint takes the same steps, bit for bit.
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ballfg.learning.config.training import TrainConfig
+from ballfg.learning.config.training import OptimizerConfig, TrainConfig
 from ballfg.learning.run.checkpoint import Checkpoint, RunProgress
 from ballfg.learning.run.metrics import Epoch
-from ballfg.learning.run.optimizer import make_optimizer, moments, rate_factor, restore_moments
 from ballfg.learning.run.ranks import Ranks, SharedMemory
 from ballfg.learning.trainee import BatchLoss, Trainee
 from ballfg.progress import Watch
@@ -194,7 +193,8 @@ class Training:
                 sums += _sums(self.task.trainee.judge(part))
             return sums
 
-        return _Tally(*ranks.sum(ranks.together(work)).tolist())
+        loss, tracks, squared_error, points, failed = ranks.sum(ranks.together(work)).tolist()
+        return _Tally(loss, tracks, squared_error, points, failed)
 
     def _note(self, number: int, judged: _Tally) -> None:
         """Keep the weights if they are the best so far. An epoch in which too many tracks failed does not count."""
@@ -252,3 +252,41 @@ def _sums(found: BatchLoss) -> Tensor:
 def _weights(module: nn.Module) -> dict[str, Tensor]:
     """A copy of a module's state."""
     return {name: tensor.detach().clone() for name, tensor in module.state_dict().items()}
+
+
+def make_optimizer(trainee: Trainee, settings: OptimizerConfig) -> torch.optim.AdamW:
+    """AdamW over the trainee's groups. Raises: ValueError: if one holds a parameter that the module does not name."""
+    groups = trainee.groups()
+    named = {id(parameter) for parameter in trainee.module.parameters()}
+    for group in groups:
+        if any(id(parameter) not in named for parameter in group["params"]):
+            raise ValueError(f"group '{group['name']}' must hold parameters of the module; got another. Register it.")
+    return torch.optim.AdamW(groups, lr=settings.learning_rate, weight_decay=settings.weight_decay)
+
+
+def rate_factor(settings: OptimizerConfig, step: int, per_epoch: int) -> float:
+    """Share of the full learning rate at a step, counted from 0 over all epochs."""
+    warm, total = settings.warm_start_epochs * per_epoch, settings.epochs * per_epoch
+    if step < warm:
+        return (step + 1) / warm
+    if settings.schedule == "constant":
+        return 1.0
+    return 0.5 * (1.0 + math.cos(math.pi * (step - warm) / (total - warm)))
+
+
+def moments(optimizer: torch.optim.Optimizer, module: nn.Module) -> dict[str, Tensor]:
+    """A copy of the optimizer's state, as `<parameter>/<moment>`."""
+    return {
+        f"{name}/{key}": tensor.clone()
+        for name, parameter in module.named_parameters()
+        if parameter in optimizer.state
+        for key, tensor in optimizer.state[parameter].items()
+    }
+
+
+def restore_moments(optimizer: torch.optim.Optimizer, module: nn.Module, state: Mapping[str, Tensor]) -> None:
+    """Restore the state that `moments` gave. Raises: KeyError: for a parameter that the module does not have."""
+    parameters = dict(module.named_parameters())
+    for name, tensor in state.items():
+        parameter, _, moment = name.rpartition("/")
+        optimizer.state[parameters[parameter]][moment] = tensor.clone()

@@ -23,9 +23,7 @@ class Epoch:
         learning_rate: of the last step, for a scale of 1.
         gradient_norm: of the mean loss of a batch before clipping, mean over steps.
         skipped: number of steps whose loss or gradient was not finite.
-        failed: number of training tracks that were left out because their estimate failed.
-        validation_failed: the same for validation tracks.
-        seconds: duration, s.
+        failed, validation_failed: numbers of tracks that were left out because their estimate failed.
     """
 
     epoch: int

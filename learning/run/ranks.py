@@ -89,8 +89,7 @@ class Ranks:
                 result = work()
         except (Exception, KeyboardInterrupt) as raised:
             error = raised
-        told: list[BaseException | None] = [None] * self.size
-        dist.all_gather_object(told, None if error is None else for_others(self.rank, error))
+        told = self.gather(None if error is None else for_others(self.rank, error))
         trouble = next((each for each in told if each is not None), None)
         if trouble is not None and not self.first:
             raise SystemExit(TOLD_BY_FIRST) from error

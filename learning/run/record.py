@@ -1,20 +1,28 @@
-"""Records a training after each epoch: metrics, curves, TensorBoard, checkpoints, a line of text."""
+"""Records a training in its first process: what each epoch gives, then the model, and a page on whether it helped."""
 
+import math
+import shlex
+import sys
 from collections.abc import Sequence
 from operator import itemgetter
 from pathlib import Path
 from statistics import fmean
+from typing import Final
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from torch.utils.tensorboard import SummaryWriter
 
-from ballfg.files.whole_file import whole_file
+from ballfg.estimation.noise.estimate import spread_over
+from ballfg.files.whole_file import whole_file, write_text
 from ballfg.learning.run import run_folder as files
 from ballfg.learning.run.checkpoint import Checkpoint, write_checkpoint
-from ballfg.learning.run.loop import Task
+from ballfg.learning.run.loop import Training
 from ballfg.learning.run.metrics import Epoch, epoch_line, read_metrics, write_metrics
+from ballfg.learning.run.training_page import beside_untrained, improved, page, verdict
+from ballfg.learning.trainee import PredictedShot
+from ballfg.machine import date, versions
 
 SCALARS = {
     "loss/train": ("loss", 1.0),
@@ -31,16 +39,21 @@ SCALARS = {
 Points = list[tuple[int, float]]
 """Epochs and values."""
 TRAIN, VALIDATION, BEST = "#3b4cc0", "#d95f02", "#7f7f7f"
+NOT_BETTER: Final = 1
+"""Exit status of a training that ended and whose model is not better than before."""
+MOST_JUDGED: Final = 25
+"""Validation tracks that are judged one by one, to show the median one."""
 
 
 class Record:
-    """The files of a training, which the first process writes.
+    """The files of a training, which the first process writes; command: as it was typed, or empty.
 
     Rows of epochs after the checkpoint from which the run continues are dropped, and those epochs run again.
     """
 
-    def __init__(self, task: Task, folder: Path, checkpoint: Checkpoint | None) -> None:
-        self.folder, self.last = folder, task.config.optimizer.epochs
+    def __init__(self, training: Training, folder: Path, checkpoint: Checkpoint | None, command: str) -> None:
+        task = training.task
+        self.training, self.folder, self.command, self.last = training, folder, command, task.config.optimizer.epochs
         self.saved = -1 if checkpoint is None else checkpoint.progress.epoch
         rows = read_metrics(folder / files.METRICS) if checkpoint is not None else []
         self.epochs = [row for row in rows if row.epoch <= self.saved]
@@ -49,11 +62,6 @@ class Record:
         files.start(folder, task.config)
         self.tensorboard = SummaryWriter(str(folder / files.EVENTS), purge_step=self.saved + 1)
         print(f"{folder / files.CONFIG}: the config; {self.title}", flush=True)
-
-    @property
-    def kept(self) -> str:
-        """The epochs that an interrupted run keeps, in words."""
-        return "no epoch is kept yet" if self.saved < 0 else f"epochs up to {self.saved} are kept"
 
     def write(self, epoch: Epoch, checkpoint: Checkpoint | None) -> None:
         """Write the row first and then the checkpoint: rows after the last checkpoint are computed again."""
@@ -78,6 +86,62 @@ class Record:
         if self.epochs:
             with whole_file(self.folder / files.CURVES) as temporary:
                 curves(self.epochs, self.title).savefig(temporary, dpi=130, format="png")
+
+    def finish(self) -> int:
+        """Write the model with the best weights and the page, and print whether it helped. Returns: the exit status."""
+        folder, progress, epochs, task = self.folder, self.training.progress, self.epochs, self.training.task
+        model = task.trainee.export(folder)
+        if progress is None:
+            return 0
+        judged = task.trainee.without_training(task.validation) if task.validation else None
+        untrained = math.sqrt(judged.squared_error / judged.points) if judged is not None and judged.points else None
+        self._write_page(model, self.median_shot(), untrained)
+        better = improved(epochs, progress.best_epoch)
+        print(verdict(epochs, progress.best_epoch))
+        beside = beside_untrained(epochs, progress.best_epoch, untrained)
+        print(beside, end="\n" if beside else "")
+        if progress.best_rmse is not None:
+            print(f"best: epoch {progress.best_epoch}, validation RMSE {1e3 * progress.best_rmse:.2f} mm")
+        else:
+            print("no validation track could be judged: the weights are those of the last epoch")
+        what = "the model before the first step, which no epoch improved" if better is False else "the trained model"
+        print(f"{folder / files.PAGE}: the training, to read")
+        print(f"{model}: {what}\n{folder / files.METRICS}: all numbers\n{folder / files.CURVES}")
+        return NOT_BETTER if better is False else 0
+
+    def stop(self) -> None:
+        """Write the best model so far after Ctrl-C, and list the kept files."""
+        kept = "no epoch is kept yet" if self.saved < 0 else f"epochs up to {self.saved} are kept"
+        print(f"{kept}; continue with --resume {self.folder}", file=sys.stderr, flush=True)
+        if self.training.progress is None:
+            print("no model is written: not even the first one had been judged", file=sys.stderr)
+            return
+        self.training.take_best()
+        model = self.training.task.trainee.export(self.folder)
+        self._write_page(model, None, None)
+        print(f"{model}: the best model so far, of epoch {self.training.progress.best_epoch}", file=sys.stderr)
+
+    def _write_page(self, model: Path, shot: PredictedShot | None, untrained: float | None) -> None:
+        best = 0 if self.training.progress is None else self.training.progress.best_epoch
+        data = self.training.task.config.data or ()
+        words = ["ballfg", "predict", *(data[:1] or ["DATASET"]), "--model", str(model)]
+        words += ["--observe", "0.3", "--out", "predictions.csv"]
+        following = shlex.join(words) if model.is_file() else ""
+        origin = {"made on": date()} | ({"command": self.command} if self.command else {}) | {"data": ", ".join(data)}
+        origin["with"] = ", ".join(f"{name} {version}" for name, version in versions(files.PACKAGES).items())
+        drawn, learned = curves(self.epochs, self.title), self.training.task.trainee.learned()
+        text = page(self.title, self.epochs, best, drawn, learned, shot, following, origin, untrained)
+        write_text(self.folder / files.PAGE, text)
+
+    def median_shot(self) -> PredictedShot | None:
+        """The validation track with the median error, of at most `MOST_JUDGED`, as the model predicts it."""
+        task, errors = self.training.task, {}
+        for track in spread_over(task.validation, len(task.validation), MOST_JUDGED):
+            judged = task.trainee.judge([track])
+            if judged.points and math.isfinite(judged.squared_error):
+                errors[track] = judged.squared_error / judged.points
+        ordered = sorted(errors, key=errors.__getitem__)
+        return task.trainee.shown(ordered[(len(ordered) - 1) // 2]) if ordered else None
 
 
 def curves(epochs: Sequence[Epoch], title: str) -> Figure:

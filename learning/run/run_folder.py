@@ -33,7 +33,15 @@ def check(folder: Path, config: Config, *, resume: bool) -> None:
         FileNotFoundError: no run to resume.
     """
     if resume:
-        _check_resumable(folder, config)
+        if not (folder / CONFIG).is_file():
+            raise FileNotFoundError(f"--resume needs the folder of an earlier run; {folder} has no {CONFIG}.")
+        earlier, now = (_flat(each.model_dump(mode="json")) for each in (read_config(folder / CONFIG), config))
+        for name in ("kind", *now):
+            if name not in config.FREE_TO_CHANGE and earlier.get(name) != now[name]:
+                raise ValueError(
+                    f"a resumed run must keep its config; '{name}' was {shown(earlier.get(name))} and is "
+                    f"{shown(now[name])}. Give {folder / CONFIG} as the config, or start a new run."
+                )
         return
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"out must be a folder; {folder} is a file. Choose another name.")
@@ -62,18 +70,6 @@ def running(folder: Path, config: Config, *, resume: bool) -> Iterator[None]:
         for path in made:
             if path.is_dir() and not any(path.iterdir()):
                 path.rmdir()
-
-
-def _check_resumable(folder: Path, config: Config) -> None:
-    if not (folder / CONFIG).is_file():
-        raise FileNotFoundError(f"--resume needs the folder of an earlier run; {folder} has no {CONFIG}.")
-    earlier, now = (_flat(each.model_dump(mode="json")) for each in (read_config(folder / CONFIG), config))
-    for name in ("kind", *now):
-        if name not in config.FREE_TO_CHANGE and earlier.get(name) != now[name]:
-            raise ValueError(
-                f"a resumed run must keep its config; '{name}' was {shown(earlier.get(name))} and is "
-                f"{shown(now[name])}. Give {folder / CONFIG} as the config, or start a new run."
-            )
 
 
 def _flat(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

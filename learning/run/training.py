@@ -6,7 +6,7 @@ import io
 from contextlib import ExitStack, redirect_stderr, redirect_stdout
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.registry import TRAINEES
@@ -54,21 +54,21 @@ def run_training(
         checkpoint = ranks.from_first(lambda: read_checkpoint(folder) if resume else None)
         task = Task(trainee, tuple(train), tuple(validation), config, ranks, watch)
         training = ranks.together(lambda: Training(task, checkpoint))
-        record, ending = ranks.together(lambda: _opened(task, folder, checkpoint))
+        record = ranks.together(lambda: _record(training, folder, checkpoint, command) if ranks.first else None)
         try:
             for epoch in training.epochs():
                 due = epoch.epoch % config.checkpoint_every == 0 or epoch.epoch == config.optimizer.epochs
                 kept = training.checkpoint() if due else None
                 ranks.from_first(partial(record.write, epoch, kept) if record is not None else lambda: None)
             training.take_best()
-            return ranks.from_first(lambda: 0 if record is None else ending.finish(training, record, command))
+            return ranks.from_first(lambda: 0 if record is None else record.finish())
         except TrainingStoppedError:
             if not ranks.first:
                 raise SystemExit(TOLD_BY_FIRST) from None
             raise
         except KeyboardInterrupt:
             if record is not None:
-                ending.stop(training, record, command)
+                record.stop()
             raise
         finally:
             if record is not None:
@@ -84,14 +84,8 @@ def _built(ranks: Ranks, config: TrainConfig) -> Prepared:
         return build(config)
 
 
-def _opened(task: Task, folder: Path, checkpoint: Checkpoint | None) -> tuple[Record | None, Any]:
-    """The writer and the ending of the run; None outside of the first process.
-
-    Pictures and TensorBoard take half a second to import; the other processes do without.
-    """
-    if not task.ranks.first:
-        return None, None
-    from ballfg.learning.run import ending
+def _record(training: Training, folder: Path, checkpoint: Checkpoint | None, command: str) -> Record:
+    """Pictures and TensorBoard take half a second to import; processes other than the first do without."""
     from ballfg.learning.run.record import Record
 
-    return Record(task, folder, checkpoint), ending
+    return Record(training, folder, checkpoint, command)

@@ -24,9 +24,7 @@ LEAST_OBSERVED = 2
 class LauncherSettings:
     """The labels of a track that are its launcher's settings; none: a model sees observations only.
 
-    Attributes:
-        labels: names; those in `categories` are text, one-hot over their values, the others are numbers.
-        categories: the values that each text label takes.
+    Labels in `categories` are text, one-hot over the values given there; the others are numbers.
     """
 
     labels: tuple[str, ...] = ()
@@ -87,12 +85,8 @@ class Batch:
     """Some examples side by side, padded at their ends: times by the last one, positions by zero.
 
     Attributes:
-        observed_times: (b, n) s.
-        observed: (b, n, 3) m.
+        observed_times, observed, settings, times, rest: (b, n) s, (b, n, 3) m, (b, k), (b, m) s, (b, m, 3) m.
         observed_count: (b,) int64, samples that are not padding.
-        settings: (b, k).
-        times: (b, m) s.
-        rest: (b, m, 3) m.
         asked: (b, m) bool, false in the padding.
     """
 

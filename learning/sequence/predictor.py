@@ -35,11 +35,8 @@ CONFIG, WEIGHTS = "config.yaml", "weights.safetensors"
 
 @dataclass(frozen=True)
 class SequenceArchitecture:
-    """Kind and size.
+    """Kind and width, of the hidden states or of the denoiser's channels: a multiple of 8, for the attention heads.
 
-    Attributes:
-        kind: lstm or diffusion.
-        width: of the hidden states; diffusion: channels of the denoiser. A multiple of 8, for the attention heads.
     Raises: ValueError: an unknown kind, or a width that is not a positive multiple of 8.
     """
 

@@ -28,10 +28,8 @@ class SequenceTrainee(Trainee):
     A track that cannot be used - too short, launcher settings missing - counts as failed in each batch.
 
     Args:
-        observed: number of observed samples of each.
-        train: numbers of the training tracks, from which the model takes its scales; at least one that can be used.
-        architecture: kind and size.
-        launcher: its labels.
+        observed: number of observed samples of each track.
+        train: numbers of the training tracks, from which the model takes its scales.
         seed: of initial weights, augmentation and diffusion noise, >= 0.
         augment: True to rotate and shift training tracks.
     Raises: ValueError: if no track of the training part can be used.

@@ -28,8 +28,8 @@ class Choice:
 
     Attributes:
         shots: (k,) numbers of candidates among `Information.shots`.
-        error: (k + 1,) mean error bar of all sides, in prior standard deviations of the unknowns; first without shots.
-        random: (k + 1,) the same after as many random shots, the median of `DRAWS` choices.
+        error, random: (k + 1,) mean error bar of all sides, in prior standard deviations of the unknowns, first without
+            shots; the same after as many random shots, the median of `DRAWS` choices.
         sigmas: (k + 1, p) standard deviation of each coefficient asked about, in its own unit.
         as_random: number of random shots with the same gain as all chosen ones.
     """
@@ -44,18 +44,24 @@ class Choice:
 def choose(
     information: Information, sides: Sequence[Sequence[str]], names: Sequence[str], count: int, seed: int
 ) -> Choice:
-    """Choose shots, with repetition.
+    """Choose so many shots, with repetition.
 
     Args:
-        information: of dataset and candidates.
         sides: coefficients that should be known well, by parameter name.
         names: of coefficients whose error bars are reported.
-        count: number of shots.
         seed: of the random choices for comparison.
     """
-    measure = _measure([information.columns(side) for side in sides])
+    columns = [information.columns(side) for side in sides]
     known, shots = information.known, information.shots
-    chosen = _ordered(known, shots, _exchanged(known, shots, _greedy(known, shots, count, measure), measure), measure)
+
+    def measure(totals: Array) -> Array:
+        covariance = np.linalg.inv(totals)
+        logs = [np.linalg.slogdet(covariance[:, side][:, :, side])[1] / (2 * len(side)) for side in columns]
+        return np.asarray(np.mean(logs, axis=0))
+
+    greedy = _greedy(known, shots, list(range(len(shots))), count, measure, repeated=True)
+    exchanged = _exchanged(known, shots, greedy, measure)
+    chosen = _greedy(known, shots, sorted(exchanged), count, measure, repeated=False)
     totals = known + np.concatenate((np.zeros((1, *known.shape)), np.cumsum(shots[chosen], axis=0)))
     wanted = information.columns(names)
     covariances = np.linalg.inv(totals)[:, wanted, wanted]
@@ -72,22 +78,16 @@ def choose(
     )
 
 
-def _measure(sides: Sequence[Sequence[int]]) -> Measure:
-    def measured(totals: Array) -> Array:
-        covariance = np.linalg.inv(totals)
-        logs = [np.linalg.slogdet(covariance[:, side][:, :, side])[1] / (2 * len(side)) for side in sides]
-        return np.asarray(np.mean(logs, axis=0))
-
-    return measured
-
-
-def _greedy(known: Array, shots: Array, count: int, measure: Measure) -> list[int]:
-    chosen: list[int] = []
+def _greedy(
+    known: Array, shots: Array, listed: list[int], count: int, measure: Measure, *, repeated: bool
+) -> list[int]:
+    """Listed shots, each the best one beside those before it."""
+    order: list[int] = []
     for _ in range(count):
-        best = int(np.argmin(measure(known + shots)))
-        chosen.append(best)
-        known = known + shots[best]
-    return chosen
+        best = int(np.argmin(measure(known + shots[listed])))
+        order.append(listed[best] if repeated else listed.pop(best))
+        known = known + shots[order[-1]]
+    return order
 
 
 def _exchanged(known: Array, shots: Array, chosen: list[int], measure: Measure) -> list[int]:
@@ -105,24 +105,16 @@ def _exchanged(known: Array, shots: Array, chosen: list[int], measure: Measure) 
     return chosen
 
 
-def _ordered(known: Array, shots: Array, chosen: Sequence[int], measure: Measure) -> list[int]:
-    left, order = sorted(chosen), list[int]()
-    while left:
-        best = left.pop(int(np.argmin(measure(known + shots[left]))))
-        order.append(best)
-        known = known + shots[best]
-    return order
-
-
 def _as_random(known: Array, mean: Array, measure: Measure, reached: float) -> float:
     """Number of mean shots that reach a measure: by bisection, since more information never raises it."""
     low, high = 0.0, 1.0
-    while float(measure((known + high * mean)[None])[0]) > reached and high < 1e6:
+
+    def too_few(count: float) -> bool:
+        return float(measure((known + count * mean)[None])[0]) > reached
+
+    while too_few(high) and high < 1e6:
         low, high = high, 2.0 * high
     for _ in range(60):
         middle = 0.5 * (low + high)
-        if float(measure((known + middle * mean)[None])[0]) > reached:
-            low = middle
-        else:
-            high = middle
+        low, high = (middle, high) if too_few(middle) else (low, middle)
     return high

@@ -23,8 +23,7 @@ class View:
 
     Attributes:
         low, high: (3,) m, corners of the box in which the ball is visible. It is open above: lobs are visible too.
-        duration: s, longest flight.
-        interval: s between samples.
+        duration, interval: s, of the longest flight and between samples.
         sigmas: (3,) m, stated noise of a coordinate.
         labelled: True if the spin at the first sample is measured.
     """
@@ -59,14 +58,9 @@ class View:
 def planned_flights(
     model: BallModel, starts: Array, settings: Array, surfaces: Surfaces, view: View
 ) -> tuple[Stretches, Mask]:
-    """Flights from first states as stretches, until they leave the view.
+    """Flights from first states (m, 9) as stretches, until they leave the view.
 
-    Args:
-        model: the ball.
-        starts: (m, 9) first states.
-        settings: (m, s) launcher settings, as in the stretches of the dataset.
-        surfaces: table and floor.
-        view: of the cameras.
+    Args: settings: (m, s) launcher settings, as in the stretches of the dataset.
     Returns: the flights that are long enough, and (m,) a mask of them.
     """
     times = torch.arange(0.0, view.duration + 0.5 * view.interval, view.interval, dtype=torch.float64)
@@ -77,14 +71,12 @@ def planned_flights(
     states, n, k = paths.numpy(), len(starts), len(times)
     lengths, contacts, levels = np.zeros(n, dtype=np.int64), *(np.full((n, MOST_CONTACTS), np.nan) for _ in range(2))
     for i, path in enumerate(states):
-        end, met = _seen(path, gaps[i], view)
-        lengths[i] = end
-        falling = -path[met, VZ]
-        contacts[i, : len(met)] = times.numpy()[met] + np.clip(gaps[i, met] / falling, 0.0, view.interval)
+        lengths[i], met = _seen(path, gaps[i], view)
+        delay = np.clip(gaps[i, met] / -path[met, VZ], 0.0, view.interval)
+        contacts[i, : len(met)] = times.numpy()[met] + delay
         levels[i, : len(met)] = heights.numpy()[i, met]
     index = np.minimum(np.arange(k), lengths[:, None] - 1).clip(0)
     seen = (np.arange(k) < lengths[:, None])[..., None]
-    labels = states[:, 0, SPIN] if view.labelled else np.full((n, 3), np.nan)
     rows = {
         "times": times.numpy()[index],
         "positions": np.take_along_axis(states[..., :3], index[..., None], axis=1),
@@ -92,12 +84,11 @@ def planned_flights(
         "starts": starts,
         "heights": levels,
         "contacts": contacts,
-        "labels": labels,
+        "labels": states[:, 0, SPIN] if view.labelled else np.full((n, 3), np.nan),
     }
     tensors = {name: torch.from_numpy(np.ascontiguousarray(row, dtype=np.float64)) for name, row in rows.items()}
-    names = tuple(str(i) for i in range(n))
     kept = lengths >= LEAST_SAMPLES
-    return Stretches(names, np.arange(n), settings, **tensors).take(kept), kept
+    return Stretches(tuple(map(str, range(n))), np.arange(n), settings, **tensors).take(kept), kept
 
 
 def _seen(path: Array, gaps: Array, view: View) -> tuple[int, Index]:

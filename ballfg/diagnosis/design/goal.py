@@ -13,11 +13,9 @@ from ballfg.dynamics import EFFECTS
 
 @dataclass(frozen=True)
 class Goal:
-    """Sides of coefficients that should be known well, each with all else unknown.
+    """Effects with unknown strengths beside the model's, and sides of parameters that should be known well, by name.
 
-    Attributes:
-        hypotheses: effects with unknown strengths, in addition to the model's.
-        sides: parameter names; two sides for effects to separate, one for a coefficient.
+    Each side is to be known with all else unknown: two sides for effects to separate, one for a coefficient.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -30,9 +28,8 @@ class Goal:
 
 
 def separating(fit: Fit, pairs: Sequence[tuple[str, str]]) -> Goal:
-    """The goal to separate the effects of some pairs.
+    """The goal to separate pairs of effects (`frame_tilt`) or strengths (`wind.x`); fit: of the declared model.
 
-    Args: fit: of the declared model.  pairs: effects (`frame_tilt`) or single strengths of them (`wind.x`).
     Raises: ValueError: an unknown effect or coefficient, one that cannot act in these data, or one named twice.
     """
     found = {text: hypothesis_of(fit, text) for pair in pairs for text in pair}
@@ -45,7 +42,8 @@ def separating(fit: Fit, pairs: Sequence[tuple[str, str]]) -> Goal:
 def shrinking(fit: Fit, text: str) -> Goal:
     """The goal to shrink the error bar of a coefficient, such as `drag.k`, or those of an effect.
 
-    Args: fit: of the declared model. A coefficient that it estimates keeps its prior.
+    A coefficient that the fit of the declared model estimates keeps its prior.
+
     Raises: ValueError: as `separating`.
     """
     hypothesis = hypothesis_of(fit, text)

@@ -1,18 +1,17 @@
 """Computes the information on coefficients in a dataset's tracks and in each flight of a launcher."""
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
-from ballfg.arrays import Array, Index, Mask
+from ballfg.arrays import Array, Index
 from ballfg.diagnosis.design.flights import View, planned_flights
 from ballfg.diagnosis.design.goal import Goal
-from ballfg.diagnosis.fit.problem import Fit, Problem, Unknowns
+from ballfg.diagnosis.fit.problem import Fit, Unknowns
 from ballfg.diagnosis.search.candidates import with_hypothesis
-from ballfg.dynamics import AnalyticModel, Surfaces
+from ballfg.dynamics import Surfaces
 
 AT_ONCE = 500
 """Number of flights whose derivatives are held at once; a flight takes up to half a megabyte."""
@@ -51,7 +50,6 @@ def information_of(fit: Fit, goal: Goal, starts: Array, settings: Array, surface
         goal: with further unknowns.
         starts: (m, 9) first states.
         settings: (m, s) launcher settings, as in the fit's stretches.
-        surfaces: table and floor.
     Raises: ValueError: if no candidate's flight is long enough.
     """
     problem = fit.problem
@@ -61,18 +59,23 @@ def information_of(fit: Fit, goal: Goal, starts: Array, settings: Array, surface
     unknowns = replace(fit.unknowns, values=values)
     units = 1.0 / np.sqrt(problem.common_precision)
     known = Fit.at(problem, unknowns, fit.noise).gram.sum(axis=0)[:-1, :-1]
-    flights, kept = planned_flights(
-        _as_fitted(problem.model, values), starts, settings, surfaces, View.of(problem.stretches)
-    )
-    parts, usable = [], []
+    fitted = copy.deepcopy(problem.model)
+    for name, parameter in fitted.named_parameters():
+        if name in values:
+            parameter.data.fill_(values[name])
+    flights, kept = planned_flights(fitted, starts, settings, surfaces, View.of(problem.stretches))
+    parts, usable = [np.zeros((0, len(units), len(units)))], [np.zeros(0, dtype=np.bool_)]
     for first in range(0, len(flights), AT_ONCE):
         own = flights.take(np.arange(first, min(first + AT_ONCE, len(flights))))
         planned = replace(problem, stretches=own)
         at = Fit.at(planned, Unknowns(own.starts.numpy(), values, fit.unknowns.launcher), fit.noise)
-        good = _as_planned(at)
-        usable.append(good)
-        parts.append(_information(at, good))
-    chosen = np.concatenate(usable) if usable else np.zeros(0, dtype=np.bool_)
+        off = np.abs(np.where(own.used.numpy()[..., None], at.predicted.positions - own.positions.numpy(), 0.0))
+        usable.append(np.nan_to_num(off, nan=np.inf).max(axis=(1, 2)) < MISSED)
+        if usable[-1].any():  # those with exactly the contacts of a rollout
+            good = replace(problem, stretches=own.take(usable[-1]))
+            at = Fit.at(good, replace(at.unknowns, starts=at.unknowns.starts[usable[-1]]), fit.noise)
+            parts.append(at.linearised().eliminated().gram[:, :-1, :-1])
+    chosen = np.concatenate(usable)
     if not chosen.any():
         raise ValueError(
             "candidates must fly for ten samples or more within the place where the tracks of the dataset were seen; "
@@ -86,30 +89,3 @@ def information_of(fit: Fit, goal: Goal, starts: Array, settings: Array, surface
         np.concatenate(parts) * scale,
         np.flatnonzero(kept)[chosen],
     )
-
-
-def _as_fitted(model: AnalyticModel, values: Mapping[str, float]) -> AnalyticModel:
-    moved = copy.deepcopy(model)
-    parameters = dict(moved.named_parameters())
-    with torch.no_grad():
-        for name, value in values.items():
-            if name in parameters:
-                parameters[name].fill_(value)
-    return moved
-
-
-def _as_planned(at: Fit) -> Mask:
-    """(m,) True for flights with exactly the contacts of a rollout."""
-    used = at.problem.stretches.used.numpy()[..., None]
-    off = np.abs(np.where(used, at.predicted.positions - at.problem.stretches.positions.numpy(), 0.0))
-    return np.asarray(np.nan_to_num(off, nan=np.inf).max(axis=(1, 2)) < MISSED)
-
-
-def _information(at: Fit, good: Mask) -> Array:
-    """(m', q, q) of the good flights."""
-    if not good.any():
-        q = len(at.problem.common_precision)
-        return np.zeros((0, q, q))
-    problem: Problem = replace(at.problem, stretches=at.problem.stretches.take(good))
-    kept = Fit.at(problem, replace(at.unknowns, starts=at.unknowns.starts[good]), at.noise)
-    return kept.linearised().eliminated().gram[:, :-1, :-1]

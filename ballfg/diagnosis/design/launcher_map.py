@@ -59,9 +59,8 @@ class LauncherMap:
 
 
 def learn_launcher(names: Sequence[str], settings: Array, states: Array) -> LauncherMap:
-    """Fits the line through the first states of shots.
+    """Fits the line through the first states (n, 9) of shots with settings (n, s) of these names.
 
-    Args: names: of s settings.  settings: (n, s) of n shots.  states: (n, 9) their first states.
     Raises: ValueError: too few shots, or settings that did not change independently of each other.
     """
     count, needed = len(settings), settings.shape[1] + 1 + SPARE
@@ -83,23 +82,17 @@ def learn_launcher(names: Sequence[str], settings: Array, states: Array) -> Laun
             f"labels {', '.join(names)} must change independently of each other; in these shots some change together "
             "only. Name fewer of them."
         )
-    design, launches = np.column_stack((np.ones(count), settings)), _launches(states)
+    velocity, launches = states[:, VELOCITY], np.zeros((count, STATE_DIM))
+    mean = np.arctan2(velocity[:, 1].sum(), velocity[:, 0].sum())  # near which azimuths stay
+    turned = np.arctan2(velocity[:, 1], velocity[:, 0]) - mean
+    azimuth = mean + np.arctan2(np.sin(turned), np.cos(turned))
+    elevation = np.arctan2(velocity[:, 2], np.hypot(velocity[:, 0], velocity[:, 1]))
+    launches[:, POSITION] = states[:, POSITION]
+    launches[:, 3:6] = np.stack((np.linalg.norm(velocity, axis=1), azimuth, elevation), axis=1)
+    launches[:, 6:] = (launch_axes(states).swapaxes(-1, -2) @ states[:, SPIN, None])[..., 0]
+    design = np.column_stack((np.ones(count), settings))
     weights, *_ = np.linalg.lstsq(design, launches, rcond=None)
     scatter = np.sqrt(((launches - design @ weights) ** 2).sum(axis=0) / (count - design.shape[1]))
     return LauncherMap(
         tuple(names), np.asarray(weights, dtype=np.float64), scatter, settings.min(axis=0), settings.max(axis=0)
     )
-
-
-def _launches(states: Array) -> Array:
-    """(n, 9) place, speed, azimuth, elevation, spin about forward, across and up. Azimuths stay near their mean."""
-    velocity = states[:, VELOCITY]
-    mean = np.arctan2(velocity[:, 1].sum(), velocity[:, 0].sum())
-    turned = np.arctan2(velocity[:, 1], velocity[:, 0]) - mean
-    azimuth = mean + np.arctan2(np.sin(turned), np.cos(turned))
-    elevation = np.arctan2(velocity[:, 2], np.hypot(velocity[:, 0], velocity[:, 1]))
-    launches = np.zeros((len(states), STATE_DIM))
-    launches[:, POSITION] = states[:, POSITION]
-    launches[:, 3:6] = np.stack((np.linalg.norm(velocity, axis=1), azimuth, elevation), axis=1)
-    launches[:, 6:] = (launch_axes(states).swapaxes(-1, -2) @ states[:, SPIN, None])[..., 0]
-    return launches

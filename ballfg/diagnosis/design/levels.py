@@ -13,10 +13,8 @@ MOST = 5000
 
 
 def parse_levels(text: str) -> dict[str, list[float]]:
-    """Levels by setting, of a text such as `topspin=-3..5,wheel=1200..2000:200,speed=9`.
+    """Rising levels by setting, of a text such as `topspin=-3..5,wheel=1200..2000:200,speed=9`.
 
-    Args: text: `NAME=FROM..TO` in steps of one, `NAME=FROM..TO:STEP`, or `NAME=LEVEL`, separated by commas.
-    Returns: the levels, rising, in the unit of the label of that name.
     Raises: ValueError: a text of another form, a repeated setting, a step that is not positive, or too many
         combinations.
     """

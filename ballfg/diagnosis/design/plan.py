@@ -8,7 +8,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.checks import did_you_mean
 from ballfg.diagnosis.design.choice import choose
-from ballfg.diagnosis.design.goal import Goal, separating, shrinking
+from ballfg.diagnosis.design.goal import separating, shrinking
 from ballfg.diagnosis.design.information import information_of
 from ballfg.diagnosis.design.launcher_map import LauncherMap, learn_launcher
 from ballfg.diagnosis.design.levels import combinations
@@ -86,24 +86,26 @@ def design_shots(
         raise ValueError("either between or shrink must say what the shots are for. Give one of them.")
     if not 1 <= shots <= MOST_SHOTS:
         raise ValueError(f"shots must be 1 to {MOST_SHOTS}; got {shots}. Choose another number.")
-    check_labels(dataset, tuple(levels))
+    names = tuple(levels)
+    check_labels(dataset, names)
     holdout = hold_out(dataset, model, jobs, watch)
     fit = _fit_of_all(model, holdout)
     goal = separating(fit, between) if between else shrinking(fit, shrink)
-    candidates = combinations(levels)
-    launcher = _launcher(fit, holdout.tracks, tuple(levels))
-    starts, settings = launcher.states(candidates), _known_settings(holdout, fit, tuple(levels), candidates)
+    candidates, launcher = combinations(levels), _launcher(fit, holdout.tracks, names)
+    starts, settings = launcher.states(candidates), _known_settings(holdout, fit, names, candidates)
     if watch is not None:
         watch(f"flying {len(candidates)} candidates")
     information = information_of(fit, goal, starts, settings, holdout.surfaces)
     choice = choose(information, goal.sides, goal.names, shots, seed)
-    listed = _units(goal, fit)
+    units = {name: c.unit for name, c in fit.problem.free.items()}
+    for h in goal.hypotheses:
+        units |= {h.parameter(n): h.coefficients[n].unit for n in h.strengths}
     return ShotPlan(
         candidates[information.kept[choice.shots]],
-        tuple(levels),
+        names,
         tuple(tuple(map(_short, side)) for side in goal.sides),
         tuple(map(_short, goal.names)),
-        tuple(listed[name] for name in goal.names),
+        tuple(units[name] for name in goal.names),
         choice.sigmas,
         choice.error,
         choice.random,
@@ -114,10 +116,7 @@ def design_shots(
 
 
 def check_labels(dataset: Dataset, names: Sequence[str]) -> None:
-    """Refuses settings without a column of labels.
-
-    Raises: ValueError: a name without a column of labels.
-    """
+    """Refuses settings without a column of labels. Raises: ValueError."""
     for name in names:
         if name not in dataset.label_names:
             present = ", ".join(dataset.label_names) or "none"
@@ -125,14 +124,6 @@ def check_labels(dataset: Dataset, names: Sequence[str]) -> None:
                 f"candidates must be columns of the dataset's labels.csv; '{name}' is none of them, there are: "
                 f"{present}.{did_you_mean(name, dataset.label_names)} Name those that the launcher was set to."
             )
-
-
-def _units(goal: Goal, fit: Fit) -> dict[str, str]:
-    """Units of the coefficients of a goal, by parameter name."""
-    units = {name: c.unit for name, c in fit.problem.free.items()}
-    for hypothesis in goal.hypotheses:
-        units |= {hypothesis.parameter(n): hypothesis.coefficients[n].unit for n in hypothesis.strengths}
-    return units
 
 
 def _fit_of_all(model: AnalyticModel, holdout: Holdout) -> Fit:
@@ -154,9 +145,8 @@ def _launcher(fit: Fit, tracks: Sequence[Track], names: tuple[str, ...]) -> Laun
 def _known_settings(holdout: Holdout, fit: Fit, names: tuple[str, ...], candidates: Array) -> Array:
     """(m, s) settings of the fit's launcher; settings other than candidates stay at their mean."""
     launcher, used = holdout.launcher.embedding.names, fit.problem.stretches.settings
-    settings = np.repeat(
-        used[used.any(axis=1)].mean(axis=0, keepdims=True) if used.any() else used[:1], len(candidates), 0
-    )
+    usual = used[used.any(axis=1)].mean(axis=0, keepdims=True) if used.any() else used[:1]
+    settings = np.repeat(usual, len(candidates), 0)
     for place, name in enumerate(names):
         if name in launcher:
             settings[:, launcher.index(name)] = candidates[:, place]
@@ -164,17 +154,13 @@ def _known_settings(holdout: Holdout, fit: Fit, names: tuple[str, ...], candidat
 
 
 def _remarks(launcher: LauncherMap, candidates: Array, usable: int) -> list[str]:
-    scatter = launcher.scatter
-    lost = (
-        []
-        if usable == len(candidates)
-        else [f"{len(candidates) - usable} of {len(candidates)} candidates leave the cameras' view at once or roll"]
-    )
+    scatter, count = launcher.scatter, len(candidates)
+    lost = f"{count - usable} of {count} candidates leave the cameras' view at once or roll"
     spread = (
         f"first states follow the settings to {1e3 * np.sqrt((scatter[:3] ** 2).mean()):.0f} mm, {scatter[3]:.2g} m/s, "
         f"{np.degrees(max(scatter[4:6])):.1f} degrees and {np.sqrt((scatter[6:] ** 2).mean()):.0f} rad/s"
     )
-    return [spread, *launcher.outside(candidates), *lost]
+    return [spread, *launcher.outside(candidates), *([lost] if usable < count else [])]
 
 
 def _short(parameter: str) -> str:

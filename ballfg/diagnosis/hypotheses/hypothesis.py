@@ -24,10 +24,9 @@ AROUND = 0.1
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """An effect that the model may lack.
+    """An effect that the model may lack, by its class.
 
     Attributes:
-        effect: its class.
         shape: coefficients of its form (a centre, a reference), and values that are tried as a whole.
         strengths: coefficients of its size, for score tests: at their absent values nothing changes.
         choices: number of shapes among which this one was chosen.
@@ -98,8 +97,7 @@ class Hypothesis:
 
 def effects_of(model: AnalyticModel) -> list[Effect]:
     """All effects of a model, in order."""
-    groups = (model.flight, model.bounce, model.measurement)
-    return [cast(Effect, effect) for group in groups for effect in group.values()]
+    return [cast(Effect, e) for group in (model.flight, model.bounce, model.measurement) for e in group.values()]
 
 
 def has_effect(model: AnalyticModel, name: str) -> bool:
@@ -109,27 +107,23 @@ def has_effect(model: AnalyticModel, name: str) -> bool:
 
 def with_effects(model: AnalyticModel, *effects: Effect) -> AnalyticModel:
     """A copy of a model with further effects; its parameters are fixed (`requires_grad` is off)."""
-    every = [*(copy.deepcopy(effect) for effect in effects_of(model)), *effects]
-    return AnalyticModel(every, radius=model.radius, inertia_factor=model.inertia_factor).requires_grad_(False)
+    return _of_effects(model, [*(copy.deepcopy(effect) for effect in effects_of(model)), *effects])
 
 
 def without_effect(model: AnalyticModel, name: str) -> AnalyticModel:
     """A copy of a model without one of its effects, and without those that need it."""
-    kept = [copy.deepcopy(e) for e in effects_of(model) if e.name != name and name not in e.needs]
-    return AnalyticModel(kept, radius=model.radius, inertia_factor=model.inertia_factor).requires_grad_(False)
+    return _of_effects(model, [copy.deepcopy(e) for e in effects_of(model) if e.name != name and name not in e.needs])
+
+
+def _of_effects(model: AnalyticModel, effects: list[Effect]) -> AnalyticModel:
+    return AnalyticModel(effects, radius=model.radius, inertia_factor=model.inertia_factor).requires_grad_(False)
 
 
 def hypotheses(model: AnalyticModel, scene: Scene, catalogue: Iterable[type[Effect]]) -> list[Hypothesis]:
-    """All effects that the model may lack and that can act in these data.
+    """All effects that the model may lack and that can act in the scene of the data, in the order of the catalogue.
 
     A missing effect of the catalogue whose needs are met is listed in each shape for the scene. An effect of the model
     is listed with the coefficients that are declared as exact.
-
-    Args:
-        model: as declared so far.
-        scene: extent of the data.
-        catalogue: effects by class.
-    Returns: the hypotheses, in the order of the catalogue.
     """
     listed: list[Hypothesis] = []
     catalogue = tuple(catalogue)
@@ -152,11 +146,7 @@ def hypotheses(model: AnalyticModel, scene: Scene, catalogue: Iterable[type[Effe
 
 
 def scene_of(fit: Fit) -> Scene:
-    """The extent of a fit's stretches: places, speeds, impacts and spin labels.
-
-    Args: fit: of a model to the stretches.
-    Returns: the scene, in m and m/s.
-    """
+    """The extent of a fit's stretches: places in m, speeds and impacts in m/s, and the number of spin labels."""
     stretches = fit.problem.stretches
     used = stretches.used.numpy()
     positions = stretches.positions.numpy()[used]

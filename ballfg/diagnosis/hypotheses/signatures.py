@@ -51,11 +51,9 @@ class Signatures:
 
 @dataclass(frozen=True)
 class Efficient:
-    """Scores of p columns on t tracks.
+    """Scores (t, p) of p columns on t tracks, with their information (t, p, p).
 
     Attributes:
-        score: (t, p).
-        information: (t, p, p).
         prior: (p, p) remaining information of the common columns' priors.
         raw: (p,) squared length of each column before common columns were projected out.
     """
@@ -99,16 +97,11 @@ def hypothesis_signatures(
     """
     ends = np.cumsum([len(hypothesis.strengths) for hypothesis in candidates]).tolist()
     chosen = [list(range(end - len(h.strengths), end)) for end, h in zip(ends, candidates, strict=True)]
-    columns = columns_of(fit, candidates) if columns is None else columns
-    return signatures_of(fit, fit.linearised(), columns), chosen
+    return signatures_of(fit, fit.linearised(), columns_of(fit, candidates) if columns is None else columns), chosen
 
 
 def columns_of(fit: Fit, candidates: Sequence[Hypothesis]) -> Array:
-    """Columns of all candidates, in their order.
-
-    Effects on the ball are computed together, and so are effects on its measurement. The latter need states at further
-    times, which is expensive for many rows.
-    """
+    """Columns of all candidates, in their order; measurement effects by themselves: their further states are costly."""
     parts: dict[int, Array] = {}
     for late in (False, True):
         group = [i for i, h in enumerate(candidates) if (h.effect.kind == "measurement") is late]

@@ -59,11 +59,16 @@ class Grouping:
 
 
 def groupings(tracks: Sequence[Track], searched: Sequence[str]) -> list[Grouping]:
-    """All groupings of the tracks of a dataset.
-
-    Args: tracks: all, in the order of the recording.  searched: names of the search half's tracks.
-    """
-    return [*_by_labels(tracks, set(searched)), *_by_place([track.name for track in tracks], searched)]
+    """All groupings of the tracks of a dataset, in the order of the recording; searched: names of the search half's."""
+    found = []
+    for label in sorted({name for track in tracks for name, value in track.labels.items() if isinstance(value, str)}):
+        known = {track.name: str(track.labels[label]) for track in tracks if label in track.labels}
+        levels = sorted(set(known.values()))
+        counts = Counter(known[name] for name in set(searched) if name in known)
+        if 2 <= len(levels) <= MOST_GROUPS and all(counts[level] >= 2 * LEAST_TRACKS for level in levels):
+            weights = {level: {n: 1.0 for n, value in known.items() if value == level} for level in levels}
+            found.append(Grouping(label, weights))
+    return [*found, *_by_place([track.name for track in tracks], searched)]
 
 
 def steps_near(grouping: Grouping, searched: Sequence[str], names: Sequence[str]) -> list[Grouping]:
@@ -73,19 +78,6 @@ def steps_near(grouping: Grouping, searched: Sequence[str], names: Sequence[str]
     reach, at = max(1, len(searched) // PARTS), searched.index(next(iter(grouping.weights)))
     begins = range(max(LEAST_TRACKS, at - reach), min(len(searched) - LEAST_TRACKS, at + reach) + 1)
     return [_step(names, searched[begin]) for begin in begins]
-
-
-def _by_labels(tracks: Sequence[Track], searched: set[str]) -> list[Grouping]:
-    found = []
-    for label in sorted({name for track in tracks for name, value in track.labels.items() if isinstance(value, str)}):
-        known = {track.name: str(track.labels[label]) for track in tracks if label in track.labels}
-        levels = sorted(set(known.values()))
-        counts = Counter(value for name, value in known.items() if name in searched)
-        enough = all(counts[level] >= 2 * LEAST_TRACKS for level in levels)
-        if 2 <= len(levels) <= MOST_GROUPS and enough:
-            weights = {level: {n: 1.0 for n, value in known.items() if value == level} for level in levels}
-            found.append(Grouping(label, weights))
-    return found
 
 
 def _by_place(names: Sequence[str], searched: Sequence[str]) -> list[Grouping]:
@@ -113,12 +105,9 @@ def _step(names: Sequence[str], begin: str) -> Grouping:
 
 @dataclass(frozen=True)
 class Varying(Hypothesis):
-    """An effect whose coefficients may differ between tracks.
+    """An effect whose coefficients may differ between tracks, as their grouping says.
 
-    Attributes:
-        effect, shape: as of `Hypothesis`.
-        strengths: the deviations, `e[backspin]`: of each varying coefficient, for each level.
-        grouping: how tracks differ.
+    Its strengths are the deviations, `e[backspin]`: of each varying coefficient, for each level.
     """
 
     grouping: Grouping = field(kw_only=True)
@@ -171,19 +160,15 @@ class Varying(Hypothesis):
         """The deviations of the fit, by name of the unknown."""
         way, found = self.grouping, {}
         for strength in self.strengths:
-            level = self._levels[_level(strength)]
-            found[self.parameter(strength)] = Deviation(
-                self._coefficient(strength), way.weights[level], way.by, level, way.first, way.line
-            )
+            level, coefficient = self._levels[_level(strength)], self.parameter(varied(strength))
+            weights = way.weights[level]
+            found[self.parameter(strength)] = Deviation(coefficient, weights, way.by, level, way.first, way.line)
         return found
 
     @property
     def _levels(self) -> dict[str, str]:
         """Levels by their names in a report."""
         return {self.grouping.named(level): level for level in self.grouping.weights}
-
-    def _coefficient(self, strength: str) -> str:
-        return self.parameter(varied(strength))
 
     def added_to(self, model: AnalyticModel) -> AnalyticModel:
         """The model with the effect at zero strength for all tracks; the model itself if it has the effect."""
@@ -196,7 +181,7 @@ class Varying(Hypothesis):
         """The coefficients at each level, for a report; values: fitted deviations, by strength."""
         variations, told = fit.variations(), dict[str, Value]()
         for strength, deviation in values.items():
-            name = self._coefficient(strength)
+            name = self.parameter(varied(strength))
             known, summed = variations[name].values, [self.parameter(strength)]
             if name in fit.problem.free:
                 summed.append(name)
@@ -220,9 +205,9 @@ def varying_hypotheses(
     free, listed = set(free), []
     for effect in catalogue:
         if has_effect(model, effect.name):
-            names = tuple(c.name for c in effect.coefficients if f"{effect.kind}.{effect.name}.{c.name}" in free)
-            taken = any(name.startswith(f"{effect.kind}.{effect.name}.") and "[" in name for name in free)
-            names = () if taken else names
+            begin = f"{effect.kind}.{effect.name}."
+            taken = any(name.startswith(begin) and "[" in name for name in free)
+            names = tuple(c.name for c in effect.coefficients if begin + c.name in free and not taken)
         else:
             single = tuple(effect.shapes(scene)) == ({},) and not effect.multiplies_spin
             formed = any(c.absent is None for c in effect.coefficients)

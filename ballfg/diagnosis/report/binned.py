@@ -65,13 +65,10 @@ def slip_speed(states: Array, radius: float) -> Array:
 
 
 def binned(against: Array, values: Array, sigmas: Array, stretch: Index) -> Bins:
-    """Weighted means of values over bins of equal counts.
+    """Weighted means of values (m,) with standard deviations (m,) over bins of equal counts, against a quantity (m,).
 
-    Args:
-        against: (m,) quantity on the axis of the bins.
-        values, sigmas: (m,) and their standard deviations, for the weights.
-        stretch: (m,) number of the stretch: values of one stretch are correlated and count as one.
-    Returns: the bins with enough stretches. The standard errors come from the scatter between stretches alone.
+    Values of one stretch, by its number (m,), are correlated and count as one: bins need enough stretches, and the
+    standard errors come from the scatter between stretches alone.
     """
     rows: list[tuple[float, float, float]] = []
     if len(against):

@@ -54,7 +54,7 @@ def _lines(row: Sequence[Candidate], most: float) -> Iterator[tuple[str, ...]]:
         unseen = c.outcome is Outcome.INVISIBLE
         length = math.log1p(max(c.explained, 0.0)) / math.log1p(most) if most > 0.0 and not unseen else 0.0
         yield (
-            tag("span", tag("b", capital(plain_name(c.name))), " ", tag("code", c.name, kind="quiet")),
+            _named(c),
             NONE if unseen else tag("span", bar(length, colour), number(c.explained)),
             NONE if unseen else probability(c.p_value),
             NONE if c.delta_bic is None else f"{c.delta_bic:+.0f}",
@@ -70,15 +70,17 @@ def noticed_from(diagnosis: Diagnosis) -> Html:
         "These effects were looked for and not found. Here is how strong each would have had to be for the test to "
         "notice it in 9 of 10 recordings like this one, whatever its other coefficients are. Weaker ones may be there."
     )
-    rows = (
-        (
-            tag("span", tag("b", capital(plain_name(c.name))), " ", tag("code", c.name, kind="quiet")),
-            ", ".join(f"{name} {sized(size, c.estimate[name].unit)}" for name, size in c.seen_from.items()),
-        )
-        for c in quiet
-    )
+    rows = []
+    for c in quiet:
+        sizes = (f"{name} {sized(size, c.estimate[name].unit)}" for name, size in c.seen_from.items())
+        rows.append((_named(c), ", ".join(sizes)))
     parts = (tag("p", words), table(("effect", "would have been noticed from"), rows)) if quiet else ()
     return section("How small an effect would have been noticed", *parts)
+
+
+def _named(candidate: Candidate) -> Html:
+    name = candidate.name
+    return tag("span", tag("b", capital(plain_name(name))), " ", tag("code", name, kind="quiet"))
 
 
 def invisible(diagnosis: Diagnosis) -> Html:

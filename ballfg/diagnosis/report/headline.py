@@ -13,7 +13,7 @@ from ballfg.diagnosis.fit.patterns import EVERYWHERE
 from ballfg.diagnosis.generic_test import ALARM
 from ballfg.diagnosis.report.origin import Origin
 from ballfg.diagnosis.report.plain_effects import BY_GROUP, DRIFT, in_plain_words, plain_name
-from ballfg.diagnosis.report.wording import MOST_CERTAIN, NONE, fixed, joined, number, probability, sized
+from ballfg.diagnosis.report.wording import MOST_CERTAIN, NONE, capital, fixed, joined, number, probability, sized
 from ballfg.diagnosis.residual_tests.label_check import LABEL
 from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Finding, Outcome, Verdict
 from ballfg.dynamics import EFFECTS
@@ -64,17 +64,18 @@ def headline(diagnosis: Diagnosis) -> str:
         nothing = f"Nothing that the model lacks was found: its predictions are off by {_error(diagnosis)}"
         return f"{nothing}, and what is left looks like noise."
     if not effects:
-        said = (
-            f"Something is missing from the model that no known effect explains: {where(diagnosis.unexplained.where)}."
-        )
+        left = where(diagnosis.unexplained.where)
+        said = f"Something is missing from the model that no known effect explains: {left}."
+        described = diagnosis.unexplained.fallback is not None
+        what = "With a description of the pattern that names no cause" if described else ""
     elif len(effects) == 1:
-        others = effects[0].indistinguishable_from
+        others, what = effects[0].indistinguishable_from, "With it"
         doubt = f" It may also be {_or(others)}: these tracks cannot tell." if others else ""
         said = in_plain_words(effects[0]) + doubt
     else:
         count = COUNTS[len(effects)] if len(effects) < len(COUNTS) else f"{len(effects)}"
-        said = f"{count} effects are missing from the model."
-    return " ".join(part for part in (said, gain(diagnosis, _what(diagnosis, len(effects)))) if part)
+        said, what = f"{count} effects are missing from the model.", "With them"
+    return " ".join(part for part in (said, gain(diagnosis, what)) if part)
 
 
 def further(diagnosis: Diagnosis) -> Iterator[str]:
@@ -104,19 +105,15 @@ def gain(diagnosis: Diagnosis, what: str) -> str:
 
 def skewed_medians(before: Errors, after: Errors) -> tuple[float, float] | None:
     """mm, errors of the median track before and after, if a few tracks dominate the root mean square."""
-    medians = tuple(
-        float(np.nanmedian(e.by_track)) if np.isfinite(e.by_track).any() else math.nan for e in (before, after)
-    )
-    pooled = (before.prediction_rmse_mm, after.prediction_rmse_mm)
-    if not any(whole > SKEWED * median for whole, median in zip(pooled, medians, strict=True)):
-        return None
-    return medians[0], medians[1]
+    was, now = (float(np.nanmedian(e.by_track)) if np.isfinite(e.by_track).any() else math.nan for e in (before, after))
+    skewed = before.prediction_rmse_mm > SKEWED * was or after.prediction_rmse_mm > SKEWED * now
+    return (was, now) if skewed else None
 
 
 def certainty(diagnosis: Diagnosis) -> Iterator[str]:
     """The certainty of the answer: a line for each finding, or the basis for finding none."""
     for finding in diagnosis.findings:
-        yield f"{_upper(plain_name(finding.name))}: {_sure(finding)}"
+        yield f"{capital(plain_name(finding.name))}: {_sure(finding)}"
     last = diagnosis.rounds[-1] if diagnosis.rounds else ()
     unseen = sum(c.outcome is Outcome.INVISIBLE for c in last)
     if diagnosis.verdict is Verdict.NOTHING and last:
@@ -152,12 +149,9 @@ def advice(diagnosis: Diagnosis, origin: Origin) -> Iterator[tuple[str, str]]:
     datasets = " ".join(map(shlex.quote, origin.datasets))
     given = f" --model {shlex.quote(origin.model)}" if origin.model else ""
     again = shlex.quote(f"{origin.out.rstrip('/')}_again")
-    changed = bool(diagnosis.findings) or diagnosis.unexplained.fallback is not None
-    if changed:
-        yield (
-            "Estimate the states with the corrected model:",
-            "\n".join(_command("estimate", "states", *room, origin) for room in rooms),
-        )
+    estimate = "\n".join(_command("estimate", "states", *room, origin) for room in rooms)
+    if diagnosis.findings or diagnosis.unexplained.fallback is not None:
+        yield "Estimate the states with the corrected model:", estimate
         yield (
             "Predict with the corrected model, from the first 0.3 s of each track:",
             "\n".join(_command("predict", "predictions", *room, origin, " --observe 0.3") for room in rooms),
@@ -165,14 +159,11 @@ def advice(diagnosis: Diagnosis, origin: Origin) -> Iterator[tuple[str, str]]:
     else:
         yield (
             "Keep the model that you have, or take the same one with its coefficients fitted to these tracks:",
-            "\n".join(_command("estimate", "states", *room, origin) for room in rooms),
+            estimate,
         )
-        yield (
-            "Once there are more tracks, look again:",
-            f"ballfg diagnose {datasets}{given} --out {again}",
-        )
-    for finding in diagnosis.findings:
-        for name in (finding.name, *finding.indistinguishable_from) if finding.indistinguishable_from else ():
+        yield "Once there are more tracks, look again:", f"ballfg diagnose {datasets}{given} --out {again}"
+    for finding in (f for f in diagnosis.findings if f.indistinguishable_from):
+        for name in (finding.name, *finding.indistinguishable_from):
             decide = finding.decide if name == finding.name else EFFECTS[name].decide if name in EFFECTS else ""
             if decide:
                 yield f"To find out whether it is {plain_name(name)}: {decide}", ""
@@ -224,21 +215,13 @@ def _sure(finding: Finding) -> str:
     if math.isfinite(finding.held_out_p):
         by_chance = probability(finding.held_out_p)
         sure += f"; its strength, fitted to half of the tracks, helps on the other half (by chance: {by_chance})"
-    if finding.indistinguishable_from:
-        sure += (
-            f". That something like it is there is sure; but it may be {_or(finding.indistinguishable_from)} as well"
-        )
+    if others := finding.indistinguishable_from:
+        sure += f". That something like it is there is sure; but it may be {_or(others)} as well"
     return f"{sure}."
 
 
 def _sure_word(p: float) -> str:
     return next((word for limit, word in SURE if p < limit), "possible")
-
-
-def _what(diagnosis: Diagnosis, effects: int) -> str:
-    if effects:
-        return "With it" if effects == 1 else "With them"
-    return "With a description of the pattern that names no cause" if diagnosis.unexplained.fallback is not None else ""
 
 
 def _or(names: Sequence[str]) -> str:
@@ -248,7 +231,3 @@ def _or(names: Sequence[str]) -> str:
 def _error(diagnosis: Diagnosis) -> str:
     value = diagnosis.after.prediction_rmse_mm
     return f"{fixed(value, 1)} mm" if math.isfinite(value) else NONE
-
-
-def _upper(words: str) -> str:
-    return words[:1].upper() + words[1:]

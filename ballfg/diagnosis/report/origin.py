@@ -10,14 +10,11 @@ PACKAGES: Final = ("ballfg", "torch", "numpy", "scipy")
 
 @dataclass(frozen=True)
 class Origin:
-    """The inputs of a report, as the user typed them.
+    """The inputs of a report, as the user typed them: command line, folders of the datasets, files.
 
     Attributes:
-        command: the command line.
-        datasets: folders.
         model: the declared model's file; empty for the nominal model.
-        out: folder of the report.
-        models: file of the corrected model of each dataset, in that folder.
+        models: file of the corrected model of each dataset, in the folder `out` of the report.
     """
 
     command: str

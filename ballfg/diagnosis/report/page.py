@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 
 from matplotlib.figure import Figure
 
-from ballfg.diagnosis.generic_test import ALARM, GenericTest
+from ballfg.diagnosis.generic_test import ALARM
 from ballfg.diagnosis.label_verdicts import percent
 from ballfg.diagnosis.report import pictures
 from ballfg.diagnosis.report.candidates import invisible, noticed_from, rankings
@@ -93,48 +93,35 @@ def _finding(finding: Finding) -> Html:
     )
     verb = "falls" if finding.delta_bic < 0 else "rises"
     gain = "adds" if finding.held_out_gain >= 0 else "takes away"
-    others = finding.indistinguishable_from
-    unusual = f"Stronger than usual: {finding.usual}." if finding.usual else ""
-    evidence = items(
-        (
-            f"Probability that it is there: {odds(finding.probability)}.",
-            *filter(None, (unusual,)),
-            tag(
-                "span",
-                "Probability of so strong a ",
-                term("trace"),
-                f" by chance, all candidates counted: {probability(finding.p_value)}.",
-            ),
-            tag("span", "The model's ", term("BIC"), f" {verb} by {abs(finding.delta_bic):.0f} with it, refitted."),
-            tag(
-                "span",
-                "On the ",
-                term("held-out tracks"),
-                f" it {gain} {number(abs(finding.held_out_gain))} of ",
-                term("log likelihood"),
-                f" per track; probability of that by chance: {probability(finding.held_out_p)}.",
-            ),
-            f"Cannot be told from {joined(others)}."
-            if others
-            else "Of the candidates that were not refused no other explains as much.",
-        )
-    )
-    return tag(
-        "article", head, tag("p", in_plain_words(finding)), tag("p", finding.sentence), values, evidence, kind="card"
-    )
+    others, evidence = finding.indistinguishable_from, [f"Probability that it is there: {odds(finding.probability)}."]
+    if finding.usual:
+        evidence.append(f"Stronger than usual: {finding.usual}.")
+    by_chance = f" by chance, all candidates counted: {probability(finding.p_value)}."
+    bic = f" {verb} by {abs(finding.delta_bic):.0f} with it, refitted."
+    gained = f" it {gain} {number(abs(finding.held_out_gain))} of "
+    per_track = f" per track; probability of that by chance: {probability(finding.held_out_p)}."
+    evidence += [
+        tag("span", "Probability of so strong a ", term("trace"), by_chance),
+        tag("span", "The model's ", term("BIC"), bic),
+        tag("span", "On the ", term("held-out tracks"), gained, term("log likelihood"), per_track),
+        f"Cannot be told from {joined(others)}."
+        if others
+        else "Of the candidates that were not refused no other explains as much.",
+    ]
+    words = (tag("p", in_plain_words(finding)), tag("p", finding.sentence))
+    return tag("article", head, *words, values, items(evidence), kind="card")
 
 
 def _alike(diagnosis: Diagnosis) -> Html:
     """Indistinguishable effects, and measurements that would separate them."""
     cards = []
-    for finding in diagnosis.findings:
+    for finding in (f for f in diagnosis.findings if f.indistinguishable_from):
         others = finding.indistinguishable_from
-        if others:
-            hints = {finding.name: finding.decide} | {n: EFFECTS[n].decide for n in others if n in EFFECTS}
-            names = joined(tuple(map(plain_name, (finding.name, *others))))
-            words = f"These data cannot tell {names} apart. What would decide it:"
-            lines = items(tag("span", tag("b", plain_name(n)), f": {hint}") for n, hint in hints.items())
-            cards.append(tag("article", tag("p", words), lines, kind="card"))
+        hints = {finding.name: finding.decide} | {n: EFFECTS[n].decide for n in others if n in EFFECTS}
+        names = joined(tuple(map(plain_name, (finding.name, *others))))
+        words = f"These data cannot tell {names} apart. What would decide it:"
+        lines = items(tag("span", tag("b", plain_name(n)), f": {hint}") for n, hint in hints.items())
+        cards.append(tag("article", tag("p", words), lines, kind="card"))
     return section("What could not be told apart", *cards)
 
 
@@ -149,20 +136,16 @@ def _left_over(diagnosis: Diagnosis) -> Html:
     loud = {t.name for t in alarms}
     quiet = tuple(dict.fromkeys(t.name for t in left.tests if t.name not in loud))
     head = (term("generic test"), term("by chance"), "pattern", "share of it at the start that is left")
-    tests = table(head, ((t.name, probability(t.p_value), t.where, _share(t)) for t in alarms))
-    silent = f"Tests that find nothing beyond noise: {joined(quiet)}." if quiet else ""
-    quietly = tag("p", silent, kind="quiet") if silent else Html()
-    rest = Html()
+    shares = (f"{100 * t.share:.0f} %" if math.isfinite(t.share) else NONE for t in alarms)
+    tests = table(head, ((t.name, probability(t.p_value), t.where, s) for t, s in zip(alarms, shares, strict=True)))
+    silent = f"Tests that find nothing beyond noise: {joined(quiet)}."
+    quietly, rest = tag("p", silent, kind="quiet") if quiet else Html(), Html()
     if left.fallback is not None:
         without, within = (fixed(e.prediction_rmse_mm, 1) for e in (left.fallback.before, left.fallback.after))
         purpose = "It describes the rest without naming a cause. Prediction error on the held-out tracks:"
-        rest = tag(
-            "article",
-            tag("h3", "A stopgap: ", left.fallback.kind),
-            tag("p", tag("code", left.fallback.description)),
-            tag("p", f"{purpose} {without} mm without, {within} mm with it."),
-            kind="card",
-        )
+        title, described = tag("h3", "A stopgap: ", left.fallback.kind), tag("code", left.fallback.description)
+        helps = tag("p", f"{purpose} {without} mm without, {within} mm with it.")
+        rest = tag("article", title, tag("p", described), helps, kind="card")
     counted = tag("p", share) if share else ""
     return section("What is left unexplained", tag("p", words), counted, tests, quietly, _labels(diagnosis), rest)
 
@@ -179,11 +162,6 @@ def _labels(diagnosis: Diagnosis) -> Html:
     rows = ((v.track, f"{v.off:.0f} rad/s", f"{v.sigma:.0f} rad/s", percent(v.probability)) for v in wrong)
     head = ("track", "label less the flight's spin", "standard deviation of that spin", "the label is wrong")
     return tag("article", tag("p", words), table(head, rows), kind="card")
-
-
-def _share(test: GenericTest) -> str:
-    """The remaining share of a pattern."""
-    return f"{100 * test.share:.0f} %" if math.isfinite(test.share) else NONE
 
 
 def _residuals(diagnosis: Diagnosis) -> Html:

@@ -6,7 +6,7 @@ its own `sentence`.
 
 from typing import Final
 
-from ballfg.diagnosis.report.wording import listed, plus_minus
+from ballfg.diagnosis.report.wording import capital, listed, plus_minus
 from ballfg.diagnosis.result import Finding
 from ballfg.dynamics import EFFECTS
 from ballfg.dynamics.wording import said
@@ -18,10 +18,7 @@ OF_A_TRACKER: Final = {
         "a tracker whose errors last",
         "The tracker's errors last from sample to sample: {sigma:milli} mm that fade over {time:milli} ms.",
     ),
-    "stamp_jitter": (
-        "time stamps that jitter",
-        "The time stamps jitter by {sigma:milli} ms from sample to sample.",
-    ),
+    "stamp_jitter": ("time stamps that jitter", "The time stamps jitter by {sigma:milli} ms from sample to sample."),
 }
 """Findings of a diagnosis other than effects: as a noun and in a sentence."""
 
@@ -42,7 +39,7 @@ def in_plain_words(finding: Finding) -> str:
         if finding.name.endswith(ending):
             whole = plain_name(finding.name.removesuffix(ending))
             levels = (f"{_level(name)} {plus_minus(value)}" for name, value in finding.parameters.items())
-            return f"{whole[:1].upper()}{whole[1:]} {words}: {', '.join(levels)}."
+            return f"{capital(whole)} {words}: {', '.join(levels)}."
     first = finding.sentence.partition(". ")[0].rstrip(".")
     return f"{first} ({listed(finding.parameters)})." if finding.parameters else f"{first}."
 

@@ -21,30 +21,19 @@ def errors(diagnosis: Diagnosis) -> Html:
     """Errors of predictions on the held-out half, before and after, with their ideal values."""
     before, after, changed = diagnosis.before, diagnosis.after, diagnosis.after is not diagnosis.before
     changed = changed and (bool(diagnosis.findings) or diagnosis.unexplained.fallback is not None)
+    near = f"near {diagnosis.floor_mm:.1f} mm" if math.isfinite(diagnosis.floor_mm) else "small"
+    held = (100 * before.intervals_held, 100 * after.intervals_held)
     numbers = (
-        (
-            term("prediction error"),
-            before.prediction_rmse_mm,
-            after.prediction_rmse_mm,
-            " mm",
-            _goal(diagnosis.floor_mm),
-        ),
+        (term("prediction error"), before.prediction_rmse_mm, after.prediction_rmse_mm, " mm", near),
         (term("apex", "error of the apex"), before.apex_rmse_mm, after.apex_rmse_mm, " mm", "small"),
         (term("NIS"), before.nis, after.nis, "", "1"),
-        (term("90 % intervals", "90 % intervals hold"), *_percents(before, after), " %", "90 %"),
+        (term("90 % intervals", "90 % intervals hold"), *held, " %", "90 %"),
         (term("log likelihood"), before.log_likelihood, after.log_likelihood, "", "large"),
     )
-    words = tag(
-        "p",
-        f"Of {diagnosis.tracks_judged_on} ",
-        term("held-out tracks"),
-        " the first 40 % was observed. The rest was predicted and compared with the measured positions. "
-        + (
-            "Both models were fitted to the other tracks, the declared one without what was added."
-            if changed
-            else "The model was fitted to the other tracks."
-        ),
-    )
+    said = " the first 40 % was observed. The rest was predicted and compared with the measured positions. "
+    said += "Both models were" if changed else "The model was"
+    said += " fitted to the other tracks" + (", the declared one without what was added." if changed else ".")
+    words = tag("p", f"Of {diagnosis.tracks_judged_on} ", term("held-out tracks"), said)
     if not changed:
         rows = [(name, _fixed(now, unit), goal) for name, _, now, unit, goal in numbers]
         shown = table(("", "value", "should be"), rows)
@@ -75,20 +64,13 @@ def meaning(diagnosis: Diagnosis) -> list[Html]:
             f"of the release cost even an exact model. The error is {error:.1f} mm, {how}."
         )
         said.append(tag("span", "The ", term("floor"), least))
-    if few := _few_tracks(diagnosis.before, after):
-        said.append(text(few))
+    if medians := skewed_medians(diagnosis.before, after):
+        was = f"{medians[0]:.1f} mm before and " if after is not diagnosis.before else ""
+        off = f"{was}{medians[1]:.1f} mm{' after' if was else ''}"
+        said.append(text(f"A few tracks make most of the prediction error: the median track is off by {off}."))
     if math.isfinite(after.nis) and after.nis > 0.0:
         said.append(text(_about_nis(after)))
     return said
-
-
-def _few_tracks(before: Errors, after: Errors) -> str:
-    """The error of the median track, if a few tracks dominate the root mean square; else empty."""
-    medians = skewed_medians(before, after)
-    if medians is None:
-        return ""
-    off = f"{medians[0]:.1f} mm before and {medians[1]:.1f} mm after" if after is not before else f"{medians[1]:.1f} mm"
-    return f"A few tracks make most of the prediction error: the median track is off by {off}."
 
 
 def _about_nis(errors: Errors) -> str:
@@ -99,26 +81,15 @@ def _about_nis(errors: Errors) -> str:
         held = f" 90 % intervals hold {100 * errors.intervals_held:.1f} % of the measured coordinates."
     if math.isfinite(errors.nis_error) and abs(errors.nis - 1.0) <= BY_CHANCE * errors.nis_error:
         return f"{begin} differs from 1 by no more than chance: predictions state their uncertainty rightly.{held}"
-    if errors.nis < 1.0:
-        share = 100 * (1.0 / math.sqrt(errors.nis) - 1.0)
-        return (
-            f"{begin} is below 1: predictions are better than they claim. The noise behind them is stated too large; "
-            f"their standard deviations are {share:.0f} % larger than the errors.{held}"
-        )
-    share = 100 * (1.0 - 1.0 / math.sqrt(errors.nis))
-    return (
-        f"{begin} is above 1: predictions are worse than they claim. The noise behind them is stated too small; their "
-        f"standard deviations are {share:.0f} % smaller than the errors.{held}"
+    share = 100 * abs(1.0 / math.sqrt(errors.nis) - 1.0)
+    below = errors.nis < 1.0
+    side, claim, size, ratio = (
+        ("below", "better", "large", "larger") if below else ("above", "worse", "small", "smaller")
     )
-
-
-def _goal(floor: float) -> str:
-    """The ideal prediction error."""
-    return f"near {floor:.1f} mm" if math.isfinite(floor) else "small"
-
-
-def _percents(before: Errors, after: Errors) -> tuple[float, float]:
-    return 100 * before.intervals_held, 100 * after.intervals_held
+    return (
+        f"{begin} is {side} 1: predictions are {claim} than they claim. The noise behind them is stated too {size}; "
+        f"their standard deviations are {share:.0f} % {ratio} than the errors.{held}"
+    )
 
 
 def _fixed(value: float, unit: str) -> str:
@@ -165,16 +136,9 @@ def one_shot(diagnosis: Diagnosis) -> Html:
     was, now = shot.errors
     off = f"off by {was:.1f} mm before and {now:.1f} mm after" if changed else f"off by {now:.1f} mm"
     ranked = "gain is the median" if changed else "error is the median"
-    caption = (
-        f"Track {shot.after.name}, whose {ranked} of all {len(after.paths)} held-out tracks: its prediction is {off}."
-    )
+    of_all = f"{ranked} of all {len(after.paths)} held-out tracks"
+    caption = f"Track {shot.after.name}, whose {of_all}: its prediction is {off}."
     words = "Root mean square errors of all held-out tracks. Cells without a number hold too few samples."
-    return section(
-        "One shot, and where the errors are",
-        tag(
-            "div",
-            picture(shots.shot_picture(shot, changed), caption),
-            picture(shots.error_map(before, after, changed), words),
-            kind="beside",
-        ),
-    )
+    drawn = picture(shots.shot_picture(shot, changed), caption)
+    mapped = picture(shots.error_map(before, after, changed), words)
+    return section("One shot, and where the errors are", tag("div", drawn, mapped, kind="beside"))

@@ -78,11 +78,7 @@ def check_report_folder(folder: Path, *, force: bool = True) -> None:
         FileNotFoundError: if its parent does not exist.
     """
     check_replaceable(
-        folder,
-        mark=REPORT,
-        what="an earlier report",
-        force=force,
-        is_mark=lambda path: earlier_files(path) is not None,
+        folder, mark=REPORT, what="an earlier report", force=force, is_mark=lambda path: earlier_files(path) is not None
     )
     _check_own(folder, (REPORT, PAGE, MODEL))
 
@@ -166,17 +162,9 @@ def _budget(budget: ErrorBudget) -> dict[str, Any]:
 
 
 def _candidate(candidate: Candidate) -> dict[str, Any]:
-    return {
-        "name": candidate.name,
-        "kind": candidate.kind,
-        "standing": candidate.outcome.value,
-        "explained": candidate.explained,
-        "p_value": candidate.p_value,
-        "delta_bic": candidate.delta_bic,
-        "estimate": _values(candidate.estimate),
-        "seen_from": candidate.seen_from,
-        "probability": candidate.probability,
-    }
+    given = vars(candidate) | {"standing": candidate.outcome.value, "estimate": _values(candidate.estimate)}
+    listed = ("name", "kind", "standing", "explained", "p_value", "delta_bic", "estimate", "seen_from", "probability")
+    return {name: given[name] for name in listed}
 
 
 def _errors(errors: Errors) -> dict[str, Any]:

@@ -7,7 +7,6 @@ from typing import Final
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 
 from ballfg.arrays import Array
 from ballfg.diagnosis.report.pictures import AFTER, BEFORE, GREY
@@ -91,15 +90,14 @@ def error_map(before: Errors, after: Errors, changed: bool) -> Figure:
     figure = Figure(figsize=(SHEET, 2.6 + 2.6 * len(series)), layout="constrained")
     panels: Sequence[Axes] = figure.subplots(len(series) + 1, 1)
     places = np.concatenate([path.measured for path in after.paths])
-    edges = [np.linspace(low, high, 1 + count) for low, high, count in _sides(places)]
+    ends = np.quantile(places[:, :2], (0.01, 0.99), axis=0).T
+    counts = (DEEP, ACROSS) if np.ptp(ends[1]) > np.ptp(ends[0]) else (ACROSS, DEEP)
+    edges = [np.linspace(low - 1e-6, high + 1e-6, 1 + n) for (low, high), n in zip(ends, counts, strict=True)]
     cells = [_cells(errors.paths, edges) for _, errors, _ in series]
     top = max((float(np.nanmax(c)) for c in cells if np.isfinite(c).any()), default=1.0)
-    drawn: list[AxesImage] = []
     for axes, (name, _, _), cell in zip(panels, series, cells, strict=False):
         extent = (edges[0][0], edges[0][-1], edges[1][0], edges[1][-1])
-        drawn.append(
-            axes.imshow(cell.T, origin="lower", extent=extent, aspect="auto", cmap="YlOrRd", vmin=0.0, vmax=top)
-        )
+        axes.imshow(cell.T, origin="lower", extent=extent, aspect="auto", cmap="YlOrRd", vmin=0.0, vmax=top)
         middles = [0.5 * (e[1:] + e[:-1]) for e in edges]
         for i, j in np.argwhere(np.isfinite(cell)):
             ink = "white" if cell[i, j] > 0.65 * top else "black"
@@ -117,22 +115,15 @@ def error_map(before: Errors, after: Errors, changed: bool) -> Figure:
     return figure
 
 
-def _sides(places: Array) -> list[tuple[float, float, int]]:
-    """Ends of the map along x and y, m, and the number of its cells."""
-    ends = [np.quantile(places[:, i], (0.01, 0.99)) for i in range(2)]
-    long = int(np.ptp(ends[1]) > np.ptp(ends[0]))
-    return [(float(e[0]) - 1e-6, float(e[1]) + 1e-6, ACROSS if i == long else DEEP) for i, e in enumerate(ends)]
-
-
 def _cells(paths: Sequence[PredictedPath], edges: Sequence[Array]) -> Array:
     """(a, b) mm, root mean square error of the samples in each cell; NaN for few samples."""
     where = np.concatenate([path.measured[:, :2] for path in paths])
     squares = np.concatenate([distances(path) ** 2 for path in paths])
     places = [np.searchsorted(own, where[:, i], side="right") - 1 for i, own in enumerate(edges)]
-    count, total = np.zeros([len(own) - 1 for own in edges]), np.zeros([len(own) - 1 for own in edges])
-    inside = np.all([(place >= 0) & (place < size) for place, size in zip(places, count.shape, strict=True)], axis=0)
-    np.add.at(count, (places[0][inside], places[1][inside]), 1.0)
-    np.add.at(total, (places[0][inside], places[1][inside]), squares[inside])
+    shape = tuple(len(own) - 1 for own in edges)
+    inside = np.all([(place >= 0) & (place < size) for place, size in zip(places, shape, strict=True)], axis=0)
+    cell = np.ravel_multi_index([place[inside] for place in places], shape)
+    count, total = (np.bincount(cell, weights, np.prod(shape)).reshape(shape) for weights in (None, squares[inside]))
     return np.where(count >= LEAST_SAMPLES, 1e3 * np.sqrt(total / np.maximum(count, 1)), np.nan)
 
 

@@ -65,10 +65,7 @@ def fallback(
     far, and those from `evaluate` are those on the held-out half. With several `jobs` both kinds are computed in
     parallel; readable terms still come first.
     """
-    makers: list[Callable[[], tuple[BallModel, str] | None]] = [
-        partial(_with_terms, before, embedding, noise, dataset, parts),
-        partial(_with_network, before, embedding, noise, dataset, parts),
-    ]
+    makers = [partial(make, before, embedding, noise, dataset, parts) for make in (_with_terms, _with_network)]
     together = do_all(makers, jobs) if jobs > 1 else (make() for make in makers)
     for kind, made in zip(("sparse terms", "learned residual"), together, strict=False):
         if made is None:
@@ -81,12 +78,8 @@ def fallback(
 
 
 def _with_terms(
-    before: Fit,
-    embedding: SpinEmbedding,
-    noise: TrackNoise | None,
-    dataset: Dataset,
-    parts: Sequence[EvaluationTrack],
-) -> tuple[AnalyticModel, str] | None:
+    before: Fit, embedding: SpinEmbedding, noise: TrackNoise | None, dataset: Dataset, parts: Sequence[EvaluationTrack]
+) -> tuple[BallModel, str] | None:
     """A model with a few generic terms, and their description."""
     terms = sparse_terms(before)
     if terms is None:
@@ -98,12 +91,8 @@ def _with_terms(
 
 
 def _with_network(
-    before: Fit,
-    embedding: SpinEmbedding,
-    noise: TrackNoise | None,
-    dataset: Dataset,
-    parts: Sequence[EvaluationTrack],
-) -> tuple[LearnedModel, str] | None:
+    before: Fit, embedding: SpinEmbedding, noise: TrackNoise | None, dataset: Dataset, parts: Sequence[EvaluationTrack]
+) -> tuple[BallModel, str] | None:
     """A model corrected by a network, and its size in words."""
     base = calibrated_model(before, embedding)
     base.noise = noise
@@ -148,8 +137,16 @@ def learned_residual(
     noise = NoiseScales(settings.process, position=settings.position_scale, learned=False)
     loss = LossConfig(position_scale=POSITION_SCALE)
     trainee = EndToEnd(shots, Learnables(model, launcher, noise), loss)
-    if not _trained(trainee, len(shots), TrainConfig(optimizer=OptimizerConfig(epochs=epochs), loss=loss)):
+    config = TrainConfig(optimizer=OptimizerConfig(epochs=epochs), loss=loss)
+    validation = tuple(range(len(shots))[VALIDATES - 1 :: VALIDATES])
+    train = tuple(n for n in range(len(shots)) if n not in validation)
+    training = Training(Task(trainee, train, validation, config, Ranks(), unwatched))
+    try:
+        for _ in training.epochs():
+            pass
+    except TrainingStoppedError:
         return None
+    training.take_best()
     model.base, model.trained = base, base.trained
     return model.requires_grad_(False)
 
@@ -162,18 +159,3 @@ def _as_happened(base: AnalyticModel, dataset: Dataset, tracks: Sequence[Track])
     through = InvertMeasurement(Smoother, base, dataset_surfaces(dataset), settings)
     undone = [through.undo(track) for track in tracks]
     return [u.track for u in undone if u.settled], through.smoother.settings
-
-
-def _trained(trainee: EndToEnd, count: int, config: TrainConfig) -> bool:
-    """True if the training was completed."""
-    numbers = range(count)
-    validation = tuple(numbers[VALIDATES - 1 :: VALIDATES])
-    train = tuple(n for n in numbers if n not in validation)
-    training = Training(Task(trainee, train, validation, config, Ranks(), unwatched))
-    try:
-        for _ in training.epochs():
-            pass
-    except TrainingStoppedError:
-        return False
-    training.take_best()
-    return True

@@ -10,15 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.diagnosis.fit.patterns import (
-    DRIFT,
-    EVERYWHERE,
-    PLAUSIBLE,
-    Block,
-    blocks_of,
-    describe_drift,
-    drift_block,
-)
+from ballfg.diagnosis.fit.patterns import DRIFT, EVERYWHERE, PLAUSIBLE, Block, blocks_of, describe_drift, drift_block
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.system import System
 from ballfg.diagnosis.generic_test import GenericTest
@@ -37,10 +29,7 @@ MOST_SEEN = 95.0
 
 @dataclass(frozen=True)
 class _Test:
-    """One test of one fit; p-value not corrected for their number. `quantities` are those of a block, else none.
-
-    The ratio of the pattern's size to the initial one is its share.
-    """
+    """One test of one fit; p-value not corrected for their number. `quantities` are those of a block, else none."""
 
     kind: str
     quantities: tuple[str, ...]
@@ -87,9 +76,12 @@ def _block_tests(fit: Fit, system: System, blocks: list[Block]) -> list[_Test]:
     directions: list[Array] = []
     for block in blocks:
         own = slice(at, at := at + block.columns.shape[-1])
-        turn = _leading(information[own, own], signatures.tracks, own, len(score))
-        if turn.shape[1]:
-            strengths = np.linalg.solve(information[own, own] + np.eye(own.stop - own.start), score[own])
+        values, vectors = np.linalg.eigh(information[own, own])
+        shown = np.flatnonzero(values >= LEAST_INFORMATION)[::-1][: max(1, signatures.tracks // TRACKS_PER_DIRECTION)]
+        if len(shown):
+            turn = np.zeros((len(score), len(shown)))
+            turn[own] = vectors[:, shown]  # the most visible directions of the block's columns
+            strengths = np.linalg.solve(information[own, own] + np.eye(len(values)), score[own])
             strengths = strengths.reshape(len(block.axes), -1)
             words = describe_drift(fit, block, strengths) if block.kind == DRIFT else where(block, strengths)
             seen.append((block, words))
@@ -99,16 +91,6 @@ def _block_tests(fit: Fit, system: System, blocks: list[Block]) -> list[_Test]:
         _Test(block.kind, block.quantities, words, p.p_value, noise * max(0.0, p.explained - p.rank))
         for (block, words), p in zip(seen, pattern_tests(signatures, directions), strict=True)
     ]
-
-
-def _leading(information: Array, tracks: int, own: slice, count: int) -> Array:
-    """(count, r) the most visible directions of a block's columns, among all `count` columns."""
-    values, vectors = np.linalg.eigh(information)
-    most = max(1, tracks // TRACKS_PER_DIRECTION)
-    shown = np.flatnonzero(values >= LEAST_INFORMATION)[::-1][:most]
-    turn = np.zeros((count, len(shown)))
-    turn[own] = vectors[:, shown]
-    return turn
 
 
 def where(block: Block, strengths: Array) -> str:

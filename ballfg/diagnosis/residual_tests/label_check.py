@@ -35,12 +35,7 @@ WRONG: Final = np.exp(np.linspace(-1.1, 1.1, 9))
 
 
 def check_labels(
-    model: AnalyticModel,
-    declared: AnalyticModel,
-    holdout: Holdout,
-    tracker: TrackNoise | None = None,
-    *,
-    jobs: int = 1,
+    model: AnalyticModel, declared: AnalyticModel, holdout: Holdout, tracker: TrackNoise | None = None, *, jobs: int = 1
 ) -> LabelCheck | None:
     """Computes the verdicts on all spin labels of a dataset.
 
@@ -56,14 +51,9 @@ def check_labels(
 
 
 def label_evidence(
-    model: AnalyticModel,
-    declared: AnalyticModel,
-    holdout: Holdout,
-    tracker: TrackNoise | None = None,
-    *,
-    jobs: int = 1,
+    model: AnalyticModel, declared: AnalyticModel, holdout: Holdout, tracker: TrackNoise | None = None, *, jobs: int = 1
 ) -> list[LabelledFlight]:
-    """The labels with the spins of their flights. Args: as `check_labels`."""
+    """The labels with the spins of their flights, from the arguments of `check_labels`."""
     parts = (*holdout.search_tracks, *holdout.held_out_tracks)
     tracks = sorted((p for p in parts if p.track.spin_label is not None), key=lambda p: p.track.name)
     if not tracks:
@@ -77,7 +67,8 @@ def judged(flights: Sequence[LabelledFlight]) -> LabelCheck | None:
     if not flights:
         return None
     right = np.stack([f.right.log_densities(RIGHT * f.right.error) for f in flights])
-    wrong = np.stack([f.wrong.log_densities(_errors_of_wrong(f)) for f in flights])
+    errors = [np.hypot(RIGHT[:, None] * f.right.error, WRONG * f.wrong.error) for f in flights]  # of wrong labels
+    wrong = np.stack([f.wrong.log_densities(e.ravel()) for f, e in zip(flights, errors, strict=True)])
     probability, p_all_right = _mixture(right, wrong)
     verdicts = [
         LabelVerdict(f.name, p, f.wrong.off, f.wrong.off_sigma)
@@ -91,12 +82,6 @@ def label_test(check: LabelCheck, before: LabelCheck | None = None) -> GenericTe
     now = len(check.contradicted)
     whole = now if before is None else max(now, len(before.contradicted))
     return GenericTest(LABEL, check.where, check.p_all_right, now / whole if whole else 0.0)
-
-
-def _errors_of_wrong(flight: LabelledFlight) -> Array:
-    """(r w,) rad/s, errors of a wrong label, for each error of right ones."""
-    total = np.hypot(RIGHT[:, None] * flight.right.error, WRONG * flight.wrong.error)
-    return np.asarray(total.ravel())
 
 
 def _mixture(right: Array, wrong: Array) -> tuple[Array, float]:

@@ -20,7 +20,7 @@ from ballfg.estimation import Settings, Smoother, TrackProblem
 from ballfg.estimation.batch import map_tracks
 from ballfg.estimation.measurement.invert_measurement import InvertMeasurement
 from ballfg.estimation.smoother.problem import UNINFORMATIVE_SPIN
-from ballfg.estimation.smoother.settle import Solution, initial_states
+from ballfg.estimation.smoother.settle import initial_states
 from ballfg.factors.batch import Values
 from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Minimum
 from ballfg.factors.linear.covariance import marginal_covariances
@@ -39,8 +39,7 @@ class LabelPosterior:
         label: (3,) rad/s.
         error: rad/s, standard deviation per axis of the label's error.
         log_density: of the label given the samples, up to a constant of the track.
-        mean: (3,) rad/s.
-        covariance: (3, 3) of it.
+        mean, covariance: (3,) rad/s, and (3, 3).
     """
 
     label: Array
@@ -77,13 +76,7 @@ class LabelPosterior:
 
 @dataclass(frozen=True)
 class LabelledFlight:
-    """A label and its flight.
-
-    Attributes:
-        name: of the track.
-        right: the spin, if the label has its stated error.
-        wrong: the spin, if the label may have a far larger error.
-    """
+    """The spin of a track's flight if its label is `right` within its stated error, and if it may be far `wrong`."""
 
     name: str
     right: LabelPosterior
@@ -95,12 +88,8 @@ def wrong_error(labels: Array, least: float) -> float:
 
     Args: labels: (n, 3) rad/s.  least: rad/s, for labels that are all alike.
     """
-    usual = np.median((labels**2).sum(axis=-1)) / MEDIAN_CHI_SQUARE
+    usual = np.median((labels**2).sum(axis=-1)) / 2.366  # median of a chi-square with three degrees of freedom
     return max(float(np.sqrt(2.0 * usual)), least)
-
-
-MEDIAN_CHI_SQUARE = 2.366
-"""Median of a chi-square with three degrees of freedom."""
 
 
 def labelled_flights(
@@ -108,12 +97,7 @@ def labelled_flights(
 ) -> list[LabelledFlight]:
     """The labels of tracks with their flights; tracks without a minimum are left out.
 
-    Args:
-        model: of the ball.
-        surfaces: table and floor.
-        settings: process noise, and the standard deviation of right labels.
-        tracks: with spin labels.
-        jobs: processes.
+    Args: settings: process noise, and the standard deviation of right labels.  tracks: with spin labels.
     """
     labels = np.array([part.track.spin_label for part in tracks]).reshape(-1, 3)
     far = wrong_error(labels, settings.spin_prior) if len(tracks) else 0.0
@@ -140,21 +124,15 @@ def _labelled_flight(
         TrackProblem(track, smoother.model, replace(smoother.settings, spin_label_noise=error), bare.segmentation)
         for error in (smoother.settings.spin_label_noise, far)
     )
-    starts = [flight.minimum.values, _from_label(near, flight)]
-    right = _lowest(smoother.optimizer, near.graph(flight.events), starts)
-    wrong = _lowest(
-        smoother.optimizer, wide.graph(flight.events), [starts[0], *([] if right is None else [right.values])]
-    )
-    if right is None or wrong is None:
+    events, label = flight.events, near.settings.spin_label(track)
+    labelled = near.start(initial_states(track, events.contacts, events.segmentation, near.model, label))
+    right = _lowest(smoother.optimizer, near.graph(events), [flight.minimum.values, labelled])
+    if right is None:
+        return None
+    wrong = _lowest(smoother.optimizer, wide.graph(events), [flight.minimum.values, right.values])
+    if wrong is None:
         return None
     return LabelledFlight(track.name, _posterior(near, right), _posterior(wide, wrong))
-
-
-def _from_label(problem: TrackProblem, flight: Solution) -> Values:
-    """Initial values with the label's spin, at the contacts of a solution."""
-    label = problem.settings.spin_label(problem.track)
-    events = flight.events
-    return problem.start(initial_states(problem.track, events.contacts, events.segmentation, problem.model, label))
 
 
 def _lowest(optimizer: LevenbergMarquardt, graph: BallGraph, starts: Sequence[Values]) -> Minimum | None:

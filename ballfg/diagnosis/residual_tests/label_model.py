@@ -10,17 +10,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from ballfg.arrays import Array
 from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout
 from ballfg.diagnosis.hypotheses.hypothesis import with_effects
 from ballfg.diagnosis.search.process_noise import noise_about
 from ballfg.dynamics import AnalyticModel
-from ballfg.estimation import Estimate, Settings, Status, dataset_settings
+from ballfg.estimation import Settings, Status, dataset_settings
 from ballfg.estimation.batch import estimate_tracks
 from ballfg.estimation.registry import make_estimator
 from ballfg.learning.calibration.coefficients import choose, values_of, with_values
-from ballfg.learning.calibration.population import Evidence, evidence, fit_population
+from ballfg.learning.calibration.population import evidence, fit_population
 from ballfg.tracks.noise import TrackNoise
 
 MOST_ROUNDS = 5
@@ -40,21 +39,13 @@ def scattering_model(
 ) -> tuple[AnalyticModel, Settings]:
     """A corrected model with refitted coefficients, and the settings for predictions with it.
 
-    Args:
-        model: from the diagnosis.
-        declared: the model before. Its coefficients of flight and bounce are refitted, about its values; added effects
-            and values that differ between tracks stay.
-        tracks: with spin labels.
-        holdout: with these tracks.
-        tracker: memory of the tracker and jitter of the stamps, if found.
-        jobs: processes.
+    The declared coefficients of flight and bounce are refitted to tracks with spin labels, about their declared values;
+    added effects and values that differ between tracks stay. The tracker's memory and jitter are used if found.
     """
     plain = with_effects(model)
     plain.variations = model.variations
     usual = dataset_settings(holdout.dataset, plain)  # no noise is stated in this model
-    names = [
-        name for name in declared_free(declared) if not name.startswith("measurement.") and name not in model.variations
-    ]
+    names = [n for n in declared_free(declared) if not n.startswith("measurement.") and n not in model.variations]
     if names:
         plain = _of_population(plain, declared, names, tracks, holdout, usual, jobs)
     plain.noise = noise_about(plain, tracks, holdout.dataset, tracker, jobs=jobs)
@@ -79,7 +70,11 @@ def _of_population(
         moving = with_values(model, names, mean)
         smoother = make_estimator("smoother", moving, holdout.surfaces, replace(settings, coefficients=priors))
         estimates = estimate_tracks(smoother, (part.track for part in tracks), len(tracks), jobs)
-        found = [_told(estimate, names, mean, chosen.sigma) for estimate in estimates if estimate.status is Status.OK]
+        found = []
+        for estimate in (e for e in estimates if e.status is Status.OK):
+            columns = [estimate.coefficient_names.index(name) for name in names]
+            covariance = estimate.coefficient_covariance[np.ix_(columns, columns)]
+            found.append(evidence(estimate.coefficients[columns], covariance, mean, chosen.sigma))
         if not found:
             return model
         population = fit_population(found, chosen.start, chosen.sigma, chosen.low, chosen.high)
@@ -87,10 +82,3 @@ def _of_population(
         if np.abs((mean - before) / population.sigma).max() < SETTLED:
             break
     return with_values(model, names, mean)
-
-
-def _told(estimate: Estimate, names: Sequence[str], mean: Array, sigma: Array) -> Evidence:
-    """Information of one track on the named coefficients, without their prior: (p,), (p,)."""
-    columns = [estimate.coefficient_names.index(name) for name in names]
-    covariance = estimate.coefficient_covariance[np.ix_(columns, columns)]
-    return evidence(estimate.coefficients[columns], covariance, mean, sigma)

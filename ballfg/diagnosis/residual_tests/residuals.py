@@ -5,6 +5,7 @@ together with the first state of their stretch, under the priors of a white proc
 """
 
 from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.free_motion import Piece, free_motion
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.fit.response import FittedPath, fitted_path, responses
+from ballfg.diagnosis.fit.response import fitted_path, responses
 from ballfg.diagnosis.result import ContactResiduals, FlightResiduals, MeasurementResiduals, Residuals
 from ballfg.state import STATE_DIM
 
@@ -34,8 +35,13 @@ def residuals_of(fit: Fit) -> Residuals:
     flights: list[_Row] = []
     contacts: list[_Row] = []
     for row, own in pieces.items():
-        value, covariance = _posterior(system.residual[row], system.by_start[row], own)
-        end = 0
+        # all kicks of the stretch together, with a free first state
+        columns = np.concatenate([system.by_start[row], *(piece.columns for piece in own)], axis=1)
+        sigma = np.concatenate([piece.sigma for piece in own])
+        precision = columns.T @ columns + np.diag(np.concatenate((np.zeros(STATE_DIM), sigma**-2)))
+        covariance = np.linalg.inv(precision)
+        value = (covariance @ (columns.T @ system.residual[row]))[STATE_DIM:]
+        covariance, end = covariance[STATE_DIM:, STATE_DIM:], 0
         for piece in own:
             for time, state in zip(piece.times, piece.states, strict=True):
                 part = slice(end, end := end + 3)
@@ -44,30 +50,8 @@ def residuals_of(fit: Fit) -> Residuals:
                 part = slice(end, end := end + 6)
                 contacts.append((row, *piece.contact, value[part], covariance[part, part]))
     flight = FlightResiduals(*(np.array(column) for column in zip(*flights, strict=True)))
-    return Residuals(fit.problem.stretches.names, flight, _contact(contacts), _measurement(fit, path))
-
-
-def _posterior(residual: Array, by_start: Array, pieces: list[Piece]) -> tuple[Array, Array]:
-    """Posterior mean (d,) and covariance (d, d) of all kicks of a stretch, with a free first state."""
-    columns = np.concatenate([by_start, *(piece.columns for piece in pieces)], axis=1)
-    sigma = np.concatenate([piece.sigma for piece in pieces])
-    precision = columns.T @ columns + np.diag(np.concatenate((np.zeros(STATE_DIM), sigma**-2)))
-    covariance = np.linalg.inv(precision)
-    return (covariance @ (columns.T @ residual))[STATE_DIM:], covariance[STATE_DIM:, STATE_DIM:]
-
-
-def _contact(found: list[_Row]) -> ContactResiduals:
-    if not found:
-        none = np.zeros(0, dtype=np.int64)
-        empty = np.zeros((0, 3))
-        return ContactResiduals(none, none, np.zeros(0), np.zeros((0, STATE_DIM)), empty, empty, np.zeros((0, 6, 6)))
-    stretch, number, times, incoming, kick, covariance = (np.array(c) for c in zip(*found, strict=True))
-    return ContactResiduals(stretch, number, times, incoming, kick[:, :3], kick[:, 3:], covariance)
-
-
-def _measurement(fit: Fit, path: FittedPath) -> MeasurementResiduals:
     used, times = fit.problem.stretches.used.numpy(), path.times.T.numpy()
-    return MeasurementResiduals(
+    measurement = MeasurementResiduals(
         stretch=np.nonzero(used)[0],
         times=times[used],
         states=path.states[used],
@@ -75,6 +59,17 @@ def _measurement(fit: Fit, path: FittedPath) -> MeasurementResiduals:
         position=(fit.problem.stretches.positions.numpy() - fit.predicted.positions)[used],
         sigma=fit.sigmas[used],
     )
+    return Residuals(fit.problem.stretches.names, flight, _contact(contacts), measurement)
+
+
+def _contact(found: list[_Row]) -> ContactResiduals:
+    shapes: tuple[tuple[int, ...], ...] = ((), (), (), (STATE_DIM,), (6,), (6, 6))
+    columns: Iterable[Sequence[Any]] = zip(*found, strict=True) if found else [()] * len(shapes)
+    stretch, number, times, incoming, kick, covariance = (
+        np.array(column, dtype=kind).reshape(len(found), *shape)
+        for column, shape, kind in zip(columns, shapes, ("i8", "i8", "f8", "f8", "f8", "f8"), strict=True)
+    )
+    return ContactResiduals(stretch, number, times, incoming, kick[:, :3], kick[:, 3:], covariance)
 
 
 def since_contact(times: Array, contacts: Array) -> Array:

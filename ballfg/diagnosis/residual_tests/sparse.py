@@ -26,12 +26,9 @@ LEAST_LEFT = 1e-6
 
 @dataclass(frozen=True)
 class SparseTerms:
-    """Chosen terms.
+    """Generic effects with the chosen terms as strengths, and their one-step coefficients by parameter name.
 
-    Attributes:
-        hypotheses: the generic effects of these terms, with the chosen terms as strengths.
-        estimates: one-step coefficients by parameter name.
-        explained: squared whitened residual that they would explain together.
+    `explained` is the squared whitened residual that they would explain together.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -40,11 +37,7 @@ class SparseTerms:
 
 
 def sparse_terms(before: Fit) -> SparseTerms | None:
-    """The generic terms that a fit lacks.
-
-    Args: before: the fit so far.
-    Returns: the terms; None if none exceeds its penalty.
-    """
+    """The generic terms that a fit lacks; None if none exceeds its penalty."""
     library = _library(before)
     found, _ = hypothesis_signatures(before, library)
     efficient = found.efficient()
@@ -81,33 +74,23 @@ def select(information: Array, score: Array, penalty: float) -> list[int]:
     """
     chosen: list[int] = []
     while len(chosen) < MOST_TERMS:
-        gain = _gains(information, score, chosen)
+        across = information[:, chosen]
+        solved = np.linalg.solve(information[np.ix_(chosen, chosen)], across.T) if chosen else np.zeros((0, len(score)))
+        left = score - solved.T @ score[chosen]
+        own = np.diagonal(information) - (across * solved.T).sum(axis=1)
+        seen = own > LEAST_LEFT * np.diagonal(information)
+        gain = np.where(seen, left**2 / np.where(seen, own, 1.0), 0.0)  # of each further term beside the chosen ones
         best = int(np.argmax(gain))
         if gain[best] < penalty:
             break
         chosen.append(best)
-    return _pruned(information, score, penalty, chosen)
-
-
-def _gains(information: Array, score: Array, chosen: list[int]) -> Array:
-    """(p,) squared residual that each further term would explain beside the chosen ones; zero for these."""
-    across = information[:, chosen]
-    solved = np.linalg.solve(information[np.ix_(chosen, chosen)], across.T) if chosen else np.zeros((0, len(score)))
-    left = score - solved.T @ score[chosen]
-    own = np.diagonal(information) - (across * solved.T).sum(axis=1)
-    seen = own > LEAST_LEFT * np.diagonal(information)
-    return np.where(seen, left**2 / np.where(seen, own, 1.0), 0.0)
-
-
-def _pruned(information: Array, score: Array, penalty: float, chosen: list[int]) -> list[int]:
-    """The chosen terms without those that the others nearly replace."""
-    while chosen:
+    while chosen:  # drop terms that the others nearly replace
         inverse = np.linalg.inv(information[np.ix_(chosen, chosen)])
         loss = (inverse @ score[chosen]) ** 2 / np.diagonal(inverse)
         least = int(np.argmin(loss))
         if loss[least] >= penalty:
             break
-        chosen = [term for k, term in enumerate(chosen) if k != least]
+        del chosen[least]
     return chosen
 
 

@@ -4,18 +4,16 @@ A memory would absorb any effect that bends flights slowly, so effects are searc
 tested for memory and jitter, on both halves of the tracks.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout
+from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.result import Finding, Value
 from ballfg.dynamics import AnalyticModel
 from ballfg.estimation import dataset_settings
 from ballfg.estimation.noise.estimate import linearised, spread_over
 from ballfg.estimation.noise.tracker_errors import JITTER, MEMORY, NUMBERS, TrackerPart, tracker_noise
-from ballfg.tracks import Track
 from ballfg.tracks.noise import TrackNoise
 
 MOST_TRACKS = 25
@@ -36,23 +34,19 @@ UNITS = {MEMORY: "m", JITTER: "s"}
 
 @dataclass(frozen=True)
 class TrackerErrors:
-    """Findings on the tracker, and the noise of its samples if that is not white.
-
-    The noise includes declared memory and jitter.
-    """
+    """Findings on the tracker, and the noise of its samples with declared memory and jitter, if that is not white."""
 
     findings: tuple[Finding, ...] = ()
     noise: TrackNoise | None = None
 
 
 def look_at_tracker(model: AnalyticModel, holdout: Holdout, jobs: int = 1) -> TrackerErrors:
-    """The memory and jitter in both halves beside a corrected model.
-
-    Args: model: with its noise about the tracks.  holdout: the halves.  jobs: processes.
-    """
+    """The memory and jitter in both halves beside a corrected model with its noise about the tracks."""
     settings = dataset_settings(holdout.dataset, model)
-    halves = [_parts(half) for half in (holdout.search_tracks, holdout.held_out_tracks)]
-    tracks = [track for half in halves for track in half]
+    halves = [spread_over(h, len(h), MOST_TRACKS) for h in (holdout.search_tracks, holdout.held_out_tracks)]
+    whole = [part.track for half in halves for part in half]
+    ends = [float(min(t.times[0] + LONGEST_PART, t.times[: MOST_SAMPLES + 1][-1])) for t in whole]
+    tracks = [track.until(end) for track, end in zip(whole, ends, strict=True)]
     linear = linearised(model, holdout.surfaces, settings, tracks, jobs=jobs)
     if linear is None:
         return TrackerErrors()
@@ -65,11 +59,6 @@ def look_at_tracker(model: AnalyticModel, holdout: Holdout, jobs: int = 1) -> Tr
     if settings.stamp_jitter > 0.0:
         noise = replace(noise, stamp_jitter=settings.stamp_jitter)
     return TrackerErrors(tuple(_finding(part) for part in found.parts), noise if found.parts or declared else None)
-
-
-def _parts(half: Sequence[EvaluationTrack]) -> list[Track]:
-    tracks = [part.track for part in spread_over(half, len(half), MOST_TRACKS)]
-    return [t.until(float(min(t.times[0] + LONGEST_PART, t.times[: MOST_SAMPLES + 1][-1]))) for t in tracks]
 
 
 def _finding(part: TrackerPart) -> Finding:

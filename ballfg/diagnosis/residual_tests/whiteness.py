@@ -34,8 +34,7 @@ class Whiteness:
         p_value: one-sided, corrected for the number of reaches.
         reach: s, of the most significant kernel.
         drift: m, root of the mean product of such pairs' errors: the common part of neighbouring samples.
-        explained: for each reach, the sum of U.
-        spread: for each reach, the standard deviation of that sum without drift.
+        explained, spread: for each reach, the sum of U and its standard deviation without drift.
     """
 
     p_value: float
@@ -51,12 +50,9 @@ class Whiteness:
 
 
 def whiteness(fit: Fit, system: System, tracker: TrackNoise | None = None) -> Whiteness:
-    """The test of a fit for drift along its tracks.
+    """The test of a fit for drift along its tracks, from its system, linearised at its minimum.
 
-    Args:
-        fit: at its minimum.
-        system: of the fit, linearised there.
-        tracker: white noise, memory and jitter of the tracker; None: errors are assumed white.
+    Args: tracker: white noise, memory and jitter of the tracker; None: errors are assumed white.
     """
     stretches = fit.problem.stretches
     n, k = stretches.times.shape
@@ -64,16 +60,28 @@ def whiteness(fit: Fit, system: System, tracker: TrackNoise | None = None) -> Wh
     rows = np.ones(system.residual.shape)  # without outliers, whose pull on the fit would look like drift
     rows[:, : 3 * k] = np.repeat(kept, 3, axis=1)
     system = System(system.residual * rows, system.by_start * rows[..., None], system.by_common * rows[..., None])
-    if tracker is not None:
+    if tracker is None:
+        projected = system.projected()
+    else:  # the fit has weighted its samples as if their errors were white
         system = _whitened(fit, system, kept, tracker)
-    projected = system.projected()
-    if tracker is not None:  # the fit has weighted its samples as if their errors were white
-        projected[..., -1] -= projected[..., :-1] @ _common_step(fit, system)
+        projected = system.projected()
+        problem, values = fit.problem, np.array([fit.unknowns.values[name] for name in fit.problem.free])
+        away, precision = (
+            np.concatenate((problem.centres - values, -fit.unknowns.launcher.ravel())),
+            problem.common_precision,
+        )
+        free = np.full(len(away), np.inf)
+        projected[..., -1] -= projected[..., :-1] @ system.eliminated().common_step(
+            precision, precision * away, -free, free
+        )
     residual = projected[:, : 3 * k, -1].reshape(n, k, 3)
     taken = _absorbed(fit, system, projected[..., :-1]).reshape(n, k, 3, -1)
     sums, spreads, p_values, products = [], [], [], []
     for reach in REACHES:
-        kernel = _kernel(stretches.times.numpy(), kept, reach)
+        times, sample = stretches.times.numpy(), np.arange(k)
+        kernel = np.exp(-0.5 * ((times[:, :, None] - times[:, None, :]) / reach) ** 2)
+        kernel *= kept[:, :, None] & kept[:, None, :]
+        kernel[:, sample, sample] = 0.0  # pairs of different samples
         total, variance, third = _summed(residual, taken, kept, kernel)
         sums.append(total)
         spreads.append(np.sqrt(max(variance, 0.0)))
@@ -113,7 +121,10 @@ def _whitened(fit: Fit, system: System, kept: Mask, tracker: TrackNoise) -> Syst
         for axis in range(3):
             spread[:, :, axis, :, axis] = tracker.memory[axis] ** 2 * lasting
     if tracker.stamp_jitter is not None:
-        way = tracker.stamp_jitter * _velocities(fit) * kept[..., None]
+        steps, moved = np.diff(times, axis=1)[..., None], np.diff(fit.predicted.positions, axis=1)
+        velocities = np.where(steps > 0.0, moved / np.where(steps > 0.0, steps, 1.0), 0.0)  # zero for padding
+        velocities = np.concatenate((velocities, velocities[:, -1:]), axis=1)
+        way = tracker.stamp_jitter * velocities * kept[..., None]
         spread[:, sample, :, sample, :] += (way[..., :, None] * way[..., None, :]).swapaxes(0, 1)
     for axis in range(3):
         spread[:, sample, axis, sample, axis] += white[..., axis] ** 2
@@ -124,14 +135,6 @@ def _whitened(fit: Fit, system: System, kept: Mask, tracker: TrackNoise) -> Syst
         return np.concatenate((np.linalg.solve(root, metres * rows[:, : 3 * k]), rows[:, 3 * k :]), axis=1)
 
     return System(turned(system.residual[..., None])[..., 0], turned(system.by_start), turned(system.by_common))
-
-
-def _velocities(fit: Fit) -> Array:
-    """(n, k, 3) m/s from one predicted sample to the next; zero for padding."""
-    steps = np.diff(fit.problem.stretches.times.numpy(), axis=1)[..., None]
-    moved = np.diff(fit.predicted.positions, axis=1)
-    velocities = np.where(steps > 0.0, moved / np.where(steps > 0.0, steps, 1.0), 0.0)
-    return np.concatenate((velocities, velocities[:, -1:]), axis=1)
 
 
 def _common_step(fit: Fit, system: System) -> Array:
@@ -179,23 +182,12 @@ def _trace(matrices: Array) -> Array:
 
 
 def _absorbed(fit: Fit, system: System, shared: Array) -> Array:
-    """(n, 3 k, 9 + q) directions of the samples' noise that the fit absorbs, of unit length over all rows.
+    """(n, 3 k, 9 + q) directions of the samples' noise that first states and shared unknowns (n, m, q) absorb.
 
-    First states absorb theirs in each stretch; shared unknowns absorb directions of unit length over all of them.
-
-    Args: shared: (n, m, q) columns of the shared unknowns, first states projected out.
+    They have unit length, over the rows of a stretch and over all rows; first states are projected out of the shared.
     """
     own, _ = np.linalg.qr(system.by_start)
     precision = (shared.swapaxes(-1, -2) @ shared).sum(axis=0) + np.diag(fit.problem.common_precision)
     root = np.linalg.inv(np.linalg.cholesky(precision)).T
     rows = system.residual.shape[1] - 3
     return np.concatenate((own[:, :rows], (shared @ root)[:, :rows]), axis=-1)
-
-
-def _kernel(times: Array, kept: Mask, reach: float) -> Array:
-    """(n, k, k) weights of pairs of different samples."""
-    apart = (times[:, :, None] - times[:, None, :]) / reach
-    weight = np.exp(-0.5 * apart**2) * (kept[:, :, None] & kept[:, None, :])
-    diagonal = np.arange(times.shape[1])
-    weight[:, diagonal, diagonal] = 0.0
-    return np.asarray(weight)

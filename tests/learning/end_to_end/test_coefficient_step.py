@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from ballfg.learning.config.training import TrainConfig
-from ballfg.learning.run.optimizer import make_optimizer
+from ballfg.learning.run.loop import make_optimizer
 from ballfg.learning.run.training import build
 
 
