@@ -14,7 +14,7 @@ import torch
 
 from ballfg.arrays import Array, Mask
 from ballfg.diagnosis.fit.free import declared_deviations, declared_free
-from ballfg.diagnosis.fit.problem import Fit, Noise, Problem, Robust, Unknowns
+from ballfg.diagnosis.fit.problem import Fit, Noise, Problem, Robust, Unknowns, launch_axes
 from ballfg.diagnosis.fit.sensitivity import Predicted, predict
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.fit.system import System
@@ -85,7 +85,7 @@ def first_guess(problem: Problem, label_noise: float, spin_prior: float) -> tupl
     """The smoother's first states and the declared coefficients; label_noise and spin_prior in rad/s."""
     launcher = np.zeros((problem.stretches.settings.shape[1], 3))
     unknowns = Unknowns(problem.stretches.starts.numpy().copy(), problem.declared, launcher)
-    return unknowns, Noise(label=label_noise, spin=spin_prior)
+    return unknowns, Noise(label=label_noise, spin=np.full(3, spin_prior))
 
 
 def fit_problem(problem: Problem, unknowns: Unknowns, noise: Noise, *, settle_noise: bool = True) -> Fit:
@@ -225,12 +225,13 @@ def _spread(result: Fit, residuals: Array) -> float:
     return float(np.median(np.abs(residuals)) / NORMAL_MEDIAN / np.sqrt(1.0 - taken))
 
 
-def _spin_scatter(result: Fit) -> float:
-    """rad/s: root of the expected square of an unlabelled spin about its launcher's mean, one step of EM."""
+def _spin_scatter(result: Fit) -> Array:
+    """(3,) rad/s: roots of the expected squares of unlabelled spins about their launcher's mean, one step of EM."""
     unlabelled = ~result.problem.stretches.labelled
     if not unlabelled.any():
         return result.noise.spin
+    axes = launch_axes(result.unknowns.starts[unlabelled])
     covariance = np.linalg.inv(result.linearised().start_information[unlabelled])[:, SPIN, SPIN]
-    about = result.whitened_spins[unlabelled]
-    square = (about * result.noise.spin) ** 2 + np.diagonal(covariance, axis1=-2, axis2=-1)
-    return max(float(np.sqrt(square.mean())), LEAST_SPIN_SCATTER)
+    about = result.whitened_spins[unlabelled] * result.noise.spin
+    square = about**2 + np.diagonal(axes.swapaxes(1, 2) @ covariance @ axes, axis1=-2, axis2=-1)
+    return np.maximum(np.sqrt(square.mean(axis=0)), LEAST_SPIN_SCATTER)

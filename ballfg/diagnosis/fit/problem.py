@@ -40,15 +40,19 @@ class Unknowns:
 
 @dataclass(frozen=True)
 class Noise:
-    """Scale of the noise: factor on the stated position noise (3,) and on spin labels, unlabelled spins in rad/s."""
+    """Scale of the noise: factor on the stated position noise (3,), spin labels in rad/s, unlabelled spins (3,) rad/s.
+
+    Unlabelled spins scatter about their launcher's mean, unequally along its axes forward, across and up.
+    """
 
     position: Array = field(default_factory=lambda: np.ones(3))
     label: float = 20.0
-    spin: float = 60.0
+    spin: Array = field(default_factory=lambda: np.full(3, 60.0))
 
     def same_as(self, other: Self) -> bool:
         """True if all scales are equal."""
-        return np.array_equal(self.position, other.position) and (self.label, self.spin) == (other.label, other.spin)
+        same = np.array_equal(self.position, other.position) and np.array_equal(self.spin, other.spin)
+        return same and self.label == other.label
 
 
 @dataclass(frozen=True)
@@ -172,11 +176,10 @@ class Fit:
 
     @cached_property
     def whitened_spins(self) -> Array:
-        """(n, 3) whitened residual of each spin against its label or, without a label, against its launcher."""
+        """(n, 3) whitened residual of each spin against its label or, without one, along the axes of its launch."""
         stretches, unknowns = self.problem.stretches, self.unknowns
-        local = stretches.settings @ unknowns.launcher
-        mean = (launch_axes(unknowns.starts) @ local[..., None])[..., 0]
-        unlabelled = (mean - unknowns.starts[:, SPIN]) / self.noise.spin
+        local = (launch_axes(unknowns.starts).swapaxes(1, 2) @ unknowns.starts[:, SPIN, None])[..., 0]
+        unlabelled = (stretches.settings @ unknowns.launcher - local) / self.noise.spin
         with np.errstate(invalid="ignore"):
             about = (stretches.labels.numpy() - self.predicted.labels) / self.noise.label
         return np.where(stretches.labelled[:, None], about, unlabelled)
@@ -250,10 +253,10 @@ class Fit:
         stretches, unknowns, noise = self.problem.stretches, self.unknowns, self.noise
         derivative = self.sensitivity()
         positions, labelled = self.position_rows(derivative.positions), stretches.labelled[:, None, None]
-        spins = np.zeros((len(stretches), 3, derivative.labels.shape[-1]))
-        spins[:, range(3), range(SPIN.start, SPIN.stop)] = 1.0 / noise.spin
+        spins, scale = np.zeros((len(stretches), 3, derivative.labels.shape[-1])), noise.spin[:, None]
+        spins[..., SPIN] = launch_axes(unknowns.starts).swapaxes(1, 2) / scale
         spins = np.where(labelled, derivative.labels / noise.label, spins) * np.sqrt(self.robust.spins)[:, None, None]
-        towards = -launch_axes(unknowns.starts)[:, :, None, :] * stretches.settings[:, None, :, None] / noise.spin
+        towards = -np.eye(3)[:, None] * stretches.settings[:, None, :, None] / scale[:, None]
         by_launcher = np.where(labelled, 0.0, towards.reshape(len(stretches), 3, -1))
         none = np.zeros((*positions.shape[:2], unknowns.launcher.size))
         by_launcher = np.concatenate((none, by_launcher), axis=1)

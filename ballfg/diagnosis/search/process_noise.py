@@ -19,6 +19,7 @@ from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.dynamics import AnalyticModel, BallModel
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.dynamics.population import SpinGroup, SpinPopulation
 from ballfg.dynamics.trained import Trained
 from ballfg.estimation import dataset_settings, dataset_surfaces, estimate_noise
 from ballfg.estimation.noise.estimate import spread_over
@@ -29,8 +30,6 @@ MOST_PREDICTED = 15
 """Number of the search half's tracks whose predictions reveal a misleading effect, evenly spread."""
 MOST_FOR_NOISE = 25
 """Number of tracks for the noise, evenly spread; more move no number by more than its error bar."""
-LEAST_SPIN_SIGMA = 1.0
-"""rad/s. Least scatter of a launcher's spin."""
 SPREAD = 0.3
 """Prior median of the spread of coefficients between tracks, over the prior of an unfitted coefficient."""
 
@@ -58,14 +57,28 @@ def calibrated_model(fit: Fit, embedding: SpinEmbedding) -> AnalyticModel:
     """The fitted model, for estimates and predictions; embedding: with the names of the fit's launcher settings."""
     model = fitted_model(fit)
     model.variations = fit.variations()
-    unlabelled = not fit.problem.stretches.labelled.all()
-    learned = SpinEmbedding(embedding.labels, embedding.categories, torch.from_numpy(fit.unknowns.launcher))
-    model.trained = Trained(
-        position_scale=float(np.sqrt((fit.noise.position**2).mean())),
-        launcher=learned.requires_grad_(False) if unlabelled else None,
-        spin_noise=max(fit.noise.spin, LEAST_SPIN_SIGMA) if unlabelled else fit.noise.label,
-    )
+    scale, labelled = float(np.sqrt((fit.noise.position**2).mean())), fit.problem.stretches.labelled
+    if labelled.all():
+        model.trained = Trained(position_scale=scale, spin_noise=fit.noise.label)
+    elif embedding.categories:
+        model.trained = Trained(position_scale=scale)
+        model.spins = _spins(fit, embedding)
+    else:  # settings are numbers: a spin for each of them, all with one scatter
+        learned = SpinEmbedding(embedding.labels, {}, torch.from_numpy(fit.unknowns.launcher)).requires_grad_(False)
+        scatter = float(np.sqrt((fit.noise.spin**2).mean()))
+        model.trained = Trained(position_scale=scale, launcher=learned, spin_noise=scatter)
     return model
+
+
+def _spins(fit: Fit, embedding: SpinEmbedding) -> SpinPopulation:
+    """The population of the groups' spins; embedding: one category for each of the fit's launcher settings."""
+    ((by, names),) = embedding.categories.items()
+    counts = fit.problem.stretches.settings.sum(axis=0)
+    groups = {
+        name: SpinGroup(tuple(mean.tolist()), tuple(fit.noise.spin.tolist()), max(int(count), 1))
+        for name, mean, count in zip(names, fit.unknowns.launcher, counts, strict=True)
+    }
+    return SpinPopulation(by, groups)
 
 
 def noise_about(

@@ -47,7 +47,7 @@ def as_declared(model: AnalyticModel, stamps: Stamps) -> AnalyticModel:
     bare = model
     for name in stamps.found:
         bare = without_effect(bare, name)
-    bare.trained, bare.noise = model.trained, model.noise
+    bare.trained, bare.noise, bare.spins = model.trained, model.noise, model.spins
     return bare
 
 
