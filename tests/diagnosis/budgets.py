@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ballfg.diagnosis.budget import EXPECTED, ErrorBudget
+from ballfg.diagnosis.error_budget import expected_squares
 from ballfg.diagnosis.fit.holdout import EvaluationTrack
-from ballfg.diagnosis.search.error_budget import expected_squares
 from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.estimation import Settings
 from ballfg.factors.noise import ProcessNoise
