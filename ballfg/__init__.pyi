@@ -11,7 +11,6 @@ from . import simulation as simulation
 from . import tracks as tracks
 from . import vision as vision
 from .diagnosis import Diagnosis as Diagnosis
-from .diagnosis import ErrorBudget as ErrorBudget
 from .dynamics import AnalyticModel as AnalyticModel
 from .dynamics import Surfaces as Surfaces
 from .dynamics import load_model as load_model

@@ -22,7 +22,8 @@ from ballfg.tracks import TABLE_TENNIS, Ball, Track
 from ballfg.tracks.info import TrackFolder
 
 if TYPE_CHECKING:
-    from ballfg.diagnosis import Diagnosis, ErrorBudget
+    from ballfg.diagnosis import Diagnosis
+    from ballfg.diagnosis.budget import ErrorBudget
     from ballfg.estimation import ConformalScales, TrackGraph
     from ballfg.estimation.observations.sighted_dataset import SightedDataset
     from ballfg.estimation.track_prediction import TrackPrediction
@@ -222,7 +223,7 @@ def error_budget(measured: Dataset | Folder, model: Model = None, *, jobs: int =
     """
     check_count("jobs", jobs, 1, MOST_JOBS)
     data = _table_of_positions(measured)
-    from ballfg.diagnosis import error_budget as budget_of_dataset
+    from ballfg.diagnosis.error_budget import error_budget as budget_of_dataset
     from ballfg.parallel.work import on_one_thread
 
     return on_one_thread(partial(budget_of_dataset, data, jobs=jobs), _model(model, data))

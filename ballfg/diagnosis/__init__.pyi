@@ -1,4 +1,3 @@
-from .budget import ErrorBudget as ErrorBudget
 from .design.plan import design_shots as design_shots
 from .diagnosis import diagnose as diagnose
 from .evidence.weighed import weigh as weigh
@@ -17,5 +16,4 @@ from .residual_tests.sparse import sparse_terms as sparse_terms
 from .result import Diagnosis as Diagnosis
 from .search.candidates import refit as refit
 from .search.candidates import score_all as score_all
-from .search.error_budget import error_budget as error_budget
 from .search.evaluation import prediction_errors as prediction_errors

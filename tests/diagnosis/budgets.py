@@ -1,7 +1,8 @@
 """Compares error budgets with the measured errors of simulated sets: `python -m tests.diagnosis.budgets --sets 20`.
 
 Each set has a world of its own (`tests.estimation.noise.intervals`): noise, memory, jitter, random motion, bounces and
-coefficients drawn at random, which estimator and budget know. Nothing but chance and nonlinearity is then left.
+coefficients drawn at random (`--world usual`: those of `Settings.for_measured`), which estimator and budget know.
+Nothing but chance and nonlinearity is then left.
 """
 
 from __future__ import annotations
@@ -12,12 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ballfg.diagnosis.budget import EXPECTED, ErrorBudget
+from ballfg.diagnosis.error_budget import expected_squares
 from ballfg.diagnosis.fit.holdout import EvaluationTrack
-from ballfg.diagnosis.search.error_budget import expected_squares
 from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.estimation import Settings
 from ballfg.factors.noise import ProcessNoise
-from tests.estimation.noise.intervals import KIND, World, worlds
+from tests.estimation.noise.intervals import KIND, WORLDS, World, worlds
 
 
 @dataclass(frozen=True)
@@ -70,9 +71,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sets", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--world", choices=list(WORLDS), default="drawn")
     given = parser.parse_args()
     rows = []
-    for number, (world, tracks) in enumerate(worlds(given.sets, given.seed)):
+    for number, (world, tracks) in enumerate(worlds(given.sets, given.seed, WORLDS[given.world])):
         row = compared(world, [EvaluationTrack(track, np.empty(0)) for track in tracks])
         print(f"set {number:2}, {len(tracks)} tracks: {row}")
         rows.append(row)

@@ -86,7 +86,6 @@ def test_diagnosis_finds_a_model_that_can_be_saved(tmp_path: Path) -> None:
 
 def test_an_error_budget_of_a_folder_adds_up(tmp_path: Path) -> None:
     budget = bf.error_budget(written(tmp_path / "shots", 8))
-    assert isinstance(budget, bf.ErrorBudget)
     assert budget.named == 0.0
     assert budget.total**2 == pytest.approx(budget.floor**2 + budget.left * abs(budget.left), rel=1e-12)
     assert budget.floor > budget.samples > 3.0

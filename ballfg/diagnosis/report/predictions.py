@@ -109,14 +109,14 @@ def parts_of_error(diagnosis: Diagnosis) -> Html:
     if budget is None:
         return Html()
     whole = max(budget.total**2, sum(budget.squares[name] for name in EXPECTED))
-    rows = []
+    rows: list[tuple[str, str, str]] = []
     for name, words in PARTS.items():
         share = budget.squares[name] / whole
         length = bar(min(max(share, 0.0), 1.0), "added" if name in EXPECTED else "alike")
         rows.append((words, fixed(getattr(budget, name), 2), tag("span", length, f"{100 * share:.0f} %")))
     rows += [
-        (text("sum: the declared model's error"), fixed(budget.total, 2), ""),
-        (text("sum without the last two parts: the floor of this model"), fixed(budget.floor, 2), ""),
+        ("sum: the declared model's error", fixed(budget.total, 2), ""),
+        ("sum without the last two parts: the floor of this model", fixed(budget.floor, 2), ""),
     ]
     words = (
         "The squares of the parts add up to the square of the measured error. A negative part takes away: the named "

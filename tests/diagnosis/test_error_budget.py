@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from ballfg.diagnosis.budget import EXPECTED, PARTS, RECORDED, ErrorBudget
-from ballfg.diagnosis.search.error_budget import expected_squares
+from ballfg.diagnosis.error_budget import expected_squares
 from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.estimation.noise.sources import SOURCES
 from ballfg.estimation.settings import Settings
