@@ -42,8 +42,9 @@ def train(
     The key `kind` of the config selects the model. kind: calibrate estimates the drag of the ball and the restitution
     of the table, with error bars.
 
-    The exit status is 1 if no epoch predicts the validation tracks better than the
-    model before the first step. After Ctrl-C the best model so far is written.
+    The exit status is 1 if no epoch predicts the validation tracks better than the model before the first step, or a
+    calibrated model predicts the judging tracks worse than the one before.
+    After Ctrl-C the best model so far is written.
 
     Example: ballfg-train train.yaml --data data/ballgun --out ballgun-model kind=mnn+gs optimizer.epochs=30
     """
@@ -60,12 +61,12 @@ def train(
     if isinstance(settings, CalibrationConfig):
         from ballfg.learning.calibration.run import run_calibration
 
-        run_calibration(settings, folder, resume=resume is not None, jobs=usable_cores(), watch=progress)
+        status = run_calibration(settings, folder, resume=resume is not None, jobs=usable_cores(), watch=progress)
     else:
         typed = _typed(config, overrides or (), data or (), out, resume)
         status = _train(settings, folder, resume is not None, typed)
-        if status:
-            raise SystemExit(status)
+    if status:
+        raise SystemExit(status)
 
 
 def _typed(config: Path, overrides: Sequence[str], data: Sequence[str], out: str | None, resume: str | None) -> str:
@@ -116,7 +117,7 @@ def _train_guarded(config: TrainConfig, folder: Path, resume: bool, typed: str) 
 def run(arguments: Sequence[str] | None = None) -> None:
     """Run `ballfg-train` with the given arguments, by default those of the command line, and exit.
 
-    Raises: SystemExit: always; status 0, 1 if the trained model is not better than before, 2 on bad input, 130 after
-        Ctrl-C.
+    Raises: SystemExit: always; status 0, 1 if the trained model is not better than before or a calibrated one is worse,
+        2 on bad input, 130 after Ctrl-C.
     """
     start(app, "ballfg-train", arguments)

@@ -56,6 +56,15 @@ def compare(
     )
 
 
+def is_worse(comparison: Comparison) -> bool:
+    """True if the model that is written, with its population and noise, predicts the judging tracks worse than before.
+
+    Without judged tracks it is not known to be.
+    """
+    before, written = comparison.before, comparison.with_noise
+    return before is not None and written is not None and written.rmse_median > before.rmse_median
+
+
 def report(problem: Problem, last: Step, comparison: Comparison, noise: NoiseEstimate | None) -> dict[str, Any]:
     """The content of `report.json`, without times and paths: the same run writes the same bytes."""
     shown = None if noise is None else {**noise.noise.to_mapping(), "relative_errors": noise.relative_errors}
@@ -81,6 +90,7 @@ def report(problem: Problem, last: Step, comparison: Comparison, noise: NoiseEst
             "after": _plain(comparison.after),
             "after_with_spread": _plain(comparison.with_spread),
             "after_with_noise": _plain(comparison.with_noise),
+            "worse": is_worse(comparison),
         },
         "noise": shown,
         "verdict": verdict(problem, last, comparison),
@@ -145,6 +155,11 @@ def verdict(problem: Problem, last: Step, comparison: Comparison) -> str:
         sentences.append(
             f"With the noise that the fitted tracks show, {1e3 * comparison.with_noise.rmse_median:.1f} mm, and 90 % "
             f"intervals hold {100 * comparison.with_noise.coverage_90:.0f} %."
+        )
+    if is_worse(comparison):
+        sentences.append(
+            "The model in the file, with its population and noise, predicts WORSE than the one before: keep that one, "
+            "or give more tracks or other coefficients."
         )
     for k, name in enumerate(problem.chosen.names):
         found = _coefficient(problem, last, k)

@@ -24,10 +24,11 @@ from ballfg.learning.calibration.calibrate import (
     score,
 )
 from ballfg.learning.calibration.picture import draw
-from ballfg.learning.calibration.report import compare, report, table
+from ballfg.learning.calibration.report import compare, is_worse, report, table
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import summary
 from ballfg.learning.run import run_folder as files
+from ballfg.learning.run.ending import NOT_BETTER
 from ballfg.learning.training_data import analytic_model, open_dataset
 from ballfg.progress import Watch
 
@@ -45,10 +46,12 @@ class Checkpoint(BaseModel):
     """Finished steps."""
 
 
-def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jobs: int, watch: Watch) -> None:
+def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jobs: int, watch: Watch) -> int:
     """Calibrate coefficients and write the folder of the run; to `resume` is to continue after the last finished step.
 
     Args: jobs: number of processes where the config has none.
+    Returns: the exit status of `ballfg-train`: 0, or 1 if the calibrated model predicts the judging tracks worse than
+        the model before.
     Raises: ValueError, FileNotFoundError: bad input. KeyboardInterrupt: after Ctrl-C; finished steps are kept.
     """
     with files.running(folder, config, resume=resume):
@@ -63,7 +66,7 @@ def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jo
         print(f"{folder / files.CONFIG}: the config; {fit} tracks fit, {judge} judge")
         try:
             _steps(problem, steps, folder, watch)
-            _finish(problem, steps, folder, watch)
+            return _finish(problem, steps, folder, watch)
         except KeyboardInterrupt:
             print(f"{len(steps)} steps are kept; continue with --resume {folder}", file=sys.stderr)
             raise
@@ -97,8 +100,11 @@ def _line(problem: Problem, step: Step, left: float) -> str:
     return "; ".join(parts)
 
 
-def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch) -> None:
-    """Judge once more with the spread as the prior and with the noise, write the results and print their paths."""
+def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch) -> int:
+    """Judge once more with the spread as the prior and with the noise, write the results and print their paths.
+
+    Returns: the exit status.
+    """
     last = steps[-1]
     population, model = population_settings(problem, last), population_model(problem, last)
     noise = fitted_noise(problem, model, population, watch)
@@ -114,6 +120,10 @@ def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch)
     print(f"\n{table(problem, last, comparison)}\n\n{found['verdict']}\n")
     print(f"{folder / files.MODEL}: the calibrated model, for the --model of other commands")
     print(f"{folder / files.REPORT}: all numbers\n{folder / files.PICTURE}")
+    if not is_worse(comparison):
+        return 0
+    print(f"note: {folder / files.MODEL} predicts the judging tracks worse than the model before", file=sys.stderr)
+    return NOT_BETTER
 
 
 def write_checkpoint(folder: Path, problem: Problem, steps: Sequence[Step]) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from ballfg.dynamics import nominal_model
 from ballfg.learning.calibration.calibrate import Problem, Step, pose
-from ballfg.learning.calibration.report import Comparison, table, verdict
+from ballfg.learning.calibration.report import Comparison, is_worse, report, table, verdict
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import Summary
 from ballfg.tracks import read_dataset
@@ -45,6 +45,16 @@ def test_whether_it_predicts_better_is_said_with_numbers(problem: Problem, after
         "that were not fitted; it fell on 2 of them. With the population as each track's prior it has 11.0 mm. With "
         "the noise that the fitted tracks show, 12.0 mm, and 90 % intervals hold 88 %."
     )
+
+
+@pytest.mark.parametrize(("noise", "worse"), [(0.019, False), (0.021, True)])
+def test_a_file_that_predicts_worse_is_not_silent(problem: Problem, noise: float, worse: bool) -> None:
+    """What counts is the model that is written, with its population and noise."""
+    comparison = compared(0.020, 0.010, 0.011, noise)
+    assert is_worse(comparison) is worse
+    assert ("predicts WORSE than the one before" in verdict(problem, step(problem), comparison)) is worse
+    assert report(problem, step(problem), comparison, None)["judged"]["worse"] is worse
+    assert not is_worse(NONE)
 
 
 def test_what_is_not_known_is_said(problem: Problem) -> None:
