@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ballfg.cli.start import guarded
-from ballfg.cli.start import start
+from ballfg.cli.start import guarded, start
 from ballfg.machine import usable_cores
 from ballfg.progress import alive, announce, idle, progress
 

@@ -28,7 +28,7 @@ from ballfg.learning.calibration.report import compare, is_worse, report, table
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import summary
 from ballfg.learning.run import run_folder as files
-from ballfg.learning.run.ending import NOT_BETTER
+from ballfg.learning.run.record import NOT_BETTER
 from ballfg.learning.training_data import analytic_model, open_dataset
 from ballfg.progress import Watch
 
