@@ -25,8 +25,6 @@ WIDTH_ROUNDS = 2
 """Number of turns in which each effect gets its most probable width."""
 MOST_STEPS = 4
 """Largest number of steps from a deterministic fit to the most probable unknowns."""
-SHARES = (1.0, 0.5, 0.25, 0.125)
-"""Shares of a step that are tried: far from a minimum the linearisation promises too much."""
 WORTH_A_STEP = 0.5
 """Least expected gain of a step, natural units."""
 
@@ -211,15 +209,15 @@ class _Step:
     common: Array
     gain: float
 
-    def taken(self, fit: Fit, share: float) -> Fit:
-        """The fit after a share of the step; coefficients stay within their bounds."""
-        unknowns, free, common = fit.unknowns, fit.problem.free, share * self.common
+    def taken(self, fit: Fit) -> Fit:
+        """The fit after the step; coefficients stay within their bounds."""
+        unknowns, free = fit.unknowns, fit.problem.free
         values = {
             name: float(np.clip(unknowns.values[name] + step, c.low, c.high))
-            for (name, c), step in zip(free.items(), common[: len(free)].tolist(), strict=True)
+            for (name, c), step in zip(free.items(), self.common[: len(free)].tolist(), strict=True)
         }
-        launcher, starts = unknowns.launcher + common[len(free) :].reshape(-1, 3), unknowns.starts + share * self.starts
-        return Fit.at(fit.problem, Unknowns(starts, values, launcher), fit.noise, fit.steps)
+        launcher = unknowns.launcher + self.common[len(free) :].reshape(-1, 3)
+        return Fit.at(fit.problem, Unknowns(unknowns.starts + self.starts, values, launcher), fit.noise, fit.steps)
 
 
 @dataclass(frozen=True)
@@ -267,13 +265,10 @@ class _Question:
         return found, _Step(likelihood.local_step(noise, result.mean)[:, :STATE_DIM], away, gain)
 
     def moved(self, model: Weighed, step: _Step) -> Fit | None:
-        """The fit after the largest share of a step that raises the evidence at the same noise; None if none does."""
-        least = self._evidence(model.fit, model)
-        for share in SHARES:
-            fit = step.taken(model.fit, share)
-            if np.isfinite(fit.cost) and self._evidence(fit, model) > least:
-                return fit
-        return None
+        """The fit after a step; None if the step lowers the evidence at the same noise: it left the linear range."""
+        fit = step.taken(model.fit)
+        better = np.isfinite(fit.cost) and self._evidence(fit, model) > self._evidence(model.fit, model)
+        return fit if better else None
 
     def _evidence(self, fit: Fit, model: Weighed) -> float:
         """The evidence at a fit's unknowns, with noise and widths of a model."""
