@@ -102,17 +102,8 @@ def diagnose_jointly(
     predicting = _Predicting(rooms, jobs)
     effects = tuple(catalogue or EFFECTS.values())
     of_ball = tuple(e for e in effects if e.belongs_to == "ball")
-    loop = SearchLoop(
-        halves,
-        of_ball,
-        predicting,
-        predicting.judge,
-        tell,
-        jobs=jobs,
-        of_some=effects,
-        ways=lambda searched: [way],
-        name_at=name_at,
-    )
+    asked = (halves, of_ball, predicting, predicting.judge, tell)
+    loop = SearchLoop(*asked, jobs=jobs, of_some=effects, ways=lambda searched: [way], name_at=name_at)
     search = loop.run(model, _first_fit(model, halves, way))
     tell("looking at what is left")
     models = predicting.models(predicting(search.whole).model)
