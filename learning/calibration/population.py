@@ -96,7 +96,7 @@ def evidence(mean: Array, covariance: Array, prior_mean: Array, prior_sigma: Arr
 
 
 def fit_population(
-    tracks: Sequence[Evidence], start: Array, sigma: Array, low: Array, high: Array, numbers: Index | None = None
+    tracks: Sequence[Evidence], start: Array, sigma: Array, low: Array, high: Array, numbers: Index | None = None, fixed: Index | None = None
 ) -> Population:
     """Mean and spread of maximum marginal likelihood, the mean within its bounds.
 
@@ -119,6 +119,8 @@ def fit_population(
     bounds = ((low - start) / sigma, (high - start) / sigma)
     about = _Means(numbers, size, bounds)
     variance = np.where(about.summed(np.einsum("ikk->ik", information)) > NO_INFORMATION, 1.0, 0.0)
+    if fixed is not None:
+        variance[fixed] = 0.0
     for _ in range(MAX_STEPS):
         own = variance[numbers]
         mean = about.best(information, moved, own)

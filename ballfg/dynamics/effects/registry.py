@@ -9,12 +9,13 @@ from typing import Final
 from ballfg.dynamics import effects
 from ballfg.dynamics.effect import Effect, Kind
 from ballfg.dynamics.effects import generic
+from ballfg.dynamics.effects.correction import AirCorrection
 from ballfg.dynamics.effects.checks import BASES, REMEDY, check_effect
 from ballfg.files.python_file import defined_classes, load_classes
 from ballfg.registry import Registry
 
 GENERIC: Final[dict[str, type[Effect]]] = {
-    effect.name: effect for effect in (generic.GenericFlight, generic.GenericContact, generic.GenericMeasurement)
+    effect.name: effect for effect in (generic.GenericFlight, generic.GenericContact, generic.GenericMeasurement, AirCorrection)
 }
 """Sums of terms that a model file may name. They describe without explaining, so searches for causes skip them."""
 
