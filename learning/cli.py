@@ -40,10 +40,11 @@ def train(
     """Train a model of the ball on a dataset: a network, or the coefficients of the analytic model.
 
     The key `kind` of the config selects the model. kind: calibrate estimates the drag of the ball and the restitution
-    of the table, with error bars.
+    of the table, with error bars. kind: auto compares the nominal model, the calibrated one, one with the spins of
+    groups and one with a learned correction of drag and lift, and writes the best.
 
     The exit status is 1 if no epoch predicts the validation tracks better than the
-    model before the first step. After Ctrl-C the best model so far is written.
+    model before the first step, or kind: auto keeps the nominal model. After Ctrl-C the best model so far is written.
 
     Example: ballfg-train train.yaml --data data/ballgun --out ballgun-model kind=mnn+gs optimizer.epochs=30
     """
@@ -60,12 +61,12 @@ def train(
     if isinstance(settings, CalibrationConfig):
         from ballfg.learning.calibration.run import run_calibration
 
-        run_calibration(settings, folder, resume=resume is not None, jobs=usable_cores(), watch=progress)
+        status = run_calibration(settings, folder, resume=resume is not None, jobs=usable_cores(), watch=progress)
     else:
         typed = _typed(config, overrides or (), data or (), out, resume)
         status = _train(settings, folder, resume is not None, typed)
-        if status:
-            raise SystemExit(status)
+    if status:
+        raise SystemExit(status)
 
 
 def _typed(config: Path, overrides: Sequence[str], data: Sequence[str], out: str | None, resume: str | None) -> str:

@@ -146,7 +146,7 @@ def verdict(problem: Problem, last: Step, comparison: Comparison) -> str:
             f"With the noise that the fitted tracks show, {1e3 * comparison.with_noise.rmse_median:.1f} mm, and 90 % "
             f"intervals hold {100 * comparison.with_noise.coverage_90:.0f} %."
         )
-    for k, name in enumerate(problem.chosen.names):
+    for k, name in problem.chosen.listed:
         found = _coefficient(problem, last, k)
         if not found["told_by_data"]:
             sentences.append(f"The tracks say little of {name}: its value is the model's.")
@@ -158,7 +158,7 @@ def verdict(problem: Problem, last: Step, comparison: Comparison) -> str:
 def table(problem: Problem, last: Step, comparison: Comparison) -> str:
     """Coefficients and errors, before and after, as plain text."""
     rows: list[tuple[str, ...]] = [("", "unit", "before", "after", "sigma", "spread between tracks")]
-    for k, name in enumerate(problem.chosen.names):
+    for k, name in problem.chosen.listed:
         values = (problem.chosen.start[k], last.mean[k], last.sigma[k], last.spread[k])
         rows.append((name, problem.chosen.units[k], *(f"{value:.4g}" for value in values)))
     names = () if problem.groups is None else problem.groups.names

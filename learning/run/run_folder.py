@@ -16,9 +16,10 @@ from ballfg.machine import versions
 
 CONFIG, VERSIONS, MODEL = "config.yaml", "versions.json", "model.yaml"
 STEPS, REPORT, PICTURE = "checkpoint.json", "report.json", "calibration.png"
+CHOICE = "choice.json"
 CHECKPOINT, METRICS, CURVES, EVENTS = "checkpoint", "metrics.csv", "curves.png", "tensorboard"
 PAGE = "training.html"
-CALIBRATION = (CONFIG, VERSIONS, MODEL, STEPS, REPORT, PICTURE)
+CALIBRATION = (CONFIG, VERSIONS, MODEL, STEPS, REPORT, PICTURE, CHOICE)
 """Files of a calibration."""
 TRAINING = (CONFIG, VERSIONS, MODEL, CHECKPOINT, METRICS, CURVES, EVENTS, PAGE)
 """Files and folders of a training; a learned model adds a folder of its own."""

@@ -9,15 +9,17 @@ from typing import Final
 from ballfg.dynamics import effects
 from ballfg.dynamics.effect import Effect, Kind
 from ballfg.dynamics.effects import generic
-from ballfg.dynamics.effects.correction import AirCorrection
 from ballfg.dynamics.effects.checks import BASES, REMEDY, check_effect
+from ballfg.dynamics.effects.correction import AirCorrection
 from ballfg.files.python_file import defined_classes, load_classes
 from ballfg.registry import Registry
 
 GENERIC: Final[dict[str, type[Effect]]] = {
-    effect.name: effect for effect in (generic.GenericFlight, generic.GenericContact, generic.GenericMeasurement, AirCorrection)
+    effect.name: effect for effect in (generic.GenericFlight, generic.GenericContact, generic.GenericMeasurement)
 }
 """Sums of terms that a model file may name. They describe without explaining, so searches for causes skip them."""
+LEARNED: Final[dict[str, type[Effect]]] = {AirCorrection.name: AirCorrection}
+"""Effects that `ballfg-train` writes; searches for causes skip them too."""
 
 
 def _check(effect: type[Effect]) -> None:
@@ -31,7 +33,7 @@ def _check(effect: type[Effect]) -> None:
 
 
 EFFECTS: Final = Registry[Effect](
-    "effect", group="ballfg.effects", base=BASES, remedy=REMEDY, check=_check, reserved=GENERIC
+    "effect", group="ballfg.effects", base=BASES, remedy=REMEDY, check=_check, reserved={**GENERIC, **LEARNED}
 )
 """Every effect that a search for causes may find, by its name in model files."""
 
@@ -41,7 +43,10 @@ def _own() -> Iterator[type[Effect]]:
     names = sorted(f"{__package__}.{module.name}" for module in iter_modules(effects.__path__))
     found = [cls for name in names if name != __name__ for cls in defined_classes(import_module(name), BASES)]
     kinds = [base.kind for base in BASES]
-    yield from sorted((cls for cls in found if cls not in GENERIC.values()), key=lambda cls: kinds.index(cls.kind))
+    yield from sorted(
+        (cls for cls in found if cls not in {*GENERIC.values(), *LEARNED.values()}),
+        key=lambda cls: kinds.index(cls.kind),
+    )
 
 
 for _effect in _own():
@@ -55,7 +60,7 @@ def effect_class(name: str, kind: Kind) -> type[Effect]:
 
     Raises: ValueError: if there is no such effect of that kind; the message lists those there are.
     """
-    effect = EFFECTS.get(name) or GENERIC.get(name)
+    effect = EFFECTS.get(name) or GENERIC.get(name) or LEARNED.get(name)
     if effect is None or effect.kind != kind:
         known = ", ".join(n for n, e in EFFECTS.items() if e.kind == kind) or "none"
         own = "One of your own must be registered first: --effects-file FILE.py, or ballfg.dynamics.register"

@@ -1,0 +1,119 @@
+"""Learns a correction of drag and lift after a calibration: further coefficients of the same population.
+
+The weights of the effect `air_correction` are shared by all tracks; their prior's width is the one of largest evidence.
+The calibrated model and its spins are where the iteration begins.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final, cast
+
+import numpy as np
+import torch
+
+from ballfg.arrays import Array
+from ballfg.dynamics import AnalyticModel
+from ballfg.dynamics.effect import Effect
+from ballfg.dynamics.effects.correction import DOUBTS, WEIGHTS, AirCorrection, correction_terms
+from ballfg.estimation import Estimate, Status
+from ballfg.learning.calibration.coefficients import Chosen, choose
+from ballfg.learning.calibration.groups import GroupSpin
+from ballfg.state import SPIN, VELOCITY
+
+SECTION: Final = f"flight.{AirCorrection.name}"
+SHARED: Final = tuple(f"{SECTION}.{name}" for name in WEIGHTS)
+"""Names of the weights."""
+LINEAR: Final = 0.1
+"""Standard deviation of each weight in one track, about the mean at which it is linearised; it is removed again."""
+REACH: Final = (5.0, 95.0)
+"""Percentiles of the speeds and spin ratios of the samples that the functions span."""
+BEYOND: Final = 1.15
+"""Scale of the functions as a multiple of half the span: the kernel's length."""
+LEAST_SPEED: Final = 1.0
+"""m/s. Least scale: over less, the drag law hardly changes."""
+LEAST_RATIO: Final = 0.1
+"""Least scale of the spin ratio."""
+ELSEWHERE: Final = 0.05
+"""Weight of places without data in the choice of the directions whose uncertainty is kept."""
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Where a correction begins.
+
+    Attributes:
+        mean: (p,) of all coefficients, those of the calibration first.
+        spins: of each group, as calibrated.
+        terms: (k, k) mean product of the functions of both forces over the samples.
+    """
+
+    mean: Array
+    spins: tuple[GroupSpin, ...]
+    terms: Array
+
+    def doubts(self, covariance: Array) -> tuple[tuple[float, ...], ...]:
+        """`DOUBTS` directions of the weights, those that move drag and lift most at the samples.
+
+        Args: covariance: (k, k) of the weights.
+        """
+        values, vectors = np.linalg.eigh(covariance)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        _, turns = np.linalg.eigh(root.T @ (self.terms + ELSEWHERE * np.eye(len(covariance))) @ root)
+        return tuple(tuple(row) for row in (root @ turns[:, ::-1][:, :DOUBTS]).T.tolist())
+
+
+def with_correction(model: AnalyticModel, estimates: Iterable[Estimate]) -> tuple[AnalyticModel, Array]:
+    """A copy of the model with a correction of zero, whose functions span the samples of some estimates.
+
+    Returns: the model, and `Correction.terms`.
+    Raises: ValueError: if the model has a correction or no drag or Magnus force, or no estimate converged.
+    """
+    if AirCorrection.name in model.flight:
+        raise ValueError(f"model must not have {SECTION} yet; got one. Start from the model that it corrects.")
+    found = [estimate for estimate in estimates if estimate.status is Status.OK]
+    if not found:
+        raise ValueError("tracks must have estimates; every one failed. Calibrate without a correction.")
+    states = np.concatenate([estimate.states for estimate in found])
+    speed = np.maximum(np.linalg.norm(states[:, VELOCITY], axis=1), LEAST_SPEED)
+    ratio = model.radius * np.linalg.norm(states[:, SPIN], axis=1) / speed
+    shape: dict[str, float] = {}
+    places = []
+    for name, values, least in (("speed", speed, LEAST_SPEED), ("ratio", ratio, LEAST_RATIO)):
+        low, high = np.percentile(values, REACH)
+        shape |= {name: float(low + high) / 2.0, f"{name}_scale": max(BEYOND * float(high - low) / 2.0, least)}
+        places.append(torch.from_numpy((values - shape[name]) / shape[f"{name}_scale"])[:, None])
+    terms = correction_terms(places[0], places[1]).numpy()
+    effect = AirCorrection(**shape)
+    effect.set_sigmas(**dict.fromkeys(WEIGHTS, LINEAR))
+    effects = [
+        copy.deepcopy(cast(Effect, one))
+        for group in (model.flight, model.bounce, model.measurement)
+        for one in group.values()
+    ]
+    corrected = AnalyticModel([*effects, effect], radius=model.radius, inertia_factor=model.inertia_factor)
+    return corrected, np.kron(np.eye(2), terms.T @ terms / len(terms))
+
+
+def set_doubts(model: AnalyticModel, doubts: Sequence[Sequence[float]]) -> None:
+    """Put the directions of the weights' uncertainty into a model with a correction."""
+    parameters = dict(model.named_parameters())
+    with torch.no_grad():
+        for k, direction in enumerate(doubts, start=1):
+            for name, value in zip(SHARED, direction, strict=True):
+                parameters[f"{name}_{k}"].fill_(value)
+
+
+def doubt_sigmas() -> dict[str, float]:
+    """Prior standard deviations of the doubts, by name."""
+    return {f"{SECTION}.doubt_{k}": 1.0 for k in range(1, DOUBTS + 1)}
+
+
+def with_weights(model: AnalyticModel, chosen: Chosen) -> Chosen:
+    """The chosen coefficients, with their priors, and the weights of the model's correction."""
+    further = choose(model, SHARED)
+    pairs = {name: (getattr(chosen, name), getattr(further, name)) for name in ("start", "sigma", "low", "high")}
+    names, units = chosen.names + further.names, chosen.units + further.units
+    return Chosen(names, units, **{name: np.concatenate(pair) for name, pair in pairs.items()}, shared=SHARED)
