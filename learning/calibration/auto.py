@@ -97,7 +97,7 @@ def choose_candidate(problem: Problem, watch: Watch = unwatched) -> Choice:
     for fit, judge in ((fitted[::2], fitted[1::2]), (fitted[1::2], fitted[::2])):
         for name, found in _fold(problem, fit, judge, watch).items():
             scores[name] += found
-    return _compared(scores)
+    return compared(scores)
 
 
 def config_of(config: CalibrationConfig, chosen: str) -> CalibrationConfig:
@@ -132,8 +132,12 @@ def _fold(
     return found
 
 
-def _compared(scores: dict[str, list[TrackScore | None]]) -> Choice:
-    """The choice by the tracks that every candidate could be judged on."""
+def compared(scores: dict[str, list[TrackScore | None]]) -> Choice:
+    """The choice by the tracks that every candidate could be judged on.
+
+    Args: scores: of the same tracks in the same order, by name of the candidate, simple ones first; None: not judged.
+    Raises: ValueError: if no track was judged by every one.
+    """
     rows = [row for row in zip(*scores.values(), strict=True) if all(row)]
     kept = {name: [row[k] for row in rows if row[k] is not None] for k, name in enumerate(scores)}
     logs = {name: np.array([one.log_score for one in kept[name] if one is not None]) for name in scores}

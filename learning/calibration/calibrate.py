@@ -28,6 +28,7 @@ from ballfg.estimation import (
 )
 from ballfg.estimation.batch import estimate_tracks, map_tracks
 from ballfg.estimation.noise.estimate import NoiseEstimate, spread_over
+from ballfg.estimation.noise.parameters import with_noise
 from ballfg.estimation.registry import make_estimator
 from ballfg.learning.calibration.coefficients import Chosen, choose, with_values
 from ballfg.learning.calibration.correction import Correction, doubt_sigmas, set_doubts, with_correction, with_weights
@@ -41,6 +42,8 @@ from ballfg.tracks import Dataset
 
 ROUGHLY: Final = 0.3
 """Tolerance of a correction at least: its weights move slowly along directions that hardly change a prediction."""
+FIRST: Final = 0.75
+"""s, the part of each track that teaches a correction: later on contacts say more than the air does."""
 
 
 class TooManyFailures(ValueError):  # noqa: N818 - the name is the statement
@@ -122,18 +125,27 @@ def pose(dataset: Dataset, model: AnalyticModel, config: CalibrationConfig, jobs
 def pose_correction(problem: Problem, last: Step, watch: Watch = unwatched) -> Problem:
     """The problem of a correction of drag and lift on top of a calibration with groups.
 
+    The tracks are linearised with the noise that they show about the calibrated model: the usual one of measured tracks
+    hides a law that is a little wrong.
+
     Raises: ValueError: as `with_correction`.
     """
     model, settings, names = population_model(problem, last), population_settings(problem, last), problem.split.fit
+    noise = fitted_noise(problem, model, settings, watch, errors=False)
+    settings = settings if noise is None else noise.settings
     smoother = make_estimator("smoother", model, problem.surfaces, settings)
     estimates = estimate_tracks(smoother, tracks_of(problem.dataset, names), len(names), problem.jobs)
     corrected, terms = with_correction(model, watch(estimates, len(names), "tracks estimated"))
     corrected.variations = dict(problem.model.variations)  # those of groups are found anew
-    chosen = with_weights(corrected, problem.chosen)
+    labelled = problem.groups is not None and bool(problem.groups.labelled)
+    chosen = with_weights(corrected, problem.chosen, labelled=labelled)
     mean = np.concatenate((last.mean, np.zeros(len(chosen.shared))))
     config = problem.config.model_copy(update={"tolerance": max(problem.config.tolerance, ROUGHLY)})
     begun = Correction(mean, last.spins, terms)
-    return replace(problem, model=corrected, chosen=chosen, config=config, correction=begun)
+    settings = (
+        problem.settings if noise is None else with_noise(problem.settings, replace(noise.noise, coefficients={}))
+    )
+    return replace(problem, model=corrected, chosen=chosen, config=config, correction=begun, settings=settings)
 
 
 def calibrate(problem: Problem, done: Iterable[Step] = (), *, watch: Watch = unwatched) -> Iterator[Step]:
@@ -216,7 +228,16 @@ def fitted_noise(
     names = problem.split.fit
     tracks = spread_over(tracks_of(problem.dataset, names), len(names))
     known = problem.dataset.info.position_noise is not None
-    return estimate_noise(model, problem.surfaces, settings, tracks, position_known=known, errors=errors, watch=watch)
+    found = estimate_noise(model, problem.surfaces, settings, tracks, position_known=known, errors=errors, watch=watch)
+    return found if found is None or problem.correction is None else _with_doubts(found)
+
+
+def _with_doubts(found: NoiseEstimate) -> NoiseEstimate:
+    """The noise with doubts as wide as their posterior: tracks that taught the weights show less of them."""
+    doubts = doubt_sigmas()
+    spreads = {name: sigma for name, sigma in found.noise.coefficients.items() if name not in doubts}
+    settings = replace(found.settings, coefficients={**found.settings.coefficients, **doubts})
+    return replace(found, noise=replace(found.noise, coefficients=spreads), settings=settings)
 
 
 def _advance(problem: Problem, last: Step, watch: Watch) -> Step:
@@ -266,7 +287,10 @@ def _fit_tracks(
     priors = {**problem.settings.coefficients, **dict(zip(chosen.names, chosen.sigma.tolist(), strict=True))}
     settings = replace(problem.settings, coefficients=priors)
     estimator = problem.estimator(about, settings if groups is None else groups.wide(settings, spins))
-    estimates = estimate_tracks(estimator, tracks_of(problem.dataset, names), len(names), problem.jobs)
+    tracks = tracks_of(problem.dataset, names)
+    if problem.correction is not None:
+        tracks = (track.opening(FIRST) for track in tracks)
+    estimates = estimate_tracks(estimator, tracks, len(names), problem.jobs)
     fits: list[TrackFit] = []
     evidences: list[Evidence] = []
     skipped: list[tuple[str, str]] = []

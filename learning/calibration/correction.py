@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, cast
 
 import numpy as np
@@ -17,15 +17,20 @@ import torch
 from ballfg.arrays import Array
 from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.effect import Effect
-from ballfg.dynamics.effects.correction import DOUBTS, WEIGHTS, AirCorrection, correction_terms
+from ballfg.dynamics.effects.correction import DOUBTS, TERMS, WEIGHTS, AirCorrection, correction_terms
 from ballfg.estimation import Estimate, Status
-from ballfg.learning.calibration.coefficients import Chosen, choose
+from ballfg.learning.calibration.coefficients import Chosen, choose, values_of
 from ballfg.learning.calibration.groups import GroupSpin
 from ballfg.state import SPIN, VELOCITY
 
 SECTION: Final = f"flight.{AirCorrection.name}"
-SHARED: Final = tuple(f"{SECTION}.{name}" for name in WEIGHTS)
-"""Names of the weights."""
+DRAG: Final = tuple(f"{SECTION}.{name}" for name in WEIGHTS if name.startswith("drag"))
+"""Names of the weights of drag."""
+ALL: Final = tuple(f"{SECTION}.{name}" for name in WEIGHTS)
+"""With those of lift, which tracks without spin labels cannot tell from another spin."""
+SCALE: Final = "flight.drag.k"
+HELD: Final = 0.1
+"""Prior standard deviation of the mean drag beside a correction, as a share of the usual one."""
 LINEAR: Final = 0.1
 """Standard deviation of each weight in one track, about the mean at which it is linearised; it is removed again."""
 REACH: Final = (5.0, 95.0)
@@ -47,7 +52,7 @@ class Correction:
     Attributes:
         mean: (p,) of all coefficients, those of the calibration first.
         spins: of each group, as calibrated.
-        terms: (k, k) mean product of the functions of both forces over the samples.
+        terms: (7, 7) mean product of the functions over the samples.
     """
 
     mean: Array
@@ -57,11 +62,12 @@ class Correction:
     def doubts(self, covariance: Array) -> tuple[tuple[float, ...], ...]:
         """`DOUBTS` directions of the weights, those that move drag and lift most at the samples.
 
-        Args: covariance: (k, k) of the weights.
+        Args: covariance: (7, 7) of the weights of drag, or (14, 14) with those of lift.
         """
         values, vectors = np.linalg.eigh(covariance)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
-        _, turns = np.linalg.eigh(root.T @ (self.terms + ELSEWHERE * np.eye(len(covariance))) @ root)
+        metric = np.kron(np.eye(len(covariance) // len(TERMS)), self.terms + ELSEWHERE * np.eye(len(TERMS)))
+        _, turns = np.linalg.eigh(root.T @ metric @ root)
         return tuple(tuple(row) for row in (root @ turns[:, ::-1][:, :DOUBTS]).T.tolist())
 
 
@@ -94,7 +100,7 @@ def with_correction(model: AnalyticModel, estimates: Iterable[Estimate]) -> tupl
         for one in group.values()
     ]
     corrected = AnalyticModel([*effects, effect], radius=model.radius, inertia_factor=model.inertia_factor)
-    return corrected, np.kron(np.eye(2), terms.T @ terms / len(terms))
+    return corrected, terms.T @ terms / len(terms)
 
 
 def set_doubts(model: AnalyticModel, doubts: Sequence[Sequence[float]]) -> None:
@@ -102,7 +108,7 @@ def set_doubts(model: AnalyticModel, doubts: Sequence[Sequence[float]]) -> None:
     parameters = dict(model.named_parameters())
     with torch.no_grad():
         for k, direction in enumerate(doubts, start=1):
-            for name, value in zip(SHARED, direction, strict=True):
+            for name, value in zip(ALL, direction, strict=False):  # those of drag come first
                 parameters[f"{name}_{k}"].fill_(value)
 
 
@@ -111,9 +117,19 @@ def doubt_sigmas() -> dict[str, float]:
     return {f"{SECTION}.doubt_{k}": 1.0 for k in range(1, DOUBTS + 1)}
 
 
-def with_weights(model: AnalyticModel, chosen: Chosen) -> Chosen:
-    """The chosen coefficients, with their priors, and the weights of the model's correction."""
-    further = choose(model, SHARED)
+def with_weights(model: AnalyticModel, chosen: Chosen, *, labelled: bool) -> Chosen:
+    """The chosen coefficients, with their priors, and weights of the model's correction.
+
+    Drag is held near its calibrated value: a larger one and a larger correction are the same.
+
+    Args: labelled: True if tracks have spin labels, which tell a larger lift from a larger spin.
+    """
+    shared = ALL if labelled else DRAG
+    further = choose(model, shared)
+    if SCALE in chosen.names:
+        k, start, sigma = chosen.names.index(SCALE), chosen.start.copy(), chosen.sigma.copy()
+        start[k], sigma[k] = values_of(model, [SCALE])[0], HELD * sigma[k]
+        chosen = replace(chosen, start=start, sigma=sigma)
     pairs = {name: (getattr(chosen, name), getattr(further, name)) for name in ("start", "sigma", "low", "high")}
     names, units = chosen.names + further.names, chosen.units + further.units
-    return Chosen(names, units, **{name: np.concatenate(pair) for name, pair in pairs.items()}, shared=SHARED)
+    return Chosen(names, units, **{name: np.concatenate(pair) for name, pair in pairs.items()}, shared=shared)
