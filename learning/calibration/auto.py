@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict
 from ballfg.arrays import Array
 from ballfg.dynamics import AnalyticModel
 from ballfg.estimation import Settings
+from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.learning.calibration.calibrate import (
     Problem,
     calibrate,
@@ -118,17 +119,21 @@ def _fold(
     grouped = replace(plain, config=config, groups=Groups.of(problem.dataset, config.groups, split.fit))
     judging = replace(plain, split=replace(split, judge=tuple(judge)))
 
-    def judged(model: AnalyticModel, settings: Settings) -> tuple[TrackScore | None, ...]:
-        noise = fitted_noise(plain, model, settings, watch, errors=False)
-        return score(judging, model, watch, settings if noise is None else noise.settings)
+    found: dict[str, tuple[TrackScore | None, ...]] = {}
 
-    found = {NOMINAL: judged(problem.model, problem.settings)}
-    for name, posed in ((CALIBRATED, plain), (GROUPED, grouped)):
+    def judged(name: str, posed: Problem, model: AnalyticModel, settings: Settings) -> NoiseEstimate | None:
+        noise = fitted_noise(posed, model, settings, watch, errors=False)
+        found[name] = score(judging, model, watch, settings if noise is None else noise.settings)
+        return noise
+
+    judged(NOMINAL, plain, problem.model, problem.settings)
+    last, noise = None, None
+    for name, posed in ((CALIBRATED, plain), (GROUPED, grouped), (CORRECTED, grouped)):
+        if name == CORRECTED:
+            assert last is not None
+            posed = pose_correction(grouped, last, watch, noise)
         *_, last = calibrate(posed, watch=watch)
-        found[name] = judged(population_model(posed, last), population_settings(posed, last))
-    corrected = pose_correction(grouped, last, watch)
-    *_, last = calibrate(corrected, watch=watch)
-    found[CORRECTED] = judged(population_model(corrected, last), population_settings(corrected, last))
+        noise = judged(name, posed, population_model(posed, last), population_settings(posed, last))
     return found
 
 

@@ -122,16 +122,19 @@ def pose(dataset: Dataset, model: AnalyticModel, config: CalibrationConfig, jobs
     return Problem(dataset, config, model, chosen, surfaces, settings, split, jobs, groups)
 
 
-def pose_correction(problem: Problem, last: Step, watch: Watch = unwatched) -> Problem:
+def pose_correction(
+    problem: Problem, last: Step, watch: Watch = unwatched, noise: NoiseEstimate | None = None
+) -> Problem:
     """The problem of a correction of drag and lift on top of a calibration with groups.
 
     The tracks are linearised with the noise that they show about the calibrated model: the usual one of measured tracks
     hides a law that is a little wrong.
 
+    Args: noise: that one, if it is known already.
     Raises: ValueError: as `with_correction`.
     """
     model, settings, names = population_model(problem, last), population_settings(problem, last), problem.split.fit
-    noise = fitted_noise(problem, model, settings, watch, errors=False)
+    noise = noise or fitted_noise(problem, model, settings, watch, errors=False)
     settings = settings if noise is None else noise.settings
     smoother = make_estimator("smoother", model, problem.surfaces, settings)
     estimates = estimate_tracks(smoother, tracks_of(problem.dataset, names), len(names), problem.jobs)

@@ -112,6 +112,37 @@ def set_doubts(model: AnalyticModel, doubts: Sequence[Sequence[float]]) -> None:
                 parameters[f"{name}_{k}"].fill_(value)
 
 
+def learned_drag(model: AnalyticModel, speed: Array, ratio: Array) -> tuple[Array, Array]:
+    """The relative correction of drag, and its standard deviation.
+
+    Args: model: with a correction.  speed: (n,) m/s.  ratio: (n,) spin ratio, dimensionless.
+    Returns: (n,) each, dimensionless.
+    """
+    values = cast(Effect, model.flight[AirCorrection.name]).values()
+    x, y = (
+        torch.from_numpy((given - values[name]) / values[f"{name}_scale"])[:, None]
+        for name, given in (("speed", speed), ("ratio", ratio))
+    )
+    terms = correction_terms(x, y).numpy()
+    rows = [[values[f"drag_{term}{end}"] for term in TERMS] for end in ("", *(f"_{k}" for k in range(1, DOUBTS + 1)))]
+    mean, *doubts = np.array(rows) @ terms.T
+    return mean, np.linalg.norm(doubts, axis=0)
+
+
+def places(model: AnalyticModel) -> tuple[Array, Array]:
+    """Speeds, m/s, and spin ratios to list a correction at: the middle of its samples and both ends of each.
+
+    Args: model: with a correction.
+    Returns: (5,) each.
+    """
+    values = cast(Effect, model.flight[AirCorrection.name]).values()
+    x, y = np.array([0.0, -1.0, 1.0, 0.0, 0.0]) / BEYOND, np.array([0.0, 0.0, 0.0, -1.0, 1.0]) / BEYOND
+    return (
+        np.maximum(values["speed"] + x * values["speed_scale"], 0.0),
+        np.maximum(values["ratio"] + y * values["ratio_scale"], 0.0),
+    )
+
+
 def doubt_sigmas() -> dict[str, float]:
     """Prior standard deviations of the doubts, by name."""
     return {f"{SECTION}.doubt_{k}": 1.0 for k in range(1, DOUBTS + 1)}

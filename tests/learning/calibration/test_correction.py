@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from ballfg.dynamics import AnalyticModel, Surfaces, load_model, nominal_model
-from ballfg.dynamics.effects.correction import DOUBTS, TERMS, WEIGHTS, AirCorrection, correction_terms
+from ballfg.dynamics.effects.correction import DOUBTS, TERMS, WEIGHTS, AirCorrection
 from ballfg.dynamics.effects.flight import Drag, DragSpeed, Gravity, Magnus
 from ballfg.dynamics.motion.paths import paths
 from ballfg.estimation import dataset_settings
@@ -25,7 +25,7 @@ from ballfg.learning.calibration.calibrate import (
     pose_correction,
     score,
 )
-from ballfg.learning.calibration.correction import Correction, set_doubts, with_correction
+from ballfg.learning.calibration.correction import Correction, learned_drag, places, set_doubts, with_correction
 from ballfg.learning.calibration.run import run_calibration
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.config_file import checked_config
@@ -81,18 +81,9 @@ def curved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Problem, Step, Pro
 
 def drag_curve(model: AnalyticModel, speed: np.ndarray, ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Drag coefficient, 1/m, and the standard deviation that the doubts give it."""
-    effect = model.flight["air_correction"]
-    assert isinstance(effect, AirCorrection)
-    values = effect.values()
-    x, y = (
-        torch.from_numpy((each - values[name]) / values[f"{name}_scale"])[:, None]
-        for name, each in (("speed", speed), ("ratio", ratio))
-    )
-    terms = correction_terms(x, y).numpy()
-    mean = terms @ [values[f"drag_{term}"] for term in TERMS]
-    ways = np.array([[values[f"drag_{term}_{k}"] for term in TERMS] for k in range(1, DOUBTS + 1)])
+    mean, sigma = learned_drag(model, speed, ratio)
     k = float(dict(model.named_parameters())["flight.drag.k"].detach())
-    return k * (1.0 + mean), k * np.linalg.norm(terms @ ways.T, axis=1)
+    return k * (1.0 + mean), k * sigma
 
 
 def test_a_planted_drag_law_comes_back_inside_its_band(curved: tuple[Problem, Step, Problem, Step]) -> None:
@@ -116,6 +107,21 @@ def test_other_flights_are_predicted_better_and_intervals_hold(curved: tuple[Pro
     assert better is not None
     assert better.rmse_median < 0.9 * plain.rmse_median
     assert better.coverage_90 > 0.85
+
+
+def test_the_listed_correction_is_that_of_the_effect() -> None:
+    """The drag of the model over that without a correction, from its acceleration, at the listed places."""
+    rng = np.random.default_rng(6)
+    effect = AirCorrection(**{name: 0.3 * rng.normal() for name in WEIGHTS})
+    model = AnalyticModel([Gravity(g=0.0), Drag(k=K), Magnus(), effect], radius=0.02)
+    speed, ratio = places(model)
+    state = torch.zeros(len(speed), 9, dtype=torch.float64)
+    state[:, 3] = torch.from_numpy(speed)
+    state[:, 6] = torch.from_numpy(ratio * speed / 0.02)  # about the flight's direction: no lift
+    gain = -model.rates(state)[0][:, 0].detach().numpy() / (K * speed**2)
+    found, sigma = learned_drag(model, speed, ratio)
+    np.testing.assert_allclose(1.0 + found, gain, atol=0.01)  # the effect softens the spin at zero
+    np.testing.assert_array_equal(sigma, 0.0)
 
 
 def test_all_tracks_share_the_weights(curved: tuple[Problem, Step, Problem, Step]) -> None:
