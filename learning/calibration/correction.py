@@ -17,7 +17,7 @@ import torch
 from ballfg.arrays import Array
 from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.effect import Effect
-from ballfg.dynamics.effects.correction import DOUBTS, TERMS, WEIGHTS, AirCorrection, correction_terms
+from ballfg.dynamics.effects.generic import DOUBTS, FUNCTIONS, WEIGHTS, AirCorrection, correction_terms
 from ballfg.estimation import Estimate, Status
 from ballfg.learning.calibration.coefficients import Chosen, choose, values_of
 from ballfg.learning.calibration.groups import GroupSpin
@@ -66,7 +66,7 @@ class Correction:
         """
         values, vectors = np.linalg.eigh(covariance)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
-        metric = np.kron(np.eye(len(covariance) // len(TERMS)), self.terms + ELSEWHERE * np.eye(len(TERMS)))
+        metric = np.kron(np.eye(len(covariance) // len(FUNCTIONS)), self.terms + ELSEWHERE * np.eye(len(FUNCTIONS)))
         _, turns = np.linalg.eigh(root.T @ metric @ root)
         return tuple(tuple(row) for row in (root @ turns[:, ::-1][:, :DOUBTS]).T.tolist())
 
@@ -124,7 +124,9 @@ def learned_drag(model: AnalyticModel, speed: Array, ratio: Array) -> tuple[Arra
         for name, given in (("speed", speed), ("ratio", ratio))
     )
     terms = correction_terms(x, y).numpy()
-    rows = [[values[f"drag_{term}{end}"] for term in TERMS] for end in ("", *(f"_{k}" for k in range(1, DOUBTS + 1)))]
+    rows = [
+        [values[f"drag_{term}{end}"] for term in FUNCTIONS] for end in ("", *(f"_{k}" for k in range(1, DOUBTS + 1)))
+    ]
     mean, *doubts = np.array(rows) @ terms.T
     return mean, np.linalg.norm(doubts, axis=0)
 

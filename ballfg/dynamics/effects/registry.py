@@ -10,7 +10,6 @@ from ballfg.dynamics import effects
 from ballfg.dynamics.effect import Effect, Kind
 from ballfg.dynamics.effects import generic
 from ballfg.dynamics.effects.checks import BASES, REMEDY, check_effect
-from ballfg.dynamics.effects.correction import AirCorrection
 from ballfg.files.python_file import defined_classes, load_classes
 from ballfg.registry import Registry
 
@@ -18,8 +17,19 @@ GENERIC: Final[dict[str, type[Effect]]] = {
     effect.name: effect for effect in (generic.GenericFlight, generic.GenericContact, generic.GenericMeasurement)
 }
 """Sums of terms that a model file may name. They describe without explaining, so searches for causes skip them."""
-LEARNED: Final[dict[str, type[Effect]]] = {AirCorrection.name: AirCorrection}
-"""Effects that `ballfg-train` writes; searches for causes skip them too."""
+
+
+def _own() -> Iterator[type[Effect]]:
+    """The effects of the modules of this folder but the generic ones, by kind, module and place in it."""
+    names = sorted(f"{__package__}.{module.name}" for module in iter_modules(effects.__path__))
+    found = [cls for name in names if name != __name__ for cls in defined_classes(import_module(name), BASES)]
+    kinds = [base.kind for base in BASES]
+    yield from sorted((cls for cls in found if cls not in GENERIC.values()), key=lambda cls: kinds.index(cls.kind))
+
+
+OWN: Final = tuple(_own())
+LEARNED: Final[dict[str, type[Effect]]] = {effect.name: effect for effect in OWN if effect.learned}
+"""Effects that a training writes; searches for causes skip them too."""
 
 
 def _check(effect: type[Effect]) -> None:
@@ -38,19 +48,9 @@ EFFECTS: Final = Registry[Effect](
 """Every effect that a search for causes may find, by its name in model files."""
 
 
-def _own() -> Iterator[type[Effect]]:
-    """The effects of the modules of this folder, by kind, module and place in it."""
-    names = sorted(f"{__package__}.{module.name}" for module in iter_modules(effects.__path__))
-    found = [cls for name in names if name != __name__ for cls in defined_classes(import_module(name), BASES)]
-    kinds = [base.kind for base in BASES]
-    yield from sorted(
-        (cls for cls in found if cls not in {*GENERIC.values(), *LEARNED.values()}),
-        key=lambda cls: kinds.index(cls.kind),
-    )
-
-
-for _effect in _own():
-    EFFECTS.register(_effect)
+for _effect in OWN:
+    if not _effect.learned:
+        EFFECTS.register(_effect)
 
 register = EFFECTS.register
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from ballfg.dynamics import AnalyticModel, load_model, nominal_model, save_model
-from ballfg.dynamics.effects import correction, registry
-from ballfg.dynamics.effects.correction import DOUBTS, WEIGHTS, AirCorrection, correction_terms
+from ballfg.dynamics.effects import generic, registry
 from ballfg.dynamics.effects.flight import Drag, Gravity, Magnus
+from ballfg.dynamics.effects.generic import DOUBTS, WEIGHTS, AirCorrection, correction_terms
 from ballfg.state import STANDARD_GRAVITY
 
 LOW, HIGH = -4.0, 4.0
@@ -71,7 +71,7 @@ def test_the_gains_are_those_of_the_formula() -> None:
     values = effect.values()
     found = model_with(effect).rates(state)[0].detach().numpy()[0]
     velocity, spin = state[0, 3:6].numpy(), state[0, 6:].numpy()
-    speed, ratio = np.linalg.norm(velocity), 0.02 * np.hypot(np.linalg.norm(spin), correction.SOFT_SPIN)
+    speed, ratio = np.linalg.norm(velocity), 0.02 * np.hypot(np.linalg.norm(spin), generic.SOFT_SPIN)
     x, y = (speed - values["speed"]) / values["speed_scale"], (ratio / speed - values["ratio"]) / values["ratio_scale"]
     near = np.exp(-(x * x + y * y) / 2)
     rest = 1 - near**2 * (1 + x * x + y * y + (x * x + y * y) ** 2 / 2)

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from ballfg.dynamics import AnalyticModel, Surfaces, load_model, nominal_model
-from ballfg.dynamics.effects.correction import DOUBTS, TERMS, WEIGHTS, AirCorrection
 from ballfg.dynamics.effects.flight import Drag, DragSpeed, Gravity, Magnus
+from ballfg.dynamics.effects.generic import DOUBTS, FUNCTIONS, WEIGHTS, AirCorrection
 from ballfg.dynamics.motion.paths import paths
 from ballfg.estimation import dataset_settings
 from ballfg.learning.calibration.auto import CANDIDATES, CORRECTED, GROUPED, NOMINAL, choose_candidate, compared
@@ -127,7 +127,7 @@ def test_the_listed_correction_is_that_of_the_effect() -> None:
 def test_all_tracks_share_the_weights(curved: tuple[Problem, Step, Problem, Step]) -> None:
     _, _, corrected, end = curved
     weights = corrected.chosen.alike
-    assert len(weights) == len(TERMS)  # without spin labels lift is as declared
+    assert len(weights) == len(FUNCTIONS)  # without spin labels lift is as declared
     assert np.all(np.array(end.spread)[weights] == 0.0)
     settings = population_settings(corrected, end)
     assert not set(corrected.chosen.shared) & set(settings.coefficients)
