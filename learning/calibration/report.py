@@ -8,7 +8,7 @@ import numpy as np
 
 from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.learning.calibration.calibrate import Problem, Step, has_converged, population_model
-from ballfg.learning.calibration.correction import learned_drag, places
+from ballfg.learning.calibration.correction import SCALE, learned_drag, places
 from ballfg.learning.evaluation import Summary, TrackScore, summary
 
 AXES = ("forward", "across", "up")
@@ -162,7 +162,7 @@ def verdict(problem: Problem, last: Step, comparison: Comparison) -> str:
         )
     for k, name in problem.chosen.listed:
         found = _coefficient(problem, last, k)
-        if not found["told_by_data"]:
+        if not found["told_by_data"] and (problem.correction is None or name != SCALE):
             sentences.append(f"The tracks say little of {name}: its value is the model's.")
         if found["at_bound"]:
             sentences.append(f"{name} lies at its bound: another effect may be missing, or a unit is wrong.")

@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -79,12 +79,12 @@ def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jo
         if resume:
             files.start(folder, config)
         try:
-            _steps(problem, calibrated, folder, watch, lambda: write_checkpoint(folder, problem, calibrated))
+            _steps(problem, calibrated, folder, watch)
             last, steps = problem, calibrated
             if problem.config.correction:
                 last, steps = pose_correction(problem, calibrated[-1], watch), corrected
                 _check_follows(corrected, last, folder / files.STEPS)
-                _steps(last, steps, folder, watch, lambda: write_checkpoint(folder, problem, calibrated, corrected))
+                _steps(last, steps, folder, watch, (problem, calibrated))
             _finish(last, [calibrated[0], *steps], folder, watch)
         except KeyboardInterrupt:
             kept = len(calibrated) + len(corrected)
@@ -105,12 +105,20 @@ def _chosen(problem: Problem, folder: Path, resume: bool, watch: Watch) -> str:
     return choice.chosen
 
 
-def _steps(problem: Problem, steps: list[Step], folder: Path, watch: Watch, keep: Callable[[], None]) -> None:
-    """Take the steps that are left, and `keep` them and print a line of text after each."""
+def _steps(
+    problem: Problem, steps: list[Step], folder: Path, watch: Watch, first: tuple[Problem, Sequence[Step]] | None = None
+) -> None:
+    """Take the steps that are left, with a checkpoint and a line of text after each.
+
+    Args: first: the calibration before a correction, and its steps.
+    """
     begun = time.monotonic()
     for step in calibrate(problem, tuple(steps), watch=watch):
         steps.append(step)
-        keep()
+        if first is None:
+            write_checkpoint(folder, problem, steps)
+        else:
+            write_checkpoint(folder, *first, steps)
         now = time.monotonic()
         left = (problem.config.max_iterations - step.number) * (now - begun)
         begun = now
@@ -141,7 +149,8 @@ def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch)
     noise = fitted_noise(problem, model, population, watch)
     spread = score(problem, model, watch, population)
     shown = spread if noise is None else score(problem, model, watch, noise.settings)
-    comparison = compare(steps[0].scores, last.scores, spread, shown)
+    after = last.scores if problem.correction is None else spread  # a correction goes with its spins
+    comparison = compare(steps[0].scores, after, spread, shown)
     found = report(problem, last, comparison, noise)
     model.noise = None if noise is None else noise.noise
     model.spins = population.spins
