@@ -12,9 +12,19 @@ import torch
 from ballfg.dynamics import AnalyticModel, Surfaces, load_model, nominal_model
 from ballfg.dynamics.effects.flight import Drag, DragSpeed, Gravity, Magnus
 from ballfg.dynamics.effects.generic import DOUBTS, FUNCTIONS, WEIGHTS, AirCorrection
+from ballfg.dynamics.model_file import model_to_dict
 from ballfg.dynamics.motion.paths import paths
 from ballfg.estimation import dataset_settings
-from ballfg.learning.calibration.auto import CANDIDATES, CORRECTED, GROUPED, NOMINAL, choose_candidate, compared
+from ballfg.learning.calibration import run
+from ballfg.learning.calibration.auto import (
+    CANDIDATES,
+    CORRECTED,
+    GROUPED,
+    NOMINAL,
+    choose_candidate,
+    compared,
+    config_of,
+)
 from ballfg.learning.calibration.calibrate import (
     Problem,
     Step,
@@ -196,6 +206,26 @@ def test_a_richer_model_must_beat_the_best_simpler_one_by_a_standard_error() -> 
         choice = compared(dict(zip(CANDIDATES, map(scored, logs), strict=True)))
         assert choice.chosen == right
         assert len(choice.table().splitlines()) == 1 + len(CANDIDATES)
+
+
+def test_a_run_that_keeps_the_nominal_model_says_so_by_its_status(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = {name: scored(np.array([1.0, 2.0, 3.0])) for name in CANDIDATES}
+    monkeypatch.setattr(run, "choose_candidate", lambda *_: compared(rows))
+    problem = posed(tmp_path, 0.0, 4)
+    config = problem.config.model_copy(update={"kind": "auto"})
+    assert run_calibration(config, tmp_path / "out", resume=False, jobs=1, watch=unwatched) == 1
+    assert model_to_dict(load_model(tmp_path / "out" / "model.yaml")) == model_to_dict(nominal_model())  # type: ignore[arg-type]
+    assert "No model beats the nominal one" in capsys.readouterr().out
+    assert (tmp_path / "out" / "choice.json").is_file()
+
+
+def test_the_config_of_a_candidate() -> None:
+    auto = CalibrationConfig(kind="auto", data="shots")
+    assert config_of(auto, CORRECTED) == CalibrationConfig(groups="group", correction=True, data="shots")
+    assert config_of(auto, "calibrated") == CalibrationConfig(data="shots")
+    assert checked_config({"kind": "auto"}, "here") == CalibrationConfig(kind="auto")
 
 
 def test_the_log_score_is_the_density_of_the_mixture() -> None:
