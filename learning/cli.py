@@ -39,10 +39,11 @@ def train(
     """Train a model of the ball on a dataset: a network, or the coefficients of the analytic model.
 
     The key `kind` of the config selects the model. kind: calibrate estimates the drag of the ball and the restitution
-    of the table, with error bars.
+    of the table, with error bars. kind: auto compares the nominal model, the calibrated one, one with the spins of
+    groups and one with a learned correction of drag and lift, and writes the best.
 
-    The exit status is 1 if no epoch predicts the validation tracks better than the model before the first step, or a
-    calibrated model predicts the judging tracks worse than the one before.
+    The exit status is 1 if no epoch predicts the validation tracks better than the model before the first step, a
+    calibrated model predicts the judging tracks worse than the one before, or kind: auto keeps the nominal model.
     After Ctrl-C the best model so far is written.
 
     Example: ballfg-train train.yaml --data data/ballgun --out ballgun-model kind=mnn+gs optimizer.epochs=30

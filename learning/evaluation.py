@@ -1,16 +1,23 @@
 """Measures a model's prediction errors on other tracks: it observes the first part and predicts the rest."""
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.special import ndtri
 
+from ballfg.arrays import Array
 from ballfg.estimation import Estimator, Status, predict_tracks
 from ballfg.tracks import Track
 
 NINETY = float(ndtri(0.95))
 """Standard deviations to each side of a central 90 % interval."""
+
+OUTLIERS: Final = 0.01
+"""Share of coordinates that a prediction may miss, as after a hit that nobody foresees."""
+WIDER: Final = 10.0
+"""Width of their density, in standard deviations: one missed bounce does not decide a comparison."""
 
 
 class TrackScore(BaseModel):
@@ -27,6 +34,8 @@ class TrackScore(BaseModel):
     """Share of measured coordinates inside the central 90 % intervals."""
     prediction_nis: float = Field(ge=0.0, le=1e100)
     """Mean over the predicted samples of the squared errors in standard deviations, x, y and z added; 3 is right."""
+    log_score: float = Field(ge=-1e9, le=1e9)
+    """Mean over measured coordinates of the log density that the prediction gives them, per metre; higher is better."""
     nis: float = Field(ge=0.0, le=1e100)
     """Mean NIS of the observed samples, each against its prediction from the others; 3 is right."""
 
@@ -72,8 +81,19 @@ def judge_track(estimator: Estimator, track: Track, observed_share: float, horiz
         rmse=float(np.sqrt((error**2).sum(axis=-1).mean())),
         covered=float((np.abs(whitened) <= NINETY).mean()),
         prediction_nis=float((whitened**2).sum(axis=-1).mean()),
+        log_score=float(log_density(whitened, prediction.sigmas).mean()),
         nis=float(nis.mean()),
     )
+
+
+def log_density(whitened: Array, sigmas: Array) -> Array:
+    """Log density, per metre, of errors under a Gaussian, of which a small share is wider.
+
+    Args: whitened: (...) errors in standard deviations.  sigmas: (...) m.
+    """
+    plain = np.log1p(-OUTLIERS) - 0.5 * whitened**2
+    wide = np.log(OUTLIERS / WIDER) - 0.5 * (whitened / WIDER) ** 2
+    return np.asarray(np.logaddexp(plain, wide) - np.log(sigmas) - 0.5 * np.log(2.0 * np.pi))
 
 
 def summary(scores: Sequence[TrackScore]) -> Summary | None:

@@ -224,6 +224,7 @@ class Effect(nn.Module, ABC):
         belongs_to: the ball (the effect follows it to every room), the room, or the rig that measures there.
         imitated: True if other effects or coefficients do exactly the same, so that tracks alone cannot name it.
         needs: names of effects that this one modifies and that must be in the same model.
+        learned: True if only a training writes it, so that no search for causes tries it.
         multiplies_spin: True if its strength multiplies the spin: without spin labels its slope at absence is zero.
 
     Raises: ValueError: if a value is given for an unknown coefficient, or lies out of its bounds.
@@ -241,6 +242,7 @@ class Effect(nn.Module, ABC):
     belongs_to: ClassVar[Owner] = "ball"
     imitated: ClassVar[bool] = False
     needs: ClassVar[tuple[str, ...]] = ()
+    learned: ClassVar[bool] = False
     multiplies_spin: ClassVar[bool] = False
 
     def __init__(self, /, **values: float) -> None:

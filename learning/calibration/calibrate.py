@@ -8,6 +8,7 @@ docs/train.md.
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Final
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
@@ -27,8 +28,10 @@ from ballfg.estimation import (
 )
 from ballfg.estimation.batch import estimate_tracks, map_tracks
 from ballfg.estimation.noise.estimate import NoiseEstimate, spread_over
+from ballfg.estimation.noise.parameters import with_noise
 from ballfg.estimation.registry import make_estimator
 from ballfg.learning.calibration.coefficients import Chosen, choose, with_values
+from ballfg.learning.calibration.correction import Correction, doubt_sigmas, set_doubts, with_correction, with_weights
 from ballfg.learning.calibration.groups import Groups, GroupSpin
 from ballfg.learning.calibration.population import Evidence, evidence, fit_population
 from ballfg.learning.config.calibration import CalibrationConfig
@@ -36,6 +39,11 @@ from ballfg.learning.evaluation import TrackScore, judge_track
 from ballfg.learning.split import Split, split_tracks, tracks_of
 from ballfg.progress import Watch, unwatched
 from ballfg.tracks import Dataset
+
+ROUGHLY: Final = 0.3
+"""Tolerance of a correction at least: its weights move slowly along directions that hardly change a prediction."""
+FIRST: Final = 0.75
+"""s, the part of each track that teaches a correction: later on contacts say more than the air does."""
 
 
 class TooManyFailures(ValueError):  # noqa: N818 - the name is the statement
@@ -55,6 +63,7 @@ class Problem:
     split: Split
     jobs: int
     groups: Groups | None = None
+    correction: Correction | None = None
 
     def estimator(self, values: Array, settings: Settings) -> Smoother:
         """The smoother with values (p,) of the coefficients."""
@@ -89,6 +98,8 @@ class Step(BaseModel):
     """The spins of each group, in the order of `Groups.names`; none without groups."""
     by_group: dict[str, tuple[float, ...]] = {}
     """Means by group, in the same order, of the coefficients that differ between groups."""
+    doubts: tuple[tuple[float, ...], ...] = ()
+    """Directions of the uncertainty of a correction's weights; none without a correction."""
     moved: float | None = None
     """Largest move of a mean in this step, in standard errors."""
     fits: tuple[TrackFit, ...] = ()
@@ -111,6 +122,35 @@ def pose(dataset: Dataset, model: AnalyticModel, config: CalibrationConfig, jobs
     return Problem(dataset, config, model, chosen, surfaces, settings, split, jobs, groups)
 
 
+def pose_correction(
+    problem: Problem, last: Step, watch: Watch = unwatched, noise: NoiseEstimate | None = None
+) -> Problem:
+    """The problem of a correction of drag and lift on top of a calibration with groups.
+
+    The tracks are linearised with the noise that they show about the calibrated model: the usual one of measured tracks
+    hides a law that is a little wrong.
+
+    Args: noise: that one, if it is known already.
+    Raises: ValueError: as `with_correction`.
+    """
+    model, settings, names = population_model(problem, last), population_settings(problem, last), problem.split.fit
+    noise = noise or fitted_noise(problem, model, settings, watch, errors=False)
+    settings = settings if noise is None else noise.settings
+    smoother = make_estimator("smoother", model, problem.surfaces, settings)
+    estimates = estimate_tracks(smoother, tracks_of(problem.dataset, names), len(names), problem.jobs)
+    corrected, terms = with_correction(model, watch(estimates, len(names), "tracks estimated"))
+    corrected.variations = dict(problem.model.variations)  # those of groups are found anew
+    labelled = problem.groups is not None and bool(problem.groups.labelled)
+    chosen = with_weights(corrected, problem.chosen, labelled=labelled)
+    mean = np.concatenate((last.mean, np.zeros(len(chosen.shared))))
+    config = problem.config.model_copy(update={"tolerance": max(problem.config.tolerance, ROUGHLY)})
+    begun = Correction(mean, last.spins, terms)
+    settings = (
+        problem.settings if noise is None else with_noise(problem.settings, replace(noise.noise, coefficients={}))
+    )
+    return replace(problem, model=corrected, chosen=chosen, config=config, correction=begun, settings=settings)
+
+
 def calibrate(problem: Problem, done: Iterable[Step] = (), *, watch: Watch = unwatched) -> Iterator[Step]:
     """The remaining steps, each as soon as it is finished; none if the calibration has ended.
 
@@ -119,7 +159,7 @@ def calibrate(problem: Problem, done: Iterable[Step] = (), *, watch: Watch = unw
     """
     steps = list(done)
     if not steps:
-        start = problem.chosen.start
+        start = problem.chosen.start if problem.correction is None else problem.correction.mean
         steps.append(Step(number=0, mean=_plain(start), scores=score(problem, start, watch)))
         yield steps[-1]
     while not has_ended(problem.config, steps[-1]):
@@ -162,7 +202,8 @@ def score(
 
 def population_settings(problem: Problem, step: Step) -> Settings:
     """Settings with the population's distribution of a new track as the prior of each calibrated number."""
-    learned = dict(zip(problem.chosen.names, step.next_track, strict=True))
+    learned = {name: step.next_track[k] for k, name in problem.chosen.listed}
+    learned |= {} if problem.correction is None else doubt_sigmas()
     settings = replace(problem.settings, coefficients={**problem.settings.coefficients, **learned})
     groups = problem.groups
     return settings if groups is None else groups.settings(settings, groups.population(step.spins))
@@ -173,37 +214,51 @@ def population_model(problem: Problem, step: Step) -> AnalyticModel:
     model = with_values(problem.model, problem.chosen.names, np.array(step.mean))
     if problem.groups is not None:
         model.variations = {**model.variations, **problem.groups.variations(step.by_group)}
+    set_doubts(model, step.doubts)
     return model
 
 
 def fitted_noise(
-    problem: Problem, model: AnalyticModel, settings: Settings, watch: Watch = unwatched
+    problem: Problem, model: AnalyticModel, settings: Settings, watch: Watch = unwatched, *, errors: bool = True
 ) -> NoiseEstimate | None:
     """The noise of the fitted tracks about the calibrated model; None if undetermined.
 
     Args: model: with the calibrated coefficients.  settings: with the population as the prior of each coefficient.
+        errors: True to compute error bars, which doubles the time.
     """
     if not model.measures_plainly:
         return None
     names = problem.split.fit
     tracks = spread_over(tracks_of(problem.dataset, names), len(names))
     known = problem.dataset.info.position_noise is not None
-    return estimate_noise(model, problem.surfaces, settings, tracks, position_known=known, watch=watch)
+    found = estimate_noise(model, problem.surfaces, settings, tracks, position_known=known, errors=errors, watch=watch)
+    return found if found is None or problem.correction is None else _with_doubts(found)
+
+
+def _with_doubts(found: NoiseEstimate) -> NoiseEstimate:
+    """The noise with doubts as wide as their posterior: tracks that taught the weights show less of them."""
+    doubts = doubt_sigmas()
+    spreads = {name: sigma for name, sigma in found.noise.coefficients.items() if name not in doubts}
+    settings = replace(found.settings, coefficients={**found.settings.coefficients, **doubts})
+    return replace(found, noise=replace(found.noise, coefficients=spreads), settings=settings)
 
 
 def _advance(problem: Problem, last: Step, watch: Watch) -> Step:
     """Linearise the fitted tracks about the last mean, and fit the population."""
     chosen, groups, about = problem.chosen, problem.groups, np.array(last.mean)
-    spins = () if groups is None else last.spins or groups.start
+    spins = () if groups is None else last.spins or _first_spins(problem, groups)
     fits, evidences, skipped = _fit_tracks(problem, about, spins, watch)
     size, before = len(about), np.concatenate((about, *(spin.mean for spin in spins)))
     next_track: Array | None = None
     by_group: dict[str, tuple[float, ...]] = {}
     found: tuple[GroupSpin, ...] = ()
+    doubts: tuple[tuple[float, ...], ...] = ()
     if groups is None:
         population = fit_population(evidences, chosen.start, chosen.sigma, chosen.low, chosen.high)
     else:
         population, by_group, found, next_track = groups.fit(evidences, [fit.name for fit in fits], chosen)
+        if problem.correction is not None:
+            doubts = problem.correction.doubts(population.covariance[np.ix_(chosen.alike, chosen.alike)])
     return Step(
         number=last.number + 1,
         mean=_plain(population.mean[:size]),
@@ -211,12 +266,17 @@ def _advance(problem: Problem, last: Step, watch: Watch) -> Step:
         spread=_plain(population.spread[:size]),
         next_track=_plain(population.next_track[:size] if next_track is None else next_track),
         spins=found,
+        doubts=doubts,
         by_group=by_group,
         moved=float(np.abs((population.mean - before) / population.sigma).max()),
         fits=tuple(fits),
         skipped=tuple(skipped),
         scores=score(problem, population.mean[:size], watch),
     )
+
+
+def _first_spins(problem: Problem, groups: Groups) -> tuple[GroupSpin, ...]:
+    return groups.start if problem.correction is None else problem.correction.spins
 
 
 def _fit_tracks(
@@ -230,7 +290,10 @@ def _fit_tracks(
     priors = {**problem.settings.coefficients, **dict(zip(chosen.names, chosen.sigma.tolist(), strict=True))}
     settings = replace(problem.settings, coefficients=priors)
     estimator = problem.estimator(about, settings if groups is None else groups.wide(settings, spins))
-    estimates = estimate_tracks(estimator, tracks_of(problem.dataset, names), len(names), problem.jobs)
+    tracks = tracks_of(problem.dataset, names)
+    if problem.correction is not None:
+        tracks = (track.opening(FIRST) for track in tracks)
+    estimates = estimate_tracks(estimator, tracks, len(names), problem.jobs)
     fits: list[TrackFit] = []
     evidences: list[Evidence] = []
     skipped: list[tuple[str, str]] = []

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Index
 from ballfg.checks import did_you_mean
 from ballfg.dynamics import AnalyticModel
 
@@ -28,6 +28,18 @@ class Chosen:
     sigma: Array
     low: Array
     high: Array
+    shared: tuple[str, ...] = ()
+    """Those that all tracks share, without spread between them: the weights of a correction."""
+
+    @property
+    def alike(self) -> Index:
+        """Numbers of the shared ones."""
+        return np.array([self.names.index(name) for name in self.shared], dtype=np.int64)
+
+    @property
+    def listed(self) -> list[tuple[int, str]]:
+        """Number and name of those that differ between tracks, which reports list."""
+        return [(k, name) for k, name in enumerate(self.names) if name not in self.shared]
 
     @property
     def needs_spin(self) -> bool:

@@ -31,6 +31,10 @@ LABEL_PRIOR: Final = 2000.0
 """rad/s, the smoother's prior beside a spin label (`UNINFORMATIVE_SPIN`)."""
 OWN: Final = "group"
 """The label without which a dataset is one group of its own name."""
+WIDTHS: Final = (0.03, 0.1, 0.3, 0.6)
+"""Standard deviations of the prior of a correction, relative to drag and lift, among which the evidence chooses: some
+per cent, up to what a law that is wrong by half needs. Beyond them the evidence overfits."""
+Columns = tuple[Array, Array, Array, Array]
 Three = tuple[float, float, float]
 
 
@@ -149,16 +153,17 @@ class Groups:
             (p,) standard deviations of a new track's coefficients about the mean of its group.
         """
         columns, numbers, size = self.beside(chosen), self.numbers(tracks, chosen), len(chosen.names)
-        best = shared = fit_population(evidences, *columns, numbers)
+        columns, best = _widest(evidences, columns, numbers, chosen.alike)
+        shared = best
         own = np.array([self._number(name) for name in tracks])
         apart: dict[str, int] = {}
-        for k, name in enumerate(chosen.names) if len(self.names) > 1 else ():
+        for k, name in chosen.listed if len(self.names) > 1 else ():
             first = len(columns[0])
             split = numbers.copy()
             split[:, k] = first + own
             start, sigma, low, high = (np.append(values, np.full(len(self.names), values[k])) for values in columns)
             wider = (start, sigma, low, high)
-            found = fit_population(evidences, *wider, split)
+            found = fit_population(evidences, *wider, split, chosen.alike)
             if found.log_likelihood - best.log_likelihood > (len(self.names) - 1) * np.log(len(tracks)):
                 best, columns, numbers, apart[name] = found, wider, split, first
         next_track = np.sqrt((best.next_track[numbers[:, :size]] ** 2).mean(axis=0))
@@ -172,7 +177,7 @@ class Groups:
             name: Variation(self.by, dict(zip(self.names, values, strict=True))) for name, values in by_group.items()
         }
 
-    def beside(self, chosen: Chosen) -> tuple[Array, Array, Array, Array]:
+    def beside(self, chosen: Chosen) -> Columns:
         """Start, sigma and both bounds of all means: (p + 3 groups,) each, the coefficients first."""
         count = 3 * len(self.names)
         further = (np.zeros(count), np.full(count, WIDEST), np.full(count, -np.inf), np.full(count, np.inf))
@@ -196,6 +201,21 @@ class Groups:
         return SpinPopulation(self.by, {name: SpinGroup(*spin, counts.count(name)) for name, spin in rows})
 
 
-def _columns_of(population: Population) -> tuple[Array, Array, Array, Array]:
+def _widest(
+    evidences: Sequence[Evidence], columns: Columns, numbers: Index, alike: Index
+) -> tuple[Columns, Population]:
+    """The population, and its columns with the prior of the shared coefficients that has the largest evidence."""
+    if not len(alike):
+        return columns, fit_population(evidences, *columns, numbers)
+    start, sigma, low, high = columns
+    tried = []
+    for width in WIDTHS:
+        own = sigma.copy()
+        own[alike] = width
+        tried.append(((start, own, low, high), fit_population(evidences, start, own, low, high, numbers, alike)))
+    return max(tried, key=lambda one: one[1].log_evidence)
+
+
+def _columns_of(population: Population) -> Columns:
     """Mean, its standard error, spread and standard deviation of a new track, of every number."""
     return population.mean, population.sigma, population.spread, population.next_track

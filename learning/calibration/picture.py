@@ -19,13 +19,14 @@ TRACKS, BAND, START = "#3b4cc0", "#d95f02", "#7f7f7f"
 
 def draw(problem: Problem, last: Step, comparison: Comparison, path: Path) -> None:
     """Write the picture as a PNG file."""
-    panels = len(problem.chosen.names) + 1
+    listed = problem.chosen.listed
+    panels = len(listed) + 1
     columns = min(panels, 4)
     rows = -(-panels // columns)
     figure, grid = plt.subplots(rows, columns, figsize=(4.0 * columns, 3.9 * rows), layout="constrained", squeeze=False)
     axes = list(grid.flat)
-    for k in range(panels - 1):
-        _coefficient(axes[k], problem, last, k)
+    for place, (k, _) in enumerate(listed):
+        _coefficient(axes[place], problem, last, k)
     _errors(axes[panels - 1], comparison)
     for unused in axes[panels:]:
         unused.set_axis_off()

@@ -53,12 +53,14 @@ class Population:
         covariance: (p, p) of the mean, for the spread found.
         spread: (p,) standard deviation between tracks.
         log_likelihood: marginal, up to a constant, with the prior of the mean.
+        log_evidence: the same with the mean integrated out too, to compare priors of the mean.
     """
 
     mean: Array
     covariance: Array
     spread: Array
     log_likelihood: float
+    log_evidence: float
 
     @property
     def sigma(self) -> Array:
@@ -96,7 +98,13 @@ def evidence(mean: Array, covariance: Array, prior_mean: Array, prior_sigma: Arr
 
 
 def fit_population(
-    tracks: Sequence[Evidence], start: Array, sigma: Array, low: Array, high: Array, numbers: Index | None = None
+    tracks: Sequence[Evidence],
+    start: Array,
+    sigma: Array,
+    low: Array,
+    high: Array,
+    numbers: Index | None = None,
+    alike: Index | None = None,
 ) -> Population:
     """Mean and spread of maximum marginal likelihood, the mean within its bounds.
 
@@ -106,6 +114,7 @@ def fit_population(
         low: (p,) least mean.  high: (p,) largest mean.
         numbers: (n, k) which of the p means each coefficient of each track is a draw about: those of its group. None:
             the same for all tracks.
+        alike: numbers of the means that all tracks share, without spread between them.
     Raises: ValueError: if there is no track.
     """
     if not tracks:
@@ -119,6 +128,7 @@ def fit_population(
     bounds = ((low - start) / sigma, (high - start) / sigma)
     about = _Means(numbers, size, bounds)
     variance = np.where(about.summed(np.einsum("ikk->ik", information)) > NO_INFORMATION, 1.0, 0.0)
+    variance[[] if alike is None else alike] = 0.0
     for _ in range(MAX_STEPS):
         own = variance[numbers]
         mean = about.best(information, moved, own)
@@ -135,11 +145,14 @@ def fit_population(
             break
     own = variance[numbers]
     mean = about.best(information, moved, own)
+    precision = about.precision(information, own)
+    likelihood = _log_likelihood(information, moved, own, mean[numbers]) - 0.5 * float(mean @ mean)
     return Population(
         mean=np.clip(start + sigma * mean, low, high),
-        covariance=np.linalg.inv(about.precision(information, own)) * np.outer(sigma, sigma),
+        covariance=np.linalg.inv(precision) * np.outer(sigma, sigma),
         spread=sigma * np.sqrt(variance),
-        log_likelihood=_log_likelihood(information, moved, own, mean[numbers]) - 0.5 * float(mean @ mean),
+        log_likelihood=likelihood,
+        log_evidence=likelihood - 0.5 * float(np.linalg.slogdet(precision)[1]),
     )
 
 

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from ballfg.estimation.noise.estimate import NoiseEstimate
-from ballfg.learning.calibration.calibrate import Problem, Step, has_converged
+from ballfg.learning.calibration.calibrate import Problem, Step, has_converged, population_model
+from ballfg.learning.calibration.correction import SCALE, learned_drag, places
 from ballfg.learning.evaluation import Summary, TrackScore, summary
 
 AXES = ("forward", "across", "up")
@@ -75,6 +76,7 @@ def report(problem: Problem, last: Step, comparison: Comparison, noise: NoiseEst
         "last_move": last.moved,
         "coefficients": {name: _coefficient(problem, last, k) for k, name in enumerate(problem.chosen.names)},
         **_groups(problem, last),
+        **({} if problem.correction is None else {"correction": _correction(problem, last)}),
         "fitted": {
             "tracks": len(last.fits),
             "names": [fit.name for fit in last.fits],
@@ -125,6 +127,18 @@ def _groups(problem: Problem, last: Step) -> dict[str, Any]:
     return {"groups": {"by": problem.groups.by, "axes": list(AXES), "spin": spins, "coefficients": apart}}
 
 
+def _correction(problem: Problem, last: Step) -> list[dict[str, float]]:
+    """The correction of drag at some places; none without one."""
+    if problem.correction is None:
+        return []
+    model = population_model(problem, last)
+    speed, ratio = places(model)
+    columns = {"speed": speed, "spin_ratio": ratio} | dict(
+        zip(("drag", "sigma"), learned_drag(model, speed, ratio), strict=True)
+    )
+    return [dict(zip(columns, map(float, row), strict=True)) for row in zip(*columns.values(), strict=True)]
+
+
 def _plain(found: Summary | None) -> dict[str, Any] | None:
     return None if found is None else found.model_dump()
 
@@ -161,9 +175,9 @@ def verdict(problem: Problem, last: Step, comparison: Comparison) -> str:
             "The model in the file, with its population and noise, predicts WORSE than the one before: keep that one, "
             "or give more tracks or other coefficients."
         )
-    for k, name in enumerate(problem.chosen.names):
+    for k, name in problem.chosen.listed:
         found = _coefficient(problem, last, k)
-        if not found["told_by_data"]:
+        if not found["told_by_data"] and (problem.correction is None or name != SCALE):
             sentences.append(f"The tracks say little of {name}: its value is the model's.")
         if found["at_bound"]:
             sentences.append(f"{name} lies at its bound: another effect may be missing, or a unit is wrong.")
@@ -173,7 +187,7 @@ def verdict(problem: Problem, last: Step, comparison: Comparison) -> str:
 def table(problem: Problem, last: Step, comparison: Comparison) -> str:
     """Coefficients and errors, before and after, as plain text."""
     rows: list[tuple[str, ...]] = [("", "unit", "before", "after", "sigma", "spread between tracks")]
-    for k, name in enumerate(problem.chosen.names):
+    for k, name in problem.chosen.listed:
         values = (problem.chosen.start[k], last.mean[k], last.sigma[k], last.spread[k])
         rows.append((name, problem.chosen.units[k], *(f"{value:.4g}" for value in values)))
     names = () if problem.groups is None else problem.groups.names
@@ -185,6 +199,9 @@ def table(problem: Problem, last: Step, comparison: Comparison) -> str:
     for name, spin in zip(names, last.spins, strict=True):
         for axis, *numbers in zip(AXES, spin.mean, spin.sigma, spin.spread, strict=True):
             rows.append((f"spin of {name}, {axis}", "rad/s", "0", *(f"{number:.4g}" for number in numbers)))
+    for one in _correction(problem, last):
+        place = f"drag's correction at {one['speed']:.2g} m/s, spin ratio {one['spin_ratio']:.2g}"
+        rows.append((place, "1", "0", f"{one['drag']:.4g}", f"{one['sigma']:.4g}", "0"))
     errors: list[tuple[str, ...]] = [
         ("judged tracks", "unit", "before", "after", "after, spread as prior", "and noise")
     ]

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from ballfg.dynamics import save_model
 from ballfg.dynamics.model_file import model_to_dict
 from ballfg.files.damaged import whole_content
+from ballfg.learning.calibration.auto import NOMINAL, Choice, choose_candidate, config_of
 from ballfg.learning.calibration.calibrate import (
     Problem,
     Step,
@@ -21,11 +22,13 @@ from ballfg.learning.calibration.calibrate import (
     population_model,
     population_settings,
     pose,
+    pose_correction,
     score,
 )
 from ballfg.learning.calibration.picture import draw
 from ballfg.learning.calibration.report import compare, is_worse, report, table
 from ballfg.learning.config.calibration import CalibrationConfig
+from ballfg.learning.config.config_file import AUTO
 from ballfg.learning.evaluation import summary
 from ballfg.learning.run import run_folder as files
 from ballfg.learning.run.record import NOT_BETTER
@@ -44,6 +47,8 @@ class Checkpoint(BaseModel):
     """Content of the model file that the run started from."""
     steps: tuple[Step, ...]
     """Finished steps."""
+    corrected: tuple[Step, ...] = ()
+    """Finished steps of the correction."""
 
 
 def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jobs: int, watch: Watch) -> int:
@@ -51,7 +56,7 @@ def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jo
 
     Args: jobs: number of processes where the config has none.
     Returns: the exit status of `ballfg-train`: 0, or 1 if the calibrated model predicts the judging tracks worse than
-        the model before.
+        the model before, or if `kind: auto` keeps the nominal model.
     Raises: ValueError, FileNotFoundError: bad input. KeyboardInterrupt: after Ctrl-C; finished steps are kept.
     """
     with files.running(folder, config, resume=resume):
@@ -59,25 +64,62 @@ def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jo
             raise ValueError("a dataset is needed; got none. Give --data FOLDER, or 'data' in the config.")
         torch.set_num_threads(1)  # the batches are small: threads cost more than they gain
         dataset = open_dataset(config.data)
-        problem = pose(dataset, analytic_model(config.model, dataset.info.ball), config, config.jobs or jobs)
-        steps = read_checkpoint(folder, problem) if resume else []
-        files.start(folder, config)
+        model = analytic_model(config.model, dataset.info.ball)
+        problem = pose(dataset, model, config, config.jobs or jobs)
+        if not resume:
+            files.start(folder, config)
         fit, judge = len(problem.split.fit), len(problem.split.judge)
         print(f"{folder / files.CONFIG}: the config; {fit} tracks fit, {judge} judge")
+        if config.kind == AUTO:
+            chosen = _chosen(problem, folder, resume, watch)
+            if chosen == NOMINAL:
+                save_model(model, folder / files.MODEL)
+                print(f"{folder / files.MODEL}: the nominal model, which nothing beats")
+                return NOT_BETTER
+            problem = pose(dataset, model, config_of(config, chosen), problem.jobs)
+        calibrated, corrected = read_checkpoint(folder, problem) if resume else ([], [])
+        if resume:
+            files.start(folder, config)
         try:
-            _steps(problem, steps, folder, watch)
-            return _finish(problem, steps, folder, watch)
+            _steps(problem, calibrated, folder, watch)
+            last, steps = problem, calibrated
+            if problem.config.correction:
+                last, steps = pose_correction(problem, calibrated[-1], watch), corrected
+                _check_follows(corrected, last, folder / files.STEPS)
+                _steps(last, steps, folder, watch, (problem, calibrated))
+            return _finish(last, [calibrated[0], *steps], folder, watch)
         except KeyboardInterrupt:
-            print(f"{len(steps)} steps are kept; continue with --resume {folder}", file=sys.stderr)
+            kept = len(calibrated) + len(corrected)
+            print(f"{kept} steps are kept; continue with --resume {folder}", file=sys.stderr)
             raise
 
 
-def _steps(problem: Problem, steps: list[Step], folder: Path, watch: Watch) -> None:
-    """Take the steps that are left, with a checkpoint and a line of text after each."""
+def _chosen(problem: Problem, folder: Path, resume: bool, watch: Watch) -> str:
+    """Name of the candidate that `kind: auto` chooses, in this run or in the one that is resumed."""
+    path = folder / files.CHOICE
+    if resume and path.is_file():
+        choice = Choice.model_validate_json(whole_content(path))
+    else:
+        choice = choose_candidate(problem, watch)
+        files.write_json(path, choice.model_dump(mode="json"))
+    print(f"\n{choice.table()}\n\n{choice.verdict()}\n", flush=True)
+    return choice.chosen
+
+
+def _steps(
+    problem: Problem, steps: list[Step], folder: Path, watch: Watch, first: tuple[Problem, Sequence[Step]] | None = None
+) -> None:
+    """Take the steps that are left, with a checkpoint and a line of text after each.
+
+    Args: first: the calibration before a correction, and its steps.
+    """
     begun = time.monotonic()
     for step in calibrate(problem, tuple(steps), watch=watch):
         steps.append(step)
-        write_checkpoint(folder, problem, steps)
+        if first is None:
+            write_checkpoint(folder, problem, steps)
+        else:
+            write_checkpoint(folder, *first, steps)
         now = time.monotonic()
         left = (problem.config.max_iterations - step.number) * (now - begun)
         begun = now
@@ -89,7 +131,8 @@ def _line(problem: Problem, step: Step, left: float) -> str:
     judged = summary([score for score in step.scores if score is not None])
     values = ", ".join(
         f"{name} {value:.5g}" + (f" ± {step.sigma[k]:.2g}" if step.sigma else "")
-        for k, (name, value) in enumerate(zip(problem.chosen.names, step.mean, strict=True))
+        for k, name in problem.chosen.listed
+        for value in [step.mean[k]]
     )
     parts = [f"iteration {step.number}: {values}"]
     parts += [] if step.moved is None else [f"moved {step.moved:.2g} sigma"]
@@ -110,7 +153,8 @@ def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch)
     noise = fitted_noise(problem, model, population, watch)
     spread = score(problem, model, watch, population)
     shown = spread if noise is None else score(problem, model, watch, noise.settings)
-    comparison = compare(steps[0].scores, last.scores, spread, shown)
+    after = last.scores if problem.correction is None else spread  # a correction goes with its spins
+    comparison = compare(steps[0].scores, after, spread, shown)
     found = report(problem, last, comparison, noise)
     model.noise = None if noise is None else noise.noise
     model.spins = population.spins
@@ -126,20 +170,21 @@ def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch)
     return NOT_BETTER
 
 
-def write_checkpoint(folder: Path, problem: Problem, steps: Sequence[Step]) -> None:
-    """Replace the checkpoint of a run."""
-    checkpoint = Checkpoint(data=problem.split.digest, model=model_to_dict(problem.model), steps=tuple(steps))
+def write_checkpoint(folder: Path, problem: Problem, steps: Sequence[Step], corrected: Sequence[Step] = ()) -> None:
+    """Replace the checkpoint of a run: its steps, and those of its correction."""
+    model = model_to_dict(problem.model)
+    checkpoint = Checkpoint(data=problem.split.digest, model=model, steps=tuple(steps), corrected=tuple(corrected))
     files.write_json(folder / files.STEPS, checkpoint.model_dump(mode="json"))
 
 
-def read_checkpoint(folder: Path, problem: Problem) -> list[Step]:
-    """The steps of an earlier run; none if it stopped before the first.
+def read_checkpoint(folder: Path, problem: Problem) -> tuple[list[Step], list[Step]]:
+    """The steps of an earlier run and those of its correction; none if it stopped before the first.
 
     Raises: ValueError: a damaged checkpoint, or one of another dataset, another model.
     """
     path = folder / files.STEPS
     if not path.is_file():
-        return []
+        return [], []
     try:
         checkpoint = Checkpoint.model_validate_json(whole_content(path))
     except ValidationError as error:
@@ -149,9 +194,13 @@ def read_checkpoint(folder: Path, problem: Problem) -> list[Step]:
         raise ValueError(f"{path}: was made from another dataset than {problem.dataset.path}. Give the same --data.")
     if checkpoint.model != model_to_dict(problem.model):
         raise ValueError(f"{path}: was started from another model. Give the same model.")
-    if not _follow(checkpoint.steps, problem):
+    _check_follows(checkpoint.steps, problem, path)
+    return list(checkpoint.steps), list(checkpoint.corrected)
+
+
+def _check_follows(steps: Sequence[Step], problem: Problem, path: Path) -> None:
+    if not _follow(steps, problem):
         raise ValueError(f"{path}: not a checkpoint (its steps are not those of this run). Start a new run.")
-    return list(checkpoint.steps)
 
 
 def _follow(steps: Sequence[Step], problem: Problem) -> bool:

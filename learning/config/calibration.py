@@ -1,9 +1,9 @@
 """Defines the config of a calibration; each field has its meaning below it."""
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
 from ballfg.dynamics.earlier_names import todays_names
 from ballfg.learning.config.training import Count, Positive, Section, Share
@@ -26,8 +26,9 @@ class CalibrationConfig(Section):
 
     EARLIER: ClassVar[Mapping[str, str]] = {"observe": "observed_share"}
 
-    kind: Literal["calibrate"] = "calibrate"
-    """Distinguishes this config from that of a training."""
+    kind: Literal["calibrate", "auto"] = "calibrate"
+    """calibrate: the model that this config describes. auto: the model that predicts best of nominal, calibrated, with
+    groups, and with a correction; `groups` is `group` if it is null."""
 
     model: str | None = None
     """Model file to start from; null: the nominal model of the dataset's ball."""
@@ -48,6 +49,9 @@ class CalibrationConfig(Section):
     groups: str | None = None
     """Label that names a track's launcher, player, ball or session, such as `group`: the spins of each group get a
     mean and a spread, which the model file keeps. A dataset without labels is one group. null: no groups."""
+
+    correction: bool = False
+    """Learn a correction of drag and lift over speed and spin ratio too, shared by all tracks; needs groups."""
 
     split: Literal["random", "label"] = "random"
     """random: half of the tracks are fitted and half judge, by the seed. label: by the label `split` of the dataset,
@@ -73,3 +77,12 @@ class CalibrationConfig(Section):
 
     jobs: Count | None = None
     """Processes; null: one per core. The result does not depend on it."""
+
+    @model_validator(mode="after")
+    def _check_correction(self) -> Self:
+        if self.correction and (self.kind == "auto" or self.groups is None):
+            raise ValueError(
+                "correction must come with groups, whose spins it needs, and kind: auto decides on it; got neither. "
+                "Write 'groups: group' for one group of all tracks, or leave correction out."
+            )
+        return self

@@ -13,8 +13,8 @@ from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.training import TrainConfig
 
 Config = TrainConfig | CalibrationConfig
-CALIBRATE = "calibrate"
-"""The kind whose config is a `CalibrationConfig`."""
+CALIBRATE, AUTO = "calibrate", "auto"
+"""The kinds whose config is a `CalibrationConfig`."""
 
 
 def read_config(path: str | Path, overrides: Iterable[str] = (), options: Mapping[str, Any] | None = None) -> Config:
@@ -58,7 +58,7 @@ def checked_config(content: Mapping[str, Any], where: str) -> Config:
 
 
 def _class_of(kind: Any) -> type[Config]:
-    return CalibrationConfig if kind == CALIBRATE else TrainConfig
+    return CalibrationConfig if kind in (CALIBRATE, AUTO) else TrainConfig
 
 
 def _load(path: Path) -> dict[str, Any]:

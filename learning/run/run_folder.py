@@ -16,6 +16,8 @@ from ballfg.machine import versions
 
 CONFIG, VERSIONS, MODEL = "config.yaml", "versions.json", "model.yaml"
 STEPS, REPORT, PICTURE = "checkpoint.json", "report.json", "calibration.png"
+CHOICE = "choice.json"
+"""The comparison of `kind: auto`."""
 CHECKPOINT, METRICS, CURVES, EVENTS = "checkpoint", "metrics.csv", "curves.png", "tensorboard"
 PAGE = "training.html"
 CALIBRATION = (CONFIG, VERSIONS, MODEL, STEPS, REPORT, PICTURE)
@@ -45,7 +47,7 @@ def check(folder: Path, config: Config, *, resume: bool) -> None:
         return
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"out must be a folder; {folder} is a file. Choose another name.")
-    there = [name for name in (*CALIBRATION, *TRAINING) if (folder / name).exists()]
+    there = [name for name in (*CALIBRATION, CHOICE, *TRAINING) if (folder / name).exists()]
     if there:
         raise ValueError(
             f"out must not hold an earlier run; {folder} has {there[0]}. Choose another folder, or continue that run "

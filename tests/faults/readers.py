@@ -110,7 +110,7 @@ def _record(folder: Path, file: Path) -> object:
 def _steps(folder: Path, file: Path) -> object:
     """Steps from which the calibration could go on, and end."""
     problem = posed()
-    steps = read_steps(folder, problem)
+    steps, _ = read_steps(folder, problem)
     return [compare(step.scores, step.scores, step.scores, step.scores) for step in steps]
 
 

@@ -102,7 +102,8 @@ def write_calibration_steps(folder: Path) -> None:
     """The checkpoint of a calibration, whose problem the reader poses too."""
     problem = posed()
     size, scores = len(problem.chosen.names), [None] * len(problem.split.judge)
-    scores[0] = TrackScore(name=problem.split.judge[0], samples=9, rmse=0.02, covered=0.9, prediction_nis=3.1, nis=3.0)
+    judged = {"rmse": 0.02, "covered": 0.9, "prediction_nis": 3.1, "log_score": 2.0, "nis": 3.0}
+    scores[0] = TrackScore(name=problem.split.judge[0], samples=9, **judged)
     first, *others = problem.split.fit
     row = (0.1,) * size
     steps = [

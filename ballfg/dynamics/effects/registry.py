@@ -19,6 +19,19 @@ GENERIC: Final[dict[str, type[Effect]]] = {
 """Sums of terms that a model file may name. They describe without explaining, so searches for causes skip them."""
 
 
+def _own() -> Iterator[type[Effect]]:
+    """The effects of the modules of this folder but the generic ones, by kind, module and place in it."""
+    names = sorted(f"{__package__}.{module.name}" for module in iter_modules(effects.__path__))
+    found = [cls for name in names if name != __name__ for cls in defined_classes(import_module(name), BASES)]
+    kinds = [base.kind for base in BASES]
+    yield from sorted((cls for cls in found if cls not in GENERIC.values()), key=lambda cls: kinds.index(cls.kind))
+
+
+OWN: Final = tuple(_own())
+LEARNED: Final[dict[str, type[Effect]]] = {effect.name: effect for effect in OWN if effect.learned}
+"""Effects that a training writes; searches for causes skip them too."""
+
+
 def _check(effect: type[Effect]) -> None:
     check_effect(effect)
     unknown = sorted(name for name in effect.needs if name not in EFFECTS)
@@ -30,21 +43,14 @@ def _check(effect: type[Effect]) -> None:
 
 
 EFFECTS: Final = Registry[Effect](
-    "effect", group="ballfg.effects", base=BASES, remedy=REMEDY, check=_check, reserved=GENERIC
+    "effect", group="ballfg.effects", base=BASES, remedy=REMEDY, check=_check, reserved={**GENERIC, **LEARNED}
 )
 """Every effect that a search for causes may find, by its name in model files."""
 
 
-def _own() -> Iterator[type[Effect]]:
-    """The effects of the modules of this folder, by kind, module and place in it."""
-    names = sorted(f"{__package__}.{module.name}" for module in iter_modules(effects.__path__))
-    found = [cls for name in names if name != __name__ for cls in defined_classes(import_module(name), BASES)]
-    kinds = [base.kind for base in BASES]
-    yield from sorted((cls for cls in found if cls not in GENERIC.values()), key=lambda cls: kinds.index(cls.kind))
-
-
-for _effect in _own():
-    EFFECTS.register(_effect)
+for _effect in OWN:
+    if not _effect.learned:
+        EFFECTS.register(_effect)
 
 register = EFFECTS.register
 
@@ -54,7 +60,7 @@ def effect_class(name: str, kind: Kind) -> type[Effect]:
 
     Raises: ValueError: if there is no such effect of that kind; the message lists those there are.
     """
-    effect = EFFECTS.get(name) or GENERIC.get(name)
+    effect = EFFECTS.get(name) or GENERIC.get(name) or LEARNED.get(name)
     if effect is None or effect.kind != kind:
         known = ", ".join(n for n, e in EFFECTS.items() if e.kind == kind) or "none"
         own = "One of your own must be registered first: --effects-file FILE.py, or ballfg.dynamics.register"

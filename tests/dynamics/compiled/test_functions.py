@@ -16,13 +16,13 @@ from ballfg.dynamics.compiled.functions import compiled
 from ballfg.dynamics.compiled.kept import cache_folder
 from ballfg.dynamics.compiled.motion import fly_jacobian, fly_through_jacobian, functions_of
 from ballfg.dynamics.effect import Coefficient, FlightEffect
-from ballfg.dynamics.effects.registry import GENERIC
+from ballfg.dynamics.effects.registry import GENERIC, LEARNED
 from ballfg.dynamics.model import substitute
 from ballfg.dynamics.motion.contact import fly_through
 from ballfg.dynamics.motion.integrate import fly
 from ballfg.estimation.segmentation.physics import physics_of
 
-MOTION = {name: effect for name, effect in {**EFFECTS, **GENERIC}.items() if effect.kind != "measurement"}
+MOTION = {name: effect for name, effect in {**EFFECTS, **GENERIC, **LEARNED}.items() if effect.kind != "measurement"}
 
 
 def model_with(*effects):

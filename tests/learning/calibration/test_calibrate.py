@@ -167,8 +167,10 @@ def test_a_track_with_nothing_left_is_not_judged(few_tracks: Path) -> None:
 
 
 def test_a_summary_weighs_tracks_by_their_samples() -> None:
-    few = TrackScore(name="a", samples=10, rmse=0.01, covered=1.0, prediction_nis=2.0, nis=3.0)
-    found = summary([few, TrackScore(name="b", samples=30, rmse=0.03, covered=0.5, prediction_nis=4.0, nis=5.0)])
+    few = TrackScore(name="a", samples=10, rmse=0.01, covered=1.0, prediction_nis=2.0, log_score=2.0, nis=3.0)
+    found = summary(
+        [few, TrackScore(name="b", samples=30, rmse=0.03, covered=0.5, prediction_nis=4.0, log_score=1.0, nis=5.0)]
+    )
     assert found is not None
     assert (found.tracks, found.rmse_median) == (2, 0.02)
     assert found.rmse_pooled == pytest.approx(np.sqrt((10 * 0.01**2 + 30 * 0.03**2) / 40))

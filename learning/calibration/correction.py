@@ -1,0 +1,168 @@
+"""Learns a correction of drag and lift after a calibration: further coefficients of the same population.
+
+The weights of the effect `air_correction` are shared by all tracks; their prior's width is the one of largest evidence.
+The calibrated model and its spins are where the iteration begins.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, cast
+
+import numpy as np
+import torch
+
+from ballfg.arrays import Array
+from ballfg.dynamics import AnalyticModel
+from ballfg.dynamics.effect import Effect
+from ballfg.dynamics.effects.generic import DOUBTS, FUNCTIONS, WEIGHTS, AirCorrection, correction_terms
+from ballfg.estimation import Estimate, Status
+from ballfg.learning.calibration.coefficients import Chosen, choose, values_of
+from ballfg.learning.calibration.groups import GroupSpin
+from ballfg.state import SPIN, VELOCITY
+
+SECTION: Final = f"flight.{AirCorrection.name}"
+DRAG: Final = tuple(f"{SECTION}.{name}" for name in WEIGHTS if name.startswith("drag"))
+"""Names of the weights of drag."""
+ALL: Final = tuple(f"{SECTION}.{name}" for name in WEIGHTS)
+"""With those of lift, which tracks without spin labels cannot tell from another spin."""
+SCALE: Final = "flight.drag.k"
+HELD: Final = 0.1
+"""Prior standard deviation of the mean drag beside a correction, as a share of the usual one."""
+LINEAR: Final = 0.1
+"""Standard deviation of each weight in one track, about the mean at which it is linearised; it is removed again."""
+REACH: Final = (5.0, 95.0)
+"""Percentiles of the speeds and spin ratios of the samples that the functions span."""
+BEYOND: Final = 1.15
+"""Scale of the functions as a multiple of half the span: the kernel's length."""
+LEAST_SPEED: Final = 1.0
+"""m/s. Least scale: over less, the drag law hardly changes."""
+LEAST_RATIO: Final = 0.1
+"""Least scale of the spin ratio."""
+ELSEWHERE: Final = 0.05
+"""Weight of places without data in the choice of the directions whose uncertainty is kept."""
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Where a correction begins.
+
+    Attributes:
+        mean: (p,) of all coefficients, those of the calibration first.
+        spins: of each group, as calibrated.
+        terms: (7, 7) mean product of the functions over the samples.
+    """
+
+    mean: Array
+    spins: tuple[GroupSpin, ...]
+    terms: Array
+
+    def doubts(self, covariance: Array) -> tuple[tuple[float, ...], ...]:
+        """`DOUBTS` directions of the weights, those that move drag and lift most at the samples.
+
+        Args: covariance: (7, 7) of the weights of drag, or (14, 14) with those of lift.
+        """
+        values, vectors = np.linalg.eigh(covariance)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        metric = np.kron(np.eye(len(covariance) // len(FUNCTIONS)), self.terms + ELSEWHERE * np.eye(len(FUNCTIONS)))
+        _, turns = np.linalg.eigh(root.T @ metric @ root)
+        return tuple(tuple(row) for row in (root @ turns[:, ::-1][:, :DOUBTS]).T.tolist())
+
+
+def with_correction(model: AnalyticModel, estimates: Iterable[Estimate]) -> tuple[AnalyticModel, Array]:
+    """A copy of the model with a correction of zero, whose functions span the samples of some estimates.
+
+    Returns: the model, and `Correction.terms`.
+    Raises: ValueError: if the model has a correction or no drag or Magnus force, or no estimate converged.
+    """
+    if AirCorrection.name in model.flight:
+        raise ValueError(f"model must not have {SECTION} yet; got one. Start from the model that it corrects.")
+    found = [estimate for estimate in estimates if estimate.status is Status.OK]
+    if not found:
+        raise ValueError("tracks must have estimates; every one failed. Calibrate without a correction.")
+    states = np.concatenate([estimate.states for estimate in found])
+    speed = np.maximum(np.linalg.norm(states[:, VELOCITY], axis=1), LEAST_SPEED)
+    ratio = model.radius * np.linalg.norm(states[:, SPIN], axis=1) / speed
+    shape: dict[str, float] = {}
+    places = []
+    for name, values, least in (("speed", speed, LEAST_SPEED), ("ratio", ratio, LEAST_RATIO)):
+        low, high = np.percentile(values, REACH)
+        shape |= {name: float(low + high) / 2.0, f"{name}_scale": max(BEYOND * float(high - low) / 2.0, least)}
+        places.append(torch.from_numpy((values - shape[name]) / shape[f"{name}_scale"])[:, None])
+    terms = correction_terms(places[0], places[1]).numpy()
+    effect = AirCorrection(**shape)
+    effect.set_sigmas(**dict.fromkeys(WEIGHTS, LINEAR))
+    effects = [
+        copy.deepcopy(cast(Effect, one))
+        for group in (model.flight, model.bounce, model.measurement)
+        for one in group.values()
+    ]
+    corrected = AnalyticModel([*effects, effect], radius=model.radius, inertia_factor=model.inertia_factor)
+    return corrected, terms.T @ terms / len(terms)
+
+
+def set_doubts(model: AnalyticModel, doubts: Sequence[Sequence[float]]) -> None:
+    """Put the directions of the weights' uncertainty into a model with a correction."""
+    parameters = dict(model.named_parameters())
+    with torch.no_grad():
+        for k, direction in enumerate(doubts, start=1):
+            for name, value in zip(ALL, direction, strict=False):  # those of drag come first
+                parameters[f"{name}_{k}"].fill_(value)
+
+
+def learned_drag(model: AnalyticModel, speed: Array, ratio: Array) -> tuple[Array, Array]:
+    """The relative correction of drag, and its standard deviation.
+
+    Args: model: with a correction.  speed: (n,) m/s.  ratio: (n,) spin ratio, dimensionless.
+    Returns: (n,) each, dimensionless.
+    """
+    values = cast(Effect, model.flight[AirCorrection.name]).values()
+    x, y = (
+        torch.from_numpy((given - values[name]) / values[f"{name}_scale"])[:, None]
+        for name, given in (("speed", speed), ("ratio", ratio))
+    )
+    terms = correction_terms(x, y).numpy()
+    rows = [
+        [values[f"drag_{term}{end}"] for term in FUNCTIONS] for end in ("", *(f"_{k}" for k in range(1, DOUBTS + 1)))
+    ]
+    mean, *doubts = np.array(rows) @ terms.T
+    return mean, np.linalg.norm(doubts, axis=0)
+
+
+def places(model: AnalyticModel) -> tuple[Array, Array]:
+    """Speeds, m/s, and spin ratios to list a correction at: the middle of its samples and both ends of each.
+
+    Args: model: with a correction.
+    Returns: (5,) each.
+    """
+    values = cast(Effect, model.flight[AirCorrection.name]).values()
+    x, y = np.array([0.0, -1.0, 1.0, 0.0, 0.0]) / BEYOND, np.array([0.0, 0.0, 0.0, -1.0, 1.0]) / BEYOND
+    return (
+        np.maximum(values["speed"] + x * values["speed_scale"], 0.0),
+        np.maximum(values["ratio"] + y * values["ratio_scale"], 0.0),
+    )
+
+
+def doubt_sigmas() -> dict[str, float]:
+    """Prior standard deviations of the doubts, by name."""
+    return {f"{SECTION}.doubt_{k}": 1.0 for k in range(1, DOUBTS + 1)}
+
+
+def with_weights(model: AnalyticModel, chosen: Chosen, *, labelled: bool) -> Chosen:
+    """The chosen coefficients, with their priors, and weights of the model's correction.
+
+    Drag is held near its calibrated value: a larger one and a larger correction are the same.
+
+    Args: labelled: True if tracks have spin labels, which tell a larger lift from a larger spin.
+    """
+    shared = ALL if labelled else DRAG
+    further = choose(model, shared)
+    if SCALE in chosen.names:
+        k, start, sigma = chosen.names.index(SCALE), chosen.start.copy(), chosen.sigma.copy()
+        start[k], sigma[k] = values_of(model, [SCALE])[0], HELD * sigma[k]
+        chosen = replace(chosen, start=start, sigma=sigma)
+    pairs = {name: (getattr(chosen, name), getattr(further, name)) for name in ("start", "sigma", "low", "high")}
+    names, units = chosen.names + further.names, chosen.units + further.units
+    return Chosen(names, units, **{name: np.concatenate(pair) for name, pair in pairs.items()}, shared=shared)
