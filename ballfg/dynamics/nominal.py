@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any, Final, cast
+from typing import Final, cast
 
 from ballfg.checks import is_number, shown, type_name
 from ballfg.dynamics.analytic import AnalyticModel
@@ -10,7 +10,6 @@ from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball, nominal_content
 from ballfg.dynamics.model import THIN_SHELL
 from ballfg.dynamics.model_file import model_from_dict
-from ballfg.state import STANDARD_GRAVITY
 from ballfg.tracks import TABLE_TENNIS, Ball
 
 TOLERANCE: Final = 0.15
@@ -32,8 +31,7 @@ def nominal_model(ball: Ball | float | str = TABLE_TENNIS) -> AnalyticModel:
 
     A ball that matches a known one (see `TOLERANCE`) gets its model, with the ball's own radius. For any other ball
     drag and Magnus force follow from radius and mass, the bounce is guessed, and all priors are wide; `nominal_note`
-    says so. Gravity is that of the ball in air (`effective_gravity`). A model file does not hold priors: a guessed
-    model that is saved and loaded has the usual ones.
+    says so. A model file does not hold priors: a guessed model that is saved and loaded has the usual ones.
 
     Args: ball: radius m and mass kg; a number is the radius in m of a table-tennis ball, a text the name of a known
         ball, such as "basketball" (`ballfg balls` lists them).
@@ -82,29 +80,6 @@ def air_coefficients(ball: Ball, drag_coefficient: float = DRAG_COEFFICIENT) -> 
     return drag_coefficient * area_over_mass, area_over_mass * ball.radius / (1 + 2 * SPIN_RATIO)
 
 
-def effective_gravity(ball: Ball) -> float:
-    """Downward acceleration g_eff of a ball in air before drag and lift, m/s^2: its weight over what has to be moved.
-
-    Scales in air show m = m_ball + m_inside - rho V with the air inside, since the displaced air carries rho V, and the
-    net weight is m g. In motion the ball has the inertia m_ball + m_inside + rho V / 2 = m + 3/2 rho V: half of the
-    displaced air moves along (added mass of a sphere). So g_eff = g m / (m + 3/2 rho V), 9.60 m/s^2 for a table-tennis
-    ball. docs/physics.md.
-
-    Source: G. K. Batchelor, An Introduction to Fluid Dynamics, 1967, section 6.4 (added mass of a sphere).
-    """
-    displaced = AIR_DENSITY * 4.0 / 3.0 * math.pi * ball.radius**3
-    return STANDARD_GRAVITY * ball.mass / (ball.mass + 1.5 * displaced)
-
-
-def falling(flight: Mapping[str, Any], ball: Ball) -> dict[str, Any]:
-    """The section `flight` of a model with the ball's effective gravity where gravity is declared without a number.
-
-    Args: flight: effects with their coefficients, as in a model file; `gravity: {g: 9.81}` stays.
-    """
-    stated = flight.get("gravity", False)
-    return dict(flight) if stated not in (None, {}) else {**flight, "gravity": {"g": effective_gravity(ball)}}
-
-
 def known_name(ball: Ball) -> str | None:
     """Name of the known ball that matches; None if there is none."""
 
@@ -119,7 +94,6 @@ def known_name(ball: Ball) -> str | None:
 def _known_model(name: str, radius: float) -> AnalyticModel:
     known = KNOWN_BALLS[name]
     content, where = nominal_content(name), f"{name}.yaml"
-    content = {**content, "flight": falling(content["flight"], known.ball)}
     model = model_from_dict(content, radius=radius, inertia_factor=known.inertia_factor, where=where)
     _set_spread(model, known.spreads)
     return model
@@ -127,7 +101,7 @@ def _known_model(name: str, radius: float) -> AnalyticModel:
 
 def _guessed_model(ball: Ball) -> AnalyticModel:
     drag, magnus = air_coefficients(ball)
-    flight = falling({"gravity": {}, "drag": {"k": drag}, "magnus": {"k": magnus}}, ball)
+    flight = {"gravity": {}, "drag": {"k": drag}, "magnus": {"k": magnus}}
     bounce = {**GUESSED_BOUNCE, "table_height": {}}
     model = model_from_dict({"flight": flight, "bounce": bounce}, radius=ball.radius, where="nominal model")
     _set_spread(model, WIDE)

@@ -10,7 +10,6 @@ from ballfg.dynamics import AnalyticModel, Surfaces, nominal_model
 from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball
 from ballfg.dynamics.model import THIN_SHELL
 from ballfg.dynamics.model_file import model_from_dict
-from ballfg.dynamics.nominal import falling
 from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR, TABLE_LENGTH, TABLE_WIDTH
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.simulation.launcher import LAUNCHERS, TABLE_LAUNCHER, SimulatedLauncher
@@ -85,8 +84,7 @@ def ball_from_mapping(content: Any, default_name: str = "ball") -> BallKind:
     """The ball of a parsed ball file.
 
     Args:
-        content: `radius` (m), `mass` (kg), `flight` and `bounce` as in a model file, where `gravity: {}` is the ball's
-            effective gravity; optional `name`,
+        content: `radius` (m), `mass` (kg), `flight` and `bounce` as in a model file; optional `name`,
             `inertia_factor`, `surface` (`table` or `court`) and `launcher` (fields of `SimulatedLauncher` that differ).
         default_name: the name if the content has none.
     Raises: ValueError, TypeError: a missing or unknown key, or a value out of its bounds.
@@ -102,9 +100,8 @@ def ball_from_mapping(content: Any, default_name: str = "ball") -> BallKind:
         if key not in content:
             raise ValueError(f"key '{key}' is required; got {listed(content)}. Add it.")
     ball = Ball(content["radius"], content["mass"])
-    flight = content["flight"]
     model = model_from_dict(
-        {"flight": falling(flight, ball) if isinstance(flight, Mapping) else flight, "bounce": content["bounce"]},
+        {"flight": content["flight"], "bounce": content["bounce"]},
         radius=ball.radius,
         inertia_factor=check_number("inertia_factor", content.get("inertia_factor", THIN_SHELL)),
         where="ball",

@@ -68,8 +68,6 @@ def _plants() -> Iterator[Plant]:
             continue
         changed = next(c for c in effect.coefficients if c.name in effect.usual.change)
         base = changed.default if changed.sigma == 0.0 or changed.absent is None else changed.absent
-        if changed.sigma == 0.0 and name in nominal.flight:
-            base = float(getattr(nominal.flight[name], changed.name).detach())
         left_out = changed.sigma > 0.0 and (name in nominal.flight or name in nominal.bounce)
         yield Plant(name, tuple(effect.usual.change.items()), base, left_out, effect.imitated, effect.usual.graded)
 

@@ -19,7 +19,7 @@ def test_the_list(capsys: pytest.CaptureFixture[str]) -> None:
     assert header.split()[:5] == ["name", "radius", "mm", "mass", "g"]
     assert [line.split()[0] for line in lines] == list(KNOWN_BALLS)
     (basketball,) = [line.split() for line in lines if line.startswith("basketball")]
-    assert basketball[1:6] == ["121.00", "600.0", "0.0248", "19.7", "0.767"]  # sqrt(9.60 / 0.0248) is 19.7 m/s
+    assert basketball[1:6] == ["121.00", "600.0", "0.0248", "19.9", "0.767"]  # sqrt(9.81 / 0.0248) is 19.9 m/s
 
 
 @pytest.fixture(scope="module")

@@ -8,10 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ballfg.dynamics import nominal_model, save_model
-from ballfg.dynamics.model_file import model_from_dict, model_to_dict
 from ballfg.simulation import SimulationConfig, parse_effects, write_simulation
-from ballfg.simulation.balls import table_tennis, with_model
 from tests.commands import status
 
 CANDIDATES = "topspin=-3..5:2,sidespin=-5..5:5,speed=8..14:2"
@@ -54,14 +51,8 @@ def test_pairs_of_a_diagnosis(launched: Path, tmp_path: Path, capsys: pytest.Cap
 def test_without_a_pair_the_dataset_is_diagnosed_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Shots that fall too slowly: a clock that is wrong, or another g. The plan is that of the pair named by hand."""
     settings, fall = {"sidespin": [0], "speed": [11]}, tuple(parse_effects(["gravity.g=9.6"]))
-    content = model_to_dict(nominal_model())
-    content["flight"]["gravity"]["g"] = 9.81
-    ball = with_model(table_tennis(), model_from_dict(content))
-    shots = SimulationConfig(8, 60.0, seed=4, settings=settings, undeclared=fall, ball=ball)
-    write_simulation(tmp_path / "shots", shots)
-    save_model(ball.model, tmp_path / "declared.yaml")
+    write_simulation(tmp_path / "shots", SimulationConfig(8, 60.0, seed=4, settings=settings, undeclared=fall))
     words = ["design", tmp_path / "shots", "--candidates", "topspin=-3..5:2", "--shots", 2, "--jobs", 1]
-    words += ["--model", tmp_path / "declared.yaml"]
     assert status(*words, "--out", tmp_path / "diagnosed.csv") == 0
     said = capsys.readouterr()
     assert "2 of 5 candidates, for time_scale.s from gravity.g" in said.out

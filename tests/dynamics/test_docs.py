@@ -10,11 +10,9 @@ import torch
 import yaml
 
 from ballfg.dynamics import EFFECTS, AnalyticModel, nominal_model
-from ballfg.dynamics.known_balls import KNOWN_BALLS
 from ballfg.dynamics.model_file import model_from_dict, model_to_dict
 from ballfg.dynamics.motion.integrate import fly
 from ballfg.dynamics.motion.rollout import advance
-from ballfg.dynamics.nominal import effective_gravity
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.simulation import parse_effects
 from ballfg.tracks import TABLE_TENNIS
@@ -89,7 +87,7 @@ def test_nominal_values_in_the_physics_page():
     nominal = {row[0]: row[1] for row in re.findall(r"^\| ([^|]+?) \| ([^|]+?) \|", text, re.MULTILINE)}
     model = nominal_model()
     for start, value in (
-        ("gravity", f"{model.flight['gravity'].g.item():.2f} m/s²"),
+        ("gravity", f"{model.flight['gravity'].g.item():g} m/s²"),
         ("drag", f"{model.flight['drag'].k.item():g} 1/m"),
         ("Magnus", f"{model.flight['magnus'].k.item():g}"),
         ("restitution", f"{model.bounce['restitution'].e.item():g}"),
@@ -103,23 +101,12 @@ def test_nominal_values_in_the_physics_page():
 
 
 def test_the_law_by_spin_in_the_physics_page_loads():
+    """Its gravity is that of the page's formula for a table-tennis ball in air of 1.2 kg/m^3."""
     law, _ = blocks("physics.md", "yaml")
     content = yaml.safe_load(law)
     assert model_to_dict(model_from_dict(content)) == content
-    assert content["flight"]["gravity"]["g"] == pytest.approx(effective_gravity(TABLE_TENNIS), abs=0.005)
-
-
-def test_effective_gravity_in_the_physics_page():
-    """Of every known ball, by the formula of the page, in air of 1.2 kg/m^3."""
-    text = (DOCS / "physics.md").read_text(encoding="utf-8").partition("## Gravity in air")[2].partition("\n## ")[0]
-    table = {
-        name.replace(" ", "_"): float(g) for name, g in re.findall(r"^\| ([a-z ]+) \| ([\d.]+) \|", text, re.MULTILINE)
-    }
-    expected = {
-        name: 9.81 * known.ball.mass / (known.ball.mass + 1.5 * 1.2 * 4 / 3 * torch.pi * known.ball.radius**3)
-        for name, known in KNOWN_BALLS.items()
-    }
-    assert table == pytest.approx(expected, abs=0.005)
+    ball, air = TABLE_TENNIS, 1.2 * 4 / 3 * torch.pi * TABLE_TENNIS.radius**3
+    assert content["flight"]["gravity"]["g"] == pytest.approx(9.81 * ball.mass / (ball.mass + 1.5 * air), abs=0.005)
 
 
 SLOW_AND_FAST = ((6.0, 50.0), (12.0, 100.0))

@@ -71,12 +71,12 @@ def test_optional_sections():
 
 
 def test_nominal_model_is_what_the_effects_say():
-    """Each effect's default, but for the table's height, whose default is `as declared`, and the ball's own gravity."""
+    """The shipped file holds each effect's default, but for the table's height, whose default is `as declared`."""
     for section, effects in model_to_dict(nominal_model()).items():
         for name, values in (effects or {}).items():
             assert EFFECTS[name].kind == section
             for c in EFFECTS[name].coefficients:
-                assert name in ("table_height", "gravity") or values[c.name] == c.default
+                assert name == "table_height" or values[c.name] == c.default
 
 
 def test_missing_file(tmp_path):

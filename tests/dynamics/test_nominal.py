@@ -8,9 +8,8 @@ import pytest
 
 from ballfg.dynamics import AnalyticModel, nominal_model
 from ballfg.dynamics.analytic import coefficient_sigmas
-from ballfg.dynamics.known_balls import KNOWN_BALLS
 from ballfg.dynamics.model_file import model_to_dict
-from ballfg.dynamics.nominal import air_coefficients, effective_gravity, falling, nominal_note
+from ballfg.dynamics.nominal import air_coefficients, nominal_note
 from ballfg.tracks import TABLE_TENNIS, Ball
 from ballfg.tracks.info import TENNIS
 
@@ -25,7 +24,7 @@ def drag(model: AnalyticModel) -> float:
 
 def test_the_table_tennis_ball() -> None:
     expected = {
-        "flight": {"gravity": {"g": effective_gravity(TABLE_TENNIS)}, "drag": {"k": 0.12}, "magnus": {"k": 0.0028}},
+        "flight": {"gravity": {"g": 9.81}, "drag": {"k": 0.12}, "magnus": {"k": 0.0028}},
         "bounce": {
             "restitution": {"e": 0.93},
             "friction": {"mu": 0.25},
@@ -90,30 +89,6 @@ def test_air_coefficients_follow_from_size_and_mass() -> None:
     spin, speed = 150.0, 24.75  # spin ratio 0.2, where the lift law was made linear
     lift = 1.2 * math.pi * ball.radius**2 * speed**2 / (2 * ball.mass) / (2 + speed / (ball.radius * spin))
     assert magnus * spin * speed == pytest.approx(lift, rel=1e-12)
-
-
-@pytest.mark.parametrize("ball", [TABLE_TENNIS, SQUASH, *(known.ball for known in KNOWN_BALLS.values())])
-def test_the_force_on_a_ball_in_air_is_its_inertia_times_the_effective_gravity(ball: Ball) -> None:
-    """Newton's law of the parts: the displaced air carries some of the ball's weight, and half of it moves along."""
-    air, volume = 1.2, 4 / 3 * math.pi * ball.radius**3
-    true_mass = ball.mass + air * volume  # a scale in air shows less than this, by what it displaces
-    force = true_mass * 9.81 - air * volume * 9.81
-    assert effective_gravity(ball) == pytest.approx(force / (true_mass + air * volume / 2), rel=1e-12)
-    assert float(nominal_model(ball).flight["gravity"].g.detach()) == effective_gravity(ball)  # type: ignore[operator]
-
-
-def test_effective_gravity_of_light_and_heavy_balls() -> None:
-    assert effective_gravity(TABLE_TENNIS) == pytest.approx(9.60, abs=0.005)
-    assert effective_gravity(TENNIS) == pytest.approx(9.76, abs=0.005)
-    assert effective_gravity(Ball(0.02, 0.25)) == pytest.approx(9.81, abs=0.003)  # as heavy as steel
-    neutral = 4 / 3 * math.pi * 0.02**3 * 1.2  # weighed as the air that it displaces: inertia 5/2 of that
-    assert effective_gravity(Ball(0.02, neutral)) == pytest.approx(2 / 5 * 9.81, rel=1e-12)
-
-
-def test_a_gravity_that_is_stated_is_meant() -> None:
-    assert falling({"gravity": {"g": 9.81}}, TABLE_TENNIS) == {"gravity": {"g": 9.81}}
-    assert falling({"gravity": None}, TABLE_TENNIS) == {"gravity": {"g": effective_gravity(TABLE_TENNIS)}}
-    assert falling({"drag": {}}, TABLE_TENNIS) == {"drag": {}}
 
 
 def test_balls_that_cannot_be_guessed() -> None:

@@ -9,7 +9,6 @@ from numpy.testing import assert_allclose
 
 import ballfg as bf
 from ballfg.dynamics import Surfaces, nominal_model, rollout
-from ballfg.dynamics.nominal import effective_gravity
 from ballfg.dynamics.surfaces import TABLE_LENGTH, TABLE_WIDTH
 from ballfg.estimation import dataset_surfaces
 from ballfg.estimation.configure import table_note
@@ -39,7 +38,7 @@ def shots(
     low, high = MIDDLE - np.array(size) / 2, MIDDLE + np.array(size) / 2
     aim = rng.uniform(low, np.where(np.isinf(beyond), high, high + np.array(beyond)), (count, 2))
     fall = rng.uniform(0.35, 0.5, count)  # s until it comes down, from 0.35 m above
-    rise = (effective_gravity(TABLE_TENNIS) * fall**2 / 2 - 0.35) / fall
+    rise = (9.81 * fall**2 / 2 - 0.35) / fall
     states = np.zeros((count, 9))
     states[:, 3:5] = rng.normal(0.0, 1.5, (count, 2))
     states[:, :2] = aim - states[:, 3:5] * fall[:, None] * 0.95

@@ -151,6 +151,7 @@ def calls_of_estimates(_folder: Path) -> dict[str, Call]:
         "predict": Call(bf.predict, {"known": track, **options, "horizon": 0.05, "conformal": None}),
         "predict of a dataset": Call(bf.predict, {"known": dataset, **options, **ahead}),
         "diagnose": Call(bf.diagnose, {"measured": "/nonexistent", "model": None, "jobs": 1}),
+        "error_budget": Call(bf.error_budget, {"measured": "/nonexistent", "model": None, "jobs": 1}),
         "Estimate.predict": Call(found.predict, {"horizon": 0.05, "step": 0.01}),
         "Forecast.crossing": Call(found.predict(0.3).crossing, {"x": 1.0}),
         "Settings": Call(bf.Settings, _example(settings)),

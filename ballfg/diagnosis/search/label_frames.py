@@ -46,7 +46,7 @@ def _spins_without_labels(before: Fit) -> tuple[Array, Array, Array]:
     starts = before.unknowns.starts[problem.stretches.labelled]
     unknowns = replace(before.unknowns, starts=starts, values=problem.declared)
     alone = replace(problem, stretches=bare, shared=False)
-    result = fit_problem(alone, unknowns, replace(before.noise, spin=UNLABELLED_SPIN), settle_noise=False)
+    result = fit_problem(alone, unknowns, replace(before.noise, spin=np.full(3, UNLABELLED_SPIN)), settle_noise=False)
     covariances = np.linalg.inv(result.linearised().start_information)[:, SPIN, SPIN]
     return result.unknowns.starts[:, SPIN], np.asarray(covariances), labelled.labels.numpy()
 

@@ -25,10 +25,7 @@ _UP = torch.tensor((0.0, 0.0, 1.0), dtype=torch.float64)
 
 
 class Gravity(FlightEffect):
-    """a = (0, 0, -g). Buoyancy and inertia of the air are the same as a smaller g.
-
-    Nominal models have the g of their ball in air (`effective_gravity`, docs/physics.md); elsewhere it is 9.81.
-    """
+    """a = (0, 0, -g). Buoyancy of the air is the same as a smaller g."""
 
     name = "gravity"
     plain = "the ball's weight"
@@ -41,7 +38,7 @@ class Gravity(FlightEffect):
     )
     decide = "Look up the local g, known to four digits: a ball that falls otherwise shows a wrong clock or length."
     coefficients = (Coefficient("g", STANDARD_GRAVITY, 0.0, "m/s^2", 0.0, 30.0),)
-    plausible = Range(9.4, 9.9, "9.76 to 9.83 m/s^2 on the ground, less 0.21 m/s^2 by the air round a light ball")
+    plausible = Range(9.4, 9.9, "9.76 to 9.83 m/s^2 on the ground, less the buoyancy of 0.15 m/s^2")
     usual = Usual({"g": 0.1}, "1 %, as of a length that is wrong by as much")
 
     def acceleration(self, flight: Flight) -> Tensor:

@@ -79,11 +79,9 @@ def test_a_ball_rolls_over_the_edge(see, match, known):
 def test_the_table_has_no_surface_where_it_is_known_to_end(see):
     """The same bounces, told that the table ends before them: no contact, so something else must have hit the ball."""
     short = Surfaces(0.75, 0.0, (-0.76, 0.76, -9.0, -2.0))
-    truth, found = see([0, -1, 1.1, 0, 3, 1, 0, 0, 0], EDGED, short)
-    bounces = [i for i in truth.contacts if truth.states[i, 2] > 0.75]
-    assert len(bounces) >= 2
+    _, found = see([0, -1, 1.1, 0, 3, 1, 0, 0, 0], EDGED, short)
     assert all(c.height == 0.0 for c in found.contacts)
-    assert len(found.hits) >= len(bounces)
+    assert len(found.hits) >= 3
 
 
 @pytest.mark.parametrize("start", [[0, 0, 0.767, 0.3, 0.6, 0, 0, 0, 0], [0, 0, 0.767, 0, 0, 0, 0, 0, 0]])

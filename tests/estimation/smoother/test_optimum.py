@@ -22,8 +22,7 @@ from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate
 from ballfg.simulation import MotionNoise as TrueNoise
 from ballfg.tracks import Track
 
-DRAG, MAGNUS, E, MU, E_T, OFFSET, RADIUS, SHELL = 0.12, 0.0028, 0.93, 0.25, 0.15, -0.003, 0.02, 2 / 3
-G = 9.81 / (1 + 2 * np.pi * 1.2 * RADIUS**3 / 0.0027)  # a ball of 2.7 g in air of 1.2 kg/m^3
+G, DRAG, MAGNUS, E, MU, E_T, OFFSET, RADIUS, SHELL = 9.81, 0.12, 0.0028, 0.93, 0.25, 0.15, -0.003, 0.02, 2 / 3
 Q_ACCELERATION, Q_SPIN, KICK_VELOCITY, KICK_SPIN = 0.2, 2.0, 0.03, 6.0
 SIGMA, LABEL_SIGMA, VELOCITY_SIGMA, POSITION_SIGMA, WIDE_SPIN = 0.003, 4.0, 20.0, 5.0, 2000.0
 LONGEST_STEP = 0.02
