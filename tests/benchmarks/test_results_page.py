@@ -29,7 +29,7 @@ def test_the_page_is_what_the_command_writes(docs: Path) -> None:
     lines = page.splitlines()
     assert len(lines) <= 300
     for head in (first for first, second in itertools.pairwise(lines) if second.startswith("|---")):
-        assert re.search(r"\brequired\b", head) or "| tracks |" in head or "| size 1 |" in head, head
+        assert re.search(r"\brequired\b", head) or "| tracks |" in head, head
 
 
 def test_rows_of_a_new_run_are_taken_over(docs: Path, tmp_path: Path) -> None:
