@@ -144,7 +144,7 @@ class Likelihood:
         gram, kept = total[:, end:, end:].copy(), np.arange(end, total.shape[-1])
         # its triangle below the eliminated rows is the same whatever these hold; large, they stay definite
         total[:, kept, kept] += 1.0 + total[:, kept, kept]
-        triangle = np.linalg.cholesky(total)
+        triangle = np.asarray(np.linalg.cholesky(total), dtype=np.float64)
         lower, solved = triangle[:, :end, :end], triangle[:, end:, :end]
         narrow = np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)
         return Reduced(logs - narrow - self.penalty, gram - solved @ solved.swapaxes(1, 2)), Local(lower, solved)
