@@ -83,8 +83,8 @@ def visible_columns(recording: Recording, number: int) -> dict[str, Any]:
         radius = focal * recording.config.ball.ball.radius / camera.depth(passage.centres[seen])
         ends = {"": PATH_POINTS // 2, "_open": 0, "_close": -1}
         places = {f"{axis}{end}": pixels[:, place, k] for end, place in ends.items() for k, axis in enumerate("uv")}
-        row: dict[str, NDArray[Any]] = {"frame": frame, "t": frames.stamps[frame], "t_true": frames.times[frame]}
-        whole = inside(camera, pixels, radius[:, None]).all(axis=1).astype(np.int64)
+        row = {"frame": frame, "t": frames.stamps[frame], "t_true": frames.times[frame]}
+        whole = np.asarray(inside(camera, pixels, radius[:, None]).all(axis=1), dtype=np.int64)
         row |= {"trajectory": np.full(len(frame), passage.name), **places, "radius": radius, "whole": whole}
         rows.append(row)
     return {"camera": camera.name} | {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
