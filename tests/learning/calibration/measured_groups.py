@@ -1,7 +1,8 @@
-"""What groups do for the prediction of measured shots: every second shot calibrates, the others are predicted.
+"""What groups and a correction do for predictions of measured shots: every second one calibrates, the others judge.
 
 `python -m tests.learning.calibration.measured_groups FOLDER... [--half 0] [--first N]` observes 0.25 s of each shot,
-predicts 0.3 s, and prints median errors and the share of coordinates in their 90 % intervals, without and with groups.
+predicts 0.3 s, and prints median errors and the share of coordinates in their 90 % intervals: calibrated, with groups,
+with groups and a correction of drag and lift.
 """
 
 from __future__ import annotations
@@ -19,13 +20,22 @@ from ballfg.benchmarks.dynamics.measured import GROUP, measured_task
 from ballfg.dynamics import nominal_model
 from ballfg.estimation import Status, predict_tracks
 from ballfg.estimation.registry import make_estimator
-from ballfg.learning.calibration.calibrate import calibrate, fitted_noise, population_model, population_settings, pose
+from ballfg.learning.calibration.calibrate import (
+    calibrate,
+    fitted_noise,
+    population_model,
+    population_settings,
+    pose,
+    pose_correction,
+)
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import NINETY
 from ballfg.tracks import Track, read_dataset, write_dataset
 
 
-def measure(folder: Path, half: int, first: int | None, groups: str | None) -> tuple[float, float, tuple[float, ...]]:
+def measure(
+    folder: Path, half: int, first: int | None, groups: str | None, correction: bool = False
+) -> tuple[float, float, tuple[float, ...]]:
     """Median RMSE, mm, share of coordinates in their 90 % intervals, %, and the same for each axis."""
     task = measured_task(read_dataset(folder), 1, first)
     parts = (task.train, task.validation) if half == 0 else (task.validation, task.train)
@@ -40,6 +50,9 @@ def measure(folder: Path, half: int, first: int | None, groups: str | None) -> t
         config = CalibrationConfig(split="label", groups=groups)
         problem = pose(read_dataset(Path(written) / "data"), nominal_model(task.info.ball), config)
         *_, last = calibrate(problem)
+        if correction:
+            problem = pose_correction(problem, last)
+            *_, last = calibrate(problem)
         model, settings = population_model(problem, last), population_settings(problem, last)
         noise = fitted_noise(problem, model, settings)
     found = settings if noise is None else noise.settings
@@ -59,7 +72,7 @@ def errors(estimator: object, judged: Sequence[Track]) -> tuple[float, float, tu
 
 
 def main() -> None:
-    """Prints a line for each folder, without and with groups."""
+    """Prints three lines for each folder."""
     torch.set_num_threads(1)
     parser = argparse.ArgumentParser()
     parser.add_argument("folders", nargs="+", type=Path)
@@ -67,11 +80,14 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=None, help="so many first tracks")
     given = parser.parse_args()
     for folder in given.folders:
-        for groups in (None, GROUP):
-            median, held, axes = measure(folder, given.half, given.first, groups)
+        for name, groups, correction in (
+            ("calibrated", None, False),
+            ("with groups", GROUP, False),
+            ("with groups and correction", GROUP, True),
+        ):
+            median, held, axes = measure(folder, given.half, given.first, groups, correction)
             shown = " / ".join(f"{axis:.0f}" for axis in axes)
-            word = "without" if groups is None else "with"
-            print(f"{folder.name}, {word} groups: median {median:.1f} mm, held {held:.0f} % ({shown})", flush=True)
+            print(f"{folder.name}, {name}: median {median:.1f} mm, held {held:.0f} % ({shown})", flush=True)
 
 
 if __name__ == "__main__":
