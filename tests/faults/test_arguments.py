@@ -5,7 +5,15 @@ import pytest
 import ballfg as bf
 from tests.faults.arguments import GROUPS, Call, faults_of
 
-WRONG_BY_PURPOSE = {"read", "load_model", "diagnose", "register", "register_estimator", "register_observation"}
+WRONG_BY_PURPOSE = {
+    "read",
+    "load_model",
+    "diagnose",
+    "error_budget",
+    "register",
+    "register_estimator",
+    "register_observation",
+}
 """Calls whose own arguments are refused too: what they need is files or classes."""
 
 MADE = {"BallState", "Dataset", "Diagnosis", "Estimate", "Status", "TrackGraph"}
