@@ -25,7 +25,7 @@ from ballfg.estimation.measurement.as_measured import (
     written_time,
 )
 from ballfg.estimation.result import Estimate, Status
-from ballfg.estimation.settings import Settings, sample_sigmas
+from ballfg.estimation.settings import WIDEST_PRIOR, Settings, sample_sigmas
 from ballfg.estimation.smoother.smoother import PiecewiseSmoother, Smoother
 from ballfg.factors.batch import FactorBatch
 from ballfg.state import POSITION, STATE_DIM
@@ -77,7 +77,8 @@ class InvertMeasurement(Estimator):
     def __init__(self, kind: type[Estimator], model: BallModel, surfaces: Surfaces | float, settings: Settings) -> None:
         super().__init__(model, surfaces, settings)
         self.labels = LabelMap.of(model)
-        own = replace(settings, spin_label_noise=settings.spin_label_noise / self.labels.gain)
+        # labels that hold almost nothing of the spin say as little as may be
+        own = replace(settings, spin_label_noise=min(settings.spin_label_noise / self.labels.gain, WIDEST_PRIOR))
         plain = plainly_measured(model)
         self.smoother = PiecewiseSmoother(plain, self.surfaces, own)
         self.inner = self.smoother if kind in (Smoother, PiecewiseSmoother) else kind(plain, self.surfaces, own)

@@ -215,3 +215,14 @@ def test_a_label_that_stands_for_a_spin_of_no_ball_is_not_used(plain) -> None:
     np.testing.assert_array_equal(found.states, expected.states)
     assert [note for note in found.notes if "no ball spins" in note]
     assert not [note for note in expected.notes if "no ball spins" in note]
+
+
+def test_labels_that_hold_almost_nothing_of_the_spin_say_nothing(plain) -> None:
+    track = plain[0].track
+    zero = replace(track, labels={**track.labels, "spin_x": 0.0, "spin_y": 0.0, "spin_z": 0.0})
+    bare = replace(track, labels={n: v for n, v in track.labels.items() if n not in SPIN_LABELS})
+    nothing = declared(EFFECTS["spin_label_scale"](s=-0.9999999))
+    found = make_estimator("smoother", nothing, SURFACES, SETTINGS).estimate(zero)
+    wide = make_estimator("smoother", declared(), SURFACES, replace(SETTINGS, spin_prior=1e5)).estimate(bare)
+    sigma = np.sqrt(np.diagonal(wide.covariances, axis1=1, axis2=2))
+    assert (np.abs(found.states - wide.states) < 0.1 * sigma).all()
