@@ -14,7 +14,7 @@ import torch
 
 from ballfg.arrays import Array, Mask
 from ballfg.diagnosis.fit.free import declared_deviations, declared_free
-from ballfg.diagnosis.fit.problem import Fit, Noise, Problem, Robust, Unknowns, launch_axes
+from ballfg.diagnosis.fit.problem import Fit, Noise, Problem, Robust, Unknowns, scatter_axes
 from ballfg.diagnosis.fit.sensitivity import Predicted, predict
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.fit.system import System
@@ -230,8 +230,8 @@ def _spin_scatter(result: Fit) -> Array:
     unlabelled = ~result.problem.stretches.labelled
     if not unlabelled.any():
         return result.noise.spin
-    axes = launch_axes(result.unknowns.starts[unlabelled])
+    axes = scatter_axes(result.unknowns.starts[unlabelled])
     covariance = np.linalg.inv(result.linearised().start_information[unlabelled])[:, SPIN, SPIN]
     about = result.whitened_spins[unlabelled] * result.noise.spin
-    square = about**2 + np.diagonal(axes.swapaxes(1, 2) @ covariance @ axes, axis1=-2, axis2=-1)
+    square = about**2 + np.diagonal(axes @ covariance @ axes.swapaxes(1, 2), axis1=-2, axis2=-1)
     return np.maximum(np.sqrt(square.mean(axis=0)), LEAST_SPIN_SCATTER)

@@ -14,6 +14,7 @@ from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.fit.system import System, by_track
 from ballfg.dynamics import AnalyticModel, Coefficient
 from ballfg.dynamics.networks.spin_embedding import SOFT_SPEED
+from ballfg.dynamics.population import launch_axes as group_axes
 from ballfg.dynamics.variation import Variation
 from ballfg.factors.loss import Loss
 from ballfg.state import SPIN, STATE_DIM, VELOCITY
@@ -178,8 +179,9 @@ class Fit:
     def whitened_spins(self) -> Array:
         """(n, 3) whitened residual of each spin against its label or, without one, along the axes of its launch."""
         stretches, unknowns = self.problem.stretches, self.unknowns
-        local = (launch_axes(unknowns.starts).swapaxes(1, 2) @ unknowns.starts[:, SPIN, None])[..., 0]
-        unlabelled = (stretches.settings @ unknowns.launcher - local) / self.noise.spin
+        mean = (launch_axes(unknowns.starts) @ (stretches.settings @ unknowns.launcher)[..., None])[..., 0]
+        away = scatter_axes(unknowns.starts) @ (mean - unknowns.starts[:, SPIN])[..., None]
+        unlabelled = away[..., 0] / self.noise.spin
         with np.errstate(invalid="ignore"):
             about = (stretches.labels.numpy() - self.predicted.labels) / self.noise.label
         return np.where(stretches.labelled[:, None], about, unlabelled)
@@ -254,15 +256,22 @@ class Fit:
         derivative = self.sensitivity()
         positions, labelled = self.position_rows(derivative.positions), stretches.labelled[:, None, None]
         spins, scale = np.zeros((len(stretches), 3, derivative.labels.shape[-1])), noise.spin[:, None]
-        spins[..., SPIN] = launch_axes(unknowns.starts).swapaxes(1, 2) / scale
+        axes = scatter_axes(unknowns.starts)
+        spins[..., SPIN] = axes / scale
         spins = np.where(labelled, derivative.labels / noise.label, spins) * np.sqrt(self.robust.spins)[:, None, None]
-        towards = -np.eye(3)[:, None] * stretches.settings[:, None, :, None] / scale[:, None]
+        along = (axes @ launch_axes(unknowns.starts))[:, :, None]
+        towards = -along * stretches.settings[:, None, :, None] / scale[:, None]
         by_launcher = np.where(labelled, 0.0, towards.reshape(len(stretches), 3, -1))
         none = np.zeros((*positions.shape[:2], unknowns.launcher.size))
         by_launcher = np.concatenate((none, by_launcher), axis=1)
         rows = np.concatenate((positions, spins), axis=1)
         by_common = np.concatenate((rows[..., STATE_DIM:], by_launcher), axis=-1)
         return System(self.weighted_residual(self.robust), rows[..., :STATE_DIM], by_common)
+
+
+def scatter_axes(starts: Array) -> Array:
+    """(n, 3, 3) rows forward, across and up of launches (n, 9), orthonormal even where a ball starts straight up."""
+    return np.stack([group_axes(velocity) for velocity in starts[:, VELOCITY]])
 
 
 def launch_axes(starts: Array) -> Array:

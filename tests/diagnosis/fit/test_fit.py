@@ -93,6 +93,15 @@ def test_spins_scatter_unequally_along_the_axes_of_the_launch(make_ball, make_la
     assert max(forward, up) < 0.5 * across
 
 
+def test_spins_of_balls_that_are_dropped_are_limited_along_all_axes(make_ball, make_launches, make_shots, make_fit):
+    starts = make_launches(3, 15, spin=0.0)
+    starts[:, 3:5] = 0.0
+    found = make_fit(make_ball(), make_shots(make_ball(), starts, 15, labelled=False).stretches, settle_noise=False)
+    by_spin = found.linearised().by_start[:, -3:, 6:]
+    information = np.trace(by_spin.swapaxes(-1, -2) @ by_spin, axis1=1, axis2=2)
+    np.testing.assert_allclose(information, (found.noise.spin**-2).sum(), rtol=1e-9)
+
+
 def test_spins_that_nobody_labelled_come_out(unlabelled_fit, unlabelled):
     system = unlabelled_fit.linearised()
     covariance = np.linalg.inv(system.by_start.swapaxes(-1, -2) @ system.by_start)[:, 6:, 6:]
