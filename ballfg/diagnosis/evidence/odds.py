@@ -58,15 +58,20 @@ def tempered(model: Weighed, declared: Weighed) -> float:
 
 
 def odds_of(models: Sequence[Weighed], declared: Weighed) -> Odds:
-    """The probabilities of all models, and of the smaller ones that they hold.
+    """The probabilities of all models, of the smaller ones that they hold, and of their neighbours.
 
     A refit without an effect may end in a poorer minimum than the model with it. Where strengths are known to be about
     absent, the linearisation with them holds the model without (J. M. Dickey, 1971), and the better of both counts.
+    Neighbours that no refit weighed count as foretold.
     """
     scores: dict[frozenset[str], float] = {}
+    foretold: dict[frozenset[str], float] = {}
     for model in models:
         score = tempered(model, declared) + model.odds
         smaller = {names: score + other - model.score for names, other in model.nested.items()}
         for names, value in (smaller | {model.names: score}).items():
             scores[names] = max(value, scores.get(names, -np.inf))
+        for names, value in model.neighbours.items():
+            foretold[names] = max(score + value - model.score, foretold.get(names, -np.inf))
+    scores = foretold | scores
     return Odds(dict(zip(scores, special.softmax(list(scores.values())).tolist(), strict=True)))

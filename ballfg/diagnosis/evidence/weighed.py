@@ -53,6 +53,7 @@ class Weighed:
         held_out: (t,) logarithm of the density of each track, with coefficients of the other half.
         nameless: whether it holds patterns without a name as well.
         nested: score of each smaller model, by its names, the rest linearised where it is.
+        neighbours: the same of models with a further effect, or with another one in place of one of its own.
     """
 
     named: tuple[Hypothesis, ...]
@@ -66,6 +67,7 @@ class Weighed:
     held_out: Array
     nameless: bool = False
     nested: Mapping[frozenset[str], float] = field(default_factory=dict)
+    neighbours: Mapping[frozenset[str], float] = field(default_factory=dict)
 
     @property
     def names(self) -> frozenset[str]:
@@ -140,12 +142,12 @@ class Priors:
         """The posterior of all common unknowns."""
         return posterior(reduced, self.precision(widths), self.away)
 
-    def without(self, effects: Sequence[int], reduced: Reduced, widths: Sequence[int]) -> float:
-        """The evidence with the strengths of some effects held where they are absent."""
+    def held(self, effects: Sequence[int], widths: Sequence[int]) -> Array:
+        """(c,) the precision that holds the strengths of some effects where they are absent."""
         precision = self.precision(widths)
         for effect in effects:
             precision[self.places[effect]] = (HELD * self.sizes[effect]) ** -2
-        return posterior(reduced, precision, self.away).evidence
+        return precision
 
 
 def weigh(fit: Fit, named: Sequence[Hypothesis] = (), *, nameless: bool = False) -> Weighed:
@@ -199,7 +201,7 @@ def weighed(
 
 
 @dataclass(frozen=True)
-class _Step:
+class Step:
     """A step of first states (n, 9) and common unknowns (c,) with the logarithm of the density that it should gain.
 
     Patterns are no unknowns of the fit: at its new values they are as free as before.
@@ -209,15 +211,15 @@ class _Step:
     common: Array
     gain: float
 
-    def taken(self, fit: Fit) -> Fit:
-        """The fit after the step; coefficients stay within their bounds."""
+    def taken(self, fit: Fit) -> Unknowns:
+        """The unknowns of a fit after the step; coefficients stay within their bounds."""
         unknowns, free = fit.unknowns, fit.problem.free
         values = {
             name: float(np.clip(unknowns.values[name] + step, c.low, c.high))
             for (name, c), step in zip(free.items(), self.common[: len(free)].tolist(), strict=True)
         }
         launcher = unknowns.launcher + self.common[len(free) :].reshape(-1, 3)
-        return Fit.at(fit.problem, Unknowns(unknowns.starts + self.starts, values, launcher), fit.noise, fit.steps)
+        return Unknowns(unknowns.starts + self.starts, values, launcher)
 
 
 @dataclass(frozen=True)
@@ -229,7 +231,7 @@ class _Question:
     halves: Mask
     nameless: bool
 
-    def at(self, fit: Fit, start: Noise | None, widths: Sequence[int] = ()) -> tuple[Weighed, _Step]:
+    def at(self, fit: Fit, start: Noise | None, widths: Sequence[int] = ()) -> tuple[Weighed, Step]:
         """The model at the unknowns of a fit, and the step to more probable ones.
 
         Args: start, widths: noise, and widths of the patterns after those of the effects, of a similar model.
@@ -262,11 +264,11 @@ class _Question:
             self.nameless,
             self._nested(priors, whole, best, mixed),
         )
-        return found, _Step(likelihood.local_step(noise, result.mean)[:, :STATE_DIM], away, gain)
+        return found, Step(likelihood.local_step(noise, result.mean)[:, :STATE_DIM], away, gain)
 
-    def moved(self, model: Weighed, step: _Step) -> Fit | None:
+    def moved(self, model: Weighed, step: Step) -> Fit | None:
         """The fit after a step; None if the step lowers the evidence at the same noise: it left the linear range."""
-        fit = step.taken(model.fit)
+        fit = Fit.at(model.fit.problem, step.taken(model.fit), model.fit.noise, model.fit.steps)
         better = np.isfinite(fit.cost) and self._evidence(fit, model) > self._evidence(model.fit, model)
         return fit if better else None
 
@@ -293,7 +295,8 @@ class _Question:
                 rest = [h for h in self.named if h not in [effects[place] for place in gone]]
                 if any(effects[place].effect.name in h.effect.needs for place in gone for h in rest):
                     continue
-                evidence = priors.without(gone, whole, widths) + sum(mixed) - sum(mixed[place] for place in gone)
+                alone = posterior(whole, priors.held(gone, widths), priors.away)
+                evidence = alone.evidence + sum(mixed) - sum(mixed[place] for place in gone)
                 names = frozenset(h.name for h in rest) | frozenset([NAMELESS] * self.nameless)
                 found[names] = evidence + choice_odds(rest) + log_odds(rest, self.nameless)
         return found

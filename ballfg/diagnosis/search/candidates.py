@@ -9,7 +9,7 @@ from scipy import stats
 
 from ballfg.arrays import Array
 from ballfg.diagnosis.evidence.rows import Motion, random_motion
-from ballfg.diagnosis.evidence.screen import foretold
+from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.weighed import Weighed
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.problem import Fit, Problem
@@ -24,8 +24,9 @@ ALARM = 0.0025
 effect is named."""
 LEAST_GAIN = 0.0
 """Natural units. Least foretold gain of a candidate that is refitted: with new noise it may gain more."""
-MOST_REFITS = 6
-"""Largest number of refitted hypotheses in a round."""
+MOST_REFITS = 4
+"""Largest number of hypotheses that are refitted alone in a round."""
+PAIR = 2
 FRAME_CHOICE = 2.0 * float(np.log(FRAMES - 1))
 """Cost of a label frame in BIC, for the choice among all frames."""
 
@@ -55,12 +56,18 @@ class Scored:
 class Refit:
     """The refit of a model with a hypothesis at the noise of the previous fit, and the difference of BIC to that.
 
-    A negative difference is better.
+    A negative difference is better. Hypotheses `beside` it were added too.
     """
 
     scored: Scored
     fit: Fit
     delta_bic: float
+    beside: tuple[Hypothesis, ...] = ()
+
+    @property
+    def added(self) -> tuple[Hypothesis, ...]:
+        """All hypotheses in it that the model lacked."""
+        return (*self.beside, self.scored.hypothesis)
 
     @property
     def name(self) -> str:
@@ -68,26 +75,31 @@ class Refit:
         return self.scored.hypothesis.name
 
 
-def score_all(model: Weighed, candidates: Sequence[Hypothesis], motion: Motion | None = None) -> list[Scored]:
+def score_all(model: Weighed, candidates: Sequence[Hypothesis]) -> list[Scored]:
     """Score tests of all hypotheses, and their foretold gains.
 
     Args:
         model: without any of them, as `weigh` gives it.
         candidates: the hypotheses; those without strengths are left out.
-        motion: random columns of the model's fit, if they are known.
     Returns: the tests, sorted by explained residual, invisible hypotheses last.
     """
     testable = [h for h in candidates if h.strengths]
-    if not testable:
-        return []
+    return screened(model, testable, random_motion(model.fit))[0] if testable else []
+
+
+def screened(model: Weighed, testable: Sequence[Hypothesis], motion: Motion) -> tuple[list[Scored], Screen]:
+    """The same of hypotheses with strengths, at least one, and what foretells the gains of sets of them.
+
+    Args: motion: random columns of the model's fit.
+    """
     columns = columns_of(model.fit, testable)
-    gains = foretold(model, random_motion(model.fit) if motion is None else motion, testable, columns)
+    screen = Screen.of(model, motion, testable, columns)
     scores = score_tests(*hypothesis_signatures(model.fit, testable, columns))
     scored = []
-    for hypothesis, score, gain in zip(testable, scores, gains, strict=True):
+    for hypothesis, score, gain in zip(testable, scores, screen.gains, strict=True):
         p_value = 1.0 if score is None else min(1.0, score.p_value * len(testable))
         scored.append(Scored(hypothesis, score, p_value, tested=len(testable), gain=gain))
-    return sorted(scored, key=lambda s: s.explained, reverse=True)
+    return sorted(scored, key=lambda s: s.explained, reverse=True), screen
 
 
 def shortlist(scored: Sequence[Scored]) -> list[Scored]:
@@ -107,6 +119,45 @@ def _opposite(best: Scored, scored: Sequence[Scored]) -> Hypothesis | None:
     estimate = best.score.estimate
     shapes = (s for s in scored if s.score is not None and s.hypothesis.name == best.hypothesis.name)
     return next((s.hypothesis for s in shapes if s.score is not None and s.score.estimate @ estimate < 0.0), None)
+
+
+def leading_sets(screen: Screen, scored: Sequence[Scored], most: int) -> list[tuple[int, ...]]:
+    """The most probable set of up to `most` visible hypotheses, and the most probable pair.
+
+    None that is foretold to be less probable than one hypothesis alone.
+    """
+    seen = {id(s.hypothesis) for s in scored if s.score is not None}
+    visible = [one for one, candidate in enumerate(screen.candidates) if id(candidate) in seen]
+    best, *others = [*screen.sets(visible, most), ()]
+    if len(best) < PAIR:
+        return []
+    alone = next(place for place, chosen in enumerate([*others, ()]) if len(chosen) < PAIR)
+    pairs = [chosen for chosen in others[:alone] if len(chosen) == PAIR]
+    return [best] if len(best) == PAIR else [best, *pairs[:1]]
+
+
+def refit_set(screen: Screen, chosen: Sequence[int], scored: Sequence[Scored]) -> Refit:
+    """The joint fit with several hypotheses, started from the most probable strengths of the linearised model."""
+    before, listed = screen.model.fit, [screen.candidates[one] for one in chosen]
+    problem = before.problem
+    for hypothesis in listed:
+        problem = with_hypothesis(problem, hypothesis)
+    step, strengths = screen.step(chosen)
+    moved, parameters = step.taken(before), dict(problem.model.named_parameters())
+    absent = {name: float(parameters[name]) if name in parameters else 0.0 for h in listed for name in h.free()}
+    names = [name for hypothesis in listed for name in hypothesis.columns]
+    foretold = {
+        name: float(np.clip(absent[name] + strength, problem.free[name].low, problem.free[name].high))
+        for name, strength in zip(names, strengths.tolist(), strict=True)
+    }
+    after = fit_problem(
+        problem, replace(moved, values={**moved.values, **absent, **foretold}), before.noise, settle_noise=False
+    )
+    if not np.isfinite(after.cost):  # too long a step: a flight missed its contact
+        values = {**before.unknowns.values, **absent}
+        after = fit_problem(problem, replace(before.unknowns, values=values), before.noise, settle_noise=False)
+    last = next(s for s in scored if s.hypothesis is listed[-1])
+    return Refit(last, after, delta_bic(before, after), tuple(listed[:-1]))
 
 
 def refit(before: Fit, scored: Scored) -> Refit:

@@ -10,6 +10,7 @@ from ballfg.arrays import Mask
 from ballfg.diagnosis.evidence.nameless import NAMELESS
 from ballfg.diagnosis.evidence.odds import Odds, odds_of
 from ballfg.diagnosis.evidence.rows import random_motion
+from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.weighed import Weighed, weighed
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.holdout import Holdout
@@ -17,7 +18,7 @@ from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, without_effect
 from ballfg.diagnosis.hypotheses.varying import Grouping, groupings
 from ballfg.diagnosis.result import Candidate, Errors, Finding
-from ballfg.diagnosis.search.candidates import Refit, Scored
+from ballfg.diagnosis.search.candidates import Refit, Scored, refit
 from ballfg.diagnosis.search.evaluation import on_all, on_others
 from ballfg.diagnosis.search.process_noise import PredictiveModel
 from ballfg.diagnosis.search.ranking import finding_of, ranking
@@ -62,11 +63,11 @@ class Search:
 
 @dataclass(frozen=True)
 class Round:
-    """Tests and refits of one round, and the name that it added."""
+    """Tests and refits of one round, and the names that it added."""
 
     scored: Sequence[Scored]
     refits: Sequence[Refit]
-    added: str = ""
+    added: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -118,13 +119,13 @@ class SearchLoop:
             fit = fit_problem(problem, replace(whole.unknowns, starts=starts), whole.noise)
             predictive = self.predictive(fit)
             judged = self.judge(predictive.model)
-        rounds = {r.added: r for r in found.rounds}
+        rounds = {name: r for r in found.rounds for name in r.added}
         rests = [found.without([h], final) for h in final.named]
         rests = found.beside_nameless(rests) if final.nameless else rests
-        findings = [
-            finding_of(h, final, rest, odds, rounds.get(h.name, found.rounds[-1]).refits)
-            for h, rest in zip(final.named, rests, strict=True)
-        ]
+        findings = []
+        for h, rest in zip(final.named, rests, strict=True):
+            own = rounds.get(h.name, found.rounds[-1])
+            findings.append(finding_of(h, final, rest, odds, own.scored, own.refits))
         return Search(
             first,
             declared,
@@ -160,42 +161,69 @@ class _Found:
         return odds_of(list(self.models.values()), self.declared)
 
     def round(self) -> bool:
-        """Adds the effect that makes the model most probable, and removes those that it makes superfluous."""
+        """Adds the effects that make the model most probable, and removes those that they make superfluous."""
         loop, best, number = self.loop, self.best, len(self.rounds) + 1
         tell: Callable[[str], None] = lambda line: loop.watch(f"round {number}: {line}")  # noqa: E731
-        scored, refits = try_hypotheses(best, self.motion, loop.catalogue, tell, loop.jobs)
+        most = MOST_EFFECTS - len(best.named)
+        scored, refits, screen = try_hypotheses(best, self.motion, loop.catalogue, tell, loop.jobs, most)
         winner = self._weighed(refits)
+        if screen is not None and (winner is None or winner.score <= best.score):
+            self.best = self.models[best.names] = replace(best, neighbours=screen.neighbours())
+            if self._exchanged(screen, scored, tell):
+                self.rounds.append(Round(scored, refits, (self.best.named[-1].name,)))
+                return True
         if winner is None or winner.score <= best.score:
             ways = loop.ways or partial(groupings, loop.holdout.tracks)
             more, fitted = try_varying(best, self.motion, loop.of_some or loop.catalogue, ways, tell, loop.jobs)
             scored, refits = [*scored, *more], [*refits, *fitted]
             winner = max((w for w in (winner, self._weighed(fitted)) if w is not None), key=_score, default=None)
         added = winner is not None and winner.score > best.score
-        self.rounds.append(Round(scored, refits, winner.named[-1].name if winner and added else ""))
+        names = tuple(h.name for h in winner.named[len(best.named) :]) if winner is not None and added else ()
+        self.rounds.append(Round(scored, refits, names))
         if winner is None or not added:
             tell("nothing makes the model more probable")
             return False
-        tell(f"{winner.named[-1].name} added")
+        tell(f"{' and '.join(names)} added")
         self.best = winner
         self.motion = random_motion(winner.fit, self.scattering)
         self._better_minimum(best, winner)
         self._pruned()
         return True
 
+    def _exchanged(self, screen: Screen, scored: Sequence[Scored], tell: Callable[[str], None]) -> bool:
+        """Puts another effect in the place of one, if that is foretold and found to be more probable."""
+        foretold, best = screen.exchanges, self.best
+        (gone, one), score = max(foretold.items(), key=lambda item: item[1], default=(("", 0), -np.inf))
+        other = screen.candidates[one]
+        if score <= best.score or best.names - {gone} | {other.name} in self.models:
+            return False
+        tell(f"fitting with {other.name} in place of {gone}")
+        own = next(h for h in best.named if h.name == gone)
+        candidate = next(s for s in scored if s.hypothesis is other)
+        fit = refit(without_named(best.fit, own, self.first), candidate).fit
+        named = (*(h for h in best.named if h is not own), other)
+        found = weighed(fit, named, self.motion, self.halves, best.noise)
+        self.models[found.names] = found
+        if found.score <= best.score:
+            return False
+        tell(f"{other.name} in place of {gone}")
+        self.best, self.motion = found, random_motion(found.fit, self.scattering)
+        return True
+
     def compare(self) -> None:
-        """Weighs the best model without each of its effects, and what is left of it beside something nameless."""
-        for hypothesis in self.best.named:
-            self.without([hypothesis])
+        """Weighs what is left of the best model beside something nameless, without effects that this makes superfluous.
+
+        The linearised model says which effects are, and a refit confirms it.
+        """
         self.loop.watch("weighing what has no name")
         self.beside_nameless([self.declared])
         (best,) = self.beside_nameless([self.best])
-        while best.named:
-            shorter = self.beside_nameless([self.without([h], best) for h in best.named])
-            gone = [h for h, model in zip(best.named, shorter, strict=True) if model.score > best.score]
-            if not gone:
+        while gone := [h for h in best.named if best.nested.get(best.names - {h.name}, -np.inf) > best.score]:
+            tried = [self.without([h], best) for h in gone] + [self.without(gone, best)] * (len(gone) > 1)
+            shorter = max(self.beside_nameless(tried), key=_score)
+            if shorter.score <= best.score:
                 break
-            shorter += self.beside_nameless([self.without(gone, best)])
-            best = max(shorter, key=_score)
+            best = shorter
         self.best = max(self.best, best, key=_score)
 
     def named_at(self, probability: float) -> Weighed:
@@ -235,7 +263,7 @@ class _Found:
         """The most probable of some refits; None without any."""
         best = self.best
         tasks = [
-            partial(weighed, r.fit, (*best.named, r.scored.hypothesis), self.motion, self.halves, best.noise)
+            partial(weighed, r.fit, (*best.named, *r.added), self.motion, self.halves, best.noise)
             for r in refits
             if np.isfinite(r.fit.cost)
         ]
@@ -246,22 +274,29 @@ class _Found:
         return max(found, key=_score, default=None)
 
     def _better_minimum(self, before: Weighed, after: Weighed) -> None:
-        """Weighs the earlier model again from the later one's fit: an effect may have led out of a poor minimum."""
-        fit = without_named(after.fit, after.named[-1], self.first)
-        again = weighed(fit, before.named, self.motion, self.halves, before.noise)
-        if again.score > before.score:
-            self.models[before.names] = again
-            if again.score > after.score:
-                self.best = again
+        """Weighs the earlier model again from the later one's fit: effects may have led out of a poor minimum.
+
+        Only if the later one's linearisation says that they have.
+        """
+        if after.nested.get(before.names, -np.inf) > before.score:
+            fit = after.fit
+            for hypothesis in after.named[len(before.named) :]:
+                fit = without_named(fit, hypothesis, self.first)
+            again = weighed(fit, before.named, self.motion, self.halves, before.noise)
+            if again.score > before.score:
+                self.models[before.names] = again
+                if again.score > after.score:
+                    self.best = again
         if not before.named:
             self.declared = self.models[before.names]
 
     def _pruned(self) -> None:
-        """Removes effects that a later one made superfluous."""
+        """Removes effects that later ones made superfluous, as the linearisation says and a refit confirms."""
         better = True
         while better:
-            shorter = [self.without([h]) for h in self.best.named[:-1]]
-            least = max(shorter, key=_score, default=self.best)
+            nested = self.best.nested
+            gone = [h for h in self.best.named if nested.get(self.best.names - {h.name}, -np.inf) > self.best.score]
+            least = max((self.without([h]) for h in gone), key=_score, default=self.best)
             better = least.score > self.best.score
             self.best = least if better else self.best
 

@@ -20,14 +20,19 @@ ALIKE: Final = 0.05
 
 
 def finding_of(
-    hypothesis: Hypothesis, model: Weighed, without: Weighed, odds: Odds, refits: Sequence[Refit]
+    hypothesis: Hypothesis,
+    model: Weighed,
+    without: Weighed,
+    odds: Odds,
+    scored: Sequence[Scored],
+    refits: Sequence[Refit],
 ) -> Finding:
     """A named effect with its evidence.
 
     Args:
         model, without: the most probable model, and the same without the effect.
         odds: of all models.
-        refits: of the round that added it.
+        scored, refits: of the round that added it.
     """
     values = fitted_values(model.fit, hypothesis)
     if hypothesis.name in model.strengths and not hypothesis.deviations():
@@ -35,7 +40,8 @@ def finding_of(
         values |= {n: replace(values[n], sigma=s) for n, s in zip(hypothesis.strengths, sigmas, strict=True)}
     gains = model.held_out - without.held_out
     error = gains.std(ddof=1) / np.sqrt(len(gains))
-    own = next((r for r in refits if r.name == hypothesis.name), None)
+    named = [r for r in refits if hypothesis.name in [h.name for h in r.added]]
+    own = min(named, key=lambda r: len(r.added), default=None)
     rest = model.names - {hypothesis.name}
     likely = odds.models[model.names] * ALIKE
     others = [names for names, p in odds.models.items() if p > likely and rest < names and hypothesis.name not in names]
@@ -46,7 +52,7 @@ def finding_of(
         sentence=hypothesis.sentence,
         decide=hypothesis.decide,
         parameters=values,
-        p_value=1.0 if own is None else own.scored.p_value,
+        p_value=_by_chance(hypothesis, model.evidence - without.evidence, scored),
         delta_bic=0.0 if own is None else own.delta_bic,
         indistinguishable_from=(*TWINS.get(hypothesis.name, ()), *alike),
         held_out_gain=float(gains.mean()),
@@ -55,6 +61,19 @@ def finding_of(
         evidence=model.evidence - without.evidence,
         usual=unusual(hypothesis, values),
     )
+
+
+def _by_chance(hypothesis: Hypothesis, evidence: float, scored: Sequence[Scored]) -> float:
+    """The probability of a trace so strong by chance, as its score test says.
+
+    If other effects hide it from the test, its gain beside them counts as a likelihood ratio, which the evidence never
+    exceeds.
+    """
+    own = next((s for s in scored if s.hypothesis.name == hypothesis.name), None)
+    if own is None:
+        return 1.0
+    ratio = float(stats.chi2.sf(2.0 * max(evidence, 0.0), max(len(hypothesis.strengths), 1)))
+    return min(own.p_value, ratio * own.tested)
 
 
 def unusual(hypothesis: Hypothesis, values: Mapping[str, Value]) -> str:
@@ -76,10 +95,12 @@ def fitted_values(fit: Fit, hypothesis: Hypothesis) -> dict[str, Value]:
     return hypothesis.reported(fit, {names[name]: value for name, value in values.items()})
 
 
-def ranking(scored: Sequence[Scored], refits: Sequence[Refit], added: str, odds: Odds) -> tuple[Candidate, ...]:
+def ranking(
+    scored: Sequence[Scored], refits: Sequence[Refit], added: Sequence[str], odds: Odds
+) -> tuple[Candidate, ...]:
     """One row per effect in its best shape, sorted by explained residual."""
-    outcomes = {added: Outcome.ADDED}
-    refitted = {r.name: r.delta_bic for r in refits}
+    outcomes = dict.fromkeys(added, Outcome.ADDED)
+    refitted = {r.name: r.delta_bic for r in refits if not r.beside}
     best: dict[str, Scored] = {}
     for candidate in scored:
         best.setdefault(candidate.hypothesis.name, candidate)

@@ -6,6 +6,7 @@ from functools import partial
 from typing import cast
 
 from ballfg.diagnosis.evidence.rows import Motion
+from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.weighed import Weighed
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import has_effect, hypotheses, scene_of
@@ -14,10 +15,12 @@ from ballfg.diagnosis.search.candidates import (
     ALARM,
     Refit,
     Scored,
+    leading_sets,
     refit,
     refit_driven,
+    refit_set,
     refit_usual,
-    score_all,
+    screened,
     shortlist,
 )
 from ballfg.diagnosis.search.label_frames import frame_hypotheses
@@ -55,7 +58,7 @@ def try_varying(
     known = ways(searched)
     listed = varying_hypotheses(problem.model, scene_of(before), catalogue, problem.free, known)
     tell(f"testing {len(listed)} ways in which tracks may differ")
-    scored = score_all(model, listed, motion)
+    scored = screened(model, listed, motion)[0] if listed else []
     names = sorted({name for way in known for level in way.weights.values() for name in level}, key=place_of)
     refits = []
     for candidate in shortlist(scored):
@@ -86,7 +89,7 @@ def _placed(model: Weighed, motion: Motion, closer: Sequence[Varying]) -> Scored
     place is chosen, since one new table changes several coefficients; else the middle of them.
     """
     known = {deviation.level for deviation in model.fit.problem.deviations.values()}
-    scored = {id(s.hypothesis): s for s in score_all(model, closer, motion)}
+    scored = {id(s.hypothesis): s for s in screened(model, closer, motion)[0]}
     most = max(s.explained for s in scored.values())
     good = [scored[id(h)] for h in closer if scored[id(h)].explained >= AS_GOOD * most]
     named = [s for h, s in ((cast(Varying, s.hypothesis), s) for s in good) if known & set(h.grouping.weights)]
@@ -99,8 +102,11 @@ def try_hypotheses(
     catalogue: Sequence[type[Effect]],
     tell: Callable[[str], None],
     jobs: int = 1,
-) -> tuple[list[Scored], list[Refit]]:
-    """Scores all hypotheses, sorted by explained residual, and refits the best.
+    most: int = 1,
+) -> tuple[list[Scored], list[Refit], Screen | None]:
+    """Scores all hypotheses, sorted by explained residual, and refits the best, and the best sets of several.
+
+    The screen foretells what it did not refit; None without hypotheses.
 
     Args:
         weighed: the model without any of them.
@@ -108,6 +114,7 @@ def try_hypotheses(
         catalogue: candidate effects.
         tell: called with progress.
         jobs: processes.
+        most: largest number of effects in a set.
     """
     before, model = weighed.fit, weighed.fit.problem.model
     listed = hypotheses(model, scene_of(before), catalogue)
@@ -115,12 +122,18 @@ def try_hypotheses(
     tell(f"testing {len(candidates)} hypotheses")
     unlabelled = before.problem.stretches.labelled.mean() < LABELLED
     driven = [h for h in candidates if h.effect.multiplies_spin and unlabelled]
-    scored = score_all(weighed, [h for h in candidates if h not in driven], motion)
-    leading = shortlist(scored)
-    called = {candidate.hypothesis.name for candidate in leading}
+    testable = [h for h in candidates if h not in driven and h.strengths]
+    scored, tasks, screen = list[Scored](), list[Callable[[], Refit]](), None
+    if testable:
+        scored, screen = screened(weighed, testable, motion)
+        leading = shortlist(scored)
+        tasks = _refits(before, leading, tell)
+        for chosen in leading_sets(screen, scored, most):
+            tell(f"fitting with {' and '.join(screen.candidates[one].name for one in chosen)}")
+            tasks.append(partial(refit_set, screen, chosen, scored))
+    called = {s.hypothesis.name for s in shortlist(scored)}
     usual = {h.name: h for h in (s.hypothesis for s in scored) if h.usual and h.name not in called}
     usual = {name: h for name, h in usual.items() if not has_effect(model, name)}
-    tasks = _refits(before, leading, tell)
     for name in usual:
         tell(f"fitting with {name}, which balls usually have")
     for hypothesis in driven:
@@ -132,4 +145,4 @@ def try_hypotheses(
     scored = [telling.get(s.hypothesis.name, s) for s in scored]
     scored += [r.scored for r in refits if r.name in {h.name for h in driven}]
     ranked = sorted(scored, key=lambda s: s.explained, reverse=True)
-    return ranked, sorted(refits, key=lambda r: r.delta_bic)
+    return ranked, sorted(refits, key=lambda r: r.delta_bic), screen
