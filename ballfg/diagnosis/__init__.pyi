@@ -8,7 +8,6 @@ from .hypotheses.hypothesis import scene_of as scene_of
 from .joint import JointDiagnosis as JointDiagnosis
 from .joint import diagnose_jointly as diagnose_jointly
 from .report.report import write_report as write_report
-from .residual_tests.fallback import learned_residual as learned_residual
 from .residual_tests.generic import generic_tests as generic_tests
 from .residual_tests.label_check import check_labels as check_labels
 from .residual_tests.residuals import residuals_of as residuals_of

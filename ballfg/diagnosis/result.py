@@ -149,7 +149,7 @@ class Errors:
 
 @dataclass(frozen=True)
 class Fallback:
-    """A description of the remaining pattern without a name, `sparse terms` or `learned residual`, in words.
+    """A description of the remaining pattern without a name, in words; its kind is `sparse terms`.
 
     Attributes:
         before, after: errors on the held-out half without and with it, named effects in both.

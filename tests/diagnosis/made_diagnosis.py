@@ -212,7 +212,7 @@ def silent() -> Diagnosis:
 
 
 def unexplained() -> Diagnosis:
-    """Something is there that has no name; a learned residual explains most of it."""
+    """Something is there that has no name; generic terms explain most of it."""
     from ballfg.diagnosis.result import Fallback
 
     tests = (GenericTest("flight", "along the flight, grows with time since launch, 0.3 m/s²", 2e-40, 0.8),)

@@ -11,7 +11,7 @@ from ballfg.diagnosis.evidence.nameless import NAMELESS
 from ballfg.diagnosis.evidence.odds import odds_of, tempered
 from ballfg.diagnosis.evidence.prior import THERE, WIDTHS, choice_odds, log_odds, scales
 from ballfg.diagnosis.evidence.rows import random_motion
-from ballfg.diagnosis.evidence.screen import foretold
+from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.weighed import weigh
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.hypotheses.signatures import columns_of
@@ -52,7 +52,13 @@ def model(names, evidence, held_out=None):
     gains = np.full(10, evidence / 10.0) if held_out is None else np.asarray(held_out)
     odds = log_odds(named)
     return SimpleNamespace(
-        names=frozenset(names), nested={}, evidence=evidence, odds=odds, score=evidence + odds, held_out=gains
+        names=frozenset(names),
+        nested={},
+        neighbours={},
+        evidence=evidence,
+        odds=odds,
+        score=evidence + odds,
+        held_out=gains,
     )
 
 
@@ -101,6 +107,17 @@ def test_an_effect_whose_strength_is_nothing_is_not_believed():
     assert odds.of("wind") > 0.99
 
 
+def test_neighbours_that_no_refit_weighed_count_as_foretold():
+    nothing, wind, tilt = model([], 0.0), model(["wind"], 20.0), model(["frame_tilt"], 5.0)
+    alone = odds_of([nothing, wind, tilt], nothing)
+    wind.neighbours = {frozenset(["frame_tilt"]): 40.0, frozenset(["drag_spin"]): wind.score}
+    odds = odds_of([nothing, wind, tilt], nothing)
+    assert alone.of("wind") > 0.99
+    assert odds.of("wind") == pytest.approx(0.5, abs=0.01)
+    assert odds.of("drag_spin") == pytest.approx(0.5, abs=0.01)
+    assert odds.of("frame_tilt") < 0.01
+
+
 def test_the_evidence_without_an_effect_is_that_of_its_columns_left_out(calm, calm_with_wind, windy_with_wind):
     """On a calm day that of the declared model; in wind far below that of the model with wind."""
     assert calm_with_wind.nested[frozenset()] == pytest.approx(calm.score, abs=1.0)
@@ -115,7 +132,7 @@ def test_a_choice_among_shapes_is_paid_for():
 
 def test_what_is_foretold_is_what_a_refit_gains(windy_fit, windy_declared, windy_with_wind):
     before, after = windy_declared, windy_with_wind
-    (gain,) = foretold(before, random_motion(windy_fit), [WIND], columns_of(windy_fit, [WIND]))
+    (gain,) = Screen.of(before, random_motion(windy_fit), [WIND], columns_of(windy_fit, [WIND])).gains
     assert gain > 20.0
     assert after.evidence - before.evidence > 0.8 * gain  # with noise of its own it gains more
     strengths = after.strengths["wind"]
@@ -153,6 +170,6 @@ def test_a_name_that_explains_a_part_is_not_believed_beside_patterns(make_ball, 
 
 
 def test_an_effect_that_is_not_there_costs_its_prior(calm_fit, calm, calm_with_wind):
-    (gain,) = foretold(calm, random_motion(calm_fit), [WIND], columns_of(calm_fit, [WIND]))
+    (gain,) = Screen.of(calm, random_motion(calm_fit), [WIND], columns_of(calm_fit, [WIND])).gains
     assert gain < 1.0
     assert calm_with_wind.evidence - calm.evidence == pytest.approx(gain, abs=1.0)

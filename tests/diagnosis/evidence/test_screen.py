@@ -1,0 +1,85 @@
+"""Sets of effects that one linearisation foretells, against refits of the same sets."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ballfg.diagnosis.evidence.rows import random_motion
+from ballfg.diagnosis.evidence.screen import Screen
+from ballfg.diagnosis.evidence.weighed import weigh
+from ballfg.diagnosis.hypotheses.hypothesis import hypotheses, scene_of
+from ballfg.diagnosis.hypotheses.signatures import columns_of
+from ballfg.diagnosis.search.candidates import Scored, leading_sets, refit, refit_set, score_all, screened
+from ballfg.dynamics import EFFECTS
+
+CATALOGUE = [EFFECTS[name] for name in ("wind", "drag_speed", "restitution_speed", "frame_tilt")]
+
+
+@pytest.fixture(scope="module")
+def declared(make_ball, make_launches, make_shots, make_fit):
+    """Shots through a wind onto a table whose restitution falls with the speed; the model has neither."""
+    true = make_ball(wind={"x": 0.5, "y": -0.3}, restitution_speed={"slope": 0.03, "reference": 2.5})
+    return weigh(make_fit(make_ball(), make_shots(true, make_launches(16, 6), 6, rate=40.0).stretches))
+
+
+@pytest.fixture(scope="module")
+def screen(declared):
+    fit = declared.fit
+    listed = [h for h in hypotheses(fit.problem.model, scene_of(fit), CATALOGUE) if h.strengths]
+    listed = [h for h in listed if not set(h.columns) & set(fit.problem.free)]
+    return screened(declared, listed, random_motion(fit))
+
+
+def names(screen, chosen):
+    return {screen.candidates[one].name for one in chosen}
+
+
+def test_two_effects_are_found_in_one_round(screen):
+    scored, found = screen
+    best, *_ = leading_sets(found, scored, 3)
+    assert names(found, best) >= {"wind", "restitution_speed"}
+    assert found.odds(best) > max(found.odds((one,)) for one in best)
+
+
+def test_a_set_is_refitted_to_what_was_foretold(screen, declared):
+    scored, found = screen
+    pair = next(
+        c for c in found.sets(range(len(found.candidates)), 2) if names(found, c) == {"wind", "restitution_speed"}
+    )
+    made = refit_set(found, pair, scored)
+    together = weigh(made.fit, made.added)
+    assert together.score - declared.score > 0.8 * found.odds(pair)
+    for hypothesis in made.added:
+        strengths = together.strengths[hypothesis.name]
+        true = {"wind": [0.5, -0.3, 0.0], "restitution_speed": [0.03]}[hypothesis.name]
+        assert (np.abs(strengths.mean - true) < 4.0 * np.sqrt(np.diagonal(strengths.covariance))).all()
+
+
+def test_one_candidate_is_foretold_as_its_score_test_says(screen):
+    scored, found = screen
+    by_test = {id(s.hypothesis): s.gain for s in scored}
+    assert found.gains == [by_test[id(candidate)] for candidate in found.candidates]
+
+
+def test_the_right_effect_in_place_of_a_wrong_one_is_foretold(make_ball, make_launches, make_shots, make_fit):
+    """Wind seen by a model that has taken a tilted frame for it."""
+    true = make_ball(wind={"x": 0.5, "y": -0.3})
+    fit = make_fit(make_ball(), make_shots(true, make_launches(16, 7), 7, rate=40.0).stretches)
+    wind, tilt = (
+        next(h for h in hypotheses(fit.problem.model, scene_of(fit), [EFFECTS[n]])) for n in ("wind", "frame_tilt")
+    )
+    windy = weigh(refit(fit, Scored(wind, None, 0.0)).fit, [wind])
+    wrong = weigh(refit(fit, Scored(tilt, None, 0.0)).fit, [tilt])
+    found = Screen.of(wrong, random_motion(wrong.fit), [wind], columns_of(wrong.fit, [wind]))
+    foretold = found.exchanges["frame_tilt", 0]
+    assert wrong.score < foretold < windy.score + 1.0  # at the wrong model's noise, which is the larger
+    assert found.neighbours()[frozenset(["wind"])] == foretold
+
+
+def test_no_set_without_anything_to_gain(make_ball, make_launches, make_shots, make_fit):
+    fit = make_fit(make_ball(), make_shots(make_ball(), make_launches(16, 8), 8, rate=40.0).stretches)
+    listed = [h for h in hypotheses(fit.problem.model, scene_of(fit), CATALOGUE) if h.strengths]
+    scored, found = screened(weigh(fit), listed, random_motion(fit))
+    assert leading_sets(found, scored, 4) == []
+    assert [s.hypothesis for s in scored] == [s.hypothesis for s in score_all(weigh(fit), listed)]
