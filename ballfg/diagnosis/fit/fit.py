@@ -88,7 +88,9 @@ def first_guess(problem: Problem, label_noise: float, spin_prior: float) -> tupl
     return unknowns, Noise(label=label_noise, spin=np.full(3, spin_prior))
 
 
-def fit_problem(problem: Problem, unknowns: Unknowns, noise: Noise, *, settle_noise: bool = True) -> Fit:
+def fit_problem(
+    problem: Problem, unknowns: Unknowns, noise: Noise, *, settle_noise: bool = True, steps: int = MOST_STEPS
+) -> Fit:
     """Minimises over all unknowns, and estimates the scale of the noise in turns.
 
     Args:
@@ -97,8 +99,9 @@ def fit_problem(problem: Problem, unknowns: Unknowns, noise: Noise, *, settle_no
             is the first guess itself, with infinite cost.
         noise: scales to start from; constant unless `settle_noise`.
         settle_noise: True to estimate the scale of the noise.
+        steps: largest number of Gauss-Newton steps.
     """
-    result = _minimise(Fit.at(problem, unknowns, noise))
+    result = _minimise(Fit.at(problem, unknowns, noise), steps)
     for _ in range(SCALE_ROUNDS if settle_noise else 0):
         before, noise = result.noise, _settled(result)
         result = _minimise(Fit.at(result.problem, result.unknowns, noise, result.steps))
@@ -132,9 +135,9 @@ def covariance_of(fit: Fit, names: Sequence[str]) -> Array:
     return np.asarray(np.linalg.inv(total)[np.ix_(chosen, chosen)])
 
 
-def _minimise(now: Fit) -> Fit:
+def _minimise(now: Fit, steps: int = MOST_STEPS) -> Fit:
     damping = FIRST_DAMPING
-    for _ in range(MOST_STEPS if np.isfinite(now.cost) else 0):
+    for _ in range(steps if np.isfinite(now.cost) else 0):
         stretches, found = now.problem.stretches, torch.from_numpy(now.predicted.contacts)
         guesses = torch.where(found.isnan(), stretches.contacts, found)
         problem = replace(now.problem, stretches=replace(stretches, contacts=guesses))

@@ -11,7 +11,7 @@ from ballfg.arrays import Array
 from ballfg.diagnosis.evidence.rows import Motion, random_motion
 from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.weighed import Weighed
-from ballfg.diagnosis.fit.fit import fit_problem
+from ballfg.diagnosis.fit.fit import MOST_STEPS, fit_problem
 from ballfg.diagnosis.fit.problem import Fit, Problem
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, with_effects
 from ballfg.diagnosis.hypotheses.signatures import columns_of, hypothesis_signatures
@@ -26,6 +26,8 @@ LEAST_GAIN = 0.0
 """Natural units. Least foretold gain of a candidate that is refitted: with new noise it may gain more."""
 MOST_REFITS = 4
 """Largest number of hypotheses that are refitted alone in a round."""
+MOST_SHAPES, FIRST_STEPS = 6, 4
+"""Largest number of shapes of a hypothesis that are refitted, and of the steps after which the lowest goes on alone."""
 PAIR = 2
 FRAME_CHOICE = 2.0 * float(np.log(FRAMES - 1))
 """Cost of a label frame in BIC, for the choice among all frames."""
@@ -35,14 +37,14 @@ FRAME_CHOICE = 2.0 * float(np.log(FRAMES - 1))
 class Scored:
     """A hypothesis and the outcome of its score test, corrected for the number of hypotheses; None: not visible.
 
-    `opposite` is the best shape with the opposite sign of its effect, a possibly better minimum.
+    `shapes` are the next best shapes of the effect: other places, other signs, possibly better minima.
     `tested` is the number of hypotheses, `gain` the foretold logarithm of the ratio of evidences.
     """
 
     hypothesis: Hypothesis
     score: Score | None
     p_value: float
-    opposite: Hypothesis | None = None
+    shapes: tuple[Hypothesis, ...] = ()
     tested: int = 1
     gain: float = -np.inf
 
@@ -103,22 +105,13 @@ def screened(model: Weighed, testable: Sequence[Hypothesis], motion: Motion) -> 
 
 
 def shortlist(scored: Sequence[Scored]) -> list[Scored]:
-    """The hypotheses to refit: the best shape of each effect that may gain."""
-    best: dict[str, Scored] = {}
+    """The hypotheses to refit: the best shapes of each effect that may gain."""
+    found: dict[str, list[Scored]] = {}
     for candidate in sorted(scored, key=lambda s: s.gain, reverse=True):
         if candidate.score is not None and candidate.gain > LEAST_GAIN:
-            best.setdefault(candidate.hypothesis.name, candidate)
-    listed = list(best.values())[:MOST_REFITS]
-    return [replace(s, opposite=_opposite(s, scored)) for s in listed]
-
-
-def _opposite(best: Scored, scored: Sequence[Scored]) -> Hypothesis | None:
-    """For an effect with one strength, the shape of the other sign that explains most."""
-    if best.score is None or len(best.score.estimate) != 1:
-        return None
-    estimate = best.score.estimate
-    shapes = (s for s in scored if s.score is not None and s.hypothesis.name == best.hypothesis.name)
-    return next((s.hypothesis for s in shapes if s.score is not None and s.score.estimate @ estimate < 0.0), None)
+            found.setdefault(candidate.hypothesis.name, []).append(candidate)
+    leading = list(found.values())[:MOST_REFITS]
+    return [replace(best, shapes=tuple(s.hypothesis for s in others[: MOST_SHAPES - 1])) for best, *others in leading]
 
 
 def leading_sets(screen: Screen, scored: Sequence[Scored], most: int) -> list[tuple[int, ...]]:
@@ -161,41 +154,45 @@ def refit_set(screen: Screen, chosen: Sequence[int], scored: Sequence[Scored]) -
 
 
 def refit(before: Fit, scored: Scored) -> Refit:
-    """The joint fit with a hypothesis in the model, started from its absence, in the shapes to be tried.
+    """The joint fit with a hypothesis in the model, started from its absence.
 
-    A usual effect (friction, say) is also started at its usual strength, for its absence may be a minimum of its own:
-    without friction, the fitted spins contradict friction.
+    If it has several shapes, all take a few steps, and the lowest goes on: a fit finds only a place nearby. A usual
+    effect (friction, say) is also started at its usual strength, for its absence may be a minimum of its own: without
+    friction, the fitted spins contradict friction.
 
     Args:
         before: the fit without the hypothesis.
         scored: the hypothesis and its score test.
-    Returns: the better of the fits.
     """
-    fits = [_refit(before, scored)]
-    if scored.opposite is not None:
-        fits.append(_refit(before, replace(scored, hypothesis=scored.opposite)))
-    return min(fits, key=lambda refitted: refitted.fit.cost)
+    if not scored.shapes:
+        return _refit(before, scored)
+    shaped = [replace(scored, hypothesis=shape) for shape in (scored.hypothesis, *scored.shapes)]
+    first = min((_refit(before, shape, FIRST_STEPS) for shape in shaped), key=lambda r: r.fit.cost)
+    after = fit_problem(first.fit.problem, first.fit.unknowns, before.noise, settle_noise=False)
+    return Refit(first.scored, after, delta_bic(before, after))
 
 
-def _refit(before: Fit, scored: Scored) -> Refit:
+def _refit(before: Fit, scored: Scored, steps: int = MOST_STEPS) -> Refit:
     hypothesis, problem = scored.hypothesis, with_hypothesis(before.problem, scored.hypothesis)
     parameters = dict(problem.model.named_parameters())
     absent = {name: float(parameters[name]) if name in parameters else 0.0 for name in hypothesis.free()}
     usual = absent | {hypothesis.parameter(n): hypothesis.coefficients[n].default for n in hypothesis.strengths}
-    tried = [_started_at(before, hypothesis, problem, absent)]
+    tried = [_started_at(before, hypothesis, problem, absent, steps)]
     if usual != absent:
-        tried.append(_started_at(before, hypothesis, problem, usual))
+        tried.append(_started_at(before, hypothesis, problem, usual, steps))
     after = min(tried, key=lambda fitted: fitted.cost)
     chosen = 0.0 if hypothesis.strengths else FRAME_CHOICE
     return Refit(scored, after, delta_bic(before, after) + chosen)
 
 
-def _started_at(before: Fit, hypothesis: Hypothesis, problem: Problem, values: Mapping[str, float]) -> Fit:
+def _started_at(
+    before: Fit, hypothesis: Hypothesis, problem: Problem, values: Mapping[str, float], steps: int = MOST_STEPS
+) -> Fit:
     """The fit of a problem with a hypothesis, started from the previous fit and some values of the hypothesis."""
     unknowns = replace(before.unknowns, values={**before.unknowns.values, **values})
     if hypothesis.shape and not hypothesis.strengths:
         unknowns = replace(unknowns, starts=_starts_with_labels(problem, unknowns.starts))
-    return fit_problem(problem, unknowns, before.noise, settle_noise=False)
+    return fit_problem(problem, unknowns, before.noise, settle_noise=False, steps=steps)
 
 
 def with_hypothesis(problem: Problem, hypothesis: Hypothesis) -> Problem:
