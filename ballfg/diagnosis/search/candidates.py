@@ -26,7 +26,7 @@ LEAST_GAIN = 0.0
 """Natural units. Least foretold gain of a candidate that is refitted: with new noise it may gain more."""
 MOST_REFITS = 4
 """Largest number of hypotheses that are refitted alone in a round."""
-MOST_SHAPES, FIRST_STEPS = 6, 4
+MOST_SHAPES, FIRST_STEPS = 9, 4
 """Largest number of shapes of a hypothesis that are refitted, and of the steps after which the lowest goes on alone."""
 PAIR = 2
 FRAME_CHOICE = 2.0 * float(np.log(FRAMES - 1))
@@ -105,12 +105,15 @@ def screened(model: Weighed, testable: Sequence[Hypothesis], motion: Motion) -> 
 
 
 def shortlist(scored: Sequence[Scored]) -> list[Scored]:
-    """The hypotheses to refit: the best shapes of each effect that may gain."""
+    """The hypotheses to refit: the best shapes of each effect that may gain.
+
+    Once one of them does, further shapes are worth a few steps even if nothing is foretold of them.
+    """
     found: dict[str, list[Scored]] = {}
     for candidate in sorted(scored, key=lambda s: s.gain, reverse=True):
-        if candidate.score is not None and candidate.gain > LEAST_GAIN:
+        if candidate.score is not None:
             found.setdefault(candidate.hypothesis.name, []).append(candidate)
-    leading = list(found.values())[:MOST_REFITS]
+    leading = [shapes for shapes in found.values() if shapes[0].gain > LEAST_GAIN][:MOST_REFITS]
     return [replace(best, shapes=tuple(s.hypothesis for s in others[: MOST_SHAPES - 1])) for best, *others in leading]
 
 
