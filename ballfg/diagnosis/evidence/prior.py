@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
+from scipy import special
 
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.free import spread
@@ -40,3 +41,24 @@ def log_odds(hypotheses: Sequence[Hypothesis], nameless: bool = False) -> float:
 def choice_odds(hypotheses: Sequence[Hypothesis]) -> float:
     """Logarithm of the prior probability of the shapes, among all those that were possible."""
     return -float(sum(np.log(h.choices) for h in hypotheses))
+
+
+def within(hypothesis: Hypothesis, mean: Array, sigmas: Array, width: float) -> float:
+    """Logarithm of the share of a normal posterior inside the bounds of the strengths, over that of their prior.
+
+    A strength that would be most probable beyond a bound of physics explains less than the linear model says.
+
+    Args: mean, sigmas: (p,) of the strengths.  width: of their prior, in usual strengths.
+    """
+    listed = [hypothesis.coefficients[name] for name in hypothesis.strengths]
+    low, high = (np.array([getattr(c, end) for c in listed]) for end in ("low", "high"))
+    absent, spreads = np.array([float(c.absent or 0.0) for c in listed]), width * scales(hypothesis)
+    after = _inside((low - mean) / sigmas, (high - mean) / sigmas)
+    return float((after - _inside((low - absent) / spreads, (high - absent) / spreads)).sum())
+
+
+def _inside(low: Array, high: Array) -> Array:
+    """Logarithm of a standard normal's probability between bounds, exact in both tails."""
+    flipped = low > 0.0
+    near, far = np.where(flipped, -low, high), np.where(flipped, -high, low)
+    return np.asarray(special.log_ndtr(near) + np.log1p(-np.exp(special.log_ndtr(far) - special.log_ndtr(near))))

@@ -12,7 +12,7 @@ from scipy import special
 from ballfg.arrays import Array, Index, Mask
 from ballfg.diagnosis.evidence.likelihood import Noise, Posterior, Reduced, posterior, settled, weighted
 from ballfg.diagnosis.evidence.nameless import NAMELESS, USUAL, Patterns
-from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, log_odds, scales
+from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, log_odds, scales, within
 from ballfg.diagnosis.evidence.rows import Motion, Rows, random_motion, rows_of
 from ballfg.diagnosis.fit.problem import Fit, Unknowns
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
@@ -246,12 +246,14 @@ class _Question:
         best, mixed = priors.widths(whole)
         result = priors.posterior(whole, best)
         strengths, values = {}, np.array([fit.unknowns.values[name] for name in fit.problem.free])
-        for hypothesis, place in zip(effects, priors.places, strict=False):
-            mean = values[place] + result.mean[place]
-            strengths[hypothesis.name] = Strengths(mean, result.covariance[np.ix_(place, place)])
+        for number, (hypothesis, place) in enumerate(zip(effects, priors.places, strict=False)):
+            found = Strengths(values[place] + result.mean[place], result.covariance[np.ix_(place, place)])
+            sigmas = np.sqrt(np.diagonal(found.covariance))
+            mixed[number] += within(hypothesis, found.mean, sigmas, WIDTHS[best[number]])
+            strengths[hypothesis.name] = found
         away, spread = result.mean[:own], result.covariance[:own, :own]
         gain = 0.5 * float(away @ np.linalg.solve(spread, away))
-        found = Weighed(
+        weighed = Weighed(
             tuple(self.named),
             fit,
             noise,
@@ -264,7 +266,7 @@ class _Question:
             self.nameless,
             self._nested(priors, whole, best, mixed),
         )
-        return found, Step(likelihood.local_step(noise, result.mean)[:, :STATE_DIM], away, gain)
+        return weighed, Step(likelihood.local_step(noise, result.mean)[:, :STATE_DIM], away, gain)
 
     def moved(self, model: Weighed, step: Step) -> Fit | None:
         """The fit after a step; None if the step lowers the evidence at the same noise: it left the linear range."""

@@ -146,7 +146,10 @@ def hypotheses(model: AnalyticModel, scene: Scene, catalogue: Iterable[type[Effe
 
 
 def scene_of(fit: Fit) -> Scene:
-    """The extent of a fit's stretches: places in m, speeds and impacts in m/s, and the number of spin labels."""
+    """The extent of a fit's stretches: places in m, speeds and impacts in m/s, and the number of spin labels.
+
+    Labels count that differ from zero by more than their noise: where all are zero, a wrong scale fits any spin.
+    """
     stretches = fit.problem.stretches
     used = stretches.used.numpy()
     positions = stretches.positions.numpy()[used]
@@ -165,4 +168,5 @@ def scene_of(fit: Fit) -> Scene:
     )
     speed = float(np.median(np.linalg.norm(velocities[used], axis=-1)))
     impact = float(np.median(impacts)) if impacts else float("nan")
-    return Scene(low, high, middle, speed, impact, len(impacts), int(stretches.labelled.sum()))
+    spins = np.linalg.norm(stretches.labels.numpy()[stretches.labelled], axis=1)
+    return Scene(low, high, middle, speed, impact, len(impacts), int((spins > fit.noise.label).sum()))

@@ -6,10 +6,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from ballfg.diagnosis.evidence.nameless import NAMELESS
 from ballfg.diagnosis.evidence.odds import odds_of, tempered
-from ballfg.diagnosis.evidence.prior import THERE, WIDTHS, choice_odds, log_odds, scales
+from ballfg.diagnosis.evidence.prior import THERE, WIDTHS, choice_odds, log_odds, scales, within
 from ballfg.diagnosis.evidence.rows import random_motion
 from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.weighed import weigh
@@ -128,6 +129,19 @@ def test_a_choice_among_shapes_is_paid_for():
     assert choice_odds([Hypothesis(EFFECTS["gust_region"], {}, ("x",), 18)]) == pytest.approx(-np.log(18.0))
     assert choice_odds([WIND]) == 0.0
     np.testing.assert_array_equal(scales(WIND), 0.2)
+
+
+def test_a_strength_beyond_a_bound_of_physics_explains_less():
+    """Spin that grows: a decay's rate is not negative, so that only the tail of its posterior counts."""
+    decay = Hypothesis(EFFECTS["spin_decay"], {}, ("rate",))
+    inside, at_zero, beyond = (
+        within(decay, np.array([sigmas * 0.05]), np.array([0.05]), 1.0) for sigmas in (8.0, 0.0, -5.0)
+    )
+    assert inside == pytest.approx(np.log(2.0), abs=0.01)  # half of the prior lies beyond the bound
+    assert at_zero == pytest.approx(0.0, abs=0.01)
+    assert beyond == pytest.approx(norm.logsf(5.0) + np.log(2.0), abs=0.01)
+    far = within(decay, np.array([-40.0]), np.array([0.05]), 1.0)
+    assert far == pytest.approx(norm.logsf(800.0) + np.log(2.0), rel=1e-6)
 
 
 def test_what_is_foretold_is_what_a_refit_gains(windy_fit, windy_declared, windy_with_wind):
