@@ -14,6 +14,7 @@ from ballfg.arrays import Array
 from ballfg.diagnosis.fit.free import spread
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.hypotheses.varying import Varying, varied
+from ballfg.dynamics import AnalyticModel
 
 WIDTHS: Final = (0.0625, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 """Widths of the prior, in usual strengths, each as probable as the others."""
@@ -32,6 +33,14 @@ def scales(hypothesis: Hypothesis) -> Array:
     return np.array([abs(usual.change.get(varied(name), largest)) for name in hypothesis.strengths])
 
 
+def centres(hypothesis: Hypothesis, model: AnalyticModel) -> Array:
+    """(p,) where the prior of each strength is: absence, or what the model states of g, which it states as exact."""
+    stated = dict(model.named_parameters())
+    listed = zip(hypothesis.strengths, hypothesis.columns, strict=True)
+    found = [(hypothesis.coefficients[name], column) for name, column in listed]
+    return np.array([float(stated[n]) if c.sigma == 0.0 and n in stated else float(c.absent or 0.0) for c, n in found])
+
+
 def log_odds(hypotheses: Sequence[Hypothesis], nameless: bool = False) -> float:
     """Logarithm of the prior odds of a model with these effects to one without any; nameless: and patterns."""
     chances = [VARIES if isinstance(h, Varying) else THERE for h in hypotheses] + [THERE] * nameless
@@ -43,18 +52,18 @@ def choice_odds(hypotheses: Sequence[Hypothesis]) -> float:
     return -float(sum(np.log(h.choices) for h in hypotheses))
 
 
-def within(hypothesis: Hypothesis, mean: Array, sigmas: Array, width: float) -> float:
+def within(hypothesis: Hypothesis, centre: Array, mean: Array, sigmas: Array, width: float) -> float:
     """Logarithm of the share of a normal posterior inside the bounds of the strengths, over that of their prior.
 
     A strength that would be most probable beyond a bound of physics explains less than the linear model says.
 
-    Args: mean, sigmas: (p,) of the strengths.  width: of their prior, in usual strengths.
+    Args: centre: (p,) of the prior.  mean, sigmas: (p,) of the strengths.  width: of the prior, in usual strengths.
     """
     listed = [hypothesis.coefficients[name] for name in hypothesis.strengths]
     low, high = (np.array([getattr(c, end) for c in listed]) for end in ("low", "high"))
-    absent, spreads = np.array([float(c.absent or 0.0) for c in listed]), width * scales(hypothesis)
+    spreads = width * scales(hypothesis)
     after = _inside((low - mean) / sigmas, (high - mean) / sigmas)
-    return float((after - _inside((low - absent) / spreads, (high - absent) / spreads)).sum())
+    return float((after - _inside((low - centre) / spreads, (high - centre) / spreads)).sum())
 
 
 def _inside(low: Array, high: Array) -> Array:

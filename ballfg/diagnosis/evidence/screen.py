@@ -16,7 +16,7 @@ from scipy import special
 
 from ballfg.arrays import Array, Index
 from ballfg.diagnosis.evidence.likelihood import Likelihood, Posterior, Reduced, posterior
-from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, log_odds, scales, within
+from ballfg.diagnosis.evidence.prior import WIDTHS, centres, choice_odds, log_odds, scales, within
 from ballfg.diagnosis.evidence.rows import Motion, roots, rows_of
 from ballfg.diagnosis.evidence.weighed import Priors, Step, Weighed
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
@@ -149,8 +149,8 @@ class Screen:
             mixed = float(special.logsumexp(evidence - evidence[best]) - np.log(len(WIDTHS)))
             after = self._posterior([one], [best])
             mean, sigmas = after.mean[self._own :], np.sqrt(np.diagonal(after.covariance)[self._own :])
-            absent = np.array([float(candidate.coefficients[n].absent or 0.0) for n in candidate.strengths])
-            mixed += within(candidate, absent + mean, sigmas, WIDTHS[best])
+            centre = centres(candidate, self.model.fit.problem.model)
+            mixed += within(candidate, centre, centre + mean, sigmas, WIDTHS[best])
             found.append((float(evidence[best]) + mixed - self._base + choice_odds([candidate]), best, mixed))
         return found
 

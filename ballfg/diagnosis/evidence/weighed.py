@@ -12,7 +12,7 @@ from scipy import special
 from ballfg.arrays import Array, Index, Mask
 from ballfg.diagnosis.evidence.likelihood import Noise, Posterior, Reduced, posterior, settled, weighted
 from ballfg.diagnosis.evidence.nameless import NAMELESS, USUAL, Patterns
-from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, log_odds, scales, within
+from ballfg.diagnosis.evidence.prior import WIDTHS, centres, choice_odds, log_odds, scales, within
 from ballfg.diagnosis.evidence.rows import Motion, Rows, random_motion, rows_of
 from ballfg.diagnosis.fit.problem import Fit, Unknowns
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
@@ -102,16 +102,13 @@ class Priors:
         with_strengths = [h for h in named if h.strengths]
         places = tuple(np.array([listed.index(c) for c in h.columns]) for h in with_strengths)
         values = np.array([fit.unknowns.values[name] for name in listed])
-        centres = problem.centres.copy()
+        middles = problem.centres.copy()
         for hypothesis, place in zip(with_strengths, places, strict=True):
-            listed = [hypothesis.coefficients[n] for n in hypothesis.strengths]
-            # g, which models state as exact, is about the stated value
-            kept = zip(listed, centres[place], strict=True)
-            centres[place] = [at if c.sigma == 0.0 else float(c.absent or 0.0) for c, at in kept]
+            middles[place] = centres(hypothesis, problem.model)
         base = problem.common_precision.copy()
         for place in places:
             base[place] = 0.0
-        away = np.concatenate((centres - values, -fit.unknowns.launcher.ravel()))
+        away = np.concatenate((middles - values, -fit.unknowns.launcher.ravel()))
         sizes = tuple(scales(h) for h in with_strengths)
         if patterns is None:
             return cls(base, away, places, sizes)
@@ -252,7 +249,8 @@ class _Question:
         for number, (hypothesis, place) in enumerate(zip(effects, priors.places, strict=False)):
             found = Strengths(values[place] + result.mean[place], result.covariance[np.ix_(place, place)])
             sigmas = np.sqrt(np.diagonal(found.covariance))
-            mixed[number] += within(hypothesis, found.mean, sigmas, WIDTHS[best[number]])
+            centre = centres(hypothesis, fit.problem.model)
+            mixed[number] += within(hypothesis, centre, found.mean, sigmas, WIDTHS[best[number]])
             strengths[hypothesis.name] = found
         away, spread = result.mean[:own], result.covariance[:own, :own]
         gain = 0.5 * float(away @ np.linalg.solve(spread, away))

@@ -143,12 +143,12 @@ def test_a_strength_beyond_a_bound_of_physics_explains_less():
     """Spin that grows: a decay's rate is not negative, so that only the tail of its posterior counts."""
     decay = Hypothesis(EFFECTS["spin_decay"], {}, ("rate",))
     inside, at_zero, beyond = (
-        within(decay, np.array([sigmas * 0.05]), np.array([0.05]), 1.0) for sigmas in (8.0, 0.0, -5.0)
+        within(decay, np.zeros(1), np.array([sigmas * 0.05]), np.array([0.05]), 1.0) for sigmas in (8.0, 0.0, -5.0)
     )
     assert inside == pytest.approx(np.log(2.0), abs=0.01)  # half of the prior lies beyond the bound
     assert at_zero == pytest.approx(0.0, abs=0.01)
     assert beyond == pytest.approx(norm.logsf(5.0) + np.log(2.0), abs=0.01)
-    far = within(decay, np.array([-40.0]), np.array([0.05]), 1.0)
+    far = within(decay, np.zeros(1), np.array([-40.0]), np.array([0.05]), 1.0)
     assert far == pytest.approx(norm.logsf(800.0) + np.log(2.0), rel=1e-6)
 
 
