@@ -112,10 +112,13 @@ def set_doubts(model: AnalyticModel, doubts: Sequence[Sequence[float]]) -> None:
                 parameters[f"{name}_{k}"].fill_(value)
 
 
-def learned_drag(model: AnalyticModel, speed: Array, ratio: Array) -> tuple[Array, Array]:
-    """The relative correction of drag, and its standard deviation.
+def learned(model: AnalyticModel, force: str, speed: Array, ratio: Array) -> tuple[Array, Array]:
+    """The relative correction of a force, and its standard deviation.
 
-    Args: model: with a correction.  speed: (n,) m/s.  ratio: (n,) spin ratio, dimensionless.
+    Args:
+        model: with a correction.
+        force: `drag` or `lift`.
+        speed, ratio: (n,) m/s, and (n,) spin ratio, dimensionless.
     Returns: (n,) each, dimensionless.
     """
     values = cast(Effect, model.flight[AirCorrection.name]).values()
@@ -125,10 +128,17 @@ def learned_drag(model: AnalyticModel, speed: Array, ratio: Array) -> tuple[Arra
     )
     terms = correction_terms(x, y).numpy()
     rows = [
-        [values[f"drag_{term}{end}"] for term in FUNCTIONS] for end in ("", *(f"_{k}" for k in range(1, DOUBTS + 1)))
+        [values[f"{force}_{term}{end}"] for term in FUNCTIONS] for end in ("", *(f"_{k}" for k in range(1, DOUBTS + 1)))
     ]
     mean, *doubts = np.array(rows) @ terms.T
     return mean, np.linalg.norm(doubts, axis=0)
+
+
+def spans(model: AnalyticModel) -> dict[str, tuple[float, float]]:
+    """Ends of the range of the samples, 5 to 95 %: of `speed`, m/s, and `ratio`; model: with a correction."""
+    values = cast(Effect, model.flight[AirCorrection.name]).values()
+    half = {name: values[f"{name}_scale"] / BEYOND for name in ("speed", "ratio")}
+    return {name: (max(values[name] - reach, 0.0), values[name] + reach) for name, reach in half.items()}
 
 
 def places(model: AnalyticModel) -> tuple[Array, Array]:

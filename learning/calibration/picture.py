@@ -1,32 +1,45 @@
-"""Draws a calibration: each track's coefficients, the population, and the errors before and after."""
+"""Draws a calibration: each track's coefficients, the population, a learned correction, the errors before and after."""
 
 from pathlib import Path
+from typing import Final, cast
 
 import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
+from ballfg.dynamics import AnalyticModel
+from ballfg.dynamics.effect import Effect
+from ballfg.dynamics.effects.generic import FUNCTIONS, AirCorrection
 from ballfg.files.whole_file import whole_file
-from ballfg.learning.calibration.calibrate import Problem, Step
+from ballfg.learning.calibration.calibrate import Problem, Step, population_model
+from ballfg.learning.calibration.correction import learned, spans
 from ballfg.learning.calibration.report import Comparison
+from ballfg.learning.evaluation import NINETY
 
 matplotlib.use("Agg")
 
 DPI = 130
 TRACKS, BAND, START = "#3b4cc0", "#d95f02", "#7f7f7f"
+AXES: Final = {"speed": ("speed", " m/s"), "ratio": ("spin ratio", "")}
+"""Quantities of a correction: their words and units."""
+CURVE: Final = 101
+"""Points of a curve."""
 
 
 def draw(problem: Problem, last: Step, comparison: Comparison, path: Path) -> None:
     """Write the picture as a PNG file."""
     listed = problem.chosen.listed
-    panels = len(listed) + 1
+    curves = [] if problem.correction is None else _curves(population_model(problem, last))
+    panels = len(listed) + len(curves) + 1
     columns = min(panels, 4)
     rows = -(-panels // columns)
     figure, grid = plt.subplots(rows, columns, figsize=(4.0 * columns, 3.9 * rows), layout="constrained", squeeze=False)
     axes = list(grid.flat)
     for place, (k, _) in enumerate(listed):
         _coefficient(axes[place], problem, last, k)
+    for place, curve in enumerate(curves, start=len(listed)):
+        _correction(axes[place], *curve)
     _errors(axes[panels - 1], comparison)
     for unused in axes[panels:]:
         unused.set_axis_off()
@@ -50,6 +63,34 @@ def _coefficient(axes: Axes, problem: Problem, last: Step, k: int) -> None:
     unit = "" if problem.chosen.units[k] == "1" else f", {problem.chosen.units[k]}"
     axes.set(xlabel="tracks, sorted", ylabel=f"{problem.chosen.names[k]}{unit}")
     axes.set_title(f"{mean:.4g} ± {last.sigma[k]:.2g}, spread {last.spread[k]:.2g}", size=10)
+    axes.grid(visible=True, alpha=0.25)
+    axes.legend(fontsize="x-small")
+
+
+def _curves(model: AnalyticModel) -> list[tuple[AnalyticModel, str, str]]:
+    """Each force with a learned correction, along each of its two quantities."""
+    values = cast(Effect, model.flight[AirCorrection.name]).values()
+    forces = [force for force in ("drag", "lift") if any(values[f"{force}_{term}"] for term in FUNCTIONS)]
+    return [(model, force, along) for force in forces for along in AXES]
+
+
+def _correction(axes: Axes, model: AnalyticModel, force: str, along: str) -> None:
+    """A learned correction in percent along one quantity, the other in the middle of its samples."""
+    reach = spans(model)
+    middle = {name: np.full(CURVE, 0.5 * (low + high)) for name, (low, high) in reach.items()}
+    low, high = reach[along]
+    at = middle | {along: np.linspace(max(low - 0.3 * (high - low), 0.0), high + 0.3 * (high - low), CURVE)}
+    mean, sigma = (100.0 * values for values in learned(model, force, at["speed"], at["ratio"]))
+    axes.axvspan(low, high, color=START, alpha=0.12, linewidth=0, label="90 % of the samples")
+    axes.fill_between(at[along], mean - NINETY * sigma, mean + NINETY * sigma, color=BAND, alpha=0.25, linewidth=0)
+    axes.plot(at[along], mean, color=BAND, linewidth=1.5, label="learned, with its 90 % band")
+    axes.axhline(0.0, color=START, linestyle="--", linewidth=1.0, label="declared law")
+    (other,) = set(AXES) - {along}
+    words, unit = AXES[other]
+    axes.set_title(f"{force} where the {words} is {middle[other][0]:.3g}{unit}", size=10)
+    axes.set(
+        xlabel=f"{AXES[along][0]}{',' + AXES[along][1] if AXES[along][1] else ''}", ylabel=f"correction of {force}, %"
+    )
     axes.grid(visible=True, alpha=0.25)
     axes.legend(fontsize="x-small")
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.learning.calibration.calibrate import Problem, Step, has_converged, population_model
-from ballfg.learning.calibration.correction import SCALE, learned_drag, places
+from ballfg.learning.calibration.correction import SCALE, learned, places
 from ballfg.learning.evaluation import Summary, TrackScore, summary
 
 AXES = ("forward", "across", "up")
@@ -134,7 +134,7 @@ def _correction(problem: Problem, last: Step) -> list[dict[str, float]]:
     model = population_model(problem, last)
     speed, ratio = places(model)
     columns = {"speed": speed, "spin_ratio": ratio} | dict(
-        zip(("drag", "sigma"), learned_drag(model, speed, ratio), strict=True)
+        zip(("drag", "sigma"), learned(model, "drag", speed, ratio), strict=True)
     )
     return [dict(zip(columns, map(float, row), strict=True)) for row in zip(*columns.values(), strict=True)]
 

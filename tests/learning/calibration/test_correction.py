@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
@@ -15,7 +16,7 @@ from ballfg.dynamics.effects.generic import DOUBTS, FUNCTIONS, WEIGHTS, AirCorre
 from ballfg.dynamics.model_file import model_to_dict
 from ballfg.dynamics.motion.paths import paths
 from ballfg.estimation import dataset_settings
-from ballfg.learning.calibration import run
+from ballfg.learning.calibration import picture, run
 from ballfg.learning.calibration.auto import (
     CANDIDATES,
     CORRECTED,
@@ -35,7 +36,9 @@ from ballfg.learning.calibration.calibrate import (
     pose_correction,
     score,
 )
-from ballfg.learning.calibration.correction import Correction, learned_drag, places, set_doubts, with_correction
+from ballfg.learning.calibration.correction import Correction, learned, places, set_doubts, spans, with_correction
+from ballfg.learning.calibration.picture import draw
+from ballfg.learning.calibration.report import compare
 from ballfg.learning.calibration.run import run_calibration
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.config_file import checked_config
@@ -91,7 +94,7 @@ def curved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Problem, Step, Pro
 
 def drag_curve(model: AnalyticModel, speed: np.ndarray, ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Drag coefficient, 1/m, and the standard deviation that the doubts give it."""
-    mean, sigma = learned_drag(model, speed, ratio)
+    mean, sigma = learned(model, "drag", speed, ratio)
     k = float(dict(model.named_parameters())["flight.drag.k"].detach())
     return k * (1.0 + mean), k * sigma
 
@@ -129,9 +132,26 @@ def test_the_listed_correction_is_that_of_the_effect() -> None:
     state[:, 3] = torch.from_numpy(speed)
     state[:, 6] = torch.from_numpy(ratio * speed / 0.02)  # about the flight's direction: no lift
     gain = -model.rates(state)[0][:, 0].detach().numpy() / (K * speed**2)
-    found, sigma = learned_drag(model, speed, ratio)
+    found, sigma = learned(model, "drag", speed, ratio)
     np.testing.assert_allclose(1.0 + found, gain, atol=0.01)  # the effect softens the spin at zero
     np.testing.assert_array_equal(sigma, 0.0)
+
+
+def test_the_picture_has_the_curve_with_its_band(curved: tuple[Problem, Step, Problem, Step], tmp_path: Path) -> None:
+    """Drag along the speed, in percent, about the spin ratio in the middle of the samples."""
+    _, _, corrected, end = curved
+    model = population_model(corrected, end)
+    assert [(force, along) for _, force, along in picture._curves(model)] == [("drag", "speed"), ("drag", "ratio")]
+    axes = plt.figure().gca()
+    picture._correction(axes, model, "drag", "speed")
+    shown = next(line for line in axes.lines if "learned" in str(line.get_label()))
+    speed, percent = (np.asarray(values, dtype=np.float64) for values in (shown.get_xdata(), shown.get_ydata()))
+    low, high = spans(model)["ratio"]
+    mean, _ = learned(model, "drag", speed, np.full(len(speed), (low + high) / 2.0))
+    np.testing.assert_allclose(percent, 100.0 * mean, atol=1e-9)
+    assert axes.get_xlabel() == "speed, m/s"
+    draw(corrected, end, compare([], [], [], []), tmp_path / "picture.png")
+    assert (tmp_path / "picture.png").stat().st_size > 20_000
 
 
 def test_all_tracks_share_the_weights(curved: tuple[Problem, Step, Problem, Step]) -> None:
