@@ -163,8 +163,11 @@ def calibrate(problem: Problem, done: Iterable[Step] = (), *, watch: Watch = unw
         steps.append(Step(number=0, mean=_plain(start), scores=score(problem, start, watch)))
         yield steps[-1]
     while not has_ended(problem.config, steps[-1]):
-        steps.append(_advance(problem, steps[-1], watch))
-        yield steps[-1]
+        found = _advance(problem, steps[-1], watch)
+        if has_ended(problem.config, found):
+            found = found.model_copy(update={"scores": score(problem, np.array(found.mean), watch)})
+        steps.append(found)
+        yield found
 
 
 def has_converged(config: CalibrationConfig, step: Step) -> bool:
@@ -271,7 +274,6 @@ def _advance(problem: Problem, last: Step, watch: Watch) -> Step:
         moved=float(np.abs((population.mean - before) / population.sigma).max()),
         fits=tuple(fits),
         skipped=tuple(skipped),
-        scores=score(problem, population.mean[:size], watch),
     )
 
 

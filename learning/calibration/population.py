@@ -9,6 +9,8 @@ L. Hu, J. Zhou, K. Lange, "MM algorithms for variance components models", J. Com
 lowers the likelihood and needs no step size.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,13 +20,15 @@ from scipy.optimize import lsq_linear
 from ballfg.arrays import Array, Index
 
 MAX_STEPS = 20_000
-"""Largest number of iterations: some tens are usual, thousands for a spread close to zero. A step takes 50 us."""
+"""Largest number of iterations, two steps and an extrapolation each; some tens are usual."""
 STEP_TOLERANCE = 1e-11
 """Relative change of every variance at which the iteration ends."""
 NO_SPREAD = 1e-10
 """Variance, as a share of the prior's, below which it is zero."""
 MOST_SPREAD = 100.0
 """Largest variance, as a multiple of the prior's: tracks with almost no information set no limit."""
+LONGEST, MOST_CHANGE = 1e3, 5.0
+"""Bounds of an extrapolation: its length in steps, and the change of a variance's logarithm."""
 NO_INFORMATION = 1e-2
 """Information of all tracks, as a share of the prior's, below which the spread of a coefficient is zero."""
 
@@ -129,24 +133,19 @@ def fit_population(
     about = _Means(numbers, size, bounds)
     variance = np.where(about.summed(np.einsum("ikk->ik", information)) > NO_INFORMATION, 1.0, 0.0)
     variance[[] if alike is None else alike] = 0.0
+    fit = _Fit(information, moved, about)
     for _ in range(MAX_STEPS):
-        own = variance[numbers]
-        mean = about.best(information, moved, own)
-        # the pulls as large as they are, against as large as they should be
-        pulls = about.summed(_residual(information, moved, own, mean[numbers]) ** 2)
-        expected = about.summed(np.einsum("ikk->ik", _marginal(information, own)))
-        growth = np.sqrt(np.divide(pulls, expected, out=np.zeros_like(pulls), where=expected > 0.0))
-        updated = np.minimum(variance * growth, MOST_SPREAD)
-        updated[updated < NO_SPREAD] = 0.0
-        change = np.abs(updated - variance)
-        done = bool((change <= STEP_TOLERANCE * variance).all())
-        variance = updated
-        if done:
+        once = fit.updated(variance)
+        if (np.abs(once - variance) <= STEP_TOLERANCE * variance).all():
+            variance = once
             break
+        twice = fit.updated(once)
+        further = _further(variance, once, twice)
+        variance = further if fit.log_likelihood(further) > fit.log_likelihood(twice) else twice
     own = variance[numbers]
     mean = about.best(information, moved, own)
     precision = about.precision(information, own)
-    likelihood = _log_likelihood(information, moved, own, mean[numbers]) - 0.5 * float(mean @ mean)
+    likelihood = fit.log_likelihood(variance)
     return Population(
         mean=np.clip(start + sigma * mean, low, high),
         covariance=np.linalg.inv(precision) * np.outer(sigma, sigma),
@@ -154,6 +153,51 @@ def fit_population(
         log_likelihood=likelihood,
         log_evidence=likelihood - 0.5 * float(np.linalg.slogdet(precision)[1]),
     )
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """The marginal likelihood of tracks with information (n, k, k) and vectors (n, k), by the variances (p,)."""
+
+    information: Array
+    moved: Array
+    about: _Means
+
+    def updated(self, variance: Array) -> Array:
+        """(p,) the variances after one step: the pulls as large as they are, against as large as they should be."""
+        own = variance[self.about.numbers]
+        mean = self.about.best(self.information, self.moved, own)
+        pulls = self.about.summed(_residual(self.information, self.moved, own, mean[self.about.numbers]) ** 2)
+        expected = self.about.summed(np.einsum("ikk->ik", _marginal(self.information, own)))
+        growth = np.sqrt(np.divide(pulls, expected, out=np.zeros_like(pulls), where=expected > 0.0))
+        found = np.minimum(variance * growth, MOST_SPREAD)
+        found[found < NO_SPREAD] = 0.0
+        return found
+
+    def log_likelihood(self, variance: Array) -> float:
+        """At the best means, with their prior."""
+        own = variance[self.about.numbers]
+        mean = self.about.best(self.information, self.moved, own)
+        found = _log_likelihood(self.information, self.moved, own, mean[self.about.numbers])
+        return found - 0.5 * float(mean @ mean)
+
+
+def _further(start: Array, once: Array, twice: Array) -> Array:
+    """Variances (p,) extrapolated from two steps, in logarithms; a variance that vanished stays zero.
+
+    The steps alone converge slowly where a variance is hardly determined. Source: R. Varadhan, C. Roland, "Simple and
+    globally convergent methods for accelerating the convergence of any EM algorithm", Scand. J. Statist. 35, 2008.
+    """
+    left = (start > 0.0) & (once > 0.0) & (twice > 0.0)
+    first, second = np.log(once[left] / start[left]), np.log(twice[left] / once[left])
+    change = second - first
+    length = float(np.linalg.norm(change))
+    if length == 0.0:
+        return twice
+    ratio = min(float(np.linalg.norm(first)) / length, LONGEST)
+    found = twice.copy()
+    found[left] = start[left] * np.exp(np.clip(2.0 * ratio * first + ratio**2 * change, -MOST_CHANGE, MOST_CHANGE))
+    return np.minimum(found, MOST_SPREAD)
 
 
 def _mixing(information: Array, variance: Array) -> Array:

@@ -136,7 +136,8 @@ def _line(problem: Problem, step: Step, left: float) -> str:
     )
     parts = [f"iteration {step.number}: {values}"]
     parts += [] if step.moved is None else [f"moved {step.moved:.2g} sigma"]
-    parts += ["no track judged"] if judged is None else [f"median RMSE {1e3 * judged.rmse_median:.2f} mm"]
+    if step.scores:  # tracks are judged before the first step and after the last
+        parts += ["no track judged"] if judged is None else [f"median RMSE {1e3 * judged.rmse_median:.2f} mm"]
     parts += [f"{len(step.skipped)} tracks skipped"] if step.skipped else []
     if step.moved is not None and not has_ended(problem.config, step):  # step 0 fits nothing: its time says little
         parts.append(f"at most about {left:.0f} s left")
@@ -213,7 +214,7 @@ def _follow(steps: Sequence[Step], problem: Problem) -> bool:
             rows += [values for fit in step.fits for values in (fit.values, fit.sigmas)]
         names = {fit.name for fit in step.fits} | {name for name, _ in step.skipped}
         groups = 0 if problem.groups is None or not number else len(problem.groups.names)
-        fit = all(len(row) == size for row in rows) and names <= tracks and len(step.scores) == judged
+        fit = all(len(row) == size for row in rows) and names <= tracks and len(step.scores) in (0, judged)
         fit = fit and len(step.spins) == groups and set(step.by_group) <= set(problem.chosen.names)
         fit = fit and all(len(row) == groups for row in step.by_group.values())
         if not fit or step.number != number or (step.moved is None) != (number == 0):

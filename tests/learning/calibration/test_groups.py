@@ -15,6 +15,7 @@ from ballfg.dynamics import Surfaces, load_model, nominal_model
 from ballfg.dynamics.motion.paths import paths
 from ballfg.estimation import dataset_settings
 from ballfg.estimation.registry import make_estimator
+from ballfg.learning.calibration.auto import CALIBRATED, GROUPED
 from ballfg.learning.calibration.calibrate import (
     Problem,
     Step,
@@ -158,7 +159,7 @@ def test_groups_predict_measured_shots_better() -> None:
     folder = DATA / "ballgun"
     if not folder.is_dir():
         pytest.skip(f"measured tracks are absent: {folder}")
-    (before, *_), (after, held, _) = (measure(folder, 0, None, groups) for groups in (None, "group"))
+    (before, *_), (after, held, _) = (measure(folder, 0, None, kind) for kind in (CALIBRATED, GROUPED))
     assert after < 0.85 * before
     assert held > 80.0
 
