@@ -50,8 +50,8 @@ def test_pairs_of_a_diagnosis(launched: Path, tmp_path: Path, capsys: pytest.Cap
 @pytest.mark.thorough
 def test_without_a_pair_the_dataset_is_diagnosed_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Shots that fall too slowly: a clock that is wrong, or another g. The plan is that of the pair named by hand."""
-    settings, fall = {"sidespin": [0], "speed": [11]}, tuple(parse_effects(["gravity.g=9.6"]))
-    write_simulation(tmp_path / "shots", SimulationConfig(8, 60.0, seed=4, settings=settings, undeclared=fall))
+    settings, slow = {"sidespin": [0], "speed": [11]}, tuple(parse_effects(["time_scale.s=0.015"]))
+    write_simulation(tmp_path / "shots", SimulationConfig(8, 60.0, seed=4, settings=settings, undeclared=slow))
     words = ["design", tmp_path / "shots", "--candidates", "topspin=-3..5:2", "--shots", 2, "--jobs", 1]
     assert status(*words, "--out", tmp_path / "diagnosed.csv") == 0
     said = capsys.readouterr()

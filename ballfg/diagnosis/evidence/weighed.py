@@ -102,7 +102,10 @@ class Priors:
         values = np.array([fit.unknowns.values[name] for name in listed])
         centres = problem.centres.copy()
         for hypothesis, place in zip(with_strengths, places, strict=True):
-            centres[place] = [float(hypothesis.coefficients[n].absent or 0.0) for n in hypothesis.strengths]
+            listed = [hypothesis.coefficients[n] for n in hypothesis.strengths]
+            # g, which models state as exact, is about the stated value
+            kept = zip(listed, centres[place], strict=True)
+            centres[place] = [at if c.sigma == 0.0 else float(c.absent or 0.0) for c, at in kept]
         base = problem.common_precision.copy()
         for place in places:
             base[place] = 0.0

@@ -107,6 +107,14 @@ def test_the_evidence_without_an_effect_is_that_of_its_columns_left_out(calm, ca
     assert windy_with_wind.nested[frozenset()] < windy_with_wind.score - 20.0
 
 
+def test_a_coefficient_that_models_state_as_exact_is_about_the_stated_value(calm, calm_fit):
+    """Gravity is absent where g is 9.81 m/s2, not where a ball has no weight."""
+    gravity = Hypothesis(EFFECTS["gravity"], {}, ("g",))
+    weighed = weigh(refit(calm_fit, Scored(gravity, None, 0.0)).fit, [gravity])
+    assert weighed.nested[frozenset()] == pytest.approx(calm.score, abs=1.0)
+    assert weighed.evidence > calm.evidence - 5.0
+
+
 def test_a_choice_among_shapes_is_paid_for():
     assert choice_odds([Hypothesis(EFFECTS["gust_region"], {}, ("x",), 18)]) == pytest.approx(-np.log(18.0))
     assert choice_odds([WIND]) == 0.0
