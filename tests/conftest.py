@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 
 import pytest
 
@@ -13,6 +14,8 @@ from ballfg.progress import VARIABLE
 
 collect_rarely()  # as the commands do
 os.environ[VARIABLE] = "1"  # what commands print must not depend on how long they take
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell has it for what it starts in the background
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # tests send it to the processes that they start
 
 
 @pytest.fixture

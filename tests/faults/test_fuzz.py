@@ -20,10 +20,11 @@ from tests.faults.worker import Worker, verdict
 from tests.places import ROOT
 
 
-@pytest.mark.parametrize("seconds", [0, pytest.param(6, marks=pytest.mark.thorough)])
-def test_every_reader_refuses_damaged_files_in_one_line(seconds: int) -> None:
-    """The corpus, every file replaced as a whole, then some seconds of random damage."""
-    command = [sys.executable, "-m", "tests.faults.fuzz", "--replay", "--seconds", str(seconds), "--seed", "1"]
+@pytest.mark.parametrize(("ways", "seconds"), [(1, 0), pytest.param(7, 6, marks=pytest.mark.thorough)])
+def test_every_reader_refuses_damaged_files_in_one_line(ways: int, seconds: int) -> None:
+    """The corpus, every file replaced as a whole in some ways, then some seconds of random damage."""
+    options = ["--replay", "--ways", str(ways), "--seconds", str(seconds), "--seed", "1"]
+    command = [sys.executable, "-m", "tests.faults.fuzz", *options]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"

@@ -7,11 +7,12 @@ import pytest
 
 from ballfg.diagnosis.hypotheses.hypothesis import with_effects
 from ballfg.diagnosis.residual_tests import fallback
-from ballfg.dynamics import EFFECTS, nominal_model
+from ballfg.dynamics import EFFECTS, build, nominal_model
 from ballfg.dynamics.trained import Trained
 from ballfg.simulation import SimulationConfig, simulate
 from ballfg.simulation.synthetic import dataset_info
 from ballfg.tracks import read_dataset, write_dataset
+from tests.small_networks import SMALL
 
 COUNT = 12
 
@@ -31,7 +32,11 @@ def stretched():
     return model
 
 
-def test_a_network_upon_a_model_with_a_measurement_effect(dataset):
+def test_a_network_upon_a_model_with_a_measurement_effect(dataset, monkeypatch):
+    def small(architecture, **given):
+        return build(architecture.model_copy(update=SMALL), **given)
+
+    monkeypatch.setattr(fallback, "build", small)
     base = stretched()
     network = fallback.learned_residual(base, dataset, list(dataset), epochs=2)  # it runs; it need not help
     assert network is not None
