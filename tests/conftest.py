@@ -8,7 +8,10 @@ import signal
 
 import pytest
 
-from ballfg.dynamics import EFFECTS, AnalyticModel
+from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel
+from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.compiled import motion
+from ballfg.dynamics.compiled.functions import CompiledModel
 from ballfg.machine import collect_rarely
 from ballfg.progress import VARIABLE
 
@@ -32,6 +35,18 @@ def every_effect() -> AnalyticModel:
         "table_height": {"offset": -0.004},
     }
     return AnalyticModel([EFFECTS[name](**v) for name, v in values.items()])
+
+
+@pytest.fixture
+def networks_in_torch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Networks move in torch, the definition of their machine code, which takes up to half a minute to make."""
+    machine_code = motion.functions_of
+
+    def functions_of(model: BallModel) -> CompiledModel | None:
+        alone = model.model if isinstance(model, AugmentedModel) else model
+        return machine_code(model) if isinstance(alone, AnalyticModel) else None
+
+    monkeypatch.setattr(motion, "functions_of", functions_of)
 
 
 def pytest_collection_finish() -> None:

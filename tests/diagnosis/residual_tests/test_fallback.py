@@ -32,6 +32,7 @@ def stretched():
     return model
 
 
+@pytest.mark.usefixtures("networks_in_torch")
 def test_a_network_upon_a_model_with_a_measurement_effect(dataset, monkeypatch):
     def small(architecture, **given):
         return build(architecture.model_copy(update=SMALL), **given)

@@ -27,7 +27,7 @@ def holdout(search, held_out):
 
 
 def shots(make_ball, make_launches, make_shots, seed, **truth):
-    return make_shots(make_ball(**truth), make_launches(10, seed), seed, duration=0.6, rate=40.0).stretches
+    return make_shots(make_ball(**truth), make_launches(10, seed), seed, duration=0.45, rate=50.0).stretches
 
 
 def predicting(fitted, rmse):
@@ -138,7 +138,7 @@ def test_predictions_do_not_decide(make_ball, make_launches, make_shots):
 
 def test_effects_are_named_from_a_probability_on(make_ball, make_launches, make_shots):
     """A tilt so small that the tracks leave it open; the probability is what it is, the name is a choice."""
-    data = [shots(make_ball, make_launches, make_shots, seed, table_tilt={"x": 0.0015, "y": 0.0}) for seed in (71, 72)]
+    data = [shots(make_ball, make_launches, make_shots, seed, table_tilt={"x": 0.0025, "y": 0.0}) for seed in (71, 72)]
     loop = SearchLoop(holdout(*data), [EFFECTS["table_tilt"]], predicts_well, judges_alike, unwatched)
     strict, loose = (replace(loop, name_at=at).run(make_ball()) for at in (0.9999, 0.01))
     assert strict.odds.models == loose.odds.models
