@@ -81,13 +81,10 @@ class Fuzzer:
             if found[0] == "fault":
                 _keep(corpus, reader, name, content)
 
-    def replaced(self, ways: int = len(REPLACEMENTS)) -> None:
-        """Every file empty, gone, a folder, a link to itself or to nothing, unreadable, or of zeros.
-
-        Args: ways: number of these for each file; fewer than all are taken in turn.
-        """
-        for number, (reader, name) in enumerate(self.files):
-            for kind in (*REPLACEMENTS, *REPLACEMENTS)[number % len(REPLACEMENTS) :][:ways]:
+    def replaced(self) -> None:
+        """Every file empty, gone, a folder, a link to itself or to nothing, unreadable, or of zeros."""
+        for reader, name in self.files:
+            for kind in REPLACEMENTS:
                 self._replace(self._place / reader / name, kind)
                 self._ended(reader, name, kind)
 
@@ -182,7 +179,6 @@ def main() -> int:
     parser.add_argument("--only", default="", help="names of readers begin so")
     parser.add_argument("--corpus", type=Path, default=CORPUS, help="folder for files with faults")
     parser.add_argument("--replay", action="store_true", help="first the corpus, and every file replaced as a whole")
-    parser.add_argument("--ways", type=int, default=len(REPLACEMENTS), help="of each file to be replaced as a whole")
     options = parser.parse_args()
     options.corpus.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
@@ -191,7 +187,7 @@ def main() -> int:
             for reader, name, content in corpus_cases(options.corpus):
                 if reader.startswith(options.only):
                     fuzzer.case(reader, name, content)
-            fuzzer.replaced(options.ways)
+            fuzzer.replaced()
         fuzzer.run(options.seconds, options.seed, options.corpus)
         fuzzer.close()
     counts = fuzzer.counts

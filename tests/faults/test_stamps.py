@@ -13,7 +13,6 @@ QUICK = (
     "ballfg track DETECTIONS",
     "bf.estimate(folder)",
     "bf.predict(track), events ahead",
-    "Online.push",
     "sightings: Smoother, push_sighting, time offsets",
     "RadarSpeed.at, bf.estimate",
 )
