@@ -27,7 +27,7 @@ bench: $(WARM)  ## the estimator comparison: table, results/results.json, pictur
 test: $(WARM)  ## the tests but for those marked `thorough`: five minutes on two cores
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not thorough"
 
-test-all: $(WARM)  ## all tests, twelve minutes: also README and tutorials, cold compilation, long fault tables, videos, campaigns
+test-all: $(WARM)  ## all tests, twelve minutes: also README, tutorials, cold compilation, fuzz, bombs, signals, full disks, videos, campaigns
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 check: $(READY)  ## format, lint, types (of the installed package: its folders lie apart in the source tree)
