@@ -102,10 +102,9 @@ class Priors:
         values = np.array([fit.unknowns.values[name] for name in listed])
         centres = problem.centres.copy()
         for hypothesis, place in zip(with_strengths, places, strict=True):
-            listed = [hypothesis.coefficients[n] for n in hypothesis.strengths]
-            # g, which models state as exact, is about the stated value
-            kept = zip(listed, centres[place], strict=True)
-            centres[place] = [at if c.sigma == 0.0 else float(c.absent or 0.0) for c, at in kept]
+            strengths = [hypothesis.coefficients[n] for n in hypothesis.strengths]
+            stated = zip(strengths, centres[place], strict=True)  # models state g as exact: it is about that value
+            centres[place] = [value if c.sigma == 0.0 else float(c.absent or 0.0) for c, value in stated]
         base = problem.common_precision.copy()
         for place in places:
             base[place] = 0.0
