@@ -17,8 +17,9 @@ from ballfg.progress import VARIABLE
 
 collect_rarely()  # as the commands do
 os.environ[VARIABLE] = "1"  # what commands print must not depend on how long they take
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell has it for what it starts in the background
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # tests send it to the processes that they start
+for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+    if signal.getsignal(number) is signal.SIG_IGN:  # in the background of a shell, and under nohup
+        signal.signal(number, handler)  # tests send them to the processes that they start
 
 
 @pytest.fixture
