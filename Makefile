@@ -4,6 +4,8 @@ DATA   ?= $(or $(BALLFG_DATA),../shared/data)
 VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
+WARM   := $(VENV)/.compiled
+CODE   := $(wildcard ballfg/dynamics/*.yaml factors/*.py $(addprefix ballfg/dynamics/, compiled/*.py compiled/*/*.py effects/*.py motion/*.py))
 SOURCES := ballfg factors learning benchmarks tests docs/results
 TOOLS  := build/tools/bin/pip-audit
 OLDEST := tests/factors tests/files tests/importing/test_forms.py tests/live/test_bag.py tests/dynamics/test_model_file.py \
@@ -16,16 +18,16 @@ unexport PYTHONDONTWRITEBYTECODE  # interpreters that tests start compile the pa
 
 .PHONY: bench test test-all check check-speed check-deps check-oldest docs results-page package sbom readme fuzz mutants format clean
 
-bench: $(READY)  ## the estimator comparison: table, results/results.json, pictures; measured tracks too where they are
+bench: $(WARM)  ## the estimator comparison: table, results/results.json, pictures; measured tracks too where they are
 	$(BIN)/ballfg-bench estimators --out results
 	@for set in aimy ballgun; do if [ -d "$(DATA)/$$set" ]; then \
 		$(BIN)/ballfg-bench estimators --data "$(DATA)/$$set" --out results/$$set || exit 1; \
 	else echo "no measured tracks at $(DATA)/$$set: skipped"; fi; done
 
-test: $(READY)  ## the tests but for those marked `thorough`: five minutes on two cores
+test: $(WARM)  ## the tests but for those marked `thorough`: five minutes on two cores
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not thorough"
 
-test-all: $(READY)  ## all tests, twelve minutes: also README and tutorials, cold compilation, long fault tables, videos, campaigns
+test-all: $(WARM)  ## all tests, twelve minutes: also README, tutorials, cold compilation, fuzz, bombs, signals, full disks, videos, campaigns
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 check: $(READY)  ## format, lint, types (of the installed package: its folders lie apart in the source tree)
@@ -38,7 +40,7 @@ check: $(READY)  ## format, lint, types (of the installed package: its folders l
 docs: check  ## the documentation as a site: build/site/index.html
 	@echo "build/site/index.html"
 
-check-speed: $(READY)  ## times as multiples of a control, against those of the baseline; two minutes, nothing else running
+check-speed: $(WARM)  ## times as multiples of a control, against those of the baseline; two minutes, nothing else running
 	$(BIN)/ballfg-bench speed --gate benchmarks/speed/baseline.json --out results/speed
 
 results-page: $(READY)  ## docs/benchmarks.md from the result files in docs/results
@@ -90,6 +92,9 @@ $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip "setuptools>=77" wheel
 	$(BIN)/python -m pip install --quiet --no-build-isolation -c constraints.txt -e ".[dev]"
+	touch $@
+
+$(WARM): $(READY) $(CODE)  # before the tests, whose two processes would else compile the same code
 	$(BIN)/ballfg compile
 	touch $@
 

@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 
 import pytest
 
-from ballfg.dynamics import EFFECTS, AnalyticModel
+from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel
+from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.compiled import motion
+from ballfg.dynamics.compiled.functions import CompiledModel
 from ballfg.machine import collect_rarely
 from ballfg.progress import VARIABLE
 
 collect_rarely()  # as the commands do
 os.environ[VARIABLE] = "1"  # what commands print must not depend on how long they take
+for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+    if signal.getsignal(number) is signal.SIG_IGN:  # in the background of a shell, and under nohup
+        signal.signal(number, handler)  # tests send them to the processes that they start
 
 
 @pytest.fixture
@@ -29,6 +36,18 @@ def every_effect() -> AnalyticModel:
         "table_height": {"offset": -0.004},
     }
     return AnalyticModel([EFFECTS[name](**v) for name, v in values.items()])
+
+
+@pytest.fixture
+def networks_in_torch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Networks move in torch, the definition of their machine code, which takes up to half a minute to make."""
+    machine_code = motion.functions_of
+
+    def functions_of(model: BallModel) -> CompiledModel | None:
+        alone = model.model if isinstance(model, AugmentedModel) else model
+        return machine_code(model) if isinstance(alone, AnalyticModel) else None
+
+    monkeypatch.setattr(motion, "functions_of", functions_of)
 
 
 def pytest_collection_finish() -> None:

@@ -192,6 +192,7 @@ def test_the_benchmark_on_measured_tracks_has_its_rows(with_package: Interpreter
     assert scored["back-and-forth"] == pytest.approx(scored["ekf"], rel=1e-6)  # at the newest sample the pass is over
 
 
+@pytest.mark.thorough  # a quicker one: on measured tracks
 def test_the_benchmark_on_simulated_tracks_has_its_rows(with_package: Interpreter, tmp_path: Path) -> None:
     """The suite of `ballfg-bench estimators --quick` with fewer tracks."""
     said = printed(with_package(tmp_path, function="small_run:run"))

@@ -8,8 +8,10 @@ from pathlib import Path
 
 import pytest
 
+import ballfg.diagnosis
 from ballfg.simulation import SimulationConfig, parse_effects, write_simulation
 from tests.commands import status
+from tests.diagnosis.made_diagnosis import silent
 
 CANDIDATES = "topspin=-3..5:2,sidespin=-5..5:5,speed=8..14:2"
 
@@ -63,11 +65,14 @@ def test_without_a_pair_the_dataset_is_diagnosed_first(tmp_path: Path, capsys: p
 
 
 def test_a_diagnosis_without_a_pair_is_refused(
-    launched: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    launched: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(ballfg.diagnosis, "diagnose", lambda *_, **__: silent())
     out = tmp_path / "shots.csv"
     assert status("design", launched, "--candidates", CANDIDATES, "--out", out, "--jobs", 1) == 2
-    assert "the diagnosis names no pair of effects that it could not tell apart" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "nothing says what the shots are for: diagnosing the dataset" in said
+    assert "the diagnosis names no pair of effects that it could not tell apart" in said
     assert not out.exists()
 
 

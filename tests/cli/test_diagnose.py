@@ -27,7 +27,7 @@ NAMES = ["model.yaml", "report.html", "report.json"]
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("cli") / "shots"
-    write_simulation(folder, SimulationConfig(tracks=12, rate=100.0, seed=2))
+    write_simulation(folder, SimulationConfig(tracks=8, rate=60.0, seed=2))
     return folder
 
 

@@ -113,7 +113,10 @@ def test_a_fault_of_the_program_keeps_its_traceback():
         guarded(command)
 
 
-@pytest.mark.parametrize("words", ["--help", "estimate --help", "info", "simulate --out x --tracks 2"])
+@pytest.mark.parametrize(
+    "words",
+    ["--help", "estimate --help", "info", pytest.param("simulate --out x --tracks 2", marks=pytest.mark.thorough)],
+)
 def test_a_reader_of_stdout_that_leaves_is_no_error(words, tmp_path):
     """As `| head`: no word, and the status that shells show of a program which SIGPIPE ends; results stay."""
     code = "from ballfg.cli.main import run; run()"

@@ -216,7 +216,7 @@ def test_the_group_of_all_tracks(dataset: Dataset, tmp_path: Path, capsys: pytes
     )
     save_model(model, tmp_path / "model.yaml")
     unlabelled = tmp_path / "shots"
-    write_dataset(unlabelled, dataset.info, (replace(track, labels={}) for track in dataset))
+    write_dataset(unlabelled, dataset.info, (replace(track, labels={}) for track in list(dataset)[:2]))
 
     def table(command: str, *options: object) -> str:
         out = tmp_path / "out.csv"

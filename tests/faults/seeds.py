@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Collection
 from pathlib import Path
 
 import cv2
@@ -44,15 +45,17 @@ noise: {position: [0.003, 0.004, 0.005], memory: [0.001, 0, 0.002], coefficients
 """
 
 
-def write_seeds(folder: Path) -> None:
-    """Writes `folder/<reader>/...` for every reader of `tests.faults.readers`."""
+def write_seeds(folder: Path, only: Collection[str] | None = None) -> None:
+    """Writes `folder/<reader>/...` for some readers of `tests.faults.readers`, all of them by default."""
     shots = [one.track for one in simulate(SimulationConfig(2, rate=120.0, seed=3))]
     for name in _WRITERS:
-        write_reader(folder, name)
+        if only is None or name in only:
+            write_reader(folder, name)
     for form in FORMS:
         place = folder / f"import_{form.__name__}"
-        place.mkdir()
-        form(place, shots)
+        if only is None or place.name in only:
+            place.mkdir(parents=True)
+            form(place, shots)
 
 
 def write_reader(folder: Path, name: str) -> None:

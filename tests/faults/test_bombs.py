@@ -23,6 +23,7 @@ QUICK = (
 """Those that are written in a moment."""
 
 
+@pytest.mark.thorough
 def test_bombs_are_refused(tmp_path: Path) -> None:
     """In a process that has no threads yet; each gets twice its time, for processors that others use too are slower."""
     code = (
@@ -85,6 +86,11 @@ def test_every_format_has_bombs() -> None:
     assert {kind for kind, _, _ in BOMBS.values()} >= {"dataset", "parquet_dataset", "import", "results", "video"}
 
 
-def test_the_path_of_a_bomb_is_named(tmp_path: Path) -> None:
-    (found,) = run(["csv/endless header"], tmp_path).values()
-    assert "tracks.csv, line 1: the line of column names must have at most 65536 bytes" in found.words
+def test_some_bombs_are_refused_in_this_process_too_and_their_path_is_named(tmp_path: Path) -> None:
+    found = run(
+        ["csv/endless header", "json/small lists", "yaml/aliases", "npy/a header alone", "safetensors/a length alone"],
+        tmp_path,
+    )
+    assert {name for name, one in found.items() if one.outcome != "refused" or one.memory > MEMORY} == set()
+    said = found["csv/endless header"].words
+    assert "tracks.csv, line 1: the line of column names must have at most 65536 bytes" in said

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -16,11 +18,34 @@ import pytest
 from ballfg.files.damaged import library_reads
 from ballfg.importing.formats.containers import read_hdf5
 from tests.faults import worker
+from tests.faults.fuzz import corpus_cases
+from tests.faults.readers import reader_of
+from tests.faults.seeds import write_seeds
 from tests.faults.worker import Worker, verdict
 from tests.places import ROOT
 
 
-@pytest.mark.parametrize("seconds", [0, pytest.param(6, marks=pytest.mark.thorough)])
+@pytest.mark.filterwarnings("ignore")  # a damaged file may be warned of, as the command line hides
+def test_the_corpus_is_refused_in_one_line(tmp_path: Path) -> None:
+    """Damaged files that once were a fault, read in this process."""
+    cases, place = list(corpus_cases()), tmp_path / "case"
+    write_seeds(tmp_path / "seeds", {reader for reader, _, _ in cases})
+    wrong = []
+    for reader, name, content in cases:
+        shutil.copytree(tmp_path / "seeds" / reader, place, symlinks=True)
+        (place / name).write_bytes(content)
+        wanted = reader_of(reader)
+        found = verdict(
+            partial(wanted.read, place, place / name), (Path(name).name, str(place)) if wanted.names_file else ()
+        )
+        wrong += [(reader, name, found)] if found[0] == "fault" else []
+        shutil.rmtree(place)
+    assert not wrong
+    assert len(cases) > 30
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("seconds", [6])
 def test_every_reader_refuses_damaged_files_in_one_line(seconds: int) -> None:
     """The corpus, every file replaced as a whole, then some seconds of random damage."""
     command = [sys.executable, "-m", "tests.faults.fuzz", "--replay", "--seconds", str(seconds), "--seed", "1"]

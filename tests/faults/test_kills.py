@@ -24,10 +24,15 @@ SOME = {
     "train": 2,
 }
 """Numbers of calls at which these are killed here; `python -m tests.faults.kills --all` tries every call of all."""
+LONG = ("train", "calibrate-cameras", "learned-model", "sequence-model")
+"""Those of `SOME` that take long, or write as others do."""
 NAMED = {scenario.name: scenario for scenario in SCENARIOS}
 
 
-@pytest.mark.parametrize(("words", "points"), [(("folder",), 30), (("folder-again", "--full-disk"), 150)])
+@pytest.mark.parametrize(
+    ("words", "points"),
+    [(("folder",), 30), pytest.param(("folder-again", "--full-disk"), 150, marks=pytest.mark.thorough)],
+)
 def test_a_folder_at_every_call_that_is_killed_or_finds_the_disk_full(words: tuple[str, ...], points: int) -> None:
     command = [sys.executable, "-m", "tests.faults.kills", "--all", *words]  # without torch a copy takes 2 ms
     said = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
@@ -37,7 +42,7 @@ def test_a_folder_at_every_call_that_is_killed_or_finds_the_disk_full(words: tup
     assert [word for word in last.split() if word.strip(",").isdigit()][1:] == [*["0,"] * 6, "0"]
 
 
-@pytest.mark.parametrize("name", SOME)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.thorough] * (n in LONG)) for n in SOME])
 def test_a_kill_of_each_command(name: str) -> None:
     warm_up()
     tally = Tally()

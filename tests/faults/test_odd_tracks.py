@@ -20,7 +20,7 @@ from tests.commands import status
 from tests.faults.odd_tracks import INFO, estimator_of, judged, realistic, sound, still, wild
 
 FAST = ("smoother", "sliding-window", "ekf", "online")
-COUNTS = {"smoother": 10, "sliding-window": 16, "ekf": 8, "online": 8}
+COUNTS = {"smoother": 6, "sliding-window": 16, "ekf": 6, "online": 5}
 """Tracks of each sort; the slower estimators see fewer of them here, and all of them in the whole run."""
 
 

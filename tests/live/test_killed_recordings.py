@@ -9,11 +9,8 @@ import pytest
 from tests.live.killed_recordings import Case, run
 
 
-@pytest.mark.parametrize(
-    "case",
-    [Case("jsonl", "tcp", 1.7), pytest.param(Case("mcap", "pipe", 2.2), marks=pytest.mark.thorough)],
-    ids=["jsonl", "mcap"],
-)
+@pytest.mark.thorough  # a quicker one: test_recording.py
+@pytest.mark.parametrize("case", [Case("jsonl", "tcp", 1.7), Case("mcap", "pipe", 2.2)], ids=["jsonl", "mcap"])
 def test_a_kill_loses_nothing_and_the_same_command_continues(case: Case, tmp_path: Path) -> None:
     if case.ending == "mcap":
         pytest.importorskip("rosbags", reason="the extra 'ros' is not installed")

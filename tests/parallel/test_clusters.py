@@ -71,6 +71,7 @@ def test_a_dask_cluster_finds_the_same_to_the_last_bit(
 
 
 @needs_dask
+@pytest.mark.thorough  # a quicker one: test_stream.py
 def test_a_killed_dask_worker_loses_and_doubles_nothing(
     cluster: Any, dataset: Dataset, estimator: Estimator, alone: list[bytes]
 ) -> None:

@@ -54,7 +54,14 @@ def _interleave(path) -> None:
     path.write_text(header + "".join(rows))
 
 
-@pytest.mark.parametrize("kind", [pytest.param("csv", marks=pytest.mark.thorough), "parquet", "interleaved csv"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param("csv", marks=pytest.mark.thorough),
+        "parquet",
+        pytest.param("interleaved csv", marks=pytest.mark.thorough),
+    ],
+)
 def test_memory_does_not_grow_with_the_number_of_tracks(tmp_path, kind):
     info = DatasetInfo("many", 0.76, TABLE_TENNIS, rate=150.0)
     peaks = []

@@ -45,6 +45,7 @@ def test_filter_and_graph_agree_at_the_newest_sample(small_run: tuple[Results, l
         assert ratio == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.thorough  # a quicker one: test_protocols.py
 def test_same_seed_gives_the_same_rows(small_run: tuple[Results, list[Path]], tmp_path: Path) -> None:
     again = Results("test", 2)
     run_synthetic(again, tmp_path, SMALL, 1)

@@ -21,7 +21,7 @@ def problem() -> Problem:
     return replace(whole, measured=whole.measured[:2], label=whole.label[:2])
 
 
-@pytest.mark.parametrize("kind", ["estimate", "gradient"])
+@pytest.mark.parametrize("kind", ["estimate", pytest.param("gradient", marks=pytest.mark.thorough)])
 def test_libraries_meet_the_reference(problem, kind, tmp_path) -> None:
     task, results = suite.Task("A", kind, network=False, tracks=2, turns=1, runs=2), Results("test", 0)
     suite._run_task(results, task, problem, {name: [suite.sys.executable] for name in suite.OWN}, tmp_path)
@@ -29,7 +29,7 @@ def test_libraries_meet_the_reference(problem, kind, tmp_path) -> None:
     assert off is not None
     assert time is not None
     assert off < suite.SAME
-    assert 0.0 < time < 1e4
+    assert time > 0.0
     if kind == "estimate":
         assert (results.value("A", "gtsam", "difference") or np.inf) < suite.SAME
         assert (results.value("A", "gtsam", "memory") or 0.0) > 10.0

@@ -26,7 +26,7 @@ SETTINGS = Settings.for_measured(MODEL, position_noise=(NOISE,) * 3, spin_label_
 @pytest.fixture(scope="module")
 def scattered():
     """Tracks of the world of `Settings.for_measured` with right labels, in two halves."""
-    dataset, _ = scattering_set(11, 1.0)
+    dataset, _ = scattering_set(11, 1.0, tracks=16)
     return hold_out(dataset, MODEL)
 
 
@@ -83,7 +83,7 @@ def test_right_labels_are_not_accused(scattered) -> None:
 
 
 def test_wrong_labels_are_found() -> None:
-    dataset, bad = scattering_set(12, 0.5, 0.2)
+    dataset, bad = scattering_set(12, 0.5, 0.2, tracks=15)
     labels, _ = judged(dataset, whole=False)
     named = {verdict.track for verdict in labels.contradicted}
     assert named <= bad

@@ -76,7 +76,7 @@ def too_many(alarms, trials, level):
 
 
 @pytest.mark.parametrize("kind", NOISE)
-@pytest.mark.parametrize("count", [6, 12, 40])
+@pytest.mark.parametrize("count", [6, 12, pytest.param(40, marks=pytest.mark.thorough)])
 def test_false_alarms(count, kind):
     """At most a fifth more than stated at 10 %, half more at 2 %: few tracks cannot tell their scatter better."""
     found = p_values(count, kind)
@@ -109,7 +109,7 @@ def test_power_where_the_ideal_test_has_ninety_percent(count, least):
 
 
 @pytest.mark.parametrize(("candidate", "column"), [(0, 0), (2, 4)])
-@pytest.mark.parametrize("alarm", [0.05, 1e-4])
+@pytest.mark.parametrize("alarm", [0.05, pytest.param(1e-4, marks=pytest.mark.thorough)])
 def test_an_effect_of_the_stated_size_is_noticed_in_nine_of_ten_cases(candidate, column, alarm):
     """Exactly for a single coefficient; of several at least, for the others need not be free."""
     rng, count = np.random.default_rng(7), 40

@@ -13,10 +13,10 @@ from ballfg.dynamics.compiled.build import read_note, write_note
 from ballfg.dynamics.compiled.kept import cache_folder
 
 SCRIPT = """
-from ballfg.dynamics import nominal_model
+from ballfg.dynamics import EFFECTS, AnalyticModel
 from ballfg.dynamics.compiled.functions import compiled
 from ballfg.dynamics.compiled.kept import cache_folder
-assert compiled(nominal_model()) is not None
+assert compiled(AnalyticModel([EFFECTS["gravity"](), EFFECTS["restitution"]()])) is not None
 print(*sorted(p.name for p in cache_folder().glob("*.py")))
 """
 

@@ -1,4 +1,7 @@
-"""Compiled networks against torch: every kind, alone and as a correction that fades; new weights need no new code."""
+"""Compiled networks against torch: every kind, alone and as a correction that fades; new weights need no new code.
+
+Those that take long to compile are in `make test-all`; a small correction has all that they have but for fading.
+"""
 
 import copy
 
@@ -42,12 +45,26 @@ def faded(kind):
     return model
 
 
-@pytest.mark.parametrize("kind", ["mlp", *(pytest.param(kind, marks=pytest.mark.thorough) for kind in KINDS[1:])])
+def small(kind):
+    """A correction that does not fade."""
+    return network(kind, residual=True, **SMALL)
+
+
+either = pytest.mark.parametrize("made", [small, pytest.param(faded, marks=pytest.mark.thorough)])
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_of_network(kind) -> None:
     agree(network(kind))
 
 
-@pytest.mark.parametrize("kind", [*(pytest.param(kind, marks=pytest.mark.thorough) for kind in KINDS[:-1]), KINDS[-1]])
+def test_a_small_correction() -> None:
+    agree(small("mnn+gs"))
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("kind", KINDS)
 def test_corrections_of_a_model_that_fade(kind) -> None:
     agree(faded(kind))
 
@@ -59,21 +76,24 @@ def test_networks_that_give_spin_rates_and_small_ones() -> None:
     agree(network("mnn+gs", residual=True))
 
 
-def test_weights_are_those_of_the_moment() -> None:
-    model = faded("mnn+gs")
+@either
+def test_weights_are_those_of_the_moment(made) -> None:
+    model = made("mnn+gs")
     other = copy.deepcopy(model)
     assert compiled(other) is compiled(model)
     agree(model)
     with torch.no_grad():
-        other.flight.network.first.weight.mul_(0.5)
+        next(other.flight.network.parameters()).mul_(0.5)
         agree(other)
         other.contact.network.last.weight.add_(0.01)
     agree(other)
     agree(model)
 
 
-def test_coefficients_that_travel_with_the_state_of_a_learned_model() -> None:
-    model = AugmentedModel(faded("mnn+gs"), ("fading.flight", "base.flight.drag.k"))
+@either
+def test_coefficients_that_travel_with_the_state_of_a_learned_model(made) -> None:
+    first = "fading.flight" if made is faded else "base.bounce.restitution.e"
+    model = AugmentedModel(made("mnn+gs"), (first, "base.flight.drag.k"))
     known = functions_of(model)
     assert known is not None
     rows = torch.cat((states(), torch.tensor([[0.3, 0.11]], dtype=torch.float64).expand(12, 2)), dim=1)

@@ -17,6 +17,7 @@ from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.estimation.segmentation.physics import physics_of
 from tests.small_networks import SMALL
 
+pytestmark = pytest.mark.usefixtures("networks_in_torch")
 KINDS = ("mlp", "mlp+gs", "skip+gs", "mnn+gs")
 SYMMETRIC = KINDS[1:]
 GRAVITY = (0.0, 0.0, -9.81)

@@ -74,7 +74,7 @@ def test_covariance_is_the_mean_squared_error(rng):
     positions, velocities = parabola(GRAVITY)
     truth = np.concatenate((positions[10], velocities[10]))
     errors = []
-    for _ in range(4000):
+    for _ in range(2500):
         noise = settings.position_noise * rng.standard_normal((11, 3))
         result = estimate(Track(TIMES[:11], positions[:11] + noise, name="noisy"), settings=settings)
         errors.append(result.states[-1, :6] - truth)

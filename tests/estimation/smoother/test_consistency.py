@@ -111,7 +111,7 @@ def test_coefficients_of_a_track_are_honest() -> None:
     smoother = Smoother(CONFIG.ball.model, CONFIG.ball.surfaces, settings)
     nominal = {n: float(p.detach()) for n, p in CONFIG.ball.model.named_parameters()}
     values, states = [], []
-    for i in range(20):
+    for i in range(count := 12):
         truth = {name: nominal[name] + sigma * rng.standard_normal() for name, sigma in names.items()}
         effects = []
         for full, value in truth.items():
@@ -128,7 +128,7 @@ def test_coefficients_of_a_track_are_honest() -> None:
         values.append(nees(error, estimate.coefficient_covariance[None])[0])
         states.append(nees(estimate.states - simulated.true_states, estimate.covariances).mean())
         assert estimate.cross_covariances.shape == (len(simulated.track), 9, len(names))
-    low, high = chi2.ppf([0.005, 0.995], 20 * len(names)) / 20
+    low, high = chi2.ppf([0.005, 0.995], count * len(names)) / count
     assert low < np.mean(values) < high
-    low, high = chi2.ppf([0.005, 0.995], 20 * 9) / 20
+    low, high = chi2.ppf([0.005, 0.995], count * 9) / count
     assert low < np.mean(states) < high

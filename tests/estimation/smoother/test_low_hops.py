@@ -101,14 +101,14 @@ def test_averages_over_heights_are_moments_of_the_mixture() -> None:
 
 @pytest.mark.parametrize("name", ["exact model", pytest.param("coefficients estimated", marks=pytest.mark.thorough)])
 def test_no_ball_that_hops_out_is_sure_of_a_wrong_state(name) -> None:
-    """Eight tracks; `python -m tests.estimation.low_bounces` is the same over hundreds."""
+    """Five tracks; `python -m tests.estimation.low_bounces` is the same over hundreds."""
     smoother, fine = Smoother(MODEL, SURFACES, SETTINGS[name]), 0
-    for states, track in hopping_out(8, seed=1):
+    for states, track in hopping_out(5, seed=1):
         estimate = smoother.estimate(track)
         fine += estimate.status is Status.OK
         assert nees(estimate, states)[~beside_bounces(states)].max() < LIMIT
         assert np.linalg.eigvalsh(estimate.covariances).min() > 0.0
-    assert fine >= 6
+    assert fine >= 4
 
 
 def test_bounces_that_can_be_counted_are() -> None:

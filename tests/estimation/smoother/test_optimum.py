@@ -142,7 +142,7 @@ class Reference:
 
 
 CONFIG = SimulationConfig(
-    tracks=5,
+    tracks=3,
     rate=60.0,
     seed=21,
     noise=MeasurementNoise(position=SIGMA, spin=LABEL_SIGMA, dropout=0.05),

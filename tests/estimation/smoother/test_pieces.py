@@ -130,7 +130,7 @@ def test_events_are_those_of_the_whole_track():
 
 def test_a_ball_that_lies_still_across_many_pieces():
     """Its vertical spin is remembered over the whole rest: no overlap of pieces would do."""
-    throw, rest = rally(60, seed=5), 1500
+    throw, rest = rally(60, seed=5), 900
     times = 0.01 * np.arange(60 + rest)
     lying = np.tile([0.3, 0.2, HEIGHT + MODEL.radius], (rest, 1))
     noise = np.random.default_rng(0).normal(0.0, 0.0015, lying.shape)
@@ -145,7 +145,7 @@ def test_a_ball_that_lies_still_across_many_pieces():
 
 def test_results_do_not_depend_on_the_number_of_processes(monkeypatch):
     monkeypatch.setattr(smoother_module, "LONG", 1000)
-    smoother, track = PiecewiseSmoother(MODEL, TABLE, Settings.for_measured(MODEL)), rally(6500, seed=2)
+    smoother, track = PiecewiseSmoother(MODEL, TABLE, Settings.for_measured(MODEL)), rally(3000, seed=2)
     one, two = (with_jobs(jobs, smoother.estimate, track) for jobs in (1, 2))
     assert one.states.tobytes() == two.states.tobytes()
     assert one.covariances.tobytes() == two.covariances.tobytes()

@@ -78,7 +78,9 @@ def posed(parent: Path, slope: float, count: int = 28) -> Problem:
     info = DatasetInfo(name="curve", table_height=0.0, ball=TABLE_TENNIS, position_noise=NOISE)
     write_dataset(parent / "data", info, flights(7, count, slope))
     dataset = read_dataset(parent / "data")
-    config = CalibrationConfig(groups="group", coefficients=("flight.drag.k",), data=str(parent / "data"))
+    config = CalibrationConfig(
+        groups="group", coefficients=("flight.drag.k",), data=str(parent / "data"), max_iterations=4
+    )
     return pose(dataset, nominal_model(), config)
 
 

@@ -63,15 +63,20 @@ def shots(seed: int, count: int, drag: Mapping[str, float]) -> list[Track]:
     return found
 
 
-def written(parent: Path, drag: Mapping[str, float]) -> Path:
+def written(parent: Path, drag: Mapping[str, float], count: int = 40) -> Path:
     info = DatasetInfo(name="two", table_height=0.0, ball=TABLE_TENNIS, position_noise=NOISE)
-    write_dataset(parent / "data", info, shots(11, 40, drag))
+    write_dataset(parent / "data", info, shots(11, count, drag))
     return parent / "data"
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return written(tmp_path_factory.mktemp("groups"), {"back": 0.12, "top": 0.12})
+
+
+@pytest.fixture(scope="module")
+def few(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return written(tmp_path_factory.mktemp("few"), {"back": 0.12, "top": 0.12}, 12)
 
 
 def posed(folder: Path, **fields: Any) -> Problem:
@@ -111,14 +116,14 @@ def test_other_tracks_are_predicted_better_with_intervals_that_hold(steps: list[
     assert found.coverage_90 > 0.85
 
 
-def test_a_run_writes_the_groups_into_the_model(folder: Path, tmp_path: Path) -> None:
-    config = CalibrationConfig(groups="launcher", data=str(folder), max_iterations=1)
+def test_a_run_writes_the_groups_into_the_model(few: Path, tmp_path: Path) -> None:
+    config = CalibrationConfig(groups="launcher", data=str(few), max_iterations=1)
     run_calibration(config, tmp_path / "out", resume=False, jobs=1, watch=unwatched)
     spins = load_model(tmp_path / "out" / "model.yaml").spins
     assert spins is not None
     assert spins.by == "launcher"
     assert {name: group.tracks for name, group in spins.groups.items()} == {
-        name: sum(track.labels["launcher"] == name for track in read_dataset(folder) if track.name in fitted(folder))
+        name: sum(track.labels["launcher"] == name for track in read_dataset(few) if track.name in fitted(few))
         for name in PLANTED
     }
     again = replace_steps(config)
@@ -138,7 +143,7 @@ def replace_steps(config: CalibrationConfig) -> CalibrationConfig:
 
 def test_a_drag_of_each_launcher_comes_back(tmp_path: Path) -> None:
     planted = {"back": 0.15, "top": 0.10}
-    config = CalibrationConfig(groups="launcher", data=str(written(tmp_path, planted)))
+    config = CalibrationConfig(groups="launcher", data=str(written(tmp_path, planted, 24)))
     run_calibration(config, tmp_path / "out", resume=False, jobs=1, watch=unwatched)
     model = load_model(tmp_path / "out" / "model.yaml")
     assert set(model.variations) == {"flight.drag.k"}
@@ -155,6 +160,7 @@ def test_a_drag_of_each_launcher_comes_back(tmp_path: Path) -> None:
     assert drags == [values["back"], values["top"]]
 
 
+@pytest.mark.thorough
 def test_groups_predict_measured_shots_better() -> None:
     folder = DATA / "ballgun"
     if not folder.is_dir():

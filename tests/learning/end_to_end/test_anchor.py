@@ -41,6 +41,7 @@ def test_states_fly_in_all_directions_and_fall() -> None:
     assert torch.equal(random_states(1, 2000)[0], flying)
 
 
+@pytest.mark.usefixtures("networks_in_torch")
 def test_its_weight_adds_its_gradient_for_each_track(no_spin_labels: Path) -> None:
     """Two losses that differ in the weight alone differ by the anchor's gradient, times tracks and weight."""
     gradients = []

@@ -46,6 +46,7 @@ def check(learner: EndToEnd, steps: dict[str, float], tolerance: float) -> None:
         assert got == pytest.approx(expected, rel=tolerance), name
 
 
+pytestmark = pytest.mark.usefixtures("networks_in_torch")
 STEPS = {
     "model.flight.drag.k": 5e-4,
     "model.bounce.restitution.e": 5e-4,

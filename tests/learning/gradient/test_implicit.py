@@ -90,6 +90,7 @@ def test_a_tracker_with_memory_and_jitter() -> None:
         assert float((gradient * direction).sum()) == pytest.approx(expected, rel=SAME)
 
 
+@pytest.mark.usefixtures("networks_in_torch")
 @pytest.mark.parametrize(("kind", "step"), [("mnn+gs", 1e-4), pytest.param("mlp", 3e-5, marks=pytest.mark.thorough)])
 def test_weights_of_networks(kind, step) -> None:
     """Random directions in all weights of a network; small steps, since a residual lies 8e-5 from Huber's bend."""

@@ -23,7 +23,10 @@ def bouncing(number: int) -> Track:
     return Track(times, np.stack([vx * times, vy * times, z], axis=1), name=str(number))
 
 
-@pytest.mark.parametrize(("kind", "width", "steps", "rate"), [("lstm", 64, 500, 1e-2), ("diffusion", 16, 300, 4e-3)])
+@pytest.mark.parametrize(
+    ("kind", "width", "steps", "rate"),
+    [("lstm", 64, 500, 1e-2), pytest.param("diffusion", 16, 300, 4e-3, marks=pytest.mark.thorough)],
+)
 def test_four_tracks_are_learned_to_millimetres(kind: SequenceKind, width: int, steps: int, rate: float) -> None:
     examples = [example(bouncing(number), 5, torch.zeros(0, dtype=torch.float64)) for number in range(4)]
     batch = collate(examples)

@@ -38,7 +38,13 @@ def apart(one: Camera, other: Camera) -> float:
     return float(np.linalg.norm(astray(one, other), axis=1).max())
 
 
-@pytest.mark.parametrize(("board", "reach"), [(CHESSBOARD, 1.0), (CHARUCO, 1.7)], ids=["chessboard", "charuco"])
+@pytest.mark.parametrize(
+    ("board", "reach"),
+    [
+        pytest.param(CHESSBOARD, 1.0, marks=pytest.mark.thorough, id="chessboard"),
+        pytest.param(CHARUCO, 1.7, id="charuco"),
+    ],
+)
 def test_lens_is_recovered_from_images(board: Chessboard | Charuco, reach: float) -> None:
     rng = np.random.default_rng(0)
     views = []

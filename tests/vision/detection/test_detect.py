@@ -112,6 +112,7 @@ def test_example_in_the_docs_runs(
     assert f"{COUNT} frames" in capsys.readouterr().out
 
 
+@pytest.mark.thorough  # a quicker one: tests/parallel/test_stream.py
 def test_a_process_that_dies_ends_the_search(films: dict[str, Path]) -> None:
     def die(video: Video) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
