@@ -58,6 +58,7 @@ class Finding:
         held_out_p: probability of such a gain there by chance.
         sentence, decide: what the effect is, and the measurement that tells it from others.
         probability: that the effect is there, over all models that were compared.
+        together: probability that it or one of `indistinguishable_from` is there.
         evidence: logarithm of the density of the tracks with it over that without it, natural units.
         usual: words on a strength outside of the usual range; empty inside.
     """
@@ -75,6 +76,7 @@ class Finding:
     probability: float = 1.0
     evidence: float = float("nan")
     usual: str = ""
+    together: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from ballfg.benchmarks.diagnosis.suite import collect_records, run_case
 from ballfg.benchmarks.metrics import CONFIDENCE, Figure
 from ballfg.benchmarks.results import Results
 from ballfg.benchmarks.resumable import RUNS_FOLDER
+from ballfg.diagnosis.hypotheses.hypothesis import TWINS
 
 TITLE, ALL = "reliability", "all"
 EDGES = (0.5, 0.7, 0.9, 0.97, 1.0)  # Ends of the bins of the stated probability; a bin holds its lower end
@@ -48,6 +49,11 @@ def run_reliability(
     add_reliability(results, cases, collect_records(cases, runs, jobs, run))
 
 
+def _right(case: Case) -> set[str]:
+    """The planted effects, and the equivalent ones: less gravity is a buoyancy."""
+    return set(case.planted) | {name for name, twins in TWINS.items() if set(twins) & set(case.planted)}
+
+
 def add_reliability(results: Results, cases: Sequence[Case], records: Mapping[str, Record]) -> None:
     """In each bin the mean stated probability, and the share of right names with the band that chance allows about it.
 
@@ -56,7 +62,7 @@ def add_reliability(results: Results, cases: Sequence[Case], records: Mapping[st
     """
     done = [(case, records[case.name]) for case in cases if case.name in records]
     results.add(TITLE, "failed", ALL, "1", float(len(cases) - len(done)), len(cases))
-    stated = [(p, name in case.planted) for case, record in done for name, p in record.probabilities.items()]
+    stated = [(p, name in _right(case)) for case, record in done for name, p in record.probabilities.items()]
     if not stated:
         print("note: no reliability rows: the diagnoses state no probability", file=sys.stderr)
         return

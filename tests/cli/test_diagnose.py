@@ -77,7 +77,7 @@ def test_what_is_printed_and_written(
     assert first == headline(found())
     assert lines[0] == f"effect found: {found().sentence}"
     assert lines[2].split()[:4] == ["effect", "probability", "kind", "by"]
-    assert lines[3].startswith("wind    99.8 %       flight  less than 1e-99  -598  gust_region          x 0.2")
+    assert lines[3].startswith("wind    99.8 % (one of them > 99.9 %)  flight  less than 1e-99  -598  gust_region")
     assert lines[5:8] == [
         "on 25 judging tracks  before  after",
         "prediction RMSE, mm   20.1    10.2",

@@ -113,7 +113,8 @@ def _summary(diagnosis: Diagnosis) -> Iterator[str]:
     for f in diagnosis.findings:
         others = ", ".join(f.indistinguishable_from) or "-"
         chance, bic = probability(f.p_value), f"{f.delta_bic:+.0f}"
-        rows.append((f.name, odds(f.probability), f.kind, chance, bic, others, listed(f.parameters)))
+        there = odds(f.probability) + (f" (one of them {odds(f.together)})" if f.indistinguishable_from else "")
+        rows.append((f.name, there, f.kind, chance, bic, others, listed(f.parameters)))
     if diagnosis.findings:
         yield from ("", *_aligned(rows))
     before, after = diagnosis.before, diagnosis.after

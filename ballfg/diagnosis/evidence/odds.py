@@ -11,6 +11,8 @@ from scipy import special
 from ballfg.diagnosis.evidence.nameless import NAMELESS
 from ballfg.diagnosis.evidence.weighed import Weighed
 
+ALIKE = 0.05
+"""Odds of another effect in an effect's place above which the two cannot be told apart."""
 SURELY = 2.0
 """Standard errors by which the gain on the other half must fall short of the evidence to be believed instead."""
 
@@ -38,6 +40,17 @@ class Odds:
     def nameless(self) -> float:
         """Probability that something nameless is there."""
         return self.of(NAMELESS)
+
+    def alike(self, name: str, model: frozenset[str]) -> list[str]:
+        """Effects that can hardly be told from one of a model: in its place they are at least `ALIKE` as probable."""
+        least, rest = self.models[model] * ALIKE, model - {name}
+        others = [names for names, p in self.models.items() if p > least and rest < names and name not in names]
+        return sorted({other for names in others for other in names - rest} - {NAMELESS})
+
+    def together(self, name: str, model: frozenset[str]) -> float:
+        """Probability that an effect of a model is there, or one of those that can hardly be told from it."""
+        group = {name, *self.alike(name, model)}
+        return float(sum(p for names, p in self.models.items() if names & group))
 
     def effects(self) -> dict[str, float]:
         """Probability of each effect in any model, the most probable first."""

@@ -7,7 +7,7 @@ solution, so that effects which only help together are found together.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final
 
@@ -22,6 +22,8 @@ from ballfg.diagnosis.evidence.weighed import Priors, Step, Weighed
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.state import STATE_DIM
 
+TRIED: Final = tuple(range(0, len(WIDTHS), 2))
+"""Numbers of the widths that are tried: a screen needs no finer ones."""
 KEPT: Final = 6
 """Number of the most probable sets of each size that are enlarged."""
 
@@ -43,6 +45,7 @@ class Screen:
     likelihood: Likelihood
     total: Reduced
     priors: Priors
+    _known: dict[tuple[tuple[tuple[int, int], ...], int], _Gain] = field(default_factory=dict)
 
     @classmethod
     def of(cls, model: Weighed, motion: Motion, candidates: Sequence[Hypothesis], columns: Array) -> Screen:
@@ -60,15 +63,16 @@ class Screen:
     @cached_property
     def gains(self) -> list[float]:
         """Logarithm of the evidence with each candidate over that of the model, at the model's noise."""
-        return [gain for gain, *_ in self._alone]
+        return [self._beside((), one).gain + choice_odds([self.candidates[one]]) for one in range(len(self.candidates))]
 
     def odds(self, chosen: Sequence[int]) -> float:
-        """Logarithm of the posterior odds of the model with some candidates to the model itself."""
+        """Logarithm of the posterior odds of the model with some candidates, added in turn, to the model itself."""
+        gain, beside = 0.0, tuple[tuple[int, int], ...]()
+        for one in chosen:
+            more = self._beside(beside, one)
+            gain, beside = gain + more.gain, (*beside, (one, more.width))
         listed = [self.candidates[one] for one in chosen]
-        widths = [self._alone[one][1] for one in chosen]
-        mixed = sum(self._alone[one][2] for one in chosen)
-        evidence = self._posterior(chosen, widths).evidence - self._base + mixed
-        return evidence + choice_odds(listed) + log_odds(listed)
+        return gain + choice_odds(listed) + log_odds(listed)
 
     def sets(self, offered: Sequence[int], most: int) -> list[tuple[int, ...]]:
         """Sets of up to `most` of the candidates offered, each more probable than all its parts; the best first.
@@ -80,12 +84,12 @@ class Screen:
         for _ in range(most - 1):
             larger: dict[tuple[int, ...], float] = {}
             for chosen in best:
-                names = self._names(chosen)
+                names, known = self._names(chosen), {frozenset(c) for c in larger}
                 for one in offered:
-                    both = tuple(sorted((*chosen, one)))
-                    if self.candidates[one].name not in names and both not in larger:
-                        larger[both] = self.odds(both)
-            gained = {c: o for c, o in larger.items() if o > max(found.get(part, -np.inf) for part in _parts(c))}
+                    if self.candidates[one].name not in names and frozenset((*chosen, one)) not in known:
+                        larger[*chosen, one] = self.odds((*chosen, one))
+            parts = {frozenset(c): o for c, o in found.items()}
+            gained = {c: o for c, o in larger.items() if o > max(parts.get(part, -np.inf) for part in _parts(c))}
             best = self._leading(gained)
             found |= {chosen: gained[chosen] for chosen in best}
         return self._leading(found, len(found))
@@ -100,11 +104,8 @@ class Screen:
             if without not in self.model.nested:
                 continue
             held = self.priors.held([place], widths)
-            base = self._posterior([], [], held).evidence
             for one, candidate in enumerate(self.candidates):
-                _, width, mixed = self._alone[one]
-                gain = self._posterior([one], [width], held).evidence - base + mixed
-                gain += choice_odds([candidate]) + log_odds([candidate])
+                gain = self._beside((), one, held).gain + choice_odds([candidate]) + log_odds([candidate])
                 found[effect.name, one] = self.model.nested[without] + gain
         return found
 
@@ -119,7 +120,10 @@ class Screen:
 
     def step(self, chosen: Sequence[int]) -> tuple[Step, Array]:
         """The step to the most probable unknowns beside some candidates, and (s,) their strengths in order."""
-        mean = self._posterior(chosen, [self._alone[one][1] for one in chosen]).mean
+        beside = tuple[tuple[int, int], ...]()
+        for one in chosen:
+            beside = (*beside, (one, self._beside(beside, one).width))
+        mean = self._posterior(beside).mean
         common = np.zeros(self.likelihood.rows.by_common.shape[-1])
         common[self._columns(chosen)] = mean
         starts = self.likelihood.local_step(self.model.noise, common)[:, :STATE_DIM]
@@ -139,24 +143,23 @@ class Screen:
     def _own(self) -> int:
         return len(self.priors.base)
 
-    @cached_property
-    def _alone(self) -> list[tuple[float, int, float]]:
-        """For each candidate its gain, its most probable width, and the mean evidence of all widths over that."""
-        found = []
-        for one, candidate in enumerate(self.candidates):
-            evidence = np.array([self._posterior([one], [width]).evidence for width in range(len(WIDTHS))])
-            best = int(evidence.argmax())
-            mixed = float(special.logsumexp(evidence - evidence[best]) - np.log(len(WIDTHS)))
-            after = self._posterior([one], [best])
-            mean, sigmas = after.mean[self._own :], np.sqrt(np.diagonal(after.covariance)[self._own :])
-            centre = centres(candidate, self.model.fit.problem.model)
-            mixed += within(candidate, centre, centre + mean, sigmas, WIDTHS[best])
-            found.append((float(evidence[best]) + mixed - self._base + choice_odds([candidate]), best, mixed))
-        return found
-
-    @cached_property
-    def _base(self) -> float:
-        return self._posterior([], []).evidence
+    def _beside(self, beside: tuple[tuple[int, int], ...], one: int, precision: Array | None = None) -> _Gain:
+        """What one more candidate gains beside others of given widths; precision: of the model's own unknowns."""
+        key = (beside, one)
+        if precision is None and key in self._known:
+            return self._known[key]
+        candidate, least = self.candidates[one], self._posterior(beside, precision).evidence
+        found = [self._posterior((*beside, (one, width)), precision) for width in TRIED]
+        evidence = np.array([after.evidence for after in found])
+        best, size = int(evidence.argmax()), len(candidate.strengths)
+        mean, sigmas = found[best].mean[-size:], np.sqrt(np.diagonal(found[best].covariance)[-size:])
+        centre = centres(candidate, self.model.fit.problem.model)
+        inside = within(candidate, centre, centre + mean, sigmas, WIDTHS[TRIED[best]])
+        gain = float(special.logsumexp(evidence)) - np.log(len(TRIED)) - least + inside
+        more = _Gain(float(gain), TRIED[best])
+        if precision is None:
+            self._known[key] = more
+        return more
 
     @cached_property
     def _ends(self) -> Index:
@@ -167,17 +170,25 @@ class Screen:
         strengths = [np.arange(self._ends[one], self._ends[one + 1]) for one in chosen]
         return np.concatenate((np.arange(self._own), *strengths))
 
-    def _posterior(self, chosen: Sequence[int], widths: Sequence[int], precision: Array | None = None) -> Posterior:
-        """With some candidates in some widths; precision: of the model's own unknowns, if not as in the model."""
-        columns = self._columns(chosen)
+    def _posterior(self, chosen: Sequence[tuple[int, int]], precision: Array | None = None) -> Posterior:
+        """With some candidates, each in a width; precision: of the model's own unknowns, if not as in the model."""
+        columns = self._columns([one for one, _ in chosen])
         listed = np.append(columns, self.total.gram.shape[-1] - 1)
         part = Reduced(self.total.constant, self.total.gram[:, listed[:, None], listed])
-        sizes = [WIDTHS[width] * scales(self.candidates[one]) for one, width in zip(chosen, widths, strict=True)]
+        sizes = [WIDTHS[width] * scales(self.candidates[one]) for one, width in chosen]
         own = self.priors.precision(self.model.widths) if precision is None else precision
         whole = np.concatenate((own, *(size**-2 for size in sizes)))
         return posterior(part, whole, np.append(self.priors.away, np.zeros(len(columns) - self._own)))
 
 
-def _parts(chosen: tuple[int, ...]) -> list[tuple[int, ...]]:
+@dataclass(frozen=True)
+class _Gain:
+    """Logarithm of the evidence over that without a candidate, and the number of its most probable width."""
+
+    gain: float
+    width: int
+
+
+def _parts(chosen: tuple[int, ...]) -> list[frozenset[int]]:
     """The sets with one candidate less."""
-    return [chosen[:place] + chosen[place + 1 :] for place in range(len(chosen))]
+    return [frozenset(chosen[:place] + chosen[place + 1 :]) for place in range(len(chosen))]

@@ -94,6 +94,8 @@ def _finding(finding: Finding) -> Html:
     verb = "falls" if finding.delta_bic < 0 else "rises"
     gain = "adds" if finding.held_out_gain >= 0 else "takes away"
     others, evidence = finding.indistinguishable_from, [f"Probability that it is there: {odds(finding.probability)}."]
+    if others:
+        evidence.append(f"That it or one of those that cannot be told from it is there: {odds(finding.together)}.")
     if finding.usual:
         evidence.append(f"Stronger than usual: {finding.usual}.")
     by_chance = f" by chance, all candidates counted: {probability(finding.p_value)}."

@@ -8,7 +8,7 @@ import numpy as np
 
 from ballfg.arrays import Mask
 from ballfg.diagnosis.evidence.nameless import NAMELESS
-from ballfg.diagnosis.evidence.odds import Odds, odds_of
+from ballfg.diagnosis.evidence.odds import ALIKE, Odds, odds_of
 from ballfg.diagnosis.evidence.rows import random_motion
 from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.weighed import Weighed, weighed
@@ -30,6 +30,8 @@ from ballfg.estimation.batch import do_all
 
 MOST_EFFECTS = 5
 """Largest number of added effects: each costs a round."""
+MOST_EXCHANGES = 3
+"""Largest number of exchanges that a round refits."""
 NAMED = 0.9
 """Probability above which an effect is named."""
 
@@ -169,8 +171,8 @@ class _Found:
         winner = self._weighed(refits)
         if screen is not None and (winner is None or winner.score <= best.score):
             self.best = self.models[best.names] = replace(best, neighbours=screen.neighbours())
-            if self._exchanged(screen, scored, tell):
-                self.rounds.append(Round(scored, refits, (self.best.named[-1].name,)))
+            if (exchanged := self._exchanged(screen, scored, tell)) is not None:
+                self.rounds.append(Round(scored, [*refits, exchanged], (exchanged.name,)))
                 return True
         if winner is None or winner.score <= best.score:
             ways = loop.ways or partial(groupings, loop.holdout.tracks)
@@ -190,25 +192,31 @@ class _Found:
         self._pruned()
         return True
 
-    def _exchanged(self, screen: Screen, scored: Sequence[Scored], tell: Callable[[str], None]) -> bool:
-        """Puts another effect in the place of one, if that is foretold and found to be more probable."""
-        foretold, best = screen.exchanges, self.best
-        (gone, one), score = max(foretold.items(), key=lambda item: item[1], default=(("", 0), -np.inf))
-        other = screen.candidates[one]
-        if score <= best.score or best.names - {gone} | {other.name} in self.models:
-            return False
-        tell(f"fitting with {other.name} in place of {gone}")
-        own = next(h for h in best.named if h.name == gone)
-        candidate = next(s for s in scored if s.hypothesis is other)
-        fit = refit(without_named(best.fit, own, self.first), candidate).fit
-        named = (*(h for h in best.named if h is not own), other)
-        found = weighed(fit, named, self.motion, self.halves, best.noise)
-        self.models[found.names] = found
-        if found.score <= best.score:
-            return False
-        tell(f"{other.name} in place of {gone}")
+    def _exchanged(self, screen: Screen, scored: Sequence[Scored], tell: Callable[[str], None]) -> Refit | None:
+        """The refit with another effect in the place of one that makes the model more probable; None if none does.
+
+        All exchanges that are foretold to come close are refitted: they are what cannot be told apart.
+        """
+        foretold, best, tried = screen.exchanges, self.best, list[tuple[Weighed, Refit]]()
+        for gone, one in sorted(foretold, key=lambda exchange: -foretold[exchange]):
+            other, own = screen.candidates[one], next(h for h in best.named if h.name == gone)
+            if foretold[gone, one] < best.score + np.log(ALIKE) or len(tried) == MOST_EXCHANGES:
+                break
+            if best.names - {gone} | {other.name} in self.models:
+                continue
+            tell(f"fitting with {other.name} in place of {gone}")
+            candidate = next(s for s in scored if s.hypothesis is other)
+            refitted = refit(without_named(best.fit, own, self.first), candidate)
+            named = (*(h for h in best.named if h is not own), other)
+            found = weighed(refitted.fit, named, self.motion, self.halves, best.noise)
+            self.models[found.names] = found
+            tried.append((found, refitted))
+        found, refitted = max(tried, key=lambda one: one[0].score, default=(best, None))
+        if refitted is None or found.score <= best.score:
+            return None
+        tell(f"{refitted.name} exchanged for another")
         self.best, self.motion = found, random_motion(found.fit, self.scattering)
-        return True
+        return refitted
 
     def compare(self) -> None:
         """Weighs what is left of the best model beside something nameless, without effects that this makes superfluous.
@@ -227,9 +235,14 @@ class _Found:
         self.best = max(self.best, best, key=_score)
 
     def named_at(self, probability: float) -> Weighed:
-        """The model with all effects that are at least so probable, or with most of them."""
-        odds = self.odds
+        """The model with all effects that are at least so probable, or with most of them.
+
+        Of several that can hardly be told apart, the most probable one stands for all.
+        """
+        odds, best = self.odds, self.best.names
         likely = {name for name in odds.effects() if odds.of(name) >= probability} | {NAMELESS}
+        if best in odds.models:
+            likely |= {h.name for h in self.best.named if odds.together(h.name, best) >= probability}
         if gone := [h for h in self.best.named if h.name not in likely]:
             rest = self.without(gone)
             if self.best.nameless:

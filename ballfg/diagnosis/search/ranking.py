@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Final
 
 import numpy as np
 from scipy import stats
@@ -14,9 +13,6 @@ from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import TWINS, Hypothesis
 from ballfg.diagnosis.result import Candidate, Finding, Outcome, Value
 from ballfg.diagnosis.search.candidates import ALARM, Refit, Scored
-
-ALIKE: Final = 0.05
-"""Odds of another effect in an effect's place above which the two cannot be told apart."""
 
 
 def finding_of(
@@ -42,10 +38,7 @@ def finding_of(
     error = gains.std(ddof=1) / np.sqrt(len(gains))
     named = [r for r in refits if hypothesis.name in [h.name for h in r.added]]
     own = min(named, key=lambda r: len(r.added), default=None)
-    rest = model.names - {hypothesis.name}
-    likely = odds.models[model.names] * ALIKE
-    others = [names for names, p in odds.models.items() if p > likely and rest < names and hypothesis.name not in names]
-    alike = sorted({name for names in others for name in names - rest})
+    alike = odds.alike(hypothesis.name, model.names)
     return Finding(
         name=hypothesis.name,
         kind=hypothesis.effect.kind,
@@ -58,6 +51,7 @@ def finding_of(
         held_out_gain=float(gains.mean()),
         held_out_p=float(stats.norm.sf(gains.mean() / error)),
         probability=odds.of(hypothesis.name),
+        together=odds.together(hypothesis.name, model.names),
         evidence=model.evidence - without.evidence,
         usual=unusual(hypothesis, values),
     )

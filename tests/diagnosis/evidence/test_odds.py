@@ -119,6 +119,18 @@ def test_neighbours_that_no_refit_weighed_count_as_foretold():
     assert odds.of("frame_tilt") < 0.01
 
 
+def test_effects_that_cannot_be_told_apart_are_there_together():
+    """Of two that explain the same neither is sure, one of them is."""
+    nothing = model([], 0.0)
+    group = [model([name, "wind"], 60.0 + more) for name, more in (("time_scale", 0.0), ("scale", 0.2))]
+    odds, best = odds_of([nothing, *group], nothing), group[1].names
+    assert 0.5 < odds.of("scale") < 0.6
+    assert odds.alike("scale", best) == ["time_scale"]
+    assert odds.together("scale", best) > 0.99
+    assert odds.alike("wind", best) == []
+    assert odds.together("wind", best) == pytest.approx(odds.of("wind"))
+
+
 def test_the_evidence_without_an_effect_is_that_of_its_columns_left_out(calm, calm_with_wind, windy_with_wind):
     """On a calm day that of the declared model; in wind far below that of the model with wind."""
     assert calm_with_wind.nested[frozenset()] == pytest.approx(calm.score, abs=1.0)
