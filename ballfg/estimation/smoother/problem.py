@@ -91,6 +91,7 @@ class TrackProblem:
     Attributes:
         ball: the model with the estimated coefficients.
         observations: of the track, positions among them.
+        one_view: True if one camera alone saw the ball.
         unknowns: those of the observations; they follow the coefficients of the ball.
         observed: the factors of each observation, by its name.
         added: further factors, at first empty; append to it before the problem is solved.
@@ -114,6 +115,7 @@ class TrackProblem:
         self.sigma = effective_sigmas(track, segmentation, settings) if sigma is None else sigma
         self.ball = trackwise_model(model, settings)
         self.observations: tuple[Observation, ...] = observations_of(track)
+        self.one_view = any(one.one_view for one in self.observations)
         self.unknowns: Unknowns = unknowns_of(self.observations, settings)
         self.width = model_width(self.ball)
         columns = {name: self.width + k for k, name in enumerate(self.unknowns.names)}

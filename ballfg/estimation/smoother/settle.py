@@ -125,7 +125,8 @@ class ContactSearch:
         self._seen[places] = solution
         refined = refined_contacts(times, solution)
         if places_of(refined) == places:
-            unseen = () if self._settled else contacts_at_ends(times, solution, ball, self.surfaces)
+            told = self._settled is not None or self.problem.one_view  # one camera's start has all of its bounces
+            unseen = () if told else contacts_at_ends(times, solution, ball, self.surfaces)
             if not unseen:  # a contact that only the end of the track suggests must also explain it better
                 stayed = (solution,) if self._settled is None else (self._settled, solution)
                 self._best = min(stayed, key=lambda s: s.minimum.error)

@@ -74,6 +74,7 @@ class Smoother(Estimator):
 
     name = "smoother"
     has_graph = True
+    takes_one_view = True
 
     def __init__(
         self,
@@ -132,6 +133,10 @@ class Smoother(Estimator):
 
     def _segmented(self, track: Track) -> tuple[Segmentation, tuple[LowHops, ...]]:
         """The events in a track, and the compatible low hops."""
+        for observation in track.observations:
+            shown = observation.segmentation()
+            if shown is not None:
+                return shown, ()
         settings = self.settings.for_track(track)
         white = sample_sigmas(settings, len(track), track.sigmas)
         sigma = total_sigmas(settings, white, window_velocities(track.times, track.positions))
@@ -155,6 +160,8 @@ class Smoother(Estimator):
             segmentation: the initial events; None: found in the track.
             sigma: (n, 3) m, of the positions; None: the settings' or the track's own.
         """
+        for observation in track.observations:
+            track = observation.started(track, self.model, self.surfaces)
         events, hops = self._segmented(track) if segmentation is None else (segmentation, None)
         return TrackProblem(track, self.model, self.settings, events, sigma, hops)
 
@@ -172,7 +179,7 @@ class Smoother(Estimator):
         for left in range(MAX_UNSEEN_HITS if self.settings.find_events else 0, -1, -1):
             search = ContactSearch(problem, self.surfaces, segmentation)
             if earlier is None:
-                label = self.settings.spin_label(problem.track)
+                label = problem.settings.spin_label(problem.track)
                 states = initial_states(problem.track, segmentation.contacts, segmentation, self.model, label)
                 start = problem.start(states)
             else:
@@ -187,7 +194,7 @@ class Smoother(Estimator):
                     minimum = minimise_with_restart(rough, graph, values, minimum)
                 arrangement = search.after(Solution(events, graph, minimum))
             solution = search.best
-            if earlier is None and not spin_start(self.settings.spin_label(problem.track), self.settings).measured:
+            if earlier is None and not spin_start(problem.settings.spin_label(problem.track), problem.settings).measured:
                 solution = with_other_spins(solution, problem.ball, rough)
             if before is not None and leads_nowhere(solution, before):
                 break
@@ -247,10 +254,12 @@ class Smoother(Estimator):
             quality=segmentation.quality,
             error=minimum.error,
             iterations=minimum.iterations,
-            world=self.world,
+            world=replace(self.world, process=problem.settings.process),
             notes=self.doubts(track),
         )
         estimate = plausible(estimate, track, problem.sigma, self.settings)
+        for observation in problem.observations:
+            estimate = observation.judged(estimate)
         estimate = replace(estimate, notes=estimate.notes + rival_note(solution, estimate.covariances[0]))
         return widened_near_contacts(estimate, problem.ball)
 
