@@ -142,19 +142,19 @@ class Observation(ABC):
         """The track with stamps corrected by the unknowns; None, the default, if its stamps stay."""
         return None
 
-    def started(self, track: Track, model: BallModel, surfaces: Surfaces) -> Track:
-        """The track with positions for a start of its estimate; by default its own.
+    def starts(self, track: Track, model: BallModel, surfaces: Surfaces) -> tuple[Track, ...]:
+        """The track with the positions from which its estimate may start, the likely ones first; by default its own.
 
         Args: track: of the observation, with stamps since its first.  model: the ball.  surfaces: table and floor.
         """
-        return track
+        return (track,)
 
     def segmentation(self) -> Segmentation | None:
         """The events that the observation itself shows; None, the default: the positions show them."""
         return None
 
     def judged(self, estimate: Estimate) -> Estimate:
-        """The estimate of its track, with another status if the observation does not determine it; by default it does."""
+        """The estimate of its track, with a status that says what the observation leaves open; by default nothing."""
         return estimate
 
     def onto(self, old: Track, new: Track) -> Observation:

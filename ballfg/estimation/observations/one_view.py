@@ -33,6 +33,9 @@ RESTITUTION_SIGMA: Final = 0.15
 """m/s, of the vertical velocity after a bounce."""
 PRICE: Final = 10.0
 """Twice the log likelihood that a bounce must gain over a flight without one."""
+RIVAL: Final = 10.0
+"""Twice the log likelihood by which a bounce between two other samples may fit worse and is tried all the same."""
+MOST_RIVALS: Final = 2
 PLANE_SIGMA: Final = 1e-3
 """m, of the height at which a ball bounces."""
 ASIDE: Final = 0.1
@@ -47,17 +50,18 @@ class OneView:
 
     Attributes:
         path: positions, velocities and sigmas.  bounce: s, time of the bounce, or None.
-        height: m, declared height of the surface there.  misfit: twice the sum of losses of sightings and priors.
+        height: m, declared height of the surface there; None without a bounce.
+        misfit: twice the sum of the losses of sightings and priors.
     """
 
     path: Path
     bounce: float | None
-    height: float
+    height: float | None
     misfit: float
 
     def contact(self, times: Array) -> Contact | None:
         """The bounce between two of the samples at times (n,) s; None without one."""
-        if self.bounce is None:
+        if self.bounce is None or self.height is None:
             return None
         interval = int(np.clip(np.searchsorted(times, self.bounce, side="right") - 1, 0, len(times) - 2))
         return Contact(interval, self.bounce, self.height)
@@ -68,32 +72,34 @@ class _Flights:
     """Solutions about k guessed times, s: misfits (k,), unknowns (k, 9), covariances (k, 9, 9)."""
 
     times: Array
-    bounces: bool
     misfit: Array
     unknown: Array
     covariance: Array
 
 
-def one_view(rays: Rays, moments: Array, physics: SegmentationPhysics, surfaces: Surfaces) -> OneView:
-    """The most likely path with one bounce or none.
+def one_view(rays: Rays, moments: Array, physics: SegmentationPhysics, surfaces: Surfaces) -> list[OneView]:
+    """The likely paths with one bounce or none, best first; those beside the best bounce in other intervals.
 
     Args: rays: of all sightings.  moments: (n,) s, of the track's samples.  physics: of the ball.  surfaces: to meet.
     """
-    middle = np.array([float(np.median(rays.times))])
-    best, chosen, height = _solved(rays, middle, None, physics), 0, 0.0
-    least = float(best.misfit[0])
+    flight = _solved(rays, np.array([float(np.median(rays.times))]), None, physics)
     step = STEPS * rays.period
-    guesses = np.arange(rays.times[0] + step, rays.times[-1] - 0.5 * step, step) if step > 0.0 else middle[:0]
-    for place, level in enumerate(surfaces.heights() if len(guesses) else ()):
-        plane = level + physics.radius + physics.surface_offset
+    guesses = np.arange(rays.times[0] + step, rays.times[-1] - 0.5 * step, step) if step > 0.0 else np.zeros(0)
+    for place, height in enumerate(surfaces.heights() if len(guesses) else ()):
+        plane = height + physics.radius + physics.surface_offset
         tried = _solved(rays, guesses, plane, physics)
-        possible = _possible(tried, surfaces if place == 0 else None)
-        row = int(np.argmin(np.where(possible, tried.misfit, np.inf)))
-        if possible[row] and tried.misfit[row] + PRICE < least:
-            best, chosen, height = tried, row, level
-            break  # on the floor only what cannot be on the table: farther away and faster both look alike
-    path = _path(best, chosen, moments, physics, len(rays.times))
-    return OneView(path, float(best.times[chosen]) if best.bounces else None, height, float(best.misfit[chosen]))
+        misfit = np.where(_possible(tried, surfaces if place == 0 else None), tried.misfit, np.inf)
+        if misfit.min() + PRICE < flight.misfit[0]:  # the next surface only gets what cannot be on this one
+            rows = _rivals(misfit, np.searchsorted(moments, guesses, side="right"))
+            return [_path(tried, row, height, moments, physics) for row in rows]
+    return [_path(flight, 0, None, moments, physics)]
+
+
+def _rivals(misfit: Array, intervals: NDArray[np.int64]) -> list[int]:
+    """The best guess, and those of other intervals that are nearly as good, best first, `MOST_RIVALS` at most."""
+    order = [int(row) for row in np.argsort(misfit, kind="stable") if misfit[row] <= misfit.min() + RIVAL]
+    first = {int(intervals[row]): row for row in reversed(order)}
+    return sorted(first.values(), key=order.index)[: 1 + MOST_RIVALS]
 
 
 def _solved(rays: Rays, guesses: Array, plane: float | None, physics: SegmentationPhysics) -> _Flights:
@@ -135,7 +141,7 @@ def _solved(rays: Rays, guesses: Array, plane: float | None, physics: Segmentati
         depth = np.maximum((rays.depth_row[:, :3] * point).sum(axis=-1) + rays.depth_row[:, 3], NEAREST)
     loss = ROBUST**2 * np.log1p(square / ROBUST**2).sum(axis=1)
     misfit = loss + ((unknown @ prior.T - target) ** 2).sum(axis=1)
-    return _Flights(guesses, plane is not None, misfit, unknown, np.linalg.inv(information))
+    return _Flights(guesses, misfit, unknown, np.linalg.inv(information))
 
 
 def _priors(plane: float | None, physics: SegmentationPhysics) -> tuple[Array, Array]:
@@ -167,11 +173,11 @@ def _possible(tried: _Flights, table: Surfaces | None) -> NDArray[np.bool_]:
     return fine
 
 
-def _path(solved: _Flights, row: int, moments: Array, physics: SegmentationPhysics, sightings: int) -> Path:
-    """The path of one solution at moments (n,) s; misfits widen its sigmas."""
+def _path(solved: _Flights, row: int, height: float | None, moments: Array, physics: SegmentationPhysics) -> OneView:
+    """One solution at moments (n,) s, with a bounce on a surface at `height` m; misfits widen its sigmas."""
     since = moments - solved.times[row]
     unknown, covariance = solved.unknown[row], solved.covariance[row]
-    later = (since > 0.0) & solved.bounces
+    later = (since > 0.0) & (height is not None)
     start = np.where(later[:, None], unknown[6:], unknown[3:6])
     drag = physics.drag * np.minimum(np.linalg.norm(start, axis=1), 2.0 * SPEED)
     span = _stretched(since[None], drag[None])[0]
@@ -185,5 +191,7 @@ def _path(solved: _Flights, row: int, moments: Array, physics: SegmentationPhysi
         slope[:, axis, 3 + axis] = np.where(later, 0.0, span)
         slope[:, axis, 6 + axis] = np.where(later, span, 0.0)
     variance = np.einsum("nij,jk,nik->ni", slope, covariance, slope)
-    scale = max(float(solved.misfit[row]) / max(2 * sightings - 8, 1), 1.0)
-    return Path(positions, velocities, np.sqrt(scale * variance))
+    misfit = float(solved.misfit[row])
+    sigmas = np.sqrt(max(misfit / max(2 * len(moments) - 8, 1), 1.0) * variance)
+    bounce = None if height is None else float(solved.times[row])
+    return OneView(Path(positions, velocities, sigmas), bounce, height, misfit)

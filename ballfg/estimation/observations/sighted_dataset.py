@@ -111,7 +111,7 @@ def read_sighted(folder: str | PathLike[str]) -> SightedDataset:
     dataset = SightedDataset(path, info, cameras, balls, labels, notes + more)
     if not len(dataset):
         raise ValueError(
-            f"{path / DETECTIONS_FILE}: must hold a ball that was seen often enough, its name in the column 'trajectory'; "
-            f"got none ({len(balls)} named). Find balls with 'ballfg track', or look at the calibration."
+            f"{path / DETECTIONS_FILE}: must hold a ball, seen often enough, its name in the column 'trajectory'; got "
+            f"none ({len(balls)} named). Find balls with 'ballfg track', or look at the calibration."
         )
     return dataset

@@ -17,11 +17,11 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.nominal import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.observation import Context, Observation, Unknowns
-from ballfg.estimation.observations.one_view import one_view
+from ballfg.estimation.observations.one_view import OneView, one_view
 from ballfg.estimation.observations.ray_path import Path, Rays, rough_path
+from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.segmentation.result import Contact, Quality, Segmentation
-from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.settings import Settings
 from ballfg.factors.camera import FIXED, CameraFactors
 from ballfg.state import POSITION, STANDARD_GRAVITY, Z
@@ -158,19 +158,21 @@ class CameraSightings(Observation):
         sightings, state = self.sightings.select(rows), number[self.state[rows]]
         return CameraSightings(sightings, self.cameras, state, self.delay[rows], self.moved, self.one_view)
 
-    def started(self, track: Track, model: BallModel, surfaces: Surfaces) -> Track:
-        """The track with the path that its own sightings, the ball and the surfaces give, if one camera saw it.
+    def starts(self, track: Track, model: BallModel, surfaces: Surfaces) -> tuple[Track, ...]:
+        """The track with the paths that its own sightings, the ball and the surfaces give, if one camera saw it.
 
         Args: track: of the observation, with stamps since its first.  model: the ball.  surfaces: table and floor.
         """
         if not self.one_view:
-            return track
+            return (track,)
         times = track.times[self.state] + self.delay
         found = one_view(Rays.of(self.sightings, times, self.cameras), track.times, physics_of(model), surfaces)
-        bounce = found.contact(track.times)
-        own = CameraSightings(
-            self.sightings, self.cameras, self.state, self.delay, self.moved, one_view=True, bounce=bounce
-        )
+        return tuple(self._on(track, path) for path in found)
+
+    def _on(self, track: Track, found: OneView) -> Track:
+        """The track with one path."""
+        arrays = (self.sightings, self.cameras, self.state, self.delay, self.moved)
+        own = CameraSightings(*arrays, one_view=True, bounce=found.contact(track.times))
         seen = tuple(own if other is self else other for other in track.observations)
         return replace(track, positions=found.path.positions, sigmas=found.path.sigmas, observations=seen)
 
@@ -260,7 +262,7 @@ def sighted_track(
                 f"{len(moments)}. Leave the track out, or look at the time offsets of the cameras."
             )
         ball = physics_of(nominal_model() if model is None else model)
-        path = one_view(rays, moments, ball, Surfaces.table_tennis(0.0) if surfaces is None else surfaces).path
+        path = one_view(rays, moments, ball, Surfaces.table_tennis(0.0) if surfaces is None else surfaces)[0].path
     else:
         path = filled(moments, path)
     seen = CameraSightings(sightings, rig, state, times - moments[state], np.zeros(len(rig)), alone)

@@ -100,8 +100,8 @@ class Smoother(Estimator):
             return joined
         smoother = self.first_look() if moving else self
         for _ in range(OFFSET_ROUNDS):
-            problem = smoother.problem(track.since_first())
-            found = smoother.result(problem, smoother.settle(problem))
+            problem, solution = smoother.settled(track.since_first())
+            found = smoother.result(problem, solution)
             estimate = found.dated(track.times)
             if not moving or estimate.status.failed:
                 return estimate
@@ -150,6 +150,15 @@ class Smoother(Estimator):
         """The stretches with hops too low for distinguishing single bounces."""
         return low_hops(track, events, self.model, self.surfaces, self.settings)
 
+    def settled(self, track: Track) -> tuple[TrackProblem, Solution]:
+        """The minimisation problem of a track and its solution, the lowest from all starts of its observations."""
+        starts = [track]
+        for observation in track.observations:
+            starts = [start for one in starts for start in observation.starts(one, self.model, self.surfaces)]
+        problems = [self.problem(start) for start in starts]
+        found = [(problem, self.settle(problem)) for problem in problems]
+        return min(found, key=lambda one: one[1].minimum.error)
+
     def problem(
         self, track: Track, segmentation: Segmentation | None = None, sigma: Array | None = None
     ) -> TrackProblem:
@@ -160,8 +169,6 @@ class Smoother(Estimator):
             segmentation: the initial events; None: found in the track.
             sigma: (n, 3) m, of the positions; None: the settings' or the track's own.
         """
-        for observation in track.observations:
-            track = observation.started(track, self.model, self.surfaces)
         events, hops = self._segmented(track) if segmentation is None else (segmentation, None)
         return TrackProblem(track, self.model, self.settings, events, sigma, hops)
 
@@ -194,7 +201,10 @@ class Smoother(Estimator):
                     minimum = minimise_with_restart(rough, graph, values, minimum)
                 arrangement = search.after(Solution(events, graph, minimum))
             solution = search.best
-            if earlier is None and not spin_start(problem.settings.spin_label(problem.track), problem.settings).measured:
+            if (
+                earlier is None
+                and not spin_start(problem.settings.spin_label(problem.track), problem.settings).measured
+            ):
                 solution = with_other_spins(solution, problem.ball, rough)
             if before is not None and leads_nowhere(solution, before):
                 break
@@ -210,7 +220,10 @@ class Smoother(Estimator):
     def result(self, problem: TrackProblem, solution: Solution) -> Estimate:
         """The estimate of a track from a solution."""
         known = self.optimizer.covariances(solution.graph, solution.minimum)
-        estimate = with_both_sides(self, problem, self.at_minimum(problem, solution, known))
+        estimate = self.at_minimum(problem, solution, known)
+        if problem.one_view:  # the first samples alone, as a second look takes them, would not show their depth
+            return estimate
+        estimate = with_both_sides(self, problem, estimate)
         segmentation = solution.events.segmentation
         hops = problem.hops if segmentation is problem.segmentation else None
         hops = self.low_hops(problem.track, segmentation) if hops is None else hops
