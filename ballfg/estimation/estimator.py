@@ -118,7 +118,7 @@ class Estimator(ABC):
             )
         if len(track) >= LEAST_CHECKED and not track.part:
             check_scale(f"track {shown(track.name)}", track.times, track.positions, track.sigmas, None)
-        if not self.takes_one_view and any(one.one_view for one in track.observations):
+        if not self.takes_one_view and track.one_view:
             raise ValueError(
                 f"track {shown(track.name)} must be seen by two cameras for the estimator '{self.name}'; got one. "
                 "Use the smoother."

@@ -186,7 +186,7 @@ class Settings:
         if not track.rough:
             return self
         plain = replace(self, memory=(0.0, 0.0, 0.0), stamp_jitter=0.0)
-        if not any(one.one_view for one in track.observations):
+        if not track.one_view:
             return plain
         noise = max(self.process.acceleration, self.one_view_acceleration)
         strokes = SpinPopulation("stroke", {"any": SpinGroup((0.0, 0.0, 0.0), self.one_view_spin, 1)})

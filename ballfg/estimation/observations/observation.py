@@ -153,6 +153,10 @@ class Observation(ABC):
         """The events that the observation itself shows; None, the default: the positions show them."""
         return None
 
+    def priors(self) -> list[FactorBatch]:
+        """Further factors that the start of a track needs; by default none."""
+        return []
+
     def judged(self, estimate: Estimate) -> Estimate:
         """The estimate of its track, with a status that says what the observation leaves open; by default nothing."""
         return estimate

@@ -25,6 +25,8 @@ STEPS: Final = 0.25
 """Of the camera's period, between guessed times of a bounce; the smoother finds the time itself."""
 SPEED: Final = 15.0
 """m/s, prior standard deviation of each component of a velocity."""
+PLAY: Final = 1.0
+"""Half diagonals of a table, prior standard deviation along each axis of the ball's place about its centre."""
 KEPT: Final = 0.8
 """Share of the horizontal velocity that a bounce leaves; friction takes or adds some."""
 FRICTION_SIGMA: Final = 1.0
@@ -82,12 +84,12 @@ def one_view(rays: Rays, moments: Array, physics: SegmentationPhysics, surfaces:
 
     Args: rays: of all sightings.  moments: (n,) s, of the track's samples.  physics: of the ball.  surfaces: to meet.
     """
-    flight = _solved(rays, np.array([float(np.median(rays.times))]), None, physics)
+    flight = _solved(rays, np.array([float(np.median(rays.times))]), None, physics, surfaces)
     step = STEPS * rays.period
     guesses = np.arange(rays.times[0] + step, rays.times[-1] - 0.5 * step, step) if step > 0.0 else np.zeros(0)
     for place, height in enumerate(surfaces.heights() if len(guesses) else ()):
         plane = height + physics.radius + physics.surface_offset
-        tried = _solved(rays, guesses, plane, physics)
+        tried = _solved(rays, guesses, plane, physics, surfaces)
         misfit = np.where(_possible(tried, surfaces if place == 0 else None), tried.misfit, np.inf)
         if misfit.min() + PRICE < flight.misfit[0]:  # the next surface only gets what cannot be on this one
             rows = _rivals(misfit, np.searchsorted(moments, guesses, side="right"))
@@ -102,12 +104,14 @@ def _rivals(misfit: Array, intervals: NDArray[np.int64]) -> list[int]:
     return sorted(first.values(), key=order.index)[: 1 + MOST_RIVALS]
 
 
-def _solved(rays: Rays, guesses: Array, plane: float | None, physics: SegmentationPhysics) -> _Flights:
+def _solved(
+    rays: Rays, guesses: Array, plane: float | None, physics: SegmentationPhysics, surfaces: Surfaces
+) -> _Flights:
     """The flights through a point at guessed times (k,) s, which lies at height `plane` m; None: anywhere, no bounce.
 
     The unknowns are the point and the velocities before and after; without a bounce the last one counts nowhere.
     """
-    prior, target = _priors(plane, physics)
+    prior, target = _priors(plane, physics, surfaces)
     k, m = len(guesses), len(rays.times)
     since = rays.times - guesses[:, None]
     later = (since > 0.0) & (plane is not None)
@@ -144,17 +148,26 @@ def _solved(rays: Rays, guesses: Array, plane: float | None, physics: Segmentati
     return _Flights(guesses, misfit, unknown, np.linalg.inv(information))
 
 
-def _priors(plane: float | None, physics: SegmentationPhysics) -> tuple[Array, Array]:
+def place_prior(surfaces: Surfaces) -> tuple[Array, float]:
+    """Mean (3,) m and standard deviation, m, of the place of a ball in play: about the table, if its ends are known."""
+    if surfaces.extent is None or not np.isfinite(surfaces.extent).all():
+        return np.array([0.0, 0.0, surfaces.table_height]), SPREAD
+    low, high = np.array(surfaces.extent).reshape(2, 2).T
+    return np.append((low + high) / 2, surfaces.table_height), PLAY * float(np.linalg.norm(high - low)) / 2
+
+
+def _priors(plane: float | None, physics: SegmentationPhysics, surfaces: Surfaces) -> tuple[Array, Array]:
     """Whitened rows (r, 9) and their targets (r,): wide priors; with a bounce, its plane and its laws."""
-    wide = np.diag([1.0 / SPREAD] * 3 + [1.0 / SPEED] * 6)
+    centre, spread = place_prior(surfaces)
+    wide, target = np.diag([1.0 / spread] * 3 + [1.0 / SPEED] * 6), np.append(centre / spread, np.zeros(6))
     if plane is None:
-        return wide, np.zeros(9)
-    laws, target = np.zeros((4, 9)), np.zeros(13)
+        return wide, target
+    laws = np.zeros((4, 9))
     before, after = np.eye(3, 9, 3), np.eye(3, 9, 6)
-    laws[0, Z], target[9] = 1.0 / PLANE_SIGMA, plane / PLANE_SIGMA
+    laws[0, Z] = 1.0 / PLANE_SIGMA
     laws[1:3] = (after[:2] - KEPT * before[:2]) / FRICTION_SIGMA
     laws[3] = (after[2] + physics.restitution * before[2]) / RESTITUTION_SIGMA
-    return np.concatenate((wide, laws)), target
+    return np.concatenate((wide, laws)), np.append(target, (plane / PLANE_SIGMA, 0.0, 0.0, 0.0))
 
 
 def _stretched(since: Array, drag: Array) -> Array:

@@ -17,14 +17,16 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.nominal import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.observation import Context, Observation, Unknowns
-from ballfg.estimation.observations.one_view import OneView, one_view
+from ballfg.estimation.observations.one_view import OneView, one_view, place_prior
 from ballfg.estimation.observations.ray_path import Path, Rays, rough_path
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.segmentation.result import Contact, Quality, Segmentation
 from ballfg.estimation.settings import Settings
+from ballfg.factors.batch import FactorBatch
 from ballfg.factors.camera import FIXED, CameraFactors
-from ballfg.state import POSITION, STANDARD_GRAVITY, Z
+from ballfg.factors.prior import PriorFactors
+from ballfg.state import POSITION, STANDARD_GRAVITY, STATE_DIM, Z
 from ballfg.tracks.sightings import Sightings
 from ballfg.tracks.stamps import elapsed, written
 from ballfg.tracks.track import Label, Track
@@ -74,6 +76,7 @@ class CameraSightings(Observation):
             value.
         one_view: True if no two cameras saw the ball within a few frames: motion gives the depth.
         bounce: of such a track, as its start has it; None: without.
+        place: of such a track, prior mean (3,) m and standard deviation m of the first position; None: without.
     """
 
     name: ClassVar[str] = "sighting"
@@ -88,6 +91,7 @@ class CameraSightings(Observation):
         moved: Array,
         one_view: bool = False,
         bounce: Contact | None = None,
+        place: tuple[Array, float] | None = None,
     ) -> None:
         self.sightings = sightings
         self.cameras = cameras
@@ -96,6 +100,7 @@ class CameraSightings(Observation):
         self.moved = moved
         self.one_view = one_view
         self.bounce = bounce
+        self.place = place
 
     @property
     def time_offsets(self) -> Array:
@@ -167,14 +172,22 @@ class CameraSightings(Observation):
             return (track,)
         times = track.times[self.state] + self.delay
         found = one_view(Rays.of(self.sightings, times, self.cameras), track.times, physics_of(model), surfaces)
-        return tuple(self._on(track, path) for path in found)
+        return tuple(self._on(track, path, place_prior(surfaces)) for path in found)
 
-    def _on(self, track: Track, found: OneView) -> Track:
-        """The track with one path."""
+    def _on(self, track: Track, found: OneView, place: tuple[Array, float]) -> Track:
+        """The track with one path and the prior of its place."""
         arrays = (self.sightings, self.cameras, self.state, self.delay, self.moved)
-        own = CameraSightings(*arrays, one_view=True, bounce=found.contact(track.times))
+        own = CameraSightings(*arrays, one_view=True, bounce=found.contact(track.times), place=place)
         seen = tuple(own if other is self else other for other in track.observations)
         return replace(track, positions=found.path.positions, sigmas=found.path.sigmas, observations=seen)
+
+    def priors(self) -> list[FactorBatch]:
+        """The prior of the first position of a track that one camera saw: rays alone leave its distance open."""
+        if self.place is None:
+            return []
+        mean, root = np.zeros((1, STATE_DIM)), np.zeros((1, 3, STATE_DIM))
+        mean[:, POSITION], root[0, :, POSITION] = self.place[0], np.eye(3) / self.place[1]
+        return [PriorFactors(np.zeros(1, dtype=np.int64), mean, root)]
 
     def judged(self, estimate: Estimate) -> Estimate:
         """The estimate, with the status `DEPTH_UNCERTAIN` if one camera saw the ball and its depth is loose."""
