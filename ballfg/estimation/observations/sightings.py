@@ -18,7 +18,7 @@ from ballfg.dynamics.nominal import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.observation import Context, Observation, Unknowns
 from ballfg.estimation.observations.one_view import OneView, one_view, place_prior
-from ballfg.estimation.observations.ray_path import Path, Rays, rough_path
+from ballfg.estimation.observations.ray_path import Rays, determined, filled, rough_path
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.segmentation.result import Contact, Quality, Segmentation
@@ -26,7 +26,7 @@ from ballfg.estimation.settings import Settings
 from ballfg.factors.batch import FactorBatch
 from ballfg.factors.camera import FIXED, CameraFactors
 from ballfg.factors.prior import PriorFactors
-from ballfg.state import POSITION, STANDARD_GRAVITY, STATE_DIM, Z
+from ballfg.state import POSITION, STATE_DIM
 from ballfg.tracks.sightings import Sightings
 from ballfg.tracks.stamps import elapsed, written
 from ballfg.tracks.track import Label, Track
@@ -41,14 +41,6 @@ OFFSET_SETTLED: Final = 1e-5
 SAME_MOMENT: Final = 2e-4
 """s. Sightings closer than this share a state, and a camera factor carries it over the rest in a straight line: at 20
 m/s^2 that is wrong by 0.4 um. States closer together would cost time without gain."""
-LOOSE: Final = 0.05
-"""m. If the rays at a moment leave the position more uncertain, its neighbours in time replace it."""
-LOOSE_SIGMA: Final = 0.1
-"""m, standard deviation of a position that was interpolated in time: a bounce may lie between its neighbours."""
-LOOSE_GROWTH: Final = 2.0
-"""m/s, growth of that with the time to the next determined moment: the error of a window's velocity."""
-
-
 LEAST_SEEN: Final = 5
 """Least number of sightings from one point: a flight has six unknowns, and noise must show."""
 LOOSE_DEPTH: Final = 0.5
@@ -75,7 +67,7 @@ class CameraSightings(Observation):
         moved: (c,) s, change of the time offsets since the track was made: the prior of an offset is about its first
             value.
         one_view: True if no two cameras saw the ball within a few frames: motion gives the depth.
-        bounce: of such a track, as its start has it; None: without.
+        bounces: of such a track, as its start has them.
         place: of such a track, prior mean (3,) m and standard deviation m of the first position; None: without.
     """
 
@@ -90,7 +82,7 @@ class CameraSightings(Observation):
         delay: Array,
         moved: Array,
         one_view: bool = False,
-        bounce: Contact | None = None,
+        bounces: tuple[Contact, ...] = (),
         place: tuple[Array, float] | None = None,
     ) -> None:
         self.sightings = sightings
@@ -99,7 +91,7 @@ class CameraSightings(Observation):
         self.delay = delay
         self.moved = moved
         self.one_view = one_view
-        self.bounce = bounce
+        self.bounces = bounces
         self.place = place
 
     @property
@@ -177,7 +169,7 @@ class CameraSightings(Observation):
     def _on(self, track: Track, found: OneView, place: tuple[Array, float]) -> Track:
         """The track with one path and the prior of its place."""
         arrays = (self.sightings, self.cameras, self.state, self.delay, self.moved)
-        own = CameraSightings(*arrays, one_view=True, bounce=found.contact(track.times), place=place)
+        own = CameraSightings(*arrays, one_view=True, bounces=found.contacts(track.times), place=place)
         seen = tuple(own if other is self else other for other in track.observations)
         return replace(track, positions=found.path.positions, sigmas=found.path.sigmas, observations=seen)
 
@@ -202,12 +194,12 @@ class CameraSightings(Observation):
         return replace(estimate, status=Status.DEPTH_UNCERTAIN) if loose else estimate
 
     def segmentation(self) -> Segmentation | None:
-        """The bounce of a track that one camera saw; None if the positions show the events."""
+        """The bounces of a track that one camera saw; None if the positions show the events."""
         if not self.one_view:
             return None
         none = np.zeros(0, dtype=np.int64)
         good = np.full(int(self.state.max()) + 1, Quality.GOOD, dtype=np.int8)
-        return Segmentation(() if self.bounce is None else (self.bounce,), none, none, (), good)
+        return Segmentation(self.bounces, none, none, (), good)
 
 
 def sightings_of(track: Track) -> CameraSightings:
@@ -321,36 +313,3 @@ def in_order(sightings: Sightings, cameras: Sequence[Camera]) -> Sightings:
 def _bank(cameras: tuple[Camera, ...]) -> CameraBank:
     """The cameras in torch; one object for all tracks of a rig."""
     return CameraBank(cameras)
-
-
-def determined(path: Path) -> NDArray[np.bool_]:
-    """(n,) True where the rays around a moment determine the position."""
-    return np.asarray(path.sigmas.max(axis=1) <= LOOSE)
-
-
-def filled(moments: Array, path: Path) -> Path:
-    """The path at moments (n,) s, with undetermined positions interpolated in time and extrapolated at its ends."""
-    firm = determined(path)
-    if firm.all():
-        return path
-    (at,), (gaps,) = np.nonzero(firm), np.nonzero(~firm)
-    place = np.searchsorted(at, gaps)
-    before, after = at[np.maximum(place - 1, 0)], at[np.minimum(place, len(at) - 1)]
-    since, until = moments[gaps] - moments[before], moments[after] - moments[gaps]
-    whole = since + until
-    share = np.where(whole > 0.0, since / np.where(whole > 0.0, whole, 1.0), 0.0)[:, None]
-    share = share**2 * (3.0 - 2.0 * share)  # Hermite's blend of the two extrapolations: smooth at both ends
-    positions, velocities, sigmas = path.positions.copy(), path.velocities.copy(), path.sigmas.copy()
-    positions[gaps] = (1 - share) * _fallen(path, before, since) + share * _fallen(path, after, -until)
-    velocities[gaps] = (1 - share) * path.velocities[before] + share * path.velocities[after]
-    nearest = np.minimum(np.abs(since), np.abs(until))
-    nearest = np.where(before == after, np.maximum(np.abs(since), np.abs(until)), nearest)
-    sigmas[gaps] = (LOOSE_SIGMA + LOOSE_GROWTH * nearest)[:, None]
-    return Path(positions, velocities, sigmas)
-
-
-def _fallen(path: Path, rows: NDArray[np.int64], elapsed: Array) -> Array:
-    """(k, 3) m, positions of the free fall from some moments after some time, s."""
-    points = path.positions[rows] + elapsed[:, None] * path.velocities[rows]
-    points[:, Z] -= 0.5 * STANDARD_GRAVITY * elapsed**2
-    return points
