@@ -49,7 +49,7 @@ class Status(enum.Enum):
 
     DEPTH_UNCERTAIN = (
         "one camera saw the ball, and its motion does not show how far away it was: the covariances are wide along the "
-        "rays. Film from the side, include a bounce, or use a second camera"
+        "rays. Observe it together with a bounce, from higher above the table, or with a second camera"
     )
 
     @property
