@@ -7,6 +7,7 @@ from functools import partial
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ballfg.arrays import Array
 from ballfg.benchmarks.metrics import bootstrap, inside, median_and_quartiles, share
@@ -34,7 +35,7 @@ class Stroke:
     """
 
     error: float
-    within: Array
+    within: NDArray[np.bool_]
     late: float
     apart: float
     duration: float

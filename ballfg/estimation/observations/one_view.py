@@ -180,7 +180,7 @@ def _solved(scene: _Scene, times: Array, bounces: int) -> _Paths:
         turned = prior.swapaxes(1, 2)
         information = pulled @ seen + turned @ prior
         side = pulled @ wanted[..., None] + turned @ target[..., None]
-        unknown = np.linalg.solve(information, side)
+        unknown: Array = np.asarray(np.linalg.solve(information, side), dtype=np.float64)
         square = (((seen @ unknown)[..., 0] - wanted).reshape(k, m, 2) ** 2).sum(axis=-1)
         weight = 1.0 / (1.0 + square / ROBUST**2)
         vectors = unknown.reshape(k, bounces + 2, 3)
@@ -190,7 +190,7 @@ def _solved(scene: _Scene, times: Array, bounces: int) -> _Paths:
         depth = np.maximum((rays.depth_row[:, :3] * point).sum(axis=-1) + rays.depth_row[:, 3], NEAREST)
     loss = ROBUST**2 * np.log1p(square / ROBUST**2).sum(axis=1)
     misfit = loss + (((prior @ unknown)[..., 0] - target) ** 2).sum(axis=1)
-    return _Paths(times, bounces, misfit, vectors, drag, np.linalg.inv(information))
+    return _Paths(times, bounces, misfit, vectors, drag, np.asarray(np.linalg.inv(information), dtype=np.float64))
 
 
 def _shares(moments: Array, times: Array, bounces: int, drag: Array, gravity: float) -> tuple[Array, Array]:
