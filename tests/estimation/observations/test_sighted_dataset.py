@@ -70,6 +70,17 @@ def test_estimate_command_reads_detections(folder: Path, capsys: pytest.CaptureF
         np.testing.assert_allclose(read, stated, rtol=1e-9, atol=1e-12)
 
 
+def test_predict_command_reads_detections(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A row per stamp after the observed part; scales of measured positions are refused."""
+    out = folder / "predictions.csv"
+    assert command("predict", folder, "--observe", 0.2, "--out", out, "--jobs", 1) == 0
+    with out.open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == sum(int((t.seconds > 0.2 + 1e-6).sum()) for t in read_sighted(folder))
+    assert command("predict", folder, "--observe", 0.2, "--conformal", folder, "--out", out) == 2
+    assert "conformal must not be given with detections" in capsys.readouterr().err
+
+
 def test_source_can_be_chosen(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = folder / "states.csv"
     assert command("estimate", folder, "--from", "positions", "--out", out) == 2
