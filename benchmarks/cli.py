@@ -34,6 +34,9 @@ _data = partial(typer.Option, "--data")
 Data = Annotated[Path | None, _data(help="Dataset of measured tracks; synthetic tracks by default.")]
 Datasets = Annotated[Paths, _data(help="Dataset of measured tracks; may be repeated; synthetic tracks by default.")]
 Beside = Annotated[Paths, _data(help="Dataset of measured tracks in addition; may be repeated.")]
+Views = Annotated[
+    Paths, typer.Option("--view", help="Dataset of one camera's detections of the same tracks; may be repeated.")
+]
 Planted = Annotated[
     Paths, _data(help="Dataset of measured tracks; may be repeated; by default the sets in $BALLFG_DATA.")
 ]
@@ -152,17 +155,32 @@ def estimators(
 @_benchmark
 def cameras(
     run: Run,
+    data: Data = None,
+    view: Views = None,
 ) -> None:
     """Tracking from rendered videos of three cameras: points, velocities and clocks against the truth.
+
+    With --data and --view: states from the detections of one camera at a time, against the measured tracks.
 
     The recordings have one shutter or three, one ball or two, dropped frames, a clock that is late, and a camera that
     was turned after its calibration. The speed of the tracking is measured too.
 
     Example: ballfg-bench cameras --out results/cameras
     """
+    from ballfg.benchmarks.cameras.one_view import run_views
     from ballfg.benchmarks.cameras.suite import FULL, QUICK, run_cameras
+    from ballfg.estimation import read_sighted
 
-    results = run.results("cameras")
+    if (data is None) != (not view):
+        raise ValueError("--data and --view must be given together: tracks, and what one camera saw of them")
+    words = [word for one in view or () for word in ("--view", one.resolve().name)]
+    results = run.results("cameras", [] if data is None else [data], words)
+    if data is not None:
+        truth, views = _open(data), [read_sighted(one) for one in view or ()]
+        with run.folder():
+            run_views(results, views, truth)
+            run.finish(results)
+        return
     with run.working() as (folder, processes):
         run.finish(results, run_cameras(results, folder, QUICK if run.quick else FULL, processes))
 

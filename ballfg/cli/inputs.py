@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
 
 import typer
 
@@ -109,6 +109,14 @@ class Source(enum.StrEnum):
     DETECTIONS = "detections"
 
 
+SourceName = Annotated[
+    Source | None,
+    typer.Option(
+        "--from",
+        help="Input: positions of tracks, or camera detections (detections.csv with cameras.yaml).",
+        show_default="positions where there is a table of tracks",
+    ),
+]
 D = TypeVar("D", bound="Dataset | SightedDataset")
 
 
@@ -187,6 +195,22 @@ def open_sighted(
     know_effects(effects_files)
     data = read_sighted(dataset)
     return Inputs(data, open_model(data, model, ball), dataset_surfaces(data), math.inf)
+
+
+def open_source(
+    source: Source | None,
+    dataset: Path,
+    model: Path | None,
+    effects_files: Iterable[Path] | None = None,
+    observed: float = math.inf,
+    ball: str | None = None,
+) -> Inputs[Any]:
+    """`open_inputs` or `open_sighted`; without a source the positions, where there is a table of them."""
+    from ballfg.estimation.reading import has_positions
+
+    if has_positions(dataset) if source is None else source is Source.POSITIONS:
+        return open_inputs(dataset, model, effects_files, observed, ball)
+    return open_sighted(dataset, model, effects_files, ball)
 
 
 def open_model(data: Dataset | SightedDataset, model: Path | None, ball: str | None = None) -> BallModel:

@@ -94,6 +94,9 @@ def fitted_settings(
     settings = dataset_settings(dataset, model)
     at_home = model.trained is not None and not model.trained.is_foreign(dataset.info.name)
     stated = dataset.info.noise is not None or model.noise is not None or at_home
+    if isinstance(dataset, SightedDataset) and all(track.one_view for track in dataset):
+        process = settings.for_track(next(iter(dataset))).process  # predictions have one for all tracks
+        return replace(settings, process=process)
     if stated or dataset.rough or len(dataset) < LEAST_TRACKS:
         return settings
     key = (dataset, _content(model), observed)

@@ -38,6 +38,8 @@ class Estimator(ABC):
     name: ClassVar[str]
     undoes_measurement: ClassVar[bool] = False
     """True if it takes a model that does not measure plainly."""
+    takes_one_view: ClassVar[bool] = False
+    """True if it takes tracks that one camera saw."""
     has_graph: ClassVar[bool] = False
     """True if GTSAM can solve it (`Settings.solver`)."""
 
@@ -116,6 +118,11 @@ class Estimator(ABC):
             )
         if len(track) >= LEAST_CHECKED and not track.part:
             check_scale(f"track {shown(track.name)}", track.times, track.positions, track.sigmas, None)
+        if not self.takes_one_view and track.one_view:
+            raise ValueError(
+                f"track {shown(track.name)} must be seen by two cameras for the estimator '{self.name}'; got one. "
+                "Use the smoother."
+            )
         return track.observed(*given(factors))
 
     def doubts(self, track: Track) -> tuple[str, ...]:

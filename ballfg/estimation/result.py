@@ -47,6 +47,11 @@ class Status(enum.Enum):
         "and look at the track for jumps"
     )
 
+    DEPTH_UNCERTAIN = (
+        "one camera saw the ball, and its motion does not show how far away it was: the covariances are wide along the "
+        "rays. Observe it together with a bounce, from higher above the table, or with a second camera"
+    )
+
     @property
     def failed(self) -> bool:
         """True if states are not estimated: they are measured positions and priors, with wide covariances."""

@@ -22,7 +22,7 @@ from ballfg.checks import (
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.earlier_names import todays_name, todays_names
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.population import SpinPopulation
+from ballfg.dynamics.population import SpinGroup, SpinPopulation
 from ballfg.estimation.launcher import Launcher, SpinLabel, group_spin
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
@@ -99,6 +99,14 @@ class Settings:
     group: str | None = None
     """The group of tracks whose labels name none, for `spins`; None: unknown, so that its mixture counts."""
 
+    one_view_acceleration: float = 0.5
+    """m/s^1.5, least acceleration noise of a track that one camera saw. There the depth comes from the motion, so that
+    an error of the ball's laws, which two cameras would correct, moves it. Chosen on 35 strokes seen from the side."""
+
+    one_view_spin: tuple[float, float, float] = (40.0, 150.0, 40.0)
+    """rad/s, standard deviations of the first spin of such a track about forward, across and up, in place of
+    `spin_prior`: strokes make topspin and backspin, about the axis across. Not with `spins`."""
+
     find_events: bool = True
     """Look for hits, outliers and tracker shifts. False: the track is one undisturbed flight with contacts that the
     model explains."""
@@ -118,6 +126,7 @@ class Settings:
         check_number("memory_time", self.memory_time, "s", above=0.0)
         if max(self.memory) > MOST_NOISE:
             raise ValueError(f"memory must be at most {MOST_NOISE:g} m; got {max(self.memory):g}. Give it in m.")
+        check_number("one_view_acceleration", self.one_view_acceleration, "m/s^1.5", above=0.0)
         check_range("stamp_jitter", self.stamp_jitter, 0.0, MOST_JITTER)
         for name in ("spin_prior", "spin_label_noise", "velocity_prior"):
             check_range(name, getattr(self, name), NARROWEST_PRIOR, WIDEST_PRIOR)
@@ -170,8 +179,19 @@ class Settings:
         return np.maximum(self.memory, LEAST_BIAS)
 
     def for_track(self, track: Track) -> Settings:
-        """The settings of a track: positions computed from other observations have no tracker's errors."""
-        return replace(self, memory=(0.0, 0.0, 0.0), stamp_jitter=0.0) if track.rough else self
+        """The settings of a track: positions computed from other observations have no tracker's errors.
+
+        A track that one camera saw has an acceleration noise and a spin prior of its own.
+        """
+        if not track.rough:
+            return self
+        plain = replace(self, memory=(0.0, 0.0, 0.0), stamp_jitter=0.0)
+        if not track.one_view:
+            return plain
+        noise = max(self.process.acceleration, self.one_view_acceleration)
+        strokes = SpinPopulation("stroke", {"any": SpinGroup((0.0, 0.0, 0.0), self.one_view_spin, 1)})
+        process = replace(self.process, acceleration=noise)
+        return replace(plain, process=process, spins=self.spins or strokes)
 
     def grouped(self, track: Track) -> Track:
         """The track with the label of its group, if the settings name the group of tracks without one."""

@@ -142,6 +142,11 @@ class Track:
         return self if count == len(self) else self.until(float(self.times[count - 1]))
 
     @property
+    def one_view(self) -> bool:
+        """True if one camera alone saw the ball, so that its motion gives the depth."""
+        return any(getattr(observation, "one_view", False) for observation in self.observations)
+
+    @property
     def spin_label(self) -> Array | None:
         """(3,) rad/s: the labelled spin at the first sample; None unless all three components are labelled."""
         values = [self.labels[key] for key in SPIN_LABELS if key in self.labels]

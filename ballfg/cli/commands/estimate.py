@@ -34,14 +34,7 @@ def estimate(
     model: inputs.ModelFile = None,
     group: inputs.GroupName = None,
     ball: inputs.BallName = None,
-    source: Annotated[
-        inputs.Source | None,
-        typer.Option(
-            "--from",
-            help="Input: positions of tracks, or camera detections (detections.csv with cameras.yaml).",
-            show_default="positions where there is a table of tracks",
-        ),
-    ] = None,
+    source: inputs.SourceName = None,
     effects_file: inputs.EffectsFiles = None,
     observations_file: inputs.ObservationsFiles = None,
     jobs: inputs.Jobs = inputs.CORES,
@@ -54,7 +47,8 @@ def estimate(
 
     From detections, the smoother and the online estimator use every camera's pixels at its own stamp; the stamps of the
     table are then true times, with the cameras' time offsets subtracted. The other methods use roughly triangulated
-    positions. A network that knows where it was trained adds the column outside: 0 there, 1 far from it.
+    positions. For a ball that one camera saw, gravity and a bounce on the table give the depth; only the smoother
+    takes it. A network that knows where it was trained adds the column outside: 0 there, 1 far from it.
 
     A track that no motion explains has its measured positions with wide sigmas. Where there are such tracks, the table
     is written whole, they are listed, and the exit status is 3.
@@ -62,17 +56,14 @@ def estimate(
     Example: ballfg estimate data/aimy --method smoother --out states.csv
     """
     from ballfg.estimation.batch import map_tracks
-    from ballfg.estimation.reading import has_positions
     from ballfg.tracks import TableWriter
 
     outcome = inputs.Outcome()
     rows = hits = 0
     with TableWriter(out) as table, inputs.workers(cluster, address, jobs) as workers:
         inputs.check_out(out, dataset)
-        positions = has_positions(dataset) if source is None else source is inputs.Source.POSITIONS
-        open_dataset = inputs.open_inputs if positions else inputs.open_sighted
         inputs.know_observations(observations_file)
-        opened = open_dataset(dataset, model, effects_file, ball=ball)
+        opened = inputs.open_source(source, dataset, model, effects_file, ball=ball)
         count = len(opened.dataset)
         work = partial(_estimated, opened.model, opened.estimator(method, solver, group))
         results = map_tracks(work, opened.dataset, count, workers)

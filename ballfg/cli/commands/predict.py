@@ -28,6 +28,7 @@ def predict(
     model: inputs.ModelFile = None,
     group: inputs.GroupName = None,
     ball: inputs.BallName = None,
+    source: inputs.SourceName = None,
     effects_file: inputs.EffectsFiles = None,
     observations_file: inputs.ObservationsFiles = None,
     conformal: Annotated[
@@ -49,6 +50,9 @@ def predict(
     These are the positions that will be measured: measurement effects of the model file are included. A network that
     knows where it was trained adds the column outside: 0 there, 1 far from it.
 
+    From detections, they are the ball's positions, and the error stated at the end is the distance from the rough ones
+    that all sightings give.
+
     Where the observed part of a track could not be estimated, its prediction is wide; such tracks are listed, and the
     exit status is 3.
 
@@ -68,10 +72,12 @@ def predict(
             if conformal is None:
                 raise ValueError("save_conformal must come with --conformal, whose scales it keeps. Add --conformal.")
         inputs.know_observations(observations_file)
-        opened = inputs.open_inputs(dataset, model, effects_file, observe, ball)
+        opened = inputs.open_source(source, dataset, model, effects_file, observe, ball)
         count = len(opened.dataset)
         estimator = opened.estimator(method, solver, group)
         scales = None
+        if conformal is not None and opened.dataset.rough:
+            raise ValueError("conformal must not be given with detections: its scales are those of positions")
         if conformal is not None:
             scales = _conformal_scales(conformal, opened.dataset, estimator, method, observe, workers)
         predictions = predict_tracks(estimator, opened.dataset, count, observe, jobs=workers)

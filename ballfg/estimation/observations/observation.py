@@ -18,7 +18,9 @@ from torch import Tensor
 from ballfg.arrays import Array, Index
 from ballfg.checks import check_each, shown
 from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.innovation import leave_one_out
+from ballfg.estimation.segmentation.result import Segmentation
 from ballfg.estimation.settings import Settings
 from ballfg.factors.batch import FactorBatch, Rows, Values
 from ballfg.factors.linear.covariance import Covariances
@@ -75,6 +77,7 @@ class Observation(ABC):
         file: name of its table in the folder of a dataset; None without a table of its own.
         columns: of that table, beside `trajectory`, `t` (s) and `sigma`.
         largest: largest possible size of a value, in the units of the columns; larger ones are refused.
+        one_view: True if it locates the ball from one point alone, so that the depth comes from the motion.
     """
 
     name: ClassVar[str]
@@ -82,6 +85,7 @@ class Observation(ABC):
     file: ClassVar[str | None] = None
     columns: ClassVar[tuple[str, ...]] = ()
     largest: ClassVar[float] = np.inf
+    one_view: bool = False
     state: Index
 
     def __len__(self) -> int:
@@ -137,6 +141,25 @@ class Observation(ABC):
     def retimed(self, track: Track, estimate: Estimate) -> Track | None:
         """The track with stamps corrected by the unknowns; None, the default, if its stamps stay."""
         return None
+
+    def starts(self, track: Track, model: BallModel, surfaces: Surfaces) -> tuple[Track, ...]:
+        """The track with the positions from which its estimate may start, the likely ones first; by default its own.
+
+        Args: track: of the observation, with stamps since its first.  model: the ball.  surfaces: table and floor.
+        """
+        return (track,)
+
+    def segmentation(self) -> Segmentation | None:
+        """The events that the observation itself shows; None, the default: the positions show them."""
+        return None
+
+    def priors(self) -> list[FactorBatch]:
+        """Further factors that the start of a track needs; by default none."""
+        return []
+
+    def judged(self, estimate: Estimate) -> Estimate:
+        """The estimate of its track, with a status that says what the observation leaves open; by default nothing."""
+        return estimate
 
     def onto(self, old: Track, new: Track) -> Observation:
         """The same measurements on a track of the same ball with other stamps.

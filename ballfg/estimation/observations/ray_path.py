@@ -37,6 +37,12 @@ SPREAD: Final = 100.0
 """m, prior standard deviation of the position about the cameras."""
 NEAREST: Final = 0.05
 """m, least depth that a ball may have while its window is solved."""
+LOOSE: Final = 0.05
+"""m. If the rays at a moment leave the position more uncertain, its neighbours in time replace it."""
+LOOSE_SIGMA: Final = 0.1
+"""m, standard deviation of a position that was interpolated in time: a bounce may lie between its neighbours."""
+LOOSE_GROWTH: Final = 2.0
+"""m/s, growth of that with the time to the next determined moment: the error of a window's velocity."""
 
 
 @dataclass(frozen=True)
@@ -152,3 +158,36 @@ def _robust(
         depth = np.maximum((depth_row[..., :3] * point).sum(axis=-1) + depth_row[..., 3], NEAREST)
     loss = ROBUST**2 * (np.log1p(square / ROBUST**2) * inside).sum(axis=1)
     return np.asarray(unknown[..., 0]), np.asarray(np.linalg.inv(information)), np.asarray(loss)
+
+
+def determined(path: Path) -> NDArray[np.bool_]:
+    """(n,) True where the rays around a moment determine the position."""
+    return np.asarray(path.sigmas.max(axis=1) <= LOOSE)
+
+
+def filled(moments: Array, path: Path) -> Path:
+    """The path at moments (n,) s, with undetermined positions interpolated in time and extrapolated at its ends."""
+    firm = determined(path)
+    if firm.all():
+        return path
+    (at,), (gaps,) = np.nonzero(firm), np.nonzero(~firm)
+    place = np.searchsorted(at, gaps)
+    before, after = at[np.maximum(place - 1, 0)], at[np.minimum(place, len(at) - 1)]
+    since, until = moments[gaps] - moments[before], moments[after] - moments[gaps]
+    whole = since + until
+    share = np.where(whole > 0.0, since / np.where(whole > 0.0, whole, 1.0), 0.0)[:, None]
+    share = share**2 * (3.0 - 2.0 * share)  # Hermite's blend of the two extrapolations: smooth at both ends
+    positions, velocities, sigmas = path.positions.copy(), path.velocities.copy(), path.sigmas.copy()
+    positions[gaps] = (1 - share) * _fallen(path, before, since) + share * _fallen(path, after, -until)
+    velocities[gaps] = (1 - share) * path.velocities[before] + share * path.velocities[after]
+    nearest = np.minimum(np.abs(since), np.abs(until))
+    nearest = np.where(before == after, np.maximum(np.abs(since), np.abs(until)), nearest)
+    sigmas[gaps] = (LOOSE_SIGMA + LOOSE_GROWTH * nearest)[:, None]
+    return Path(positions, velocities, sigmas)
+
+
+def _fallen(path: Path, rows: NDArray[np.int64], elapsed: Array) -> Array:
+    """(k, 3) m, positions of the free fall from some moments after some time, s."""
+    points = path.positions[rows] + elapsed[:, None] * path.velocities[rows]
+    points[:, Z] -= 0.5 * STANDARD_GRAVITY * elapsed**2
+    return points

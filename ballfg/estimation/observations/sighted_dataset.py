@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Final
 
 from ballfg.checks import shown
-from ballfg.estimation.observations.sightings import NeverSeenByTwoError, sighted_track
+from ballfg.dynamics.nominal import nominal_model
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.observations.sightings import TooFewSightingsError, sighted_track
 from ballfg.files.whole_folder import of_one_state
 from ballfg.tracks.detections_file import DETECTIONS_FILE, read_sightings
 from ballfg.tracks.info import INFO_FILE, DatasetInfo, TrackFolder, read_info
@@ -45,13 +47,15 @@ class SightedDataset(TrackFolder):
     ) -> None:
         self.path, self.info, self.cameras, self.notes = path, info, cameras, notes
         self._tracks = {}
+        model = nominal_model(info.ball)
+        surfaces = replace(Surfaces.table_tennis(info.table_height), extent=info.table_extent)
         for name, sightings in balls.items():
             try:
-                track = sighted_track(name, sightings, cameras, labels.of(name))
+                track = sighted_track(name, sightings, cameras, labels.of(name), model=model, surfaces=surfaces)
                 self._tracks[name] = replace(track, dataset=self)
-            except NeverSeenByTwoError as error:
+            except TooFewSightingsError as error:
                 notes.append(str(error))
-            except ValueError as error:  # cameras with numbers that no lens has
+            except ValueError as error:  # cameras at one point, or with numbers that no lens has
                 raise ValueError(f"{path}: {error} Look at {CAMERAS_FILE}.") from None
 
     def __len__(self) -> int:
@@ -87,7 +91,7 @@ def read_sighted(folder: str | PathLike[str]) -> SightedDataset:
     Args:
         folder: holds `dataset.yaml`, `cameras.yaml`, `detections.csv` with the trajectory of each row, and optionally
             `labels.csv`.
-    Returns: the balls that two cameras saw; `notes` list the others.
+    Returns: the balls that were seen often enough; `notes` list the others.
     Raises:
         FileNotFoundError: one of the files is missing.
         ValueError: the content breaks a rule, or there is no ball in it; the message names file, line and remedy.
@@ -107,7 +111,7 @@ def read_sighted(folder: str | PathLike[str]) -> SightedDataset:
     dataset = SightedDataset(path, info, cameras, balls, labels, notes + more)
     if not len(dataset):
         raise ValueError(
-            f"{path / DETECTIONS_FILE}: must hold a ball that two cameras saw, its name in the column 'trajectory'; "
-            f"got none ({len(balls)} named). Find balls with 'ballfg track', or look at the calibration."
+            f"{path / DETECTIONS_FILE}: must hold a ball, seen often enough, its name in the column 'trajectory'; got "
+            f"none ({len(balls)} named). Find balls with 'ballfg track', or look at the calibration."
         )
     return dataset

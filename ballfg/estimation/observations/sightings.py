@@ -1,31 +1,37 @@
-"""Holds the sightings of one ball by several cameras, and makes a track with rough positions from them."""
+"""Holds the sightings of one ball by one or more cameras, and makes a track with rough positions from them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, ClassVar, Final, cast
+from itertools import combinations
+from typing import ClassVar, Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array, Index
 from ballfg.checks import listed, shown
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.nominal import nominal_model
+from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.observation import Context, Observation, Unknowns
-from ballfg.estimation.observations.ray_path import Path, Rays, rough_path
+from ballfg.estimation.observations.one_view import OneView, one_view, place_prior
+from ballfg.estimation.observations.ray_path import Rays, determined, filled, rough_path
+from ballfg.estimation.result import Estimate, Status
+from ballfg.estimation.segmentation.physics import physics_of
+from ballfg.estimation.segmentation.result import Contact, Quality, Segmentation
 from ballfg.estimation.settings import Settings
+from ballfg.factors.batch import FactorBatch
 from ballfg.factors.camera import FIXED, CameraFactors
-from ballfg.state import STANDARD_GRAVITY, Z
+from ballfg.factors.prior import PriorFactors
+from ballfg.state import POSITION, STATE_DIM
 from ballfg.tracks.sightings import Sightings
 from ballfg.tracks.stamps import elapsed, written
 from ballfg.tracks.track import Label, Track
 from ballfg.vision.camera import Camera
 from ballfg.vision.projection import CameraBank
-
-if TYPE_CHECKING:
-    from ballfg.estimation.result import Estimate
-
 
 TIME_OFFSET: Final = "time_offset."
 """Prefix of the name of a camera's time offset among the unknowns of a track."""
@@ -35,16 +41,16 @@ OFFSET_SETTLED: Final = 1e-5
 SAME_MOMENT: Final = 2e-4
 """s. Sightings closer than this share a state, and a camera factor carries it over the rest in a straight line: at 20
 m/s^2 that is wrong by 0.4 um. States closer together would cost time without gain."""
-LOOSE: Final = 0.05
-"""m. If the rays at a moment leave the position more uncertain, its neighbours in time replace it."""
-LOOSE_SIGMA: Final = 0.1
-"""m, standard deviation of a position that was interpolated in time: a bounce may lie between its neighbours."""
-LOOSE_GROWTH: Final = 2.0
-"""m/s, growth of that with the time to the next determined moment: the error of a window's velocity."""
+LEAST_SEEN: Final = 5
+"""Least number of sightings from one point: a flight has six unknowns, and noise must show."""
+LOOSE_DEPTH: Final = 0.5
+"""m, standard deviation of the depth from which the status of an estimate says so."""
+APART: Final = 0.01
+"""m. Least distance of two cameras: rays from one point do not meet anywhere else, and count twice."""
 
 
-class NeverSeenByTwoError(ValueError):
-    """No two cameras saw the ball within a few frames, so its position is unknown."""
+class TooFewSightingsError(ValueError):
+    """The ball was seen too rarely for a path."""
 
 
 class CameraSightings(Observation):
@@ -60,19 +66,33 @@ class CameraSightings(Observation):
         delay: (m,) s, true time of each sighting minus the stamp of its sample: 0 to `SAME_MOMENT`.
         moved: (c,) s, change of the time offsets since the track was made: the prior of an offset is about its first
             value.
+        one_view: True if no two cameras saw the ball within a few frames: motion gives the depth.
+        bounces: of such a track, as its start has them.
+        place: of such a track, prior mean (3,) m and standard deviation m of the first position; None: without.
     """
 
     name: ClassVar[str] = "sighting"
     locates: ClassVar[bool] = True
 
     def __init__(
-        self, sightings: Sightings, cameras: tuple[Camera, ...], state: Index, delay: Array, moved: Array
+        self,
+        sightings: Sightings,
+        cameras: tuple[Camera, ...],
+        state: Index,
+        delay: Array,
+        moved: Array,
+        one_view: bool = False,
+        bounces: tuple[Contact, ...] = (),
+        place: tuple[Array, float] | None = None,
     ) -> None:
         self.sightings = sightings
         self.cameras = cameras
         self.state = state
         self.delay = delay
         self.moved = moved
+        self.one_view = one_view
+        self.bounces = bounces
+        self.place = place
 
     @property
     def time_offsets(self) -> Array:
@@ -133,7 +153,53 @@ class CameraSightings(Observation):
         """The sightings of some samples."""
         rows, number = samples[self.state], np.cumsum(samples) - 1
         sightings, state = self.sightings.select(rows), number[self.state[rows]]
-        return CameraSightings(sightings, self.cameras, state, self.delay[rows], self.moved)
+        return CameraSightings(sightings, self.cameras, state, self.delay[rows], self.moved, self.one_view)
+
+    def starts(self, track: Track, model: BallModel, surfaces: Surfaces) -> tuple[Track, ...]:
+        """The track with the paths that its own sightings, the ball and the surfaces give, if one camera saw it.
+
+        Args: track: of the observation, with stamps since its first.  model: the ball.  surfaces: table and floor.
+        """
+        if not self.one_view:
+            return (track,)
+        times = track.times[self.state] + self.delay
+        found = one_view(Rays.of(self.sightings, times, self.cameras), track.times, physics_of(model), surfaces)
+        return tuple(self._on(track, path, place_prior(surfaces)) for path in found)
+
+    def _on(self, track: Track, found: OneView, place: tuple[Array, float]) -> Track:
+        """The track with one path and the prior of its place."""
+        arrays = (self.sightings, self.cameras, self.state, self.delay, self.moved)
+        own = CameraSightings(*arrays, one_view=True, bounces=found.contacts(track.times), place=place)
+        seen = tuple(own if other is self else other for other in track.observations)
+        return replace(track, positions=found.path.positions, sigmas=found.path.sigmas, observations=seen)
+
+    def priors(self) -> list[FactorBatch]:
+        """The prior of the first position of a track that one camera saw: rays alone leave its distance open."""
+        if self.place is None:
+            return []
+        mean, root = np.zeros((1, STATE_DIM)), np.zeros((1, 3, STATE_DIM))
+        mean[:, POSITION], root[0, :, POSITION] = self.place[0], np.eye(3) / self.place[1]
+        return [PriorFactors(np.zeros(1, dtype=np.int64), mean, root)]
+
+    def judged(self, estimate: Estimate) -> Estimate:
+        """The estimate, with the status `DEPTH_UNCERTAIN` if one camera saw the ball and its depth is loose."""
+        if not self.one_view or estimate.status is not Status.OK:
+            return estimate
+        first = np.searchsorted(self.state, np.arange(len(estimate)))
+        centres = np.stack([camera.centre for camera in self.cameras])[self.sightings.camera[first]]
+        rays = estimate.states[:, POSITION] - centres
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        spread = np.einsum("ni,nij,nj->n", rays, estimate.covariances[:, POSITION, POSITION], rays)
+        loose = np.sqrt(np.median(spread)) > LOOSE_DEPTH
+        return replace(estimate, status=Status.DEPTH_UNCERTAIN) if loose else estimate
+
+    def segmentation(self) -> Segmentation | None:
+        """The bounces of a track that one camera saw; None if the positions show the events."""
+        if not self.one_view:
+            return None
+        none = np.zeros(0, dtype=np.int64)
+        good = np.full(int(self.state.max()) + 1, Quality.GOOD, dtype=np.int8)
+        return Segmentation(self.bounces, none, none, (), good)
 
 
 def sightings_of(track: Track) -> CameraSightings:
@@ -150,9 +216,15 @@ def sightings_of(track: Track) -> CameraSightings:
 
 
 def sighted_track(
-    name: str, sightings: Sightings, cameras: Sequence[Camera], labels: Mapping[str, Label] | None = None
+    name: str,
+    sightings: Sightings,
+    cameras: Sequence[Camera],
+    labels: Mapping[str, Label] | None = None,
+    *,
+    model: BallModel | None = None,
+    surfaces: Surfaces | None = None,
 ) -> Track:
-    """The track of one ball from the sightings of cameras.
+    """The track of one ball from the sightings of one or more cameras.
 
     Its `positions` and `sigmas` are rough, from the rays around each stamp: good enough for finding events and for a
     start. The smoother and the online estimator use camera factors instead; the extended Kalman filter and the sliding
@@ -163,10 +235,13 @@ def sighted_track(
         sightings: of the ball, in order of true time.
         cameras: of the rig, in any order, with all that `sightings` names.
         labels: of the shot.
-    Raises: ValueError: if a camera is missing, rows are not in order of true time, or the ball was never in the view of
-        two cameras within a few frames.
+        model, surfaces: of the ball, and of what it bounces on, for the positions of a ball that one camera saw;
+            estimators use their own. None: table tennis, with the table at z = 0.
+    Raises: ValueError: if a camera is missing, two cameras stand at one point, rows are not in order of true time, or
+        one camera saw the ball less than `LEAST_SEEN` times.
     """
     rig = cameras_of(sightings, cameras)
+    check_apart([rig[number] for number in np.unique(sightings.camera)])
     origin = float(sightings.times[0]) if len(sightings) else 0.0
     times = true_times_of(replace(sightings, times=elapsed(sightings.times, origin)), rig)
     if (np.diff(times) < 0.0).any():
@@ -182,10 +257,32 @@ def sighted_track(
         begun = times[row] if first[row] else begun
     moments = times[first]
     state = np.cumsum(first) - 1
-    path = filled(moments, rough_path(Rays.of(sightings, times, rig), moments), name)
-    seen = CameraSightings(sightings, rig, state, times - moments[state], np.zeros(len(rig)))
+    rays = Rays.of(sightings, times, rig)
+    path = rough_path(rays, moments)
+    alone = not determined(path).any()
+    if alone:
+        if len(moments) < LEAST_SEEN:
+            raise TooFewSightingsError(
+                f"track {shown(name)}: a ball that one camera saw must be seen {LEAST_SEEN} times or more; got "
+                f"{len(moments)}. Leave the track out, or look at the time offsets of the cameras."
+            )
+        ball = physics_of(nominal_model() if model is None else model)
+        path = one_view(rays, moments, ball, Surfaces.table_tennis(0.0) if surfaces is None else surfaces)[0].path
+    else:
+        path = filled(moments, path)
+    seen = CameraSightings(sightings, rig, state, times - moments[state], np.zeros(len(rig)), alone)
     stamps = written(moments, origin)
     return Track(stamps, path.positions, path.sigmas, dict(labels or {}), observations=(seen,), rough=True, name=name)
+
+
+def check_apart(cameras: Sequence[Camera]) -> None:
+    """Refuses cameras that stand at one point. Raises: ValueError: naming two of them."""
+    for one, other in combinations(cameras, 2):
+        if np.linalg.norm(one.centre - other.centre) < APART:
+            raise ValueError(
+                f"cameras must stand apart; {shown(one.name)} and {shown(other.name)} share a centre, so that together "
+                "they see no more than one. Leave one of them out, or correct its pose."
+            )
 
 
 def cameras_of(sightings: Sightings, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
@@ -216,39 +313,3 @@ def in_order(sightings: Sightings, cameras: Sequence[Camera]) -> Sightings:
 def _bank(cameras: tuple[Camera, ...]) -> CameraBank:
     """The cameras in torch; one object for all tracks of a rig."""
     return CameraBank(cameras)
-
-
-def filled(moments: Array, path: Path, name: str) -> Path:
-    """The path at moments (n,) s, with undetermined positions interpolated in time and extrapolated at its ends.
-
-    Raises: NeverSeenByTwoError: if rays determine no position at all.
-    """
-    firm = path.sigmas.max(axis=1) <= LOOSE
-    if not firm.any():
-        raise NeverSeenByTwoError(
-            f"track {shown(name)}: the ball must be seen by two cameras within a few frames; it never is. "
-            "Leave the track out, or look at the time offsets of the cameras."
-        )
-    if firm.all():
-        return path
-    (at,), (gaps,) = np.nonzero(firm), np.nonzero(~firm)
-    place = np.searchsorted(at, gaps)
-    before, after = at[np.maximum(place - 1, 0)], at[np.minimum(place, len(at) - 1)]
-    since, until = moments[gaps] - moments[before], moments[after] - moments[gaps]
-    whole = since + until
-    share = np.where(whole > 0.0, since / np.where(whole > 0.0, whole, 1.0), 0.0)[:, None]
-    share = share**2 * (3.0 - 2.0 * share)  # Hermite's blend of the two extrapolations: smooth at both ends
-    positions, velocities, sigmas = path.positions.copy(), path.velocities.copy(), path.sigmas.copy()
-    positions[gaps] = (1 - share) * _fallen(path, before, since) + share * _fallen(path, after, -until)
-    velocities[gaps] = (1 - share) * path.velocities[before] + share * path.velocities[after]
-    nearest = np.minimum(np.abs(since), np.abs(until))
-    nearest = np.where(before == after, np.maximum(np.abs(since), np.abs(until)), nearest)
-    sigmas[gaps] = (LOOSE_SIGMA + LOOSE_GROWTH * nearest)[:, None]
-    return Path(positions, velocities, sigmas)
-
-
-def _fallen(path: Path, rows: NDArray[np.int64], elapsed: Array) -> Array:
-    """(k, 3) m, positions of the free fall from some moments after some time, s."""
-    points = path.positions[rows] + elapsed[:, None] * path.velocities[rows]
-    points[:, Z] -= 0.5 * STANDARD_GRAVITY * elapsed**2
-    return points

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ballfg.checks import check_array, check_choice, shown
-from ballfg.estimation.observations.ray_path import AROUND, BEFORE, Path, Rays, rough_path
-from ballfg.estimation.observations.sightings import LOOSE, SAME_MOMENT, filled
+from ballfg.estimation.observations.ray_path import AROUND, BEFORE, LOOSE, Path, Rays, filled, rough_path
+from ballfg.estimation.observations.sightings import SAME_MOMENT
 from ballfg.estimation.online.state import Measurement, Sample
 from ballfg.factors.camera import CameraFactors
 from ballfg.factors.loss import Loss
@@ -105,7 +105,7 @@ class SightingStream:
             last, known = self._firm
             moments = np.array([last, now])
             path = known.joined(path)
-        path = filled(moments, path, "of the stream")
+        path = filled(moments, path)
         for k, sample in enumerate(reversed(self._held)):
             sample.position, sample.stated = path.positions[-1 - k], path.sigmas[-1 - k]
         placed, self._held = self._held, []

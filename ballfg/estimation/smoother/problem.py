@@ -91,6 +91,7 @@ class TrackProblem:
     Attributes:
         ball: the model with the estimated coefficients.
         observations: of the track, positions among them.
+        one_view: True if one camera alone saw the ball.
         unknowns: those of the observations; they follow the coefficients of the ball.
         observed: the factors of each observation, by its name.
         added: further factors, at first empty; append to it before the problem is solved.
@@ -114,6 +115,7 @@ class TrackProblem:
         self.sigma = effective_sigmas(track, segmentation, settings) if sigma is None else sigma
         self.ball = trackwise_model(model, settings)
         self.observations: tuple[Observation, ...] = observations_of(track)
+        self.one_view = track.one_view
         self.unknowns: Unknowns = unknowns_of(self.observations, settings)
         self.width = model_width(self.ball)
         columns = {name: self.width + k for k, name in enumerate(self.unknowns.names)}
@@ -133,6 +135,8 @@ class TrackProblem:
         batches: list[FactorBatch] = [*self.observed.values(), *self.added]
         batches += self._dynamics.factors(replace(events.segmentation, contacts=events.contacts))
         batches += _priors(self.track, events.segmentation, self.settings)
+        for observation in self.observations:
+            batches += observation.priors()
         if self.biased:
             sigma, dt = self.settings.bias_sigmas, np.diff(self.track.times)
             batches.append(BiasStartFactors(np.array([0]), sigma))

@@ -43,6 +43,8 @@ LEAST_GAIN = 0.9
 not the reason: the stated noise is far too small, and every further hit would cost a long search."""
 LEAST_FALL = 0.05
 """m/s, least downward speed of a guess before a contact."""
+DEAR = 5.0
+"""Of the objective, a log likelihood: gain of a contact that only the end of a track suggests, if one camera saw it."""
 MAX_REFINEMENTS = 6
 """Largest number of moves of contacts to a neighbouring interval; measured tracks needed two."""
 LABELS = (LauncherSpinFactors, SpinLabelFactors)
@@ -127,8 +129,9 @@ class ContactSearch:
         if places_of(refined) == places:
             unseen = () if self._settled else contacts_at_ends(times, solution, ball, self.surfaces)
             if not unseen:  # a contact that only the end of the track suggests must also explain it better
-                stayed = (solution,) if self._settled is None else (self._settled, solution)
-                self._best = min(stayed, key=lambda s: s.minimum.error)
+                gain = np.inf if self._settled is None else self._settled.minimum.error - solution.minimum.error
+                more = self._settled is None or gain > (DEAR if self.problem.one_view else 0.0)
+                self._best = solution if more else self._settled
                 return None
             self._settled = solution
             refined = tuple(sorted((*refined, *unseen), key=lambda c: c.time))

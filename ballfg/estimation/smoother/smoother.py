@@ -74,6 +74,7 @@ class Smoother(Estimator):
 
     name = "smoother"
     has_graph = True
+    takes_one_view = True
 
     def __init__(
         self,
@@ -99,8 +100,8 @@ class Smoother(Estimator):
             return joined
         smoother = self.first_look() if moving else self
         for _ in range(OFFSET_ROUNDS):
-            problem = smoother.problem(track.since_first())
-            found = smoother.result(problem, smoother.settle(problem))
+            problem, solution = smoother.settled(track.since_first())
+            found = smoother.result(problem, solution)
             estimate = found.dated(track.times)
             if not moving or estimate.status.failed:
                 return estimate
@@ -132,6 +133,10 @@ class Smoother(Estimator):
 
     def _segmented(self, track: Track) -> tuple[Segmentation, tuple[LowHops, ...]]:
         """The events in a track, and the compatible low hops."""
+        for observation in track.observations:
+            shown = observation.segmentation()
+            if shown is not None:
+                return shown, ()
         settings = self.settings.for_track(track)
         white = sample_sigmas(settings, len(track), track.sigmas)
         sigma = total_sigmas(settings, white, window_velocities(track.times, track.positions))
@@ -144,6 +149,15 @@ class Smoother(Estimator):
     def low_hops(self, track: Track, events: Segmentation) -> tuple[LowHops, ...]:
         """The stretches with hops too low for distinguishing single bounces."""
         return low_hops(track, events, self.model, self.surfaces, self.settings)
+
+    def settled(self, track: Track) -> tuple[TrackProblem, Solution]:
+        """The minimisation problem of a track and its solution, the lowest from all starts of its observations."""
+        starts = [track]
+        for observation in track.observations:
+            starts = [start for one in starts for start in observation.starts(one, self.model, self.surfaces)]
+        problems = [self.problem(start) for start in starts]
+        found = [(problem, self.settle(problem)) for problem in problems]
+        return min(found, key=lambda one: one[1].minimum.error)
 
     def problem(
         self, track: Track, segmentation: Segmentation | None = None, sigma: Array | None = None
@@ -172,7 +186,7 @@ class Smoother(Estimator):
         for left in range(MAX_UNSEEN_HITS if self.settings.find_events else 0, -1, -1):
             search = ContactSearch(problem, self.surfaces, segmentation)
             if earlier is None:
-                label = self.settings.spin_label(problem.track)
+                label = problem.settings.spin_label(problem.track)
                 states = initial_states(problem.track, segmentation.contacts, segmentation, self.model, label)
                 start = problem.start(states)
             else:
@@ -187,7 +201,10 @@ class Smoother(Estimator):
                     minimum = minimise_with_restart(rough, graph, values, minimum)
                 arrangement = search.after(Solution(events, graph, minimum))
             solution = search.best
-            if earlier is None and not spin_start(self.settings.spin_label(problem.track), self.settings).measured:
+            if (
+                earlier is None
+                and not spin_start(problem.settings.spin_label(problem.track), problem.settings).measured
+            ):
                 solution = with_other_spins(solution, problem.ball, rough)
             if before is not None and leads_nowhere(solution, before):
                 break
@@ -203,7 +220,10 @@ class Smoother(Estimator):
     def result(self, problem: TrackProblem, solution: Solution) -> Estimate:
         """The estimate of a track from a solution."""
         known = self.optimizer.covariances(solution.graph, solution.minimum)
-        estimate = with_both_sides(self, problem, self.at_minimum(problem, solution, known))
+        estimate = self.at_minimum(problem, solution, known)
+        if problem.one_view:  # the first samples alone, as a second look takes them, would not show their depth
+            return estimate
+        estimate = with_both_sides(self, problem, estimate)
         segmentation = solution.events.segmentation
         hops = problem.hops if segmentation is problem.segmentation else None
         hops = self.low_hops(problem.track, segmentation) if hops is None else hops
@@ -247,10 +267,12 @@ class Smoother(Estimator):
             quality=segmentation.quality,
             error=minimum.error,
             iterations=minimum.iterations,
-            world=self.world,
+            world=replace(self.world, process=problem.settings.process),
             notes=self.doubts(track),
         )
         estimate = plausible(estimate, track, problem.sigma, self.settings)
+        for observation in problem.observations:
+            estimate = observation.judged(estimate)
         estimate = replace(estimate, notes=estimate.notes + rival_note(solution, estimate.covariances[0]))
         return widened_near_contacts(estimate, problem.ball)
 

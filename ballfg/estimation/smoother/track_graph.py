@@ -61,8 +61,7 @@ class TrackGraph:
         Raises: ValueError: a track without a graph, or as `Estimator.estimate`.
         """
         prepared = smoother.prepared(track)
-        problem = smoother.problem(prepared.since_first())
-        solution = smoother.settle(problem)
+        problem, solution = smoother.settled(prepared.since_first())
         if solution.minimum.step is None:
             raise ValueError(f"track {shown(track.name)}: {Status.FAILED.value}")
         return cls(

@@ -20,7 +20,7 @@ from ballfg.vision.detection.detections import Detections, Detector
 from ballfg.vision.detection.video import Video, open_video
 from ballfg.vision.tracking.recordings import check_sizes
 
-FEWEST: Final = 2  # least number of cameras: a single one does not see the distance of a ball
+FEWEST: Final = 2  # least number of cameras: candidates of a single one agree with nothing
 DIGITS: Final = 3  # least number of digits in a track's name: names then sort as their tracks do
 
 
@@ -129,7 +129,10 @@ def track_detections(
 def check_rig(cameras: Sequence[Camera]) -> None:
     """Refuses too few cameras. Raises: ValueError."""
     if len(cameras) < FEWEST:
-        raise ValueError(f"cameras must be at least {FEWEST}; got {len(cameras)}. One alone does not see distance.")
+        raise ValueError(
+            f"cameras must be at least {FEWEST}; got {len(cameras)}. For one camera name the ball of each row of "
+            "detections.csv in its column 'trajectory' and run 'ballfg estimate FOLDER --from detections'."
+        )
 
 
 def check_overlap(detections: Sequence[Detections], cameras: Sequence[Camera]) -> None:

@@ -104,8 +104,12 @@ def test_refuses_what_is_no_track(made: Scene) -> None:
         sighted_track("a", made.sightings, RIG[:2])
     with pytest.raises(ValueError, match=r"in order of true time; row 1, camera 'right', is earlier"):
         sighted_track("a", made.sightings, (RIG[0], replace(RIG[1], time_offset=0.004), RIG[2]))
-    with pytest.raises(ValueError, match="seen by two cameras within a few frames"):
-        sighted_track("a", made.sightings.select(made.sightings.camera == 1), RIG)
+    alone = np.flatnonzero(made.sightings.camera == 1)
+    with pytest.raises(ValueError, match="one camera saw must be seen 5 times or more; got 4"):
+        sighted_track("a", made.sightings.select(alone[:4]), RIG)
+    twice = (RIG[0], replace(RIG[0], name="right"), RIG[2])
+    with pytest.raises(ValueError, match="'left' and 'right' share a centre"):
+        sighted_track("a", made.sightings, twice)
 
 
 def nearest_stamp_positions(made: Scene) -> Track:

@@ -1,0 +1,101 @@
+"""Judges strokes that one camera saw: depth, intervals and bounces against the measured tracks of the same strokes."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.arrays import Array
+from ballfg.benchmarks.metrics import bootstrap, inside, median_and_quartiles, share
+from ballfg.benchmarks.results import Results
+from ballfg.estimation import Estimate
+from ballfg.estimation.observations.sighted_dataset import SightedDataset
+from ballfg.front import estimator_for
+from ballfg.progress import progress
+from ballfg.tracks import Dataset, Track
+
+METHOD: Final = "smoother, one camera"
+FAILED: Final = 1.0
+"""m, error of a stroke from which it counts as a failure, as one without states does."""
+LEVEL: Final = 0.9
+
+
+@dataclass(frozen=True)
+class Stroke:
+    """One stroke against its measured track.
+
+    Attributes:
+        error: m, root mean square over the stamps.  within: (n, 3) True inside the 90 % interval of an axis.
+        late: s, and apart, m: distance in time and in place from the measured track's bounce; NaN without one.
+        duration: s, of the estimate.
+    """
+
+    error: float
+    within: NDArray[np.bool_]
+    late: float
+    apart: float
+    duration: float
+
+
+def run_views(results: Results, views: Sequence[SightedDataset], truth: Dataset) -> None:
+    """Adds the rows of each view; its name is the case.
+
+    Args: views: strokes of one camera each.  truth: their measured tracks, under the same names.
+    Raises: ValueError: a view without a stroke of the truth.
+    """
+    known: dict[str, Track] = {track.name: track for track in truth}
+    measured = estimator_for(truth)
+    whole = {name: measured.estimate(track.since_first()) for name, track in known.items()}
+    for view in views:
+        estimator, found = estimator_for(view), list[Stroke]()
+        tracks = [track for track in view if track.name in known]
+        if not tracks:
+            raise ValueError(f"{view.path} must hold tracks of {truth.path}; it holds none. Give views of its strokes.")
+        estimator.estimate(tracks[0])  # machine code is compiled once
+        for track in progress(tracks, len(tracks), f"strokes of {view.info.name}"):
+            begun = time.perf_counter()
+            estimate = estimator.estimate(track)
+            duration = time.perf_counter() - begun
+            found.append(_judged(estimate, known[track.name], whole[track.name], duration))
+        _add(results, view.info.name, found)
+
+
+def _judged(estimate: Estimate, track: Track, whole: Estimate, duration: float) -> Stroke:
+    """One estimate against the measured track, and its first bounce against that of the track's estimate."""
+    times = estimate.times - estimate.times[0]
+    true = np.stack([np.interp(times, track.seconds, p) for p in track.positions.T], axis=1)
+    error, late, apart = estimate.states[:, :3] - true, np.nan, np.nan
+    if estimate.contacts and whole.contacts:
+        one, other = estimate.contacts[0].time - estimate.times[0], whole.contacts[0].time
+        late = abs(one - other)
+        apart = float(np.linalg.norm(_place(estimate, estimate.times[0] + one) - _place(whole, other)))
+    within = inside(error, estimate.sigmas[:, :3], LEVEL)
+    lost = np.inf if estimate.status.failed else float(np.sqrt((error**2).sum(axis=1).mean()))
+    return Stroke(lost, within, late, apart, duration)
+
+
+def _place(estimate: Estimate, at: float) -> Array:
+    """(2,) m, horizontal place at a bounce: the state before it, moved on in a straight line."""
+    row = max(int(np.searchsorted(estimate.times, at, side="right")) - 1, 0)
+    state = estimate.states[row]
+    return np.asarray(state[:2] + (at - estimate.times[row]) * state[3:5])
+
+
+def _add(results: Results, case: str, found: Sequence[Stroke]) -> None:
+    """The rows of one view."""
+    add, n, rng = partial(results.add, case, METHOD), len(found), np.random.default_rng(results.seed)
+    errors = 1e3 * np.array([stroke.error for stroke in found])
+    add("error_median", "mm", bootstrap(lambda rows: np.median(errors[rows], axis=-1), n, rng), n)
+    add("error_p90", "mm", float(np.quantile(errors, 0.9)), n)
+    add("failures", "1", share([stroke.error > FAILED for stroke in found]), n)
+    held = np.array([stroke.within.mean(axis=0) for stroke in found])
+    for axis, name in enumerate("xyz"):
+        add(f"coverage_90_{name}", "1", float(held[:, axis].mean()), n)
+    late, apart = (np.array([getattr(stroke, name) for stroke in found]) for name in ("late", "apart"))
+    add("bounce_time_median", "ms", 1e3 * float(np.nanmedian(late)), int(np.isfinite(late).sum()))
+    add("bounce_place_median", "mm", 1e3 * float(np.nanmedian(apart)), int(np.isfinite(apart).sum()))
+    add("time", "s", median_and_quartiles([stroke.duration for stroke in found]), n)
