@@ -1,6 +1,6 @@
 """Small mistakes put into the code one by one: which of them does the test suite notice? `make mutants`.
 
-The tests that reach each line come from one recorded run of the suite (tests/mutants/README.md). Every mistake is tried in a
+The tests that reach each line come from one recorded run of the suite (README.md here). Every mistake is tried in a
 copy of the tree. The table goes to `results.csv` in the folder of the recording.
 """
 
