@@ -79,7 +79,7 @@ class Screen:
 
         The most probable sets of each size are enlarged by one candidate after the other.
         """
-        found = {(one,): self.odds((one,)) for one in offered}
+        found: dict[tuple[int, ...], float] = {(one,): self.odds((one,)) for one in offered}
         best = self._leading(found)
         for _ in range(most - 1):
             larger: dict[tuple[int, ...], float] = {}

@@ -211,8 +211,10 @@ class _Found:
             found = weighed(refitted.fit, named, self.motion, self.halves, best.noise)
             self.models[found.names] = found
             tried.append((found, refitted))
-        found, refitted = max(tried, key=lambda one: one[0].score, default=(best, None))
-        if refitted is None or found.score <= best.score:
+        if not tried:
+            return None
+        found, refitted = max(tried, key=lambda one: one[0].score)
+        if found.score <= best.score:
             return None
         tell(f"{refitted.name} exchanged for another")
         self.best, self.motion = found, random_motion(found.fit, self.scattering)
