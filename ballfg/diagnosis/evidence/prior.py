@@ -59,7 +59,8 @@ def within(hypothesis: Hypothesis, centre: Array, mean: Array, sigmas: Array, wi
 
     Args: centre: (p,) of the prior.  mean, sigmas: (p,) of the strengths.  width: of the prior, in usual strengths.
     """
-    listed = [hypothesis.coefficients[name] for name in hypothesis.strengths]
+    free = hypothesis.free()
+    listed = [free[name] for name in hypothesis.columns]
     low, high = (np.array([getattr(c, end) for c in listed]) for end in ("low", "high"))
     spreads = width * scales(hypothesis)
     after = _inside((low - mean) / sigmas, (high - mean) / sigmas)

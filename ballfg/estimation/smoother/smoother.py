@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -100,7 +100,8 @@ class Smoother(Estimator):
             return joined
         smoother = self.first_look() if moving else self
         for _ in range(OFFSET_ROUNDS):
-            problem, solution = smoother.settled(track.since_first())
+            problem, *rivals = smoother.problems(track.since_first())
+            problem, solution = smoother.lowest(problem, smoother.settle(problem), rivals)
             found = smoother.result(problem, solution)
             estimate = found.dated(track.times)
             if not moving or estimate.status.failed:
@@ -150,14 +151,22 @@ class Smoother(Estimator):
         """The stretches with hops too low for distinguishing single bounces."""
         return low_hops(track, events, self.model, self.surfaces, self.settings)
 
-    def settled(self, track: Track) -> tuple[TrackProblem, Solution]:
-        """The minimisation problem of a track and its solution, the lowest from all starts of its observations."""
+    def problems(self, track: Track) -> list[TrackProblem]:
+        """The minimisation problem of a track, from each start that its observations offer."""
         starts = [track]
         for observation in track.observations:
             starts = [start for one in starts for start in observation.starts(one, self.model, self.surfaces)]
-        problems = [self.problem(start) for start in starts]
-        found = [(problem, self.settle(problem)) for problem in problems]
-        return min(found, key=lambda one: one[1].minimum.error)
+        return [self.problem(start) for start in starts]
+
+    def lowest(
+        self, problem: TrackProblem, solution: Solution, rivals: Iterable[TrackProblem]
+    ) -> tuple[TrackProblem, Solution]:
+        """A problem with its solution, or a rival with its own if that is lower."""
+        for rival in rivals:
+            other = self.settle(rival)
+            if other.minimum.error < solution.minimum.error:
+                problem, solution = rival, other
+        return problem, solution
 
     def problem(
         self, track: Track, segmentation: Segmentation | None = None, sigma: Array | None = None

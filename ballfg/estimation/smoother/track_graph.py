@@ -61,7 +61,8 @@ class TrackGraph:
         Raises: ValueError: a track without a graph, or as `Estimator.estimate`.
         """
         prepared = smoother.prepared(track)
-        problem, solution = smoother.settled(prepared.since_first())
+        problem, *rivals = smoother.problems(prepared.since_first())
+        problem, solution = smoother.lowest(problem, smoother.settle(problem), rivals)
         if solution.minimum.step is None:
             raise ValueError(f"track {shown(track.name)}: {Status.FAILED.value}")
         return cls(
