@@ -147,12 +147,9 @@ def places(model: AnalyticModel) -> tuple[Array, Array]:
     Args: model: with a correction.
     Returns: (5,) each.
     """
-    values = cast(Effect, model.flight[AirCorrection.name]).values()
-    x, y = np.array([0.0, -1.0, 1.0, 0.0, 0.0]) / BEYOND, np.array([0.0, 0.0, 0.0, -1.0, 1.0]) / BEYOND
-    return (
-        np.maximum(values["speed"] + x * values["speed_scale"], 0.0),
-        np.maximum(values["ratio"] + y * values["ratio_scale"], 0.0),
-    )
+    values, ends = cast(Effect, model.flight[AirCorrection.name]).values(), spans(model)
+    speed, ratio = values["speed"], values["ratio"]
+    return np.array([speed, *ends["speed"], speed, speed]), np.array([ratio, ratio, ratio, *ends["ratio"]])
 
 
 def doubt_sigmas() -> dict[str, float]:

@@ -21,8 +21,8 @@ matplotlib.use("Agg")
 
 DPI = 130
 TRACKS, BAND, START = "#3b4cc0", "#d95f02", "#7f7f7f"
-AXES: Final = {"speed": ("speed", " m/s"), "ratio": ("spin ratio", "")}
-"""Quantities of a correction: their words and units."""
+AXES: Final = {"speed": "speed, m/s", "ratio": "spin ratio"}
+"""Quantities of a correction: their labels."""
 CURVE: Final = 101
 """Points of a curve."""
 
@@ -86,11 +86,9 @@ def _correction(axes: Axes, model: AnalyticModel, force: str, along: str) -> Non
     axes.plot(at[along], mean, color=BAND, linewidth=1.5, label="learned, with its 90 % band")
     axes.axhline(0.0, color=START, linestyle="--", linewidth=1.0, label="declared law")
     (other,) = set(AXES) - {along}
-    words, unit = AXES[other]
-    axes.set_title(f"{force} where the {words} is {middle[other][0]:.3g}{unit}", size=10)
-    axes.set(
-        xlabel=f"{AXES[along][0]}{',' + AXES[along][1] if AXES[along][1] else ''}", ylabel=f"correction of {force}, %"
-    )
+    words, _, unit = AXES[other].partition(", ")
+    axes.set_title(f"{force} where the {words} is {middle[other][0]:.3g} {unit}".rstrip(), size=10)
+    axes.set(xlabel=AXES[along], ylabel=f"correction of {force}, %")
     axes.grid(visible=True, alpha=0.25)
     axes.legend(fontsize="x-small")
 

@@ -77,7 +77,9 @@ def predict(
         estimator = opened.estimator(method, solver, group)
         scales = None
         if conformal is not None and opened.dataset.rough:
-            raise ValueError("conformal must not be given with detections: its scales are those of positions")
+            raise ValueError(
+                "conformal must not be given with detections: its scales are those of positions. Leave it out."
+            )
         if conformal is not None:
             scales = _conformal_scales(conformal, opened.dataset, estimator, method, observe, workers)
         predictions = predict_tracks(estimator, opened.dataset, count, observe, jobs=workers)

@@ -153,13 +153,21 @@ class Screen:
         evidence = np.array([after.evidence for after in found])
         best, size = int(evidence.argmax()), len(candidate.strengths)
         mean, sigmas = found[best].mean[-size:], np.sqrt(np.diagonal(found[best].covariance)[-size:])
-        centre = centres(candidate, self.model.fit.problem.model)
+        centre = self._centres[one]
         inside = within(candidate, centre, centre + mean, sigmas, WIDTHS[TRIED[best]])
         gain = float(special.logsumexp(evidence)) - np.log(len(TRIED)) - least + inside
         more = _Gain(float(gain), TRIED[best])
         if precision is None:
             self._known[key] = more
         return more
+
+    @cached_property
+    def _centres(self) -> list[Array]:
+        return [centres(candidate, self.model.fit.problem.model) for candidate in self.candidates]
+
+    @cached_property
+    def _scales(self) -> list[Array]:
+        return [scales(candidate) for candidate in self.candidates]
 
     @cached_property
     def _ends(self) -> Index:
@@ -175,7 +183,7 @@ class Screen:
         columns = self._columns([one for one, _ in chosen])
         listed = np.append(columns, self.total.gram.shape[-1] - 1)
         part = Reduced(self.total.constant, self.total.gram[:, listed[:, None], listed])
-        sizes = [WIDTHS[width] * scales(self.candidates[one]) for one, width in chosen]
+        sizes = [WIDTHS[width] * self._scales[one] for one, width in chosen]
         own = self.priors.precision(self.model.widths) if precision is None else precision
         whole = np.concatenate((own, *(size**-2 for size in sizes)))
         return posterior(part, whole, np.append(self.priors.away, np.zeros(len(columns) - self._own)))

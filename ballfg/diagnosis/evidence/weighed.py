@@ -249,7 +249,7 @@ class _Question:
         for number, (hypothesis, place) in enumerate(zip(effects, priors.places, strict=False)):
             found = Strengths(values[place] + result.mean[place], result.covariance[np.ix_(place, place)])
             sigmas = np.sqrt(np.diagonal(found.covariance))
-            centre = centres(hypothesis, fit.problem.model)
+            centre = values[place] + priors.away[place]
             mixed[number] += within(hypothesis, centre, found.mean, sigmas, WIDTHS[best[number]])
             strengths[hypothesis.name] = found
         away, spread = result.mean[:own], result.covariance[:own, :own]

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 
 import numpy as np
 import torch
@@ -10,7 +11,7 @@ from scipy import stats
 from ballfg.arrays import Array
 from ballfg.diagnosis.evidence.rows import Motion, random_motion
 from ballfg.diagnosis.evidence.screen import Screen
-from ballfg.diagnosis.evidence.weighed import Weighed
+from ballfg.diagnosis.evidence.weighed import Step, Weighed
 from ballfg.diagnosis.fit.fit import MOST_STEPS, fit_problem
 from ballfg.diagnosis.fit.problem import Fit, Problem
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, with_effects
@@ -29,6 +30,7 @@ MOST_REFITS = 4
 MOST_SHAPES, FIRST_STEPS = 9, 4
 """Largest number of shapes of a hypothesis that are refitted, and of the steps after which the lowest goes on alone."""
 PAIR = 2
+"""Number of hypotheses in the smallest set of several."""
 FRAME_CHOICE = 2.0 * float(np.log(FRAMES - 1))
 """Cost of a label frame in BIC, for the choice among all frames."""
 
@@ -77,16 +79,19 @@ class Refit:
         return self.scored.hypothesis.name
 
 
-def score_all(model: Weighed, candidates: Sequence[Hypothesis]) -> list[Scored]:
+def score_all(model: Weighed, candidates: Sequence[Hypothesis], motion: Motion | None = None) -> list[Scored]:
     """Score tests of all hypotheses, and their foretold gains.
 
     Args:
         model: without any of them, as `weigh` gives it.
         candidates: the hypotheses; those without strengths are left out.
+        motion: random columns of the model's fit, if they are known.
     Returns: the tests, sorted by explained residual, invisible hypotheses last.
     """
     testable = [h for h in candidates if h.strengths]
-    return screened(model, testable, random_motion(model.fit))[0] if testable else []
+    if not testable:
+        return []
+    return screened(model, testable, random_motion(model.fit) if motion is None else motion)[0]
 
 
 def screened(model: Weighed, testable: Sequence[Hypothesis], motion: Motion) -> tuple[list[Scored], Screen]:
@@ -124,21 +129,22 @@ def leading_sets(screen: Screen, scored: Sequence[Scored], most: int) -> list[tu
     """
     seen = {id(s.hypothesis) for s in scored if s.score is not None}
     visible = [one for one, candidate in enumerate(screen.candidates) if id(candidate) in seen]
-    best, *others = [*screen.sets(visible, most), ()]
-    if len(best) < PAIR:
-        return []
-    alone = next(place for place, chosen in enumerate([*others, ()]) if len(chosen) < PAIR)
-    pairs = [chosen for chosen in others[:alone] if len(chosen) == PAIR]
-    return [best] if len(best) == PAIR else [best, *pairs[:1]]
+    likely = list(takewhile(lambda chosen: len(chosen) >= PAIR, screen.sets(visible, most)))
+    pairs = [chosen for chosen in likely if len(chosen) == PAIR]
+    return list(dict.fromkeys((*likely[:1], *pairs[:1])))
 
 
-def refit_set(screen: Screen, chosen: Sequence[int], scored: Sequence[Scored]) -> Refit:
-    """The joint fit with several hypotheses, started from the most probable strengths of the linearised model."""
-    before, listed = screen.model.fit, [screen.candidates[one] for one in chosen]
-    problem = before.problem
+def refit_set(before: Fit, chosen: Sequence[Scored], step: Step, strengths: Array) -> Refit:
+    """The joint fit with several hypotheses, started from the most probable strengths of the linearised model.
+
+    Args:
+        before: the fit without them.
+        chosen: the hypotheses and their score tests.
+        step, strengths: as `Screen.step` gives them: a process for the fit then needs no screen, which is large.
+    """
+    problem, listed = before.problem, [one.hypothesis for one in chosen]
     for hypothesis in listed:
         problem = with_hypothesis(problem, hypothesis)
-    step, strengths = screen.step(chosen)
     moved, parameters = step.taken(before), dict(problem.model.named_parameters())
     absent = {name: float(parameters[name]) if name in parameters else 0.0 for h in listed for name in h.free()}
     names = [name for hypothesis in listed for name in hypothesis.columns]
@@ -152,8 +158,7 @@ def refit_set(screen: Screen, chosen: Sequence[int], scored: Sequence[Scored]) -
     if not np.isfinite(after.cost):  # too long a step: a flight missed its contact
         values = {**before.unknowns.values, **absent}
         after = fit_problem(problem, replace(before.unknowns, values=values), before.noise, settle_noise=False)
-    last = next(s for s in scored if s.hypothesis is listed[-1])
-    return Refit(last, after, delta_bic(before, after), tuple(listed[:-1]))
+    return Refit(chosen[-1], after, delta_bic(before, after), tuple(listed[:-1]))
 
 
 def refit(before: Fit, scored: Scored) -> Refit:

@@ -20,6 +20,7 @@ from ballfg.diagnosis.search.candidates import (
     refit_driven,
     refit_set,
     refit_usual,
+    score_all,
     screened,
     shortlist,
 )
@@ -58,7 +59,7 @@ def try_varying(
     known = ways(searched)
     listed = varying_hypotheses(problem.model, scene_of(before), catalogue, problem.free, known)
     tell(f"testing {len(listed)} ways in which tracks may differ")
-    scored = screened(model, listed, motion)[0] if listed else []
+    scored = score_all(model, listed, motion)
     names = sorted({name for way in known for level in way.weights.values() for name in level}, key=place_of)
     refits = []
     for candidate in shortlist(scored):
@@ -82,6 +83,18 @@ def _refits(before: Fit, leading: Sequence[Scored], tell: Callable[[str], None])
     return [partial(refit, before, one) for one in shaped]
 
 
+def _set_refits(
+    screen: Screen, scored: Sequence[Scored], most: int, tell: Callable[[str], None]
+) -> list[Callable[[], Refit]]:
+    """The refits of the leading sets of hypotheses."""
+    tested, found = {id(s.hypothesis): s for s in scored}, list[Callable[[], Refit]]()
+    for chosen in leading_sets(screen, scored, most):
+        members = [tested[id(screen.candidates[one])] for one in chosen]
+        tell(f"fitting with {' and '.join(one.hypothesis.name for one in members)}")
+        found.append(partial(refit_set, screen.model.fit, members, *screen.step(chosen)))
+    return found
+
+
 def _placed(model: Weighed, motion: Motion, closer: Sequence[Varying]) -> Scored:
     """The change along the recording at its best place.
 
@@ -89,7 +102,7 @@ def _placed(model: Weighed, motion: Motion, closer: Sequence[Varying]) -> Scored
     place is chosen, since one new table changes several coefficients; else the middle of them.
     """
     known = {deviation.level for deviation in model.fit.problem.deviations.values()}
-    scored = {id(s.hypothesis): s for s in screened(model, closer, motion)[0]}
+    scored = {id(s.hypothesis): s for s in score_all(model, closer, motion)}
     most = max(s.explained for s in scored.values())
     good = [scored[id(h)] for h in closer if scored[id(h)].explained >= AS_GOOD * most]
     named = [s for h, s in ((cast(Varying, s.hypothesis), s) for s in good) if known & set(h.grouping.weights)]
@@ -123,17 +136,13 @@ def try_hypotheses(
     unlabelled = before.problem.stretches.labelled.mean() < LABELLED
     driven = [h for h in candidates if h.effect.multiplies_spin and unlabelled]
     testable = [h for h in candidates if h not in driven and h.strengths]
-    scored, tasks, screen = list[Scored](), list[Callable[[], Refit]](), None
-    if testable:
-        scored, screen = screened(weighed, testable, motion)
-        leading = shortlist(scored)
-        tasks = _refits(before, leading, tell)
-        for chosen in leading_sets(screen, scored, most):
-            tell(f"fitting with {' and '.join(screen.candidates[one].name for one in chosen)}")
-            tasks.append(partial(refit_set, screen, chosen, scored))
-    called = {s.hypothesis.name for s in shortlist(scored)}
+    scored, screen = screened(weighed, testable, motion) if testable else ([], None)
+    leading = shortlist(scored)
+    called = {candidate.hypothesis.name for candidate in leading}
     usual = {h.name: h for h in (s.hypothesis for s in scored) if h.usual and h.name not in called}
     usual = {name: h for name, h in usual.items() if not has_effect(model, name)}
+    tasks = _refits(before, leading, tell)
+    tasks += [] if screen is None else _set_refits(screen, scored, most, tell)
     for name in usual:
         tell(f"fitting with {name}, which balls usually have")
     for hypothesis in driven:

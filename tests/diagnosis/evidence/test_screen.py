@@ -47,7 +47,9 @@ def test_a_set_is_refitted_to_what_was_foretold(screen, declared):
     pair = next(
         c for c in found.sets(range(len(found.candidates)), 2) if names(found, c) == {"wind", "restitution_speed"}
     )
-    made = refit_set(found, pair, scored)
+    tested = {id(s.hypothesis): s for s in scored}
+    members = [tested[id(found.candidates[one])] for one in pair]
+    made = refit_set(declared.fit, members, *found.step(pair))
     together = weigh(made.fit, made.added)
     assert together.score - declared.score > 0.8 * found.odds(pair)
     for hypothesis in made.added:
