@@ -74,7 +74,7 @@ def information_of(fit: Fit, goal: Goal, starts: Array, settings: Array, surface
         if usable[-1].any():  # those with exactly the contacts of a rollout
             good = replace(problem, stretches=own.take(usable[-1]))
             at = Fit.at(good, replace(at.unknowns, starts=at.unknowns.starts[usable[-1]]), fit.noise)
-            parts.append(at.linearised().eliminated().gram[:, :-1, :-1])
+            parts.append(at.linearised.eliminated().gram[:, :-1, :-1])
     chosen = np.concatenate(usable)
     if not chosen.any():
         raise ValueError(

@@ -17,7 +17,6 @@ import numpy as np
 from ballfg.arrays import Array, Index, Mask
 from ballfg.diagnosis.fit.free_motion import ACCELERATION, CONTACT_SPIN, CONTACT_VELOCITY, free_motion
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.fit.response import fitted_path, responses
 
 ACCELERATIONS, VELOCITIES, SPINS, COEFFICIENTS = range(4)
 """Kinds of random columns; each kind has one size for all tracks."""
@@ -75,7 +74,7 @@ class Rows:
 
 def rows_of(fit: Fit, motion: Motion) -> Rows:
     """The rows of a fit at its minimum; motion: `random_motion` of this or a similar fit to the same samples."""
-    system, stretches, root = fit.linearised(), fit.problem.stretches, roots(fit)
+    system, stretches, root = fit.linearised, fit.problem.stretches, roots(fit)
     return Rows(
         system.residual / root[..., 0],
         system.by_start / root,
@@ -101,7 +100,7 @@ def random_motion(fit: Fit, scattering: Collection[str] | None = None) -> Motion
     if scattering is None:
         scattering = [name for name in fit.problem.free if name not in fit.problem.deviations]
     own: dict[int, list[tuple[Array, Array]]] = defaultdict(list)
-    for arc in responses(fit, fitted_path(fit)):
+    for arc in fit.arcs:
         for row, piece in zip(arc.rows.tolist(), free_motion(fit, arc), strict=True):
             kinds = np.full(piece.columns.shape[1], ACCELERATIONS)
             if piece.contact is not None:
@@ -111,7 +110,7 @@ def random_motion(fit: Fit, scattering: Collection[str] | None = None) -> Motion
     chosen = [listed.index(name) for name in scattering]
     spread, count = np.array([fit.problem.free[name].sigma for name in scattering]), len(chosen)
     width = max(sum(len(k) for _, k in pieces) for pieces in own.values()) + count
-    by_common = fit.linearised().by_common
+    by_common = fit.linearised.by_common
     n, m = by_common.shape[:2]
     random, kinds = np.zeros((n, m, width)), np.full((n, width), -1)
     random[..., :count], kinds[:, :count] = by_common[..., chosen] * spread, COEFFICIENTS

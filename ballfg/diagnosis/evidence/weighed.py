@@ -185,14 +185,16 @@ def weighed(
         nameless: with patterns without a name beside the effects.
     """
     question = _Question(named, motion, halves, nameless)
-    found, step = question.at(fit, start)
+    point = question.point(fit)
+    found, step = question.at(point, start)
     for number in range(MOST_STEPS):
         if step.gain < WORTH_A_STEP and (number or not nameless):  # noise and widths of patterns need a second turn
             break
-        moved = question.moved(found, step)
+        moved = question.moved(point, found, step)
         if moved is None:
             break
-        again, after = question.at(moved, found.noise, found.widths)
+        point = moved
+        again, after = question.at(point, found.noise, found.widths)
         # patterns take the place of strengths far from the fit: there the foretold gain is only believed if it comes
         if again.evidence < found.evidence - step.gain * nameless:
             break
@@ -223,6 +225,15 @@ class Step:
 
 
 @dataclass(frozen=True)
+class _Point:
+    """A fit with its rows, beside patterns without a name if the question has them, and the priors there."""
+
+    fit: Fit
+    rows: Rows
+    priors: Priors
+
+
+@dataclass(frozen=True)
 class _Question:
     """The arguments of `weighed` that stay the same at all values of the unknowns."""
 
@@ -231,12 +242,18 @@ class _Question:
     halves: Mask
     nameless: bool
 
-    def at(self, fit: Fit, start: Noise | None, widths: Sequence[int] = ()) -> tuple[Weighed, Step]:
-        """The model at the unknowns of a fit, and the step to more probable ones.
+    def point(self, fit: Fit) -> _Point:
+        """The rows of a fit and the priors at its unknowns."""
+        rows, patterns = rows_of(fit, self.motion), Patterns.of(fit) if self.nameless else None
+        beside = rows if patterns is None else patterns.beside(rows)
+        return _Point(fit, beside, Priors.of(fit, self.named, patterns))
+
+    def at(self, point: _Point, start: Noise | None, widths: Sequence[int] = ()) -> tuple[Weighed, Step]:
+        """The model at the unknowns of a point, and the step to more probable ones.
 
         Args: start, widths: noise, and widths of the patterns after those of the effects, of a similar model.
         """
-        rows, priors = self._rows(fit)
+        fit, rows, priors = point.fit, point.rows, point.priors
         own, effects = len(fit.problem.free) + fit.unknowns.launcher.size, [h for h in self.named if h.strengths]
         of_patterns = list(widths[len(effects) :]) or [0] * (len(priors.places) - len(effects))
         first = priors.precision([len(WIDTHS) - 1] * len(effects) + of_patterns)
@@ -269,24 +286,20 @@ class _Question:
         )
         return weighed, Step(likelihood.local_step(noise, result.mean)[:, :STATE_DIM], away, gain)
 
-    def moved(self, model: Weighed, step: Step) -> Fit | None:
-        """The fit after a step; None if the step lowers the evidence at the same noise: it left the linear range."""
-        fit = Fit.at(model.fit.problem, step.taken(model.fit), model.fit.noise, model.fit.steps)
-        better = np.isfinite(fit.cost) and self._evidence(fit, model) > self._evidence(model.fit, model)
-        return fit if better else None
+    def moved(self, point: _Point, model: Weighed, step: Step) -> _Point | None:
+        """The point after a step; None if it lowers the evidence at the same noise: it left the linear range."""
+        fit = Fit.at(point.fit.problem, step.taken(point.fit), point.fit.noise, point.fit.steps)
+        if not np.isfinite(fit.cost):
+            return None
+        after = self.point(fit)
+        return after if self._evidence(after, model) > self._evidence(point, model) else None
 
-    def _evidence(self, fit: Fit, model: Weighed) -> float:
-        """The evidence at a fit's unknowns, with noise and widths of a model."""
-        rows, priors = self._rows(fit)
-        start = np.zeros(rows.by_common.shape[-1])
+    def _evidence(self, point: _Point, model: Weighed) -> float:
+        """The evidence at a point, with noise and widths of a model."""
+        rows, none = point.rows, np.zeros(point.rows.by_common.shape[-1])
         plain = weighted(rows, np.zeros_like(rows.residual), np.zeros((len(rows.residual), 3)))
-        reduced, _ = plain.reweighted(model.noise, start).reduced(model.noise)
-        return priors.posterior(reduced, model.widths).evidence
-
-    def _rows(self, fit: Fit) -> tuple[Rows, Priors]:
-        """The rows of a fit, beside patterns without a name if the question has them, and the priors."""
-        rows, patterns = rows_of(fit, self.motion), Patterns.of(fit) if self.nameless else None
-        return rows if patterns is None else patterns.beside(rows), Priors.of(fit, self.named, patterns)
+        reduced, _ = plain.reweighted(model.noise, none).reduced(model.noise)
+        return point.priors.posterior(reduced, model.widths).evidence
 
     def _nested(
         self, priors: Priors, whole: Reduced, widths: Sequence[int], mixed: Sequence[float]

@@ -153,7 +153,7 @@ def _minimise(now: Fit, steps: int = MOST_STEPS) -> Fit:
 
 def _step(now: Fit, damping: float) -> tuple[Fit | None, float]:
     """The fit after one step, None if no damping lowers the objective; and the damping of the next step."""
-    system, first = now.linearised(), damping
+    system, first = now.linearised, damping
     while damping < LARGEST_DAMPING:
         moved = _followed_up(_moved(now, system, damping), system, now.robust)
         if moved.cost < now.cost:
@@ -234,7 +234,7 @@ def _spin_scatter(result: Fit) -> Array:
     if not unlabelled.any():
         return result.noise.spin
     axes = scatter_axes(result.unknowns.starts[unlabelled])
-    covariance = np.linalg.inv(result.linearised().start_information[unlabelled])[:, SPIN, SPIN]
+    covariance = np.linalg.inv(result.linearised.start_information[unlabelled])[:, SPIN, SPIN]
     about = result.whitened_spins[unlabelled] * result.noise.spin
     square = about**2 + np.diagonal(axes @ covariance @ axes.swapaxes(1, 2), axis1=-2, axis2=-1)
     return np.maximum(np.sqrt(square.mean(axis=0)), LEAST_SPIN_SCATTER)

@@ -15,7 +15,7 @@ import torch
 
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.fit.response import ArcResponse, FittedPath, fitted_path, responses, weighted
+from ballfg.diagnosis.fit.response import ArcResponse, FittedPath, weighted
 from ballfg.diagnosis.fit.system import System
 from ballfg.dynamics.effects.generic import flight_axes
 from ballfg.state import POSITION, SPIN, VELOCITY
@@ -70,13 +70,11 @@ class Block:
 
 def blocks_of(fit: Fit) -> list[Block]:
     """All blocks of a fit; those of contacts only if there are contacts."""
-    path = fitted_path(fit)
-    arcs = list(responses(fit, path))
-    after = [arc for arc in arcs if arc.number]
-    blocks = [_flight(fit, arcs, group, axes) for group, axes in FLIGHT]
+    after = [arc for arc in fit.arcs if arc.number]
+    blocks = [_flight(fit, fit.arcs, group, axes) for group, axes in FLIGHT]
     if after:
         blocks += [_contact(fit, after, group, axes) for group, axes in CONTACT]
-    return blocks + [_measurement(fit, path, group) for group in MEASUREMENT]
+    return blocks + [_measurement(fit, fit.path, group) for group in MEASUREMENT]
 
 
 def _flight(fit: Fit, arcs: list[ArcResponse], group: Names, axes: Names) -> Block:

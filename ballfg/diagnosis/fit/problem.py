@@ -1,7 +1,7 @@
 """Defines a fit problem with its unknowns, priors and losses, and linearises its rows."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Self
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from ballfg.arrays import Array, Index
 from ballfg.diagnosis.fit.free import Deviation
+from ballfg.diagnosis.fit.response import ArcResponse, FittedPath, fitted_path, responses
 from ballfg.diagnosis.fit.sensitivity import Predicted, Sensitivity, predict, sensitivity
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.fit.system import System, by_track
@@ -246,10 +247,25 @@ class Fit:
         return {name: float(parameters[name].detach()) for name in names} | self.values
 
     @cached_property
+    def path(self) -> FittedPath:
+        """The motion at the unknowns."""
+        return fitted_path(self)
+
+    @cached_property
+    def arcs(self) -> list[ArcResponse]:
+        """Responses of all arcs of the motion to forces and kicks, in order of time."""
+        return list(responses(self, self.path))
+
+    def __getstate__(self) -> dict[str, object]:
+        """The fields alone: other processes compute again what they need of the rest, which is larger."""
+        return {one.name: getattr(self, one.name) for one in fields(self)}
+
+    @cached_property
     def gram(self) -> Array:
         """(t, q + 1, q + 1) inner products of the common columns on each of t tracks, the residual last."""
-        return by_track(self.linearised().eliminated().gram, self.problem.stretches.track)
+        return by_track(self.linearised.eliminated().gram, self.problem.stretches.track)
 
+    @cached_property
     def linearised(self) -> System:
         """The whitened, robustly weighted rows; common columns are coefficients, then launcher settings."""
         stretches, unknowns, noise = self.problem.stretches, self.unknowns, self.noise

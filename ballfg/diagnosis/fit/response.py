@@ -7,8 +7,11 @@ thus serves every pattern of forces. The columns of P for velocity and spin are 
 contact.
 """
 
-from collections.abc import Iterator
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -17,10 +20,16 @@ from torch import Tensor
 
 from ballfg.arrays import Array, Index
 from ballfg.diagnosis.fit.dual import dual_level, make_dual
-from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.fit.sensitivity import with_values
+from ballfg.diagnosis.fit.moved_shot import shoot_compiled
+from ballfg.diagnosis.fit.sensitivity import coefficients_of, with_values
 from ballfg.diagnosis.fit.shooting import LEAST_ARC, Arc, Trajectories, shoot
+from ballfg.diagnosis.fit.tangents import RepeatedMotion
+from ballfg.dynamics import BallModel
+from ballfg.dynamics.compiled.functions import compiled
 from ballfg.state import STATE_DIM, VELOCITY
+
+if TYPE_CHECKING:
+    from ballfg.diagnosis.fit.problem import Fit
 
 NODE = 0.01
 """s. Spacing of the points at which forces act; a pattern of 1 m/s^2 is then right to 13 micrometres."""
@@ -137,21 +146,42 @@ def _at(arc: Arc, rows: Tensor, times: Tensor) -> Array:
 
 
 def _shot(fit: Fit, path: FittedPath, number: int, part: Tensor, nodes: Tensor) -> tuple[Array, Array, Array]:
-    """A dual shot from an arc's first state: states at nodes, and two derivatives by that first state.
+    """A shot from an arc's first state: states at nodes, and two derivatives by that first state.
 
     Returns: states (m, q, 9), their derivatives (m, q, 9, 9), those of the measured positions (m, k, 3, 9).
     """
-    arc, stretches = path.motion.arcs[number], fit.problem.stretches
-    rows, begun = arc.rows[part].repeat(STATE_DIM), arc.begun[part].repeat(STATE_DIM)
-    m = len(part)
-    start = arc.nodes[0][part].repeat(STATE_DIM, 1)
-    times = path.times[:, rows] - begun
+    model, stretches, arc = fit.problem.model, fit.problem.stretches, path.motion.arcs[number]
+    rows, begun, start = arc.rows[part], arc.begun[part], arc.nodes[0][part]
     values = {name: value if isinstance(value, float) else value[rows.numpy()] for name, value in fit.values.items()}
-    model = with_values(fit.problem.model, values, len(rows))
+    times, heights = path.times[:, rows] - begun, stretches.heights[rows, number:]
+    guesses = path.motion.contacts[rows, number:] - begun.unsqueeze(-1)
+    functions = compiled(model) if model.measures_plainly else None
+    if functions is None:
+        return _dual_shot(_repeated(model, values, len(rows)), start, heights, guesses, times, nodes)
+    unit = np.tile(np.eye(STATE_DIM), (len(rows), 1, 1))
+    known = coefficients_of(model, len(rows), values)
+    shot = shoot_compiled(functions, known, start.numpy(), unit, heights, guesses, times[-1])
+    reached, by_first = RepeatedMotion(shot.arcs, len(rows), STATE_DIM, 3).states(nodes)
+    positions = RepeatedMotion(shot.arcs, len(rows), STATE_DIM, 1).states(times.clamp_min(0.0))[1]
+    positions *= (times >= 0.0).T[..., None, None]
+    return reached.numpy(), by_first.numpy(), positions.numpy()
+
+
+def _repeated(model: BallModel, values: Mapping[str, float | Array], count: int) -> BallModel:
+    """The model for `count` balls, each repeated for the components of its state, component by component."""
+    tiled = {n: value if isinstance(value, float) else np.tile(value, STATE_DIM) for n, value in values.items()}
+    return with_values(model, tiled, count * STATE_DIM)
+
+
+def _dual_shot(
+    model: BallModel, start: Tensor, heights: Tensor, guesses: Tensor, times: Tensor, nodes: Tensor
+) -> tuple[Array, Array, Array]:
+    """The same in dual numbers, for every model."""
+    m, times = len(start), times.repeat(1, STATE_DIM)
     with dual_level():
-        first = make_dual(start, torch.eye(STATE_DIM, dtype=torch.float64).repeat_interleave(m, dim=0))
-        guesses = path.motion.contacts[rows, number:] - begun.unsqueeze(-1)
-        motion = shoot(model, first, stretches.heights[rows, number:], guesses, times[-1])
+        directions = torch.eye(STATE_DIM, dtype=torch.float64).repeat_interleave(m, dim=0)
+        first = make_dual(start.repeat(STATE_DIM, 1), directions)
+        motion = shoot(model, first, heights.repeat(STATE_DIM, 1), guesses.repeat(STATE_DIM, 1), times[-1])
 
         def at(asked: Tensor) -> Tensor:
             moved = motion.states(asked.clamp_min(0.0))

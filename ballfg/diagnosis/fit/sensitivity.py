@@ -60,7 +60,7 @@ def predict(model: BallModel, stretches: Stretches, starts: Array, values: Mappi
             motion = shoot(valued, state, stretches.heights, stretches.contacts, times[-1])
             states, contacts = motion.states, motion.contacts
         else:
-            known, still = _coefficients(model, stretches, values, []), np.zeros((*starts.shape, 0))
+            known, still = coefficients_of(model, n, values), np.zeros((*starts.shape, 0))
             shot = shoot_compiled(functions, known, starts, still, stretches.heights, stretches.contacts, times[-1])
             parts = 1 if model.measures_plainly else 3
             states, contacts = RepeatedMotion(shot.arcs, n, 0, parts).plain_states, shot.contacts
@@ -137,7 +137,7 @@ def _compiled_derivatives(
             moved[:, direction.component, block] = 1.0
     with torch.no_grad():
         times = _true_times(with_values(model, values, n), stretches)
-    known = _coefficients(model, stretches, values, wanted)
+    known = coefficients_of(model, n, values, wanted)
     shot = shoot_compiled(functions, known, starts, moved, stretches.heights, stretches.contacts, times[-1])
     motion = RepeatedMotion(shot.arcs, n, d, 1 if model.measures_plainly else 3)
     if model.measures_plainly:
@@ -190,11 +190,11 @@ def _repeated(
     return repeated, substitute(model, columns), make_dual(state, state_tangent)
 
 
-def _coefficients(
-    model: BallModel, stretches: Stretches, values: Mapping[str, float | Array], wanted: Sequence[_Direction]
+def coefficients_of(
+    model: BallModel, n: int, values: Mapping[str, float | Array], wanted: Sequence[_Direction] = ()
 ) -> Coefficients:
-    """All coefficients of a model for each stretch, and the direction of the nonzero tangent of each."""
-    n, own = len(stretches), {name: p for name, p in model.named_parameters() if p.dim() == 0}
+    """All coefficients of a model for each of n balls, and the direction of the nonzero tangent of each."""
+    own = {name: p for name, p in model.named_parameters() if p.dim() == 0}
     known = {name: np.full(n, float(p.detach())) for name, p in own.items()}
     known |= {name: np.array(np.broadcast_to(value, n), dtype=np.float64) for name, value in values.items()}
     moving: dict[str, Array] = {}

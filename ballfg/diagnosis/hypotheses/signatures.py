@@ -97,7 +97,7 @@ def hypothesis_signatures(
     """
     ends = np.cumsum([len(hypothesis.strengths) for hypothesis in candidates]).tolist()
     chosen = [list(range(end - len(h.strengths), end)) for end, h in zip(ends, candidates, strict=True)]
-    return signatures_of(fit, fit.linearised(), columns_of(fit, candidates) if columns is None else columns), chosen
+    return signatures_of(fit, fit.linearised, columns_of(fit, candidates) if columns is None else columns), chosen
 
 
 def columns_of(fit: Fit, candidates: Sequence[Hypothesis]) -> Array:

@@ -59,7 +59,7 @@ def generic_tests(fit: Fit, reference: Fit | None = None, tracker: TrackNoise | 
 
 
 def _tests_of(fit: Fit, tracker: TrackNoise | None) -> list[_Test]:
-    system = fit.linearised()
+    system = fit.linearised
     drifting = drift_block(fit, system)
     drift = whiteness(fit, system, tracker)
     tests = _block_tests(fit, system, [*blocks_of(fit), *([] if drifting is None else [drifting])])

@@ -13,7 +13,6 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.free_motion import Piece, free_motion
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.fit.response import fitted_path, responses
 from ballfg.diagnosis.result import ContactResiduals, FlightResiduals, MeasurementResiduals, Residuals
 from ballfg.state import STATE_DIM
 
@@ -27,9 +26,9 @@ def residuals_of(fit: Fit) -> Residuals:
     Args: fit: at its minimum.
     Returns: accelerations in flight, kicks at contacts and errors of positions, with their covariances.
     """
-    path, system = fitted_path(fit), fit.linearised()
+    system = fit.linearised
     pieces: dict[int, list[Piece]] = defaultdict(list)
-    for arc in responses(fit, path):
+    for arc in fit.arcs:
         for row, piece in zip(arc.rows.tolist(), free_motion(fit, arc), strict=True):
             pieces[row].append(piece)
     flights: list[_Row] = []
@@ -50,12 +49,12 @@ def residuals_of(fit: Fit) -> Residuals:
                 part = slice(end, end := end + 6)
                 contacts.append((row, *piece.contact, value[part], covariance[part, part]))
     flight = FlightResiduals(*(np.array(column) for column in zip(*flights, strict=True)))
-    used, times = fit.problem.stretches.used.numpy(), path.times.T.numpy()
+    used, times = fit.problem.stretches.used.numpy(), fit.path.times.T.numpy()
     measurement = MeasurementResiduals(
         stretch=np.nonzero(used)[0],
         times=times[used],
-        states=path.states[used],
-        since_contact=since_contact(times, path.motion.contacts.numpy())[used],
+        states=fit.path.states[used],
+        since_contact=since_contact(times, fit.path.motion.contacts.numpy())[used],
         position=(fit.problem.stretches.positions.numpy() - fit.predicted.positions)[used],
         sigma=fit.sigmas[used],
     )

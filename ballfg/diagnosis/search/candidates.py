@@ -269,7 +269,7 @@ def _narrowness(fitted: Fit) -> float:
     With a lift every spin is a degree of freedom of its flight, which also fits noise. This term is its cost, by
     Laplace's approximation.
     """
-    return 0.5 * float(np.linalg.slogdet(fitted.linearised().start_information)[1].sum())
+    return 0.5 * float(np.linalg.slogdet(fitted.linearised.start_information)[1].sum())
 
 
 def delta_bic(before: Fit, after: Fit) -> float:

@@ -47,7 +47,7 @@ def _spins_without_labels(before: Fit) -> tuple[Array, Array, Array]:
     unknowns = replace(before.unknowns, starts=starts, values=problem.declared)
     alone = replace(problem, stretches=bare, shared=False)
     result = fit_problem(alone, unknowns, replace(before.noise, spin=np.full(3, UNLABELLED_SPIN)), settle_noise=False)
-    covariances = np.linalg.inv(result.linearised().start_information)[:, SPIN, SPIN]
+    covariances = np.linalg.inv(result.linearised.start_information)[:, SPIN, SPIN]
     return result.unknowns.starts[:, SPIN], np.asarray(covariances), labelled.labels.numpy()
 
 

@@ -97,13 +97,13 @@ def test_spins_of_balls_that_are_dropped_are_limited_along_all_axes(make_ball, m
     starts = make_launches(3, 15, spin=0.0)
     starts[:, 3:5] = 0.0
     found = make_fit(make_ball(), make_shots(make_ball(), starts, 15, labelled=False).stretches, settle_noise=False)
-    by_spin = found.linearised().by_start[:, -3:, 6:]
+    by_spin = found.linearised.by_start[:, -3:, 6:]
     information = np.trace(by_spin.swapaxes(-1, -2) @ by_spin, axis1=1, axis2=2)
     np.testing.assert_allclose(information, (found.noise.spin**-2).sum(), rtol=1e-9)
 
 
 def test_spins_that_nobody_labelled_come_out(unlabelled_fit, unlabelled):
-    system = unlabelled_fit.linearised()
+    system = unlabelled_fit.linearised
     covariance = np.linalg.inv(system.by_start.swapaxes(-1, -2) @ system.by_start)[:, 6:, 6:]
     off = unlabelled_fit.unknowns.starts[:, 6:] - unlabelled.states[:, 6:].numpy()
     square = (off * np.linalg.solve(covariance, off[..., None])[..., 0]).sum()
@@ -113,7 +113,7 @@ def test_spins_that_nobody_labelled_come_out(unlabelled_fit, unlabelled):
 def test_at_the_minimum_the_gradient_is_zero(unlabelled_fit):
     """Of the objective itself, launch directions included, along each common unknown: by central differences."""
     found = unlabelled_fit
-    system = found.linearised()
+    system = found.linearised
     information = system.eliminated().gram.sum(0)[:-1, :-1] + np.diag(found.problem.common_precision)
     q = len(found.problem.free)
     for i in range(q + 3):
@@ -153,7 +153,7 @@ def test_noise_stays_where_asked(calm_fit):
 
 def test_declared_coefficients_are_found(calm_fit, make_ball):
     """Within four standard deviations; the fit knows friction hardly beyond its prior."""
-    total = calm_fit.linearised().eliminated().gram.sum(0)
+    total = calm_fit.linearised.eliminated().gram.sum(0)
     q = len(calm_fit.problem.free)
     sigma = np.sqrt(np.diagonal(np.linalg.inv(total[:q, :q] + np.diag(calm_fit.problem.precisions))))
     truth = dict(make_ball().named_parameters())

@@ -42,7 +42,7 @@ def test_one_session_is_silent(calm_fit):
 
 
 def test_columns_are_those_of_the_coefficients_from_minus_to_plus_one_sigma(calm_fit):
-    system = calm_fit.linearised()
+    system = calm_fit.linearised
     block = drift_block(calm_fit, system)
     free = calm_fit.problem.free
     assert block.quantities == tuple(free)
@@ -57,5 +57,5 @@ def test_one_track_tells_nothing_of_changes(calm_fit):
     alone = replace(
         calm_fit, problem=replace(calm_fit.problem, stretches=replace(stretches, track=np.zeros_like(stretches.track)))
     )
-    system = calm_fit.linearised()
+    system = calm_fit.linearised
     assert drift_block(alone, system) is None

@@ -47,7 +47,7 @@ def left_of_noise(system, rng, kind):
 
 @pytest.mark.parametrize("kind", ["even", "uneven", "heavy"])
 def test_whiteness_raises_no_more_alarms_than_stated(calm, kind):
-    system = calm.linearised()
+    system = calm.linearised
     rng, count = np.random.default_rng(0), 60
     results = [whiteness(calm, replace(system, residual=left_of_noise(system, rng, kind))) for _ in range(count)]
     standard = np.array([r.explained / r.spread for r in results])
@@ -58,7 +58,7 @@ def test_whiteness_raises_no_more_alarms_than_stated(calm, kind):
 
 
 def test_drift_of_each_track_by_itself_is_not_white(calm):
-    system = calm.linearised()
+    system = calm.linearised
     n, k = calm.problem.stretches.times.shape
     rng, size = np.random.default_rng(1), 0.8
     times = calm.problem.stretches.times.numpy()

@@ -62,7 +62,7 @@ def test_p_values_of_a_chi_square_are_exact(freedom):
 
 
 def test_a_memory_is_an_alarm_until_it_is_known(lasting):
-    system = lasting.linearised()
+    system = lasting.linearised
     assert whiteness(lasting, system).p_value < 1e-6
     assert whiteness(lasting, system, TRACKER).p_value > 0.01
     (time,) = [t for t in generic_tests(lasting, tracker=TRACKER) if t.name == "time"]
@@ -70,7 +70,7 @@ def test_a_memory_is_an_alarm_until_it_is_known(lasting):
 
 
 def test_a_tracker_that_is_taken_to_be_white_changes_nothing(calm_fit):
-    system = calm_fit.linearised()
+    system = calm_fit.linearised
     plain, same = whiteness(calm_fit, system), whiteness(calm_fit, system, TrackNoise(position=(POSITION_NOISE,) * 3))
     np.testing.assert_allclose(same.explained / same.spread, plain.explained / plain.spread, atol=0.2)
 
@@ -83,7 +83,7 @@ def test_jitter_alone_is_no_drift(make_ball, make_launches, make_shots, make_fit
     moved = replace(stretches, positions=stretches.positions + late[..., None] * velocities)
     fit = make_fit(make_ball(), moved)
     tracker = TrackNoise(position=(POSITION_NOISE,) * 3, stamp_jitter=JITTER)
-    assert whiteness(fit, fit.linearised(), tracker).p_value > 0.01
+    assert whiteness(fit, fit.linearised, tracker).p_value > 0.01
 
 
 def test_a_force_that_is_lacking_stays_a_pattern(make_ball, make_launches, make_shots, make_fit):

@@ -63,7 +63,7 @@ def test_settings_that_are_numbers_tell_the_spins_of_the_fit(unlabelled):
 
 def test_standard_deviations_are_those_of_the_whole_problem(calm_fit):
     """Of the dense information matrix with every first state in it."""
-    system = calm_fit.linearised()
+    system = calm_fit.linearised
     n, m, q = system.by_common.shape
     dense = np.zeros((n * m, 9 * n + q))
     for i in range(n):
