@@ -23,7 +23,7 @@ from ballfg.diagnosis.result import Diagnosis, Errors, Fallback, Unexplained, Va
 from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.diagnosis.search.loop import NAMED, Search, SearchLoop
 from ballfg.diagnosis.search.plausible import at_bound, implausible
-from ballfg.diagnosis.search.process_noise import Predicting, calibrated_model, noise_about
+from ballfg.diagnosis.search.process_noise import calibrated_model, noise_about, predictive_model
 from ballfg.diagnosis.search.stamp_effects import as_declared
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel
 from ballfg.dynamics.effect import Effect
@@ -66,7 +66,9 @@ def diagnose(
     holdout = hold_out(dataset, model, jobs, tell)
     evaluate = partial(_errors, holdout, jobs)
     effects = tuple(catalogue or EFFECTS.values())
-    loop = SearchLoop(holdout, effects, Predicting(holdout, jobs), evaluate, tell, jobs=jobs, name_at=name_at)
+    loop = SearchLoop(
+        holdout, effects, partial(predictive_model, holdout, jobs), evaluate, tell, jobs=jobs, name_at=name_at
+    )
     search = loop.run(model)
     corrected, tracker, search = _with_own_noise(search, holdout, evaluate, tell, jobs)
     tell("looking at what is left")
@@ -139,7 +141,7 @@ def _with_own_noise(
 
     Errors of the declared model are those with the same tracker.
     """
-    declared, corrected = search.declared.model, search.predictive.model
+    declared, corrected = search.declared, search.predictive
     tell("looking at the tracker")
     tracker = look_at_tracker(corrected, holdout, jobs)
     if not tracker.findings:

@@ -33,7 +33,7 @@ from ballfg.diagnosis.residual_tests.residuals import residuals_of
 from ballfg.diagnosis.result import Diagnosis, Errors, Finding
 from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.diagnosis.search.loop import NAMED, SearchLoop
-from ballfg.diagnosis.search.process_noise import PredictiveModel, calibrated_model, fitted_model, noise_about
+from ballfg.diagnosis.search.process_noise import calibrated_model, fitted_model, noise_about
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel
 from ballfg.dynamics.effect import Effect
 from ballfg.estimation import dataset_settings
@@ -106,7 +106,7 @@ def diagnose_jointly(
     loop = SearchLoop(*asked, jobs=jobs, of_some=effects, ways=lambda searched: [way], name_at=name_at)
     search = loop.run(model, _first_fit(model, halves, way))
     tell("looking at what is left")
-    models = predicting.models(predicting(search.whole).model)
+    models = predicting.models(predicting(search.whole))
     labels = _labels(rooms, models, model, jobs)
     of_labels = () if labels is None else (label_test(labels),)
     patterns = (test for test in generic_tests(search.fit, search.first) if test.name != DRIFT)
@@ -115,7 +115,7 @@ def diagnose_jointly(
     unexplained = what_is_left(tests)
     declared = {name: float(value.detach()) for name, value in model.named_parameters()}
     calibrated = values_of(search.whole, [name for name in search.whole.problem.free if name in declared], declared)
-    remarks = [*_of_whom(search.findings), *predicting.errors_by_room(search.declared.model, search.predictive.model)]
+    remarks = [*_of_whom(search.findings), *predicting.errors_by_room(search.declared, search.predictive)]
     whole = Diagnosis(
         dataset=", ".join(room.name for room in rooms),
         verdict=verdict,
@@ -222,12 +222,12 @@ class _Predicting:
         self._models: WeakKeyDictionary[BallModel, dict[str, AnalyticModel]] = WeakKeyDictionary()
         self._judged: WeakKeyDictionary[BallModel, dict[str, Errors]] = WeakKeyDictionary()
 
-    def __call__(self, fit: Fit) -> PredictiveModel:
-        """The model with its rooms' models attached, and the errors on the search half of each."""
+    def __call__(self, fit: Fit) -> AnalyticModel:
+        """The model with its rooms' models attached."""
         models = {room.name: self._model(fit, room) for room in self.rooms}
         model = with_effects(fit.problem.model)
         self._models[model] = models
-        return PredictiveModel(model, _pooled(self._errors(models, "search_tracks")))
+        return model
 
     def models(self, model: BallModel) -> dict[str, AnalyticModel]:
         """The room models of a model from this class."""
@@ -236,7 +236,7 @@ class _Predicting:
     def judge(self, model: BallModel) -> Errors:
         """The errors on the judging halves of all rooms."""
         if model not in self._judged:
-            self._judged[model] = self._errors(self._models[model], "held_out_tracks")
+            self._judged[model] = self._errors(self._models[model])
         return _pooled(self._judged[model])
 
     def errors_by_room(self, declared: BallModel, corrected: BallModel) -> list[str]:
@@ -262,12 +262,12 @@ class _Predicting:
         model.noise = self._noise[room.name]
         return model
 
-    def _errors(self, models: dict[str, AnalyticModel], half: str) -> dict[str, Errors]:
+    def _errors(self, models: dict[str, AnalyticModel]) -> dict[str, Errors]:
         found = {}
         for room in self.rooms:
             model, holdout = models[room.name], room.holdout
             settings = dataset_settings(holdout.dataset, model)
-            found[room.name] = prediction_errors(model, getattr(holdout, half), holdout.surfaces, settings, self.jobs)
+            found[room.name] = prediction_errors(model, holdout.held_out_tracks, holdout.surfaces, settings, self.jobs)
         return found
 
 

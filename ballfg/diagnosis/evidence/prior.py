@@ -16,7 +16,7 @@ from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.hypotheses.varying import Varying, varied
 from ballfg.dynamics import AnalyticModel
 
-WIDTHS: Final = (0.0625, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
+WIDTHS: Final = (0.0625, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
 """Widths of the prior, in usual strengths, each as probable as the others."""
 THERE: Final = 0.05
 """Prior probability that an effect of the catalogue is there: one or two of some thirty."""

@@ -20,7 +20,6 @@ from ballfg.diagnosis.hypotheses.varying import Grouping, groupings
 from ballfg.diagnosis.result import Candidate, Errors, Finding
 from ballfg.diagnosis.search.candidates import Refit, Scored, refit
 from ballfg.diagnosis.search.evaluation import on_all, on_others
-from ballfg.diagnosis.search.process_noise import PredictiveModel
 from ballfg.diagnosis.search.ranking import finding_of, ranking
 from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_findings, stamp_hypotheses
 from ballfg.diagnosis.search.trial import try_hypotheses, try_varying
@@ -51,9 +50,9 @@ class Search:
     """
 
     first: Fit
-    declared: PredictiveModel
+    declared: AnalyticModel
     fit: Fit
-    predictive: PredictiveModel
+    predictive: AnalyticModel
     before: Errors
     judged: Errors
     whole: Fit
@@ -84,7 +83,7 @@ class SearchLoop:
 
     holdout: Holdout
     catalogue: Sequence[type[Effect]]
-    predictive: Callable[[Fit], PredictiveModel]
+    predictive: Callable[[Fit], AnalyticModel]
     judge: Callable[[BallModel], Errors]
     watch: Callable[[str], None]
     jobs: int = 1
@@ -112,15 +111,15 @@ class SearchLoop:
         whole = found.models[final.names - {NAMELESS}].fit
         self.watch("predicting the other half")
         declared = self.predictive(first)
-        judged = self.judge(declared.model)
-        before = self.judge(as_declared(declared.model, stamps)) if stamps.found else judged
+        judged = self.judge(declared)
+        before = self.judge(as_declared(declared, stamps)) if stamps.found else judged
         fit, predictive = first, declared
         if final.named:
             problem = replace(whole.problem, stretches=first.problem.stretches)
             starts = whole.unknowns.starts[: len(first.problem.stretches)]
             fit = fit_problem(problem, replace(whole.unknowns, starts=starts), whole.noise)
             predictive = self.predictive(fit)
-            judged = self.judge(predictive.model)
+            judged = self.judge(predictive)
         rounds = {name: r for r in found.rounds for name in r.added}
         rests = [found.without([h], final) for h in final.named]
         rests = found.beside_nameless(rests) if final.nameless else rests

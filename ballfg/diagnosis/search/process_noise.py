@@ -6,7 +6,7 @@ forecasts within the tracks of the search half.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -14,8 +14,6 @@ import torch
 from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import with_effects
-from ballfg.diagnosis.result import Errors
-from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.dynamics import AnalyticModel, BallModel
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
@@ -26,20 +24,10 @@ from ballfg.estimation.noise.estimate import spread_over
 from ballfg.tracks import Dataset
 from ballfg.tracks.noise import TrackNoise
 
-MOST_PREDICTED = 15
-"""Number of the search half's tracks whose predictions reveal a misleading effect, evenly spread."""
 MOST_FOR_NOISE = 25
 """Number of tracks for the noise, evenly spread; more move no number by more than its error bar."""
 SPREAD = 0.3
 """Prior median of the spread of coefficients between tracks, over the prior of an unfitted coefficient."""
-
-
-@dataclass(frozen=True)
-class PredictiveModel:
-    """A model with its noise for predictions, and its errors on tracks of its fit."""
-
-    model: AnalyticModel
-    errors: Errors
 
 
 def fitted_model(fit: Fit) -> AnalyticModel:
@@ -115,23 +103,12 @@ def noise_about(
     return replace(noise, memory=settings.memory, memory_time=settings.memory_time) if settings.has_memory else noise
 
 
-class Predicting:
-    """Makes predicting models from fits of one holdout, each with its noise on the search half.
+def predictive_model(holdout: Holdout, jobs: int, fit: Fit) -> AnalyticModel:
+    """The fitted model with its own noise on the search half.
 
     A model that lacks an effect has too much noise for the corrected one; with that noise predictions hardly follow the
     observed part, and an effect's gain would depend on the errors of the others.
-
-    Args: holdout: the halves.  jobs: processes.
     """
-
-    def __init__(self, holdout: Holdout, jobs: int) -> None:
-        self.holdout, self.jobs = holdout, jobs
-
-    def __call__(self, fit: Fit) -> PredictiveModel:
-        """The fitted model with its noise, and its errors on some tracks of the search half."""
-        holdout, model = self.holdout, calibrated_model(fit, self.holdout.launcher.embedding)
-        model.noise = noise_about(model, holdout.search_tracks, holdout.dataset, jobs=self.jobs)
-        count = len(holdout.search_tracks)
-        some = spread_over(holdout.search_tracks, count, MOST_PREDICTED)
-        settings = dataset_settings(holdout.dataset, model)
-        return PredictiveModel(model, prediction_errors(model, some, holdout.surfaces, settings, self.jobs))
+    model = calibrated_model(fit, holdout.launcher.embedding)
+    model.noise = noise_about(model, holdout.search_tracks, holdout.dataset, jobs=jobs)
+    return model

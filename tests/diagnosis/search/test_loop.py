@@ -13,7 +13,6 @@ from ballfg.diagnosis.fit.stamps import Stamps
 from ballfg.diagnosis.hypotheses.hypothesis import has_effect, without_effect
 from ballfg.diagnosis.result import Errors, Outcome
 from ballfg.diagnosis.search.loop import SearchLoop
-from ballfg.diagnosis.search.process_noise import PredictiveModel
 from ballfg.dynamics import EFFECTS
 from ballfg.estimation.settings import Settings
 
@@ -30,17 +29,13 @@ def shots(make_ball, make_launches, make_shots, seed, **truth):
     return make_shots(make_ball(**truth), make_launches(10, seed), seed, duration=0.45, rate=50.0).stretches
 
 
-def predicting(fitted, rmse):
-    """A fit that predicts with some error, in mm: the search asks for no more."""
-    return PredictiveModel(fitted.problem.model, Errors(rmse, rmse, 1.0, 0.0, np.array([rmse])))
-
-
 def unwatched(line):
     """Nobody watches."""
 
 
 def predicts_well(fitted):
-    return predicting(fitted, 10.0)
+    """A fit that predicts with its model: the search asks for no more."""
+    return fitted.problem.model
 
 
 def judges_alike(model):
@@ -129,10 +124,11 @@ def test_predictions_do_not_decide(make_ball, make_launches, make_shots):
     """They are reported; a few balls that miss the table's end would decide a root mean square."""
     data = (shots(make_ball, make_launches, make_shots, seed, table_tilt={"x": 0.02, "y": 0.0}) for seed in (71, 72))
 
-    def predict(fitted):
-        return predicting(fitted, 15.0 if has_effect(fitted.problem.model, "table_tilt") else 10.0)
+    def judge(model):
+        rmse = 15.0 if has_effect(model, "table_tilt") else 10.0
+        return Errors(rmse, rmse, 1.0, 0.0, np.array([rmse]))
 
-    search = SearchLoop(holdout(*data), [EFFECTS["table_tilt"]], predict, judges_alike, unwatched).run(make_ball())
+    search = SearchLoop(holdout(*data), [EFFECTS["table_tilt"]], predicts_well, judge, unwatched).run(make_ball())
     assert [finding.name for finding in search.findings] == ["table_tilt"]
 
 
