@@ -83,6 +83,7 @@ def predict_tracks(
     observe: Observed,
     *,
     horizon: float = np.inf,
+    beyond: bool = False,
     jobs: int = 1,
 ) -> Iterator[TrackPrediction]:
     """Predictions in the order of the tracks.
@@ -93,6 +94,8 @@ def predict_tracks(
         count: approximate number of tracks.
         observe: s from the track's first stamp; a stamp at its end is observed. A function gives each track its own.
         horizon: s after the last observed stamp; later stamps are left out.
+        beyond: True for further stamps after the last measured one, in the track's usual steps up to a finite horizon;
+            what was measured there is NaN.
         jobs: processes.
 
     Raises: ValueError: if observe or horizon is not positive.
@@ -102,7 +105,8 @@ def predict_tracks(
     horizon = as_float("horizon", horizon, "s")
     if not horizon > 0.0:
         raise ValueError(f"horizon must be a positive number of seconds; got {horizon:g}. Leave it out for all stamps.")
-    work = partial(_block, estimator, Propagator(estimator.surfaces, estimator.settings.process), observe, horizon)
+    asked = _Asked(observe, horizon, beyond and math.isfinite(horizon))
+    work = partial(_block, estimator, Propagator(estimator.surfaces, estimator.settings.process), asked)
     made = map_blocks(work, tracks, count, jobs, BLOCK)
     return (
         replace(one, estimate=replace(one.estimate, world=estimator.world)) if one.estimate.world is None else one
@@ -123,26 +127,57 @@ def check_observe(observe: float) -> None:
         )
 
 
+@dataclass(frozen=True)
+class _Asked:
+    """The arguments of `predict_tracks` that say which stamps are predicted."""
+
+    observe: Observed
+    horizon: float
+    beyond: bool
+
+    def opening(self, track: Track) -> Track:
+        """The observed part."""
+        return track.opening(self.observe(track) if callable(self.observe) else self.observe)
+
+    def ahead(self, track: Track, begin: float, white: Array) -> tuple[Array, Array, Array]:
+        """Stamps (k,) s after one, the measured positions (k, 3) m and the sigmas (k, 3) m of white noise there.
+
+        Args: white: (n, 3) m, of the whole track.
+        """
+        later = (track.times > begin) & (track.times <= begin + self.horizon + STAMP_TOLERANCE)
+        times, measured, white = track.times[later], track.positions[later], white[later]
+        if not self.beyond or len(track) < 2:
+            return times, measured, white
+        step, last = float(np.median(np.diff(track.times))), max(float(track.times[-1]), begin)
+        count = max(int((begin + self.horizon - last + STAMP_TOLERANCE) / step), 0) if step > 0.0 else 0
+        usual = np.median(white, axis=0) if len(white) else np.zeros(3)
+        return (
+            np.concatenate((times, last + step * np.arange(1, count + 1))),
+            np.concatenate((measured, np.full((count, 3), np.nan))),
+            np.concatenate((white, np.tile(usual, (count, 1)))),
+        )
+
+
 def _block(
-    estimator: Estimator, propagator: Propagator, observe: Observed, horizon: float, tracks: Sequence[Track]
+    estimator: Estimator, propagator: Propagator, asked: _Asked, tracks: Sequence[Track]
 ) -> list[TrackPrediction]:
     """Predictions of a block, without a model that all tracks share, so that processes need not send it."""
     for track in tracks:
         estimator.prepared(track)  # checks the whole track for metres and seconds
     counted = [track.since_first() for track in tracks]
-    parts = [track.opening(observe(track) if callable(observe) else observe) for track in counted]
-    estimates = [estimator.estimate(part) for part in parts]
+    estimates = [estimator.estimate(asked.opening(track)) for track in counted]
     made: dict[int, TrackPrediction] = {}
     owners = [estimator.of(track) for track in counted]
     for owner in dict.fromkeys(owners):  # tracks with the same coefficients are predicted together
         rows = [i for i, own in enumerate(owners) if own is owner]
-        alike = _predict_alike(owner, propagator, [estimates[i] for i in rows], [counted[i] for i in rows], horizon)
+        alike = _predict_alike(owner, propagator, [estimates[i] for i in rows], [counted[i] for i in rows], asked)
         made.update(zip(rows, alike, strict=True))
     found = []
     for number, track in enumerate(tracks):  # with the stamps of the data
         one = made[number]
-        seen = len(one.estimate.times)
+        seen, start = len(one.estimate.times), float(track.times[0]) - float(counted[number].times[0])
         estimate, times = one.estimate.dated(track.times[:seen]), track.times[seen : seen + len(one.times)]
+        times = np.concatenate((times, start + one.times[len(times) :]))
         if not estimator.model.variations:  # else the world of each estimate is that of its track
             estimate = replace(estimate, world=None)
         found.append(replace(one, times=times, estimate=estimate))
@@ -150,14 +185,16 @@ def _block(
 
 
 def _predict_alike(
-    estimator: Estimator, propagator: Propagator, estimates: list[Estimate], tracks: list[Track], horizon: float
+    estimator: Estimator, propagator: Propagator, estimates: list[Estimate], tracks: list[Track], asked: _Asked
 ) -> Iterator[TrackPrediction]:
-    begun = [float(e.times[-1]) for e in estimates]
-    pairs = zip(tracks, begun, strict=True)
-    later = [(t.times > begin) & (t.times <= begin + horizon + STAMP_TOLERANCE) for t, begin in pairs]
-    clocks = [true_times(estimator.model, t.times) for t in tracks]
-    ends = [float(clock[len(e.times) - 1]) for clock, e in zip(clocks, estimates, strict=True)]
-    times = _padded([clock[mask] for clock, mask in zip(clocks, later, strict=True)], ends)
+    settings, model = estimator.settings, estimator.model
+    noise = [sample_sigmas(settings, len(track), track.sigmas) for track in tracks]
+    parts = [asked.ahead(t, float(e.times[-1]), w) for t, e, w in zip(tracks, estimates, noise, strict=True)]
+    seen = [len(e.times) for e in estimates]
+    stamps = [np.concatenate((t.times[:n], later)) for t, n, (later, _, _) in zip(tracks, seen, parts, strict=True)]
+    clocks = [true_times(model, one) for one in stamps]
+    ends = [float(clock[n - 1]) for clock, n in zip(clocks, seen, strict=True)]
+    times = _padded([clock[n:] for clock, n in zip(clocks, seen, strict=True)], ends)
     belief = Belief.of(estimator.model, [e.last for e in estimates], estimator.settings.coefficients)
     belief = replace(belief, time=torch.tensor(ends, dtype=torch.float64))
     positions, velocities, variances = (np.zeros((*times.shape, 3)) for _ in range(3))
@@ -170,13 +207,11 @@ def _predict_alike(
             outside = np.zeros(times.shape) if outside is None else outside
             outside[:, k] = share
         variances[:, k] = torch.diagonal(predicted.covariance, dim1=-2, dim2=-1)[:, POSITION].numpy()
-    for i, (track, result, mask) in enumerate(zip(tracks, estimates, later, strict=True)):
-        k = int(mask.sum())
-        white = sample_sigmas(estimator.settings, len(track), track.sigmas)[mask]
-        sigmas = np.sqrt(variances[i, :k] + total_sigmas(estimator.settings, white, velocities[i, :k]) ** 2)
+    for i, (track, result, (later, measured, white)) in enumerate(zip(tracks, estimates, parts, strict=True)):
+        k = len(later)
+        sigmas = np.sqrt(variances[i, :k] + total_sigmas(settings, white, velocities[i, :k]) ** 2)
         left = None if outside is None else outside[i, :k]
-        ahead = track.times[mask], positions[i, :k], sigmas, track.positions[mask]
-        yield TrackPrediction(track.name, *ahead, result, outside=left)
+        yield TrackPrediction(track.name, later, positions[i, :k], sigmas, measured, result, outside=left)
 
 
 def _padded(times: list[Array], ends: list[float]) -> Array:

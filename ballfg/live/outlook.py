@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -13,17 +12,17 @@ from typing import Any
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.checks import shown
 from ballfg.estimation.online.state import OnlineState
 from ballfg.estimation.result import Status
 from ballfg.live.tracker import BallUpdate
-from ballfg.prediction import BallState, apex, next_contact, plane_crossing
+from ballfg.prediction import BallState, apex, next_contact
 from ballfg.prediction.crossing import Crossing
+from ballfg.prediction.event_ahead import crossing_of
 from ballfg.prediction.forecast import carried_by
+from ballfg.prediction.plane import Plane
 from ballfg.state import POSITION, SPIN, VELOCITY
 
 VAGUE = 3.0  # m/s, standard deviation of the velocity beyond which predictions carry no information
-AXES = ("x", "y", "z")
 
 
 @dataclass(frozen=True)
@@ -38,31 +37,6 @@ class Outlook:
     apex: Crossing | None = None
     crossing: Crossing | None = None
     note: str = ""
-
-
-@dataclass(frozen=True)
-class Plane:
-    """A plane across one axis. Attributes: axis: x, y or z. place: m."""
-
-    axis: str
-    place: float
-
-    @property
-    def normal(self) -> tuple[float, ...]:
-        """(3,) dimensionless."""
-        return tuple(float(axis == self.axis) for axis in AXES)
-
-    @classmethod
-    def parse(cls, text: str) -> Plane:
-        """The plane of a text such as x=2.0. Raises: ValueError: any other text."""
-        found = re.fullmatch(r"\s*([xyz])\s*=\s*(\S+)\s*", text)
-        try:
-            place = float(found[2]) if found else math.nan
-        except ValueError:
-            place = math.nan
-        if found is None or not math.isfinite(place):
-            raise ValueError(f"plane must be an axis and a place in m; got {shown(text)}. Write x=2.0, for instance.")
-        return cls(found[1], place)
 
 
 def look_out(state: OnlineState, horizon: float, plane: Plane | None) -> Outlook:
@@ -81,7 +55,7 @@ def look_out(state: OnlineState, horizon: float, plane: Plane | None) -> Outlook
             return Outlook(note=f"no prediction: {_one_line(error)}")
         bounce = _tried(partial(next_contact, *carried, horizon), "bounce", notes)
         top = _tried(partial(apex, *carried, horizon), "apex", notes)
-        across = None if plane is None else partial(plane_crossing, *carried, plane.normal, plane.place, horizon)
+        across = None if plane is None else partial(crossing_of, carried, plane, horizon)
         crossing = None if across is None else _tried(across, "crossing", notes)
     return Outlook(bounce, top, crossing, "; ".join(notes))
 

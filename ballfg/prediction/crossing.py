@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from ballfg.arrays import Array
-from ballfg.checks import check_number
+from ballfg.checks import check_array, check_number
 from ballfg.dynamics.compiled.beliefs.events import FOUND, LOOKS, NONE, TIME_TOLERANCE
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import contact_time
@@ -25,6 +25,7 @@ from ballfg.dynamics.motion.limits import MAX_STEP
 from ballfg.dynamics.motion.rollout import advance, is_resting
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.prediction.belief import Belief
+from ballfg.prediction.plane import Plane
 from ballfg.prediction.propagate import Found, Propagator
 from ballfg.state import POSITION, STATE_DIM, VZ
 
@@ -98,24 +99,23 @@ def plane_crossing(
     horizon: float = 3.0,
     *,
     after: float = -math.inf,
+    direction: str = "either",
 ) -> Crossing | None:
-    """The crossing of the plane normal . p = offset by the ball's centre, from either side.
+    """The crossing of the plane normal . p = offset by the ball's centre.
 
     Args:
         propagator, belief, horizon, after: as for `next_crossing`.
         normal: (3,) dimensionless, of the plane, of any length but zero.
         offset: m, in units of the normal's length.
+        direction: `up` along the normal, `down` against it, or `either`.
     Returns: None if the ball does not get there within the horizon. A ball that starts on the plane has crossed it.
-    Raises: ValueError: a normal that is zero or not three finite numbers, or as `next_crossing`.
+    Raises: ValueError: a normal that is zero or not three finite numbers, an unknown direction, or as `next_crossing`.
     """
-    direction = torch.as_tensor(normal, dtype=torch.float64)
-    if direction.shape != (3,) or not bool(direction.isfinite().all()) or not bool(direction.any()):
-        raise ValueError(f"normal must be three finite numbers, not all zero; got {direction.tolist()}")
-    offset = check_number("offset", offset, "m")
-    length = float(direction.square().sum().sqrt())
-    line = np.zeros(STATE_DIM)
-    line[POSITION] = direction.numpy() / length
-    return _line_crossing(propagator, belief, (line, offset / length), horizon, after, either_way=True)
+    given = tuple(check_array("normal", normal).ravel().tolist())
+    towards, place = Plane(given, offset, direction).line  # type: ignore[arg-type]
+    line, sign = np.zeros(STATE_DIM), -1.0 if direction == "up" else 1.0
+    line[POSITION] = sign * towards
+    return _line_crossing(propagator, belief, (line, sign * place), horizon, after, either_way=direction == "either")
 
 
 def _line_crossing(

@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.checks import check_number
+from ballfg.checks import check_number, check_text
 from ballfg.factors.linear.definite import definite
 from ballfg.prediction.belief import Belief
-from ballfg.prediction.crossing import Crossing, apex, next_contact, plane_crossing
+from ballfg.prediction.crossing import Crossing, apex, next_contact
+from ballfg.prediction.event_ahead import EventAhead, Path, asked_event, crossing_of, event_on
+from ballfg.prediction.plane import AXES, Plane
 from ballfg.prediction.propagate import Propagator
 from ballfg.prediction.state import BallState
 from ballfg.state import POSITION
@@ -22,7 +24,6 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 
-AXES = ("x", "y", "z")
 MOST_STEPS = 100_000
 """Largest number of times in a path. They take some seconds and 100 MB; the longest flight of a ball lasts 10 s."""
 
@@ -74,19 +75,42 @@ class Forecast:
         """The next highest point; None if there is none within the horizon."""
         return apex(*self._carried, self.horizon)
 
-    def crossing(self, *, x: float | None = None, y: float | None = None, z: float | None = None) -> Crossing | None:
+    def crossing(
+        self,
+        *,
+        x: float | None = None,
+        y: float | None = None,
+        z: float | None = None,
+        direction: str = "either",
+        after: int = 0,
+    ) -> Crossing | None:
         """Place and time of the ball's crossing of a plane across one axis.
 
-        Args: x, y, z: m, the place of the plane on its axis; exactly one of them.
+        Args:
+            x, y, z: m, the place of the plane on its axis; exactly one of them.
+            direction: `up` along the axis, `down` against it, or `either`.
+            after: number of bounces before the crossing.
         Returns: None if the ball does not get there within the horizon.
-        Raises: ValueError: if not exactly one is given.
+        Raises: ValueError: if not exactly one is given, or an unknown direction.
         """
         given = [(i, place) for i, place in enumerate((x, y, z)) if place is not None]
         if len(given) != 1:
             raise ValueError(f"crossing takes exactly one of x, y, z; got {len(given)} of them. Ask for one plane.")
-        (axis, place), normal = given[0], np.zeros(3)
-        normal[axis] = 1.0
-        return plane_crossing(*self._carried, normal, place, self.horizon)
+        axis, place = given[0]
+        along = (float(axis == 0), float(axis == 1), float(axis == 2))
+        return crossing_of(self._carried, Plane(along, place, direction, after), self.horizon)
+
+    def event(self, asked: Plane | str) -> EventAhead:
+        """An event ahead with its probability.
+
+        Args: asked: `apex`, `next-contact`, a plane, or its text, such as `z=3.05,down` (`Plane.parse`).
+        Returns: the event on the mean path, and the probability that there is one within the horizon.
+        Raises: ValueError: another text.
+        """
+        if not isinstance(asked, Plane):
+            check_text("asked", asked)
+            asked = asked_event(asked)
+        return event_on(Path(self.start, self._carried, self.times, self.states, self.covariances), asked)
 
     @property
     def _carried(self) -> tuple[Propagator, Belief]:

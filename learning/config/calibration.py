@@ -39,12 +39,9 @@ class CalibrationConfig(Section):
     out: str = "calibration"
     """Folder that is written. `--out` replaces it."""
 
-    coefficients: Coefficients = (
-        "flight.drag.k",
-        "bounce.restitution.e",
-        "bounce.table_height.offset",
-    )
-    """Calibrated parameters by name: `flight.` or `bounce.`, the effect, its coefficient."""
+    coefficients: Coefficients | None = None
+    """Calibrated parameters by name: `flight.` or `bounce.`, the effect, its coefficient. null: drag, restitution and
+    table height, as far as the model has them."""
 
     groups: str | None = None
     """Label that names a track's launcher, player, ball or session, such as `group`: the spins of each group get a

@@ -16,6 +16,8 @@ from ballfg.dynamics import nominal_model, save_model
 from ballfg.dynamics.population import SpinGroup, SpinPopulation
 from ballfg.estimation import ConformalScales
 from ballfg.estimation.conformal import load_conformal
+from ballfg.front import estimator_for
+from ballfg.prediction.event_ahead import event_numbers
 from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.tracks import Dataset, read_dataset, write_dataset
 from tests.commands import status
@@ -240,4 +242,55 @@ def test_the_group_of_all_tracks(dataset: Dataset, tmp_path: Path, capsys: pytes
     assert "group must be one of the model's, a, b; got 'c'" in capsys.readouterr().err
     assert status(*options, "--group", "a") == 2
     assert "group must be None for a model without groups; got 'a'" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_events_in_place_of_positions_are_those_of_python(dataset: Dataset, tmp_path: Path) -> None:
+    out = tmp_path / "events.csv"
+    asked = ("--plane", "z=0.3,down", "--plane", "x=1.5", "--apex", "--next-contact", "--horizon", "1.5")
+    assert status("predict", dataset.path, "--observe", 0.3, *asked, "--out", out) == 0
+    table = pa_csv.read_csv(out, convert_options=TEXT)
+    assert table["trajectory"].to_pylist() == [track.name for track in dataset for _ in range(4)]
+    assert table["event"].to_pylist() == ["z=0.3,down", "x=1.5", "apex", "next-contact"] * len(dataset)
+    estimator = estimator_for(dataset, "smoother", None, None, None, 0.3)
+    for number, track in enumerate(dataset):
+        ahead = estimator.estimate(track.opening(0.3)).predict(1.5, 0.005)
+        for place, text in enumerate(table["event"].to_pylist()[:4]):
+            row, found = table.slice(4 * number + place, 1).to_pylist()[0], ahead.event(text)
+            assert row["probability"] == pytest.approx(found.probability, abs=1e-9)
+            for name, value in event_numbers(found.crossing).items():
+                shown = np.nan if row[name] is None else row[name]
+                assert shown == pytest.approx(value, rel=1e-9, abs=1e-12, nan_ok=True), (text, name)
+
+
+def test_a_horizon_goes_on_beyond_the_last_stamp(dataset: Dataset, tmp_path: Path) -> None:
+    whole, beyond = tmp_path / "whole.csv", tmp_path / "beyond.csv"
+    assert status("predict", dataset.path, "--observe", 0.3, "--out", whole) == 0
+    assert status("predict", dataset.path, "--observe", 0.3, "--horizon", 5, "--out", beyond) == 0
+    before, after = (pa_csv.read_csv(path, convert_options=TEXT).to_pylist() for path in (whole, beyond))
+    for track in dataset:
+        own, more = ([row for row in rows if row["trajectory"] == track.name] for rows in (before, after))
+        assert more[: len(own)] == own
+        seen = track.times[track.times <= track.times[0] + 0.3 + 1e-9][-1]
+        times = np.array([row["t"] for row in more])
+        assert times[-1] == pytest.approx(seen + 5.0, abs=np.median(np.diff(track.times)))
+        np.testing.assert_allclose(np.diff(times[len(own) - 1 :]), np.median(np.diff(track.times)), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("more", "rule"),
+    [
+        (("--plane", "z=3,sideways"), "plane must be an axis and a place in m"),
+        (("--plane", "x"), "event must be apex, next-contact or a plane"),
+        (("--horizon", "-1"), "horizon must be"),
+        (("--apex", "--conformal", "."), "conformal must not be given with events"),
+    ],
+)
+def test_events_that_are_none_are_one_line(
+    dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, ...], rule: str
+) -> None:
+    out = tmp_path / "events.csv"
+    assert status("predict", dataset.path, "--observe", 0.3, *more, "--out", out) == 2
+    said = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
+    assert said[0].startswith(f"ballfg: error: {rule}")
     assert not out.exists()

@@ -18,6 +18,7 @@ from ballfg.dynamics.known_balls import known_ball
 from ballfg.estimation.launcher import Launcher
 from ballfg.estimation.registry import make_estimator
 from ballfg.factors.loss import Loss
+from ballfg.prediction import Plane
 from ballfg.prediction.state import World
 from ballfg.simulation.launcher import SimulatedLauncher
 from ballfg.tracks.info import DatasetInfo
@@ -153,7 +154,9 @@ def calls_of_estimates(_folder: Path) -> dict[str, Call]:
         "diagnose": Call(bf.diagnose, {"measured": "/nonexistent", "model": None, "jobs": 1}),
         "error_budget": Call(bf.error_budget, {"measured": "/nonexistent", "model": None, "jobs": 1}),
         "Estimate.predict": Call(found.predict, {"horizon": 0.05, "step": 0.01}),
-        "Forecast.crossing": Call(found.predict(0.3).crossing, {"x": 1.0}),
+        "Forecast.crossing": Call(found.predict(0.3).crossing, {"x": 1.0, "direction": "up", "after": 1}),
+        "Forecast.event": Call(found.predict(0.3).event, {"asked": "apex"}),
+        "Plane": Call(Plane, {"normal": (0.0, 0.0, 1.0), "offset": 0.9, "direction": "down", "after": 1}),
         "Settings": Call(bf.Settings, _example(settings)),
         "Smoother": Call(bf.Smoother, {**parts, "optimizer": None}),
         "ExtendedKalmanFilter": Call(bf.ExtendedKalmanFilter, {**parts, "smooth": False, "initialise": "prior"}),

@@ -9,7 +9,8 @@ import pytest
 
 from ballfg.estimation import Online, Status
 from ballfg.estimation.online.state import OnlineState
-from ballfg.live.outlook import Plane, look_out
+from ballfg.live.outlook import look_out
+from ballfg.prediction.plane import Plane
 from tests.live.shots import SURFACES, ball_model, ball_settings, shots
 
 
@@ -20,7 +21,7 @@ def state() -> OnlineState:
 
 
 def test_events_are_those_of_the_prediction(state: OnlineState) -> None:
-    ahead, seen = state.predict(0.5), look_out(state, 0.5, Plane("x", 1.5))
+    ahead, seen = state.predict(0.5), look_out(state, 0.5, Plane.parse("x=1.5"))
     assert seen.note == ""
     for mine, theirs in ((seen.bounce, ahead.next_contact), (seen.crossing, ahead.crossing(x=1.5))):
         assert mine is not None
@@ -28,7 +29,7 @@ def test_events_are_those_of_the_prediction(state: OnlineState) -> None:
         assert mine.time == pytest.approx(theirs.time, abs=1e-9)
         np.testing.assert_allclose(mine.state, theirs.state, atol=1e-9)
     assert (seen.apex is None) == (ahead.apex is None)
-    assert look_out(state, 0.01, Plane("x", 50.0)).crossing is None
+    assert look_out(state, 0.01, Plane.parse("x=50")).crossing is None
 
 
 def test_what_cannot_be_predicted_says_why(state: OnlineState) -> None:
@@ -40,10 +41,3 @@ def test_what_cannot_be_predicted_says_why(state: OnlineState) -> None:
     nowhere = look_out(replace(state, world=None), 0.5, None)
     assert nowhere.note.startswith("no prediction: ValueError: a state must know its model")
     assert nowhere.bounce is nowhere.apex is nowhere.crossing is None
-
-
-def test_planes_are_read() -> None:
-    assert Plane.parse(" y = -0.5 ") == Plane("y", -0.5)
-    for text in ("x", "w=1", "x=one", "x=nan", "x=1=2"):
-        with pytest.raises(ValueError, match=r"plane must be an axis and a place in m; got .* Write x=2\.0"):
-            Plane.parse(text)

@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 from ballfg.live import Tracker
-from ballfg.live.outlook import Plane, look_out
+from ballfg.live.outlook import look_out
 from ballfg.live.viewer import Viewer
+from ballfg.prediction.plane import Plane
 from tests.live.shots import SURFACES, ball_model, ball_settings, rows, shots
 
 pytest.importorskip("rerun", reason="the extra 'viewer' is not installed")
@@ -21,7 +22,7 @@ def test_a_ball_is_drawn(tmp_path: Path) -> None:
     live = Tracker(ball_model(), SURFACES, ball_settings())
     for t, *position in rows(shots(1)[0])[:9]:
         for update in live.push(t, position):
-            viewer.see(update, None if update.state is None else look_out(update.state, 0.3, Plane("x", 1.0)))
+            viewer.see(update, None if update.state is None else look_out(update.state, 0.3, Plane.parse("x=1")))
     for update in live.end():
         viewer.see(update, None)
     viewer.close()

@@ -43,7 +43,9 @@ def live(
     ] = 300.0,
     speed: Annotated[float, typer.Option(help="Speed of a replay: 1 is real time, 0 as fast as possible.")] = 1.0,
     topic: Annotated[str | None, typer.Option(help="Topic of positions in a bag.")] = None,
-    plane: Annotated[str | None, typer.Option(help="Plane whose crossing is predicted, such as x=2.0 (m).")] = None,
+    plane: Annotated[
+        str | None, typer.Option(help="Plane whose crossing is predicted, such as x=2.0 or z=3.05,down (m).")
+    ] = None,
     horizon: Annotated[float, typer.Option(help="How far ahead events are predicted, s.")] = 1.0,
     lag: Annotated[float, typer.Option(help="By how much stamps may be late, s.")] = 0.1,
     patience: Annotated[
@@ -75,10 +77,10 @@ def live(
     Example: ballfg live --replay data/aimy --plane x=2.0 --out states.jsonl
     """
     from ballfg.checks import check_number, check_range
-    from ballfg.live.outlook import Plane
     from ballfg.live.session import Session, Wanted, warm_up
     from ballfg.live.sources.source import Inbox
     from ballfg.live.tracker import Tracker
+    from ballfg.prediction.plane import Plane
 
     check_range("speed", speed, 0.0, 1e6)
     wanted = Wanted(

@@ -12,11 +12,18 @@ from ballfg.cli import inputs
 from ballfg.progress import progress
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     import numpy as np
 
     from ballfg.estimation import ConformalScales, Estimator
     from ballfg.estimation.track_prediction import TrackPrediction
-    from ballfg.tracks import Dataset
+    from ballfg.prediction.plane import Plane
+    from ballfg.tracks import Dataset, TableWriter
+
+EVENTS_WITHIN, LONGEST, STEP, SOON = 3.0, 60.0, 0.005, 1e-9
+"""s: range of the search for events, the largest one, steps of the path that gives their probability, and next to
+nothing."""
 
 
 def predict(
@@ -41,6 +48,23 @@ def predict(
     save_conformal: Annotated[
         Path | None, typer.Option(help="YAML file to keep the scales of --conformal in, for later predictions.")
     ] = None,
+    horizon: Annotated[
+        float | None,
+        typer.Option(
+            help="How far to predict after the observed part, s: also beyond the last stamp, in the track's usual "
+            "steps. Of events, how far ahead they are looked for.",
+            show_default="all stamps; events: 3",
+        ),
+    ] = None,
+    plane: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="In place of positions, where and when the ball crosses a plane: x=2.0, or z=3.05,down, or "
+            "z=0.9,up,after=1 (bounces before it), or 0.6:0:0.8=1.2 (any normal). May be repeated."
+        ),
+    ] = None,
+    apex: Annotated[bool, typer.Option("--apex", help="The same of the next highest point.")] = False,
+    next_contact: Annotated[bool, typer.Option("--next-contact", help="The same of the next bounce.")] = False,
     jobs: inputs.Jobs = inputs.CORES,
     cluster: inputs.Cluster = None,
     address: inputs.Address = None,
@@ -53,17 +77,27 @@ def predict(
     From detections, they are the ball's positions, and the error stated at the end is the distance from the rough ones
     that all sightings give.
 
+    With --plane, --apex or --next-contact the table has a row for each track and event: its probability within the
+    horizon; and, where the expected ball has one, time, place, speed and their standard deviations.
+
     Where the observed part of a track could not be estimated, its prediction is wide; such tracks are listed, and the
     exit status is 3.
 
     Example: ballfg predict data/ballgun --observe 0.25 --out predictions.csv
+    Example: ballfg predict throws --observe 0.4 --plane z=3.05,down --out hoop.csv
     """
+    from ballfg.checks import check_number
     from ballfg.estimation import predict_tracks
     from ballfg.estimation.track_prediction import check_observe
     from ballfg.files.whole_file import check_file
+    from ballfg.prediction.event_ahead import APEX, CONTACT, asked_event
     from ballfg.tracks import TableWriter
 
     outcome = _Outcome()
+    asked = {text: asked_event(text) for text in (*(plane or ()), *[APEX] * apex, *[CONTACT] * next_contact)}
+    ahead = None if horizon is None else check_number("horizon", horizon, "s", above=0.0, limit=LONGEST)
+    if asked and conformal is not None:
+        raise ValueError("conformal must not be given with events: its scales are those of positions. Leave it out.")
     with TableWriter(out) as table, inputs.workers(cluster, address, jobs) as workers:
         inputs.check_out(out, dataset)
         check_observe(observe)
@@ -82,7 +116,14 @@ def predict(
             )
         if conformal is not None:
             scales = _conformal_scales(conformal, opened.dataset, estimator, method, observe, workers)
-        predictions = predict_tracks(estimator, opened.dataset, count, observe, jobs=workers)
+        if asked:
+            _write_events(table, estimator, opened.dataset, observe, asked, ahead or EVENTS_WITHIN, workers, outcome)
+            print(f"{out}: {outcome.rows} events of {count} tracks, from the first {observe:g} s of each by {method}")
+            outcome.tracks.print()
+            outcome.tracks.end()
+            return
+        until = {} if ahead is None else {"horizon": ahead, "beyond": True}
+        predictions = predict_tracks(estimator, opened.dataset, count, observe, **until, jobs=workers)
         for plain in progress(predictions, count, "tracks predicted"):
             result = plain if scales is None else scales.scaled(plain)
             columns: dict[str, str | np.ndarray] = {"trajectory": result.name, "t": result.times}
@@ -99,6 +140,35 @@ def predict(
             scales.save(save_conformal)
             print(f"{save_conformal}: the scales, for --conformal")
     outcome.tracks.end()
+
+
+def _write_events(
+    table: TableWriter,
+    estimator: Estimator,
+    dataset: Dataset,
+    observe: float,
+    asked: Mapping[str, Plane | str],
+    horizon: float,
+    workers: int,
+    outcome: _Outcome,
+) -> None:
+    """A row for each track and event, by its text."""
+    import numpy as np
+
+    from ballfg.estimation import Status, predict_tracks
+    from ballfg.prediction.event_ahead import event_numbers
+
+    first = predict_tracks(estimator, dataset, len(dataset), observe, horizon=SOON, jobs=workers)
+    for one in progress(first, len(dataset), "tracks predicted"):
+        ahead = one.estimate.predict(horizon, STEP) if one.status is Status.OK else None
+        for text, event in asked.items():
+            found = None if ahead is None else ahead.event(event)
+            numbers = {"probability": np.nan if found is None else found.probability}
+            numbers |= event_numbers(None if found is None else found.crossing)
+            columns = {name: np.array([value]) for name, value in numbers.items()}
+            table.write({"trajectory": one.name, "event": text} | columns)
+            outcome.rows += 1
+        outcome.tracks.add(one.name, one.status, one.estimate.notes, None)
 
 
 def _conformal_scales(
@@ -143,8 +213,7 @@ def _print_conformal(scales: ConformalScales, outcome: _Outcome) -> None:
     if outcome.finite:
         own, held = 100 * outcome.held_by_own / outcome.finite, 100 * outcome.held / outcome.finite
         print(f"  90 % intervals on the {outcome.tracks.statuses.total()} predicted tracks: {what.format(own, held)}")
-    infinite = 3 * outcome.rows - outcome.finite
-    if infinite:
+    if infinite := outcome.infinite:
         inputs.print_notes(
             [
                 f"{infinite} of {3 * outcome.rows} sigmas are infinite: a finite 90 % interval needs {FEWEST} "
@@ -156,11 +225,13 @@ def _print_conformal(scales: ConformalScales, outcome: _Outcome) -> None:
 @dataclass
 class _Outcome:
     rows: int = 0
+    measured: int = 0
     squares: float = 0.0
     ended: int = 0
     held: int = 0
     held_by_own: int = 0
     finite: int = 0
+    infinite: int = 0
     tracks: inputs.Outcome = field(default_factory=inputs.Outcome)
 
     def add(self, result: TrackPrediction, own_sigmas: np.ndarray) -> None:
@@ -170,11 +241,14 @@ class _Outcome:
         from ballfg.estimation.conformal import HALF_WIDTH
 
         errors = np.abs(result.positions - result.measured)
-        finite = np.isfinite(result.sigmas)
+        measured = np.isfinite(errors)  # else beyond the track's end
+        finite = np.isfinite(result.sigmas) & measured
         self.rows += len(result.times)
-        self.squares += float((errors**2).sum())
+        self.measured += int(measured.all(axis=1).sum())
+        self.squares += float((errors[measured] ** 2).sum())
         self.ended += len(result.times) == 0
         self.finite += int(finite.sum())
+        self.infinite += int(np.isinf(result.sigmas).sum())
         self.held += int((finite & (errors <= HALF_WIDTH * result.sigmas)).sum())
         self.held_by_own += int((finite & (errors <= HALF_WIDTH * own_sigmas)).sum())
         outside = None if result.outside is None or not len(result.outside) else float(result.outside.mean())
@@ -183,8 +257,8 @@ class _Outcome:
     def print(self, observe: float) -> None:
         """Prints the counts of tracks by status and the errors of their predictions."""
         self.tracks.print()
-        if self.rows:
-            rmse = 1e3 * (self.squares / self.rows) ** 0.5
+        if self.measured:
+            rmse = 1e3 * (self.squares / self.measured) ** 0.5
             print(f"  RMSE against what was measured there: {rmse:.1f} mm over all stamps")
         if self.ended:
             print(f"  {self.ended} of the tracks end within {observe:g} s: nothing to predict")

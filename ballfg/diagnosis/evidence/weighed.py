@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
@@ -273,7 +273,7 @@ class _Question:
         gain = 0.5 * float(away @ np.linalg.solve(spread, away))
         weighed = Weighed(
             tuple(self.named),
-            fit,
+            replace(fit),  # without what can be computed again: a search keeps dozens of models
             noise,
             (likelihood.samples, likelihood.spins, likelihood.penalty),
             tuple(best),

@@ -1,0 +1,89 @@
+"""Describes a plane that a ball may cross: where it is, in which direction, and after how many bounces."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.checks import check_array, check_choice, check_count, check_number, shown
+
+AXES: Final = ("x", "y", "z")
+DIRECTIONS: Final = ("either", "up", "down")
+MOST_BOUNCES: Final = 20
+"""Largest number of bounces before a crossing: after so many a ball rolls."""
+
+
+@dataclass(frozen=True)
+class Plane:
+    """The plane normal . p = offset, and the crossings of it that count.
+
+    Attributes:
+        normal: (3,) dimensionless, of any length but zero.
+        offset: m, in units of the normal's length.
+        direction: `up` along the normal, `down` against it, or `either`.
+        after: number of bounces before the crossing.
+
+    Raises: ValueError, TypeError: numbers that are not finite, a normal of zero, an unknown direction, a number of
+        bounces beyond `MOST_BOUNCES`.
+    """
+
+    normal: tuple[float, float, float]
+    offset: float
+    direction: str = "either"
+    after: int = 0
+
+    def __post_init__(self) -> None:
+        normal = check_array("normal", self.normal)
+        if normal.shape != (3,) or not (np.isfinite(normal).all() and normal.any()):
+            raise ValueError(f"normal must be three finite numbers, not all zero; got {normal.tolist()}")
+        check_number("offset", self.offset, "m")
+        check_choice("direction", self.direction, DIRECTIONS)
+        check_count("after", self.after, 0, MOST_BOUNCES)
+
+    @classmethod
+    def parse(cls, text: str) -> Plane:
+        """The plane of a text such as `x=2.0`, `z=3.05,down`, `z=0.9,up,after=1`, or `0.6:0:0.8=1.2` for any normal.
+
+        Raises: ValueError: any other text.
+        """
+        place, *words = (word.strip() for word in text.split(","))
+        given = {"direction" if word in DIRECTIONS else "after": word for word in words}
+        bounces = re.fullmatch(r"after=(\d{1,3})", given.get("after", "after=0"))
+        found = re.fullmatch(r"(\S+?)\s*=\s*(\S+)", place)
+        normal = _normal(found[1]) if found else None
+        offset = _number(found[2]) if found else math.nan
+        if normal is None or bounces is None or len(given) != len(words) or not math.isfinite(offset):
+            raise ValueError(
+                f"plane must be an axis and a place in m, then, if wanted, up or down and the bounces before it; "
+                f"got {shown(text)}. Write x=2.0, z=3.05,down or z=0.9,up,after=1, for instance; 0.6:0:0.8=1.2 is a "
+                "plane across any other direction."
+            )
+        return cls(normal, offset, given.get("direction", "either"), int(bounces[1]))
+
+    @property
+    def line(self) -> tuple[Array, float]:
+        """Normal (3,) of length one, and the offset in m."""
+        normal = np.array(self.normal)
+        length = float(np.linalg.norm(normal))
+        return normal / length, self.offset / length
+
+
+def _normal(text: str) -> tuple[float, float, float] | None:
+    """The normal of an axis by its name, or of three numbers; None for any other text."""
+    if text in AXES:
+        x, y, z = (float(axis == text) for axis in AXES)
+        return x, y, z
+    numbers = [_number(part) for part in text.split(":")]
+    return (numbers[0], numbers[1], numbers[2]) if len(numbers) == 3 and np.isfinite(numbers).all() else None
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
