@@ -8,8 +8,7 @@ from typing import Any, Final
 from ballfg.checks import check_number, listed, shown
 from ballfg.dynamics import AnalyticModel, Surfaces, nominal_model
 from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball
-from ballfg.dynamics.model import THIN_SHELL
-from ballfg.dynamics.model_file import model_from_dict
+from ballfg.dynamics.model_file import model_from_dict, model_to_dict
 from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR, TABLE_LENGTH, TABLE_WIDTH
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.simulation.launcher import LAUNCHERS, TABLE_LAUNCHER, SimulatedLauncher
@@ -84,28 +83,26 @@ def ball_from_mapping(content: Any, default_name: str = "ball") -> BallKind:
     """The ball of a parsed ball file.
 
     Args:
-        content: `radius` (m), `mass` (kg), `flight` and `bounce` as in a model file; optional `name`,
-            `inertia_factor`, `surface` (`table` or `court`) and `launcher` (fields of `SimulatedLauncher` that differ).
+        content: `radius` (m) and `mass` (kg); optional `flight` and `bounce` as in a model file (else those of the
+            nominal model of such a ball), `inertia_factor`, `name`, `surface` (`table` or `court`) and `launcher`
+            (fields of `SimulatedLauncher` that differ).
         default_name: the name if the content has none.
     Raises: ValueError, TypeError: a missing or unknown key, or a value out of its bounds.
     """
     if not isinstance(content, Mapping):
-        raise ValueError(
-            f"a ball must be a mapping with radius, mass, flight and bounce; got {shown(content)}. Rewrite it."
-        )
+        raise ValueError(f"a ball must be a mapping with radius and mass; got {shown(content)}. Rewrite it.")
     for key in content:
         if key not in _FILE_KEYS:
             raise ValueError(f"keys must be among {', '.join(_FILE_KEYS)}; got {shown(key)}. Rename or delete it.")
-    for key in ("radius", "mass", "flight", "bounce"):
+    for key in ("radius", "mass"):
         if key not in content:
             raise ValueError(f"key '{key}' is required; got {listed(content)}. Add it.")
     ball = Ball(content["radius"], content["mass"])
-    model = model_from_dict(
-        {"flight": content["flight"], "bounce": content["bounce"]},
-        radius=ball.radius,
-        inertia_factor=check_number("inertia_factor", content.get("inertia_factor", THIN_SHELL)),
-        where="ball",
-    )
+    known = nominal_model(ball)
+    usual = model_to_dict(known)
+    stated = {part: content.get(part, usual[part]) for part in ("flight", "bounce")}
+    factor = check_number("inertia_factor", content.get("inertia_factor", known.inertia_factor))
+    model = model_from_dict(stated, radius=ball.radius, inertia_factor=factor, where="ball")
     surface = content.get("surface", "table")
     if surface not in ("table", "court"):
         raise ValueError(f"surface must be 'table' or 'court'; got {shown(surface)}. Choose one of them.")

@@ -125,6 +125,7 @@ def read_dataset(folder: str | PathLike[str]) -> Dataset:
     labels = LabelTable({}, {})
     if (path / LABELS_FILE).is_file():
         labels = read_labels(path / LABELS_FILE, index.names)
+        notes += labels.notes
         if missing := len(index.names) - len(labels):
             notes.append(f"{LABELS_FILE}: {missing} of {len(index.names)} trajectories unlabelled")
     findings = Findings()

@@ -1,6 +1,6 @@
 """Reads `labels.csv`: the labels of each shot, one row per trajectory."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from ballfg.checks import NAME_RULE, TEXT_RULE, did_you_mean, is_name, is_text, shown
@@ -11,6 +11,8 @@ from ballfg.tracks.track import FASTEST_SPIN, SPIN_LABELS, Label
 LABELS_FILE = "labels.csv"
 NUMERIC_LABELS = (*SPIN_LABELS, "topspin", "sidespin", "speed")
 TEXT_LABELS = ("group", "split")
+MOST_ABSURD = 0.1
+"""Share of the spin labels that may be beyond the spin of every ball: they are set aside; more are no slips."""
 
 
 class LabelTable:
@@ -20,9 +22,11 @@ class LabelTable:
     the launcher settings always numbers. An empty cell means that the trajectory lacks the label.
     """
 
-    def __init__(self, columns: dict[str, list[Label | None]], rows: dict[str, int]) -> None:
+    def __init__(self, columns: dict[str, list[Label | None]], rows: dict[str, int], notes: Sequence[str] = ()) -> None:
         self._columns = columns
         self._rows = rows
+        self.notes = tuple(notes)
+        """On spin labels that were set aside, one sentence each."""
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -68,7 +72,32 @@ def read_labels(path: Path, trajectories: Collection[str]) -> LabelTable:
     lines = [line for line, _ in found.values()]
     texts = {name: [row[i] for _, row in found.values()] for i, name in enumerate(header) if name != KEY}
     columns = {name: _column(path, name, cells, lines) for name, cells in texts.items()}
-    return LabelTable(columns, {name: number for number, name in enumerate(found)})
+    notes = _set_aside(path, columns, lines)
+    return LabelTable(columns, {name: number for number, name in enumerate(found)}, notes)
+
+
+def _set_aside(path: Path, columns: dict[str, list[Label | None]], lines: list[int]) -> list[str]:
+    """Removes spin labels that no ball has from the columns, with a note on each.
+
+    Raises: ValueError: if they are more than `MOST_ABSURD` of all spin labels.
+    """
+    spins = [column for name, column in columns.items() if name in SPIN_LABELS]
+    labelled = sum(any(cell is not None for cell in row) for row in zip(*spins, strict=True))
+    notes = []
+    for name, column in columns.items():
+        for number, value in enumerate(column if name in SPIN_LABELS else ()):
+            if not isinstance(value, float) or abs(value) <= FASTEST_SPIN:
+                continue
+            rule = f"within {FASTEST_SPIN:g} rad/s, as the spin of every ball"
+            if len(notes) + 1 > MOST_ABSURD * labelled:
+                raise ValueError(
+                    f"{path}, line {lines[number]}, column {shown(name)}: must be {rule}; got {value:g}. Correct it, "
+                    "or leave the cell empty if it is unknown."
+                )
+            notes.append(f"{path.name}, line {lines[number]}: {name} {value:g} is not {rule}: the label is set aside")
+            for spin in spins:
+                spin[number] = None
+    return notes
 
 
 def _column(path: Path, name: str, cells: list[str], lines: list[int]) -> list[Label | None]:
@@ -87,7 +116,4 @@ def _column(path: Path, name: str, cells: list[str], lines: list[int]) -> list[L
     if others:
         refuse(others[0], f"a number; got {shown(cells[others[0]])}")
     values: list[Label | None] = [float(cell) if cell.strip() else None for cell in cells]
-    for number, value in enumerate(values if name in SPIN_LABELS else ()):
-        if isinstance(value, float) and abs(value) > FASTEST_SPIN:
-            refuse(number, f"within {FASTEST_SPIN:g} rad/s, as the spin of every ball; got {value:g}")
     return values

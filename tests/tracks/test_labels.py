@@ -61,3 +61,32 @@ def test_bad_labels_are_named(make_folder, labels, message):
     assert str(caught.value).startswith(str(folder / "labels.csv"))
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def _spins(count: int, absurd: int) -> tuple[str, str]:
+    """tracks.csv and labels.csv of some shots, the first ones with a spin that no ball has."""
+    tracks = "trajectory,t,x,y,z\n" + "".join(
+        f"{k},{0.01 * i},{0.03 * i},0,1\n" for k in range(count) for i in range(5)
+    )
+    rows = (f"{k},{-2231 if k < absurd else 10 * k},1,2\n" for k in range(count))
+    return "trajectory,t,x,y,z\n" + "".join(samples), "trajectory,spin_x,spin_y,spin_z\n" + "".join(rows)
+
+
+def test_a_spin_that_no_ball_has_is_set_aside_with_a_note(make_folder):
+    tracks, labels = _spins(20, 2)
+    dataset = read_dataset(make_folder(tracks=tracks, labels=labels))
+    assert dataset.notes == [
+        f"labels.csv, line {line}: spin_x -2231 is not within 2000 rad/s, as the spin of every ball: "
+        "the label is set aside"
+        for line in (2, 3)
+    ]
+    spins = [track.spin_label for track in dataset]
+    assert [spin is None for spin in spins] == [True] * 2 + [False] * 18
+    assert dataset.track("7").spin_label.tolist() == [70.0, 1.0, 2.0]
+
+
+def test_more_than_a_tenth_of_such_spins_is_refused(make_folder):
+    tracks, labels = _spins(20, 3)
+    rule = r"labels.csv, line 4, column 'spin_x': must be within 2000 rad/s, .*; got -2231. Correct it, or leave"
+    with pytest.raises(ValueError, match=rule):
+        read_dataset(make_folder(tracks=tracks, labels=labels))

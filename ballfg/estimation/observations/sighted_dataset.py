@@ -108,7 +108,7 @@ def read_sighted(folder: str | PathLike[str]) -> SightedDataset:
     balls, more = read_sightings(path / DETECTIONS_FILE, {camera.name: camera.time_offset for camera in cameras})
     labels_file = path / LABELS_FILE
     labels = read_labels(labels_file, list(balls)) if labels_file.is_file() else LabelTable({}, {})
-    dataset = SightedDataset(path, info, cameras, balls, labels, notes + more)
+    dataset = SightedDataset(path, info, cameras, balls, labels, [*notes, *more, *labels.notes])
     if not len(dataset):
         raise ValueError(
             f"{path / DETECTIONS_FILE}: must hold a ball, seen often enough, its name in the column 'trajectory'; got "
