@@ -65,9 +65,7 @@ def test_bad_labels_are_named(make_folder, labels, message):
 
 def _spins(count: int, absurd: int) -> tuple[str, str]:
     """tracks.csv and labels.csv of some shots, the first ones with a spin that no ball has."""
-    tracks = "trajectory,t,x,y,z\n" + "".join(
-        f"{k},{0.01 * i},{0.03 * i},0,1\n" for k in range(count) for i in range(5)
-    )
+    samples = (f"{k},{0.01 * i},{0.03 * i},0,1\n" for k in range(count) for i in range(5))
     rows = (f"{k},{-2231 if k < absurd else 10 * k},1,2\n" for k in range(count))
     return "trajectory,t,x,y,z\n" + "".join(samples), "trajectory,spin_x,spin_y,spin_z\n" + "".join(rows)
 
