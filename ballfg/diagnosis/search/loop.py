@@ -194,14 +194,15 @@ class _Found:
     def _exchanged(self, screen: Screen, scored: Sequence[Scored], tell: Callable[[str], None]) -> Refit | None:
         """The refit with another effect in the place of one that makes the model more probable; None if none does.
 
-        All exchanges that are foretold to come close are refitted: they are what cannot be told apart.
+        Those that are foretold to come close are refitted: they are what cannot be told apart. An absence that is many
+        standard deviations away lies beyond the linear range, so that close is a share of what the effect explains.
         """
         foretold, best, tried = screen.exchanges, self.best, list[tuple[Weighed, Refit]]()
         for gone, one in sorted(foretold, key=lambda exchange: -foretold[exchange]):
             other, own = screen.candidates[one], next(h for h in best.named if h.name == gone)
-            if foretold[gone, one] < best.score + np.log(ALIKE) or len(tried) == MOST_EXCHANGES:
-                break
-            if best.names - {gone} | {other.name} in self.models:
+            explains = best.score - best.nested[best.names - {gone}]
+            close = foretold[gone, one] > best.score - max(-np.log(ALIKE), ALIKE * explains)
+            if len(tried) == MOST_EXCHANGES or not close or best.names - {gone} | {other.name} in self.models:
                 continue
             tell(f"fitting with {other.name} in place of {gone}")
             candidate = next(s for s in scored if s.hypothesis is other)
