@@ -39,12 +39,13 @@ class CalibrationConfig(Section):
     out: str = "calibration"
     """Folder that is written. `--out` replaces it."""
 
-    coefficients: Coefficients = (
-        "flight.drag.k",
-        "bounce.restitution.e",
-        "bounce.table_height.offset",
-    )
-    """Calibrated parameters by name: `flight.` or `bounce.`, the effect, its coefficient."""
+    source: Literal["positions", "detections"] | None = None
+    """positions: of the dataset's table of tracks. detections: the sightings of its cameras, one or more. null:
+    positions where there is a table of them."""
+
+    coefficients: Coefficients | None = None
+    """Calibrated parameters by name: `flight.` or `bounce.`, the effect, its coefficient. null: drag, restitution and
+    the table's height; from one camera drag alone."""
 
     groups: str | None = None
     """Label that names a track's launcher, player, ball or session, such as `group`: the spins of each group get a
