@@ -42,6 +42,8 @@ GRIP: Final = 0.6
 0.3. More is a hit."""
 CATCH: Final = 1.0
 """m/s, always allowed change."""
+CLOSE: Final = 2.0
+"""Median NIS of the sightings of a ball whose estimate did not converge; 1.4 is right."""
 STRAIGHT: Final = 0.3
 """s. What moves so long in a straight line does not fall."""
 NEAREST: Final = 0.5
@@ -83,7 +85,7 @@ def track_one_camera(
             track = sighted_track("stroke", stroke, [camera], model=model, surfaces=surfaces)
             estimate = smoother.estimate(track)
             distance = np.linalg.norm(estimate.states[:, POSITION] - camera.centre, axis=1)
-            if estimate.status in (Status.OK, Status.DEPTH_UNCERTAIN) and np.median(distance) > NEAREST:
+            if _fits(estimate) and np.median(distance) > NEAREST:
                 covariances = estimate.covariances[:, POSITION, POSITION]
                 views = np.ones(len(track), dtype=np.int64)
                 ball = SeenBall(track.times, estimate.states[:, POSITION], covariances, stroke, views)
@@ -92,6 +94,13 @@ def track_one_camera(
     tracking = Tracking((camera,), (detections,), tuple(ball for ball, _ in found), None)
     pairs = zip(tracking.names, found, strict=True)
     return Strokes(tracking, tuple(replace(estimate, name=name) for name, (_, estimate) in pairs))
+
+
+def _fits(estimate: Estimate) -> bool:
+    """True if an estimate converged, or did not but passes through most sightings all the same."""
+    if estimate.status is Status.NOT_CONVERGED:
+        return bool(np.median(estimate.nis) < CLOSE)
+    return not estimate.status.failed
 
 
 def _cut(chain: Sequence[Sightings], camera: Camera, smoother: Smoother) -> list[Sightings]:

@@ -104,7 +104,8 @@ class CameraSightings(Observation):
         columns = np.array([context.columns.get(name, FIXED) for name in names])
         seen, unknown = self.sightings, columns if (columns != FIXED).any() else None
         measured, loss = (seen.camera, seen.pixels, seen.covariances), context.settings.sighting_loss
-        return CameraFactors(self.state, *measured, _bank(self.cameras), self.delay, unknown, loss)
+        radius = (seen.radii, context.model.radius)
+        return CameraFactors(self.state, *measured, _bank(self.cameras), self.delay, unknown, loss, *radius)
 
     def unknowns(self, settings: Settings) -> Unknowns:
         """The time offsets that the settings name, s, each counted from that of its camera.
