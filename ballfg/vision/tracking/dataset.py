@@ -63,8 +63,8 @@ def write_tracking(
         info: the content of dataset.yaml.
         table: (x_low, x_high, y_low, y_high) m, drawn in the contact sheet; None where it is not known.
         streams: the videos; None where there are none: then there is no overlay, and the sheet has no pictures.
-        states: columns (n,) of each ball's states, those of `ballfg estimate` in SI units; then states.csv takes the place of
-            tracks.csv: the depth of points that one camera saw is no measurement.
+        states: columns (n,) of each ball's states, those of `ballfg estimate` in SI units; then states.csv takes the
+            place of tracks.csv: the depth of points that one camera saw is no measurement.
         watch: sees the frames of the overlay that are drawn.
     Returns: the names of the files.
     Raises: OSError: something cannot be written. ValueError: a track that breaks a rule of datasets.
