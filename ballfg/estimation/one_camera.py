@@ -42,8 +42,8 @@ GRIP: Final = 0.6
 0.3. More is a hit."""
 CATCH: Final = 1.0
 """m/s, always allowed change."""
-CLOSE: Final = 2.0
-"""Median NIS of the sightings of a ball whose estimate did not converge; 1.4 is right."""
+CLOSE: Final = 1.4
+"""Largest median NIS of the sightings of a ball whose estimate did not converge: that of right noise."""
 STRAIGHT: Final = 0.3
 """s. What moves so long in a straight line does not fall."""
 NEAREST: Final = 0.5
