@@ -160,7 +160,8 @@ def cameras(
 ) -> None:
     """Tracking from rendered videos of three cameras: points, velocities and clocks against the truth.
 
-    With --data and --view: states from the detections of one camera at a time, against the measured tracks.
+    With --data and --view: states from the detections of one camera at a time, against the measured tracks; with two
+    views also of two phones at the first two cameras, with clocks that drift apart.
 
     The recordings have one shutter or three, one ball or two, dropped frames, a clock that is late, and a camera that
     was turned after its calibration. The speed of the tracking is measured too.
@@ -168,6 +169,7 @@ def cameras(
     Example: ballfg-bench cameras --out results/cameras
     """
     from ballfg.benchmarks.cameras.one_view import run_views
+    from ballfg.benchmarks.cameras.phones import run_phones
     from ballfg.benchmarks.cameras.suite import FULL, QUICK, run_cameras
     from ballfg.estimation import read_sighted
 
@@ -179,6 +181,8 @@ def cameras(
         truth, views = _open(data), [read_sighted(one) for one in view or ()]
         with run.folder():
             run_views(results, views, truth)
+            if len(views) > 1:
+                run_phones(results, (views[0].cameras[0], views[1].cameras[0]), truth)
             run.finish(results)
         return
     with run.working() as (folder, processes):

@@ -1,4 +1,4 @@
-"""A camera factor compares the pixel of a sighting with the projection of the state's position."""
+"""A camera factor compares the pixel of a sighting, and the ball's radius, with the projection of the state."""
 
 from collections.abc import Hashable
 from typing import ClassVar
@@ -22,7 +22,8 @@ class CameraFactors(FactorBatch):
 
     W whitens the pixel noise, W^T W = R^-1. The delay is known. d is a coefficient, the error of the camera's time
     offset: positive if its stamps are later than assumed. Over the milliseconds of tau the path is straight to some
-    micrometres, unless the ball bounces meanwhile.
+    micrometres, unless the ball bounces meanwhile. Where the ball's radius in the picture is known, a third number
+    compares it with that at the depth.
 
     Args:
         states: (m,) indices of the observed states.  camera: (m,) numbers of the cameras in the bank.
@@ -31,11 +32,13 @@ class CameraFactors(FactorBatch):
         columns: (c,) index of the coefficient that is each camera's d, or `FIXED`. None: the factors do not depend on
             coefficients.
         loss: a robust one if the sightings contain wrong candidates.
+        radii: (m, 2) px, radius in the picture, 0 where unknown, and its sigma; None: residuals have two numbers.
+        ball: m, radius of the ball.
 
     Raises: ValueError: if the shapes of the arrays do not agree.
     """
 
-    row_arrays: ClassVar[tuple[str, ...]] = ("variables", "camera", "pixels", "root", "delay", "column")
+    row_arrays: ClassVar[tuple[str, ...]] = ("variables", "camera", "pixels", "root", "delay", "column", "radii")
 
     def __init__(
         self,
@@ -47,11 +50,13 @@ class CameraFactors(FactorBatch):
         delay: Array | None = None,
         columns: Index | None = None,
         loss: Loss | None = None,
+        radii: Array | None = None,
+        ball: float = 0.0,
     ) -> None:
         variables = np.asarray(states)[:, None]
         if columns is not None:
             variables = np.concatenate((variables, np.full_like(variables, COEFFICIENTS)), axis=1)
-        super().__init__(variables, 2, loss)
+        super().__init__(variables, 2 if radii is None else 3, loss)
         m = len(self)
         if pixels.shape != (m, 2) or covariances.shape != (m, 2, 2) or np.shape(camera) != (m,):
             raise ValueError(
@@ -64,14 +69,18 @@ class CameraFactors(FactorBatch):
         self.delay = np.zeros(m) if delay is None else delay
         self.column = np.full(m, FIXED) if columns is None else np.asarray(columns)[self.camera]
         self.bank = bank
+        self.ball = ball
+        given = np.zeros((m, 2)) if radii is None else radii
+        known = given[:, 0] > 0.0
+        self.radii = np.stack((given[:, 0], np.divide(1.0, given[:, 1], out=np.zeros(m), where=known)), axis=1)
 
     @property
     def group(self) -> Hashable:
-        """Further entries of the group: the cameras."""
-        return (*super().group, id(self.bank))  # type: ignore[misc]
+        """Further entries of the group: the cameras, the ball's radius."""
+        return (*super().group, id(self.bank), self.ball)  # type: ignore[misc]
 
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
-        """Whitened residuals (k, 2) and Jacobians (k, 2, 9), with time offsets also (k, 2, p).
+        """Whitened residuals (k, r) and Jacobians (k, r, 9), with time offsets also (k, r, p); r is 2, or 3 with radii.
 
         A residual is NaN if the ball is not in front of its camera.
         """
@@ -82,25 +91,36 @@ class CameraFactors(FactorBatch):
         pixels, by_point = self.bank.jacobian(points, torch.from_numpy(self.camera[rows]))
         residual = (root @ (pixels.numpy() - self.pixels[rows])[..., None])[..., 0]
         slope = root @ by_point.numpy()
-        by_state = np.zeros((len(state), 2, STATE_DIM))
+        if self.dim == 3:
+            (radius, sharp), numbers = self.radii[rows].T, torch.from_numpy(self.camera[rows])
+            seen, by_place = (t.numpy() for t in self.bank.radius(points, numbers, self.ball))
+            residual = np.concatenate((residual, (sharp * (seen - radius))[:, None]), axis=1)
+            slope = np.concatenate((slope, (sharp[:, None] * by_place)[:, None]), axis=1)
+        by_state = np.zeros((len(state), self.dim, STATE_DIM))
         by_state[..., POSITION], by_state[..., VELOCITY] = slope, slope * tau[:, None, None]
         if len(inputs) == 1:
             return residual, (by_state,)
-        by_offset = np.zeros((len(state), 2, inputs[1].shape[-1]))
+        by_offset = np.zeros((len(state), self.dim, inputs[1].shape[-1]))
         (free,) = np.nonzero(column != FIXED)
         by_offset[free, :, column[free]] = -(slope[free] @ velocity[free, :, None])[..., 0]
         return residual, (by_state, by_offset)
 
     def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
-        """(m, 2) whitened residuals in torch."""
+        """(m, r) whitened residuals in torch."""
         tau = torch.from_numpy(self.delay)
         if len(inputs) > 1:
             column = torch.from_numpy(self.column)
             own = inputs[1].gather(1, column.clamp(min=0)[:, None])[:, 0]
             tau = tau - torch.where(column != FIXED, own, 0.0)
         points = inputs[0][:, POSITION] + tau[:, None] * inputs[0][:, VELOCITY]
-        pixels = self.bank.project(points, torch.from_numpy(self.camera))
-        return (torch.from_numpy(self.root) @ (pixels - torch.from_numpy(self.pixels))[..., None])[..., 0]
+        camera = torch.from_numpy(self.camera)
+        pixels = self.bank.project(points, camera)
+        residual = (torch.from_numpy(self.root) @ (pixels - torch.from_numpy(self.pixels))[..., None])[..., 0]
+        if self.dim == 2:
+            return residual
+        seen, _ = self.bank.radius(points, camera, self.ball)
+        radius, sharp = torch.from_numpy(self.radii).unbind(-1)
+        return torch.cat((residual, (sharp * (seen - radius))[:, None]), dim=-1)
 
 
 def _own(coefficients: tuple[Array, ...], column: Index) -> Array:

@@ -1,4 +1,7 @@
-"""Measures a model's prediction errors on other tracks: it observes the first part and predicts the rest."""
+"""Measures a model's prediction errors on other tracks: it observes the first part and predicts the rest.
+
+Errors of tracks that cameras saw are those across the rays of their sightings; nobody measured the others.
+"""
 
 from collections.abc import Sequence
 from typing import Final
@@ -9,6 +12,8 @@ from scipy.special import ndtri
 
 from ballfg.arrays import Array
 from ballfg.estimation import Estimator, Status, predict_tracks
+from ballfg.estimation.observations.sightings import sightings_of
+from ballfg.estimation.track_prediction import TrackPrediction
 from ballfg.tracks import Track
 
 NINETY = float(ndtri(0.95))
@@ -18,6 +23,10 @@ OUTLIERS: Final = 0.01
 """Share of coordinates that a prediction may miss, as after a hit that nobody foresees."""
 WIDER: Final = 10.0
 """Width of their density, in standard deviations: one missed bounce does not decide a comparison."""
+
+
+JUDGED: Final = (Status.OK, Status.DEPTH_UNCERTAIN)
+"""Statuses of estimates whose predictions count."""
 
 
 class TrackScore(BaseModel):
@@ -33,7 +42,8 @@ class TrackScore(BaseModel):
     covered: float = Field(ge=0.0, le=1.0)
     """Share of measured coordinates inside the central 90 % intervals."""
     prediction_nis: float = Field(ge=0.0, le=1e100)
-    """Mean over the predicted samples of the squared errors in standard deviations, x, y and z added; 3 is right."""
+    """Mean over the predicted samples of the squared errors in standard deviations, x, y and z added; 3 is right. Those
+    of sightings are scaled from two coordinates to three."""
     log_score: float = Field(ge=-1e9, le=1e9)
     """Mean over measured coordinates of the log density that the prediction gives them, per metre; higher is better."""
     nis: float = Field(ge=0.0, le=1e100)
@@ -69,21 +79,30 @@ def judge_track(estimator: Estimator, track: Track, observed_share: float, horiz
         return None
     prediction = next(predict_tracks(estimator, [track], 1, observed_share * track.duration, horizon=horizon))
     nis = prediction.estimate.nis[np.isfinite(prediction.estimate.nis)]
-    if prediction.status is not Status.OK or not len(prediction.times) or not len(nis):
+    if prediction.status not in JUDGED or not len(prediction.times) or not len(nis):
         return None
-    error = prediction.positions - prediction.measured
-    whitened = error / prediction.sigmas
-    if not np.isfinite(whitened).all():
+    error, sigmas = _errors(track, prediction)
+    whitened = error / sigmas
+    if not len(error) or not np.isfinite(whitened).all():
         return None
+    three = 3.0 / error.shape[1]
     return TrackScore(
         name=track.name,
         samples=len(error),
         rmse=float(np.sqrt((error**2).sum(axis=-1).mean())),
         covered=float((np.abs(whitened) <= NINETY).mean()),
-        prediction_nis=float((whitened**2).sum(axis=-1).mean()),
-        log_score=float(log_density(whitened, prediction.sigmas).mean()),
-        nis=float(nis.mean()),
+        prediction_nis=three * float((whitened**2).sum(axis=-1).mean()),
+        log_score=float(log_density(whitened, sigmas).mean()),
+        nis=three * float(nis.mean()),
     )
+
+
+def _errors(track: Track, prediction: TrackPrediction) -> tuple[Array, Array]:
+    """(k, 3) m errors of positions, or (m, 2) m across the rays of sightings, and their standard deviations."""
+    if not track.rough:
+        return prediction.positions - prediction.measured, prediction.sigmas
+    assert prediction.covariances is not None
+    return sightings_of(track).across(len(prediction.estimate), prediction.positions, prediction.covariances)
 
 
 def log_density(whitened: Array, sigmas: Array) -> Array:

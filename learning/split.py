@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 
+from ballfg.estimation.observations.sighted_dataset import SightedDataset
 from ballfg.learning.config.training import SplitConfig
 from ballfg.tracks import Dataset, Track
 
@@ -30,7 +31,9 @@ class Split:
     digest: str
 
 
-def split_tracks(dataset: Dataset, how: Literal["random", "label"], seed: int, *, needs_spin: bool) -> Split:
+def split_tracks(
+    dataset: Dataset | SightedDataset, how: Literal["random", "label"], seed: int, *, needs_spin: bool
+) -> Split:
     """Split the tracks of a dataset, in one pass.
 
     Args:
@@ -99,7 +102,7 @@ def training_split(tracks: Sequence[tuple[int, Track]], config: SplitConfig, see
     return parts[0], parts[1]
 
 
-def tracks_of(dataset: Dataset, names: tuple[str, ...]) -> Iterator[Track]:
+def tracks_of(dataset: Dataset | SightedDataset, names: tuple[str, ...]) -> Iterator[Track]:
     """The tracks of some names, streamed in the order of the dataset."""
     wanted = set(names)
     return (track for track in dataset if track.name in wanted)

@@ -4,21 +4,24 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import torch
 
 from ballfg.dynamics import AnalyticModel, load_model, nominal_model
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.dynamics.nominal import inertia_factor
-from ballfg.estimation import Settings, dataset_settings, dataset_surfaces
+from ballfg.estimation import Settings, dataset_settings, dataset_surfaces, read_sighted
 from ballfg.estimation.configure import table_note
 from ballfg.estimation.launcher import Launcher
-from ballfg.estimation.reading import with_readings
+from ballfg.estimation.observations.sighted_dataset import SightedDataset
+from ballfg.estimation.reading import has_positions, with_readings
 from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.shots import TrainingShot, shots_of
 from ballfg.learning.split import training_split
 from ballfg.tracks import Ball, Dataset, Track, read_dataset
 
+D = TypeVar("D", Dataset, SightedDataset)
 FIRST_SPIN = {"topspin": (0.0, 50.0, 0.0), "sidespin": (0.0, 0.0, 50.0)}
 """rad/s about (forward, across, up) per level of the settings with a known axis; other settings start at no spin."""
 FIRST_SPIN_NOISE = 60.0
@@ -74,7 +77,21 @@ def open_dataset(folder: str) -> Dataset:
 
     Raises: ValueError, FileNotFoundError: as in reading.
     """
-    dataset = with_readings(read_dataset(folder))
+    return noted(with_readings(read_dataset(folder)))
+
+
+def open_source(folder: str, source: str | None) -> Dataset | SightedDataset:
+    """As `open_dataset`, or the sightings of its cameras.
+
+    Args: source: `positions` or `detections`; None: positions, if the folder has a table of them.
+    Raises: ValueError, FileNotFoundError: as in reading.
+    """
+    positions = has_positions(folder) if source is None else source == "positions"
+    return open_dataset(folder) if positions else noted(read_sighted(folder))
+
+
+def noted(dataset: D) -> D:
+    """The dataset, after its notes on stderr."""
     for note in (*dataset.notes, *filter(None, [table_note(dataset)])):
         print(f"note: {note}", file=sys.stderr)
     return dataset

@@ -77,6 +77,8 @@ def dataset_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Set
         settings = replace(settings, spin_label_noise=info.spin_noise)
     for stated in (info.noise, model.noise):
         settings = settings if stated is None else with_noise(settings, stated)
+    if dataset.one_view:  # predictions have one process noise for all tracks
+        settings = replace(settings, process=settings.for_track(next(iter(dataset))).process)
     return settings if model.spins is None else replace(settings, spins=model.spins)
 
 
@@ -94,9 +96,6 @@ def fitted_settings(
     settings = dataset_settings(dataset, model)
     at_home = model.trained is not None and not model.trained.is_foreign(dataset.info.name)
     stated = dataset.info.noise is not None or model.noise is not None or at_home
-    if isinstance(dataset, SightedDataset) and all(track.one_view for track in dataset):
-        process = settings.for_track(next(iter(dataset))).process  # predictions have one for all tracks
-        return replace(settings, process=process)
     if stated or dataset.rough or len(dataset) < LEAST_TRACKS:
         return settings
     key = (dataset, _content(model), observed)

@@ -196,8 +196,13 @@ class Estimate:
         """
         import pandas
 
-        columns = {"t": self.times, **dict(zip(STATE_NAMES, self.states.T, strict=True))}
-        return pandas.DataFrame(columns | dict(zip(SIGMA_NAMES, self.sigmas.T, strict=True)))
+        return pandas.DataFrame(self.columns)
+
+    @property
+    def columns(self) -> dict[str, Array]:
+        """The columns of `ballfg estimate`, (n,) each: t (s), the state and its standard deviations."""
+        states = dict(zip(STATE_NAMES, self.states.T, strict=True))
+        return {"t": self.times, **states, **dict(zip(SIGMA_NAMES, self.sigmas.T, strict=True))}
 
     def plot(self) -> Figure:
         """A picture of position, velocity and spin over time, each with a band of two standard deviations."""

@@ -49,6 +49,7 @@ class TrackPrediction:
         measured: (k, 3) m, the track's positions at those stamps.
         estimate: from the observed part.
         conformal: the scales of the sigmas; None for the model's own sigmas.
+        covariances: (k, 3, 3) m^2, of the positions, without measurement noise.
         outside: (k,) share from 0, where a network was trained, to 1 far from there; None for other models.
     """
 
@@ -60,6 +61,7 @@ class TrackPrediction:
     estimate: Estimate
     conformal: ConformalScales | None = None
     outside: Array | None = None
+    covariances: Array | None = None
 
     def __repr__(self) -> str:
         return f"TrackPrediction({self.name!r}, {len(self.times)} positions, {self.status.name.lower()})"
@@ -197,7 +199,8 @@ def _predict_alike(
     times = _padded([clock[n:] for clock, n in zip(clocks, seen, strict=True)], ends)
     belief = Belief.of(estimator.model, [e.last for e in estimates], estimator.settings.coefficients)
     belief = replace(belief, time=torch.tensor(ends, dtype=torch.float64))
-    positions, velocities, variances = (np.zeros((*times.shape, 3)) for _ in range(3))
+    positions, velocities = (np.zeros((*times.shape, 3)) for _ in range(2))
+    covariances = np.zeros((*times.shape, 3, 3))
     outside: Array | None = None
     for k, predicted in enumerate(propagator.walk(belief, torch.from_numpy(times)) if times.size else ()):
         velocities[:, k] = predicted.mean[:, VELOCITY].numpy()
@@ -206,12 +209,14 @@ def _predict_alike(
         if share is not None:
             outside = np.zeros(times.shape) if outside is None else outside
             outside[:, k] = share
-        variances[:, k] = torch.diagonal(predicted.covariance, dim1=-2, dim2=-1)[:, POSITION].numpy()
+        covariances[:, k] = predicted.covariance[:, POSITION, POSITION].numpy()
     for i, (track, result, (later, measured, white)) in enumerate(zip(tracks, estimates, parts, strict=True)):
         k = len(later)
-        sigmas = np.sqrt(variances[i, :k] + total_sigmas(settings, white, velocities[i, :k]) ** 2)
+        variances = np.diagonal(covariances[i, :k], axis1=1, axis2=2)
+        sigmas = np.sqrt(variances + total_sigmas(settings, white, velocities[i, :k]) ** 2)
         left = None if outside is None else outside[i, :k]
-        yield TrackPrediction(track.name, later, positions[i, :k], sigmas, measured, result, outside=left)
+        ahead = later, positions[i, :k], sigmas, measured
+        yield TrackPrediction(track.name, *ahead, result, outside=left, covariances=covariances[i, :k])
 
 
 def _padded(times: list[Array], ends: list[float]) -> Array:

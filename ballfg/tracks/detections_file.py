@@ -26,7 +26,8 @@ CAMERA: Final = "camera"
 PLACE: Final = ("t", "u", "v")
 NOISE: Final = ("sigma_u", "sigma_v", "rho_uv")
 SCORE: Final = "score"
-OPTIONAL: Final = (*NOISE, SCORE)
+RADIUS: Final = ("radius", "sigma_radius")
+OPTIONAL: Final = (*NOISE, *RADIUS, SCORE)
 UNSTATED: Final = {"sigma_u": 0.5, "sigma_v": 0.5, "rho_uv": 0.0}  # px; half a pixel, as of patch centres
 LEAST_SIGMA: Final = 1e-4  # px, best resolution of a camera; far surer pixels cannot be solved in double precision
 MOST_PIXELS: Final = 1e6  # px. Largest width of an image; larger numbers overflow when squared.
@@ -38,6 +39,8 @@ RULES: Final[Mapping[str, Rule]] = {
     "sigma_u": _SIGMA,
     "sigma_v": _SIGMA,
     "rho_uv": ("between -1 and 1", lambda x: np.abs(x) < 1.0),
+    "radius": (f"0 (unknown) to {MOST_PIXELS:.0f} px", lambda x: (x >= 0.0) & (x <= MOST_PIXELS)),
+    "sigma_radius": _SIGMA,
 }
 DETECTIONS_FILE: Final = "detections.csv"
 REQUIRED: Final = (KEY, "t", CAMERA, "u", "v")
@@ -53,7 +56,8 @@ def read_sightings(
 
     Args:
         path: a table `trajectory,t,camera,u,v` (t in s, as recorded by the camera, u and v in px), optionally with
-            `sigma_u`, `sigma_v` (px), `rho_uv` and `score`.
+            `sigma_u`, `sigma_v` (px), `rho_uv`, `radius` of the ball in the picture (px; 0: unknown), `sigma_radius`
+            (px) and `score`.
         time_offsets: s, by camera of the rig: rows are sorted by t less the offset.
     Returns: sightings by trajectory, in the order in which the trajectories first appear; ignored entries, one sentence
         each.
@@ -85,7 +89,8 @@ def read_sightings(
         mine = rows[names[rows] == name]
         own = {column: cells[mine] for column, cells in values.items()}
         pixels = np.column_stack((own["u"], own["v"]))
-        found[name] = Sightings(tuple(time_offsets), seen_by[mine], own["t"], pixels, covariances(own))
+        radii = _radii(own) if RADIUS[0] in own else None
+        found[name] = Sightings(tuple(time_offsets), seen_by[mine], own["t"], pixels, covariances(own), radii)
     return found, notes
 
 
@@ -98,7 +103,8 @@ def write_sightings(path: str | os.PathLike[str], balls: Iterable[tuple[str, Sig
     with TableWriter(path) as table:
         for name, seen in balls:
             camera = np.array(seen.cameras, dtype=object)[seen.camera]
-            table.write({KEY: name} | seen_columns(seen.times, camera, seen.pixels, seen.covariances))
+            radii = {} if seen.radii is None else dict(zip(RADIUS, seen.radii.T, strict=True))
+            table.write({KEY: name} | seen_columns(seen.times, camera, seen.pixels, seen.covariances) | radii)
 
 
 def _chosen(path: Path, lines: Index, names: Texts, camera: Index, values: Mapping[str, Array]) -> tuple[Index, int]:
@@ -186,6 +192,12 @@ def covariances(values: Mapping[str, Array]) -> Array:
     sigma_u, sigma_v, rho = (values[name] for name in NOISE)
     across = rho * sigma_u * sigma_v
     return np.stack((sigma_u**2, across, across, sigma_v**2), axis=-1).reshape(-1, 2, 2)
+
+
+def _radii(values: Mapping[str, Array]) -> Array:
+    """(n, 2) px, the ball's radius in the picture and its sigma."""
+    radius = values[RADIUS[0]]
+    return np.stack((radius, values.get(RADIUS[1], np.full_like(radius, UNSTATED["sigma_u"]))), axis=1)
 
 
 def seen_columns(times: Array, camera: ArrayLike, pixels: Array, spread: Array) -> dict[str, ArrayLike]:

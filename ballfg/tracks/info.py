@@ -154,9 +154,15 @@ class DatasetInfo:
 
 
 class TrackFolder:
-    """Ball and table of a dataset."""
+    """Ball and table of a dataset.
+
+    Attributes:
+        info: the content of `dataset.yaml`.
+        one_view: True if one camera alone saw each ball.
+    """
 
     info: DatasetInfo
+    one_view: bool = False
 
     @property
     def ball(self) -> Ball:

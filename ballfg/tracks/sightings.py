@@ -29,6 +29,8 @@ class Sightings:
     times: Array  # (m,) s, stamps as recorded by the camera
     pixels: Array  # (m, 2) px, place of the ball's centre in the middle of the exposure
     covariances: Array  # (m, 2, 2) px^2
+    radii: Array | None = None
+    """(m, 2) px, radius of the ball in the picture, 0 where unknown, and its standard deviation; None: all unknown."""
 
     def __post_init__(self) -> None:
         check_iterable("cameras", self.cameras)
@@ -53,6 +55,14 @@ class Sightings:
                 row = int(np.argwhere(~np.isfinite(array))[0][0])
                 raise ValueError(f"{field} must be finite; {field}[{row}]={array[row].tolist()}. Drop that sighting.")
             object.__setattr__(self, field, array)
+        if self.radii is not None:
+            radii = check_array("radii", self.radii, (m, 2), "Pass one row per sighting.")
+            good = np.isfinite(radii).all(axis=1) & (radii[:, 0] >= 0.0) & (radii[:, 1] > 0.0)
+            if not good.all():
+                row = int(np.argmin(good))
+                problem = f"radii must be a radius and a sigma above zero, in px; radii[{row}]={radii[row].tolist()}"
+                raise ValueError(f"{problem}. Give 0 for an unknown radius.")
+            object.__setattr__(self, "radii", radii)
         for number, name in enumerate(self.cameras):
             rows = np.flatnonzero(self.camera == number)
             wrong = np.flatnonzero(np.diff(self.times[rows]) <= 0.0)
@@ -76,7 +86,9 @@ class Sightings:
     def select(self, rows: ArrayLike) -> Sightings:
         """The rows of the numbers (k,), ascending, or of the mask (m,) bool. Raises: ValueError: if none remains."""
         kept = np.asarray(rows)
-        return Sightings(self.cameras, self.camera[kept], self.times[kept], self.pixels[kept], self.covariances[kept])
+        radii = None if self.radii is None else self.radii[kept]
+        own = (self.camera[kept], self.times[kept], self.pixels[kept], self.covariances[kept])
+        return Sightings(self.cameras, *own, radii)
 
 
 def are_covariances(matrices: Array) -> NDArray[np.bool_]:

@@ -48,6 +48,16 @@ class CameraBank:
             bent = tilted[:, :2] / tilted[:, 2:]
         return bent * self._focal[camera] + self._principal[camera]
 
+    def radius(self, points: Tensor, camera: Tensor, radius: float) -> tuple[Tensor, Tensor]:
+        """Mean radius (n,) px of the outline of a ball about each point (n, 3) m, and its derivatives (n, 3) px/m.
+
+        Args: camera: (n,) number of each row's.  radius: m, of the ball.
+        """
+        forward = self._rotation[camera, 2]
+        depth = (forward * points).sum(-1) + self._tvec[camera, 2]
+        seen = self._focal[camera].prod(-1).sqrt() * radius / torch.where(depth > 0.0, depth, torch.nan)
+        return seen, -(seen / depth)[:, None] * forward
+
     def jacobian(self, points: Tensor, camera: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels (n, 2) of points (n, 3) m in the cameras (n,) of their rows, and derivatives (n, 2, 3) px/m."""
         points = points.detach().requires_grad_()

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
 
@@ -12,16 +12,23 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array
 from ballfg.benchmarks.metrics import bootstrap, inside, median_and_quartiles, share
 from ballfg.benchmarks.results import Results
-from ballfg.estimation import Estimate
+from ballfg.dynamics import nominal_model
+from ballfg.estimation import Estimate, Estimator
 from ballfg.estimation.observations.sighted_dataset import SightedDataset
+from ballfg.estimation.registry import make_estimator
 from ballfg.front import estimator_for
+from ballfg.learning.calibration.calibrate import calibrate, population_model, population_settings, pose
+from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.progress import progress
 from ballfg.tracks import Dataset, Track
 
 METHOD: Final = "smoother, one camera"
+CALIBRATED: Final = "smoother, one camera, calibrated by the view's other strokes"
 FAILED: Final = 1.0
 """m, error of a stroke from which it counts as a failure, as one without states does."""
 LEVEL: Final = 0.9
+LEAST: Final = 8
+"""Strokes of a view of which one half can calibrate for the other."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +49,9 @@ class Stroke:
 
 
 def run_views(results: Results, views: Sequence[SightedDataset], truth: Dataset) -> None:
-    """Adds the rows of each view; its name is the case.
+    """Adds the rows of each view, with the nominal ball and with one that the view's other half calibrated.
+
+    The case is the name of the view. Every second stroke calibrates for the others, and the others for it.
 
     Args: views: strokes of one camera each.  truth: their measured tracks, under the same names.
     Raises: ValueError: a view without a stroke of the truth.
@@ -51,17 +60,39 @@ def run_views(results: Results, views: Sequence[SightedDataset], truth: Dataset)
     measured = estimator_for(truth)
     whole = {name: measured.estimate(track.since_first()) for name, track in known.items()}
     for view in views:
-        estimator, found = estimator_for(view), list[Stroke]()
         tracks = [track for track in view if track.name in known]
         if not tracks:
             raise ValueError(f"{view.path} must hold tracks of {truth.path}; it holds none. Give views of its strokes.")
-        estimator.estimate(tracks[0])  # machine code is compiled once
-        for track in progress(tracks, len(tracks), f"strokes of {view.info.name}"):
+        nominal = estimator_for(view)
+        nominal.estimate(tracks[0])  # machine code is compiled once
+
+        def judged(estimator: Estimator, track: Track) -> Stroke:
             begun = time.perf_counter()
             estimate = estimator.estimate(track)
             duration = time.perf_counter() - begun
-            found.append(_judged(estimate, known[track.name], whole[track.name], duration))
-        _add(results, view.info.name, found)
+            return _judged(estimate, known[track.name], whole[track.name], duration)
+
+        watched = progress(tracks, len(tracks), f"strokes of {view.info.name}")
+        _add(results, view.info.name, METHOD, [judged(nominal, track) for track in watched])
+        if len(tracks) < LEAST:
+            continue
+        found = list[Stroke]()
+        for fit, judge in ((tracks[::2], tracks[1::2]), (tracks[1::2], tracks[::2])):
+            estimator = calibrated(view, [track.name for track in fit])
+            found += [judged(estimator, track) for track in judge]
+        _add(results, view.info.name, CALIBRATED, found)
+
+
+def calibrated(view: SightedDataset, names: Sequence[str]) -> Estimator:
+    """The smoother with a ball that some strokes of a view calibrated, as `ballfg-train` with `kind: calibrate` does.
+
+    Args: view: of one camera.  names: of those strokes.
+    """
+    problem = pose(view, nominal_model(view.ball), CalibrationConfig())
+    problem = replace(problem, split=replace(problem.split, fit=tuple(names), judge=()))
+    *_, last = calibrate(problem, watch=progress)
+    model, settings = population_model(problem, last), population_settings(problem, last)
+    return make_estimator("smoother", model, problem.surfaces, settings)
 
 
 def _judged(estimate: Estimate, track: Track, whole: Estimate, duration: float) -> Stroke:
@@ -85,9 +116,9 @@ def _place(estimate: Estimate, at: float) -> Array:
     return np.asarray(state[:2] + (at - estimate.times[row]) * state[3:5])
 
 
-def _add(results: Results, case: str, found: Sequence[Stroke]) -> None:
-    """The rows of one view."""
-    add, n, rng = partial(results.add, case, METHOD), len(found), np.random.default_rng(results.seed)
+def _add(results: Results, case: str, method: str, found: Sequence[Stroke]) -> None:
+    """The rows of one view and method."""
+    add, n, rng = partial(results.add, case, method), len(found), np.random.default_rng(results.seed)
     errors = 1e3 * np.array([stroke.error for stroke in found])
     add("error_median", "mm", bootstrap(lambda rows: np.median(errors[rows], axis=-1), n, rng), n)
     add("error_p90", "mm", float(np.quantile(errors, 0.9)), n)

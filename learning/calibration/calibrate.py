@@ -21,7 +21,6 @@ from ballfg.estimation import (
     Estimator,
     Settings,
     Smoother,
-    Status,
     dataset_settings,
     dataset_surfaces,
     estimate_noise,
@@ -29,13 +28,16 @@ from ballfg.estimation import (
 from ballfg.estimation.batch import estimate_tracks, map_tracks
 from ballfg.estimation.noise.estimate import NoiseEstimate, spread_over
 from ballfg.estimation.noise.parameters import with_noise
+from ballfg.estimation.observations.sighted_dataset import SightedDataset
 from ballfg.estimation.registry import make_estimator
-from ballfg.learning.calibration.coefficients import Chosen, choose, with_values
+from ballfg.learning.calibration.coefficients import ONE_VIEW, USUAL, Chosen, choose, with_values
 from ballfg.learning.calibration.correction import Correction, doubt_sigmas, set_doubts, with_correction, with_weights
 from ballfg.learning.calibration.groups import Groups, GroupSpin
 from ballfg.learning.calibration.population import Evidence, evidence, fit_population
+from ballfg.learning.calibration.volume import estimate_with_slopes
 from ballfg.learning.config.calibration import CalibrationConfig
-from ballfg.learning.evaluation import TrackScore, judge_track
+from ballfg.learning.config.config_file import AUTO
+from ballfg.learning.evaluation import JUDGED, TrackScore, judge_track
 from ballfg.learning.split import Split, split_tracks, tracks_of
 from ballfg.progress import Watch, unwatched
 from ballfg.tracks import Dataset
@@ -54,7 +56,7 @@ class TooManyFailures(ValueError):  # noqa: N818 - the name is the statement
 class Problem:
     """A calibration, checked and ready to start; made by `pose`. The estimator's settings are those of `predict`."""
 
-    dataset: Dataset
+    dataset: Dataset | SightedDataset
     config: CalibrationConfig
     model: AnalyticModel
     chosen: Chosen
@@ -110,12 +112,17 @@ class Step(BaseModel):
     """Scores of the judging tracks with the mean of this step; None where a track could not be judged."""
 
 
-def pose(dataset: Dataset, model: AnalyticModel, config: CalibrationConfig, jobs: int = 1) -> Problem:
+def pose(dataset: Dataset | SightedDataset, model: AnalyticModel, config: CalibrationConfig, jobs: int = 1) -> Problem:
     """Check a calibration against its data before anything starts; the model has the ball's radius.
 
     Raises: ValueError: coefficients that the model does not have or the data cannot determine, too few tracks.
     """
-    chosen = choose(model, config.coefficients)
+    if dataset.one_view and (config.kind == AUTO or config.groups is not None):
+        raise ValueError(
+            "groups and kind: auto need positions, or two cameras; one camera's spins hold errors of its depth. Write "
+            "kind: calibrate without groups."
+        )
+    chosen = choose(model, config.coefficients, ONE_VIEW if dataset.one_view else USUAL)
     split = split_tracks(dataset, config.split, config.seed, needs_spin=chosen.needs_spin)
     surfaces, settings = dataset_surfaces(dataset), dataset_settings(dataset, model)
     groups = None if config.groups is None else Groups.of(dataset, config.groups, split.fit)
@@ -229,7 +236,7 @@ def fitted_noise(
     Args: model: with the calibrated coefficients.  settings: with the population as the prior of each coefficient.
         errors: True to compute error bars, which doubles the time.
     """
-    if not model.measures_plainly:
+    if not model.measures_plainly or problem.dataset.rough:
         return None
     names = problem.split.fit
     tracks = spread_over(tracks_of(problem.dataset, names), len(names))
@@ -257,7 +264,8 @@ def _advance(problem: Problem, last: Step, watch: Watch) -> Step:
     found: tuple[GroupSpin, ...] = ()
     doubts: tuple[tuple[float, ...], ...] = ()
     if groups is None:
-        population = fit_population(evidences, chosen.start, chosen.sigma, chosen.low, chosen.high)
+        alike = np.arange(size) if problem.dataset.one_view else None  # one view does not show a spread
+        population = fit_population(evidences, chosen.start, chosen.sigma, chosen.low, chosen.high, alike=alike)
     else:
         population, by_group, found, next_track = groups.fit(evidences, [fit.name for fit in fits], chosen)
         if problem.correction is not None:
@@ -295,13 +303,18 @@ def _fit_tracks(
     tracks = tracks_of(problem.dataset, names)
     if problem.correction is not None:
         tracks = (track.opening(FIRST) for track in tracks)
-    estimates = estimate_tracks(estimator, tracks, len(names), problem.jobs)
+    estimates: Iterator[tuple[Estimate, Array | None]]
+    if problem.dataset.one_view:
+        estimates = map_tracks(partial(estimate_with_slopes, estimator, chosen.names), tracks, len(names), problem.jobs)
+    else:
+        estimates = ((one, None) for one in estimate_tracks(estimator, tracks, len(names), problem.jobs))
     fits: list[TrackFit] = []
     evidences: list[Evidence] = []
     skipped: list[tuple[str, str]] = []
-    for estimate in watch(estimates, len(names), "tracks fitted"):
+    for estimate, slopes in watch(estimates, len(names), "tracks fitted"):
         try:
             fit, found = _read(estimate, chosen, about)
+            found = found if slopes is None else replace(found, vector=found.vector - slopes)
             if groups is not None:
                 found = groups.evidence(estimate, chosen, about, spins, problem.settings.spin_prior)
         except ValueError as error:
@@ -320,7 +333,7 @@ def _fit_tracks(
 
 def _read(estimate: Estimate, chosen: Chosen, about: Array) -> tuple[TrackFit, Evidence]:
     """Posterior and likelihood of the chosen coefficients in one estimate. Raises: ValueError: if it failed."""
-    if estimate.status is not Status.OK:
+    if estimate.status not in JUDGED:
         raise ValueError(estimate.status.value)
     columns = [estimate.coefficient_names.index(name) for name in chosen.names]
     mean = estimate.coefficients[columns]

@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import torch
@@ -14,8 +15,10 @@ from ballfg.dynamics import AnalyticModel
 NEED_SPIN_LABELS = ("flight.magnus.k", "flight.spin_decay.rate")
 """Coefficients that act through the spin alone: without measured spin only their product with it is observable."""
 
-USUAL = ("flight.drag.k", "bounce.restitution.e", "bounce.table_height.offset")
+USUAL: Final = ("flight.drag.k", "bounce.restitution.e", "bounce.table_height.offset")
 """Coefficients that are calibrated if none are chosen, as far as the model has them."""
+ONE_VIEW: Final = ("flight.drag.k",)
+"""The same where one camera saw the ball: others take on errors of laws, which there pass for a depth."""
 
 
 @dataclass(frozen=True)
@@ -50,16 +53,19 @@ class Chosen:
         return any(name in NEED_SPIN_LABELS for name in self.names)
 
 
-def choose(model: AnalyticModel, names: Sequence[str] | None) -> Chosen:
-    """The coefficients of some names; None: the usual ones.
+def choose(model: AnalyticModel, names: Sequence[str] | None, usual: Sequence[str] = USUAL) -> Chosen:
+    """The coefficients of some names; None: the usual ones that the model has.
 
-    Raises: ValueError: a model without any of the usual ones, a name that the model does not have, that stands twice, or whose prior sigma is 0.
+    Raises: ValueError: a model without any of the usual ones, a name that the model does not have, that stands twice,
+        or whose prior sigma is 0.
     """
     known = model.declared_coefficients()
     if names is None:
-        names = [name for name in USUAL if name in known and known[name].sigma > 0.0]
+        names = [name for name in usual if name in known and known[name].sigma > 0.0]
         if not names:
-            raise ValueError(f"coefficients must be chosen for a model without {', '.join(USUAL)}; got none. List some.")
+            raise ValueError(
+                f"coefficients must be chosen for a model without {', '.join(usual)}; got none. List some."
+            )
     for name in names:
         if name not in known:
             hint = did_you_mean(name, known) or f" It has: {', '.join(known) or 'none'}."

@@ -19,6 +19,7 @@ from ballfg.checks import listed, shown
 from ballfg.dynamics.population import SpinGroup, SpinPopulation, launch_axes
 from ballfg.dynamics.variation import Variation
 from ballfg.estimation import Estimate, Settings
+from ballfg.estimation.observations.sighted_dataset import SightedDataset
 from ballfg.factors.loss import Loss
 from ballfg.learning.calibration.coefficients import Chosen
 from ballfg.learning.calibration.population import Evidence, Population, evidence, fit_population
@@ -80,7 +81,7 @@ class Groups:
     own: str
 
     @classmethod
-    def of(cls, dataset: Dataset, by: str, fit: Sequence[str]) -> Groups:
+    def of(cls, dataset: Dataset | SightedDataset, by: str, fit: Sequence[str]) -> Groups:
         """The groups of a dataset's fitted tracks. Raises: ValueError: if no track has the label."""
         if by not in dataset.label_names and by != OWN:
             known = listed(dataset.label_names) if dataset.label_names else "none"

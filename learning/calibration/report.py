@@ -12,6 +12,10 @@ from ballfg.learning.calibration.correction import SCALE, learned, places
 from ballfg.learning.evaluation import Summary, TrackScore, summary
 
 AXES = ("forward", "across", "up")
+SMALLEST = 1e-9
+"""m, of an error."""
+SURELY = 2.0
+"""Standard errors beyond which a model counts as worse, if one camera saw the judging tracks."""
 NEW_INFORMATION = 0.05
 """Least share by which informative data narrow the prior of a coefficient."""
 
@@ -26,6 +30,7 @@ class Comparison:
         better: number of tracks whose RMSE fell.
         pairs: (n, 2) m, RMSE before and after of each track.
         failed: number of tracks that could not be judged each time.
+        one_view: True if one camera saw the tracks: unknown depths then make most of each error.
     """
 
     before: Summary | None
@@ -35,6 +40,7 @@ class Comparison:
     better: int
     pairs: np.ndarray
     failed: int
+    one_view: bool = False
 
 
 def compare(
@@ -42,8 +48,10 @@ def compare(
     after: Sequence[TrackScore | None],
     spread: Sequence[TrackScore | None],
     noise: Sequence[TrackScore | None],
+    *,
+    one_view: bool = False,
 ) -> Comparison:
-    """Compare scores of the same tracks in the same order."""
+    """Compare scores of the same tracks in the same order, of one camera or not."""
     rows = [(b, a, s, n) for b, a, s, n in zip(before, after, spread, noise, strict=True) if b and a and s and n]
     pairs = np.array([(b.rmse, a.rmse) for b, a, *_ in rows]).reshape(-1, 2)
     return Comparison(
@@ -54,15 +62,19 @@ def compare(
         better=int((pairs[:, 1] < pairs[:, 0]).sum()),
         pairs=pairs,
         failed=len(before) - len(rows),
+        one_view=one_view,
     )
 
 
 def is_worse(comparison: Comparison) -> bool:
     """True if the model that is written, with its population and noise, predicts the judging tracks worse than before.
 
-    Without judged tracks it is not known to be.
+    Without judged tracks it is not known to be, and of one view only beyond two standard errors.
     """
-    before, written = comparison.before, comparison.with_noise
+    before, written, count = comparison.before, comparison.with_noise, len(comparison.pairs)
+    if comparison.one_view:
+        rise = np.diff(np.log(np.maximum(comparison.pairs, SMALLEST)), axis=1)
+        return count > 1 and bool(rise.mean() > SURELY * rise.std(ddof=1) / np.sqrt(count))
     return before is not None and written is not None and written.rmse_median > before.rmse_median
 
 
@@ -161,6 +173,8 @@ def verdict(problem: Problem, last: Step, comparison: Comparison) -> str:
             f"{1e3 * after.rmse_median:.1f} mm after, on {after.tracks} tracks that were not fitted; it fell on "
             f"{comparison.better} of them."
         )
+        if problem.dataset.rough:
+            sentences.append("Errors are those across the rays of the cameras' sightings.")
     if comparison.with_spread is not None:
         sentences.append(
             f"With the population as each track's prior it has {1e3 * comparison.with_spread.rmse_median:.1f} mm."

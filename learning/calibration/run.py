@@ -32,8 +32,9 @@ from ballfg.learning.config.config_file import AUTO
 from ballfg.learning.evaluation import summary
 from ballfg.learning.run import run_folder as files
 from ballfg.learning.run.record import NOT_BETTER
-from ballfg.learning.training_data import analytic_model, open_dataset
+from ballfg.learning.training_data import analytic_model, open_source
 from ballfg.progress import Watch
+from ballfg.tracks.noise import TrackNoise
 
 
 class Checkpoint(BaseModel):
@@ -63,7 +64,7 @@ def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jo
         if config.data is None:
             raise ValueError("a dataset is needed; got none. Give --data FOLDER, or 'data' in the config.")
         torch.set_num_threads(1)  # the batches are small: threads cost more than they gain
-        dataset = open_dataset(config.data)
+        dataset = open_source(config.data, config.source)
         model = analytic_model(config.model, dataset.info.ball)
         problem = pose(dataset, model, config, config.jobs or jobs)
         if not resume:
@@ -155,9 +156,11 @@ def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch)
     spread = score(problem, model, watch, population)
     shown = spread if noise is None else score(problem, model, watch, noise.settings)
     after = last.scores if problem.correction is None else spread  # a correction goes with its spins
-    comparison = compare(steps[0].scores, after, spread, shown)
+    comparison = compare(steps[0].scores, after, spread, shown, one_view=problem.dataset.one_view)
     found = report(problem, last, comparison, noise)
     model.noise = None if noise is None else noise.noise
+    if problem.dataset.one_view:  # its tracks cannot correct a drag: the model file states how sure it is
+        model.noise = TrackNoise(coefficients={name: last.next_track[k] for k, name in problem.chosen.listed})
     model.spins = population.spins
     save_model(model, folder / files.MODEL)
     files.write_json(folder / files.REPORT, found)

@@ -39,9 +39,13 @@ class CalibrationConfig(Section):
     out: str = "calibration"
     """Folder that is written. `--out` replaces it."""
 
+    source: Literal["positions", "detections"] | None = None
+    """positions: of the dataset's table of tracks. detections: the sightings of its cameras, one or more. null:
+    positions where there is a table of them."""
+
     coefficients: Coefficients | None = None
     """Calibrated parameters by name: `flight.` or `bounce.`, the effect, its coefficient. null: drag, restitution and
-    table height, as far as the model has them."""
+    table height, as far as the model has them; from one camera drag alone."""
 
     groups: str | None = None
     """Label that names a track's launcher, player, ball or session, such as `group`: the spins of each group get a

@@ -180,7 +180,8 @@ def test_bad_detections_are_refused(rig: Path, tmp_path: Path, capsys: pytest.Ca
         (("--stamps", "left=a.csv"), "--stamps must not be given with detections"),
         (("--colour", "white"), "--colour must not be given with detections"),
         (("--without", "lft"), "without must name a camera: left, middle, right; got 'lft'"),
-        (("--without", "left", "--without", "right"), "cameras must be at least 2; got 1"),
+        (tuple(word for name in ("left", "middle", "right") for word in ("--without", name)), "at least 2; got 0"),
+        (("--without", "left", "--without", "right", "--time-offsets"), "--time-offsets needs two cameras"),
         (("--ball", "squash"), "ball must be "),
     ):
         assert message in refused(capsys, *words, *options)
@@ -283,6 +284,25 @@ def test_states_and_predictions_of_what_was_filmed_agree_with_the_truth(
         soon = coming[:, 0] < coming[0, 0] + 0.1
         assert np.linalg.norm(off[soon], axis=1).max() < 0.03
         assert np.median(np.abs(off / coming[:, 4:])) < 1.5
+
+
+def test_one_camera_gives_states(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, states = tmp_path / "shots", tmp_path / "states.csv"
+    rig = [camera for camera in read_cameras(scene / "cameras.yaml") if camera.name == "right"]
+    write_cameras(tmp_path / "one.yaml", rig)
+    words = [scene / "right.mp4", "--stamps", f"right={scene}/right_stamps.csv", "--cameras", tmp_path / "one.yaml"]
+    assert status("track", *words, "--out", out, "--jobs", 1) == 0
+    said = capsys.readouterr().out
+    assert "wrote dataset.yaml, states.csv, detections.csv, cameras.yaml, overlay.mp4, contact_sheet.png" in said
+    truth, found = (numbers(path, "t", "x", "y", "z") for path in (scene / "truth.csv", out / "states.csv"))
+    assert len(truth) == len(found) == 2
+    for flown, estimated in zip(truth.values(), found.values(), strict=True):
+        error = estimated[:, 1:] - at(flown, estimated[:, 0])
+        assert np.sqrt((error**2).sum(axis=1).mean()) < 0.08
+    assert status("estimate", out, "--out", states, "--jobs", 1) == 0  # from the detections, without an option
+    again = numbers(states, "t", "x", "y", "z")
+    for name, estimated in found.items():
+        np.testing.assert_allclose(again[name], estimated, atol=1e-3)
 
 
 def at(flown: np.ndarray, times: np.ndarray) -> np.ndarray:

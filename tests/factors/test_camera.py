@@ -65,22 +65,50 @@ def test_residual_is_opencvs_whitened(offsets: bool) -> None:
         assert residual[k] @ residual[k] == pytest.approx(off @ np.linalg.solve(covariance, off), rel=1e-9)
 
 
+def radii(n: int, known: bool) -> dict[str, object]:
+    """Radii in the picture of n sightings, one of them unknown; or none."""
+    rows = np.column_stack((np.linspace(6.0, 9.0, n), np.full(n, 0.3)))
+    rows[n // 2 :: n, 0] = 0.0
+    return {"radii": rows, "ball": 0.02} if known else {}
+
+
+@pytest.mark.parametrize("known", [False, True])
 @pytest.mark.parametrize("offsets", [False, True])
 @pytest.mark.parametrize("n", [1, 7])
-def test_jacobians_agree_with_differences(n: int, offsets: bool) -> None:
+def test_jacobians_agree_with_differences(n: int, offsets: bool, known: bool) -> None:
     """Five-point differences with a step of 1e-4 m: the projection's own terms beyond them are below 1e-9."""
-    assert check_factor(*factors(n, offsets), tolerance=1e-8) < 1e-8
+    assert check_factor(*factors(n, offsets, **radii(n, known)), tolerance=1e-8) < 1e-8
 
 
+def test_a_radius_is_that_of_the_outline() -> None:
+    """The area of the projected outline of a ball gives its mean radius, to the per mille that a lens bends it."""
+    kind, values = factors(**radii(6, True))
+    residual = kind.linearize(values).residual
+    assert residual.shape == (6, 3)
+    assert residual[3, 2] == 0.0  # unknown
+    for k in (0, 1, 2, 4, 5):
+        camera, place = RIG[k % 3], values.states[k, POSITION] + kind.delay[k] * values.states[k, VELOCITY]
+        plain = Camera("plain", camera.size, camera.matrix, [], camera.rvec, camera.tvec)
+        ray = (place - camera.centre) / np.linalg.norm(place - camera.centre)
+        side = np.linalg.svd(ray[None])[2][1:]
+        turns = np.linspace(0.0, 2.0 * np.pi, 400, endpoint=False)
+        ring = place + 0.02 * (np.cos(turns)[:, None] * side[0] + np.sin(turns)[:, None] * side[1])
+        u, v = plain.project(ring).T
+        mean = np.sqrt(0.5 * abs(np.sum(u * np.roll(v, 1) - v * np.roll(u, 1))) / np.pi)
+        seen = kind.radii[k, 0] + residual[k, 2] / kind.radii[k, 1]
+        assert seen == pytest.approx(mean, rel=0.05)
+
+
+@pytest.mark.parametrize("known", [False, True])
 @pytest.mark.parametrize("offsets", [False, True])
-def test_torch_gives_the_same_residual_and_derivatives(offsets: bool) -> None:
-    kind, values = factors(offsets=offsets)
+def test_torch_gives_the_same_residual_and_derivatives(offsets: bool, known: bool) -> None:
+    kind, values = factors(offsets=offsets, **radii(6, known))
     inputs = tuple(np.array(values.gather(column)) for column in kind.variables.T)
     residual, jacobians = kind.compute(slice(None), inputs)
     tensors = tuple(torch.from_numpy(x).requires_grad_(True) for x in inputs)
     again = kind.residual(tensors)
     np.testing.assert_allclose(again.detach(), residual, atol=1e-9)
-    for axis in range(2):
+    for axis in range(kind.dim):
         slopes = torch.autograd.grad(again[:, axis].sum(), tensors, retain_graph=True)
         for slope, jacobian in zip(slopes, jacobians, strict=True):
             np.testing.assert_allclose(slope, jacobian[:, axis], atol=1e-8)

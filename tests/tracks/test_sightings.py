@@ -60,6 +60,8 @@ def test_arrays_are_copies() -> None:
         ({"pixels": "here"}, "pixels must be an array of numbers"),
         ({"covariances": np.tile([[1.0, 2.0], [2.0, 1.0]], (6, 1, 1))}, r"positive definite; covariances\[0\]"),
         ({"covariances": np.tile([[1.0, 0.1], [0.2, 1.0]], (6, 1, 1))}, "must be symmetric"),
+        ({"radii": np.ones((6, 1))}, r"radii must have shape \(6, 2\)"),
+        ({"radii": np.tile([5.0, 0.0], (6, 1))}, r"a sigma above zero, in px; radii\[0\]=\[5.0, 0.0\]"),
     ],
 )
 def test_refuses(changes: dict[str, object], message: str) -> None:
@@ -79,6 +81,21 @@ def test_file_gives_back_what_was_written(tmp_path: Path) -> None:
         np.testing.assert_array_equal(read[name].times, ball.times[order])
         np.testing.assert_array_equal(read[name].pixels, ball.pixels[order])
         np.testing.assert_allclose(read[name].covariances, ball.covariances[order], rtol=1e-14)
+
+
+def test_radii_are_kept_and_unknown_ones_may_be_zero(tmp_path: Path) -> None:
+    radii = np.column_stack((np.array([5.0, 6.0, 0.0, 7.5, 8.0, 9.0]), np.full(6, 0.3)))
+    ball = sightings(radii=radii)
+    np.testing.assert_array_equal(ball.select(np.array([1, 2])).radii, radii[1:3])
+    write_sightings(tmp_path / "detections.csv", [("a", ball)])
+    read, notes = read_sightings(tmp_path / "detections.csv", OFFSETS)
+    assert notes == []
+    assert read["a"].radii is not None
+    np.testing.assert_array_equal(np.sort(read["a"].radii, axis=0), np.sort(radii, axis=0))
+    text = (tmp_path / "detections.csv").read_text().replace(",9.0,", ",-9.0,").replace(",9,", ",-9,")
+    (tmp_path / "detections.csv").write_text(text)
+    with pytest.raises(ValueError, match=r"column 'radius': must be 0 \(unknown\) to 1000000 px; got -9"):
+        read_sightings(tmp_path / "detections.csv", OFFSETS)
 
 
 def test_rows_are_put_in_order_of_true_time(tmp_path: Path) -> None:

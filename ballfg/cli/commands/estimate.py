@@ -93,14 +93,12 @@ class _Estimated:
 
 def _estimated(model: BallModel, estimator: Estimator, track: Track) -> _Estimated:
     from ballfg.estimation.out_of_distribution import out_of_distribution
-    from ballfg.state import SIGMA_NAMES, STATE_NAMES
 
     columns, shares, notes, rows, hits = [], list[float](), list[str](), 0, 0
     status = None
     for part in estimator.in_sections(track):
         share = out_of_distribution(model, part.states)
-        own: dict[str, str | np.ndarray] = {"trajectory": part.name, "t": part.times}
-        own |= dict(zip(STATE_NAMES, part.states.T, strict=True)) | dict(zip(SIGMA_NAMES, part.sigmas.T, strict=True))
+        own: dict[str, str | np.ndarray] = {"trajectory": part.name, **part.columns}
         columns.append(own if share is None else own | {"outside": share})
         shares += [] if share is None else [float(share.sum())]
         notes += part.notes

@@ -16,8 +16,10 @@ from ballfg.cli.inputs import print_notes
 from ballfg.progress import progress
 
 if TYPE_CHECKING:
+    from ballfg.arrays import Array
     from ballfg.dynamics import AnalyticModel, Surfaces
     from ballfg.vision import Camera
+    from ballfg.vision.detection.detections import Detections
     from ballfg.vision.detection.detector import Colour as BallColour
     from ballfg.vision.tracking.dataset import Streams
     from ballfg.vision.tracking.pipeline import Tracking
@@ -63,17 +65,21 @@ def track(
 
     Example: ballfg track left.mp4 middle.mp4 right.mp4 --cameras cameras.yaml --out shots
 
-    The dataset holds tracks.csv, detections.csv (all candidates) and cameras.yaml.
+    The dataset holds tracks.csv, detections.csv (all candidates) and cameras.yaml; of one camera states.csv in place of
+    tracks.csv.
     overlay.mp4 shows the views with what was found, contact_sheet.png each track.
     """
     # FFmpeg and OpenCV print messages on a file, unless switched off before the import of OpenCV.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    from ballfg.estimation.one_camera import track_one_camera
     from ballfg.files.whole_folder import reserved
     from ballfg.simulation.balls import ball_kind
     from ballfg.tracks.info import DatasetInfo
     from ballfg.vision.camera_file import read_cameras
+    from ballfg.vision.detection.detections_table import read_detections
     from ballfg.vision.tracking.dataset import check_result_folder, write_tracking
+    from ballfg.vision.tracking.pipeline import check_rig, track_detections
     from ballfg.vision.tracking.recordings import without as others
     from ballfg.vision.tracking.report import blind_cameras, disagreement, no_ball, summary
 
@@ -84,25 +90,37 @@ def track(
         files = " ".join(Path(text).name for text in recordings)
         info = DatasetInfo(name or out.resolve().name, height, kind.ball, source=f"ballfg track {files}")
         rig = others(read_cameras(cameras), without or ())
+        surfaces = replace(kind.surfaces, table_height=height)
+        if len(rig) != 1:
+            check_rig(rig)
+        elif time_offsets:
+            raise ValueError("--time-offsets needs two cameras: they are relative to the first. Leave it out.")
         streams: Streams | None = None
         if len(recordings) == 1 and recordings[0].lower().endswith(".csv"):
             _refuse(stamps=stamps, colour=colour, detector=detector)
-            tracking = _from_table(Path(recordings[0]), rig, without or ())
+            detections, notes = read_detections(Path(recordings[0]), rig, without or ())
+            print_notes(notes)
         else:
-            tracking, streams = _from_videos(recordings, rig, stamps or (), colour, detector, jobs, without or ())
+            detections, streams = _from_videos(recordings, rig, stamps or (), colour, detector, jobs, without or ())
+        states: list[dict[str, Array]] | None = None
+        if len(rig) == 1:
+            strokes = track_one_camera(detections[0], rig[0], kind.model, surfaces, watch=progress)
+            tracking, states = strokes.tracking, [estimate.columns for estimate in strokes.estimates]
+            info = replace(info, table_extent=surfaces.extent)
+        else:
+            tracking = track_detections(detections, rig)
         if time_offsets and tracking.balls:
-            tracking = _on_one_clock(tracking, kind.model, replace(kind.surfaces, table_height=height))
+            tracking = _on_one_clock(tracking, kind.model, surfaces)
         print_notes(blind_cameras(tracking))
         if (doubt := disagreement(tracking)) is not None:
             print_notes([doubt])
         info = replace(info, rate=tracking.rate)
         written = write_tracking(
-            out, tracking, info, table=kind.surfaces.extent, streams=streams, overlay=overlay, watch=progress
+            out, tracking, info, table=surfaces.extent, streams=streams, states=states, overlay=overlay, watch=progress
         )
         if not tracking.balls:
-            raise ValueError(
-                f"{no_ball(tracking)} {out} holds an empty dataset; look at {', '.join(written[4:])} there."
-            )
+            pictures = [one for one in written if not one.endswith((".csv", ".yaml"))]
+            raise ValueError(f"{no_ball(tracking)} {out} holds an empty dataset; look at {', '.join(pictures)} there.")
         points = sum(len(ball.times) for ball in tracking.balls)
         print(f"{out}: {len(tracking.balls)} tracks of {points} points; wrote {', '.join(written)}")
         print(*summary(tracking), sep="\n")
@@ -125,12 +143,12 @@ def _from_videos(
     detector: str | None,
     jobs: int | None,
     without: Sequence[str],
-) -> tuple[Tracking, Streams]:
+) -> tuple[list[Detections], Streams]:
     """The detections, and a function that gives each video's frames again."""
     from ballfg.vision.detection.detect import learn_detector, load_detector
     from ballfg.vision.detection.detector import DetectorSettings
     from ballfg.vision.detection.video import open_video
-    from ballfg.vision.tracking.pipeline import track_videos
+    from ballfg.vision.tracking.pipeline import detect_videos
     from ballfg.vision.tracking.recordings import match_videos, stamp_files
 
     videos, files = match_videos(recordings, rig, without), stamp_files(stamps, rig)
@@ -138,8 +156,8 @@ def _from_videos(
         raise ValueError("--colour must not be given with --detector: it is about ballfg's own. Leave one of them out.")
     settings = DetectorSettings(colour=cast("BallColour | None", colour))
     make = partial(learn_detector, settings=settings) if detector is None else load_detector(detector)
-    tracking = track_videos(videos, rig, make, stamps=files, jobs=jobs or len(rig), watch=progress)
-    return tracking, [open_video(path, files.get(name)).frames for name, path in videos.items()]
+    found = detect_videos(videos, rig, make, stamps=files, jobs=jobs or len(rig), watch=progress)
+    return found, [open_video(path, files.get(name)).frames for name, path in videos.items()]
 
 
 def _on_one_clock(tracking: Tracking, model: AnalyticModel, surfaces: Surfaces) -> Tracking:
@@ -162,12 +180,3 @@ def _on_one_clock(tracking: Tracking, model: AnalyticModel, surfaces: Surfaces) 
         late = f"{1e3 * camera.time_offset:.3f} ± {1e3 * sigma:.3f} ms"
         print(f"  {camera.name}: stamps late by {late} against {found.cameras[0].name}")
     return corrected
-
-
-def _from_table(path: Path, rig: Sequence[Camera], without: Sequence[str]) -> Tracking:
-    from ballfg.vision.detection.detections_table import read_detections
-    from ballfg.vision.tracking.pipeline import track_detections
-
-    detections, notes = read_detections(path, rig, without)
-    print_notes(notes)
-    return track_detections(detections, rig)

@@ -36,6 +36,8 @@ RESTITUTION_SIGMA: Final = 0.15
 """m/s, of the vertical velocity after a bounce."""
 PLANE_SIGMA: Final = 1e-3
 """m, of the height at which a ball bounces."""
+LAWS: Final = 5e-3
+"""m, standard deviation of the ball's place about a path of these laws, which leave out spin."""
 PRICE: Final = 10.0
 """Twice the log likelihood that a bounce must gain over a path without it."""
 BETTER: Final = 1.15
@@ -169,10 +171,11 @@ def _solved(scene: _Scene, times: Array, bounces: int) -> _Paths:
     rays, physics = scene.rays, scene.physics
     k, m, size = len(times), len(rays.times), 3 * (bounces + 2)
     drag, depth, weight = np.zeros((k, bounces + 1)), np.ones((k, m)), np.ones((k, m))
+    precision = LAWS**2 * np.linalg.det(rays.root)  # (m,) of a sighting, at 1 m, beside that of the laws
     for _ in range(ROUNDS):
         prior, target = _priors(scene, times, bounces, drag)
         share, drop = _shares(rays.times[None], times, bounces, drag, physics.gravity)
-        root = rays.root / depth[..., None, None]
+        root = rays.root / np.sqrt(depth**2 + precision)[..., None, None]
         seen = (root @ rays.matrix)[:, :, :, None, :] * share[:, :, None, :, None]
         seen = seen.reshape(k, 2 * m, size)
         wanted = (root @ (rays.target + rays.matrix[..., Z] * drop[..., None])[..., None]).reshape(k, 2 * m)

@@ -25,7 +25,7 @@ class SightedDataset(TrackFolder):
 
     Attributes:
         path: the folder.  info: what `dataset.yaml` states.  cameras: of the rig.
-        notes: ignored rows and balls, one sentence each.
+        notes: ignored rows and balls, one sentence each.  label_names: of the labels, in the order of `labels.csv`.
 
     Raises: ValueError: cameras with numbers that no lens has.
     """
@@ -46,6 +46,7 @@ class SightedDataset(TrackFolder):
         notes: list[str],
     ) -> None:
         self.path, self.info, self.cameras, self.notes = path, info, cameras, notes
+        self.label_names = labels.names
         self._tracks = {}
         model = nominal_model(info.ball)
         surfaces = replace(Surfaces.table_tennis(info.table_height), extent=info.table_extent)
@@ -57,6 +58,7 @@ class SightedDataset(TrackFolder):
                 notes.append(str(error))
             except ValueError as error:  # cameras at one point, or with numbers that no lens has
                 raise ValueError(f"{path}: {error} Look at {CAMERAS_FILE}.") from None
+        self.one_view = all(track.one_view for track in self)
 
     def __len__(self) -> int:
         return len(self._tracks)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from itertools import combinations
 from typing import ClassVar, Final, cast
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array, Index
@@ -19,6 +19,7 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.observation import Context, Observation, Unknowns
 from ballfg.estimation.observations.one_view import OneView, one_view, place_prior
 from ballfg.estimation.observations.ray_path import Rays, determined, filled, rough_path
+from ballfg.estimation.observations.rig import cameras_of, check_apart, in_order, true_times_of
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.segmentation.result import Contact, Quality, Segmentation
@@ -45,8 +46,6 @@ LEAST_SEEN: Final = 5
 """Least number of sightings from one point: a flight has six unknowns, and noise must show."""
 LOOSE_DEPTH: Final = 0.5
 """m, standard deviation of the depth from which the status of an estimate says so."""
-APART: Final = 0.01
-"""m. Least distance of two cameras: rays from one point do not meet anywhere else, and count twice."""
 
 
 class TooFewSightingsError(ValueError):
@@ -105,7 +104,8 @@ class CameraSightings(Observation):
         columns = np.array([context.columns.get(name, FIXED) for name in names])
         seen, unknown = self.sightings, columns if (columns != FIXED).any() else None
         measured, loss = (seen.camera, seen.pixels, seen.covariances), context.settings.sighting_loss
-        return CameraFactors(self.state, *measured, _bank(self.cameras), self.delay, unknown, loss)
+        radius = (seen.radii, context.model.radius)
+        return CameraFactors(self.state, *measured, _bank(self.cameras), self.delay, unknown, loss, *radius)
 
     def unknowns(self, settings: Settings) -> Unknowns:
         """The time offsets that the settings name, s, each counted from that of its camera.
@@ -172,6 +172,23 @@ class CameraSightings(Observation):
         own = CameraSightings(*arrays, one_view=True, bounces=found.contacts(track.times), place=place)
         seen = tuple(own if other is self else other for other in track.observations)
         return replace(track, positions=found.path.positions, sigmas=found.path.sigmas, observations=seen)
+
+    def across(self, first: int, positions: Array, covariances: Array) -> tuple[Array, Array]:
+        """Errors of positions across the rays of the sightings, with their standard deviations.
+
+        Args:
+            first: index of the sample of the first position; the others follow.
+            positions: (k, 3) m.  covariances: (k, 3, 3) m^2.
+        Returns: (m, 2) m each, of the m sightings of those samples: along u and v, at the depth of the position; NaN
+            behind a camera. The deviations include the noise of the sightings.
+        """
+        rows = (self.state >= first) & (self.state < first + len(positions))
+        state, seen = self.state[rows] - first, self.sightings.select(rows)
+        points, camera = torch.from_numpy(positions[state]), torch.from_numpy(seen.camera)
+        pixels, slope = (tensor.numpy() for tensor in _bank(self.cameras).jacobian(points, camera))
+        spread = slope @ covariances[state] @ slope.swapaxes(1, 2) + seen.covariances
+        scale = np.sqrt(2.0) / np.linalg.norm(slope, axis=(1, 2))[:, None]  # m for a pixel
+        return scale * (pixels - seen.pixels), scale * np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
 
     def priors(self) -> list[FactorBatch]:
         """The prior of the first position of a track that one camera saw: rays alone leave its distance open."""
@@ -273,40 +290,6 @@ def sighted_track(
     seen = CameraSightings(sightings, rig, state, times - moments[state], np.zeros(len(rig)), alone)
     stamps = written(moments, origin)
     return Track(stamps, path.positions, path.sigmas, dict(labels or {}), observations=(seen,), rough=True, name=name)
-
-
-def check_apart(cameras: Sequence[Camera]) -> None:
-    """Refuses cameras that stand at one point. Raises: ValueError: naming two of them."""
-    for one, other in combinations(cameras, 2):
-        if np.linalg.norm(one.centre - other.centre) < APART:
-            raise ValueError(
-                f"cameras must stand apart; {shown(one.name)} and {shown(other.name)} share a centre, so that together "
-                "they see no more than one. Leave one of them out, or correct its pose."
-            )
-
-
-def cameras_of(sightings: Sightings, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
-    """The cameras that sightings name, in their order. Raises: ValueError: if one is missing."""
-    known = {camera.name: camera for camera in cameras}
-    for name in sightings.cameras:
-        if name not in known:
-            raise ValueError(
-                f"cameras must hold every camera of the sightings; {shown(name)} is missing among {listed(known)}. "
-                "Add it to cameras.yaml, or leave its sightings out."
-            )
-    return tuple(known[name] for name in sightings.cameras)
-
-
-def true_times_of(sightings: Sightings, cameras: Sequence[Camera]) -> Array:
-    """(m,) s, true times of sightings: stamps less the time offsets of the cameras, in the order of their numbers."""
-    offsets = np.array([camera.time_offset for camera in cameras])
-    return np.asarray(sightings.times - offsets[sightings.camera])
-
-
-def in_order(sightings: Sightings, cameras: Sequence[Camera]) -> Sightings:
-    """The sightings in order of true time, by the cameras' time offsets."""
-    times = true_times_of(sightings, cameras_of(sightings, cameras))
-    return sightings.select(np.argsort(times, kind="stable"))
 
 
 @lru_cache(maxsize=64)

@@ -100,8 +100,7 @@ class Smoother(Estimator):
             return joined
         smoother = self.first_look() if moving else self
         for _ in range(OFFSET_ROUNDS):
-            problem, *rivals = smoother.problems(track.since_first())
-            problem, solution = smoother.lowest(problem, smoother.settle(problem), rivals)
+            problem, solution = smoother.solved(track.since_first())
             found = smoother.result(problem, solution)
             estimate = found.dated(track.times)
             if not moving or estimate.status.failed:
@@ -157,6 +156,14 @@ class Smoother(Estimator):
         for observation in track.observations:
             starts = [start for one in starts for start in observation.starts(one, self.model, self.surfaces)]
         return [self.problem(start) for start in starts]
+
+    def solved(self, track: Track) -> tuple[TrackProblem, Solution]:
+        """The problem with the lowest minimum among those of a track's starts, and its solution.
+
+        Args: track: prepared, with stamps since its first.
+        """
+        problem, *rivals = self.problems(track)
+        return self.lowest(problem, self.settle(problem), rivals)
 
     def lowest(
         self, problem: TrackProblem, solution: Solution, rivals: Iterable[TrackProblem]

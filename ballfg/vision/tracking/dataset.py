@@ -1,12 +1,13 @@
 """Writes the tracking as a dataset with pictures, all files or none."""
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
+from ballfg.arrays import Array
 from ballfg.files.whole_folder import check_replaceable, whole_folder
 from ballfg.progress import Watch, unwatched
 from ballfg.tracks import TableWriter, write_dataset
@@ -24,7 +25,8 @@ Streams = Sequence[Callable[[], Iterator[tuple[float, Image]]]]
 TRACKS: Final = "tracks.csv"
 OVERLAY: Final = "overlay.mp4"
 SHEET: Final = "contact_sheet.png"
-FILES: Final = (INFO_FILE, TRACKS, DETECTIONS_FILE, CAMERAS_FILE, OVERLAY, SHEET)  # all written files
+STATES: Final = "states.csv"
+FILES: Final = (INFO_FILE, TRACKS, STATES, DETECTIONS_FILE, CAMERAS_FILE, OVERLAY, SHEET)  # all written files
 
 
 def check_result_folder(folder: Path, inputs: Sequence[Path], *, force: bool) -> None:
@@ -47,6 +49,7 @@ def write_tracking(
     *,
     table: Extent | None = None,
     streams: Streams | None = None,
+    states: Sequence[Mapping[str, Array]] | None = None,
     overlay: bool = True,
     watch: Watch = unwatched,
 ) -> list[str]:
@@ -60,12 +63,20 @@ def write_tracking(
         info: the content of dataset.yaml.
         table: (x_low, x_high, y_low, y_high) m, drawn in the contact sheet; None where it is not known.
         streams: the videos; None where there are none: then there is no overlay, and the sheet has no pictures.
+        states: columns (n,) of each ball's states, those of `ballfg estimate` in SI units; then states.csv takes the
+            place of tracks.csv: the depth of points that one camera saw is no measurement.
         watch: sees the frames of the overlay that are drawn.
     Returns: the names of the files.
     Raises: OSError: something cannot be written. ValueError: a track that breaks a rule of datasets.
     """
     with whole_folder(folder, earlier=FILES) as stage:
-        if tracking.balls:
+        if states is not None:
+            write_info(stage / INFO_FILE, info)
+            if states:
+                with TableWriter(stage / STATES) as table_of_states:
+                    for name, columns_of_ball in zip(tracking.names, states, strict=True):
+                        table_of_states.write({KEY: name, **columns_of_ball})
+        elif tracking.balls:
             write_dataset(stage, info, tracking.tracks)
         else:
             write_info(stage / INFO_FILE, info)

@@ -101,9 +101,22 @@ def track_videos(
     Raises: FileNotFoundError: a file is missing. ValueError: as `open_video`, `check_sizes` and `track_detections`.
     """
     check_rig(cameras)
+    found = detect_videos(videos, cameras, make, stamps=stamps, jobs=jobs, watch=watch)
+    return track_detections(found, cameras, settings)
+
+
+def detect_videos(
+    videos: Mapping[str, Path],
+    cameras: Sequence[Camera],
+    make: Callable[[Video], Detector] = learn_detector,
+    *,
+    stamps: Mapping[str, Path] | None = None,
+    jobs: int = 1,
+    watch: Watch = unwatched,
+) -> list[Detections]:
+    """The candidates in the videos of one or more cameras; arguments and errors as of `track_videos`."""
     check_sizes({name: open_video(path, (stamps or {}).get(name)).size for name, path in videos.items()}, cameras)
-    found = detect_all(videos, make, stamps=stamps, jobs=jobs, watch=watch)
-    return track_detections(list(found.values()), cameras, settings)
+    return list(detect_all(videos, make, stamps=stamps, jobs=jobs, watch=watch).values())
 
 
 def track_detections(
@@ -130,8 +143,8 @@ def check_rig(cameras: Sequence[Camera]) -> None:
     """Refuses too few cameras. Raises: ValueError."""
     if len(cameras) < FEWEST:
         raise ValueError(
-            f"cameras must be at least {FEWEST}; got {len(cameras)}. For one camera name the ball of each row of "
-            "detections.csv in its column 'trajectory' and run 'ballfg estimate FOLDER --from detections'."
+            f"cameras must be at least {FEWEST}; got {len(cameras)}. For one camera run 'ballfg track', or "
+            "track_one_camera of ballfg.estimation.one_camera."
         )
 
 

@@ -12,7 +12,8 @@ import torch
 
 from ballfg.dynamics import AnalyticModel, Surfaces, nominal_model
 from ballfg.dynamics.motion.rollout import advance
-from ballfg.estimation.observations.sightings import in_order, sighted_track
+from ballfg.estimation.observations.rig import in_order
+from ballfg.estimation.observations.sightings import sighted_track
 from ballfg.tracks import Track
 from ballfg.tracks.sightings import Sightings
 from ballfg.vision.camera import Camera

@@ -114,6 +114,22 @@ def test_states_and_bounces_against_the_truth(ball: World) -> None:
     assert np.mean(inside) > 0.84
 
 
+def test_the_balls_radius_shows_its_depth(ball: World) -> None:
+    """Radii known to 0.05 px at 4.5 m, beside pixels of 2 px, lower the errors."""
+    estimator, errors = Smoother(ball.model, ball.surfaces), []
+    for seed in range(8):
+        times, states = stroke(ball, seed)
+        seen = pixels_of(states[:, :3], times, SIDE, 2.0, seed)
+        true = 1000.0 * 0.02 / SIDE.depth(states[:, :3])
+        noise = 0.05 * np.random.default_rng(seed).standard_normal(len(times))
+        known = replace(seen, radii=np.column_stack((true + noise, np.full(len(times), 0.05))))
+        both = [estimator.estimate(sighted_track("a", one, [SIDE])) for one in (seen, known)]
+        assert both[1].whitened.shape == (len(times), 3)
+        errors.append([np.sqrt(((one.states[:, :3] - states[:, :3]) ** 2).sum(axis=1).mean()) for one in both])
+    plain, better = np.median(errors, axis=0)
+    assert better < 0.8 * plain
+
+
 def test_covariances_are_honest() -> None:
     """NEES of flights with one to three bounces and the process noise that the settings state, spins labelled."""
     tracks, noise = 16, 1.0

@@ -10,7 +10,8 @@ from scipy.stats import chi2
 
 from ballfg.estimation.measurement.position_noise import estimate_position_noise
 from ballfg.estimation.observations.ray_path import BEFORE, SPEED, SPREAD, Rays, _robust, rough_path
-from ballfg.estimation.observations.sightings import SAME_MOMENT, in_order, sighted_track, sightings_of
+from ballfg.estimation.observations.rig import in_order
+from ballfg.estimation.observations.sightings import SAME_MOMENT, sighted_track, sightings_of
 from ballfg.estimation.registry import make_estimator
 from ballfg.estimation.result import Status
 from ballfg.estimation.settings import Settings
