@@ -44,7 +44,8 @@ from ballfg.tracks import Dataset
 from ballfg.tracks.noise import TrackNoise
 
 ROUGHLY: Final = 0.3
-"""Tolerance of a correction at least: its weights move slowly along directions that hardly change a prediction."""
+"""Least tolerance of a correction, whose weights move slowly along directions that hardly change a prediction, and of a
+comparison."""
 
 
 class TooManyFailures(ValueError):  # noqa: N818 - the name is the statement
@@ -269,7 +270,8 @@ def fitted_noise(
     names = problem.split.fit
     tracks = spread_over(tracks_of(problem.dataset, names), len(names))
     known = problem.dataset.info.position_noise is not None
-    found = estimate_noise(model, problem.surfaces, settings, tracks, position_known=known, errors=errors, watch=watch)
+    how = {"position_known": known, "errors": errors, "watch": watch, "jobs": problem.jobs}
+    found = estimate_noise(model, problem.surfaces, settings, tracks, **how)
     return found if found is None or problem.correction is None else _with_doubts(found)
 
 

@@ -101,7 +101,8 @@ def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jo
         if resume:
             files.start(folder, config)
         try:
-            _steps(problem, calibrated, folder, watch)
+            if last is None or not problem.config.correction:
+                _steps(problem, calibrated, folder, watch)
             if not problem.config.correction:
                 return _finish(problem, calibrated, folder, watch)
             if last is None:

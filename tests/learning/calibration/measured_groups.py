@@ -29,7 +29,7 @@ from ballfg.learning.calibration.auto import (
     CORRECTED,
     GROUPED,
     NOMINAL,
-    UNLEARNED,
+    Fitted,
     choose_candidate,
     config_of,
 )
@@ -82,39 +82,42 @@ class Halves:
             write_dataset(Path(written) / "data", self.info, tracks)
             dataset, model = read_dataset(Path(written) / "data"), nominal_model(self.info.ball)
             problem = pose(dataset, model, CalibrationConfig(split="label"))
-            return {kind: _errors(problem, *fitted(problem, kind), self.judge) for kind in kinds}
+            return {kind: errors(problem, *fitted(problem, kind), self.judge) for kind in kinds}
 
 
 def fitted(problem: Problem, kind: str) -> tuple[AnalyticModel, Settings]:
     """The model and settings of a kind, with the noise that the fitted tracks show."""
     begun = time.process_time()
-    found = {}
     if kind == AUTO:
         choice, found = choose_candidate(problem)
         print(choice.table(), choice.verdict(), sep="\n")
-        kind = choice.chosen
-    if kind in UNLEARNED:
-        if kind == NOMINAL:
-            problem = replace(problem, settings=replace(problem.settings, coefficients={}))
-        model, settings = problem.model, problem.settings
+        made = found.get(choice.chosen, choice.chosen)
     else:
-        if kind in found:
-            problem, last = found[kind].problem, found[kind].steps[-1]
-        else:
-            config = problem.config
-            problem = pose(problem.dataset, problem.model, config_of(config, kind))
-            problem = with_shown_noise(replace(problem, split=replace(problem.split, judge=())))
-            *_, last = calibrate(problem)
-            if kind == CORRECTED:
-                problem = pose_correction(problem, last)
-                *_, last = calibrate(problem)
-        model, settings = population_model(problem, last), population_settings(problem, last)
-    noise = fitted_noise(problem, model, settings, errors=False)
+        alone = pose(problem.dataset, problem.model, config_of(problem.config, kind))
+        alone = with_shown_noise(replace(alone, split=replace(alone.split, judge=())))
+        made = Fitted(alone, tuple(calibrate(alone)))
+        if kind == CORRECTED:
+            alone = pose_correction(alone, made.steps[-1])
+            made = Fitted(alone, tuple(calibrate(alone)))
+    model, settings = finished(problem, made)
     print(f"{time.process_time() - begun:.0f} s of processor time")
+    return model, settings
+
+
+def finished(problem: Problem, made: Fitted | str) -> tuple[AnalyticModel, Settings]:
+    """The model and settings of a calibration, or of a candidate without one, with the noise that the tracks show."""
+    if isinstance(made, Fitted):
+        problem, last = made.problem, made.steps[-1]
+        model, settings = population_model(problem, last), population_settings(problem, last)
+    else:
+        model, settings = problem.model, problem.settings
+        settings = replace(settings, coefficients={}) if made == NOMINAL else settings
+    noise = fitted_noise(problem, model, settings, errors=False)
     return model, settings if noise is None else noise.settings
 
 
-def _errors(problem: Problem, model: AnalyticModel, settings: Settings, judged: Sequence[Track]) -> Array:
+def errors(problem: Problem, model: AnalyticModel, settings: Settings, judged: Sequence[Track]) -> Array:
+    """As `Halves.judged`."""
     estimator = make_estimator("smoother", model, problem.surfaces, settings)
     rows = []
     for one in predict_tracks(estimator, judged, len(judged), 0.25, horizon=0.3):
