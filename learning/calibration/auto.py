@@ -18,7 +18,6 @@ from ballfg.arrays import Array
 from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.estimation.noise.parameters import with_noise
 from ballfg.learning.calibration.calibrate import (
-    ROUGHLY,
     Linear,
     Problem,
     Step,
@@ -120,8 +119,7 @@ def choose_candidate(problem: Problem, watch: Watch = unwatched) -> tuple[Choice
     fitted = problem.split.fit
     if len(fitted) < LEAST:
         raise ValueError(f"kind: auto needs {LEAST} tracks to fit; got {len(fitted)}. Add some, or write calibrate.")
-    roughly = problem.config.model_copy(update={"tolerance": max(problem.config.tolerance, ROUGHLY)})
-    problem = replace(problem, config=roughly, split=replace(problem.split, judge=()))
+    problem = replace(problem, split=replace(problem.split, judge=()))
     plain = replace(problem, config=config_of(problem.config, CALIBRATED), groups=None)
     config = config_of(problem.config, GROUPED)
     assert config.groups is not None

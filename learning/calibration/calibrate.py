@@ -44,8 +44,9 @@ from ballfg.tracks import Dataset
 from ballfg.tracks.noise import TrackNoise
 
 ROUGHLY: Final = 0.3
-"""Least tolerance of a correction, whose weights move slowly along directions that hardly change a prediction, and of a
-comparison."""
+"""Tolerance of a correction at least: its weights move slowly along directions that hardly change a prediction."""
+FIRST: Final = 0.75
+"""s, the part of each track that teaches a correction: later on contacts say more than the air does."""
 
 
 class TooManyFailures(ValueError):  # noqa: N818 - the name is the statement
@@ -335,6 +336,8 @@ def linearised(problem: Problem, last: Step, watch: Watch = unwatched) -> Linear
     settings = replace(settings, coefficients=priors)
     estimator = problem.estimator(about, settings if groups is None else groups.wide(settings, spins))
     tracks = tracks_of(problem.dataset, names)
+    if problem.correction is not None:
+        tracks = (track.opening(FIRST) for track in tracks)
     estimates = estimate_tracks(estimator, tracks, len(names), problem.jobs)
     fits: list[TrackFit] = []
     evidences: list[Evidence] = []

@@ -107,3 +107,7 @@ def main() -> None:
     if rows:
         print("means of: error of the corrected model and of auto's over the true dynamics', drag and lift in band, %")
         print(" ".join(f"{value:.2f}" for value in np.mean(rows, axis=0)))
+
+
+if __name__ == "__main__":
+    main()

@@ -26,30 +26,22 @@ from ballfg.estimation import Settings, Status, predict_tracks
 from ballfg.estimation.registry import make_estimator
 from ballfg.learning.calibration.auto import (
     CALIBRATED,
-    CORRECTED,
-    GROUPED,
     NOMINAL,
     Fitted,
     choose_candidate,
-    config_of,
 )
 from ballfg.learning.calibration.calibrate import (
     Problem,
-    calibrate,
     fitted_noise,
     population_model,
     population_settings,
     pose,
-    pose_correction,
-    with_shown_noise,
 )
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.config_file import AUTO
 from ballfg.learning.evaluation import NINETY, log_density
 from ballfg.tracks import Track, read_dataset, write_dataset
 from ballfg.tracks.info import DatasetInfo
-
-KINDS = (CALIBRATED, GROUPED, CORRECTED, AUTO)
 
 
 @dataclass(frozen=True)
@@ -68,7 +60,7 @@ class Halves:
         until = (shot.track.until(float(shot.track.times[shot.judged - 1])) for shot in judge)
         return cls(task.info, tuple(shot.track for shot in train), tuple(until))
 
-    def judged(self, chosen: Sequence[int], kinds: Sequence[str]) -> dict[str, Array]:
+    def judged(self, chosen: Sequence[int]) -> dict[str, Array]:
         """(n, 5) RMSE, mm, log score, and share in 90 % intervals by axis, %, of the judging tracks, by kind.
 
         Args: chosen: numbers of the training tracks.
@@ -82,26 +74,14 @@ class Halves:
             write_dataset(Path(written) / "data", self.info, tracks)
             dataset, model = read_dataset(Path(written) / "data"), nominal_model(self.info.ball)
             problem = pose(dataset, model, CalibrationConfig(split="label"))
-            return {kind: errors(problem, *fitted(problem, kind), self.judge) for kind in kinds}
-
-
-def fitted(problem: Problem, kind: str) -> tuple[AnalyticModel, Settings]:
-    """The model and settings of a kind, with the noise that the fitted tracks show."""
-    begun = time.process_time()
-    if kind == AUTO:
-        choice, found = choose_candidate(problem)
-        print(choice.table(), choice.verdict(), sep="\n")
-        made = found.get(choice.chosen, choice.chosen)
-    else:
-        alone = pose(problem.dataset, problem.model, config_of(problem.config, kind))
-        alone = with_shown_noise(replace(alone, split=replace(alone.split, judge=())))
-        made = Fitted(alone, tuple(calibrate(alone)))
-        if kind == CORRECTED:
-            alone = pose_correction(alone, made.steps[-1])
-            made = Fitted(alone, tuple(calibrate(alone)))
-    model, settings = finished(problem, made)
-    print(f"{time.process_time() - begun:.0f} s of processor time")
-    return model, settings
+            begun = time.process_time()
+            choice, candidates = choose_candidate(problem)
+            print(choice.table(), choice.verdict(), sep="\n")
+            print(f"{time.process_time() - begun:.0f} s of processor time", flush=True)
+            found = {name: errors(problem, *finished(problem, one), self.judge) for name, one in candidates.items()}
+            if choice.chosen not in found:
+                found[choice.chosen] = errors(problem, *finished(problem, choice.chosen), self.judge)
+            return found | {AUTO: found[choice.chosen]}
 
 
 def finished(problem: Problem, made: Fitted | str) -> tuple[AnalyticModel, Settings]:
@@ -136,8 +116,9 @@ def few(halves: Halves, size: int, draws: int, seed: int) -> str:
     rng, gains = np.random.default_rng([seed, size]), []
     for _ in range(draws):
         chosen = np.sort(rng.permutation(len(halves.train))[:size]).tolist()
-        found = halves.judged(chosen, (CALIBRATED, AUTO))
+        found = halves.judged(chosen)
         gains.append(np.nanmean(found[AUTO] - found[CALIBRATED], axis=0)[1])
+        print(f"{gains[-1]:+.3f}", flush=True)
     error = np.std(gains, ddof=1) / np.sqrt(draws) if draws > 1 else np.nan
     worst = f"least {min(gains):+.3f}, largest {max(gains):+.3f}"
     return (
@@ -152,7 +133,6 @@ def main() -> None:
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("--half", type=int, default=0, choices=(0, 1), help="which half trains")
     parser.add_argument("--first", type=int, default=None, help="so many first tracks")
-    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
     parser.add_argument("--tracks", nargs="+", type=int, help="numbers of training tracks to draw")
     parser.add_argument("--draws", type=int, default=30)
     parser.add_argument("--seed", type=int, default=0)
@@ -161,8 +141,8 @@ def main() -> None:
         halves = Halves.of(folder, given.half, given.first)
         for size in given.tracks or ():
             print(f"{folder.name}, {few(halves, size, given.draws, given.seed)}", flush=True)
-        for kind in () if given.tracks else given.kinds:
-            rows = halves.judged(range(len(halves.train)), (kind,))[kind]
+        kinds = {} if given.tracks else halves.judged(range(len(halves.train)))
+        for kind, rows in kinds.items():
             held = np.nanmean(rows[:, 2:], axis=0)
             numbers = f"median {np.nanmedian(rows[:, 0]):.1f} mm, log score {np.nanmean(rows[:, 1]):.3f}"
             axes = " / ".join(f"{axis:.0f}" for axis in held)

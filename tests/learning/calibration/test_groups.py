@@ -166,7 +166,8 @@ def test_groups_predict_measured_shots_better() -> None:
     if not folder.is_dir():
         pytest.skip(f"measured tracks are absent: {folder}")
     halves = Halves.of(folder, 0, None)
-    before, after = halves.judged(range(len(halves.train)), (CALIBRATED, GROUPED)).values()
+    found = halves.judged(range(len(halves.train)))
+    before, after = found[CALIBRATED], found[GROUPED]
     assert np.median(after[:, 0]) < 0.85 * np.median(before[:, 0])
     assert after[:, 2:].mean() > 80.0
 
