@@ -72,10 +72,13 @@ class Problem:
 
     @property
     def linearising(self) -> Settings:
-        """The settings with that noise; the priors of coefficients stay."""
+        """The settings with that noise; priors of coefficients and the noise of spin labels stay.
+
+        A lift that is wrong looks like wrong labels: with wide ones, lift and spin cannot be told apart.
+        """
         if self.shown is None:
             return self.settings
-        return with_noise(self.settings, replace(self.shown, coefficients={}))
+        return with_noise(self.settings, replace(self.shown, coefficients={}, spin_label=None))
 
     def estimator(self, values: Array, settings: Settings) -> Smoother:
         """The smoother with values (p,) of the coefficients."""

@@ -133,7 +133,8 @@ def _resumed(
     found: Mapping[str, Fitted], chosen: str, problem: Problem, watch: Watch
 ) -> tuple[Problem, Problem, tuple[list[Step], list[Step]]]:
     """The problems of a chosen candidate and of a correction, with judging tracks, and the steps of both."""
-    base, correction = found[GROUPED if chosen == CORRECTED else chosen], found[CORRECTED]
+    base = found[GROUPED if chosen == CORRECTED else chosen]
+    correction = found.get(CORRECTED, base)
     last = replace(correction.problem, split=problem.split)
     problem = replace(base.problem, split=problem.split, config=problem.config)
     first, *between, end = base.steps

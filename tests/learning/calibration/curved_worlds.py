@@ -3,7 +3,7 @@
 `python -m tests.learning.calibration.curved_worlds --tracks 30 --worlds 10 --seed 1` simulates worlds with curves of
 random strength, fits half of twice as many tracks, and prints for the corrected model and for the one that `kind: auto`
 chooses the median error of predictions (0.25 s seen, 0.3 s predicted) over that of the true dynamics, and the share of
-points of the true drag and lift inside the correction's 90 % band: at speeds and spin ratios of the true states.
+points of the true drag and lift inside the correction's 90 % band, at the speeds and spin ratios of the judging tracks.
 `--nominal` simulates worlds without curves: it prints what `auto` chooses, and what the correction gains.
 """
 
@@ -18,22 +18,24 @@ from typing import cast
 import numpy as np
 import torch
 
+from ballfg.arrays import Array
 from ballfg.dynamics import AnalyticModel, load_model
 from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.effects.bounce import RestitutionSpeed
 from ballfg.dynamics.effects.flight import DragSpeed, MagnusSaturation
+from ballfg.estimation.batch import estimate_tracks
+from ballfg.estimation.registry import make_estimator
 from ballfg.learning.calibration.auto import CORRECTED, NOMINAL, Fitted, choose_candidate
 from ballfg.learning.calibration.calibrate import Problem, pose
-from ballfg.learning.calibration.correction import learned, spans
+from ballfg.learning.calibration.correction import learned
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import NINETY
 from ballfg.learning.split import tracks_of
 from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.simulation.motion import true_model
+from ballfg.state import SPIN, VELOCITY
 from ballfg.tracks import read_dataset
 from tests.learning.calibration.measured_groups import errors, finished
-
-POINTS = 200
 
 
 def curves(seed: int) -> tuple[Effect, ...]:
@@ -47,11 +49,10 @@ def curves(seed: int) -> tuple[Effect, ...]:
     )
 
 
-def inside(model: AnalyticModel, truth: AnalyticModel, force: str) -> float:
-    """Share of the points of a true force inside its 90 % band, %: a grid over the span of the samples."""
-    (slow, fast), (least, most) = spans(model)["speed"], spans(model)["ratio"]
-    rng = np.random.default_rng(0)
-    speed, ratio = rng.uniform(slow, fast, POINTS), rng.uniform(least, most, POINTS)
+def inside(model: AnalyticModel, truth: AnalyticModel, force: str, states: Array) -> float:
+    """Share of the points of a true force inside its 90 % band, %, at the speeds and spin ratios of states (n, 9)."""
+    speed = np.linalg.norm(states[:, VELOCITY], axis=1)
+    ratio = model.radius * np.linalg.norm(states[:, SPIN], axis=1) / speed
     found, sigma = learned(model, force, speed, ratio)
     right = gain(truth, force, speed, ratio) / gain(model, force, speed, ratio) * (1.0 + found) - 1.0
     return 100.0 * float((np.abs(right - found) <= NINETY * sigma).mean())
@@ -82,7 +83,10 @@ def compared(problem: Problem, truth: AnalyticModel, corrected: Fitted, chosen: 
     model, settings = finished(problem, corrected)
     best = finished(known, NOMINAL), (model, settings), finished(problem, chosen)
     right, *others = (np.nanmedian(errors(problem, *one, judge)[:, 0]) for one in best)
-    return [*(other / right for other in others), inside(model, truth, "drag"), inside(model, truth, "lift")]
+    smoother = make_estimator("smoother", model, problem.surfaces, settings)
+    states = np.concatenate([one.states for one in estimate_tracks(smoother, judge, len(judge), 1)])
+    shares = (inside(model, truth, force, states) for force in ("drag", "lift"))
+    return [*(other / right for other in others), *shares]
 
 
 def main() -> None:

@@ -218,15 +218,15 @@ def test_a_richer_model_must_surely_beat_the_best_simpler_one() -> None:
     noise -= noise.mean(axis=1, keepdims=True)
     error = noise.std(axis=1, ddof=1) / 50**0.5
     for gains, right in (
-        ((1.9, 1.9, 1.9, 1.9), NOMINAL),
-        ((-9.0, 2.1, 1.9, 1.9), "calibrated"),
-        ((2.1, 2.1, 5.0, 1.9), GROUPED),
-        ((2.1, -9.0, -9.0, 2.1), CORRECTED),
+        ((0.9, 0.9, 0.9, 0.9), NOMINAL),
+        ((-9.0, 1.1, 0.9, 0.9), "calibrated"),
+        ((1.1, 1.1, 5.0, 0.9), GROUPED),
+        ((1.1, -9.0, -9.0, 1.1), CORRECTED),
     ):
         logs, best = [base], base
         for gain, own, sigma in zip(gains, noise, error, strict=True):
             logs.append(best + gain * sigma + own)
-            best = logs[-1] if gain > 2.0 else best
+            best = logs[-1] if gain > 1.0 else best
         choice = compared(dict(zip(CANDIDATES, map(scored, logs), strict=True)))
         assert choice.chosen == right
         assert len(choice.table().splitlines()) == 1 + len(CANDIDATES)
