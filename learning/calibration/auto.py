@@ -2,7 +2,8 @@
 
 All fitted tracks calibrate every candidate; then each fifth of them is judged by the population of the others. Every
 candidate is calibrated and judged with the noise that the tracks show. A richer model must beat the best simpler one
-in the mean log score by more than its standard error over the tracks; docs/train.md.
+in the mean log score by more than its standard error over the tracks, calibration by any amount that someone notices;
+docs/train.md.
 """
 
 from __future__ import annotations
@@ -48,7 +49,8 @@ UNLEARNED: Final = (NOMINAL, PER_TRACK)
 """Without calibration: coefficients as they are, or estimated with each track."""
 SURELY: Final = 1.0
 """Standard errors by which a richer model must gain. Two leave out models that pay where tracks are few; one misleads
-in none of forty nominal worlds, where no candidate gains as much as `NOTICED`."""
+in none of forty nominal worlds, where no candidate gains as much as `NOTICED`. Calibration needs `NOTICED` alone: its
+priors and its population contain the simpler models, and it costs 0.001 in those worlds."""
 NOTICED: Final = 0.005
 """Least gain in the mean log density of a coordinate: half a per cent, which no user of a prediction notices."""
 NEAR: Final = 0.3
@@ -206,7 +208,7 @@ def compared(scores: dict[str, Sequence[TrackScore | None]]) -> Choice:
             raise ValueError("tracks must be judged by every candidate; none was. Look at them with ballfg show.")
         gain, error = _gain(logs[name] - logs[chosen])
         candidates.append(_candidate(name, found, logs[name], gain, error))
-        if gain > max(SURELY * error, NOTICED):
+        if gain > max(0.0 if name == CALIBRATED else SURELY * error, NOTICED):
             chosen = name
     return Choice(chosen=chosen, candidates=tuple(candidates))
 
