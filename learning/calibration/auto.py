@@ -129,7 +129,8 @@ def choose_candidate(problem: Problem, watch: Watch = unwatched) -> tuple[Choice
     assert config.groups is not None
     grouped = replace(plain, config=config, groups=Groups.of(problem.dataset, config.groups, fitted))
 
-    found, scores = {}, {}
+    found: dict[str, Fitted] = {}
+    scores: dict[str, Sequence[TrackScore | None]] = {}
     known = replace(problem, settings=replace(problem.settings, coefficients={}))
     for name, posed in ((NOMINAL, known), (PER_TRACK, problem)):
         noise = fitted_noise(posed, problem.model, posed.settings, watch, errors=False)

@@ -274,8 +274,16 @@ def fitted_noise(
     names = problem.split.fit
     tracks = spread_over(tracks_of(problem.dataset, names), len(names))
     known = problem.dataset.info.position_noise is not None
-    how = {"position_known": known, "errors": errors, "watch": watch, "jobs": problem.jobs}
-    found = estimate_noise(model, problem.surfaces, settings, tracks, **how)
+    found = estimate_noise(
+        model,
+        problem.surfaces,
+        settings,
+        tracks,
+        position_known=known,
+        errors=errors,
+        watch=watch,
+        jobs=problem.jobs,
+    )
     return found if found is None or problem.correction is None else _with_doubts(found)
 
 

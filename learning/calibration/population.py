@@ -239,7 +239,8 @@ class _Means:
     def paired(self, values: Array) -> Array:
         """(p, p) sums of values (n, k, k) by pairs of means."""
         places = (self.numbers[:, :, None] * self.size + self.numbers[:, None, :]).ravel()
-        return np.bincount(places, values.ravel(), minlength=self.size**2).reshape(self.size, self.size)
+        found = np.bincount(places, values.ravel(), minlength=self.size**2)
+        return np.asarray(found, dtype=np.float64).reshape(self.size, self.size)
 
     def best(self, precision: Array, target: Array) -> Array:
         """(p,) the best means within their bounds."""
