@@ -5,6 +5,8 @@ finds the population's mean and spread, and puts the mean into the model. It end
 docs/train.md.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -41,6 +43,7 @@ from ballfg.learning.evaluation import JUDGED, TrackScore, judge_track
 from ballfg.learning.split import Split, split_tracks, tracks_of
 from ballfg.progress import Watch, unwatched
 from ballfg.tracks import Dataset
+from ballfg.tracks.noise import TrackNoise
 
 ROUGHLY: Final = 0.3
 """Tolerance of a correction at least: its weights move slowly along directions that hardly change a prediction."""
@@ -66,6 +69,18 @@ class Problem:
     jobs: int
     groups: Groups | None = None
     correction: Correction | None = None
+    shown: TrackNoise | None = None
+    """The noise that the fitted tracks are linearised with; None: the settings'."""
+
+    @property
+    def linearising(self) -> Settings:
+        """The settings with that noise; priors of coefficients and the noise of spin labels stay.
+
+        A lift that is wrong looks like wrong labels: with wide ones, lift and spin cannot be told apart.
+        """
+        if self.shown is None:
+            return self.settings
+        return with_noise(self.settings, replace(self.shown, coefficients={}, spin_label=None))
 
     def estimator(self, values: Array, settings: Settings) -> Smoother:
         """The smoother with values (p,) of the coefficients."""
@@ -112,6 +127,20 @@ class Step(BaseModel):
     """Scores of the judging tracks with the mean of this step; None where a track could not be judged."""
 
 
+@dataclass(frozen=True)
+class Linear:
+    """Fitted tracks, linearised: posteriors, likelihoods without the prior, names and reasons of skipped tracks."""
+
+    fits: tuple[TrackFit, ...]
+    evidences: tuple[Evidence, ...]
+    skipped: tuple[tuple[str, str], ...]
+
+    def without(self, names: Sequence[str]) -> Linear:
+        """Without some tracks."""
+        kept = [k for k, fit in enumerate(self.fits) if fit.name not in names]
+        return replace(self, fits=tuple(self.fits[k] for k in kept), evidences=tuple(self.evidences[k] for k in kept))
+
+
 def pose(dataset: Dataset | SightedDataset, model: AnalyticModel, config: CalibrationConfig, jobs: int = 1) -> Problem:
     """Check a calibration against its data before anything starts; the model has the ball's radius.
 
@@ -129,13 +158,18 @@ def pose(dataset: Dataset | SightedDataset, model: AnalyticModel, config: Calibr
     return Problem(dataset, config, model, chosen, surfaces, settings, split, jobs, groups)
 
 
+def with_shown_noise(problem: Problem, watch: Watch = unwatched) -> Problem:
+    """The problem with the noise that the fitted tracks show about its first model."""
+    noise = fitted_noise(problem, problem.model, problem.settings, watch, errors=False)
+    return replace(problem, shown=None if noise is None else noise.noise)
+
+
 def pose_correction(
     problem: Problem, last: Step, watch: Watch = unwatched, noise: NoiseEstimate | None = None
 ) -> Problem:
     """The problem of a correction of drag and lift on top of a calibration with groups.
 
-    The tracks are linearised with the noise that they show about the calibrated model: the usual one of measured tracks
-    hides a law that is a little wrong.
+    The tracks are linearised with the noise that they show about the calibrated model.
 
     Args: noise: that one, if it is known already.
     Raises: ValueError: as `with_correction`.
@@ -152,10 +186,8 @@ def pose_correction(
     mean = np.concatenate((last.mean, np.zeros(len(chosen.shared))))
     config = problem.config.model_copy(update={"tolerance": max(problem.config.tolerance, ROUGHLY)})
     begun = Correction(mean, last.spins, terms)
-    settings = (
-        problem.settings if noise is None else with_noise(problem.settings, replace(noise.noise, coefficients={}))
-    )
-    return replace(problem, model=corrected, chosen=chosen, config=config, correction=begun, settings=settings)
+    shown = None if noise is None else noise.noise
+    return replace(problem, model=corrected, chosen=chosen, config=config, correction=begun, shown=shown)
 
 
 def calibrate(problem: Problem, done: Iterable[Step] = (), *, watch: Watch = unwatched) -> Iterator[Step]:
@@ -166,15 +198,23 @@ def calibrate(problem: Problem, done: Iterable[Step] = (), *, watch: Watch = unw
     """
     steps = list(done)
     if not steps:
-        start = problem.chosen.start if problem.correction is None else problem.correction.mean
-        steps.append(Step(number=0, mean=_plain(start), scores=score(problem, start, watch)))
+        steps.append(first_step(problem, watch))
         yield steps[-1]
     while not has_ended(problem.config, steps[-1]):
-        found = _advance(problem, steps[-1], watch)
-        if has_ended(problem.config, found):
-            found = found.model_copy(update={"scores": score(problem, np.array(found.mean), watch)})
-        steps.append(found)
-        yield found
+        found = advanced(problem, steps[-1], linearised(problem, steps[-1], watch))
+        steps.append(with_scores(problem, found, watch) if has_ended(problem.config, found) else found)
+        yield steps[-1]
+
+
+def first_step(problem: Problem, watch: Watch = unwatched) -> Step:
+    """Step 0, where a calibration begins."""
+    start = problem.chosen.start if problem.correction is None else problem.correction.mean
+    return with_scores(problem, Step(number=0, mean=_plain(start)), watch)
+
+
+def with_scores(problem: Problem, step: Step, watch: Watch = unwatched) -> Step:
+    """A step with the scores of the judging tracks."""
+    return step.model_copy(update={"scores": score(problem, np.array(step.mean), watch)})
 
 
 def has_converged(config: CalibrationConfig, step: Step) -> bool:
@@ -241,7 +281,16 @@ def fitted_noise(
     names = problem.split.fit
     tracks = spread_over(tracks_of(problem.dataset, names), len(names))
     known = problem.dataset.info.position_noise is not None
-    found = estimate_noise(model, problem.surfaces, settings, tracks, position_known=known, errors=errors, watch=watch)
+    found = estimate_noise(
+        model,
+        problem.surfaces,
+        settings,
+        tracks,
+        position_known=known,
+        errors=errors,
+        watch=watch,
+        jobs=problem.jobs,
+    )
     return found if found is None or problem.correction is None else _with_doubts(found)
 
 
@@ -253,11 +302,11 @@ def _with_doubts(found: NoiseEstimate) -> NoiseEstimate:
     return replace(found, noise=replace(found.noise, coefficients=spreads), settings=settings)
 
 
-def _advance(problem: Problem, last: Step, watch: Watch) -> Step:
-    """Linearise the fitted tracks about the last mean, and fit the population."""
+def advanced(problem: Problem, last: Step, linear: Linear) -> Step:
+    """The population of tracks that are linearised about the last step."""
     chosen, groups, about = problem.chosen, problem.groups, np.array(last.mean)
-    spins = () if groups is None else last.spins or _first_spins(problem, groups)
-    fits, evidences, skipped = _fit_tracks(problem, about, spins, watch)
+    spins = _spins(problem, last)
+    fits, evidences = linear.fits, linear.evidences
     size, before = len(about), np.concatenate((about, *(spin.mean for spin in spins)))
     next_track: Array | None = None
     by_group: dict[str, tuple[float, ...]] = {}
@@ -280,25 +329,30 @@ def _advance(problem: Problem, last: Step, watch: Watch) -> Step:
         doubts=doubts,
         by_group=by_group,
         moved=float(np.abs((population.mean - before) / population.sigma).max()),
-        fits=tuple(fits),
-        skipped=tuple(skipped),
+        fits=fits,
+        skipped=linear.skipped,
     )
 
 
-def _first_spins(problem: Problem, groups: Groups) -> tuple[GroupSpin, ...]:
-    return groups.start if problem.correction is None else problem.correction.spins
+def _spins(problem: Problem, last: Step) -> tuple[GroupSpin, ...]:
+    """Of each group, as the last step has them, or where the calibration begins."""
+    if problem.groups is None:
+        return ()
+    return last.spins or (problem.groups.start if problem.correction is None else problem.correction.spins)
 
 
-def _fit_tracks(
-    problem: Problem, about: Array, spins: Sequence[GroupSpin], watch: Watch
-) -> tuple[list[TrackFit], list[Evidence], list[tuple[str, str]]]:
-    """Posterior and likelihood of each fitted track, and the skipped tracks.
+def linearised(problem: Problem, last: Step, watch: Watch = unwatched) -> Linear:
+    """The fitted tracks, linearised about the last step.
 
     Coefficients that vary from track to track stay free in each track, calibrated or not.
+
+    Raises: TooManyFailures: as `calibrate`.
     """
     chosen, names, groups = problem.chosen, problem.split.fit, problem.groups
-    priors = {**problem.settings.coefficients, **dict(zip(chosen.names, chosen.sigma.tolist(), strict=True))}
-    settings = replace(problem.settings, coefficients=priors)
+    about, spins = np.array(last.mean), _spins(problem, last)
+    settings = problem.linearising
+    priors = {**settings.coefficients, **dict(zip(chosen.names, chosen.sigma.tolist(), strict=True))}
+    settings = replace(settings, coefficients=priors)
     estimator = problem.estimator(about, settings if groups is None else groups.wide(settings, spins))
     tracks = tracks_of(problem.dataset, names)
     if problem.correction is not None:
@@ -316,7 +370,7 @@ def _fit_tracks(
             fit, found = _read(estimate, chosen, about)
             found = found if slopes is None else replace(found, vector=found.vector - slopes)
             if groups is not None:
-                found = groups.evidence(estimate, chosen, about, spins, problem.settings.spin_prior)
+                found = groups.evidence(estimate, chosen, about, spins, settings.spin_prior)
         except ValueError as error:
             skipped.append((estimate.name, str(error)))
             limit = problem.config.failure_limit
@@ -328,7 +382,7 @@ def _fit_tracks(
         else:
             fits.append(fit)
             evidences.append(found)
-    return fits, evidences, skipped
+    return Linear(tuple(fits), tuple(evidences), tuple(skipped))
 
 
 def _read(estimate: Estimate, chosen: Chosen, about: Array) -> tuple[TrackFit, Evidence]:

@@ -4,31 +4,30 @@ Track i has a Gaussian likelihood of its own coefficients b_i, with the informat
 the information is zero in directions that the track does not observe. The tracks are draws b_i ~ N(theta, D) with a
 diagonal D, and theta ~ N(start, sigma^2) is the prior of the model. theta and D maximise the likelihood of all tracks
 with every b_i integrated out, times the prior of theta (N. Laird, J. Ware, "Random-effects models for longitudinal
-data", Biometrics 38, 1982). Given D, theta is a least-squares solution; D follows by the minorisation step of H. Zhou,
-L. Hu, J. Zhou, K. Lange, "MM algorithms for variance components models", J. Comput. Graph. Stat. 28, 2019, which never
-lowers the likelihood and needs no step size.
+data", Biometrics 38, 1982). Given D, theta is a least-squares solution. D follows by Fisher scoring, or where that is
+worse by the minorisation step of H. Zhou, L. Hu, J. Zhou, K. Lange, "MM algorithms for variance components models",
+J. Comput. Graph. Stat. 28, 2019, which never lowers the likelihood and needs no step size.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from ballfg.arrays import Array, Index
+from ballfg.arrays import Array, Index, Mask
 
-MAX_STEPS = 20_000
-"""Largest number of iterations, two steps and an extrapolation each; some tens are usual."""
+MAX_STEPS = 500
+"""Largest number of iterations, a step of each sort; ten are usual."""
 STEP_TOLERANCE = 1e-11
 """Relative change of every variance at which the iteration ends."""
 NO_SPREAD = 1e-10
 """Variance, as a share of the prior's, below which it is zero."""
 MOST_SPREAD = 100.0
 """Largest variance, as a multiple of the prior's: tracks with almost no information set no limit."""
-LONGEST, MOST_CHANGE = 1e3, 5.0
-"""Bounds of an extrapolation: its length in steps, and the change of a variance's logarithm."""
 NO_INFORMATION = 1e-2
 """Information of all tracks, as a share of the prior's, below which the spread of a coefficient is zero."""
 
@@ -133,97 +132,91 @@ def fit_population(
     about = _Means(numbers, size, bounds)
     variance = np.where(about.summed(np.einsum("ikk->ik", information)) > NO_INFORMATION, 1.0, 0.0)
     variance[[] if alike is None else alike] = 0.0
-    fit = _Fit(information, moved, about)
+    fit = _Fit(information, moved, about, variance, variance > 0.0)
     for _ in range(MAX_STEPS):
-        once = fit.updated(variance)
-        if (np.abs(once - variance) <= STEP_TOLERANCE * variance).all():
-            variance = once
+        once = fit.at(fit.updated)
+        still = np.abs(once.variance - fit.variance) <= STEP_TOLERANCE * fit.variance
+        if (still & ~fit.grows).all():
             break
-        twice = fit.updated(once)
-        further = _further(variance, once, twice)
-        variance = further if fit.log_likelihood(further) > fit.log_likelihood(twice) else twice
-    own = variance[numbers]
-    mean = about.best(information, moved, own)
-    precision = about.precision(information, own)
-    likelihood = fit.log_likelihood(variance)
+        scored = fit.at(fit.scored)
+        fit = scored if scored.log_likelihood > once.log_likelihood else once
     return Population(
-        mean=np.clip(start + sigma * mean, low, high),
-        covariance=np.linalg.inv(precision) * np.outer(sigma, sigma),
-        spread=sigma * np.sqrt(variance),
-        log_likelihood=likelihood,
-        log_evidence=likelihood - 0.5 * float(np.linalg.slogdet(precision)[1]),
+        mean=np.clip(start + sigma * fit.mean, low, high),
+        covariance=np.linalg.inv(fit.precision) * np.outer(sigma, sigma),
+        spread=sigma * np.sqrt(fit.variance),
+        log_likelihood=fit.log_likelihood,
+        log_evidence=fit.log_likelihood - 0.5 * float(np.linalg.slogdet(fit.precision)[1]),
     )
 
 
-@dataclass(frozen=True)
 class _Fit:
-    """The marginal likelihood of tracks with information (n, k, k) and vectors (n, k), by the variances (p,)."""
+    """Tracks with information L (n, k, k) and vectors h (n, k), their deviations of some variances integrated out.
 
-    information: Array
-    moved: Array
-    about: _Means
+    With the variances D of a track the information on its means is M = (I + L D)^-1 L, the vector g = (I + L D)^-1 h.
+    Only numbers that vary are solved for: (I + L D)^-1 = I - L R (I + R L R)^-1 R with the roots R of D.
 
-    def updated(self, variance: Array) -> Array:
-        """(p,) the variances after one step: the pulls as large as they are, against as large as they should be."""
-        own = variance[self.about.numbers]
-        mean = self.about.best(self.information, self.moved, own)
-        pulls = self.about.summed(_residual(self.information, self.moved, own, mean[self.about.numbers]) ** 2)
-        expected = self.about.summed(np.einsum("ikk->ik", _marginal(self.information, own)))
-        growth = np.sqrt(np.divide(pulls, expected, out=np.zeros_like(pulls), where=expected > 0.0))
-        found = np.minimum(variance * growth, MOST_SPREAD)
-        found[found < NO_SPREAD] = 0.0
-        return found
-
-    def log_likelihood(self, variance: Array) -> float:
-        """At the best means, with their prior."""
-        own = variance[self.about.numbers]
-        mean = self.about.best(self.information, self.moved, own)
-        found = _log_likelihood(self.information, self.moved, own, mean[self.about.numbers])
-        return found - 0.5 * float(mean @ mean)
-
-
-def _further(start: Array, once: Array, twice: Array) -> Array:
-    """Variances (p,) extrapolated from two steps, in logarithms; a variance that vanished stays zero.
-
-    The steps alone converge slowly where a variance is hardly determined. Source: R. Varadhan, C. Roland, "Simple and
-    globally convergent methods for accelerating the convergence of any EM algorithm", Scand. J. Statist. 35, 2008.
+    Attributes:
+        variance: (p,) of each mean's draws.  free: (p,) true where it may be above zero.
+        mean: (p,) the best means.  precision: (p, p) of them, with their prior.
+        log_likelihood: marginal, without its constants, with the prior of the means.
     """
-    left = (start > 0.0) & (once > 0.0) & (twice > 0.0)
-    first, second = np.log(once[left] / start[left]), np.log(twice[left] / once[left])
-    change = second - first
-    length = float(np.linalg.norm(change))
-    if length == 0.0:
-        return twice
-    ratio = min(float(np.linalg.norm(first)) / length, LONGEST)
-    found = twice.copy()
-    found[left] = start[left] * np.exp(np.clip(2.0 * ratio * first + ratio**2 * change, -MOST_CHANGE, MOST_CHANGE))
-    return np.minimum(found, MOST_SPREAD)
+
+    def __init__(self, information: Array, moved: Array, about: _Means, variance: Array, free: Mask) -> None:
+        self.information, self.moved, self.about, self.variance, self.free = information, moved, about, variance, free
+        own = variance[about.numbers]
+        varies = own.any(axis=0)
+        roots = np.sqrt(own[:, varies])[:, :, None]
+        pulled = roots * information[:, varies]
+        inner = np.eye(roots.shape[1]) + pulled[:, :, varies] * roots.swapaxes(1, 2)
+        pushed = roots * moved[:, varies, None]
+        solved = np.linalg.solve(inner, np.concatenate((pulled, pushed), axis=2))
+        self._marginal = information - pulled.swapaxes(1, 2) @ solved[:, :, :-1]
+        self._vector = moved - (pulled.swapaxes(1, 2) @ solved[:, :, -1:])[..., 0]
+        self.precision, target = about.precision(self._marginal), about.summed(self._vector)
+        self.mean = about.best(self.precision, target)
+        quadratic = (
+            self.mean @ self.precision @ self.mean - 2.0 * target @ self.mean - (pushed * solved[:, :, -1:]).sum()
+        )
+        self.log_likelihood = float(-0.5 * (np.linalg.slogdet(inner)[1].sum() + quadratic))
+
+    def at(self, variance: Array) -> _Fit:
+        """The same tracks with other variances (p,)."""
+        return _Fit(self.information, self.moved, self.about, variance, self.free)
+
+    @property
+    def updated(self) -> Array:
+        """(p,) the variances after one step: the pulls as large as they are, against as large as they should be."""
+        pulls, expected = self._slopes
+        growth = np.sqrt(np.divide(pulls, expected, out=np.zeros_like(pulls), where=expected > 0.0))
+        return _bounded(self.variance * growth)
+
+    @property
+    def scored(self) -> Array:
+        """(p,) the variances after a step of Fisher scoring."""
+        pulls, expected = self._slopes
+        free = (self.variance > 0.0) | self.grows
+        step = np.zeros(len(free))
+        curvature = self.about.paired(self._marginal**2)[np.ix_(free, free)]
+        step[free] = np.linalg.lstsq(curvature, (pulls - expected)[free], rcond=None)[0]
+        return _bounded(self.variance + step)
+
+    @property
+    def grows(self) -> Mask:
+        """(p,) true for a variance of zero that should be larger."""
+        pulls, expected = self._slopes
+        return np.asarray(self.free & (self.variance == 0.0) & (pulls > expected))
+
+    @cached_property
+    def _slopes(self) -> tuple[Array, Array]:
+        """(p,) twice the slope of the log likelihood by each variance: squared pulls, less what they should be."""
+        about = self.about
+        pulls = about.summed((self._vector - (self._marginal @ self.mean[about.numbers][..., None])[..., 0]) ** 2)
+        return pulls, about.summed(np.einsum("ikk->ik", self._marginal))
 
 
-def _mixing(information: Array, variance: Array) -> Array:
-    """(n, k, k) I + L_i D_i, with the variances (n, k) of each track's group."""
-    return np.eye(variance.shape[1]) + information * variance[:, None, :]
-
-
-def _marginal(information: Array, variance: Array) -> Array:
-    """(n, k, k) information of each track on the mean, its own deviation integrated out: (I + L_i D)^-1 L_i."""
-    found = np.linalg.solve(_mixing(information, variance), information)
-    return (found + found.swapaxes(-1, -2)) / 2.0
-
-
-def _residual(information: Array, moved: Array, variance: Array, mean: Array) -> Array:
-    """(n, k) each track's pull on the means (n, k) of its group."""
-    pull = moved[..., None] - information @ mean[..., None]
-    return np.asarray(np.linalg.solve(_mixing(information, variance), pull)[..., 0])
-
-
-def _log_likelihood(information: Array, moved: Array, variance: Array, mean: Array) -> float:
-    """Marginal log likelihood, without its constants, with the means (n, k) of each track's group."""
-    _, log_determinant = np.linalg.slogdet(_mixing(information, variance))
-    pull = moved - (information @ mean[..., None])[..., 0]
-    explained = (pull * variance * _residual(information, moved, variance, mean)).sum()
-    quadratic = np.einsum("ij,ijk,ik->", mean, information, mean) - 2.0 * (moved * mean).sum() - explained
-    return float(-0.5 * (log_determinant.sum() + quadratic))
+def _bounded(variance: Array) -> Array:
+    """Variances (p,) within their bounds; next to none is none."""
+    return np.where(variance < NO_SPREAD, 0.0, np.minimum(variance, MOST_SPREAD))
 
 
 @dataclass(frozen=True)
@@ -238,16 +231,19 @@ class _Means:
         """(p,) sums of values (n, k) by mean."""
         return np.asarray(np.bincount(self.numbers.ravel(), values.ravel(), minlength=self.size), dtype=np.float64)
 
-    def precision(self, information: Array, variance: Array) -> Array:
-        """(p, p) of the means, their prior included."""
-        found = np.eye(self.size)
-        np.add.at(found, (self.numbers[:, :, None], self.numbers[:, None, :]), _marginal(information, variance))
-        return found
+    def precision(self, marginal: Array) -> Array:
+        """(p, p) of the means, their prior included. Args: marginal: (n, k, k) information of each track."""
+        found = self.paired(marginal)
+        return (found + found.T) / 2.0 + np.eye(self.size)
 
-    def best(self, information: Array, moved: Array, variance: Array) -> Array:
-        """(p,) the best means for some variances (n, k)."""
-        target = self.summed(np.asarray(np.linalg.solve(_mixing(information, variance), moved[..., None])[..., 0]))
-        precision = self.precision(information, variance)
+    def paired(self, values: Array) -> Array:
+        """(p, p) sums of values (n, k, k) by pairs of means."""
+        places = (self.numbers[:, :, None] * self.size + self.numbers[:, None, :]).ravel()
+        found = np.bincount(places, values.ravel(), minlength=self.size**2)
+        return np.asarray(found, dtype=np.float64).reshape(self.size, self.size)
+
+    def best(self, precision: Array, target: Array) -> Array:
+        """(p,) the best means within their bounds."""
         free = np.linalg.solve(precision, target)
         if ((self.bounds[0] <= free) & (free <= self.bounds[1])).all():
             return np.asarray(free)

@@ -2,7 +2,8 @@
 
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,15 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from ballfg.dynamics import save_model
 from ballfg.dynamics.model_file import model_to_dict
 from ballfg.files.damaged import whole_content
-from ballfg.learning.calibration.auto import NOMINAL, Choice, choose_candidate, config_of
+from ballfg.learning.calibration.auto import (
+    CORRECTED,
+    GROUPED,
+    UNLEARNED,
+    Choice,
+    Fitted,
+    choose_candidate,
+    config_of,
+)
 from ballfg.learning.calibration.calibrate import (
     Problem,
     Step,
@@ -24,6 +33,8 @@ from ballfg.learning.calibration.calibrate import (
     pose,
     pose_correction,
     score,
+    with_scores,
+    with_shown_noise,
 )
 from ballfg.learning.calibration.picture import draw
 from ballfg.learning.calibration.report import compare, is_worse, report, table
@@ -71,40 +82,65 @@ def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jo
             files.start(folder, config)
         fit, judge = len(problem.split.fit), len(problem.split.judge)
         print(f"{folder / files.CONFIG}: the config; {fit} tracks fit, {judge} judge")
+        found: dict[str, Fitted] = {}
         if config.kind == AUTO:
-            chosen = _chosen(problem, folder, resume, watch)
-            if chosen == NOMINAL:
+            chosen, found = _chosen(problem, folder, resume, watch)
+            if chosen in UNLEARNED:
                 save_model(model, folder / files.MODEL)
                 print(f"{folder / files.MODEL}: the nominal model, which nothing beats")
                 return NOT_BETTER
             problem = pose(dataset, model, config_of(config, chosen), problem.jobs)
-        calibrated, corrected = read_checkpoint(folder, problem) if resume else ([], [])
+        steps: tuple[list[Step], list[Step]] = ([], [])
+        last: Problem | None = None
+        if found:
+            problem, last, steps = _resumed(found, chosen, problem, watch)
+            write_checkpoint(folder, problem, *steps)
+        else:
+            steps = read_checkpoint(folder, problem) if resume else steps
+            problem = with_shown_noise(problem, watch)
+        calibrated, corrected = steps
         if resume:
             files.start(folder, config)
         try:
-            _steps(problem, calibrated, folder, watch)
-            last, steps = problem, calibrated
-            if problem.config.correction:
-                last, steps = pose_correction(problem, calibrated[-1], watch), corrected
+            if last is None or not problem.config.correction:
+                _steps(problem, calibrated, folder, watch)
+            if not problem.config.correction:
+                return _finish(problem, calibrated, folder, watch)
+            if last is None:
+                last = pose_correction(problem, calibrated[-1], watch)
                 _check_follows(corrected, last, folder / files.STEPS)
-                _steps(last, steps, folder, watch, (problem, calibrated))
-            return _finish(last, [calibrated[0], *steps], folder, watch)
+                _steps(last, corrected, folder, watch, (problem, calibrated))
+            return _finish(last, [calibrated[0], *corrected], folder, watch)
         except KeyboardInterrupt:
             kept = len(calibrated) + len(corrected)
             print(f"{kept} steps are kept; continue with --resume {folder}", file=sys.stderr)
             raise
 
 
-def _chosen(problem: Problem, folder: Path, resume: bool, watch: Watch) -> str:
-    """Name of the candidate that `kind: auto` chooses, in this run or in the one that is resumed."""
+def _chosen(problem: Problem, folder: Path, resume: bool, watch: Watch) -> tuple[str, dict[str, Fitted]]:
+    """Name of the candidate that `kind: auto` chooses or, in the run that is resumed, chose; those just calibrated."""
     path = folder / files.CHOICE
+    candidates: dict[str, Fitted] = {}
     if resume and path.is_file():
         choice = Choice.model_validate_json(whole_content(path))
     else:
-        choice = choose_candidate(problem, watch)
+        choice, candidates = choose_candidate(problem, watch)
         files.write_json(path, choice.model_dump(mode="json"))
     print(f"\n{choice.table()}\n\n{choice.verdict()}\n", flush=True)
-    return choice.chosen
+    return choice.chosen, candidates
+
+
+def _resumed(
+    found: Mapping[str, Fitted], chosen: str, problem: Problem, watch: Watch
+) -> tuple[Problem, Problem, tuple[list[Step], list[Step]]]:
+    """The problems of a chosen candidate and of a correction, with judging tracks, and the steps of both."""
+    base = found[GROUPED if chosen == CORRECTED else chosen]
+    correction = found.get(CORRECTED, base)
+    last = replace(correction.problem, split=problem.split)
+    problem = replace(base.problem, split=problem.split, config=problem.config)
+    first, *between, end = base.steps
+    calibrated = [with_scores(problem, first, watch), *between, with_scores(problem, end, watch)]
+    return problem, last, (calibrated, list(correction.steps) if chosen == CORRECTED else [])
 
 
 def _steps(
@@ -115,6 +151,8 @@ def _steps(
     Args: first: the calibration before a correction, and its steps.
     """
     begun = time.monotonic()
+    if first is not None:  # a correction is judged with its spins, at the end
+        problem = replace(problem, split=replace(problem.split, judge=()))
     for step in calibrate(problem, tuple(steps), watch=watch):
         steps.append(step)
         if first is None:

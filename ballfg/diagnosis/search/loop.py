@@ -11,7 +11,7 @@ from ballfg.diagnosis.evidence.nameless import NAMELESS
 from ballfg.diagnosis.evidence.odds import ALIKE, Odds, odds_of
 from ballfg.diagnosis.evidence.rows import random_motion
 from ballfg.diagnosis.evidence.screen import Screen
-from ballfg.diagnosis.evidence.weighed import Weighed, weighed
+from ballfg.diagnosis.evidence.weighed import WORTH_A_STEP, Weighed, weighed
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.fit.problem import Fit
@@ -155,6 +155,7 @@ class _Found:
         self.declared = self.best = weighed(whole, (), self.motion, self.halves)
         self.models = {self.best.names: self.best}
         self.rounds: list[Round] = []
+        self.tried: set[tuple[frozenset[str], frozenset[str]]] = set()
 
     @property
     def odds(self) -> Odds:
@@ -179,7 +180,7 @@ class _Found:
             scored, refits = [*scored, *more], [*refits, *fitted]
             winner = max((w for w in (winner, self._weighed(fitted)) if w is not None), key=_score, default=None)
         added = winner is not None and winner.score > best.score
-        names = tuple(h.name for h in winner.named[len(best.named) :]) if winner is not None and added else ()
+        names = tuple(h.name for h in winner.named if h not in best.named) if winner is not None and added else ()
         self.rounds.append(Round(scored, refits, names))
         if winner is None or not added:
             tell("nothing makes the model more probable")
@@ -234,7 +235,7 @@ class _Found:
             if shorter.score <= best.score:
                 break
             best = shorter
-        self.best = max(self.best, best, key=_score)
+        self.best = max(self.models.values(), key=_score)
 
     def named_at(self, probability: float) -> Weighed:
         """The model with all effects that are at least so probable, or with most of them.
@@ -261,21 +262,31 @@ class _Found:
         return [self.models[m.names | {NAMELESS}] for m in models]
 
     def without(self, gone: Sequence[Hypothesis], model: Weighed | None = None) -> Weighed:
-        """A model without some of its effects, and without those that need them."""
+        """A model without some of its effects, and without those that need them.
+
+        It is weighed again from there if the linearisation says that it was found in a poorer minimum before.
+        """
         model = model or self.best
         lost = {h.effect.name for h in gone if not has_effect(self.first.problem.model, h.effect.name)}
         gone = [h for h in model.named if h in gone or lost & set(h.effect.needs)]
         kept = tuple(h for h in model.named if h not in gone)
         names = frozenset(h.name for h in kept)
-        if names not in self.models:
+        known = self.models.get(names)
+        poor = known is not None and known.score < model.nested.get(names, -np.inf) - WORTH_A_STEP
+        if known is None or (poor and (model.names, names) not in self.tried):
+            self.tried.add((model.names, names))
             fit = model.fit
             for hypothesis in gone:
                 fit = without_named(fit, hypothesis, self.first)
-            self.models[names] = weighed(fit, kept, self.motion, self.halves, model.noise)
+            found = weighed(fit, kept, self.motion, self.halves, model.noise)
+            self.models[names] = found if known is None else max(known, found, key=_score)
         return self.models[names]
 
     def _weighed(self, refits: Sequence[Refit]) -> Weighed | None:
-        """The most probable of some refits; None without any."""
+        """The most probable of some refits, and of them without an effect that they make superfluous; None without any.
+
+        One that takes the place of a named effect needs both for a while.
+        """
         best = self.best
         tasks = [
             partial(weighed, r.fit, (*best.named, *r.added), self.motion, self.halves, best.noise)
@@ -286,6 +297,10 @@ class _Found:
         for model in found:
             if model.names not in self.models or model.score > self.models[model.names].score:
                 self.models[model.names] = model
+        for model in list(found):
+            names, foretold = max(model.nested.items(), key=lambda item: item[1], default=(model.names, -np.inf))
+            if foretold > max(model.score, best.score):
+                found.append(self.without([h for h in model.named if h.name not in names], model))
         return max(found, key=_score, default=None)
 
     def _better_minimum(self, before: Weighed, after: Weighed) -> None:

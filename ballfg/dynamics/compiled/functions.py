@@ -91,8 +91,8 @@ weights of rates, impact and surface that were computed from them."""
 _weights: weakref.WeakKeyDictionary[BallModel, _Weighed] = weakref.WeakKeyDictionary()
 _OF_TORCH: Final = frozenset(vars(nn.Module()))
 """Attributes of every module; its parameters, buffers and parts are compared by themselves."""
-_BESIDE: Final = frozenset({"trained", "noise", "variations", "measurement"})
-"""Attributes of a ball model that do not belong to its motion."""
+_BESIDE: Final = frozenset({"trained", "noise", "variations", "measurement", "spins", "coefficients"})
+"""Attributes of a ball model and of its effects that do not belong to its motion: priors among them."""
 
 
 class NotTheSameError(Exception):
