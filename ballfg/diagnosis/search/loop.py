@@ -235,7 +235,8 @@ class _Found:
             if shorter.score <= best.score:
                 break
             best = shorter
-        self.best = max(self.models.values(), key=_score)
+        odds = self.odds.models
+        self.best = max(self.models.values(), key=lambda model: odds[model.names])
 
     def named_at(self, probability: float) -> Weighed:
         """The model with all effects that are at least so probable, or with most of them.
