@@ -83,7 +83,7 @@ def _set_aside(path: Path, columns: dict[str, list[Label | None]], lines: list[i
     """
     spins = [column for name, column in columns.items() if name in SPIN_LABELS]
     labelled = sum(any(cell is not None for cell in row) for row in zip(*spins, strict=True))
-    notes = []
+    notes: list[str] = []
     for name, column in columns.items():
         for number, value in enumerate(column if name in SPIN_LABELS else ()):
             if not isinstance(value, float) or abs(value) <= FASTEST_SPIN:

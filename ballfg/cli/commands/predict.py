@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -122,8 +123,10 @@ def predict(
             outcome.tracks.print()
             outcome.tracks.end()
             return
-        until = {} if ahead is None else {"horizon": ahead, "beyond": True}
-        predictions = predict_tracks(estimator, opened.dataset, count, observe, **until, jobs=workers)
+        until = math.inf if ahead is None else ahead
+        predictions = predict_tracks(
+            estimator, opened.dataset, count, observe, horizon=until, beyond=True, jobs=workers
+        )
         for plain in progress(predictions, count, "tracks predicted"):
             result = plain if scales is None else scales.scaled(plain)
             columns: dict[str, str | np.ndarray] = {"trajectory": result.name, "t": result.times}
@@ -165,8 +168,8 @@ def _write_events(
             found = None if ahead is None else ahead.event(event)
             numbers = {"probability": np.nan if found is None else found.probability}
             numbers |= event_numbers(None if found is None else found.crossing)
-            columns = {name: np.array([value]) for name, value in numbers.items()}
-            table.write({"trajectory": one.name, "event": text} | columns)
+            columns: dict[str, str | np.ndarray] = {"trajectory": one.name, "event": text}
+            table.write(columns | {name: np.array([value]) for name, value in numbers.items()})
             outcome.rows += 1
         outcome.tracks.add(one.name, one.status, one.estimate.notes, None)
 
