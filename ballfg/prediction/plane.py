@@ -59,9 +59,8 @@ class Plane:
         offset = _number(found[2]) if found else math.nan
         if normal is None or bounces is None or len(given) != len(words) or not math.isfinite(offset):
             raise ValueError(
-                f"plane must be an axis and a place in m, then, if wanted, up or down and the bounces before it; "
-                f"got {shown(text)}. Write x=2.0, z=3.05,down or z=0.9,up,after=1, for instance; 0.6:0:0.8=1.2 is a "
-                "plane across any other direction."
+                f"plane must be an axis and a place in m; got {shown(text)}. Write x=2.0, for instance; z=3.05,down or "
+                "z=0.9,up,after=1 for a direction and bounces before it; 0.6:0:0.8=1.2 across any other normal."
             )
         return cls(normal, offset, given.get("direction", "either"), int(bounces[1]))
 

@@ -100,7 +100,8 @@ class Smoother(Estimator):
             return joined
         smoother = self.first_look() if moving else self
         for _ in range(OFFSET_ROUNDS):
-            problem, solution = smoother.solved(track.since_first())
+            problem, *rivals = smoother.problems(track.since_first())
+            problem, solution = smoother.lowest(problem, smoother.settle(problem), rivals)
             found = smoother.result(problem, solution)
             estimate = found.dated(track.times)
             if not moving or estimate.status.failed:

@@ -188,7 +188,7 @@ def test_coefficients_are_estimated_in_foreign_rooms_only(model):
 
     def settings(room):
         info = SimpleNamespace(position_noise=0.001, spin_noise=None, noise=None, name=room)
-        return dataset_settings(SimpleNamespace(info=info, rough=False), model)
+        return dataset_settings(SimpleNamespace(info=info, rough=False, one_view=False), model)
 
     assert not settings("hall").coefficients
     assert settings("hall").process.acceleration == 0.08
