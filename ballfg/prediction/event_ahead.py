@@ -66,6 +66,11 @@ def crossing_of(carried: Carried, plane: Plane, horizon: float) -> Crossing | No
         if contact is None:
             return None
         since = contact.time
+    return _crossed(carried, plane, horizon, since)
+
+
+def _crossed(carried: Carried, plane: Plane, horizon: float, since: float) -> Crossing | None:
+    """The first crossing of a plane after a time, s; bounces before it have been counted."""
     return plane_crossing(*carried, plane.normal, plane.offset, horizon, after=since, direction=plane.direction)
 
 
@@ -152,7 +157,7 @@ def _crossing(path: Path, plane: Plane) -> EventAhead:
     value, sigma = path.along(line, offset, since)
     down, up = falls(value, sigma), falls(-value, sigma)
     ways = {"down": down, "up": up, "either": max(down, up)}
-    found = crossing_of(path.carried, plane, path.horizon)
+    found = _crossed(path.carried, plane, path.horizon, since)
     # the mean path may cross between two of its times, as close to a table it does
     least = 0.0 if found is None else HALF
     return EventAhead(found, chance * max(ways[plane.direction], least))

@@ -108,6 +108,5 @@ def _together(both: tuple[Sightings, ...], cameras: tuple[Camera, Camera], clock
     times = np.concatenate((one.times, (other.times - clock[1]) / (1.0 + clock[0])))
     camera = np.repeat([0, 1], [len(one), len(other)])
     pixels, spread = (np.concatenate((getattr(one, name), getattr(other, name))) for name in ("pixels", "covariances"))
-    order = np.argsort(times, kind="stable")
-    rows = Sightings(tuple(c.name for c in cameras), camera[order], times[order], pixels[order], spread[order])
+    rows = Sightings(tuple(c.name for c in cameras), camera, times, pixels, spread)
     return sighted_track("stroke", in_order(rows, cameras), cameras)

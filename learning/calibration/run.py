@@ -102,14 +102,12 @@ def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jo
         if resume:
             files.start(folder, config)
         try:
-            if last is None or not problem.config.correction:
-                _steps(problem, calibrated, folder, watch)
+            _steps(problem, calibrated, folder, watch)  # none are left of a candidate that was just compared
             if not problem.config.correction:
                 return _finish(problem, calibrated, folder, watch)
-            if last is None:
-                last = pose_correction(problem, calibrated[-1], watch)
-                _check_follows(corrected, last, folder / files.STEPS)
-                _steps(last, corrected, folder, watch, (problem, calibrated))
+            last = last or pose_correction(problem, calibrated[-1], watch)
+            _check_follows(corrected, last, folder / files.STEPS)
+            _steps(last, corrected, folder, watch, (problem, calibrated))
             return _finish(last, [calibrated[0], *corrected], folder, watch)
         except KeyboardInterrupt:
             kept = len(calibrated) + len(corrected)

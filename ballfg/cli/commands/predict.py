@@ -22,9 +22,8 @@ if TYPE_CHECKING:
     from ballfg.prediction.plane import Plane
     from ballfg.tracks import Dataset, TableWriter
 
-EVENTS_WITHIN, LONGEST, STEP, SOON = 3.0, 60.0, 0.005, 1e-9
-"""s: range of the search for events, the largest one, steps of the path that gives their probability, and next to
-nothing."""
+EVENTS_WITHIN, LONGEST, STEP = 3.0, 60.0, 0.005
+"""s: range of the search for events, the largest one, and steps of the path that gives their probability."""
 
 
 def predict(
@@ -158,20 +157,22 @@ def _write_events(
     """A row for each track and event, by its text."""
     import numpy as np
 
-    from ballfg.estimation import Status, predict_tracks
+    from ballfg.estimation import Status
+    from ballfg.estimation.batch import estimate_tracks
     from ballfg.prediction.event_ahead import event_numbers
 
-    first = predict_tracks(estimator, dataset, len(dataset), observe, horizon=SOON, jobs=workers)
-    for one in progress(first, len(dataset), "tracks predicted"):
-        ahead = one.estimate.predict(horizon, STEP) if one.status is Status.OK else None
+    count = len(dataset)
+    estimates = estimate_tracks(estimator, (track.opening(observe) for track in dataset), count, workers)
+    for estimate in progress(estimates, count, "tracks predicted"):
+        ahead = estimate.predict(horizon, STEP) if estimate.status is Status.OK else None
         for text, event in asked.items():
             found = None if ahead is None else ahead.event(event)
             numbers = {"probability": np.nan if found is None else found.probability}
             numbers |= event_numbers(None if found is None else found.crossing)
-            columns: dict[str, str | np.ndarray] = {"trajectory": one.name, "event": text}
+            columns: dict[str, str | np.ndarray] = {"trajectory": estimate.name, "event": text}
             table.write(columns | {name: np.array([value]) for name, value in numbers.items()})
             outcome.rows += 1
-        outcome.tracks.add(one.name, one.status, one.estimate.notes, None)
+        outcome.tracks.add(estimate.name, estimate.status, estimate.notes, None)
 
 
 def _conformal_scales(
