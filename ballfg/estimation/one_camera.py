@@ -59,6 +59,12 @@ class Strokes:
     tracking: Tracking
     estimates: tuple[Estimate, ...]
 
+    @property
+    def doubts(self) -> list[str]:
+        """Sentences on the strokes whose estimate is not sure."""
+        unsure = (one for one in self.estimates if one.status is not Status.OK)
+        return [f"track {one.name}: {one.status.value}" for one in unsure]
+
 
 def track_one_camera(
     detections: Detections,

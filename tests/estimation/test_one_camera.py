@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from ballfg.dynamics.motion.rollout import rollout
+from ballfg.estimation import Status
 from ballfg.estimation.one_camera import Strokes, track_one_camera
 from ballfg.vision.detection.detections import Candidates, Detections
 from tests.estimation.observations.sighted_rig import TABLE, World, looking, world
@@ -76,6 +77,10 @@ def test_a_rally_is_cut_at_its_hits(ball: World) -> None:
         assert estimate.times[-1] - 100.0 == pytest.approx(end, abs=0.1)
         assert len(estimate.contacts) in (1, 2)
     assert max(judged(strokes, times, states)) < 0.08
+    assert strokes.doubts == []
+    first, *others = strokes.estimates
+    unsure = replace(strokes, estimates=(replace(first, status=Status.NOT_CONVERGED), *others))
+    assert unsure.doubts == [f"track 000: {Status.NOT_CONVERGED.value}"]
     ball_one = strokes.tracking.balls[0]
     np.testing.assert_array_equal(ball_one.points, strokes.estimates[0].states[:, :3])
     assert strokes.tracking.seen(ball_one, 0).frames[0] == pytest.approx(HITS[0] * RATE, abs=5)

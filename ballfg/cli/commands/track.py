@@ -106,6 +106,7 @@ def track(
         if len(rig) == 1:
             strokes = track_one_camera(detections[0], rig[0], kind.model, surfaces, watch=progress)
             tracking, states = strokes.tracking, [estimate.columns for estimate in strokes.estimates]
+            print_notes(strokes.doubts)
             info = replace(info, table_extent=surfaces.extent)
         else:
             tracking = track_detections(detections, rig)
