@@ -3,10 +3,14 @@
 Track i has a Gaussian likelihood of its own coefficients b_i, with the information L_i and the vector h_i = L_i y_i;
 the information is zero in directions that the track does not observe. The tracks are draws b_i ~ N(theta, D) with a
 diagonal D, and theta ~ N(start, sigma^2) is the prior of the model. theta and D maximise the likelihood of all tracks
-with every b_i integrated out, times the prior of theta (N. Laird, J. Ware, "Random-effects models for longitudinal
-data", Biometrics 38, 1982). Given D, theta is a least-squares solution. D follows by Fisher scoring, or where that is
-worse by the minorisation step of H. Zhou, L. Hu, J. Zhou, K. Lange, "MM algorithms for variance components models",
-J. Comput. Graph. Stat. 28, 2019, which never lowers the likelihood and needs no step size.
+with every b_i integrated out (N. Laird, J. Ware, "Random-effects models for longitudinal data", Biometrics 38, 1982),
+times the priors of theta and of D. The prior of a spread is a Rayleigh distribution about the prior's sigma. It rises
+from zero, so that a few tracks that happen to agree do not show a spread of zero (Y. Chung, S. Rabe-Hesketh, V. Dorie,
+A. Gelman, J. Liu, "A nondegenerate penalized likelihood estimator for variance parameters in multilevel models",
+Psychometrika 78, 2013), and ends where the tracks set no limit. Given D, theta is a least-squares solution. D follows
+by Fisher scoring, or where that is worse by the minorisation step of H. Zhou, L. Hu, J. Zhou, K. Lange, "MM algorithms
+for variance components models", J. Comput. Graph. Stat. 28, 2019, which never lowers the maximum's objective and needs
+no step size.
 """
 
 from __future__ import annotations
@@ -18,18 +22,16 @@ from functools import cached_property
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from ballfg.arrays import Array, Index, Mask
+from ballfg.arrays import Array, Index
 
 MAX_STEPS = 500
 """Largest number of iterations, a step of each sort; ten are usual."""
 STEP_TOLERANCE = 1e-11
 """Relative change of every variance at which the iteration ends."""
-NO_SPREAD = 1e-10
-"""Variance, as a share of the prior's, below which it is zero."""
-MOST_SPREAD = 100.0
-"""Largest variance, as a multiple of the prior's: tracks with almost no information set no limit."""
+LARGEST_FALL = 10.0
+"""A step of Fisher scoring divides no variance by more."""
 NO_INFORMATION = 1e-2
-"""Information of all tracks, as a share of the prior's, below which the spread of a coefficient is zero."""
+"""Information of all tracks, as a share of the prior's, below which a coefficient has no spread but its prior."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ class Population:
         mean: (p,).
         covariance: (p, p) of the mean, for the spread found.
         spread: (p,) standard deviation between tracks.
-        log_likelihood: marginal, up to a constant, with the prior of the mean.
+        log_likelihood: marginal, up to a constant, with the priors of mean and spread.
         log_evidence: the same with the mean integrated out too, to compare priors of the mean.
     """
 
@@ -132,11 +134,10 @@ def fit_population(
     about = _Means(numbers, size, bounds)
     variance = np.where(about.summed(np.einsum("ikk->ik", information)) > NO_INFORMATION, 1.0, 0.0)
     variance[[] if alike is None else alike] = 0.0
-    fit = _Fit(information, moved, about, variance, variance > 0.0)
+    fit = _Fit(information, moved, about, variance)
     for _ in range(MAX_STEPS):
         once = fit.at(fit.updated)
-        still = np.abs(once.variance - fit.variance) <= STEP_TOLERANCE * fit.variance
-        if (still & ~fit.grows).all():
+        if (np.abs(once.variance - fit.variance) <= STEP_TOLERANCE * fit.variance).all():
             break
         scored = fit.at(fit.scored)
         fit = scored if scored.log_likelihood > once.log_likelihood else once
@@ -156,13 +157,13 @@ class _Fit:
     Only numbers that vary are solved for: (I + L D)^-1 = I - L R (I + R L R)^-1 R with the roots R of D.
 
     Attributes:
-        variance: (p,) of each mean's draws.  free: (p,) true where it may be above zero.
+        variance: (p,) of each mean's draws; zero for means without a spread.
         mean: (p,) the best means.  precision: (p, p) of them, with their prior.
-        log_likelihood: marginal, without its constants, with the prior of the means.
+        log_likelihood: marginal, without its constants, with the priors of means and spreads.
     """
 
-    def __init__(self, information: Array, moved: Array, about: _Means, variance: Array, free: Mask) -> None:
-        self.information, self.moved, self.about, self.variance, self.free = information, moved, about, variance, free
+    def __init__(self, information: Array, moved: Array, about: _Means, variance: Array) -> None:
+        self.information, self.moved, self.about, self.variance = information, moved, about, variance
         own = variance[about.numbers]
         varies = own.any(axis=0)
         roots = np.sqrt(own[:, varies])[:, :, None]
@@ -177,34 +178,33 @@ class _Fit:
         quadratic = (
             self.mean @ self.precision @ self.mean - 2.0 * target @ self.mean - (pushed * solved[:, :, -1:]).sum()
         )
-        self.log_likelihood = float(-0.5 * (np.linalg.slogdet(inner)[1].sum() + quadratic))
+        own = variance[variance > 0.0]
+        prior = 0.5 * float((np.log(own) - own).sum())
+        self.log_likelihood = prior - 0.5 * float(np.linalg.slogdet(inner)[1].sum() + quadratic)
 
     def at(self, variance: Array) -> _Fit:
         """The same tracks with other variances (p,)."""
-        return _Fit(self.information, self.moved, self.about, variance, self.free)
+        return _Fit(self.information, self.moved, self.about, variance)
 
     @property
     def updated(self) -> Array:
         """(p,) the variances after one step: the pulls as large as they are, against as large as they should be."""
         pulls, expected = self._slopes
-        growth = np.sqrt(np.divide(pulls, expected, out=np.zeros_like(pulls), where=expected > 0.0))
-        return _bounded(self.variance * growth)
+        down = expected + 1.0
+        return np.where(
+            self.variance > 0.0, (1.0 + np.sqrt(1.0 + 4.0 * down * pulls * self.variance**2)) / (2.0 * down), 0.0
+        )
 
     @property
     def scored(self) -> Array:
         """(p,) the variances after a step of Fisher scoring."""
         pulls, expected = self._slopes
-        free = (self.variance > 0.0) | self.grows
-        step = np.zeros(len(free))
-        curvature = self.about.paired(self._marginal**2)[np.ix_(free, free)]
-        step[free] = np.linalg.lstsq(curvature, (pulls - expected)[free], rcond=None)[0]
-        return _bounded(self.variance + step)
-
-    @property
-    def grows(self) -> Mask:
-        """(p,) true for a variance of zero that should be larger."""
-        pulls, expected = self._slopes
-        return np.asarray(self.free & (self.variance == 0.0) & (pulls > expected))
+        free, found = self.variance > 0.0, self.variance.copy()
+        own = found[free]
+        curvature = self.about.paired(self._marginal**2)[np.ix_(free, free)] + np.diag(own**-2)
+        step = np.linalg.solve(curvature, (pulls - expected)[free] + 1.0 / own - 1.0)
+        found[free] = np.maximum(own + step, own / LARGEST_FALL)
+        return found
 
     @cached_property
     def _slopes(self) -> tuple[Array, Array]:
@@ -212,11 +212,6 @@ class _Fit:
         about = self.about
         pulls = about.summed((self._vector - (self._marginal @ self.mean[about.numbers][..., None])[..., 0]) ** 2)
         return pulls, about.summed(np.einsum("ikk->ik", self._marginal))
-
-
-def _bounded(variance: Array) -> Array:
-    """Variances (p,) within their bounds; next to none is none."""
-    return np.where(variance < NO_SPREAD, 0.0, np.minimum(variance, MOST_SPREAD))
 
 
 @dataclass(frozen=True)

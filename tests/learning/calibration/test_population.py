@@ -2,7 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
+from scipy.optimize import minimize_scalar
+from scipy.stats import multivariate_normal, norm
 
 from ballfg.arrays import Array
 from ballfg.learning.calibration.population import Evidence, evidence, fit_population
@@ -22,35 +23,49 @@ def unbounded(p: int) -> tuple[Array, Array]:
     return np.full(p, -np.inf), np.full(p, np.inf)
 
 
+def log_prior(spread: Array, sigma: Array) -> float:
+    """Of Rayleigh distributions with the scales `sigma`, up to a constant."""
+    return float((np.log(spread / sigma) - 0.5 * (spread / sigma) ** 2).sum())
+
+
 @pytest.mark.parametrize("spread", [0.5, 0.05])
-def test_balanced_tracks_have_the_closed_form(spread: float) -> None:
-    # equal noise s: the mean is the average, the variance between tracks max(0, mean square - s^2)
+@pytest.mark.parametrize("count", [4, 40])
+def test_balanced_tracks_have_the_spread_of_a_scalar_search(spread: float, count: int) -> None:
+    # equal noise s: the mean is the average, and each spread the maximum of a function of one variable
     rng = np.random.default_rng(0)
-    noise = np.array([0.1, 0.3])
-    y = np.array([1.0, -2.0]) + rng.normal(size=(40, 2)) * np.hypot(noise, spread)
+    noise, sigma = np.array([0.1, 0.3]), np.array([2.0, 1.0])
+    y = np.array([1.0, -2.0]) + rng.normal(size=(count, 2)) * np.hypot(noise, spread)
     tracks = [gaussian(row, np.diag(noise**2)) for row in y]
-    found = fit_population(tracks, np.zeros(2), np.full(2, 100.0), *unbounded(2))
-    variance = np.maximum(((y - y.mean(axis=0)) ** 2).mean(axis=0) - noise**2, 0.0)
-    # the prior, 100 wide, moves the mean by 1e-6 of itself; 1e-6 = 1e-10 prior variances count as zero
-    np.testing.assert_allclose(found.mean, y.mean(axis=0), rtol=2e-6)
-    np.testing.assert_allclose(found.spread**2, variance, rtol=1e-6, atol=1.1e-6)
-    np.testing.assert_allclose(found.sigma, np.sqrt((found.spread**2 + noise**2) / 40), rtol=2e-6)
+    found = fit_population(tracks, y.mean(axis=0), sigma, *unbounded(2))
+    np.testing.assert_allclose(found.mean, y.mean(axis=0), atol=1e-12)  # where the prior sits
+    for k in range(2):
+
+        def cost(log: float, k: int = k) -> float:
+            own = np.exp([log])
+            likely = norm.logpdf(y[:, k], y[:, k].mean(), np.hypot(own, noise[k])).sum()
+            return -float(likely) - log_prior(own, sigma[k : k + 1])
+
+        best = minimize_scalar(cost, bounds=(-8.0, 3.0), method="bounded", options={"xatol": 1e-9})
+        np.testing.assert_allclose(found.spread[k], np.exp(best.x), rtol=1e-6)
+    expected = 1.0 / np.sqrt(count / (found.spread**2 + noise**2) + sigma**-2.0)
+    np.testing.assert_allclose(found.sigma, expected, rtol=1e-9)
 
 
-def test_variance_is_the_closed_form_where_the_prior_is_not_absurdly_wide() -> None:
+def test_many_tracks_leave_the_usual_estimate_of_the_spread() -> None:
     rng = np.random.default_rng(1)
-    y = rng.normal(size=(30, 1)) * 0.5
+    y = rng.normal(size=(3000, 1)) * 0.5
     found = fit_population([gaussian(row, np.array([[0.04]])) for row in y], y.mean(axis=0), np.ones(1), *unbounded(1))
-    # the prior sits on the average, so the average stays the best mean
-    np.testing.assert_allclose(found.mean, y.mean(axis=0), atol=1e-12)
-    np.testing.assert_allclose(found.spread**2, y.var() - 0.04, rtol=1e-8)
+    np.testing.assert_allclose(found.spread**2, y.var() - 0.04, rtol=2e-3)
 
 
-def test_zero_spread_where_the_noise_explains_all() -> None:
-    y = np.linspace(-0.1, 0.1, 11)[:, None]
-    found = fit_population([gaussian(row, np.eye(1)) for row in y], np.zeros(1), np.ones(1), *unbounded(1))
-    assert found.spread.tolist() == [0.0]
-    np.testing.assert_allclose(found.sigma, 1.0 / np.sqrt(12.0), rtol=1e-12)  # eleven tracks and the prior
+def test_spread_is_not_zero_where_a_few_tracks_happen_to_agree() -> None:
+    # the noise explains all of y; what the tracks leave open is a spread of the standard error of their scatter
+    noise, y = 0.2, np.linspace(-0.01, 0.01, 5)[:, None]
+    found = fit_population([gaussian(row, np.eye(1) * noise**2) for row in y], np.zeros(1), np.ones(1), *unbounded(1))
+    assert 0.2 * noise < found.spread[0] < noise
+    more = np.linspace(-0.01, 0.01, 500)[:, None]
+    many = fit_population([gaussian(r, np.eye(1) * noise**2) for r in more], np.zeros(1), np.ones(1), *unbounded(1))
+    assert many.spread[0] < 0.12 * noise
 
 
 def test_unequal_tracks_reach_the_maximum_of_the_dense_likelihood() -> None:
@@ -68,7 +83,8 @@ def test_unequal_tracks_reach_the_maximum_of_the_dense_likelihood() -> None:
         total = sum(
             multivariate_normal.logpdf(a, mean, c + np.diag(variance)) for a, c in zip(y, covariances, strict=True)
         )
-        return float(total + multivariate_normal.logpdf(mean, start, np.diag(sigma**2)))
+        prior = log_prior(np.sqrt(variance), sigma)
+        return float(total + prior + multivariate_normal.logpdf(mean, start, np.diag(sigma**2)))
 
     variance = found.spread**2
     best = dense(found.mean, variance)
@@ -76,8 +92,7 @@ def test_unequal_tracks_reach_the_maximum_of_the_dense_likelihood() -> None:
         for step in (1e-3, -1e-3):
             shift = step * np.eye(3)[k]
             assert dense(found.mean + shift, variance) < best
-            if (variance + shift)[k] >= 0.0:
-                assert dense(found.mean, variance + shift) < best
+            assert dense(found.mean, np.maximum(variance + shift, 1e-4)) < best
     elsewhere = fit_population(tracks[::-1], start, sigma, *unbounded(3))
     np.testing.assert_allclose(elsewhere.mean, found.mean, rtol=1e-9)
     # its own likelihood differs from the dense one by what depends on the data only
@@ -131,8 +146,9 @@ def test_mean_stays_in_its_bounds_and_the_others_follow() -> None:
     tracks = [gaussian(np.array([1.2, 0.5]), covariance) for _ in range(10)]
     found = fit_population(tracks, np.zeros(2), np.full(2, WIDE), np.zeros(2), np.ones(2))
     assert found.mean[0] == 1.0
-    # given the first, the second moves along their correlation: 0.5 - 0.03 / 0.04 * 0.2
-    np.testing.assert_allclose(found.mean[1], 0.35, rtol=1e-6)
+    # given the first, the second moves along their correlation
+    whole = covariance + np.diag(found.spread**2)
+    np.testing.assert_allclose(found.mean[1], 0.5 - 0.2 * whole[1, 0] / whole[0, 0], rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -167,7 +183,8 @@ def test_groups_share_a_coefficient_and_reach_the_maximum_of_the_dense_likelihoo
             multivariate_normal.logpdf(a, mean[own], c + np.diag(variance[own]))
             for a, c, own in zip(y, covariances, numbers, strict=True)
         )
-        return float(total + multivariate_normal.logpdf(mean, start, np.diag(sigma**2)))
+        prior = log_prior(np.sqrt(variance), sigma)
+        return float(total + prior + multivariate_normal.logpdf(mean, start, np.diag(sigma**2)))
 
     variance = found.spread**2
     best = dense(found.mean, variance)
@@ -175,8 +192,7 @@ def test_groups_share_a_coefficient_and_reach_the_maximum_of_the_dense_likelihoo
         for step in (1e-3, -1e-3):
             shift = step * np.eye(3)[k]
             assert dense(found.mean + shift, variance) < best
-            if (variance + shift)[k] >= 0.0:
-                assert dense(found.mean, variance + shift) < best
+            assert dense(found.mean, np.maximum(variance + shift, 1e-4)) < best
     other = fit_population(tracks, start, sigma, np.full(3, -np.inf), np.array([np.inf, -2.5, np.inf]), numbers)
     np.testing.assert_allclose(
         found.log_likelihood - other.log_likelihood, best - dense(other.mean, other.spread**2), rtol=1e-8
