@@ -216,6 +216,30 @@ def posterior(reduced: Reduced, precision: Array, away: Array) -> Posterior:
     return Posterior(float(reduced.constant.sum() - 0.5 * square - narrow), float(square), mean, covariance)
 
 
+def evidences(reduced: Reduced, precision: Array, away: Array) -> Array:
+    """(n,) the evidence of each part alone, with all common unknowns integrated out; arguments as in `posterior`."""
+    information = reduced.gram[:, :-1, :-1] + np.diag(precision)
+    gradient = reduced.gram[:, :-1, -1] + precision * away
+    lower = np.linalg.cholesky(information)
+    solved = np.linalg.solve(lower, gradient[..., None])[..., 0]
+    square = reduced.gram[:, -1, -1] - (solved**2).sum(axis=-1) + float((precision * away**2).sum())
+    narrow = np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=-1) - 0.5 * np.log(precision).sum()
+    return np.asarray(reduced.constant - 0.5 * square - narrow)
+
+
+def held_out(tracks: Reduced, precision: Array, away: Array, halves: Mask) -> Array:
+    """(t,) logarithm of the density of each track, with common unknowns from the tracks of the other half.
+
+    Args: tracks: the part of each.  precision, away: as in `posterior`.  halves: (t,) which half each belongs to.
+    """
+    found = np.zeros(len(halves))
+    for half in (True, False):
+        own, others = halves == half, tracks.of(halves != half)
+        more = Reduced(others.constant + tracks.constant[own], others.gram + tracks.gram[own])
+        found[own] = evidences(more, precision, away) - evidences(others, precision, away)
+    return found
+
+
 def settled(rows: Rows, precision: Array, away: Array, start: Noise | None = None) -> tuple[Likelihood, Noise]:
     """The likelihood with the robust weights and sizes of noise that maximise the evidence.
 

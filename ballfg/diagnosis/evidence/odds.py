@@ -9,12 +9,15 @@ import numpy as np
 from scipy import special
 
 from ballfg.diagnosis.evidence.nameless import NAMELESS
-from ballfg.diagnosis.evidence.weighed import Weighed
+from ballfg.diagnosis.evidence.weighed import Weighed, Weight
 
 ALIKE = 0.05
 """Odds of another effect in an effect's place above which the two cannot be told apart."""
 SURELY = 2.0
-"""Standard errors by which the gain on the other half must fall short of the evidence to be believed instead."""
+"""Standard errors by which the gain on the other half must fall short of the evidence to take its place."""
+
+ABSENT = 4.5
+"""Largest loss of evidence, natural units, with which an effect is still about absent: three standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -58,33 +61,53 @@ class Odds:
         return dict(sorted(((name, self.of(name)) for name in names), key=lambda item: -item[1]))
 
 
-def tempered(model: Weighed, declared: Weighed) -> float:
-    """The evidence of a model over that of the declared one, as far as the other half bears it out.
-
-    Each half is predicted with the coefficients of the other. If the model is right, its gain there is about the
-    evidence. Where it is smaller by more than chance, the likelihood is raised to a power that makes them equal.
-    """
-    promised = model.evidence - declared.evidence
-    gains = model.held_out - declared.held_out
-    most = float(gains.sum() + SURELY * gains.std(ddof=1) * np.sqrt(len(gains)))
-    return float(np.clip(most, 0.0, promised)) if promised > 0.0 else promised
+def odds_of(models: Sequence[Weighed]) -> Odds:
+    """The probabilities of all models, of the smaller ones that they hold, and of their neighbours."""
+    scores = scores_of(models)
+    return Odds(dict(zip(scores, special.softmax(list(scores.values())).tolist(), strict=True)))
 
 
-def odds_of(models: Sequence[Weighed], declared: Weighed) -> Odds:
-    """The probabilities of all models, of the smaller ones that they hold, and of their neighbours.
+def scores_of(models: Sequence[Weighed]) -> dict[frozenset[str], float]:
+    """Logarithm of the odds of all models, of the smaller ones that they hold, and of their neighbours, by their names.
+
+    Each half is predicted with the coefficients of the other. If further effects are there, they gain about as much
+    there as in evidence. Where their gain over a smaller model is less by more than chance, it takes the place of that
+    evidence.
 
     A refit without an effect may end in a poorer minimum than the model with it. Where strengths are known to be about
     absent, the linearisation with them holds the model without (J. M. Dickey, 1971), and the better of both counts.
-    Neighbours that no refit weighed count as foretold.
+    Models that no refit weighed count as foretold, and lose what those lose whose linearisations foretell them.
     """
-    scores: dict[frozenset[str], float] = {}
+    weighed: dict[frozenset[str], list[Weight]] = {model.names: [model.weight] for model in models}
+    for model in models:
+        for names, weight in model.nested.items():
+            if names in weighed and weight.evidence > model.evidence - ABSENT:
+                weighed[names].append(weight)
+    believed: dict[frozenset[str], tuple[Weight, float]] = {}
+    for names in sorted(weighed, key=lambda names: (len(names), sorted(names))):
+        tried = [(weight, tempered(names, weight, believed)) for weight in weighed[names]]
+        believed[names] = max(tried, key=lambda one: one[1] + one[0].odds)
+    scores = {names: value + weight.odds for names, (weight, value) in believed.items()}
     foretold: dict[frozenset[str], float] = {}
     for model in models:
-        score = tempered(model, declared) + model.odds
-        smaller = {names: score + other - model.score for names, other in model.nested.items()}
-        for names, value in (smaller | {model.names: score}).items():
-            scores[names] = max(value, scores.get(names, -np.inf))
-        for names, value in model.neighbours.items():
-            foretold[names] = max(score + value - model.score, foretold.get(names, -np.inf))
-    scores = foretold | scores
-    return Odds(dict(zip(scores, special.softmax(list(scores.values())).tolist(), strict=True)))
+        for names, weight in (*model.nested.items(), *model.neighbours.items()):
+            if names not in scores:
+                lost = scores[model.names] + weight.score - model.score
+                score = min(lost, tempered(names, weight, believed) + weight.odds)
+                foretold[names] = max(score, foretold.get(names, -np.inf))
+    return scores | foretold
+
+
+def tempered(names: frozenset[str], weight: Weight, believed: Mapping[frozenset[str], tuple[Weight, float]]) -> float:
+    """The evidence of a model as far as the other half bears out what it gains over each smaller one.
+
+    Args: believed: other models, with their tempered evidence.
+    """
+    smaller = [one for known, one in believed.items() if known < names and one[0].evidence < weight.evidence]
+    if not smaller:
+        return weight.evidence
+    promised = weight.evidence - np.array([other.evidence for other, _ in smaller])
+    gains = weight.held_out - np.stack([other.held_out for other, _ in smaller])
+    most = gains.sum(axis=1) + SURELY * gains.std(axis=1, ddof=1) * np.sqrt(gains.shape[1])
+    whole = np.array([value for _, value in smaller]) + np.clip(most, 0.0, promised)
+    return float(min(weight.evidence, whole.min()))

@@ -15,10 +15,10 @@ import numpy as np
 from scipy import special
 
 from ballfg.arrays import Array, Index
-from ballfg.diagnosis.evidence.likelihood import Likelihood, Posterior, Reduced, posterior
+from ballfg.diagnosis.evidence.likelihood import Likelihood, Posterior, Reduced, held_out, posterior
 from ballfg.diagnosis.evidence.prior import WIDTHS, centres, choice_odds, log_odds, scales, within
 from ballfg.diagnosis.evidence.rows import Motion, roots, rows_of
-from ballfg.diagnosis.evidence.weighed import Priors, Step, Weighed
+from ballfg.diagnosis.evidence.weighed import Priors, Step, Weighed, Weight
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.state import STATE_DIM
 
@@ -30,19 +30,21 @@ KEPT: Final = 6
 
 @dataclass(frozen=True)
 class Screen:
-    """Inner products of a model's common unknowns and of the strengths of all candidates, summed over the tracks.
+    """Inner products of a model's common unknowns and of the strengths of all candidates.
 
     Attributes:
         model: without the candidates.
         candidates: the hypotheses.
         likelihood: with the columns of their strengths last.
-        total: the same, first states and random motion integrated out.
+        tracks: the same of each track, first states and random motion integrated out.
+        total: summed over the tracks.
         priors: of the model's own common unknowns.
     """
 
     model: Weighed
     candidates: Sequence[Hypothesis]
     likelihood: Likelihood
+    tracks: Reduced
     total: Reduced
     priors: Priors
     _known: dict[tuple[tuple[tuple[int, int], ...], int], _Gain] = field(default_factory=dict)
@@ -56,9 +58,9 @@ class Screen:
         rows = rows_of(model.fit, motion)
         wide = replace(rows, by_common=np.concatenate((rows.by_common, columns / roots(model.fit)), axis=-1))
         likelihood = Likelihood(wide, *model.weights)
-        reduced, _ = likelihood.reduced(model.noise)
-        summed = Reduced(reduced.constant.sum(keepdims=True), reduced.gram.sum(axis=0, keepdims=True))
-        return cls(model, candidates, likelihood, summed, Priors.of(model.fit, model.named))
+        tracks = likelihood.reduced(model.noise)[0].by_track(rows.track)
+        total = tracks.of(np.full(len(model.halves), True))
+        return cls(model, candidates, likelihood, tracks, total, Priors.of(model.fit, model.named))
 
     @cached_property
     def gains(self) -> list[float]:
@@ -95,28 +97,35 @@ class Screen:
         return self._leading(found, len(found))
 
     @cached_property
-    def exchanges(self) -> dict[tuple[str, int], float]:
-        """Score of the model with a candidate in place of an effect, by the effect's name and the candidate."""
-        found: dict[tuple[str, int], float] = {}
+    def exchanges(self) -> dict[tuple[str, int], Weight]:
+        """The weight of the model with a candidate in place of an effect, by the effect's name and the candidate."""
+        found: dict[tuple[str, int], Weight] = {}
         widths, effects = list(self.model.widths), [h for h in self.model.named if h.strengths]
         for place, effect in enumerate(effects):
-            without = self.model.names - {effect.name}
-            if without not in self.model.nested:
-                continue
-            held = self.priors.held([place], widths)
-            for one, candidate in enumerate(self.candidates):
-                gain = self._beside((), one, held).gain + choice_odds([candidate]) + log_odds([candidate])
-                found[effect.name, one] = self.model.nested[without] + gain
+            rest = self.model.nested.get(self.model.names - {effect.name})
+            if rest is not None:
+                held = self.priors.held([place], widths)
+                for one in range(len(self.candidates)):
+                    found[effect.name, one] = self._with(one, rest, held)
         return found
 
-    def neighbours(self) -> dict[frozenset[str], float]:
-        """Score of every model with a further candidate, or with one in place of an effect, by the names of effects."""
-        found: dict[frozenset[str], float] = {}
-        further = {("", one): self.model.score + self.odds((one,)) for one in range(len(self.candidates))}
-        for (gone, one), score in (further | self.exchanges).items():
+    @cached_property
+    def neighbours(self) -> dict[frozenset[str], Weight]:
+        """The weight of every model with a further candidate, or with one in place of an effect, by its names."""
+        found: dict[frozenset[str], Weight] = {}
+        further = {("", one): self._with(one, self.model.weight) for one in range(len(self.candidates))}
+        for (gone, one), weight in (further | self.exchanges).items():
             names = self.model.names - {gone} | {self.candidates[one].name}
-            found[names] = max(score, found.get(names, -np.inf))
+            if names not in found or weight.score > found[names].score:
+                found[names] = weight
         return found
+
+    def _with(self, one: int, rest: Weight, precision: Array | None = None) -> Weight:
+        """The weight with a candidate beside the rest; precision: of the rest, if not as in the model."""
+        more, listed = self._beside((), one, precision), [self.candidates[one]]
+        part, whole, away = self._part(self.tracks, [(one, more.width)], precision)
+        density = held_out(part, whole, away, self.model.halves)
+        return Weight(rest.evidence + more.gain + choice_odds(listed), rest.odds + log_odds(listed), density)
 
     def step(self, chosen: Sequence[int]) -> tuple[Step, Array]:
         """The step to the most probable unknowns beside some candidates, and (s,) their strengths in order."""
@@ -180,13 +189,19 @@ class Screen:
 
     def _posterior(self, chosen: Sequence[tuple[int, int]], precision: Array | None = None) -> Posterior:
         """With some candidates, each in a width; precision: of the model's own unknowns, if not as in the model."""
+        return posterior(*self._part(self.total, chosen, precision))
+
+    def _part(
+        self, whole: Reduced, chosen: Sequence[tuple[int, int]], precision: Array | None
+    ) -> tuple[Reduced, Array, Array]:
+        """The part of all columns that some candidates need, the precision of their priors and how far these are."""
         columns = self._columns([one for one, _ in chosen])
-        listed = np.append(columns, self.total.gram.shape[-1] - 1)
-        part = Reduced(self.total.constant, self.total.gram[:, listed[:, None], listed])
+        listed = np.append(columns, whole.gram.shape[-1] - 1)
+        part = Reduced(whole.constant, whole.gram[:, listed[:, None], listed])
         sizes = [WIDTHS[width] * self._scales[one] for one, width in chosen]
         own = self.priors.precision(self.model.widths) if precision is None else precision
-        whole = np.concatenate((own, *(size**-2 for size in sizes)))
-        return posterior(part, whole, np.append(self.priors.away, np.zeros(len(columns) - self._own)))
+        away = np.append(self.priors.away, np.zeros(len(columns) - self._own))
+        return part, np.concatenate((own, *(size**-2 for size in sizes))), away
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ import numpy as np
 from scipy import special
 
 from ballfg.arrays import Array, Index, Mask
-from ballfg.diagnosis.evidence.likelihood import Noise, Posterior, Reduced, posterior, settled, weighted
+from ballfg.diagnosis.evidence.halves import unlike_halves
+from ballfg.diagnosis.evidence.likelihood import Noise, Posterior, Reduced, held_out, posterior, settled, weighted
 from ballfg.diagnosis.evidence.nameless import NAMELESS, USUAL, Patterns
 from ballfg.diagnosis.evidence.prior import WIDTHS, centres, choice_odds, log_odds, scales, within
 from ballfg.diagnosis.evidence.rows import Motion, Rows, random_motion, rows_of
@@ -38,6 +39,26 @@ class Strengths:
 
 
 @dataclass(frozen=True)
+class Weight:
+    """What decides about a model: as weighed, or as another one's linearisation foretells it.
+
+    Attributes:
+        evidence: logarithm, natural units, up to a constant that all models of the same tracks share.
+        odds: logarithm of the prior odds.
+        held_out: (t,) logarithm of the density of each track, with coefficients of the other half.
+    """
+
+    evidence: float
+    odds: float
+    held_out: Array
+
+    @property
+    def score(self) -> float:
+        """Logarithm of the posterior odds, up to the constant of `evidence`."""
+        return self.evidence + self.odds
+
+
+@dataclass(frozen=True)
 class Weighed:
     """A model with its evidence.
 
@@ -51,8 +72,9 @@ class Weighed:
         odds: logarithm of the prior odds.
         strengths: by name of the effect.
         held_out: (t,) logarithm of the density of each track, with coefficients of the other half.
+        halves: (t,) which half each track belongs to.
         nameless: whether it holds patterns without a name as well.
-        nested: score of each smaller model, by its names, the rest linearised where it is.
+        nested: the weight of each smaller model, by its names, the rest linearised where it is.
         neighbours: the same of models with a further effect, or with another one in place of one of its own.
     """
 
@@ -65,9 +87,10 @@ class Weighed:
     odds: float
     strengths: Mapping[str, Strengths]
     held_out: Array
+    halves: Mask
     nameless: bool = False
-    nested: Mapping[frozenset[str], float] = field(default_factory=dict)
-    neighbours: Mapping[frozenset[str], float] = field(default_factory=dict)
+    nested: Mapping[frozenset[str], Weight] = field(default_factory=dict)
+    neighbours: Mapping[frozenset[str], Weight] = field(default_factory=dict)
 
     @property
     def names(self) -> frozenset[str]:
@@ -75,9 +98,14 @@ class Weighed:
         return frozenset(h.name for h in self.named) | frozenset([NAMELESS] * self.nameless)
 
     @property
+    def weight(self) -> Weight:
+        """What decides about it."""
+        return Weight(self.evidence, self.odds, self.held_out)
+
+    @property
     def score(self) -> float:
-        """Logarithm of the posterior odds, up to the constant of `evidence`."""
-        return self.evidence + self.odds
+        """As of its weight."""
+        return self.weight.score
 
 
 @dataclass(frozen=True)
@@ -154,13 +182,12 @@ def weigh(fit: Fit, named: Sequence[Hypothesis] = (), *, nameless: bool = False)
     """The evidence of a fitted model, with the sizes of its noise.
 
     Args:
-        fit: to all tracks; every second one counts as one half.
+        fit: to all tracks.
         named: effects in the fit that the declared model lacks; their strengths get the priors of effects.
         nameless: with patterns without a name beside them.
     Returns: the model with its evidence; ratios of evidences compare models of the same stretches.
     """
-    halves = np.arange(len(np.unique(fit.problem.stretches.track))) % 2 == 0
-    return weighed(fit, named, random_motion(fit), halves, nameless=nameless)
+    return weighed(fit, named, random_motion(fit), unlike_halves(fit), nameless=nameless)
 
 
 def weighed(
@@ -180,7 +207,7 @@ def weighed(
         fit: to the tracks of both halves.
         named: effects added to the declared model.
         motion: random columns of this or a similar model.
-        halves: (t,) True for tracks of the search half, in the order of the fit's tracks.
+        halves: (t,) which half each track belongs to, in the order of the fit's tracks (`unlike_halves`).
         start: noise of a similar model.
         nameless: with patterns without a name beside the effects.
     """
@@ -280,9 +307,10 @@ class _Question:
             result.evidence + sum(mixed) + choice_odds(self.named),
             log_odds(self.named, self.nameless),
             strengths,
-            held_out(priors, total, best, self.halves),
+            held_out(total, priors.precision(best), priors.away, self.halves),
+            self.halves,
             self.nameless,
-            self._nested(priors, whole, best, mixed),
+            self._nested(priors, total, best, mixed),
         )
         return weighed, Step(likelihood.local_step(noise, result.mean)[:, :STATE_DIM], away, gain)
 
@@ -302,29 +330,20 @@ class _Question:
         return point.priors.posterior(reduced, model.widths).evidence
 
     def _nested(
-        self, priors: Priors, whole: Reduced, widths: Sequence[int], mixed: Sequence[float]
-    ) -> dict[frozenset[str], float]:
-        """The score of every model with some of the effects: strengths of the others are held where they are absent."""
+        self, priors: Priors, tracks: Reduced, widths: Sequence[int], mixed: Sequence[float]
+    ) -> dict[frozenset[str], Weight]:
+        """Weights of all models with some of the effects; strengths of the others are held where they are absent."""
         found, effects = {}, [h for h in self.named if h.strengths]
+        whole = tracks.of(np.full(len(self.halves), True))
         for count in range(1, len(effects) + 1):
             for gone in combinations(range(len(effects)), count):
                 rest = [h for h in self.named if h not in [effects[place] for place in gone]]
                 if any(effects[place].effect.name in h.effect.needs for place in gone for h in rest):
                     continue
-                alone = posterior(whole, priors.held(gone, widths), priors.away)
-                evidence = alone.evidence + sum(mixed) - sum(mixed[place] for place in gone)
+                precision = priors.held(gone, widths)
+                evidence = posterior(whole, precision, priors.away).evidence
+                evidence += sum(mixed) - sum(mixed[place] for place in gone) + choice_odds(rest)
                 names = frozenset(h.name for h in rest) | frozenset([NAMELESS] * self.nameless)
-                found[names] = evidence + choice_odds(rest) + log_odds(rest, self.nameless)
+                density = held_out(tracks, precision, priors.away, self.halves)
+                found[names] = Weight(evidence, log_odds(rest, self.nameless), density)
         return found
-
-
-def held_out(priors: Priors, by_tracks: Reduced, widths: Sequence[int], halves: Mask) -> Array:
-    """(t,) logarithm of the density of each track, with common unknowns from the tracks of the other half."""
-    found = np.zeros(len(halves))
-    for half in (True, False):
-        others = halves != half
-        alone = priors.posterior(by_tracks.of(others), widths).evidence
-        for track in np.flatnonzero(halves == half):
-            more = others | (np.arange(len(halves)) == track)
-            found[track] = priors.posterior(by_tracks.of(more), widths).evidence - alone
-    return found

@@ -1,14 +1,15 @@
 """The search adds, removes and exchanges effects as long as that makes the model more probable."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 
 from ballfg.arrays import Mask
+from ballfg.diagnosis.evidence.halves import unlike_halves
 from ballfg.diagnosis.evidence.nameless import NAMELESS
-from ballfg.diagnosis.evidence.odds import ALIKE, Odds, odds_of
+from ballfg.diagnosis.evidence.odds import ALIKE, Odds, odds_of, scores_of
 from ballfg.diagnosis.evidence.rows import random_motion
 from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.weighed import WORTH_A_STEP, Weighed, weighed
@@ -28,7 +29,9 @@ from ballfg.dynamics.effect import Effect
 from ballfg.estimation.batch import do_all
 
 MOST_EFFECTS = 5
-"""Largest number of added effects: each costs a round."""
+"""Largest number of added effects."""
+MOST_ROUNDS = 8
+"""Largest number of rounds: one adds several effects, or exchanges one."""
 MOST_EXCHANGES = 3
 """Largest number of exchanges that a round refits."""
 NAMED = 0.9
@@ -99,7 +102,7 @@ class SearchLoop:
         self.watch(f"fitting the declared model to {len(self.holdout.search)} flights")
         first = first_fit(model, self.holdout) if first is None else first
         found = _Found(self, first)
-        while len(found.best.named) < MOST_EFFECTS and found.round():
+        while len(found.best.named) < MOST_EFFECTS and len(found.rounds) < MOST_ROUNDS and found.round():
             pass
         found.compare()
         return self._told(found, first)
@@ -148,11 +151,9 @@ class _Found:
     def __init__(self, loop: SearchLoop, first: Fit) -> None:
         self.loop, self.first = loop, first
         whole = on_all(first, on_others(first, loop.holdout.held_out))
-        count = len(np.unique(first.problem.stretches.track))
-        self.halves: Mask = np.arange(len(np.unique(whole.problem.stretches.track))) < count
-        self.scattering = [name for name in whole.problem.free if name not in whole.problem.deviations]
-        self.motion = random_motion(whole, self.scattering)
-        self.declared = self.best = weighed(whole, (), self.motion, self.halves)
+        self.halves: Mask = unlike_halves(whole)
+        self.motion = random_motion(whole)  # the same for all models: with another one they cannot be compared
+        self.best = weighed(whole, (), self.motion, self.halves)
         self.models = {self.best.names: self.best}
         self.rounds: list[Round] = []
         self.tried: set[tuple[frozenset[str], frozenset[str]]] = set()
@@ -160,7 +161,21 @@ class _Found:
     @property
     def odds(self) -> Odds:
         """Probabilities over all models weighed so far."""
-        return odds_of(list(self.models.values()), self.declared)
+        return odds_of(list(self.models.values()))
+
+    @property
+    def scores(self) -> dict[frozenset[str], float]:
+        """Logarithm of the odds of all models weighed or foretold so far."""
+        return scores_of(list(self.models.values()))
+
+    def most_probable(self, models: Iterable[Weighed]) -> Weighed | None:
+        """The best of some models weighed before; None without any."""
+        scores = self.scores
+        return max(models, key=lambda model: scores[model.names], default=None)
+
+    def is_better(self, model: Weighed | None) -> bool:
+        """Whether a model weighed before is more probable than the best one so far."""
+        return model is not None and self.scores[model.names] > self.scores[self.best.names]
 
     def round(self) -> bool:
         """Adds the effects that make the model most probable, and removes those that they make superfluous."""
@@ -169,17 +184,17 @@ class _Found:
         most = MOST_EFFECTS - len(best.named)
         scored, refits, screen = try_hypotheses(best, self.motion, loop.catalogue, tell, loop.jobs, most)
         winner = self._weighed(refits)
-        if screen is not None and (winner is None or winner.score <= best.score):
-            self.best = self.models[best.names] = replace(best, neighbours=screen.neighbours())
+        if screen is not None and not self.is_better(winner):
+            self.best = self.models[best.names] = replace(best, neighbours=screen.neighbours)
             if (exchanged := self._exchanged(screen, scored, tell)) is not None:
                 self.rounds.append(Round(scored, [*refits, exchanged], (exchanged.name,)))
                 return True
-        if winner is None or winner.score <= best.score:
+        if not self.is_better(winner):
             ways = loop.ways or partial(groupings, loop.holdout.tracks)
             more, fitted = try_varying(best, self.motion, loop.of_some or loop.catalogue, ways, tell, loop.jobs)
             scored, refits = [*scored, *more], [*refits, *fitted]
-            winner = max((w for w in (winner, self._weighed(fitted)) if w is not None), key=_score, default=None)
-        added = winner is not None and winner.score > best.score
+            winner = self.most_probable(w for w in (winner, self._weighed(fitted)) if w is not None)
+        added = self.is_better(winner)
         names = tuple(h.name for h in winner.named if h not in best.named) if winner is not None and added else ()
         self.rounds.append(Round(scored, refits, names))
         if winner is None or not added:
@@ -187,7 +202,6 @@ class _Found:
             return False
         tell(f"{' and '.join(names)} added")
         self.best = winner
-        self.motion = random_motion(winner.fit, self.scattering)
         self._better_minimum(best, winner)
         self._pruned()
         return True
@@ -198,12 +212,16 @@ class _Found:
         Those that are foretold to come close are refitted: they are what cannot be told apart. An absence that is many
         standard deviations away lies beyond the linear range, so that close is a share of what the effect explains.
         """
-        foretold, best, tried = screen.exchanges, self.best, list[tuple[Weighed, Refit]]()
-        for gone, one in sorted(foretold, key=lambda exchange: -foretold[exchange]):
+        best, tried, scores = self.best, list[tuple[Weighed, Refit]](), self.scores
+
+        def exchanged(gone: str, one: int) -> frozenset[str]:
+            return best.names - {gone} | {screen.candidates[one].name}
+
+        for gone, one in sorted(screen.exchanges, key=lambda exchange: -scores[exchanged(*exchange)]):
             other, own = screen.candidates[one], next(h for h in best.named if h.name == gone)
-            explains = best.score - best.nested[best.names - {gone}]
-            close = foretold[gone, one] > best.score - max(-np.log(ALIKE), ALIKE * explains)
-            if len(tried) == MOST_EXCHANGES or not close or best.names - {gone} | {other.name} in self.models:
+            explains = best.score - best.nested[best.names - {gone}].score
+            close = scores[exchanged(gone, one)] > scores[best.names] - max(-np.log(ALIKE), ALIKE * explains)
+            if len(tried) == MOST_EXCHANGES or not close or exchanged(gone, one) in self.models:
                 continue
             tell(f"fitting with {other.name} in place of {gone}")
             candidate = next(s for s in scored if s.hypothesis is other)
@@ -212,13 +230,12 @@ class _Found:
             found = weighed(refitted.fit, named, self.motion, self.halves, best.noise)
             self.models[found.names] = found
             tried.append((found, refitted))
-        if not tried:
+        winner = self.most_probable(found for found, _ in tried)
+        if winner is None or not self.is_better(winner):
             return None
-        found, refitted = max(tried, key=lambda one: one[0].score)
-        if found.score <= best.score:
-            return None
+        found, refitted = next(one for one in tried if one[0] is winner)
         tell(f"{refitted.name} exchanged for another")
-        self.best, self.motion = found, random_motion(found.fit, self.scattering)
+        self.best = found
         return refitted
 
     def compare(self) -> None:
@@ -227,12 +244,12 @@ class _Found:
         The linearised model says which effects are, and a refit confirms it.
         """
         self.loop.watch("weighing what has no name")
-        self.beside_nameless([self.declared])
+        self.beside_nameless([self.models[frozenset()]])
         (best,) = self.beside_nameless([self.best])
-        while gone := [h for h in best.named if best.nested.get(best.names - {h.name}, -np.inf) > best.score]:
+        while gone := self._superfluous(best):
             tried = [self.without([h], best) for h in gone] + [self.without(gone, best)] * (len(gone) > 1)
-            shorter = max(self.beside_nameless(tried), key=_score)
-            if shorter.score <= best.score:
+            shorter = self.most_probable(self.beside_nameless(tried))
+            if shorter is None or self.scores[shorter.names] <= self.scores[best.names]:
                 break
             best = shorter
         odds = self.odds.models
@@ -273,7 +290,7 @@ class _Found:
         kept = tuple(h for h in model.named if h not in gone)
         names = frozenset(h.name for h in kept)
         known = self.models.get(names)
-        poor = known is not None and known.score < model.nested.get(names, -np.inf) - WORTH_A_STEP
+        poor = known is not None and names in model.nested and known.score < model.nested[names].score - WORTH_A_STEP
         if known is None or (poor and (model.names, names) not in self.tried):
             self.tried.add((model.names, names))
             fit = model.fit
@@ -298,38 +315,40 @@ class _Found:
         for model in found:
             if model.names not in self.models or model.score > self.models[model.names].score:
                 self.models[model.names] = model
+        scores = self.scores
         for model in list(found):
-            names, foretold = max(model.nested.items(), key=lambda item: item[1], default=(model.names, -np.inf))
-            if foretold > max(model.score, best.score):
+            names = max(model.nested, key=lambda names: scores[names], default=model.names)
+            if scores[names] > max(scores[model.names], scores[best.names]):
                 found.append(self.without([h for h in model.named if h.name not in names], model))
-        return max(found, key=_score, default=None)
+        return self.most_probable(found)
+
+    def _superfluous(self, model: Weighed) -> list[Hypothesis]:
+        """Effects without which a model is more probable, as far as is known."""
+        scores = self.scores
+        return [h for h in model.named if scores.get(model.names - {h.name}, -np.inf) > scores[model.names]]
 
     def _better_minimum(self, before: Weighed, after: Weighed) -> None:
         """Weighs the earlier model again from the later one's fit: effects may have led out of a poor minimum.
 
         Only if the later one's linearisation says that they have.
         """
-        if after.nested.get(before.names, -np.inf) > before.score:
+        if before.names in after.nested and after.nested[before.names].score > before.score:
             fit = after.fit
             for hypothesis in after.named[len(before.named) :]:
                 fit = without_named(fit, hypothesis, self.first)
             again = weighed(fit, before.named, self.motion, self.halves, before.noise)
             if again.score > before.score:
                 self.models[before.names] = again
-                if again.score > after.score:
+                if self.scores[again.names] > self.scores[after.names]:
                     self.best = again
-        if not before.named:
-            self.declared = self.models[before.names]
 
     def _pruned(self) -> None:
         """Removes effects that later ones made superfluous, as the linearisation says and a refit confirms."""
-        better = True
-        while better:
-            nested = self.best.nested
-            gone = [h for h in self.best.named if nested.get(self.best.names - {h.name}, -np.inf) > self.best.score]
-            least = max((self.without([h]) for h in gone), key=_score, default=self.best)
-            better = least.score > self.best.score
-            self.best = least if better else self.best
+        while gone := self._superfluous(self.best):
+            least = self.most_probable(self.without([h]) for h in gone)
+            if least is None or not self.is_better(least):
+                break
+            self.best = least
 
 
 def _score(model: Weighed) -> float:

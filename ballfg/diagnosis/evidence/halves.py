@@ -1,0 +1,51 @@
+"""Splits the tracks into two halves of unlike shots, of which each judges what the other one taught.
+
+Where shots repeat, halves that are alike repeat the errors of a wrong model too: whatever describes one half describes
+the other. An effect that is there acts on other shots as well, and gains there what it promises. One that only stands
+for missing physics at these speeds and spins does not.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from scipy.cluster.vq import kmeans2
+
+from ballfg.arrays import Array, Mask
+from ballfg.diagnosis.fit.problem import Fit
+from ballfg.state import POSITION, SPIN, VELOCITY
+
+LEAST_SHARE: Final = 0.25
+"""Of the tracks in the smaller half: a few shots teach too little about the others."""
+LENGTH: Final = 0.5
+"""s of flight at the usual speed, the distance between places of launch that counts as much as that speed does."""
+
+
+def unlike_halves(fit: Fit) -> Mask:
+    """(t,) which half each track belongs to, in order: those of similar first states to the same one.
+
+    Two means of the launches, in units of their usual speed and spin, give the direction along which the tracks are
+    split between them.
+    """
+    launches = _launches(fit)
+    away = launches - launches.mean(axis=0)
+    place = away @ np.linalg.svd(away, full_matrices=False)[2][0]
+    if place.any():
+        begun = np.stack([away[side].mean(axis=0) for side in (place > 0.0, place <= 0.0)])
+        means, _ = kmeans2(away, begun, minit="matrix", missing="raise")
+        place = (away - means.mean(axis=0)) @ (means[0] - means[1])
+    count, halves = len(place), np.full(len(place), False)
+    least = round(LEAST_SHARE * count)
+    halves[np.argsort(place, kind="stable")[int(np.clip((place <= 0.0).sum(), least, count - least)) :]] = True
+    return halves
+
+
+def _launches(fit: Fit) -> Array:
+    """(t, 9) the first state of each track, in units of the usual speed and spin."""
+    _, first = np.unique(fit.problem.stretches.track, return_index=True)
+    states = fit.unknowns.starts[first]
+    speed, spin = (float(np.sqrt((states[:, part] ** 2).sum(axis=1).mean())) or 1.0 for part in (VELOCITY, SPIN))
+    return np.concatenate(
+        (states[:, POSITION] / (LENGTH * speed), states[:, VELOCITY] / speed, states[:, SPIN] / spin), axis=1
+    )
