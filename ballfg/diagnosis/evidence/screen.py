@@ -16,6 +16,7 @@ from scipy import special
 
 from ballfg.arrays import Array, Index
 from ballfg.diagnosis.evidence.likelihood import Likelihood, Posterior, Reduced, held_out, posterior
+from ballfg.diagnosis.evidence.odds import tempered
 from ballfg.diagnosis.evidence.prior import WIDTHS, centres, choice_odds, log_odds, scales, within
 from ballfg.diagnosis.evidence.rows import Motion, roots, rows_of
 from ballfg.diagnosis.evidence.weighed import Priors, Step, Weighed, Weight
@@ -64,25 +65,38 @@ class Screen:
 
     @cached_property
     def gains(self) -> list[float]:
-        """Logarithm of the evidence with each candidate over that of the model, at the model's noise."""
-        return [self._beside((), one).gain + choice_odds([self.candidates[one]]) for one in range(len(self.candidates))]
+        """What each candidate adds to the evidence, at the model's noise, as far as the other half bears it out."""
+        weights = {one: self._with(one, self.model.weight) for one in range(len(self.candidates))}
+        names = {one: self._names((one,)) for one in weights}
+        return [tempered(names[one], weights[one], self._alone) - self.model.evidence for one in weights]
+
+    @property
+    def _alone(self) -> dict[frozenset[str], tuple[Weight, float]]:
+        return {self.model.names: (self.model.weight, self.model.evidence)}
 
     def odds(self, chosen: Sequence[int]) -> float:
         """Logarithm of the posterior odds of the model with some candidates, added in turn, to the model itself."""
+        gain, _ = self._together(chosen)
+        listed = [self.candidates[one] for one in chosen]
+        return gain + choice_odds(listed) + log_odds(listed)
+
+    def _together(self, chosen: Sequence[int]) -> tuple[float, tuple[tuple[int, int], ...]]:
+        """What candidates that are added in turn gain, and with which widths."""
         gain, beside = 0.0, tuple[tuple[int, int], ...]()
         for one in chosen:
             more = self._beside(beside, one)
             gain, beside = gain + more.gain, (*beside, (one, more.width))
-        listed = [self.candidates[one] for one in chosen]
-        return gain + choice_odds(listed) + log_odds(listed)
+        return gain, beside
 
     def sets(self, offered: Sequence[int], most: int) -> list[tuple[int, ...]]:
         """Sets of up to `most` of the candidates offered, each more probable than all its parts; the best first.
 
-        The most probable sets of each size are enlarged by one candidate after the other.
+        The most probable sets of each size are enlarged by one candidate after the other. What a set gains counts as
+        far as the other half bears it out.
         """
         found: dict[tuple[int, ...], float] = {(one,): self.odds((one,)) for one in offered}
-        best = self._leading(found)
+        best, believed = self._leading(found), self._alone
+        scores = self._borne_out(best, believed)
         for _ in range(most - 1):
             larger: dict[tuple[int, ...], float] = {}
             for chosen in best:
@@ -94,7 +108,25 @@ class Screen:
             gained = {c: o for c, o in larger.items() if o > max(parts.get(part, -np.inf) for part in _parts(c))}
             best = self._leading(gained)
             found |= {chosen: gained[chosen] for chosen in best}
-        return self._leading(found, len(found))
+            known_scores = {frozenset(c): score for c, score in scores.items()}
+            more = self._borne_out(best, believed)
+            best = [c for c in best if more[c] > max(known_scores.get(part, -np.inf) for part in _parts(c))]
+            scores |= {chosen: more[chosen] for chosen in best}
+        return sorted(scores, key=lambda chosen: -scores[chosen])
+
+    def _borne_out(
+        self, leading: Sequence[tuple[int, ...]], believed: dict[frozenset[str], tuple[Weight, float]]
+    ) -> dict[tuple[int, ...], float]:
+        """Odds of sets to the model, as far as the other half bears them out; adds them to the sets believed."""
+        found = {}
+        for chosen in leading:
+            gain, beside = self._together(chosen)
+            listed, names = [self.candidates[one] for one in chosen], self._names(chosen)
+            density = held_out(*self._part(self.tracks, beside, None), self.model.halves)
+            weight = Weight(self.model.evidence + gain + choice_odds(listed), log_odds(listed), density)
+            believed[names] = weight, tempered(names, weight, believed)
+            found[chosen] = believed[names][1] - self.model.evidence + weight.odds
+        return found
 
     @cached_property
     def exchanges(self) -> dict[tuple[str, int], Weight]:
@@ -139,7 +171,7 @@ class Screen:
         return Step(starts, mean[: self._own], 0.0), mean[self._own :]
 
     def _names(self, chosen: Sequence[int]) -> frozenset[str]:
-        return frozenset(self.candidates[one].name for one in chosen)
+        return self.model.names | {self.candidates[one].name for one in chosen}
 
     def _leading(self, odds: Mapping[tuple[int, ...], float], most: int = KEPT) -> list[tuple[int, ...]]:
         """The most probable sets, each with its candidates in their best shapes."""
