@@ -21,6 +21,9 @@ LEAST_SHARE: Final = 0.25
 LENGTH: Final = 0.5
 """s of flight at the usual speed, the distance between places of launch that counts as much as that speed does."""
 
+ALIKE: Final = 1e-9
+"""Shots that differ by less are equal: any halves will do."""
+
 
 def unlike_halves(fit: Fit) -> Mask:
     """(t,) which half each track belongs to, in order: those of similar first states to the same one.
@@ -31,8 +34,9 @@ def unlike_halves(fit: Fit) -> Mask:
     launches = _launches(fit)
     away = launches - launches.mean(axis=0)
     place = away @ np.linalg.svd(away, full_matrices=False)[2][0]
-    if place.any():
-        begun = np.stack([away[side].mean(axis=0) for side in (place > 0.0, place <= 0.0)])
+    if np.ptp(place) > ALIKE:
+        middle = np.median(place)
+        begun = np.stack([away[side].mean(axis=0) for side in (place >= middle, place < middle)])
         means, _ = kmeans2(away, begun, minit="matrix", missing="raise")
         place = (away - means.mean(axis=0)) @ (means[0] - means[1])
     count, halves = len(place), np.full(len(place), False)

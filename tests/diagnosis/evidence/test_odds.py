@@ -13,7 +13,7 @@ from ballfg.diagnosis.evidence.odds import odds_of, tempered
 from ballfg.diagnosis.evidence.prior import THERE, WIDTHS, choice_odds, log_odds, scales, within
 from ballfg.diagnosis.evidence.rows import random_motion
 from ballfg.diagnosis.evidence.screen import Screen
-from ballfg.diagnosis.evidence.weighed import weigh
+from ballfg.diagnosis.evidence.weighed import Weight, weigh
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.hypotheses.signatures import columns_of
 from ballfg.diagnosis.search.candidates import Scored, refit
@@ -51,16 +51,15 @@ def windy_with_wind(refitted):
 def model(names, evidence, held_out=None):
     named = [Hypothesis(EFFECTS[name], {}, ("x",)) for name in names]
     gains = np.full(10, evidence / 10.0) if held_out is None else np.asarray(held_out)
-    odds = log_odds(named)
+    weight = Weight(evidence, log_odds(named), gains)
     return SimpleNamespace(
-        names=frozenset(names),
-        nested={},
-        neighbours={},
-        evidence=evidence,
-        odds=odds,
-        score=evidence + odds,
-        held_out=gains,
+        names=frozenset(names), nested={}, neighbours={}, weight=weight, evidence=evidence, score=weight.score
     )
+
+
+def borne_out(effect, *smaller):
+    """The tempered evidence of a model, with smaller ones whose own is believed."""
+    return tempered(effect.names, effect.weight, {one.names: (one.weight, one.evidence) for one in smaller})
 
 
 def test_a_strength_of_five_times_the_usual_one_costs_two_nats():
@@ -77,7 +76,7 @@ def test_a_strength_of_five_times_the_usual_one_costs_two_nats():
 
 def test_probabilities_follow_evidence_and_prior():
     nothing, wind, tilt = model([], 0.0), model(["wind"], 6.0), model(["frame_tilt"], 4.0)
-    odds = odds_of([nothing, wind, tilt], nothing)
+    odds = odds_of([nothing, wind, tilt])
     prior = THERE / (1.0 - THERE)
     weights = np.array([1.0, np.exp(6.0) * prior, np.exp(4.0) * prior])
     expected = weights / weights.sum()
@@ -89,30 +88,49 @@ def test_probabilities_follow_evidence_and_prior():
 
 def test_what_the_other_half_does_not_bear_out_is_tempered():
     nothing = model([], 0.0)
-    assert tempered(model(["wind"], 20.0), nothing) == pytest.approx(20.0)
+    assert borne_out(model(["wind"], 20.0), nothing) == pytest.approx(20.0)
     little = np.tile([0.1, 0.3], 5)
-    assert 2.0 < tempered(model(["wind"], 20.0, little), nothing) < 3.0
+    assert 2.0 < borne_out(model(["wind"], 20.0, little), nothing) < 3.0
     by_one = np.array([19.0, *np.full(9, -2.0)])  # that chance may have put there: the scatter says so
-    assert tempered(model(["wind"], 20.0, by_one), nothing) == pytest.approx(20.0)
-    assert tempered(model(["wind"], 20.0, np.full(10, -1.0)), nothing) == 0.0
-    assert tempered(model(["wind"], -3.0), nothing) == -3.0
+    assert borne_out(model(["wind"], 20.0, by_one), nothing) == pytest.approx(20.0)
+    assert borne_out(model(["wind"], 20.0, np.full(10, -1.0)), nothing) == 0.0
+    assert borne_out(model(["wind"], -3.0), nothing) == -3.0
+
+
+def test_an_addition_is_believed_as_far_as_it_gains_over_the_smaller_model():
+    """With a true effect beside it a wrong one still gains over nothing, but less than the true one alone."""
+    nothing, true = model([], 0.0), model(["wind"], 20.0, np.tile([2.5, 3.5], 5))
+    both = model(["wind", "scale"], 40.0, np.tile([2.0, 3.0], 5))
+    assert borne_out(both, nothing) == pytest.approx(40.0, abs=15.0)
+    assert borne_out(both, nothing, true) == pytest.approx(20.0)
+    odds = odds_of([nothing, true, both])
+    assert odds.of("wind") > 0.99
+    assert odds.of("scale") < 0.1
+
+
+def test_what_is_foretold_loses_what_its_origin_loses():
+    """A smaller model that only the linearisation of a wrong one knows is no better than that one."""
+    nothing, wrong = model([], 0.0), model(["gust_region", "scale"], 60.0, np.full(10, -5.0))
+    wrong.nested = {frozenset(["scale"]): Weight(50.0, model(["scale"], 0.0).weight.odds, np.full(10, 5.0))}
+    odds = odds_of([nothing, wrong])
+    assert odds.of("scale") < 0.1
 
 
 def test_an_effect_whose_strength_is_nothing_is_not_believed():
     """Its refit without it ended in a poorer minimum: the model with it knows better."""
     nothing, both, wind = model([], 0.0), model(["wind", "scale"], 60.0), model(["wind"], 20.0)
-    assert odds_of([nothing, both, wind], nothing).of("scale") > 0.99
-    both.nested = {frozenset(["scale"]): 5.0, frozenset(["wind"]): 61.0 + wind.odds, frozenset(): 3.0}
-    odds = odds_of([nothing, both, wind], nothing)
+    assert odds_of([nothing, both, wind]).of("scale") > 0.99
+    both.nested = {one.names: one.weight for one in (model(["scale"], 8.0), model(["wind"], 61.0), model([], 3.0))}
+    odds = odds_of([nothing, both, wind])
     assert odds.of("scale") < 0.1
     assert odds.of("wind") > 0.99
 
 
 def test_neighbours_that_no_refit_weighed_count_as_foretold():
     nothing, wind, tilt = model([], 0.0), model(["wind"], 20.0), model(["frame_tilt"], 5.0)
-    alone = odds_of([nothing, wind, tilt], nothing)
-    wind.neighbours = {frozenset(["frame_tilt"]): 40.0, frozenset(["drag_spin"]): wind.score}
-    odds = odds_of([nothing, wind, tilt], nothing)
+    alone = odds_of([nothing, wind, tilt])
+    wind.neighbours = {one.names: one.weight for one in (model(["frame_tilt"], 40.0), model(["drag_spin"], 20.0))}
+    odds = odds_of([nothing, wind, tilt])
     assert alone.of("wind") > 0.99
     assert odds.of("wind") == pytest.approx(0.5, abs=0.01)
     assert odds.of("drag_spin") == pytest.approx(0.5, abs=0.01)
@@ -123,7 +141,7 @@ def test_effects_that_cannot_be_told_apart_are_there_together():
     """Of two that explain the same neither is sure, one of them is."""
     nothing = model([], 0.0)
     group = [model([name, "wind"], 60.0 + more) for name, more in (("time_scale", 0.0), ("scale", 0.2))]
-    odds, best = odds_of([nothing, *group], nothing), group[1].names
+    odds, best = odds_of([nothing, *group]), group[1].names
     assert 0.5 < odds.of("scale") < 0.6
     assert odds.alike("scale", best) == ["time_scale"]
     assert odds.together("scale", best) > 0.99
@@ -133,15 +151,15 @@ def test_effects_that_cannot_be_told_apart_are_there_together():
 
 def test_the_evidence_without_an_effect_is_that_of_its_columns_left_out(calm, calm_with_wind, windy_with_wind):
     """On a calm day that of the declared model; in wind far below that of the model with wind."""
-    assert calm_with_wind.nested[frozenset()] == pytest.approx(calm.score, abs=1.0)
-    assert windy_with_wind.nested[frozenset()] < windy_with_wind.score - 20.0
+    assert calm_with_wind.nested[frozenset()].score == pytest.approx(calm.score, abs=1.0)
+    assert windy_with_wind.nested[frozenset()].score < windy_with_wind.score - 20.0
 
 
 def test_a_coefficient_that_models_state_as_exact_is_about_the_stated_value(calm, calm_fit):
     """Gravity is absent where g is 9.81 m/s2, not where a ball has no weight."""
     gravity = Hypothesis(EFFECTS["gravity"], {}, ("g",))
     weighed = weigh(refit(calm_fit, Scored(gravity, None, 0.0)).fit, [gravity])
-    assert weighed.nested[frozenset()] == pytest.approx(calm.score, abs=1.0)
+    assert weighed.nested[frozenset()].score == pytest.approx(calm.score, abs=1.0)
     assert weighed.evidence > calm.evidence - 5.0
 
 
@@ -184,7 +202,7 @@ def test_patterns_lose_against_an_effect_that_is_there(
     assert weigh(calm_fit, nameless=True).score < calm.score
     assert patterns.names == {NAMELESS}
     assert both.names == {"wind", NAMELESS}
-    odds = odds_of([declared, named, patterns, both], declared)
+    odds = odds_of([declared, named, patterns, both])
     assert odds.effects() == {"wind": odds.of("wind")}
     assert odds.of("wind") > 0.9
     assert odds.nameless < 0.2
@@ -196,9 +214,9 @@ def test_a_name_that_explains_a_part_is_not_believed_beside_patterns(make_ball, 
     declared = make_fit(make_ball(), make_shots(sheared, make_launches(16, 5), 5, rate=40.0).stretches)
     windy = refit(declared, Scored(WIND, None, 0.0)).fit
     without = [weigh(declared), weigh(windy, [WIND])]
-    assert odds_of(without, without[0]).of("wind") > 0.95
+    assert odds_of(without).of("wind") > 0.95
     beside = [weigh(declared, nameless=True), weigh(windy, [WIND], nameless=True)]
-    odds = odds_of([*without, *beside], without[0])
+    odds = odds_of([*without, *beside])
     assert odds.of("wind") < 0.5
     assert odds.nameless > 0.95
 

@@ -75,8 +75,8 @@ def test_the_right_effect_in_place_of_a_wrong_one_is_foretold(make_ball, make_la
     wrong = weigh(refit(fit, Scored(tilt, None, 0.0)).fit, [tilt])
     found = Screen.of(wrong, random_motion(wrong.fit), [wind], columns_of(wrong.fit, [wind]))
     foretold = found.exchanges["frame_tilt", 0]
-    assert wrong.score < foretold < windy.score + 1.0  # at the wrong model's noise, which is the larger
-    assert found.neighbours()[frozenset(["wind"])] == foretold
+    assert wrong.score < foretold.score < windy.score + 1.0  # at the wrong model's noise, which is the larger
+    assert found.neighbours[frozenset(["wind"])] == foretold
 
 
 def test_no_set_without_anything_to_gain(make_ball, make_launches, make_shots, make_fit):
