@@ -14,7 +14,7 @@ from scipy.cluster.vq import kmeans2
 
 from ballfg.arrays import Array, Mask
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.state import POSITION, SPIN, VELOCITY
+from ballfg.state import SPIN, VELOCITY
 
 LEAST_SHARE: Final = 0.25
 """Of the tracks in the smaller half: a few shots teach too little about the others."""
@@ -31,8 +31,7 @@ def unlike_halves(fit: Fit) -> Mask:
     Two means of the launches, in units of their usual speed and spin, give the direction along which the tracks are
     split between them.
     """
-    launches = _launches(fit)
-    away = launches - launches.mean(axis=0)
+    away = _launches(fit)
     place = away @ np.linalg.svd(away, full_matrices=False)[2][0]
     if np.ptp(place) > ALIKE:
         middle = np.median(place)
@@ -46,10 +45,18 @@ def unlike_halves(fit: Fit) -> Mask:
 
 
 def _launches(fit: Fit) -> Array:
-    """(t, 9) the first state of each track, in units of the usual speed and spin."""
-    _, first = np.unique(fit.problem.stretches.track, return_index=True)
+    """(t, 9) the first state of each track less the mean, in units of the usual speed and spin.
+
+    Tracks whose coefficients differ as declared, such as those of another room, have a mean of their own: both halves
+    hold some of them.
+    """
+    stretches = fit.problem.stretches
+    _, first = np.unique(stretches.track, return_index=True)
     states = fit.unknowns.starts[first]
     speed, spin = (float(np.sqrt((states[:, part] ** 2).sum(axis=1).mean())) or 1.0 for part in (VELOCITY, SPIN))
-    return np.concatenate(
-        (states[:, POSITION] / (LENGTH * speed), states[:, VELOCITY] / speed, states[:, SPIN] / spin), axis=1
-    )
+    scaled = states / np.repeat([LENGTH * speed, speed, spin], 3)
+    declared = [deviation.along(stretches)[first] for deviation in fit.problem.deviations.values()]
+    _, kinds = np.unique(np.stack([np.ones(len(first)), *declared], axis=1), axis=0, return_inverse=True)
+    for kind in np.unique(kinds):
+        scaled[kinds == kind] -= scaled[kinds == kind].mean(axis=0)
+    return scaled

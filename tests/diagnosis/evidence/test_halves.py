@@ -11,17 +11,22 @@ from ballfg.diagnosis.evidence.halves import LEAST_SHARE, unlike_halves
 from ballfg.diagnosis.evidence.odds import tempered
 from ballfg.diagnosis.evidence.rows import random_motion
 from ballfg.diagnosis.evidence.weighed import weighed
+from ballfg.diagnosis.fit.free import Deviation
 from ballfg.diagnosis.hypotheses.hypothesis import hypotheses, scene_of
 from ballfg.diagnosis.search.candidates import Scored, refit
 from ballfg.dynamics import EFFECTS
 from ballfg.state import SPIN, VELOCITY
 
 
-def fit_of(states):
-    """As much of a fit as the split reads: first states of tracks, each with two flights."""
-    stretches = SimpleNamespace(track=np.repeat(np.arange(len(states)), 2))
+def fit_of(states, rooms=None):
+    """As much of a fit as the split reads: first states of tracks, each with two flights; the second room's tracks."""
+    names = [f"{k:03d}" for k in np.repeat(np.arange(len(states)), 2)]
+    stretches = SimpleNamespace(track=np.repeat(np.arange(len(states)), 2), names=names)
+    second = {f"{k:03d}": 1.0 for k in np.flatnonzero(rooms)} if rooms is not None else {}
+    deviations = {"e in the second": Deviation("bounce.restitution.e", second, "room", "second")} if second else {}
     return SimpleNamespace(
-        problem=SimpleNamespace(stretches=stretches), unknowns=SimpleNamespace(starts=np.repeat(states, 2, axis=0))
+        problem=SimpleNamespace(stretches=stretches, deviations=deviations),
+        unknowns=SimpleNamespace(starts=np.repeat(states, 2, axis=0)),
     )
 
 
@@ -33,6 +38,19 @@ def test_two_kinds_of_shots_are_the_two_halves():
     states[:, SPIN] += np.where(kind[:, None], [0.0, 150.0, 0.0], [0.0, -150.0, 0.0])
     halves = unlike_halves(fit_of(states))
     assert (halves == kind).all() or (halves != kind).all()
+
+
+def test_halves_are_no_rooms():
+    """Of rooms with launchers of their own both halves hold some, or nothing could be said about a room."""
+    rng = np.random.default_rng(1)
+    rooms = np.arange(24) % 3 == 0
+    states = rng.normal(size=(24, 9)) * 0.3
+    states[:, SPIN] += [0.0, 60.0, 0.0]
+    states[:, VELOCITY] += np.where(rooms[:, None], [9.0, 0.0, 1.0], [4.0, 0.0, 2.0])
+    alone, declared = unlike_halves(fit_of(states)), unlike_halves(fit_of(states, rooms))
+    assert (alone == rooms).all() or (alone != rooms).all()
+    assert 2 <= (declared & rooms).sum() <= 6
+    assert 4 <= (declared & ~rooms).sum() <= 12
 
 
 @pytest.mark.parametrize("odd", [0, 1])
