@@ -16,12 +16,15 @@ from ballfg.estimation.flights.modes import (
     HANDLED,
     MODES,
     ROLLING,
+    SHIFT,
     STILL,
     STRIKE,
+    STRIKE_SPEEDS,
     SWAYED,
     bounce,
     enter,
     move,
+    shift,
     stop,
     strike,
 )
@@ -52,13 +55,17 @@ RATE: Final = 1.0
 """1/s. Prior rate of every event."""
 SHORTEST: Final = 1e-3
 """s. Least interval for the price of an event."""
-PRICES: Final = np.array([0.0, 1.0, 7.0, 3.0])
-"""nats in addition to the prior rate: none, of a bounce, a strike, a change of the mode."""
+PRICES: Final = np.array([0.0, 1.0, 4.0, 3.0, 4.0])
+"""nats in addition to the prior rate: none, of a bounce, a strike, a change of the mode, a shift."""
 BRIEF: Final = 8.0
 """nats, the price of the end of a flight in a hand that has just begun."""
 BRIEFLY: Final = 0.1
 """s. Time constant with which that price fades."""
-BRANCHES: Final = 6 * 6 + 5
+BRIEF_HOLD: Final = 20.0
+"""nats, of the end of a hold that has just begun: what lasts less than a hand can hold is a strike."""
+BRIEFLY_HELD: Final = 0.05
+"""s."""
+BRANCHES: Final = 6 * 7 + 4
 """Largest number of hypotheses that events add to a sample."""
 SPARE: Final = 200_000
 """Rows of the log from which it is compacted."""
@@ -74,8 +81,10 @@ def _note(work: Work, row: int, kind: int, index: int, dt: float) -> None:
 
 @machine_code(REAL(ONE_HYPOTHESIS, REAL))
 def _brevity(h: Record, dt: float) -> float:
-    """nats, the price of the end of a flight: brief ones are rare."""
-    return BRIEF * math.exp(-h.age * dt / BRIEFLY) if h.surface == FLYING else 0.0
+    """nats, the price of the end of a flight or of a hold: brief ones are rare."""
+    if h.surface == FLYING:
+        return BRIEF * math.exp(-h.age * dt / BRIEFLY)
+    return BRIEF_HOLD * math.exp(-h.age * dt / BRIEFLY_HELD) if h.surface <= SWAYED else 0.0
 
 
 @machine_code(NOTHING(WORK, BANK, COUNT, COUNT, REAL, SCENE))
@@ -93,13 +102,16 @@ def _branch(work: Work, kept: Records, place: int, index: int, dt: float, scene:
             work.bank[row].score += PRICES[CHANGE]
         if HANDLED <= mode <= SWAYED and (other == ROLLING or other == FLYING):
             work.bank[row].score -= 4.0
-        if other <= SWAYED:
+        if other <= SWAYED and (mode == FLYING or other == FLYING):
             work.bank[row].score -= brief
-    if mode == FLYING or mode == HANDLED or mode == CARRIED:
-        row = add(work, kept, place)
-        strike(work.bank[row], dt, scene)
-        _note(work, row, STRIKE, index, dt)
     if mode == FLYING:
+        for speed in STRIKE_SPEEDS:
+            row = add(work, kept, place)
+            strike(work.bank[row], speed, dt, scene)
+            _note(work, row, STRIKE, index, dt)
+        row = add(work, kept, place)
+        shift(work.bank[row], scene)
+        _note(work, row, SHIFT, index, dt)
         row = add(work, kept, place)
         stop(work.bank[row], dt)
         enter(work.bank[row], HANDLED, scene)

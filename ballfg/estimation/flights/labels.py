@@ -19,7 +19,7 @@ from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.estimation.segmentation.result import OUTLIER
 from ballfg.estimation.segmentation.settings import SegmentationSettings
 
-LEAST_SIGMA: Final = 1e-3
+LEAST_SIGMA: Final = 1.5e-3
 """m. Least standard deviation of a sample."""
 MERGED: Final = 0.15
 """s since its last event after which a hypothesis merges with others of its mode."""
@@ -122,7 +122,7 @@ def _explained(times: Array, positions: Array, sigmas: Array, physics: Segmentat
     settings = SegmentationSettings(
         most=MOST, margin=MARGIN, mature=max(LEAST_MERGED, round(MERGED / step)), slack_drift=0.0
     )
-    scene = Scene(SegmentationPhysics(physics.gravity, AIR_DRAG), Surfaces(0.0), settings)
+    scene = Scene(physics, Surfaces(0.0), settings)
     events = decode(times - times[0], np.array(positions, order="C"), np.array(sigmas, order="C"), scene.numbers)
     modes, lost = np.zeros(n, np.int64), np.zeros(n, dtype=bool)
     for kind, index, mode in events.tolist():

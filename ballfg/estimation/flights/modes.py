@@ -6,7 +6,7 @@ from typing import Any, Final
 import numpy as np
 
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.signatures import COUNT, FLAG, NOTHING, REAL
+from ballfg.dynamics.compiled.signatures import COUNT, FLAG, NOTHING, REAL, several
 from ballfg.estimation.segmentation.bank import FLYING, ONE_HYPOTHESIS, SCENE, Record
 from ballfg.estimation.segmentation.surface_contact import carry
 
@@ -28,13 +28,17 @@ STRIKE: Final = 2
 """A flying ball is hit, and flies on."""
 CHANGE: Final = 3
 """The mode changes."""
+SHIFT: Final = 4
+"""The measurements of a flying ball jump, its velocity stays: the tracker follows something else."""
 
 STILL_AIR: Final = 0.7
 """m/s^2. Spread of the acceleration of a slow flying ball beside gravity and drag."""
-AIR: Final = 0.06
+AIR: Final = 0.15
 """1/m, its growth with the square of the speed: lift of a spinning ball, and drag of another ball than assumed."""
 AIR_MEMORY: Final = 0.5
 """s. Time constant of that acceleration."""
+SHORT: Final = 0.02
+"""Time constants up to which a series is exact to 2 % and better than differences of rounded numbers."""
 MOST_AIR: Final = 30.0
 """m/s^2, of that spread."""
 
@@ -70,14 +74,14 @@ RESTITUTION: Final = 0.75
 RESTITUTION_SIGMA: Final = 0.2
 KEPT: Final = 0.9
 """Share of the tangential velocity that a bounce leaves."""
-SLIDE: Final = 0.15
+SLIDE: Final = 0.4
 """Spread of its change, as a share of the normal speed."""
 BOUNCE_JITTER: Final = 0.1
 """m/s."""
 SLOWEST_FALL: Final = 0.3
 """m/s. Slower balls are not tried with a bounce."""
-STRIKE_SPEED: Final = 15.0
-"""m/s. Spread of the velocity after a strike, per axis."""
+STRIKE_SPEEDS: Final = (8.0,)
+"""m/s. Spread of the velocity after a touch and after a strike, per axis."""
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, REAL, SCENE))
 def move(h: Record, dt: float, scene: Record) -> None:
@@ -150,20 +154,36 @@ def _wander(h: Record, t: float, spread: float, tau: float) -> None:
     memory = math.exp(-t / tau)
     gain = tau * (1.0 - memory)
     half = tau * (t - gain)
-    density = 2.0 * spread * spread / tau
+    pp, pv, pb, vv, vb, bb = _wandered(t / tau)
+    scale = spread * spread
     for axis in range(3):
         _transform(h, axis, t, half, gain, memory)
         cov = h.cov[axis]
-        # of a random walk of the acceleration, which forgets little within a step, but in the acceleration itself
-        cov[0, 0] += density * t**5 / 20.0
-        cov[0, 1] += density * t**4 / 8.0
-        cov[1, 0] += density * t**4 / 8.0
-        cov[0, 2] += density * t**3 / 6.0
-        cov[2, 0] += density * t**3 / 6.0
-        cov[1, 1] += density * t**3 / 3.0
-        cov[1, 2] += density * t**2 / 2.0
-        cov[2, 1] += density * t**2 / 2.0
-        cov[2, 2] += spread * spread * (1.0 - memory * memory)
+        cov[0, 0] += scale * tau**4 * pp
+        cov[1, 1] += scale * tau**2 * vv
+        cov[2, 2] += scale * bb
+        for i, k, more in ((0, 1, tau**3 * pv), (0, 2, tau**2 * pb), (1, 2, tau * vb)):
+            cov[i, k] += scale * more
+            cov[k, i] += scale * more
+
+
+@machine_code(several(REAL, 6)(REAL))
+def _wandered(s: float) -> Any:
+    """Covariance of position, velocity and acceleration after s time constants, of an acceleration of spread one.
+
+    Source: R. A. Singer, Estimating optimal tracking filter performance for manned maneuvering targets, 1970, eq. 14.
+    """
+    if s < SHORT:  # the first terms of its series: a random walk of the acceleration
+        return s**5 / 10.0, s**4 / 4.0, s**3 / 3.0, 2.0 * s**3 / 3.0, s * s, 2.0 * s
+    e = math.exp(-s)
+    return (
+        1.0 - e * e + 2.0 * s + 2.0 * s**3 / 3.0 - 2.0 * s * s - 4.0 * s * e,
+        (1.0 - e) ** 2 - 2.0 * s * (1.0 - e) + s * s,
+        1.0 - e * e - 2.0 * s * e,
+        4.0 * e - 3.0 - e * e + 2.0 * s,
+        (1.0 - e) ** 2,
+        1.0 - e * e,
+    )
 
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, COUNT, REAL, REAL))
@@ -188,7 +208,9 @@ def _moving(h: Record, axis: int, mean: float, spread: float) -> None:
 def enter(h: Record, mode: int, scene: Record) -> None:
     """Changes the mode of a hypothesis; place and velocity stay, as far as the new mode has one."""
     before = h.surface
-    h.surface, h.age = mode, 0
+    h.surface = mode
+    if not (HANDLED <= before <= SWAYED and HANDLED <= mode <= SWAYED):
+        h.age = 0
     for axis in range(3):
         if mode == FLYING:
             _accelerated(h, axis, 0.0, air(h))
@@ -215,15 +237,23 @@ def stop(h: Record, dt: float) -> None:
         _moving(h, axis, 0.0, HAND_SPEED)
 
 
-@machine_code(NOTHING(ONE_HYPOTHESIS, REAL, SCENE))
-def strike(h: Record, dt: float, scene: Record) -> None:
-    """A ball is struck at some time of the next interval of dt s, and flies on with any velocity."""
+@machine_code(NOTHING(ONE_HYPOTHESIS, REAL, REAL, SCENE))
+def strike(h: Record, speed: float, dt: float, scene: Record) -> None:
+    """A ball is struck at some time of the next interval of dt s, and flies on; speed: m/s, spread of its velocity."""
     h.surface, h.age = FLYING, 0
-    reach = scene.hit_spread**2 + (STRIKE_SPEED * min(dt, scene.short_gap)) ** 2
+    reach = scene.hit_spread**2 + (speed * min(dt, scene.short_gap)) ** 2
     for axis in range(3):
         h.cov[axis, 0, 0] += reach
-        _moving(h, axis, 0.0, STRIKE_SPEED)
+        _moving(h, axis, 0.0, speed)
         _accelerated(h, axis, 0.0, scene.slack)
+
+
+@machine_code(NOTHING(ONE_HYPOTHESIS, SCENE))
+def shift(h: Record, scene: Record) -> None:
+    """The measurements jump by an unknown offset."""
+    h.age = 0
+    for axis in range(3):
+        h.cov[axis, 0, 0] += scene.shift_spread**2
 
 
 @machine_code(FLAG(ONE_HYPOTHESIS, REAL, SCENE))
