@@ -8,7 +8,7 @@ from numba import types
 
 from ballfg.arrays import Array
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, NOTHING, ONE, REAL, TWO
+from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, FLAG, INDEX, NOTHING, ONE, REAL, TWO
 from ballfg.estimation.flights.modes import (
     BOUNCE,
     CARRIED,
@@ -87,13 +87,13 @@ def _brevity(h: Record, dt: float) -> float:
     return BRIEF_HOLD * math.exp(-h.age * dt / BRIEFLY_HELD) if h.surface <= SWAYED else 0.0
 
 
-@machine_code(NOTHING(WORK, BANK, COUNT, COUNT, REAL, SCENE))
-def _branch(work: Work, kept: Records, place: int, index: int, dt: float, scene: Record) -> None:
+@machine_code(NOTHING(WORK, BANK, COUNT, COUNT, REAL, FLAG, SCENE))
+def _branch(work: Work, kept: Records, place: int, index: int, dt: float, hands: bool, scene: Record) -> None:
     """Adds the changes and events that the best hypothesis of a mode may have in the interval before a sample."""
     mode = kept[place].surface
     brief = _brevity(kept[place], dt)
     for other in MODES:
-        if other == mode:
+        if other == mode or (HANDLED <= other <= SWAYED and not hands):
             continue
         row = add(work, kept, place)
         enter(work.bank[row], other, scene)
@@ -112,11 +112,12 @@ def _branch(work: Work, kept: Records, place: int, index: int, dt: float, scene:
         row = add(work, kept, place)
         shift(work.bank[row], scene)
         _note(work, row, SHIFT, index, dt)
-        row = add(work, kept, place)
-        stop(work.bank[row], dt)
-        enter(work.bank[row], HANDLED, scene)
-        _note(work, row, CHANGE, index, dt)
-        work.bank[row].score -= brief
+        if hands:
+            row = add(work, kept, place)
+            stop(work.bank[row], dt)
+            enter(work.bank[row], HANDLED, scene)
+            _note(work, row, CHANGE, index, dt)
+            work.bank[row].score -= brief
         row = add(work, kept, place)
         if bounce(work.bank[row], dt, scene):
             _note(work, row, BOUNCE, index, dt)
@@ -124,10 +125,12 @@ def _branch(work: Work, kept: Records, place: int, index: int, dt: float, scene:
             work.fill[USED] -= 1
 
 
-@machine_code(NOTHING(WORK, SAMPLE, SCENE))
-def _begin(work: Work, sample: Sample, scene: Record) -> None:
+@machine_code(NOTHING(WORK, SAMPLE, FLAG, SCENE))
+def _begin(work: Work, sample: Sample, hands: bool, scene: Record) -> None:
     """One hypothesis for each mode after a first sample."""
     for mode in MODES:
+        if HANDLED <= mode <= SWAYED and not hands:
+            continue
         row = work.fill[USED]
         work.fill[USED] += 1
         h = work.bank[row]
@@ -175,17 +178,18 @@ def _compact(kept: Records, log: Records, fill: Any) -> int:
     return count
 
 
-@machine_code(types.Array(types.int64, 2, "C")(ONE, TWO, TWO, SCENE))
-def decode(times: Array, positions: Array, sigmas: Array, scene: Record) -> Any:
+@machine_code(types.Tuple((INDEX, REAL))(ONE, TWO, TWO, FLAG, SCENE))
+def decode(times: Array, positions: Array, sigmas: Array, hands: bool, scene: Record) -> Any:
     """The events of the most likely explanation, oldest first.
 
-    Args: times: (n,) s.  positions, sigmas: (n, 3) m.  scene: of a `Scene`.
-    Returns: (k, 3): kind, index of the interval or sample, and mode from there on.
+    Args:
+        times: (n,) s.  positions, sigmas: (n, 3) m.  hands: False if no hand may touch the ball.  scene: of a `Scene`.
+    Returns: (k, 3): kind, index of the interval or sample, and mode from there on; and the log evidence, nats.
     """
     n, most = len(times), int(scene.most)
     room = 2 * (most + BRANCHES)
     work = Work(np.empty(room, HYPOTHESIS), np.empty(SPARE + 4 * room, LOGGED), np.zeros(2, np.int64))
-    _begin(work, Sample(positions[0], sigmas[0], 0, times[0]), scene)
+    _begin(work, Sample(positions[0], sigmas[0], 0, times[0]), hands, scene)
     kept = prune(work.bank, work.fill[USED], scene)
     for i in range(1, n):
         dt = times[i] - times[i - 1]
@@ -199,7 +203,7 @@ def decode(times: Array, positions: Array, sigmas: Array, scene: Record) -> Any:
             mode = kept[row].surface
             if seen[mode + 1] == 0:
                 seen[mode + 1] = 1
-                _branch(work, kept, row, i - 1, dt, scene)
+                _branch(work, kept, row, i - 1, dt, hands, scene)
         for row in range(work.fill[USED]):
             move(work.bank[row], dt, scene)
         update(work, 0, Sample(positions[i], sigmas[i], i, times[i]), scene)
@@ -208,7 +212,7 @@ def decode(times: Array, positions: Array, sigmas: Array, scene: Record) -> Any:
     for row in range(len(kept)):
         if kept[row].score - _brevity(kept[row], dt) > last:
             best, last = row, kept[row].score - _brevity(kept[row], dt)
-    return _chain(kept[best].tip, work.log)
+    return _chain(kept[best].tip, work.log), last
 
 
 @machine_code(WORK(BANK, WORK, COUNT))
@@ -222,7 +226,7 @@ def _roomy(kept: Records, work: Work, spare: int) -> Any:
     return Work(work.bank, longer, work.fill)
 
 
-@machine_code(types.Array(types.int64, 2, "C")(COUNT, LOG))
+@machine_code(INDEX(COUNT, LOG))
 def _chain(tip: int, log: Records) -> Any:
     """(k, 3) kind, index and mode of the events up to one, oldest first."""
     count, event = 0, tip

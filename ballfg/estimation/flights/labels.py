@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from itertools import pairwise
@@ -13,14 +14,18 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.flights.decode import decode
+from ballfg.estimation.flights.falling import falls_throughout, scatter
 from ballfg.estimation.flights.modes import BOUNCE, CHANGE, ROLLING, STILL, STRIKE
 from ballfg.estimation.segmentation.bank import FLYING, Scene
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.estimation.segmentation.result import OUTLIER
 from ballfg.estimation.segmentation.settings import SegmentationSettings
+from ballfg.tracks import Track
 
+FEWEST: Final = 5
+"""Least number of samples for labels."""
 LEAST_SIGMA: Final = 1.5e-3
-"""m. Least standard deviation of a sample."""
+"""m. Least standard deviation of a sample: slow errors of trackers do not show in the scatter."""
 MERGED: Final = 0.15
 """s since its last event after which a hypothesis merges with others of its mode."""
 LEAST_MERGED: Final = 12
@@ -35,9 +40,8 @@ ROLLED: Final = 0.03
 """m. A ball that gets less far does not roll."""
 ALIKE: Final = 0.03
 """m. Places within this height of each other are on one surface."""
-AIR_DRAG: Final = 0.06
-"""1/m, between the drag of a heavy and of a light ball; the acceleration by the air has room for either."""
-
+HANDS: Final = 30.0
+"""nats, by which hands must explain a recording better than flights, strikes and bounces alone."""
 
 class Label(IntEnum):
     """What a sample of a track shows."""
@@ -74,73 +78,63 @@ class Labels:
         return [run for run in runs if self.values[run[0]] == label]
 
 
-def scatter(times: Array, positions: Array) -> Array:
-    """(3,) m, white noise of each coordinate: what cubics through five neighbours leave, of the calmer samples.
-
-    Args: times: (n,) s, n >= 5.  positions: (n, 3) m.
-    """
-    stamps = np.stack([times[i : len(times) - 4 + i] for i in range(5)], axis=1)
-    apart = stamps[:, :, None] - stamps[:, None, :] + np.eye(5) * (stamps[:, -1] - stamps[:, 0])[:, None, None]
-    weights = 1.0 / np.prod(apart / apart.max(axis=(1, 2), keepdims=True), axis=2)
-    weights /= np.linalg.norm(weights, axis=1, keepdims=True)
-    values = np.stack([positions[i : len(times) - 4 + i] for i in range(5)], axis=1)
-    left = np.abs(np.einsum("ni,nix->nx", weights, values))
-    return np.asarray(np.quantile(left, CALM, axis=0) / CALM_QUANTILE)
-
-
-CALM: Final = 0.3
-"""Share of the samples that show the noise: others are near bounces, throws and catches."""
-CALM_QUANTILE: Final = 0.3853
-"""Its quantile of the absolute value of a standard normal variable."""
-
-
-def label_samples(times: Array, positions: Array, sigmas: Array | None, physics: SegmentationPhysics) -> Labels:
+def label_samples(track: Track, physics: SegmentationPhysics, levels: Sequence[float] = ()) -> Labels:
     """Labels each sample of a track.
 
-    Args:
-        times: (n,) s, increasing.  positions: (n, 3) m.
-        sigmas: (n, 3) m, or None for those that the scatter shows.
-        physics: of the ball, for gravity.
+    Positions that were computed from cameras, or seen by one, are taken for flight throughout.
+
+    Args: track: of any length.  physics: of the ball.  levels: m, heights at which the ball is known to lie.
+    Source: docs/derivations/flights.md.
     """
-    n = len(times)
-    if sigmas is None:
-        sigmas = np.tile(scatter(times, positions) if n >= 5 else np.full(3, 2e-3), (n, 1))
-    sigmas = np.maximum(sigmas, LEAST_SIGMA)
+    times, positions, n = track.seconds, track.positions, len(track)
+    whole = Labels(np.zeros(n, np.int8), np.zeros(0, np.int64))
+    if track.rough or track.one_view or n < FEWEST:
+        return whole
+    sigmas = np.maximum(np.tile(scatter(times, positions), (n, 1)), LEAST_SIGMA)
+    if falls_throughout(times, positions, sigmas[0], physics):
+        return whole
     values, bounces = np.empty(n, np.int8), list[int]()
     edges = [0, *(np.flatnonzero(np.diff(times) > GAP) + 1).tolist(), n]
     for first, stop in pairwise(edges):
         part = slice(first, stop)
-        found = _explained(times[part], positions[part], sigmas[part], physics)
+        found = _explained(times[part], positions[part], sigmas[part], physics, levels)
         values[part] = found.values
         bounces += (found.bounces + first).tolist()
     return Labels(values, np.array(bounces, dtype=np.int64))
 
 
-def _explained(times: Array, positions: Array, sigmas: Array, physics: SegmentationPhysics) -> Labels:
+def _explained(
+    times: Array, positions: Array, sigmas: Array, physics: SegmentationPhysics, levels: Sequence[float]
+) -> Labels:
     """`label_samples` without gaps."""
     n, step = len(times), float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     settings = SegmentationSettings(
         most=MOST, margin=MARGIN, mature=max(LEAST_MERGED, round(MERGED / step)), slack_drift=0.0
     )
     scene = Scene(physics, Surfaces(0.0), settings)
-    events = decode(times - times[0], np.array(positions, order="C"), np.array(sigmas, order="C"), scene.numbers)
+    given = times - times[0], np.array(positions, order="C"), np.array(sigmas, order="C")
+    (alone, least), (events, most) = (decode(*given, hands, scene.numbers) for hands in (False, True))
+    if most - least < HANDS:
+        events = alone
     modes, lost = np.zeros(n, np.int64), np.zeros(n, dtype=bool)
     for kind, index, mode in events.tolist():
         if kind in (CHANGE, STRIKE):
             modes[index + 1 :] = mode
         lost[index] |= kind == OUTLIER
     bounces = np.array([index for kind, index, _ in events.tolist() if kind == BOUNCE], dtype=np.int64)
-    values = _placed(positions, modes, bounces)
+    values = _placed(positions, modes, bounces, levels)
     values[lost] = Label.LOST
     return Labels(values, bounces)
 
 
-def _placed(positions: Array, modes: NDArray[np.int64], bounces: NDArray[np.int64]) -> NDArray[np.int8]:
+def _placed(
+    positions: Array, modes: NDArray[np.int64], bounces: NDArray[np.int64], levels: Sequence[float]
+) -> NDArray[np.int8]:
     """Labels by modes: what does not move lies where the ball bounces or rolls, and is held elsewhere."""
     values = np.full(len(modes), Label.HELD, np.int8)
     values[modes == FLYING] = Label.FLIGHT
     ends = [0, *(np.flatnonzero(np.diff(modes)) + 1).tolist(), len(modes)]
-    heights = [float(min(positions[i, 2], positions[i + 1, 2])) for i in bounces.tolist()]
+    heights = [*levels, *(float(min(positions[i, 2], positions[i + 1, 2])) for i in bounces.tolist())]
     down: list[tuple[int, int]] = []
     for first, stop in pairwise(ends):
         way = float(np.hypot(*(positions[stop - 1, :2] - positions[first, :2])))

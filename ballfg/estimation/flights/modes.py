@@ -7,6 +7,7 @@ import numpy as np
 
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNT, FLAG, NOTHING, REAL, several
+from ballfg.estimation.flights.falling import AIR, STILL_AIR
 from ballfg.estimation.segmentation.bank import FLYING, ONE_HYPOTHESIS, SCENE, Record
 from ballfg.estimation.segmentation.surface_contact import carry
 
@@ -31,10 +32,6 @@ CHANGE: Final = 3
 SHIFT: Final = 4
 """The measurements of a flying ball jump, its velocity stays: the tracker follows something else."""
 
-STILL_AIR: Final = 0.7
-"""m/s^2. Spread of the acceleration of a slow flying ball beside gravity and drag."""
-AIR: Final = 0.15
-"""1/m, its growth with the square of the speed: lift of a spinning ball, and drag of another ball than assumed."""
 AIR_MEMORY: Final = 0.5
 """s. Time constant of that acceleration."""
 SHORT: Final = 0.02
