@@ -90,10 +90,12 @@ def estimate(
     data = _opened(measured)
     estimator = estimator_for(data, method, model, surfaces, settings)
     if isinstance(data, Track):
-        return estimator.estimate(data)
+        from ballfg.estimation.flights.estimates import estimated
+
+        return estimated(estimator, data)
     from ballfg.estimation.batch import estimate_tracks
 
-    return {one.name: one for one in estimate_tracks(estimator, data, len(data), jobs)}
+    return {one.name: one for one in estimate_tracks(estimator, data, len(data), jobs, flights=True)}
 
 
 @overload

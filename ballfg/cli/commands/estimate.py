@@ -92,11 +92,12 @@ class _Estimated:
 
 
 def _estimated(model: BallModel, estimator: Estimator, track: Track) -> _Estimated:
+    from ballfg.estimation.flights.estimates import in_sections
     from ballfg.estimation.out_of_distribution import out_of_distribution
 
     columns, shares, notes, rows, hits = [], list[float](), list[str](), 0, 0
     status = None
-    for part in estimator.in_sections(track):
+    for part in in_sections(estimator, track):
         share = out_of_distribution(model, part.states)
         own: dict[str, str | np.ndarray] = {"trajectory": part.name, **part.columns}
         columns.append(own if share is None else own | {"outside": share})

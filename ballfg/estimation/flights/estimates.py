@@ -1,0 +1,125 @@
+"""Estimates the flights of a track, and leaves what is no flight as it was measured."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.estimation.estimator import Estimator
+from ballfg.estimation.flights.cut import LEAST
+from ballfg.estimation.flights.labels import ALIKE, Label, Labels, label_samples
+from ballfg.estimation.result import Estimate, Status
+from ballfg.estimation.segmentation.physics import physics_of
+from ballfg.estimation.settings import sample_sigmas
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
+from ballfg.tracks import Track
+
+UNKNOWN_SPEED: Final = 5.0
+"""m/s. Standard deviation of the velocity of a ball that does not fly, per axis."""
+
+
+def estimated(estimator: Estimator, track: Track) -> Estimate:
+    """The estimate of a track with its labels; only flights, and rolling and rest on declared surfaces, are estimated.
+
+    Args: estimator: of flights; it gets a track whole where nothing holds the ball.  track: any.
+    """
+    estimator.prepared(track)  # refuses what is no track before anything looks at it
+    levels = [h + estimator.model.radius for h in estimator.surfaces.heights()]
+    labels = label_samples(track, physics_of(estimator.model), levels)
+    parts = _parts(track, labels, levels)
+    if parts == [(0, len(track) - 1)]:
+        return replace(estimator.estimate(track), labels=labels.values)
+    found = [estimator.estimate(track.between(*track.times[[first, last]].tolist())) for first, last in parts]
+    return _assembled(estimator, track, labels, parts, found)
+
+
+def in_sections(estimator: Estimator, track: Track) -> Iterator[Estimate]:
+    """`estimated` in consecutive parts, where the estimator has them and nothing holds the ball."""
+    estimator.prepared(track)
+    levels = [h + estimator.model.radius for h in estimator.surfaces.heights()]
+    labels = label_samples(track, physics_of(estimator.model), levels)
+    if _parts(track, labels, levels) != [(0, len(track) - 1)]:
+        yield estimated(estimator, track)
+        return
+    begin = 0
+    for part in estimator.in_sections(track):
+        yield replace(part, labels=labels.values[begin : begin + len(part)])
+        begin += len(part)
+
+
+def _parts(track: Track, labels: Labels, levels: list[float]) -> list[tuple[int, int]]:
+    """First and last sample of each part that an estimator explains: it holds a flight, or is all of a track."""
+    values = labels.values
+    down = np.isin(values, (Label.ROLLING, Label.RESTING))
+    near = np.abs(track.positions[:, 2, None] - np.array(levels)).min(axis=1) < ALIKE
+    known = (values != Label.HELD) & (~down | near)
+    if known.all():
+        return [(0, len(values) - 1)]
+    ends = np.flatnonzero(np.diff(known, prepend=False, append=False)).reshape(-1, 2)
+    found = []
+    for first, stop in ends.tolist():
+        first, last = first + (first > 0), stop - 1 - (stop < len(values))  # a hand may touch the ball there
+        if (values[first : last + 1] == Label.FLIGHT).sum() >= LEAST:
+            found.append((first, last))
+    return found
+
+
+def _assembled(
+    estimator: Estimator, track: Track, labels: Labels, parts: list[tuple[int, int]], found: list[Estimate]
+) -> Estimate:
+    """One estimate of a track from those of its parts; coefficients are those of the last part."""
+    n, settings = len(track), estimator.settings
+    sigma = np.empty((n, STATE_DIM))
+    sigma[:, POSITION] = sample_sigmas(settings, n, track.sigmas)
+    sigma[:, VELOCITY], sigma[:, SPIN] = UNKNOWN_SPEED, settings.spin_prior
+    states, covariances = np.zeros((n, STATE_DIM)), sigma[..., None] ** 2 * np.eye(STATE_DIM)
+    states[:, POSITION] = track.positions
+    quality, sides = np.zeros(n, np.int8), np.zeros((n, STATE_DIM, STATE_DIM))
+    hits, contacts, innovations = list[int](), [], dict[str, list[Array]]()
+    for (first, last), one in zip(parts, found, strict=True):
+        own = slice(first, last + 1)
+        states[own], covariances[own] = one.states, one.covariances
+        quality[own] = one.quality if len(one.quality) else 0
+        sides[own] = one.other_sides if len(one.other_sides) else 0.0
+        hits += (one.hits + first).tolist()
+        contacts += [replace(contact, interval=contact.interval + first) for contact in one.contacts]
+        for name, values in one.innovations.items():
+            innovations.setdefault(name, []).append(values)
+    share = float(np.mean(labels.values == Label.FLIGHT))
+    notes = (f"{100 * share:.0f} % of the samples are flight, in {len(parts)} parts; the rest is as measured",)
+    whole = Estimate(track.name, track.times, states, covariances, _status(found), notes=notes, labels=labels.values)
+    if not found:
+        return replace(whole, innovations={"position": np.full((n, 3), np.nan)}, quality=quality)
+    last = found[-1]
+    cross = np.zeros((n, STATE_DIM, len(last.coefficients)))
+    if last.cross_covariances.size:
+        cross[parts[-1][0] : parts[-1][1] + 1] = last.cross_covariances
+    return replace(
+        whole,
+        innovations={name: np.concatenate(parts) for name, parts in innovations.items()},
+        coefficient_names=last.coefficient_names,
+        coefficients=last.coefficients,
+        coefficient_covariance=last.coefficient_covariance,
+        cross_covariances=cross,
+        contacts=tuple(contacts),
+        hits=np.array(hits, dtype=np.int64),
+        quality=quality,
+        error=sum(one.error for one in found),
+        iterations=sum(one.iterations for one in found),
+        world=last.world,
+        other_sides=sides,
+    )
+
+
+def _status(found: list[Estimate]) -> Status:
+    """That of most samples of the flights."""
+    counts = Counter[Status]()
+    for one in found:
+        counts[one.status] += len(one)
+    return counts.most_common(1)[0][0] if counts else Status.NO_FLIGHT
+
