@@ -75,7 +75,7 @@ def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jo
         if config.data is None:
             raise ValueError("a dataset is needed; got none. Give --data FOLDER, or 'data' in the config.")
         torch.set_num_threads(1)  # the batches are small: threads cost more than they gain
-        dataset = open_source(config.data, config.source)
+        dataset = open_source(config.data, config.source, config.anyway)
         model = analytic_model(config.model, dataset.info.ball)
         problem = pose(dataset, model, config, config.jobs or jobs)
         if not resume:

@@ -43,6 +43,7 @@ def noise(
         Path | None, typer.Option(metavar="<path>", help="Model file to write: the model with this noise.")
     ] = None,
     write: Annotated[bool, typer.Option("--write", help="Write the noise into the dataset's dataset.yaml.")] = False,
+    anyway: inputs.Anyway = False,
 ) -> None:
     """The noise of the tracker, of flights, bounces, labels and spins that the tracks of a dataset show.
 
@@ -61,6 +62,7 @@ def noise(
     inputs.know_observations(observations_file)
     data = with_readings(read_dataset(dataset))
     ball = inputs.open_model(data, model)
+    data = inputs.flights_only(data, anyway)
     if out is not None and out.resolve() == (dataset / "dataset.yaml").resolve():
         raise ValueError(f"out must be a model file; got {out}. Use --write for dataset.yaml.")
     found = estimate_noise(

@@ -65,6 +65,7 @@ def predict(
     ] = None,
     apex: Annotated[bool, typer.Option("--apex", help="The same of the next highest point.")] = False,
     next_contact: Annotated[bool, typer.Option("--next-contact", help="The same of the next bounce.")] = False,
+    anyway: inputs.Anyway = False,
     jobs: inputs.Jobs = inputs.CORES,
     cluster: inputs.Cluster = None,
     address: inputs.Address = None,
@@ -106,7 +107,7 @@ def predict(
             if conformal is None:
                 raise ValueError("save_conformal must come with --conformal, whose scales it keeps. Add --conformal.")
         inputs.know_observations(observations_file)
-        opened = inputs.open_source(source, dataset, model, effects_file, observe, ball)
+        opened = inputs.open_source(source, dataset, model, effects_file, observe, ball).in_flight(anyway)
         count = len(opened.dataset)
         estimator = opened.estimator(method, solver, group)
         scales = None

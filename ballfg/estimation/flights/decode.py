@@ -136,7 +136,17 @@ def _begin(work: Work, sample: Sample, hands: bool, scene: Record) -> None:
         h = work.bank[row]
         h.surface, h.age, h.score, h.tip = mode, 0, 0.0, NO_EVENT
         speed = scene.velocity_spread if mode == FLYING else 2.0 if mode != STILL else 0.0
-        slack = scene.slack if mode == FLYING else 30.0 if mode == HANDLED else 8.0 if mode == CARRIED else 1.0 if mode == SWAYED else 0.0
+        slack = (
+            scene.slack
+            if mode == FLYING
+            else 30.0
+            if mode == HANDLED
+            else 8.0
+            if mode == CARRIED
+            else 1.0
+            if mode == SWAYED
+            else 0.0
+        )
         for axis in range(3):
             h.shift[axis] = 0.0
             for i in range(3):

@@ -122,4 +122,3 @@ def _status(found: list[Estimate]) -> Status:
     for one in found:
         counts[one.status] += len(one)
     return counts.most_common(1)[0][0] if counts else Status.NO_FLIGHT
-

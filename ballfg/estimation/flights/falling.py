@@ -23,7 +23,7 @@ LEAST_WINDOW: Final = 5
 MOST_OFF: Final = 20.0
 """Squared whitened distance of an acceleration from that of a ball, of 3 degrees of freedom: one in 6,000 is larger."""
 BESIDE: Final = 0.04
-"""s. Windows with a bounce or a hit do not fall for the length of a window and a little; longer means something else."""
+"""s. Windows with a bounce or a hit do not fall, for the length of a window and this; longer means something else."""
 AT_END: Final = 0.05
 """s, likewise where a track begins or ends."""
 STILL_AIR: Final = 0.7
@@ -80,15 +80,14 @@ def _falling(
     for begin in range(0, len(times) - size + 1, BLOCK):
         part = slice(begin, begin + BLOCK + size - 1)
         stamps = sliding_window_view(times[part], size)
-        centre = stamps.mean(axis=1, keepdims=True)
         reach = 0.5 * (stamps[:, -1:] - stamps[:, :1])
-        scaled = (stamps - centre) / reach
-        basis, shape = np.linalg.qr(np.stack((np.ones_like(scaled), scaled, scaled**2), axis=2))
-        values = sliding_window_view(positions[part], size, axis=0)
-        fitted = np.linalg.solve(shape, np.einsum("nki,nxk->nix", basis, values))
+        scaled = (stamps - stamps.mean(axis=1, keepdims=True)) / reach
+        design = np.stack((np.ones_like(scaled), scaled, scaled**2), axis=1)
+        unscaled = np.linalg.inv(design @ design.transpose(0, 2, 1))
+        fitted = unscaled @ (design @ sliding_window_view(positions[part], size, axis=0).transpose(0, 2, 1))
         velocity, pull = fitted[:, 1] / reach, 2.0 * fitted[:, 2] / reach**2
         speed = np.linalg.norm(velocity, axis=1, keepdims=True)
-        noise = 2.0 / (np.abs(shape[:, 2, 2, None]) * reach**2) * sigma
+        noise = 2.0 * np.sqrt(unscaled[:, 2, 2, None]) / reach**2 * sigma
         off = pull + physics.drag * speed * velocity + np.array([0.0, 0.0, physics.gravity])
         spread = noise**2 + (STILL_AIR + AIR * speed**2) ** 2
         telling = noise[:, 2] ** 2 * MOST_OFF < physics.gravity**2

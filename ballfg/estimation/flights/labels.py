@@ -32,7 +32,7 @@ LEAST_MERGED: Final = 12
 """Samples, likewise, at least."""
 MOST: Final = 400
 """Largest number of hypotheses."""
-MARGIN: Final = 40.0
+MARGIN: Final = 25.0
 """nats. Hypotheses this far behind the best are dropped."""
 GAP: Final = 0.5
 """s. Nothing links the two sides of a longer gap."""
@@ -42,6 +42,7 @@ ALIKE: Final = 0.03
 """m. Places within this height of each other are on one surface."""
 HANDS: Final = 30.0
 """nats, by which hands must explain a recording better than flights, strikes and bounces alone."""
+
 
 class Label(IntEnum):
     """What a sample of a track shows."""

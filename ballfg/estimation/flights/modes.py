@@ -80,6 +80,7 @@ SLOWEST_FALL: Final = 0.3
 STRIKE_SPEEDS: Final = (8.0,)
 """m/s. Spread of the velocity after a touch and after a strike, per axis."""
 
+
 @machine_code(NOTHING(ONE_HYPOTHESIS, REAL, SCENE))
 def move(h: Record, dt: float, scene: Record) -> None:
     """A hypothesis dt s later, in its mode."""
@@ -129,7 +130,7 @@ def _constant(h: Record, axis: int, t: float) -> None:
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, COUNT, REAL, REAL, REAL, REAL))
 def _transform(h: Record, axis: int, t: float, half: float, gain: float, memory: float) -> None:
-    """p + t v + half b, v + gain b, memory b; mean and covariance of one axis."""
+    """P + t v + half b, v + gain b, memory b; mean and covariance of one axis."""
     mean, cov = h.mean[axis], h.cov[axis]
     mean[0] += t * mean[1] + half * mean[2]
     mean[1] += gain * mean[2]
