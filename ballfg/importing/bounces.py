@@ -18,6 +18,9 @@ _LEAST_SPEED: Final = 0.7  # m/s, of the fall before and the rise after a bounce
 _MOST_RESIDUAL: Final = 0.02  # m, root mean square about the two flights; more means a hit, an outlier, or two balls
 _SAME: Final = 0.04  # m: bounces within this distance of each other are on one surface
 _SHARE: Final = 0.3  # of the most frequent surface's bounces that make a higher one the table: balls bounce on below it
+_RESTITUTIONS: Final = (0.15, 0.98)  # of a bounce; a hand, a foot or a racket gives back more, or nothing
+_MOST_SCATTER: Final = 0.02  # m, standard deviation of bounces on a surface; hits at any height scatter by more
+_FEW: Final = 3  # least number of bounces that shows their scatter
 _GRAVITY: Final = 10.0  # m/s^2, of the fitted arcs: gravity and a little topspin. An error of 5 moves a bounce by 2 mm.
 BALLS: Final = {"table-tennis": TABLE_TENNIS, "tennis": TENNIS}
 _TENNIS_DRAG: Final = 0.045  # 1/m; halfway, in ratio, between the drags of the two balls
@@ -41,15 +44,21 @@ def surface(shots: Iterable[tuple[Array, Array]]) -> Surface | None:
     while len(heights):
         near = np.searchsorted(heights, heights + _SAME, side="right") - np.searchsorted(heights, heights - _SAME)
         apart = np.abs(heights - heights[int(np.argmax(near))])
-        groups.append(heights[apart <= _SAME])
+        if len(near) < _FEW or _scatter(heights[apart <= _SAME]) <= _MOST_SCATTER:
+            groups.append(heights[apart <= _SAME])
         heights = heights[apart > 2.0 * _SAME]
     if not groups:
         return None
     often = [group for group in groups if len(group) >= max(_SHARE * len(groups[0]), 1.0)]
     table = max(often, key=lambda group: float(np.median(group)))
-    spread = 1.4826 * float(np.median(np.abs(table - np.median(table))))
+    spread = _scatter(table)
     others = tuple(float(np.median(group)) for group in often if group is not table)
     return Surface(float(np.median(table)), spread, len(table), others)
+
+
+def _scatter(heights: Array) -> float:
+    """m, standard deviation of heights (n,) m, whatever a few of them are."""
+    return 1.4826 * float(np.median(np.abs(heights - np.median(heights))))
 
 
 def bounce_heights(times: Array, heights: Array) -> list[float]:
@@ -70,6 +79,9 @@ def bounce_heights(times: Array, heights: Array) -> list[float]:
             continue
         when = (before[0] - after[0]) / (after[1] - before[1])
         step = times[i + 1] - times[i]
+        restitution = (after[1] - _GRAVITY * when) / max(_GRAVITY * when - before[1], _LEAST_SPEED)
+        if not _RESTITUTIONS[0] <= restitution <= _RESTITUTIONS[1]:
+            continue
         if -0.1 * step <= when <= 1.1 * step:
             height = before[0] + before[1] * when - 0.5 * _GRAVITY * when**2
             found.append((before[2] + after[2], times[i] + when, height))

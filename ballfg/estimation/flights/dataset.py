@@ -100,19 +100,24 @@ class InFlight:
                 f"used, {self.tracks - self.mixed} tracks whole; the rest is held, rolls, rests or is lost"
             )
         if self.smoothing > SMOOTHED:
-            said.append(
-                f"a filter smoothed the positions (errors that last are {self.smoothing:.1f} times those from sample to "
-                "sample): bounces and throws are rounded, velocities lag, and sigmas are too small"
-            )
+            said.append(smoothed(self.smoothing))
         return tuple(said)
 
     def check(self, where: object, anyway: bool) -> None:
         """Refuses a dataset that is mostly no flight. Raises: ValueError."""
         if self.share < ENOUGH and not anyway:
             raise ValueError(
-                f"{where} must show flights: only {100 * self.share:.0f} % of its samples fall like a ball. Cut them out "
-                "with ballfg import --flights, check units and axes, or say --anyway."
+                f"{where} must show flights: only {100 * self.share:.0f} % of its samples fall like a ball. Cut them "
+                "out with ballfg import --flights, check units and axes, or say --anyway."
             )
+
+
+def smoothed(ratio: float) -> str:
+    """The sentence on positions that a filter smoothed. Args: ratio: of slow to fast errors."""
+    return (
+        f"a filter smoothed the positions (errors that last are {ratio:.1f} times those from sample to sample): this "
+        "is no free fall near bounces and throws, velocities lag, and sigmas are too small"
+    )
 
 
 @lru_cache(maxsize=16)

@@ -1,4 +1,4 @@
-"""Explains the samples of a track by the modes of a ball, in machine code: the most likely chain of modes and events."""
+"""Explains the samples of a track by the modes of a ball, in machine code: the most likely chain of events."""
 
 import math
 from typing import Any, Final
@@ -100,7 +100,7 @@ def _branch(work: Work, kept: Records, place: int, index: int, dt: float, hands:
         _note(work, row, CHANGE, index, dt)
         if HANDLED <= mode <= SWAYED and HANDLED <= other <= SWAYED:
             work.bank[row].score += PRICES[CHANGE]
-        if HANDLED <= mode <= SWAYED and (other == ROLLING or other == FLYING):
+        if HANDLED <= mode <= SWAYED and other in (ROLLING, FLYING):
             work.bank[row].score -= 4.0
         if other <= SWAYED and (mode == FLYING or other == FLYING):
             work.bank[row].score -= brief
