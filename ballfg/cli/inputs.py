@@ -172,6 +172,15 @@ def flights_only(data: Dataset, anyway: bool) -> Any:
     return found.dataset
 
 
+def filtered(data: Dataset | SightedDataset) -> tuple[str, ...]:
+    """A sentence on a filter that smoothed the positions of a dataset, if one did."""
+    from ballfg.estimation.configure import TRACKS_FOR_TABLE
+    from ballfg.estimation.flights.dataset import in_flight
+    from ballfg.tracks import Dataset
+
+    return in_flight(data, TRACKS_FOR_TABLE).filtered if isinstance(data, Dataset) else ()
+
+
 def know_effects(files: Iterable[Path] | None) -> None:
     """Registers the effects in files, so that model files and options can name them."""
     from ballfg.dynamics import load_effects

@@ -40,7 +40,6 @@ class Frame:
     flip: str | None
     drag: float | None  # 1/m, from the falls
     windows: int = 0
-    score: float = 0.0  # share of the short stretches that fall like a ball
 
     def metres(self, positions: Array) -> Array:
         """(n, 3) m, in the axes of the source."""
@@ -100,7 +99,7 @@ def find_frame(
         _line("up", best, found, choices.up, None, ""),
     ]
     drag = best.drag if best.score >= _LEAST_SCORE else None
-    frame = Frame(best.length, best.time, best.up, choices.flip, drag, best.windows, best.score)
+    frame = Frame(best.length, best.time, best.up, choices.flip, drag, best.windows)
     hand, sure = "taken for right-handed: positions cannot show it", "likely"
     if choices.flip:
         hand, sure = f"mirrored along {choices.flip} as stated", "stated"

@@ -9,7 +9,7 @@ import numpy as np
 from ballfg.checks import short_text
 from ballfg.importing.bounces import ball_of, table_of
 from ballfg.importing.choices import Choices, Guess, UndecidedError
-from ballfg.importing.columns import Roles
+from ballfg.importing.columns import UNMEASURED, Roles
 from ballfg.importing.formats.raw import RawTable
 from ballfg.importing.formats.sources import tables_of
 from ballfg.importing.frame import Frame, find_frame
@@ -72,12 +72,20 @@ def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
         rate=rate,
         source=source[:200],
         imported={guess.what: f"{guess.value} ({guess.sure}: {guess.why})" for guess in guesses},
-        doubts=tuple(recorded.doubts(frame, choices.flights)),
+        doubts=(*_unseen(roles), *recorded.doubts(frame, choices.flights)),
     )
     used = (*roles.time, *roles.places, roles.frame)
     doubts = [[*table.notes, *(said for name, said in table.doubts.items() if name in used)] for table in chosen]
     table_notes = list(dict.fromkeys(note for notes_of_one in doubts for note in notes_of_one))
     return Proposal(info, tracks, guesses, [*table_notes[:5], *counts.notes(), *notes])
+
+
+def _unseen(roles: Roles) -> list[str]:
+    """A sentence on axes of the source without a column."""
+    axes = [axis for axis, name in zip("xyz", roles.places, strict=True) if name == UNMEASURED]
+    if not axes:
+        return []
+    return [f"{' and '.join(axes)} of the source {'are' if len(axes) > 1 else 'is'} not measured and set to zero"]
 
 
 def _flights(recorded: Recordings) -> list[Track]:

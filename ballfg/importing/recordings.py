@@ -20,8 +20,6 @@ from ballfg.tracks import Track
 
 ANY_BALL: Final = SegmentationPhysics(drag=0.06)
 """Between the drag of a heavy and of a light ball; the labels leave room for either."""
-FALLING: Final = 0.5
-"""Share of the short stretches of flights that should fall at 9.81 m/s^2; less makes units and axis doubtful."""
 
 
 @dataclass(frozen=True)
@@ -60,13 +58,11 @@ class Recordings:
     def doubts(self, frame: Frame, cut: bool) -> list[str]:
         """Sentences for `dataset.yaml`. Args: frame: the units.  cut: True if only flights are kept."""
         said = list[str]()
-        if frame.windows and frame.score < FALLING * self.share:
+        if self.share < ENOUGH:
             said.append(
-                f"balls fall at 9.81 m/s^2 in only {100 * frame.score:.0f} % of short stretches, in {frame.length} and "
-                f"{frame.time} with {frame.up} up: check units and axis"
+                f"{'the flights were cut from tracks of which ' if cut else ''}only {100 * self.share:.0f} % of the "
+                f"samples fall like a ball, in {frame.length} and {frame.time} with {frame.up} up: check units and axis"
             )
-        if self.share < ENOUGH and not cut:
-            said.append(f"only {100 * self.share:.0f} % of the samples fall like a ball")
         if self.smoothing > SMOOTHED:
             said.append(smoothed(self.smoothing))
         if len(self.cut if cut else self.tracks) < LEAST_TRACKS:

@@ -64,6 +64,7 @@ def estimate(
         inputs.check_out(out, dataset)
         inputs.know_observations(observations_file)
         opened = inputs.open_source(source, dataset, model, effects_file, ball=ball)
+        inputs.print_doubts(inputs.filtered(opened.dataset))
         count = len(opened.dataset)
         work = partial(_estimated, opened.model, opened.estimator(method, solver, group))
         results = map_tracks(work, opened.dataset, count, workers)

@@ -8,13 +8,11 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.estimation.flights.labels import Label, Labels, label_samples
+from ballfg.estimation.flights.labels import SHORTEST, Label, Labels, label_samples
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.tracks import Track
 from ballfg.tracks.track import Label as TrackLabel
 
-LEAST: Final = 5
-"""Least number of samples of a flight that is kept: fewer show no velocity."""
 BEFORE: Final = {Label.HELD: "thrown", Label.ROLLING: "left a surface", Label.RESTING: "left a surface"}
 """Reasons of the beginning of a flight, by what was before."""
 AFTER: Final = {Label.HELD: "caught", Label.ROLLING: "rolled", Label.RESTING: "came to rest"}
@@ -44,7 +42,7 @@ def pieces_of(labels: Labels) -> list[Piece]:
         before = Label(int(values[first - 1])) if first else None
         after = Label(int(values[last + 1])) if last + 1 < len(values) else None
         first, last = first + (before is Label.HELD), last - (after is Label.HELD)
-        if last - first + 1 >= LEAST:
+        if last - first + 1 >= SHORTEST:
             begins = "start" if before is None else BEFORE.get(before, "seen again")
             found.append(Piece(first, last, begins, "end" if after is None else AFTER.get(after, "lost")))
     return found

@@ -26,6 +26,7 @@ measured sets it is at most 1.18, on simulated recordings (seeds 0 to 83) at mos
 least 1.58."""
 UNDISTURBED: Final = 0.2
 """Quantile of that ratio: stretches with a bounce or a hit have larger ones."""
+SMOOTHING: Final = "a filter smoothed the positions"
 SPAN: Final = 0.25
 """s, of the cubics whose residuals show the errors."""
 LEAST_SPAN: Final = 8
@@ -99,9 +100,13 @@ class InFlight:
                 f"{100 * self.share:.0f} % of the samples fall like a ball: {cut} flights of {self.mixed} tracks are "
                 f"used, {self.tracks - self.mixed} tracks whole; the rest is held, rolls, rests or is lost"
             )
-        if self.smoothing > SMOOTHED:
-            said.append(smoothed(self.smoothing))
-        return tuple(said)
+        return (*said, *self.filtered)
+
+    @property
+    def filtered(self) -> tuple[str, ...]:
+        """A sentence on a filter that smoothed the positions, unless `dataset.yaml` has it."""
+        known = any(SMOOTHING in doubt for doubt in self.dataset.info.doubts)
+        return () if known or not self.smoothing > SMOOTHED else (smoothed(self.smoothing),)
 
     def check(self, where: object, anyway: bool) -> None:
         """Refuses a dataset that is mostly no flight. Raises: ValueError."""
@@ -115,7 +120,7 @@ class InFlight:
 def smoothed(ratio: float) -> str:
     """The sentence on positions that a filter smoothed. Args: ratio: of slow to fast errors."""
     return (
-        f"a filter smoothed the positions (errors that last are {ratio:.1f} times those from sample to sample): this "
+        f"{SMOOTHING} (errors that last are {ratio:.1f} times those from sample to sample): this "
         "is no free fall near bounces and throws, velocities lag, and sigmas are too small"
     )
 

@@ -11,8 +11,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.estimation.estimator import Estimator
-from ballfg.estimation.flights.cut import LEAST
-from ballfg.estimation.flights.labels import ALIKE, Label, Labels, label_samples
+from ballfg.estimation.flights.labels import ALIKE, SHORTEST, Label, Labels, label_samples
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.settings import sample_sigmas
@@ -64,7 +63,7 @@ def _parts(track: Track, labels: Labels, levels: list[float]) -> list[tuple[int,
     found = []
     for first, stop in ends.tolist():
         first, last = first + (first > 0), stop - 1 - (stop < len(values))  # a hand may touch the ball there
-        if (values[first : last + 1] == Label.FLIGHT).sum() >= LEAST:
+        if (values[first : last + 1] == Label.FLIGHT).sum() >= SHORTEST:
             found.append((first, last))
     return found
 

@@ -24,6 +24,8 @@ from ballfg.tracks import Track
 
 FEWEST: Final = 5
 """Least number of samples for labels."""
+SHORTEST: Final = 5
+"""Least number of samples of a flight that is used: fewer show no velocity."""
 LEAST_SIGMA: Final = 1.5e-3
 """m. Least standard deviation of a sample: slow errors of trackers do not show in the scatter."""
 MERGED: Final = 0.15
