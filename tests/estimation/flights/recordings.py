@@ -221,6 +221,8 @@ class Recording:
     rate: float
     noise: float
     """m."""
+    truth: Array
+    """(n, 3) m, true positions."""
 
 
 def recording(seed: int, low_pass: float | None = None, kind: str | None = None) -> Recording:
@@ -238,4 +240,6 @@ def recording(seed: int, low_pass: float | None = None, kind: str | None = None)
     if low_pass is not None:
         b, a = butter(2, low_pass / (rate / 2.0))
         measured = lfilter(b, a, measured - measured[0], axis=0) + measured[0]
-    return Recording(Track(times, measured, name=f"{kind}{seed}"), [take.labels[i] for i in at], kind, rate, noise)
+    return Recording(
+        Track(times, measured, name=f"{kind}{seed}"), [take.labels[i] for i in at], kind, rate, noise, dense[at]
+    )
