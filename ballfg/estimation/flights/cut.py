@@ -36,12 +36,11 @@ class Piece:
 
 
 def pieces_of(labels: Labels) -> list[Piece]:
-    """The flights of a labelled track; samples at which a hand lets go or catches are left out."""
+    """The flights of a labelled track."""
     values, found = labels.values, list[Piece]()
     for first, last in labels.stretches(Label.FLIGHT):
         before = Label(int(values[first - 1])) if first else None
         after = Label(int(values[last + 1])) if last + 1 < len(values) else None
-        first, last = first + (before is Label.HELD), last - (after is Label.HELD)
         if last - first + 1 >= SHORTEST:
             begins = "start" if before is None else BEFORE.get(before, "seen again")
             found.append(Piece(first, last, begins, "end" if after is None else AFTER.get(after, "lost")))

@@ -101,7 +101,7 @@ def _branch(work: Work, kept: Records, place: int, index: int, dt: float, hands:
         if HANDLED <= mode <= SWAYED and HANDLED <= other <= SWAYED:
             work.bank[row].score += PRICES[CHANGE]
         if HANDLED <= mode <= SWAYED and other in (ROLLING, FLYING):
-            work.bank[row].score -= 4.0
+            work.bank[row].score -= 1.0
         if other <= SWAYED and (mode == FLYING or other == FLYING):
             work.bank[row].score -= brief
     if mode == FLYING:

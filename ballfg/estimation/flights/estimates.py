@@ -62,9 +62,8 @@ def _parts(track: Track, labels: Labels, levels: list[float]) -> list[tuple[int,
     ends = np.flatnonzero(np.diff(known, prepend=False, append=False)).reshape(-1, 2)
     found = []
     for first, stop in ends.tolist():
-        first, last = first + (first > 0), stop - 1 - (stop < len(values))  # a hand may touch the ball there
-        if (values[first : last + 1] == Label.FLIGHT).sum() >= SHORTEST:
-            found.append((first, last))
+        if (values[first:stop] == Label.FLIGHT).sum() >= SHORTEST:
+            found.append((first, stop - 1))
     return found
 
 
