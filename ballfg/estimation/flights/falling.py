@@ -22,6 +22,8 @@ LEAST_WINDOW: Final = 5
 """Samples, likewise, at least."""
 MOST_OFF: Final = 20.0
 """Squared whitened distance of an acceleration from that of a ball, of 3 degrees of freedom: one in 6,000 is larger."""
+CLEARLY: Final = 3.0
+"""Multiple of that distance at which a ball at rest would have to stand for a window to tell."""
 BESIDE: Final = 0.04
 """s. Windows with a bounce or a hit do not fall, for the length of a window and this; longer means something else."""
 AT_END: Final = 0.05
@@ -90,5 +92,5 @@ def _falling(
         noise = 2.0 * np.sqrt(unscaled[:, 2, 2, None]) / reach**2 * sigma
         off = pull + physics.drag * speed * velocity + np.array([0.0, 0.0, physics.gravity])
         spread = noise**2 + (STILL_AIR + AIR * speed**2) ** 2
-        telling = noise[:, 2] ** 2 * MOST_OFF < physics.gravity**2
+        telling = (noise[:, 2] ** 2 + STILL_AIR**2) * CLEARLY * MOST_OFF < physics.gravity**2
         yield telling & ((off**2 / spread).sum(axis=1) < MOST_OFF)

@@ -43,7 +43,7 @@ QUICK: Final = 30.0
 """m/s^2. Spread, per axis, of the acceleration of a hand that throws or catches."""
 QUICK_MEMORY: Final = 0.08
 """s. Time constant of that acceleration."""
-STOPPING: Final = 60.0
+STOPPING: Final = 120.0
 """m/s^2. Spread of the acceleration at the start of a catch."""
 SLOW: Final = 8.0
 """m/s^2. Spread of the acceleration of a hand that carries."""

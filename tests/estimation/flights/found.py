@@ -68,7 +68,7 @@ def hidden(one: Recording, end: int, found: int) -> bool:
     """
     inside = range(end, end + 5) if one.labels[min(end + 4, len(one.labels) - 1)] == FLIGHT else range(end - 4, end + 1)
     rows = [i for i in inside if 0 <= i < len(one.truth)]
-    t, away = one.track.times, one.track.times[found]
+    t, away = one.track.times * one.rate, one.track.times[found] * one.rate
     fits = [np.polyfit(t[rows] - away, one.truth[rows, k], 2)[-1] for k in range(3)]
     return bool(np.linalg.norm(np.array(fits) - one.truth[found]) < 2.0 * one.noise)
 
