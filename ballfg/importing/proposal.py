@@ -58,7 +58,7 @@ def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
     tracks, notes = _tracks(shots, frame)
     ball, ball_guess = ball_of(choices, frame)
     recorded = recordings(tracks)
-    height, height_guess = table_of(recorded.cut or tracks, ball, choices)
+    height, height_guess = table_of(tracks, recorded.cut, ball, choices)
     flights_guess = recorded.guess(choices.flights)
     tracks = _flights(recorded) if choices.flights else tracks
     rate = float(f"{1.0 / np.median(np.concatenate([np.diff(track.seconds) for track in tracks])):.4g}")

@@ -96,7 +96,9 @@ class DatasetInfo:
 
     def __post_init__(self) -> None:
         check_name("name", self.name)
-        if not isinstance(self.doubts, tuple | list) or not all(map(is_text, self.doubts)):
+        if not isinstance(self.doubts, tuple | list) or not all(
+            isinstance(one, str) and is_text(one) for one in self.doubts
+        ):
             rule = "doubts must be a list of texts, each of one line"
             raise ValueError(f"{rule}; got {shown(self.doubts)}. Write doubts: ['units were guessed'].")
         object.__setattr__(self, "doubts", tuple(self.doubts))

@@ -1,4 +1,4 @@
-"""Whether a calibrated model predicts better: the change of the errors with an interval over tracks."""
+"""Decides if a calibrated model predicts better, by an interval of the change of the errors over tracks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A dataset in flights: what commands that presume flight use of a dataset, and what they say about it."""
+"""Gives the flights of a dataset as a dataset, with what commands that presume flight say about the rest."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ BRIEF: Final = 8.0
 BRIEFLY: Final = 0.1
 """s. Time constant with which that price fades."""
 BRIEF_HOLD: Final = 20.0
-"""nats, of the end of a hold that has just begun: what lasts less than a hand can hold is a strike."""
+"""nats, of a flight that begins just after a hold, roll or rest did: what a hand cannot hold as briefly is a strike."""
 BRIEFLY_HELD: Final = 0.05
 """s."""
 BRANCHES: Final = 6 * 7 + 4
@@ -81,10 +81,10 @@ def _note(work: Work, row: int, kind: int, index: int, dt: float) -> None:
 
 @machine_code(REAL(ONE_HYPOTHESIS, REAL))
 def _brevity(h: Record, dt: float) -> float:
-    """nats, the price of the end of a flight or of a hold: brief ones are rare."""
+    """nats, the price of the change from flight to a hand, or from anything else to flight: brief modes are rare."""
     if h.surface == FLYING:
         return BRIEF * math.exp(-h.age * dt / BRIEFLY)
-    return BRIEF_HOLD * math.exp(-h.age * dt / BRIEFLY_HELD) if h.surface <= SWAYED else 0.0
+    return BRIEF_HOLD * math.exp(-h.age * dt / BRIEFLY_HELD)
 
 
 @machine_code(NOTHING(WORK, BANK, COUNT, COUNT, REAL, FLAG, SCENE))

@@ -1,4 +1,4 @@
-"""Quick tests of positions: their white noise, whether all of them fall like a ball, whether a filter smoothed them."""
+"""Tests positions quickly for white noise, for a fall of all of them, and for a filter that smoothed them."""
 
 from __future__ import annotations
 

@@ -211,6 +211,31 @@ KINDS = {"thrown": _thrown, "dribbled": _dribbled, "juggled": _juggled, "carried
          "caught": _caught, "held": _held}  # fmt: skip
 
 
+def _tapped(take: Take) -> None:
+    """A foot or a racket taps the ball up again and again, within a sample, at about one height."""
+    rng = take.rng
+    take.position, take.velocity = np.array([0.0, 0.0, 0.9]), np.array([0.0, 0.0, 3.0])
+    spread = rng.uniform(0.0, 0.15)
+    for _ in range(int(rng.integers(5, 15))):
+        low = 0.9 + rng.normal(0.0, spread)
+        take.fly(lambda p, v, t, low=low: v[2] < 0 and p[2] < low, floor=False)
+        take.velocity = np.array([*rng.normal(0.0, 0.2, 2), rng.uniform(2.0, 4.5)])
+
+
+def _walled(take: Take) -> None:
+    """A ball flies to a wall and back, with a racket's stroke between."""
+    take.position = np.array([0.0, 0.0, 1.2])
+    for _ in range(int(take.rng.integers(2, 6))):
+        take.velocity = np.array([take.rng.uniform(5.0, 9.0), 0.3, take.rng.uniform(1.0, 3.0)])
+        take.fly(lambda p, v, t: p[0] > 3.0, floor=False)
+        take.velocity = take.velocity * np.array([-0.8, 0.9, 0.9])
+        take.fly(lambda p, v, t: p[0] < 0.2 or p[2] < 0.6, floor=False)
+
+
+WITHOUT_TABLE = {"juggled": _juggled, "caught": _caught, "held": _held, "tapped": _tapped, "walled": _walled}
+"""Motions in which nothing is a table or a floor."""
+
+
 @dataclass(frozen=True)
 class Recording:
     """A measured track with the true label of each sample, and what it is."""
@@ -231,7 +256,7 @@ def recording(seed: int, low_pass: float | None = None, kind: str | None = None)
     kind = list(KINDS)[seed % len(KINDS)] if kind is None else kind
     ball = "basketball" if kind == "dribbled" else "juggling" if kind == "juggled" else rng.choice(list(BALLS))
     take = Take(rng, *BALLS[ball])
-    KINDS[kind](take)
+    {**KINDS, **WITHOUT_TABLE}[kind](take)
     rate, noise = float(rng.choice(RATES)), float(np.exp(rng.uniform(*np.log((1e-3, 1e-2)))))
     dense = np.concatenate(take.places)
     times = np.arange(rng.uniform(0.0, 1.0 / rate), STEP * (len(dense) - 1), 1.0 / rate)
