@@ -12,7 +12,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.dynamics.nominal import nominal_model
-from ballfg.estimation.flights.cut import Piece, flies_throughout, pieces_of
+from ballfg.estimation.flights.cut import Piece, pieces_of
 from ballfg.estimation.flights.falling import contrasts
 from ballfg.estimation.flights.labels import Label, Labels, label_samples
 from ballfg.estimation.segmentation.physics import physics_of
@@ -137,7 +137,8 @@ def in_flight(dataset: Dataset, most: int | None = None) -> InFlight:
     ratios, samples, flying = list[Array](), 0, 0
     for track in islice(iter(dataset), most):
         labels = label_samples(track, physics, levels)
-        pieces[track.name] = None if _as_it_is(labels) else pieces_of(labels)
+        whole = labels.estimable(track.positions[:, 2], levels).all()
+        pieces[track.name] = None if whole else pieces_of(labels)
         samples += len(track)
         flying += len(track) if pieces[track.name] is None else int((labels.values == Label.FLIGHT).sum())
         if len(pieces) <= LOOKED_AT:
@@ -147,13 +148,6 @@ def in_flight(dataset: Dataset, most: int | None = None) -> InFlight:
     smoothing = float(np.quantile(held, UNDISTURBED)) if len(held) else np.nan
     found = FlightsOf(dataset, pieces) if mixed else dataset
     return InFlight(found, len(pieces), mixed, flying / samples, smoothing)
-
-
-def _as_it_is(labels: Labels) -> bool:
-    """True for a track that estimators take whole: no hand touches the ball, and it flies for a while."""
-    return flies_throughout(labels) or not (
-        (labels.values == Label.HELD).any() or not (labels.values == Label.FLIGHT).any()
-    )
 
 
 def error_ratios(track: Track, labels: Labels) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.estimation.estimator import Estimator
-from ballfg.estimation.flights.labels import ALIKE, SHORTEST, Label, Labels, label_samples
+from ballfg.estimation.flights.labels import SHORTEST, Label, Labels, label_samples
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.settings import sample_sigmas
@@ -54,9 +54,7 @@ def in_sections(estimator: Estimator, track: Track) -> Iterator[Estimate]:
 def _parts(track: Track, labels: Labels, levels: list[float]) -> list[tuple[int, int]]:
     """First and last sample of each part that an estimator explains: it holds a flight, or is all of a track."""
     values = labels.values
-    down = np.isin(values, (Label.ROLLING, Label.RESTING))
-    near = np.abs(track.positions[:, 2, None] - np.array(levels)).min(axis=1) < ALIKE
-    known = (values != Label.HELD) & (~down | near)
+    known = labels.estimable(track.positions[:, 2], levels)
     if known.all():
         return [(0, len(values) - 1)]
     ends = np.flatnonzero(np.diff(known, prepend=False, append=False)).reshape(-1, 2)

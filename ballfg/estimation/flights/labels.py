@@ -73,6 +73,15 @@ class Labels:
     values: NDArray[np.int8]
     bounces: NDArray[np.int64]
 
+    def estimable(self, heights: Array, levels: Sequence[float]) -> NDArray[np.bool_]:
+        """(n,) True for samples of flight, and of rolling or rest on known surfaces: estimators explain them.
+
+        Args: heights: (n,) m, of the samples.  levels: m, heights of the ball's centre on the surfaces.
+        """
+        down = np.isin(self.values, (Label.ROLLING, Label.RESTING))
+        near = np.abs(heights[:, None] - np.array(levels)).min(axis=1) < ALIKE
+        return np.asarray((self.values != Label.HELD) & (~down | near))
+
     def stretches(self, label: Label) -> list[tuple[int, int]]:
         """First and last sample, inclusive, of each run of a label; lost samples within a run belong to it."""
         kept = np.flatnonzero(self.values != Label.LOST)
