@@ -41,8 +41,13 @@ class Comparison:
 
     @property
     def gain(self) -> Gain | None:
-        """The change of the errors by the model that is written; None with fewer than two tracks."""
-        return gain_of(self.pairs[:, 0], self.written if len(self.written) else self.pairs[:, 1])
+        """The change of the errors: by the coefficients or, where that is for the worse, with population and noise.
+
+        None with fewer than two tracks.
+        """
+        written = gain_of(self.pairs[: len(self.written), 0], self.written)
+        plain = gain_of(self.pairs[:, 0], self.pairs[:, 1])
+        return written if written is not None and written.word == "worse" else plain
 
 
 def compare(
@@ -67,7 +72,7 @@ def compare(
 
 
 def outcome(comparison: Comparison) -> str:
-    """Whether the model that is written predicts better than before: better, no different, worse, or not known."""
+    """Whether the calibrated model predicts better than before: better, no different, worse, or not known."""
     return "not known" if comparison.gain is None else comparison.gain.word
 
 
