@@ -221,6 +221,7 @@ def _scales(
     calibration = _opened(conformal)
     if isinstance(calibration, Track):
         raise TypeError("conformal must be a dataset of calibration tracks or its folder; got a track. Give a dataset.")
+    calibration = _in_flight(calibration).dataset if isinstance(calibration, Dataset) else calibration
     check_calibration_tracks(calibration, data)
     return ConformalScales.of(predicted(calibration, len(calibration)), calibration.info.name, observe, method)
 

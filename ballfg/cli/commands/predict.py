@@ -187,6 +187,7 @@ def _conformal_scales(
     """Scales from the calibration tracks of a folder, or from a file of scales."""
     from ballfg.estimation import ConformalScales, predict_tracks
     from ballfg.estimation.conformal import check_calibration_tracks, load_conformal
+    from ballfg.estimation.flights.dataset import in_flight
     from ballfg.estimation.reading import with_readings
     from ballfg.tracks import read_dataset
 
@@ -194,7 +195,7 @@ def _conformal_scales(
         scales = load_conformal(source)
         scales.check_fits(observe, method)
         return scales
-    calibration = with_readings(read_dataset(source))
+    calibration = in_flight(with_readings(read_dataset(source))).dataset
     check_calibration_tracks(calibration, dataset)
     inputs.print_notes(f"calibration tracks: {note}" for note in calibration.notes)
     count = len(calibration)

@@ -24,6 +24,8 @@ from ballfg.estimation.result import LABELS
 from ballfg.importing.recordings import ANY_BALL
 from tests.estimation.flights.recordings import FLIGHT, KINDS, Recording, recording
 
+LEAST_ROWS = 4
+"""Least number of samples for a parabola that is carried on."""
 NEAR = 2
 """Samples by which the ends of a flight may differ."""
 
@@ -41,6 +43,7 @@ class Count:
     false: int = 0
     seconds: float = 0.0
     lost: float = 0.0
+    smoothed: int = 0
     said: int = 0
     recordings: int = 0
     missed: list[str] = field(default_factory=list)
@@ -50,8 +53,8 @@ class Count:
             f"{100 * self.right / self.samples:.1f} % of {self.samples} samples right; {self.whole} of {self.flights} "
             f"flights whole ({100 * self.whole / max(self.flights, 1):.1f} %), {self.as_whole} as far as the noise "
             f"shows ({100 * self.as_whole / max(self.flights, 1):.1f} %); {self.false} of {self.found} found ones "
-            f"false; {100 * self.lost / max(self.seconds, 1e-9):.2f} % of {self.seconds:.0f} s lost; {self.said} of "
-            f"{self.recordings} said to be smoothed or no free fall"
+            f"false; {100 * self.lost / max(self.seconds, 1e-9):.2f} % of {self.seconds:.0f} s lost; of "
+            f"{self.recordings} {self.smoothed} said to be smoothed, {self.said} that or mostly no free fall"
         )
 
 
@@ -68,6 +71,8 @@ def hidden(one: Recording, end: int, found: int) -> bool:
     """
     inside = range(end, end + 5) if one.labels[min(end + 4, len(one.labels) - 1)] == FLIGHT else range(end - 4, end + 1)
     rows = [i for i in inside if 0 <= i < len(one.truth)]
+    if len(rows) < LEAST_ROWS:
+        return False
     t, away = one.track.times * one.rate, one.track.times[found] * one.rate
     fits = [np.polyfit(t[rows] - away, one.truth[rows, k], 2)[-1] for k in range(3)]
     return bool(np.linalg.norm(np.array(fits) - one.truth[found]) < 2.0 * one.noise)
@@ -96,6 +101,7 @@ def take(one: Recording, count: Count) -> None:
     count.seconds, count.lost = count.seconds + flying.sum() / one.rate, count.lost + (flying & ~used).sum() / one.rate
     ratios = error_ratios(one.track, labels)
     smoothed = len(ratios) > 0 and float(np.quantile(ratios, UNDISTURBED)) > SMOOTHED
+    count.smoothed += smoothed
     count.said += smoothed or (labels.values == Label.FLIGHT).mean() < ENOUGH
     count.recordings += 1
 
