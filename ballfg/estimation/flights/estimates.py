@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -22,47 +22,59 @@ UNKNOWN_SPEED: Final = 5.0
 """m/s. Standard deviation of the velocity of a ball that does not fly, per axis."""
 
 
-def estimated(estimator: Estimator, track: Track) -> Estimate:
-    """The estimate of a track with its labels; only flights, and rolling and rest on declared surfaces, are estimated.
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A track with its labels, and first and last sample of each part that an estimator explains: it holds a flight."""
 
-    Args: estimator: of flights; it gets a track whole where nothing holds the ball.  track: any.
-    """
-    estimator.prepared(track)  # refuses what is no track before anything looks at it
-    levels = [h + estimator.model.radius for h in estimator.surfaces.heights()]
-    labels = label_samples(track, physics_of(estimator.model), levels)
-    parts = _parts(track, labels, levels)
-    if parts == [(0, len(track) - 1)]:
-        return replace(estimator.estimate(track), labels=labels.values)
-    found = [estimator.estimate(track.between(*track.times[[first, last]].tolist())) for first, last in parts]
-    return _assembled(estimator, track, labels, parts, found)
+    track: Track
+    labels: Labels
+    parts: list[tuple[int, int]]
+
+    @classmethod
+    def of(cls, estimator: Estimator, track: Track) -> Seen:
+        """A track as an estimator may explain it: flights, and rolling and rest on its surfaces."""
+        estimator.prepared(track)  # refuses what is no track before anything looks at it
+        levels = [height + estimator.model.radius for height in estimator.surfaces.heights()]
+        labels = label_samples(track, physics_of(estimator.model), levels)
+        known = labels.estimable(track.positions[:, 2], levels)
+        if known.all():
+            return cls(track, labels, [(0, len(track) - 1)])
+        ends = np.flatnonzero(np.diff(known, prepend=False, append=False)).reshape(-1, 2)
+        flying = labels.values == Label.FLIGHT
+        parts = [(int(a), int(b) - 1) for a, b in ends if flying[a:b].sum() >= SHORTEST]
+        return cls(track, labels, parts)
+
+    @property
+    def whole(self) -> bool:
+        """True if nothing but the ball's flight is in the track."""
+        return self.parts == [(0, len(self.track) - 1)]
+
+    def labelled(self, estimate: Estimate, begin: int = 0) -> Estimate:
+        """An estimate of samples from `begin` on, with their labels."""
+        return replace(estimate, labels=self.labels.values[begin : begin + len(estimate)])
+
+    def estimated(self, estimator: Estimator) -> Estimate:
+        """The estimate of the parts; the rest stays as measured."""
+        cut = (self.track.between(*self.track.times[[first, last]].tolist()) for first, last in self.parts)
+        return _assembled(estimator, self.track, self.labels, self.parts, [estimator.estimate(part) for part in cut])
+
+
+def estimated(estimator: Estimator, track: Track) -> Estimate:
+    """The estimate of a track with its labels; a track that only flies is estimated as a whole."""
+    seen = Seen.of(estimator, track)
+    return seen.labelled(estimator.estimate(track)) if seen.whole else seen.estimated(estimator)
 
 
 def in_sections(estimator: Estimator, track: Track) -> Iterator[Estimate]:
     """`estimated` in consecutive parts, where the estimator has them and nothing holds the ball."""
-    estimator.prepared(track)
-    levels = [h + estimator.model.radius for h in estimator.surfaces.heights()]
-    labels = label_samples(track, physics_of(estimator.model), levels)
-    if _parts(track, labels, levels) != [(0, len(track) - 1)]:
-        yield estimated(estimator, track)
+    seen = Seen.of(estimator, track)
+    if not seen.whole:
+        yield seen.estimated(estimator)
         return
     begin = 0
     for part in estimator.in_sections(track):
-        yield replace(part, labels=labels.values[begin : begin + len(part)])
+        yield seen.labelled(part, begin)
         begin += len(part)
-
-
-def _parts(track: Track, labels: Labels, levels: list[float]) -> list[tuple[int, int]]:
-    """First and last sample of each part that an estimator explains: it holds a flight, or is all of a track."""
-    values = labels.values
-    known = labels.estimable(track.positions[:, 2], levels)
-    if known.all():
-        return [(0, len(values) - 1)]
-    ends = np.flatnonzero(np.diff(known, prepend=False, append=False)).reshape(-1, 2)
-    found = []
-    for first, stop in ends.tolist():
-        if (values[first:stop] == Label.FLIGHT).sum() >= SHORTEST:
-            found.append((first, stop - 1))
-    return found
 
 
 def _assembled(
