@@ -59,4 +59,5 @@ def gain_of(before: Array, after: Array) -> Gain | None:
     change = np.log(np.maximum(after, SMALLEST)) - np.log(np.maximum(before, SMALLEST))
     reach = float(stats.t.ppf(0.5 + SURE / 2.0, count - 1) * change.std(ddof=1) / np.sqrt(count))
     mean = float(change.mean())
-    return Gain(*(float(np.expm1(end)) for end in (mean, mean - reach, mean + reach)), count)
+    middle, low, high = (float(np.expm1(end)) for end in (mean, mean - reach, mean + reach))
+    return Gain(middle, low, high, count)

@@ -103,23 +103,23 @@ def _assembled(
     whole = Estimate(track.name, track.times, states, covariances, _status(found), notes=notes, labels=labels.values)
     if not found:
         return replace(whole, innovations={"position": np.full((n, 3), np.nan)}, quality=quality)
-    last = found[-1]
-    cross = np.zeros((n, STATE_DIM, len(last.coefficients)))
-    if last.cross_covariances.size:
-        cross[parts[-1][0] : parts[-1][1] + 1] = last.cross_covariances
+    final = found[-1]
+    cross = np.zeros((n, STATE_DIM, len(final.coefficients)))
+    if final.cross_covariances.size:
+        cross[parts[-1][0] : parts[-1][1] + 1] = final.cross_covariances
     return replace(
         whole,
         innovations={name: np.concatenate(parts) for name, parts in innovations.items()},
-        coefficient_names=last.coefficient_names,
-        coefficients=last.coefficients,
-        coefficient_covariance=last.coefficient_covariance,
+        coefficient_names=final.coefficient_names,
+        coefficients=final.coefficients,
+        coefficient_covariance=final.coefficient_covariance,
         cross_covariances=cross,
         contacts=tuple(contacts),
         hits=np.array(hits, dtype=np.int64),
         quality=quality,
         error=sum(one.error for one in found),
         iterations=sum(one.iterations for one in found),
-        world=last.world,
+        world=final.world,
         other_sides=sides,
     )
 
