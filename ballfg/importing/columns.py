@@ -11,7 +11,8 @@ from ballfg.checks import did_you_mean, listed, short_text, shown
 from ballfg.importing.choices import Choices, UndecidedError
 from ballfg.importing.fall import LENGTHS
 from ballfg.importing.formats.raw import RawTable, is_number, numbers
-from ballfg.importing.names import IDENTITIES, Meaning, meanings, words_of
+from ballfg.importing.identities import identified
+from ballfg.importing.names import Meaning, meanings
 from ballfg.importing.stamps import as_stamps
 
 RATES: Final = ("rate", "fps", "frame_rate", "framerate", "hz", "sampling_rate", "frequency")  # frames per second
@@ -88,7 +89,7 @@ def roles_of(table: RawTable, choices: Choices) -> Roles | None:
     if len(time) == 1:
         time_unit = next((m.unit for m in read.get(time[0], []) if m.role in ("t", "seconds") and m.unit), None)
     used = {*places, *time, *(sigmas or ())} | {one for one in (frame, trajectory) if one}
-    trajectory, identities = _identified(table, trajectory, time or tuple(filter(None, [frame])), used)
+    trajectory, identities = identified(table, trajectory, time or tuple(filter(None, [frame])), used)
     used.update(identities, [trajectory or ""])
     return Roles(
         places,
@@ -103,28 +104,6 @@ def roles_of(table: RawTable, choices: Choices) -> Roles | None:
         tuple(name for name in table.columns if name not in used and name.lower() not in (*RATES, *UNITS)),
         identities,
     )
-
-
-def _identified(
-    table: RawTable, trajectory: str | None, time: tuple[str, ...], used: set[str]
-) -> tuple[str | None, tuple[str, ...]]:
-    """The column of trajectories, and a further one where one stamp of a trajectory has several positions.
-
-    That one has the name of an identity, or text in it.
-    """
-    stamps = [table.columns[name].tolist() for name in time]
-    known = [table.columns[trajectory].tolist()] if trajectory else []
-    rows = len(table)
-    if not time or rows == 0 or rows == len(set(zip(*known, *stamps, strict=True))):
-        return trajectory, ()
-    for name, column in table.columns.items():
-        values = table.texts.get(name, column).tolist()
-        said = bool(set(words_of(name)) & set(IDENTITIES)) or not is_number(column)
-        if name in used or not said or len(set(values)) > rows // 2:
-            continue
-        if len(set(zip(*known, *stamps, values, strict=True))) == rows:
-            return (name, ()) if trajectory is None else (trajectory, (name,))
-    return trajectory, ()
 
 
 def _existing(table: RawTable, name: str) -> str:

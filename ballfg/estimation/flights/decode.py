@@ -13,13 +13,19 @@ from ballfg.estimation.flights.modes import (
     BOUNCE,
     CARRIED,
     CHANGE,
+    HAND_SPEED,
     HANDLED,
     MODES,
+    QUICK,
     ROLLING,
+    ROLLING_SLACK,
     SHIFT,
+    SLOPE,
+    SLOW,
     STILL,
     STRIKE,
     STRIKE_SPEEDS,
+    SWAY,
     SWAYED,
     bounce,
     enter,
@@ -57,6 +63,8 @@ SHORTEST: Final = 1e-3
 """s. Least interval for the price of an event."""
 PRICES: Final = np.array([0.0, 1.0, 4.0, 3.0, 4.0])
 """nats in addition to the prior rate: none, of a bounce, a strike, a change of the mode, a shift."""
+LETTING_GO: Final = 1.0
+"""nats, besides, of a hand that lets a ball fly or roll."""
 BRIEF: Final = 8.0
 """nats, the price of the end of a flight in a hand that has just begun."""
 BRIEFLY: Final = 0.1
@@ -101,7 +109,7 @@ def _branch(work: Work, kept: Records, place: int, index: int, dt: float, hands:
         if HANDLED <= mode <= SWAYED and HANDLED <= other <= SWAYED:
             work.bank[row].score += PRICES[CHANGE]
         if HANDLED <= mode <= SWAYED and other in (ROLLING, FLYING):
-            work.bank[row].score -= 1.0
+            work.bank[row].score -= LETTING_GO
         if other <= SWAYED and (mode == FLYING or other == FLYING):
             work.bank[row].score -= brief
     if mode == FLYING:
@@ -135,18 +143,9 @@ def _begin(work: Work, sample: Sample, hands: bool, scene: Record) -> None:
         work.fill[USED] += 1
         h = work.bank[row]
         h.surface, h.age, h.score, h.tip = mode, 0, 0.0, NO_EVENT
-        speed = scene.velocity_spread if mode == FLYING else 2.0 if mode != STILL else 0.0
-        slack = (
-            scene.slack
-            if mode == FLYING
-            else 30.0
-            if mode == HANDLED
-            else 8.0
-            if mode == CARRIED
-            else 1.0
-            if mode == SWAYED
-            else 0.0
-        )
+        speed = scene.velocity_spread if mode == FLYING else HAND_SPEED if mode != STILL else 0.0
+        pull = QUICK if mode == HANDLED else SLOW if mode == CARRIED else SWAY if mode == SWAYED else 0.0
+        pull = scene.slack if mode == FLYING else ROLLING_SLACK if mode == ROLLING else pull
         for axis in range(3):
             h.shift[axis] = 0.0
             for i in range(3):
@@ -156,10 +155,9 @@ def _begin(work: Work, sample: Sample, hands: bool, scene: Record) -> None:
             h.mean[axis, 0] = sample.position[axis]
             h.cov[axis, 0, 0] = scene.outlier_spread**2
             h.cov[axis, 1, 1] = speed * speed
-            h.cov[axis, 2, 2] = slack * slack
+            h.cov[axis, 2, 2] = pull * pull
         if mode == ROLLING:
-            h.cov[2, 1, 1] = 4e-4
-            h.cov[0, 2, 2] = h.cov[1, 2, 2] = 0.25
+            h.cov[2, 1, 1], h.cov[2, 2, 2] = SLOPE**2, 0.0
         pass_through(h, work, CHANGE, -1, mode, 0.0)
     update(work, 0, sample, scene)
 

@@ -59,8 +59,8 @@ SLOPE: Final = 0.02
 """m/s. Spread of the vertical velocity of a rolling ball: the surface or the frame is not quite level."""
 ROLLING_SLACK: Final = 0.3
 """m/s^2. Spread of the horizontal acceleration of a rolling ball."""
-ROLLING_SPEED: Final = 2.0
-"""m/s. Spread of its horizontal velocity, per axis."""
+ROLLING_DRIFT: Final = 0.02
+"""m/s per sqrt(s). Random walk of its horizontal velocity."""
 LANDING: Final = 0.3
 """m/s. Spread of the vertical speed with which a ball begins to roll or stops."""
 STIR: Final = 1e-3
@@ -97,7 +97,7 @@ def move(h: Record, dt: float, scene: Record) -> None:
         for axis in range(3):
             _constant(h, axis, dt)
         for axis in range(2):
-            h.cov[axis, 1, 1] += 4e-4 * dt
+            h.cov[axis, 1, 1] += ROLLING_DRIFT**2 * dt
         h.cov[2, 0, 0] += STIR**2 * dt
     else:
         for axis in range(3):
