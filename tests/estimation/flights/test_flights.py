@@ -38,7 +38,7 @@ def test_recordings_are_labelled_and_their_flights_found() -> None:
         take(recording(seed), count)
     assert count.right >= 0.96 * count.samples
     assert count.as_whole >= 0.85 * count.flights
-    assert count.false <= 1
+    assert count.false <= 2  # short ones, as a hand begins to move
     assert count.lost <= 0.03 * count.seconds
 
 
