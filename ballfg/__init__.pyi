@@ -32,6 +32,7 @@ from .estimation import register_observation as register_observation
 from .front import diagnose as diagnose
 from .front import error_budget as error_budget
 from .front import estimate as estimate
+from .front import flights as flights
 from .front import graph as graph
 from .front import predict as predict
 from .importing import import_tracks as import_tracks

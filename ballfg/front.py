@@ -18,16 +18,16 @@ from ballfg.estimation import Estimate, Estimator, Settings
 from ballfg.estimation.registry import make_estimator
 from ballfg.machine import MOST_JOBS
 from ballfg.prediction import BallState, Forecast
-from ballfg.tracks import TABLE_TENNIS, Ball, Track
+from ballfg.tracks import TABLE_TENNIS, Ball, Dataset, Track
 from ballfg.tracks.info import TrackFolder
 
 if TYPE_CHECKING:
     from ballfg.diagnosis import Diagnosis
     from ballfg.diagnosis.budget import ErrorBudget
     from ballfg.estimation import ConformalScales, TrackGraph
+    from ballfg.estimation.flights.dataset import InFlight
     from ballfg.estimation.observations.sighted_dataset import SightedDataset
     from ballfg.estimation.track_prediction import TrackPrediction
-    from ballfg.tracks import Dataset
 
 Folder: TypeAlias = str | PathLike[str]
 Tracks: TypeAlias = "Dataset | SightedDataset"
@@ -90,10 +90,41 @@ def estimate(
     data = _opened(measured)
     estimator = estimator_for(data, method, model, surfaces, settings)
     if isinstance(data, Track):
-        return estimator.estimate(data)
+        from ballfg.estimation.flights.estimates import Seen
+
+        seen = Seen.of(estimator, data)
+        return seen.labelled(estimator.estimate(data)) if seen.whole else seen.estimated(estimator)
     from ballfg.estimation.batch import estimate_tracks
 
-    return {one.name: one for one in estimate_tracks(estimator, data, len(data), jobs)}
+    return {one.name: one for one in estimate_tracks(estimator, data, len(data), jobs, flights=True)}
+
+
+@overload
+def flights(measured: OneTrack, *, model: Model = ...) -> list[Track]: ...
+@overload
+def flights(measured: Dataset | Folder, *, model: Model = ...) -> Dataset: ...
+def flights(measured: OneTrack | Dataset | Folder, *, model: Model = None) -> list[Track] | Dataset:
+    """The flights in recordings: where a ball flies, bounces or is struck, and is not held, rolls or rests.
+
+    A track that only flies is returned as it is. The labels `begins` and `ends` of the others say why a flight begins
+    and ends, `recording` names the track (docs/import.md).
+
+    Args:
+        measured: a track or its arrays, as for `estimate`; or a dataset of positions or its folder.
+        model: of the ball, for one track; as for `estimate`.
+    Returns: the flights of a track; of a dataset, a dataset of all flights.
+    Raises:
+        TypeError: for anything else in place of a track or a dataset of positions.
+        ValueError: a track or folder that breaks a rule.
+        FileNotFoundError: a folder or model file that is not there.
+    """
+    data = _opened(measured)
+    if isinstance(data, Track):
+        from ballfg.estimation.flights.cut import flights_of
+        from ballfg.estimation.segmentation.physics import physics_of
+
+        return flights_of(data, physics_of(_model(model, data.dataset)))
+    return _in_flight(_table_of_positions(data)).dataset
 
 
 @overload
@@ -140,18 +171,27 @@ def predict(
     data = _opened(known)
     if isinstance(data, Track):
         _refuse(conformal)
-        estimator = estimator_for(data, method, model, surfaces, settings)
-        return estimator.estimate(data).predict(horizon)
+        from ballfg.estimation.flights.estimates import estimated
+
+        return estimated(estimator_for(data, method, model, surfaces, settings), data).predict(horizon)
     from ballfg.estimation import predict_tracks
     from ballfg.estimation.track_prediction import check_observe
 
     check_observe(observe)
     observe = float(observe)
+    data = _in_flight(data).dataset if isinstance(data, Dataset) else data
     estimator = estimator_for(data, method, model, surfaces, settings, observe)
     predicted = partial(predict_tracks, estimator, observe=observe, horizon=horizon, jobs=jobs)
     scales = _scales(conformal, data, predicted, method, observe)
     found = predicted(data, len(data))
     return {one.name: one if scales is None else scales.scaled(one) for one in found}
+
+
+def _in_flight(data: Dataset) -> InFlight:
+    """The flights of a dataset, and how much of it they are."""
+    from ballfg.estimation.flights.dataset import in_flight as found_in
+
+    return found_in(data)
 
 
 def _refuse(conformal: Conformal) -> None:
@@ -182,6 +222,7 @@ def _scales(
     calibration = _opened(conformal)
     if isinstance(calibration, Track):
         raise TypeError("conformal must be a dataset of calibration tracks or its folder; got a track. Give a dataset.")
+    calibration = _in_flight(calibration).dataset if isinstance(calibration, Dataset) else calibration
     check_calibration_tracks(calibration, data)
     return ConformalScales.of(predicted(calibration, len(calibration)), calibration.info.name, observe, method)
 
@@ -205,7 +246,7 @@ def diagnose(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) 
     from ballfg.parallel.work import on_one_thread
 
     # as in the commands: threads gain nothing on such small batches, and slow each other down
-    return on_one_thread(partial(diagnose_dataset, data, jobs=jobs), _model(model, data))
+    return on_one_thread(partial(diagnose_dataset, _in_flight(data).dataset, jobs=jobs), _model(model, data))
 
 
 def error_budget(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) -> ErrorBudget:
@@ -226,13 +267,12 @@ def error_budget(measured: Dataset | Folder, model: Model = None, *, jobs: int =
     from ballfg.diagnosis.error_budget import error_budget as budget_of_dataset
     from ballfg.parallel.work import on_one_thread
 
-    return on_one_thread(partial(budget_of_dataset, data, jobs=jobs), _model(model, data))
+    return on_one_thread(partial(budget_of_dataset, _in_flight(data).dataset, jobs=jobs), _model(model, data))
 
 
 def _table_of_positions(measured: object) -> Dataset:
     """A dataset with a table of positions, or its folder, opened; errors as of `diagnose`."""
     from ballfg.estimation.observations.sighted_dataset import SightedDataset
-    from ballfg.tracks import Dataset
 
     data = _opened(measured) if isinstance(measured, str | PathLike) else measured
     if isinstance(data, SightedDataset):

@@ -43,7 +43,7 @@ def train(
     groups and one with a learned correction of drag and lift, and writes the best.
 
     The exit status is 1 if no epoch predicts the validation tracks better than the model before the first step, a
-    calibrated model predicts the judging tracks worse than the one before, or kind: auto keeps the nominal model.
+    calibrated model does not predict the judging tracks better than the one before, or kind: auto keeps that one.
     After Ctrl-C the best model so far is written.
 
     Example: ballfg-train train.yaml --data data/ballgun --out ballgun-model kind=mnn+gs optimizer.epochs=30
@@ -117,7 +117,7 @@ def _train_guarded(config: TrainConfig, folder: Path, resume: bool, typed: str) 
 def run(arguments: Sequence[str] | None = None) -> None:
     """Run `ballfg-train` with the given arguments, by default those of the command line, and exit.
 
-    Raises: SystemExit: always; status 0, 1 if the trained model is not better than before or a calibrated one is worse,
+    Raises: SystemExit: always; status 0, 1 if the trained or calibrated model is not better than before,
         2 on bad input, 130 after Ctrl-C.
     """
     start(app, "ballfg-train", arguments)

@@ -13,6 +13,7 @@ from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.dynamics.nominal import inertia_factor
 from ballfg.estimation import Settings, dataset_settings, dataset_surfaces, read_sighted
 from ballfg.estimation.configure import table_note
+from ballfg.estimation.flights.dataset import in_flight
 from ballfg.estimation.launcher import Launcher
 from ballfg.estimation.observations.sighted_dataset import SightedDataset
 from ballfg.estimation.reading import has_positions, with_readings
@@ -72,26 +73,34 @@ def read_training_data(config: TrainConfig) -> TrainingData:
     return TrainingData(shots, train, validation, analytic, embedding)
 
 
-def open_dataset(folder: str) -> Dataset:
-    """The dataset of a folder with all readings beside its positions; notes on repairs and on the table go to stderr.
+def open_dataset(folder: str, anyway: bool = False) -> Dataset:
+    """The flights of a folder with all readings beside its positions; notes on repairs and on the table go to stderr.
 
-    Raises: ValueError, FileNotFoundError: as in reading.
+    Args: anyway: True for tracks of which less than half falls like a ball.
+    Raises: ValueError, FileNotFoundError: as in reading; ValueError: such tracks otherwise.
     """
-    return noted(with_readings(read_dataset(folder)))
+    dataset = noted(with_readings(read_dataset(folder)))
+    found = in_flight(dataset)
+    for doubt in found.lines:
+        print(f"doubt: {doubt}", flush=True)
+    found.check(folder, anyway)
+    return found.dataset
 
 
-def open_source(folder: str, source: str | None) -> Dataset | SightedDataset:
+def open_source(folder: str, source: str | None, anyway: bool = False) -> Dataset | SightedDataset:
     """As `open_dataset`, or the sightings of its cameras.
 
-    Args: source: `positions` or `detections`; None: positions, if the folder has a table of them.
+    Args: source: `positions` or `detections`; None: positions, if the folder has a table of them.  anyway: as there.
     Raises: ValueError, FileNotFoundError: as in reading.
     """
     positions = has_positions(folder) if source is None else source == "positions"
-    return open_dataset(folder) if positions else noted(read_sighted(folder))
+    return open_dataset(folder, anyway) if positions else noted(read_sighted(folder))
 
 
 def noted(dataset: D) -> D:
-    """The dataset, after its notes on stderr."""
+    """The dataset, after its doubts and, on stderr, its notes."""
+    for doubt in dataset.info.doubts:
+        print(f"doubt: {doubt}", flush=True)
     for note in (*dataset.notes, *filter(None, [table_note(dataset)])):
         print(f"note: {note}", file=sys.stderr)
     return dataset

@@ -96,6 +96,9 @@ Address = Annotated[
     str | None,
     typer.Option("--address", help="Address of the cluster: of dask's scheduler, such as tcp://10.0.0.1:8786."),
 ]
+Anyway = Annotated[
+    bool, typer.Option("--anyway", help="Also if less than half of the samples fall like a ball: use the flights.")
+]
 OutTable = Annotated[Path, typer.Option("--out", help="Output table, .csv or .parquet.")]
 Seed = Annotated[int, typer.Option("--seed", help="Random seed.")]
 DATASET_TABLES = ("tracks", "labels", "detections", "truth")
@@ -129,6 +132,17 @@ class Inputs(Generic[D]):
     surfaces: Surfaces
     observed: float  # s from the start of each track that a noise estimate may use
 
+    def in_flight(self, anyway: bool) -> Inputs[D]:
+        """The same of flights alone, after what is said about the rest; sightings stay as they are.
+
+        Args: anyway: True for a dataset that hardly holds any flight.
+        Raises: ValueError: for such a dataset otherwise.
+        """
+        from ballfg.tracks import Dataset
+
+        data = self.dataset
+        return replace(self, dataset=flights_only(data, anyway)) if isinstance(data, Dataset) else self
+
     def estimator(self, method: str, solver: Solver | None = None, group: str | None = None) -> Estimator:
         """The estimator of a name, with the noise of the dataset.
 
@@ -146,6 +160,25 @@ class Inputs(Generic[D]):
         Settings(spins=self.model.spins, group=group)
         settings = fitted_settings(self.dataset, self.model, self.observed, progress)
         return make_estimator(method, self.model, self.surfaces, replace(settings, solver=solver, group=group))
+
+
+def flights_only(data: Dataset, anyway: bool) -> Any:
+    """The flights of a dataset, after what is said about the rest; errors as of `Inputs.in_flight`."""
+    from ballfg.estimation.flights.dataset import in_flight
+
+    found = in_flight(data)
+    print_doubts(found.lines)
+    found.check(data.path, anyway)
+    return found.dataset
+
+
+def filtered(data: Dataset | SightedDataset) -> tuple[str, ...]:
+    """A sentence on a filter that smoothed the positions of a dataset, if one did."""
+    from ballfg.estimation.configure import TRACKS_FOR_TABLE
+    from ballfg.estimation.flights.dataset import in_flight
+    from ballfg.tracks import Dataset
+
+    return in_flight(data, TRACKS_FOR_TABLE).filtered if isinstance(data, Dataset) else ()
 
 
 def know_effects(files: Iterable[Path] | None) -> None:
@@ -234,6 +267,7 @@ def open_model(data: Dataset | SightedDataset, model: Path | None, ball: str | N
             f"{own.radius:g} m and {own.mass:g} kg. Leave --ball out, or correct ball in dataset.yaml."
         )
     torch.set_num_threads(1)  # the batches are small: threads cost more time than they save
+    print_doubts(data.info.doubts)
     notes = [*data.notes, *filter(None, [table_note(data)])]
     if model is None:
         notes += [note for note in (nominal_note(data.ball), *unused_model(data.path, data.ball)) if note]
@@ -248,6 +282,14 @@ def check_out(out: Path, dataset: Path) -> None:
     """Refuses a result in the place of the measurements. Raises: ValueError: if `out` is a table of the dataset."""
     if out.stem in DATASET_TABLES and out.resolve().parent == dataset.resolve():
         raise ValueError(f"out must not be a table of the dataset itself; got {out}. Choose another name.")
+
+
+def print_doubts(doubts: Iterable[str]) -> None:
+    """Prints what is not sure about the tracks, before any result."""
+    from ballfg.checks import visible
+
+    for doubt in doubts:
+        print(f"doubt: {visible(doubt)}", flush=True)
 
 
 def print_notes(notes: Iterable[str]) -> None:

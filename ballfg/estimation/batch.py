@@ -9,6 +9,7 @@ from itertools import islice
 from typing import TypeVar
 
 from ballfg.estimation.estimator import Estimator
+from ballfg.estimation.flights.estimates import estimated
 from ballfg.estimation.result import Estimate
 from ballfg.parallel.executor import executor
 from ballfg.parallel.parts import with_jobs
@@ -28,18 +29,24 @@ HAND_OVER = 0.3
 """s for handing work to running processes."""
 
 
-def estimate_tracks(estimator: Estimator, tracks: Iterable[Track], count: int, jobs: int) -> Iterator[Estimate]:
-    """Estimates in the order of the tracks; arguments as for `map_tracks`."""
+def estimate_tracks(
+    estimator: Estimator, tracks: Iterable[Track], count: int, jobs: int, flights: bool = False
+) -> Iterator[Estimate]:
+    """Estimates in the order of the tracks; arguments as for `map_tracks`.
+
+    Args: flights: True if tracks may hold more than flights, which are then looked for.
+    """
+    made = partial(estimated, estimator) if flights else estimator.estimate
     if estimator.model.variations:  # the world of an estimate depends on its track
-        yield from map_tracks(estimator.estimate, tracks, count, jobs)
+        yield from map_tracks(made, tracks, count, jobs)
         return
-    for estimate in map_tracks(partial(_without_world, estimator), tracks, count, jobs):
+    for estimate in map_tracks(partial(_without_world, made), tracks, count, jobs):
         yield replace(estimate, world=estimator.world)
 
 
-def _without_world(estimator: Estimator, track: Track) -> Estimate:
+def _without_world(made: Callable[[Track], Estimate], track: Track) -> Estimate:
     """The estimate without its model, so that processes need not send it with every track."""
-    return replace(estimator.estimate(track), world=None)
+    return replace(made(track), world=None)
 
 
 def map_tracks(function: Callable[[Track], R], tracks: Iterable[Track], count: int, jobs: int) -> Iterator[R]:

@@ -14,6 +14,7 @@ from ballfg.dynamics.networks.fading import DOUBT
 from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.dynamics.trained import Trained
+from ballfg.estimation.flights.dataset import in_flight
 from ballfg.estimation.launcher import Launcher
 from ballfg.estimation.measurement.position_noise import estimate_position_noise
 from ballfg.estimation.noise.estimate import estimate_noise, spread_over
@@ -93,6 +94,8 @@ def fitted_settings(
         model: the ball.  observed: s, the part of each track that the estimate may use.
         watch: called for each track and each step of the search.
     """
+    if isinstance(dataset, Dataset):
+        dataset = in_flight(dataset, TRACKS_FOR_TABLE).dataset
     settings = dataset_settings(dataset, model)
     at_home = model.trained is not None and not model.trained.is_foreign(dataset.info.name)
     stated = dataset.info.noise is not None or model.noise is not None or at_home

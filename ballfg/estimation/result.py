@@ -6,7 +6,7 @@ import enum
 import operator
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from ballfg.estimation.smoother.track_graph import TrackGraph
+
+
+LABELS: Final = ("flight", "held", "rolling", "resting", "lost")
+"""What a sample may show, by its index in `Estimate.labels`."""
 
 
 class Status(enum.Enum):
@@ -47,6 +51,10 @@ class Status(enum.Enum):
         "and look at the track for jumps"
     )
 
+    NO_FLIGHT = (
+        "nothing in the track flies like a ball: the states are the measured positions. Check the units and the up "
+        "axis, or give recordings in which the ball is thrown, dropped or struck"
+    )
     DEPTH_UNCERTAIN = (
         "one camera saw the ball, and its motion does not show how far away it was: the covariances are wide along the "
         "rays. Observe it together with a bounce, from higher above the table, or with a second camera"
@@ -88,6 +96,8 @@ class Estimate:
         iterations: linear solutions of a minimisation, 0 for methods without one.
         world: model, surfaces and process noise of the estimate; predictions use them.
         notes: doubts about the track: an axis that does not fall, bounces where no surface is declared.
+        labels: (n,) index of what each sample shows (docs/import.md): 0 flight, 1 held, 2 rolling, 3 resting, 4 lost;
+            empty for an estimator that is called by itself. What is no flight has its measured position.
     """
 
     name: str
@@ -111,6 +121,7 @@ class Estimate:
     world: World | None = None
     notes: tuple[str, ...] = ()
     other_sides: Array = field(default_factory=lambda: np.zeros((0, 9, 9)))
+    labels: NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, dtype=np.int8))
 
     def __len__(self) -> int:
         return len(self.times)
@@ -190,7 +201,7 @@ class Estimate:
         return self.last.predict(horizon, step)
 
     def to_frame(self) -> DataFrame:
-        """A pandas table with the columns of `ballfg estimate`: t, the state and its standard deviations.
+        """A pandas table with the columns of `ballfg estimate`: t, the state, its standard deviations, the label.
 
         Raises: ImportError: without pandas.
         """
@@ -199,10 +210,12 @@ class Estimate:
         return pandas.DataFrame(self.columns)
 
     @property
-    def columns(self) -> dict[str, Array]:
-        """The columns of `ballfg estimate`, (n,) each: t (s), the state and its standard deviations."""
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """The columns of `ballfg estimate`, (n,) each: t (s), the state, its standard deviations, what samples show."""
         states = dict(zip(STATE_NAMES, self.states.T, strict=True))
-        return {"t": self.times, **states, **dict(zip(SIGMA_NAMES, self.sigmas.T, strict=True))}
+        sigmas = dict(zip(SIGMA_NAMES, self.sigmas.T, strict=True))
+        shown = np.array(LABELS, dtype=object)[self.labels if len(self.labels) else np.zeros(len(self), np.int8)]
+        return {"t": self.times, **states, **sigmas, "label": shown}
 
     def plot(self) -> Figure:
         """A picture of position, velocity and spin over time, each with a band of two standard deviations."""

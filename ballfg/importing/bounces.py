@@ -18,6 +18,12 @@ _LEAST_SPEED: Final = 0.7  # m/s, of the fall before and the rise after a bounce
 _MOST_RESIDUAL: Final = 0.02  # m, root mean square about the two flights; more means a hit, an outlier, or two balls
 _SAME: Final = 0.04  # m: bounces within this distance of each other are on one surface
 _SHARE: Final = 0.3  # of the most frequent surface's bounces that make a higher one the table: balls bounce on below it
+_RESTITUTIONS: Final = (0.15, 0.98)  # of a bounce; a hand, a foot or a racket gives back more, or nothing
+_MOST_SCATTER: Final = 0.015  # m, standard deviation of bounces on a surface; hits at any height scatter by more
+_MOST_SPREAD: Final = 0.15  # standard deviation of the restitutions of bounces on a surface; hits are of any strength
+_MOST_SWERVE: Final = 0.6  # friction changes the horizontal velocity by less than this share of the vertical change
+_FEW: Final = 10  # number of bounces that shows a surface beside hits; fewer must not scatter at all
+_FEW_SHARE: Final = 0.5  # least share of all turns that fewer bounces are
 _GRAVITY: Final = 10.0  # m/s^2, of the fitted arcs: gravity and a little topspin. An error of 5 moves a bounce by 2 mm.
 BALLS: Final = {"table-tennis": TABLE_TENNIS, "tennis": TENNIS}
 _TENNIS_DRAG: Final = 0.045  # 1/m; halfway, in ratio, between the drags of the two balls
@@ -34,27 +40,60 @@ class Surface:
     others: tuple[float, ...] = ()  # m, centres at further surfaces
 
 
+@dataclass(frozen=True)
+class Turn:
+    """A flight that turns upwards at once, on a surface or by a hit."""
+
+    height: float  # m, of the ball's centre
+    restitution: float  # vertical speed after over that before
+    swerve: float  # change of the horizontal velocity over that of the vertical one
+
+    @property
+    def bounce(self) -> bool:
+        """True if something level and at rest can do it."""
+        return _RESTITUTIONS[0] <= self.restitution <= _RESTITUTIONS[1] and self.swerve <= _MOST_SWERVE
+
+
 def surface(shots: Iterable[tuple[Array, Array]]) -> Surface | None:
     """The surface of most bounces, or a higher one with nearly as many; of times (n,) s and positions (n, 3) m."""
-    heights = np.sort([height for t, p in shots for height in bounce_heights(t, p[:, 2])])
+    turns = [turn for t, p in shots for turn in turns_of(t, p)]
+    left = sorted((turn for turn in turns if turn.bounce), key=lambda turn: turn.height)
     groups: list[Array] = []
-    while len(heights):
+    while left:
+        heights = np.array([turn.height for turn in left])
         near = np.searchsorted(heights, heights + _SAME, side="right") - np.searchsorted(heights, heights - _SAME)
         apart = np.abs(heights - heights[int(np.argmax(near))])
-        groups.append(heights[apart <= _SAME])
-        heights = heights[apart > 2.0 * _SAME]
+        group = [turn for turn, off in zip(left, apart, strict=True) if off <= _SAME]
+        if _is_surface(group, len(turns)):
+            groups.append(np.array([turn.height for turn in group]))
+        left = [turn for turn, off in zip(left, apart, strict=True) if off > 2.0 * _SAME]
     if not groups:
         return None
     often = [group for group in groups if len(group) >= max(_SHARE * len(groups[0]), 1.0)]
     table = max(often, key=lambda group: float(np.median(group)))
-    spread = 1.4826 * float(np.median(np.abs(table - np.median(table))))
     others = tuple(float(np.median(group)) for group in often if group is not table)
-    return Surface(float(np.median(table)), spread, len(table), others)
+    return Surface(float(np.median(table)), _scatter(table), len(table), others)
 
 
-def bounce_heights(times: Array, heights: Array) -> list[float]:
-    """Heights (m) of a ball's bounces, where arcs before and after meet; of times (n,) s and heights (n,) m."""
-    found: list[tuple[float, float, float]] = []
+def _is_surface(group: Sequence[Turn], turns: int) -> bool:
+    """True if bounces at one height are on one surface; few of them among many hits are chance."""
+    if len(group) < _FEW:
+        return _FEW_SHARE * turns <= len(group)
+    heights, restitutions = (
+        np.array(values) for values in zip(*((t.height, t.restitution) for t in group), strict=True)
+    )
+    return _scatter(heights) <= _MOST_SCATTER and _scatter(restitutions) <= _MOST_SPREAD
+
+
+def _scatter(values: Array) -> float:
+    """Standard deviation of values (n,), whatever a few of them are."""
+    return 1.4826 * float(np.median(np.abs(values - np.median(values))))
+
+
+def turns_of(times: Array, positions: Array) -> list[Turn]:
+    """The turns of a ball, where arcs before and after meet; of times (n,) s and positions (n, 3) m."""
+    found: list[tuple[float, float, Turn]] = []
+    heights = positions[:, 2]
     for i in range(1, len(times) - 2):
         # the bounce lies between samples i and i + 1, or one of them is the lowest of its neighbours
         if min(heights[i], heights[i + 1]) > min(heights[i - 1], heights[i + 2]):
@@ -72,12 +111,16 @@ def bounce_heights(times: Array, heights: Array) -> list[float]:
         step = times[i + 1] - times[i]
         if -0.1 * step <= when <= 1.1 * step:
             height = before[0] + before[1] * when - 0.5 * _GRAVITY * when**2
-            found.append((before[2] + after[2], times[i] + when, height))
-    kept: list[tuple[float, float, float]] = []
-    for bounce in sorted(found):  # the best-fitting of bounces less than the length of an arm apart
-        if all(abs(bounce[1] - other[1]) > _ARM for other in kept):
-            kept.append(bounce)
-    return [height for _, _, height in kept]
+            fall = max(_GRAVITY * when - before[1], _LEAST_SPEED)
+            along = [np.polyfit(times[part] - times[i], positions[part, :2], 1)[0] for part in arms]
+            swerve = float(np.linalg.norm(along[1] - along[0])) / (after[1] - before[1])
+            turn = Turn(height, (after[1] - _GRAVITY * when) / fall, swerve)
+            found.append((before[2] + after[2], times[i] + when, turn))
+    kept: list[tuple[float, float, Turn]] = []
+    for one in sorted(found, key=lambda one: one[:2]):  # the best-fitting of turns less than an arm apart
+        if all(abs(one[1] - other[1]) > _ARM for other in kept):
+            kept.append(one)
+    return [turn for _, _, turn in kept]
 
 
 def _arc(times: Array, heights: Array, origin: float) -> tuple[float, float, float]:
@@ -105,12 +148,15 @@ def ball_of(choices: Choices, frame: Frame) -> tuple[Ball, Guess]:
     return TABLE_TENNIS, Guess("ball", "table-tennis", why, sure, "--ball tennis")
 
 
-def table_of(tracks: Sequence[Track], ball: Ball, choices: Choices) -> tuple[float, Guess]:
-    """The height of the table's surface in m, and the confidence in it. Raises: UndecidedError: no bounce shows it."""
+def table_of(tracks: Sequence[Track], flights: Sequence[Track], ball: Ball, choices: Choices) -> tuple[float, Guess]:
+    """The height of the table's surface in m, and the confidence in it. Raises: UndecidedError: no bounce shows it.
+
+    Args: tracks: all.  flights: those in them; bounces of a ball in a hand are none.
+    """
     if choices.table_height is not None:
         height = choices.table_height
         return height, Guess("table height", f"{height:g} m", "as given", "stated", f"--table-height {height:g}")
-    found = surface((track.seconds, track.positions) for track in tracks)
+    found = surface((track.seconds, track.positions) for track in flights)
     if found is None:
         lowest = min(float(track.positions[:, 2].min()) for track in tracks)
         what = f"no bounce shows the height of the table (m, along the up axis); the lowest sample is at {lowest:.2f} m"

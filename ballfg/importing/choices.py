@@ -46,6 +46,8 @@ class Choices:
     key: str | None = None
     topic: str | None = None
     name: str | None = None
+    flights: bool = False
+    """Cut the flights out, one track each."""
 
     def __post_init__(self) -> None:
         for option, choices in {"length": (*LENGTHS,), "time": (*TIMES,), "up": AXES, "flip": ("x", "y", "z")}.items():

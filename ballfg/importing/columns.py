@@ -5,15 +5,20 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ballfg.checks import did_you_mean, listed, short_text, shown
 from ballfg.importing.choices import Choices, UndecidedError
+from ballfg.importing.fall import LENGTHS
 from ballfg.importing.formats.raw import RawTable, is_number, numbers
+from ballfg.importing.identities import identified
 from ballfg.importing.names import Meaning, meanings
 from ballfg.importing.stamps import as_stamps
 
 RATES: Final = ("rate", "fps", "frame_rate", "framerate", "hz", "sampling_rate", "frequency")  # frames per second
 UNITS: Final = ("unit", "units", "length_unit", "position_unit")
+UNMEASURED: Final = "(not measured)"
+"""In place of the column of an axis."""
 _REGULAR: Final = 0.3  # largest median deviation of the steps of a time column, in median steps; coordinates vary more
 _FORWARD: Final = 0.9
 _PIECES: Final = 0.2  # largest number of changes, per row, of a column with the names of trajectories
@@ -33,6 +38,12 @@ class Roles:
     rate: float | None = None
     by_name: bool = True
     others: tuple[str, ...] = ()
+    identities: tuple[str, ...] = ()  # columns that tell several balls of a trajectory apart
+
+    def coordinates(self, table: RawTable) -> NDArray[np.float64]:
+        """(n, 3) positions in the source's unit; zeros along an axis that is not measured."""
+        columns = [numbers(table.columns[one]) if one != UNMEASURED else np.zeros(len(table)) for one in self.places]
+        return np.stack(columns, axis=1)
 
 
 def roles_of(table: RawTable, choices: Choices) -> Roles | None:
@@ -78,6 +89,8 @@ def roles_of(table: RawTable, choices: Choices) -> Roles | None:
     if len(time) == 1:
         time_unit = next((m.unit for m in read.get(time[0], []) if m.role in ("t", "seconds") and m.unit), None)
     used = {*places, *time, *(sigmas or ())} | {one for one in (frame, trajectory) if one}
+    trajectory, identities = identified(table, trajectory, time or tuple(filter(None, [frame])), used)
+    used.update(identities, [trajectory or ""])
     return Roles(
         places,
         time,
@@ -89,6 +102,7 @@ def roles_of(table: RawTable, choices: Choices) -> Roles | None:
         float(rate) if isinstance(rate, int | float) and rate > 0 else None,
         by_name,
         tuple(name for name in table.columns if name not in used and name.lower() not in (*RATES, *UNITS)),
+        identities,
     )
 
 
@@ -119,7 +133,7 @@ def _places(
     _refuse_images(table, groups)
     whole = [group for group in groups.values() if len(group) == 3]
     if not whole:
-        return None, None
+        return _some_places(groups, given)
     ranks = [sum(meaning.rank for _, meaning in group.values()) for group in whole]
     best = [group for group, rank in zip(whole, ranks, strict=True) if rank == min(ranks)]
     if len(best) > 1 and not given:
@@ -134,11 +148,30 @@ def _places(
     return (chosen["x"], chosen["y"], chosen["z"]), found_units.pop()
 
 
+def _some_places(
+    groups: Mapping[str, Mapping[str, tuple[str, Meaning]]], given: Mapping[str, str]
+) -> tuple[tuple[str, str, str] | None, str | None]:
+    """The columns of one or two axes, where no others are there."""
+    axes = {axis: given[axis] for axis in "xyz" if axis in given}
+    if not axes:
+        plain = [group for group in groups.values() if all(meaning.rank == 0 for _, meaning in group.values())]
+        axes = {axis: name for axis, (name, _) in plain[0].items()} if plain else {}
+    if not axes:
+        return None, None
+    units = [m.unit for group in groups.values() for name, m in group.values() if name in axes.values() and m.unit]
+    x, y, z = (axes.get(axis, UNMEASURED) for axis in "xyz")
+    return (x, y, z), units[0] if units else None
+
+
 def _refuse_images(table: RawTable, groups: Mapping[str, Mapping[str, tuple[str, Meaning]]]) -> None:
     """Refuses pixels: without cameras they give no positions in a room."""
     whole = any(len(group) == 3 for group in groups.values())
     pixels = any(meaning.unit == "px" for group in groups.values() for _, meaning in group.values())
-    flat = [group for group in groups.values() if set(group) == {"x", "y"}]
+    flat = [
+        group
+        for group in groups.values()
+        if set(group) == {"x", "y"} and not all(meaning.unit in LENGTHS for _, meaning in group.values())
+    ]
     if pixels or (flat and not whole):
         names = ", ".join(table.columns)
         raise ValueError(

@@ -14,6 +14,8 @@ TIMES: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # units of time i
 Shot: TypeAlias = tuple[Array, Array]  # stamps (n,) and positions (n, 3)
 AXES: Final = ("x", "-x", "y", "-y", "z", "-z")  # possible directions of up
 _WINDOW: Final = 0.12  # s, fit of an acceleration: 3 mm of noise at 100 Hz leave 2 m/s^2; most flights are longer
+_LONGER: Final = (0.2, 0.3)  # s, likewise, where noise hides the fall
+_SHOWN: Final = 0.4  # score from which no longer windows are tried
 _STEPS: Final = (1e-4, 0.34)  # s between two samples: no camera is faster, and slower ones do not show the fall
 _LEAST_SAMPLES: Final = 5
 _WIDTH: Final = 0.3  # gravities, standard deviation of an acceleration about its model: noise, spin, bounces
@@ -49,9 +51,23 @@ def scales(
     Args: shots: times (n,) and positions (n, 3) of each, in their own units.  lengths, times, ups: possible values.
     Returns: the combinations; empty if no window is long enough.
     """
+    best: list[Scale] = []
+    for window in (_WINDOW, *_LONGER):
+        found = _scales(shots, lengths, times, ups, window)
+        if found and (not best or found[0].score > best[0].score):
+            best = found
+        if best and best[0].score >= _SHOWN:
+            break
+    return best
+
+
+def _scales(
+    shots: Sequence[Shot], lengths: Collection[str], times: Collection[str], ups: Collection[str], window: float
+) -> list[Scale]:
+    """`scales` by windows of one length, s."""
     found: list[Scale] = []
     for time in times:
-        velocities, accelerations = _windows(shots, TIMES[time])
+        velocities, accelerations = _windows(shots, TIMES[time], window)
         if not len(velocities):
             continue
         for length in lengths:
@@ -74,12 +90,12 @@ def odds(best: float, other: float) -> float:
     return (best + _COINCIDENCE) / (other + _COINCIDENCE)
 
 
-def _windows(shots: Sequence[Shot], unit: float) -> tuple[Array, Array]:
+def _windows(shots: Sequence[Shot], unit: float, window: float) -> tuple[Array, Array]:
     """Velocities and accelerations (k, 3) in lengths per s and s^2, of windows that overlap by half."""
     steps = [float(np.median(np.diff(t))) * unit for t, _ in shots if len(t) >= _LEAST_SAMPLES]
     if not steps or not _STEPS[0] <= np.median(steps) <= _STEPS[1]:
         return np.empty((0, 3)), np.empty((0, 3))
-    count = max(_LEAST_SAMPLES, round(_WINDOW / float(np.median(steps))) + 1)
+    count = max(_LEAST_SAMPLES, round(window / float(np.median(steps))) + 1)
     hop = max(1, count // 2)
     places = [(i, start) for i, (t, _) in enumerate(shots) for start in range(0, len(t) - count + 1, hop)]
     places = places[:: max(1, len(places) // _MOST_WINDOWS)]

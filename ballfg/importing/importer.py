@@ -28,6 +28,7 @@ def import_tracks(
     key: str | None = None,
     topic: str | None = None,
     name: str | None = None,
+    flights: bool = False,
     file_format: Literal["csv", "parquet"] = "csv",
     force: bool = False,
 ) -> Dataset:
@@ -52,6 +53,7 @@ def import_tracks(
         key: name of a table, sheet or group in a source that holds several.
         topic: of a ROS bag.
         name: of the dataset.
+        flights: one track for each flight: what is held, rolls, rests or is lost is left out.
         file_format: "csv" or "parquet".
         force: replace a dataset in `out`.
     Returns: the dataset; it goes into `bf.estimate` as it is.
@@ -60,10 +62,11 @@ def import_tracks(
     """
     check_choice("file_format", file_format, ("csv", "parquet"))
     check_flag("force", force)
+    check_flag("flights", flights)
     folder = None if out is None else check_path("out", out)
     choices = Choices(
         {} if columns is None else columns, length, time, up, flip, table_height, split_gap, ball, rate, key, topic,
-        folder.name if name is None and folder is not None else name,
+        folder.name if name is None and folder is not None else name, flights,
     )  # fmt: skip
     proposal = propose(data, choices)
     if folder is None:

@@ -29,20 +29,23 @@ _FRAME: Final = ("frame", "frames", "framenumber", "frameid", "frameidx", "frame
 _TRAJECTORY: Final = (
     "trajectory", "trajectories", "traj", "shot", "track", "throw", "rally", "run", "trial", "serve", "stroke",
     "ball", "wurf", "schuss", "versuch", "tir", "essai", "tiro", "sequence", "segment", "recording", "episode", "file",
-    "object", "id",
+    "object", "marker", "body", "player", "id",
 )  # fmt: skip
 _NOT_A_POSITION: Final = frozenset((
     "v", "vx", "vy", "vz", "vel", "velocity", "speed", "a", "acc", "accel", "acceleration", "w", "omega", "spin", "ang",
     "angular", "rot", "rotation", "q", "quat", "quaternion", "orientation", "dx", "dy", "dz", "racket", "paddle", "bat",
     "robot", "target", "camera", "cam", "player", "euler", "force", "gyro", "hand", "truth",
 ))  # fmt: skip
+IDENTITIES: Final = ("ball", "object", "marker", "body", "player", "id", "name", "label", "target")
+"""Names of columns that tell several balls apart."""
 _SIGMA: Final = frozenset(("sigma", "std", "stddev", "stdev", "sd", "err", "error", "uncertainty", "unc"))
 _FILLER: Final = frozenset((
     "pos", "position", "positions", "ball", "center", "centre", "coord", "coords", "coordinate", "p", "point", "loc",
     "location", "translation", "axis", "world", "xyz", "pose", "koordinate", "header", "data", "col", "column", "achse",
     "measured", "measurement", "tracked", "value", "ballpos",
 ))  # fmt: skip
-_AXIS: Final = {"x": "x", "y": "y", "z": "z", "0": "x", "1": "y", "2": "z", "east": "x", "north": "y", "up": "z"}
+_AXIS: Final = {"x": "x", "y": "y", "z": "z", "0": "x", "1": "y", "2": "z", "east": "x", "north": "y", "up": "z",
+    "height": "z", "altitude": "z", "elevation": "z"}  # fmt: skip
 _WORDS: Final = re.compile(r"[^\W\d_]+|\d+")
 _CAMEL: Final = re.compile(r"(?<=[a-zµ])(?=[A-Z])")
 _BRACKET: Final = re.compile(r"[\[(/{]\s*([^\W\d]+)\s*[\])}]?\s*$")
@@ -65,13 +68,18 @@ def unit_of_text(text: str) -> str | None:
     return LENGTH_UNITS.get(word) or TIME_UNITS.get(word) or ("px" if word in PIXELS else None)
 
 
+def words_of(name: str) -> list[str]:
+    """The words of a column's name, in small letters."""
+    return [word.lower() for part in _WORDS.findall(name) for word in _CAMEL.split(part)]
+
+
 def meanings(name: str) -> list[Meaning]:
     """Possible roles of a column with this name."""
     name, _, copy = name.partition("#")
     bracket = _BRACKET.search(name)
     unit_text = bracket[1] if bracket else None
     bare = name[: bracket.start()] if bracket else name
-    words = [word.lower() for part in _WORDS.findall(bare) for word in _CAMEL.split(part)]
+    words = words_of(bare)
     found = [_as_time(words, unit_text), _as_place(words, unit_text), _as_trajectory(words)]
     known = [meaning for meaning in found if meaning is not None]
     return [replace(one, rank=one.rank + 1, group=f"{one.group}#{copy}") for one in known] if copy else known

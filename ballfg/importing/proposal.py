@@ -9,11 +9,12 @@ import numpy as np
 from ballfg.checks import short_text
 from ballfg.importing.bounces import ball_of, table_of
 from ballfg.importing.choices import Choices, Guess, UndecidedError
-from ballfg.importing.columns import Roles
+from ballfg.importing.columns import UNMEASURED, Roles
 from ballfg.importing.formats.raw import RawTable
 from ballfg.importing.formats.sources import tables_of
 from ballfg.importing.frame import Frame, find_frame
 from ballfg.importing.gathering import MOST_SHOTS, relative, shots_of, split, understood, with_labels
+from ballfg.importing.recordings import Recordings, recordings
 from ballfg.importing.shots import Counts, SourceShot
 from ballfg.importing.stamps import in_seconds, origin_of
 from ballfg.tracks import Track
@@ -56,9 +57,13 @@ def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
     shots = with_labels(shots, beside)
     tracks, notes = _tracks(shots, frame)
     ball, ball_guess = ball_of(choices, frame)
-    height, height_guess = table_of(tracks, ball, choices)
+    recorded = recordings(tracks)
+    height, height_guess = table_of(tracks, recorded.cut, ball, choices)
+    flights_guess = recorded.guess(choices.flights)
+    tracks = _flights(recorded) if choices.flights else tracks
     rate = float(f"{1.0 / np.median(np.concatenate([np.diff(track.seconds) for track in tracks])):.4g}")
     guesses = [*_column_guesses(roles), *guesses, height_guess, split_guess, ball_guess]
+    guesses += [] if flights_guess is None else [flights_guess]
     source = ", ".join(dict.fromkeys(table.source for table in chosen))
     info = DatasetInfo(
         name=choices.name or "imported",
@@ -67,11 +72,29 @@ def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
         rate=rate,
         source=source[:200],
         imported={guess.what: f"{guess.value} ({guess.sure}: {guess.why})" for guess in guesses},
+        doubts=(*_unseen(roles), *recorded.doubts(frame, choices.flights)),
     )
     used = (*roles.time, *roles.places, roles.frame)
     doubts = [[*table.notes, *(said for name, said in table.doubts.items() if name in used)] for table in chosen]
     table_notes = list(dict.fromkeys(note for notes_of_one in doubts for note in notes_of_one))
     return Proposal(info, tracks, guesses, [*table_notes[:5], *counts.notes(), *notes])
+
+
+def _unseen(roles: Roles) -> list[str]:
+    """A sentence on axes of the source without a column."""
+    axes = [axis for axis, name in zip("xyz", roles.places, strict=True) if name == UNMEASURED]
+    if not axes:
+        return []
+    return [f"{' and '.join(axes)} of the source {'are' if len(axes) > 1 else 'is'} not measured and set to zero"]
+
+
+def _flights(recorded: Recordings) -> list[Track]:
+    """The flights of all tracks. Raises: ValueError: there are none."""
+    if not recorded.cut:
+        raise ValueError(
+            "--flights must find flights; nothing in the tracks flies like a ball. Check units and up axis."
+        )
+    return recorded.cut
 
 
 def _tracks(shots: Sequence[SourceShot], frame: Frame) -> tuple[list[Track], list[str]]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array
 from ballfg.checks import MAX_TEXT, NAME_RULE, is_name, listed, short_text, shown
 from ballfg.importing.choices import Choices, UndecidedError
-from ballfg.importing.columns import Roles
+from ballfg.importing.columns import UNMEASURED, Roles
 from ballfg.importing.formats.raw import Column, RawTable, is_number, numbers
 from ballfg.importing.stamps import Stamps, as_stamps, is_date, joined, missing
 from ballfg.tracks.track import Label
@@ -62,12 +62,13 @@ class Counts:
 def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list[SourceShot]:
     """A table's shots, by the trajectory column or where time restarts. Raises: UndecidedError, ValueError."""
     alone = (name for name in (roles.frame, roles.trajectory) if name is not None)
-    needed = (*roles.time, *roles.places, *alone, *(roles.sigmas or ()))
+    places = [name for name in roles.places if name != UNMEASURED]
+    needed = (*roles.time, *places, *alone, *(roles.sigmas or ()), *roles.identities)
     lacking = [name for name in needed if name not in table.columns]
     if lacking:
         raise ValueError(f"{table.where} must have the columns of the other tables; {listed(lacking)} missing. Add it.")
     stamps = _stamps(table, roles, choices, counts)
-    positions, sigmas = np.stack([numbers(table.columns[name]) for name in roles.places], axis=1), None
+    positions, sigmas = roles.coordinates(table), None
     held = ~missing(stamps) & (np.abs(positions) <= _LARGEST).all(axis=1)
     if roles.sigmas is not None:
         sigmas = np.stack([numbers(table.columns[name]) for name in roles.sigmas], axis=1)
@@ -81,7 +82,7 @@ def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list
         parts = _at_restarts(stamps, rows, counts)
         names = [f"{i:03d}" for i in range(len(parts))]
     else:
-        column = table.texts.get(roles.trajectory, table.columns[roles.trajectory])
+        column = _identity(table, roles)
         parts, names = _by_name(column, stamps, rows, counts)
         for name, part in zip(names, parts, strict=True):
             if not is_name(name):
@@ -98,6 +99,17 @@ def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list
         known = {key: value for key, values in labels.items() if (value := values[i]) is not None}
         found.append(SourceShot(name, stamps[part], positions[part], own, known, part, table))
     return found
+
+
+def _identity(table: RawTable, roles: Roles) -> Column:
+    """(n,) what tells the shots apart: the trajectory, with the ball where several share one."""
+    assert roles.trajectory is not None
+    columns = [table.texts.get(name, table.columns[name]) for name in (roles.trajectory, *roles.identities)]
+    if len(columns) == 1:
+        return columns[0]
+    joined = np.empty(len(table), dtype=object)
+    joined[:] = ["-".join(map(str, row)) for row in zip(*(column.tolist() for column in columns), strict=True)]
+    return joined
 
 
 def split_at_gaps(shots: Iterable[SourceShot], unit: float, gap: float) -> list[SourceShot]:

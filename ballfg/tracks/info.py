@@ -13,6 +13,7 @@ from ballfg.checks import (
     check_number,
     check_text,
     did_you_mean,
+    is_text,
     listed,
     nearest,
     shown,
@@ -24,7 +25,7 @@ from ballfg.tracks.noise import TrackNoise
 INFO_FILE = "dataset.yaml"
 _REQUIRED = ("name", "frame", "ball")
 _OPTIONAL = ("rate", "position_noise", "spin_noise", "source", "licence")
-_KNOWN = (*_REQUIRED, *_OPTIONAL, "noise", "labels", "import")
+_KNOWN = (*_REQUIRED, *_OPTIONAL, "noise", "labels", "import", "doubts")
 
 # The largest plausible values in SI units; larger ones are almost surely in another unit.
 _RADII = (1e-4, 0.5)  # m
@@ -90,9 +91,17 @@ class DatasetInfo:
     """All known noise of the tracks, as from `ballfg noise`; it takes precedence over the two numbers above."""
     imported: Mapping[str, Any] | None = None
     """Origin and conversion of the tracks, as `ballfg import` records them in the section `import`; for people."""
+    doubts: tuple[str, ...] = ()
+    """What is not sure about the tracks, one line of text each; commands repeat it."""
 
     def __post_init__(self) -> None:
         check_name("name", self.name)
+        if not isinstance(self.doubts, tuple | list) or not all(
+            isinstance(one, str) and is_text(one) for one in self.doubts
+        ):
+            rule = "doubts must be a list of texts, each of one line"
+            raise ValueError(f"{rule}; got {shown(self.doubts)}. Write doubts: ['units were guessed'].")
+        object.__setattr__(self, "doubts", tuple(self.doubts))
         for key in ("source", "licence"):
             check_text(key, getattr(self, key), optional=True)
         if not isinstance(self.noise, TrackNoise | None):
@@ -137,6 +146,7 @@ class DatasetInfo:
             table_extent=_stated_extent(frame),
             noise=None if content.get("noise") is None else TrackNoise.from_mapping(content["noise"]),
             imported=content.get("import"),
+            doubts=() if content.get("doubts") is None else content["doubts"],
             **{key: content.get(key) for key in _OPTIONAL},
         )
 
@@ -150,6 +160,7 @@ class DatasetInfo:
         content |= {key: value for key, value in optional.items() if value is not None}
         if self.noise is not None:
             content["noise"] = self.noise.to_mapping()
+        content |= {"doubts": list(self.doubts)} if self.doubts else {}
         return content if self.imported is None else content | {"import": dict(self.imported)}
 
 

@@ -1,7 +1,7 @@
 """Reports a calibration as `report.json` and as text: coefficients and errors before and after."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -9,13 +9,10 @@ import numpy as np
 from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.learning.calibration.calibrate import Problem, Step, has_converged, population_model
 from ballfg.learning.calibration.correction import SCALE, learned, places
+from ballfg.learning.calibration.gain import Gain, gain_of
 from ballfg.learning.evaluation import Summary, TrackScore, summary
 
 AXES = ("forward", "across", "up")
-SMALLEST = 1e-9
-"""m, of an error."""
-SURELY = 2.0
-"""Standard errors beyond which a model counts as worse, if one camera saw the judging tracks."""
 NEW_INFORMATION = 0.05
 """Least share by which informative data narrow the prior of a coefficient."""
 
@@ -30,7 +27,7 @@ class Comparison:
         better: number of tracks whose RMSE fell.
         pairs: (n, 2) m, RMSE before and after of each track.
         failed: number of tracks that could not be judged each time.
-        one_view: True if one camera saw the tracks: unknown depths then make most of each error.
+        written: (n,) m, RMSE of each track with the model that is written, with its population and noise.
     """
 
     before: Summary | None
@@ -40,7 +37,17 @@ class Comparison:
     better: int
     pairs: np.ndarray
     failed: int
-    one_view: bool = False
+    written: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def gain(self) -> Gain | None:
+        """The change of the errors: by the coefficients or, where that is for the worse, with population and noise.
+
+        None with fewer than two tracks.
+        """
+        written = gain_of(self.pairs[: len(self.written), 0], self.written)
+        plain = gain_of(self.pairs[:, 0], self.pairs[:, 1])
+        return written if written is not None and written.word == "worse" else plain
 
 
 def compare(
@@ -48,10 +55,8 @@ def compare(
     after: Sequence[TrackScore | None],
     spread: Sequence[TrackScore | None],
     noise: Sequence[TrackScore | None],
-    *,
-    one_view: bool = False,
 ) -> Comparison:
-    """Compare scores of the same tracks in the same order, of one camera or not."""
+    """Compare scores of the same tracks in the same order."""
     rows = [(b, a, s, n) for b, a, s, n in zip(before, after, spread, noise, strict=True) if b and a and s and n]
     pairs = np.array([(b.rmse, a.rmse) for b, a, *_ in rows]).reshape(-1, 2)
     return Comparison(
@@ -62,20 +67,13 @@ def compare(
         better=int((pairs[:, 1] < pairs[:, 0]).sum()),
         pairs=pairs,
         failed=len(before) - len(rows),
-        one_view=one_view,
+        written=np.array([n.rmse for *_, n in rows]),
     )
 
 
-def is_worse(comparison: Comparison) -> bool:
-    """True if the model that is written, with its population and noise, predicts the judging tracks worse than before.
-
-    Without judged tracks it is not known to be, and of one view only beyond two standard errors.
-    """
-    before, written, count = comparison.before, comparison.with_noise, len(comparison.pairs)
-    if comparison.one_view:
-        rise = np.diff(np.log(np.maximum(comparison.pairs, SMALLEST)), axis=1)
-        return count > 1 and bool(rise.mean() > SURELY * rise.std(ddof=1) / np.sqrt(count))
-    return before is not None and written is not None and written.rmse_median > before.rmse_median
+def outcome(comparison: Comparison) -> str:
+    """Whether the calibrated model predicts better than before: better, no different, worse, or not known."""
+    return "not known" if comparison.gain is None else comparison.gain.word
 
 
 def report(problem: Problem, last: Step, comparison: Comparison, noise: NoiseEstimate | None) -> dict[str, Any]:
@@ -104,7 +102,9 @@ def report(problem: Problem, last: Step, comparison: Comparison, noise: NoiseEst
             "after": _plain(comparison.after),
             "after_with_spread": _plain(comparison.with_spread),
             "after_with_noise": _plain(comparison.with_noise),
-            "worse": is_worse(comparison),
+            "outcome": outcome(comparison),
+            "change": None if comparison.gain is None else asdict(comparison.gain),
+            "worse": outcome(comparison) == "worse",
         },
         "noise": shown,
         "verdict": verdict(problem, last, comparison),
@@ -156,22 +156,26 @@ def _plain(found: Summary | None) -> dict[str, Any] | None:
 
 
 def verdict(problem: Problem, last: Step, comparison: Comparison) -> str:
-    """Sentences on convergence, prediction error and coefficients that the data do not determine."""
-    sentences = []
+    """Sentences: whether it predicts better, coefficients at a bound, errors, convergence, what data do not show."""
+    before, after, gain = comparison.before, comparison.after, comparison.gain
+    if before is None or after is None or gain is None:
+        sentences = ["Too few tracks could be judged: whether the prediction is better is not known."]
+    else:
+        sentences = [f"The calibrated model predicts {gain.word}: {gain}."]
+    if gain is not None and gain.word == "worse":
+        sentences.append("Keep the model before, or give more tracks or other coefficients.")
+    found = {name: _coefficient(problem, last, k) for k, name in problem.chosen.listed}
+    for name in (name for name, one in found.items() if one["at_bound"]):
+        sentences.append(f"{name} lies at its bound: another effect may be missing, or a unit is wrong.")
     if not has_converged(problem.config, last):
         sentences.append(
             f"The mean still moved by {last.moved:.2g} standard errors in iteration {last.number}: continue with a "
             "larger max_iterations."
         )
-    before, after = comparison.before, comparison.after
-    if before is None or after is None:
-        sentences.append("No track could be judged: whether the prediction is better is not known.")
-    else:
-        word = "better" if after.rmse_median < before.rmse_median else "NOT better"
+    if before is not None and after is not None:
         sentences.append(
-            f"The calibrated model predicts {word}: median RMSE {1e3 * before.rmse_median:.1f} mm before, "
-            f"{1e3 * after.rmse_median:.1f} mm after, on {after.tracks} tracks that were not fitted; it fell on "
-            f"{comparison.better} of them."
+            f"Median RMSE {1e3 * before.rmse_median:.1f} mm before, {1e3 * after.rmse_median:.1f} mm after; it fell on "
+            f"{comparison.better} of {after.tracks} tracks."
         )
         if problem.dataset.rough:
             sentences.append("Errors are those across the rays of the cameras' sightings.")
@@ -184,17 +188,9 @@ def verdict(problem: Problem, last: Step, comparison: Comparison) -> str:
             f"With the noise that the fitted tracks show, {1e3 * comparison.with_noise.rmse_median:.1f} mm, and 90 % "
             f"intervals hold {100 * comparison.with_noise.coverage_90:.0f} %."
         )
-    if is_worse(comparison):
-        sentences.append(
-            "The model in the file, with its population and noise, predicts WORSE than the one before: keep that one, "
-            "or give more tracks or other coefficients."
-        )
-    for k, name in problem.chosen.listed:
-        found = _coefficient(problem, last, k)
-        if not found["told_by_data"] and (problem.correction is None or name != SCALE):
+    for name, one in found.items():
+        if not one["told_by_data"] and (problem.correction is None or name != SCALE):
             sentences.append(f"The tracks say little of {name}: its value is the model's.")
-        if found["at_bound"]:
-            sentences.append(f"{name} lies at its bound: another effect may be missing, or a unit is wrong.")
     return " ".join(sentences)
 
 
@@ -220,14 +216,14 @@ def table(problem: Problem, last: Step, comparison: Comparison) -> str:
         ("judged tracks", "unit", "before", "after", "after, spread as prior", "and noise")
     ]
     summaries = (comparison.before, comparison.after, comparison.with_spread, comparison.with_noise)
-    for label, unit, field, scale in (
+    for label, unit, name, scale in (
         ("RMSE, median", "mm", "rmse_median", 1e3),
         ("RMSE, pooled", "mm", "rmse_pooled", 1e3),
         ("90 % intervals hold", "%", "coverage_90", 1e2),
         ("NIS of predictions (3)", "1", "prediction_nis", 1.0),
         ("NIS of observed part (3)", "1", "nis", 1.0),
     ):
-        cells = ("-" if s is None else f"{scale * getattr(s, field):.4g}" for s in summaries)
+        cells = ("-" if s is None else f"{scale * getattr(s, name):.4g}" for s in summaries)
         errors.append((label, unit, *cells))
     return "\n\n".join(_aligned(part) for part in (rows, errors))
 

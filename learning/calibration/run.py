@@ -37,7 +37,7 @@ from ballfg.learning.calibration.calibrate import (
     with_shown_noise,
 )
 from ballfg.learning.calibration.picture import draw
-from ballfg.learning.calibration.report import compare, is_worse, report, table
+from ballfg.learning.calibration.report import compare, outcome, report, table
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.config_file import AUTO
 from ballfg.learning.evaluation import summary
@@ -67,15 +67,15 @@ def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jo
     """Calibrate coefficients and write the folder of the run; to `resume` is to continue after the last finished step.
 
     Args: jobs: number of processes where the config has none.
-    Returns: the exit status of `ballfg-train`: 0, or 1 if the calibrated model predicts the judging tracks worse than
-        the model before, or if `kind: auto` keeps the nominal model.
+    Returns: the exit status of `ballfg-train`: 0 if the calibrated model predicts the judging tracks better than the
+        model before, else 1, as if `kind: auto` keeps the nominal model.
     Raises: ValueError, FileNotFoundError: bad input. KeyboardInterrupt: after Ctrl-C; finished steps are kept.
     """
     with files.running(folder, config, resume=resume):
         if config.data is None:
             raise ValueError("a dataset is needed; got none. Give --data FOLDER, or 'data' in the config.")
         torch.set_num_threads(1)  # the batches are small: threads cost more than they gain
-        dataset = open_source(config.data, config.source)
+        dataset = open_source(config.data, config.source, config.anyway)
         model = analytic_model(config.model, dataset.info.ball)
         problem = pose(dataset, model, config, config.jobs or jobs)
         if not resume:
@@ -192,7 +192,7 @@ def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch)
     spread = score(problem, model, watch, population)
     shown = spread if noise is None else score(problem, model, watch, noise.settings)
     after = last.scores if problem.correction is None else spread  # a correction goes with its spins
-    comparison = compare(steps[0].scores, after, spread, shown, one_view=problem.dataset.one_view)
+    comparison = compare(steps[0].scores, after, spread, shown)
     found = report(problem, last, comparison, noise)
     model.noise = None if noise is None else noise.noise
     if problem.dataset.one_view:  # its tracks cannot correct a drag: the model file states how sure it is
@@ -201,13 +201,10 @@ def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch)
     save_model(model, folder / files.MODEL)
     files.write_json(folder / files.REPORT, found)
     draw(problem, last, comparison, folder / files.PICTURE)
-    print(f"\n{table(problem, last, comparison)}\n\n{found['verdict']}\n")
+    print(f"\n{found['verdict']}\n\n{table(problem, last, comparison)}\n")
     print(f"{folder / files.MODEL}: the calibrated model, for the --model of other commands")
     print(f"{folder / files.REPORT}: all numbers\n{folder / files.PICTURE}")
-    if not is_worse(comparison):
-        return 0
-    print(f"note: {folder / files.MODEL} predicts the judging tracks worse than the model before", file=sys.stderr)
-    return NOT_BETTER
+    return 0 if outcome(comparison) == "better" else NOT_BETTER
 
 
 def write_checkpoint(folder: Path, problem: Problem, steps: Sequence[Step], corrected: Sequence[Step] = ()) -> None:

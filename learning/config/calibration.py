@@ -43,6 +43,9 @@ class CalibrationConfig(Section):
     """positions: of the dataset's table of tracks. detections: the sightings of its cameras, one or more. null:
     positions where there is a table of them."""
 
+    anyway: bool = False
+    """Also if less than half of the samples fall like a ball: the flights are used."""
+
     coefficients: Coefficients | None = None
     """Calibrated parameters by name: `flight.` or `bounce.`, the effect, its coefficient. null: drag, restitution and
     table height, as far as the model has them; from one camera drag alone."""

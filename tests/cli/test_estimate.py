@@ -51,7 +51,7 @@ def test_one_row_of_finite_numbers_for_each_stamp(
     assert f"states of 4 tracks by {method}" in said.out
     assert "  4 tracks: converged\n" in said.out
     table = pa_csv.read_csv(out, convert_options=pa_csv.ConvertOptions(column_types={"trajectory": "string"}))
-    assert table.column_names == COLUMNS
+    assert table.column_names == [*COLUMNS, "label"]
     values = np.stack([table[name].to_numpy() for name in COLUMNS[1:]], axis=1)
     assert np.isfinite(values).all()
     assert (values[:, 10:] > 0).all()

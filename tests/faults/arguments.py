@@ -120,7 +120,8 @@ def calls_of_tracks(folder: Path) -> dict[str, Call]:
         "write_dataset": Call(tracks.write_dataset, {"folder": folder / "set", "info": info, "tracks": [one, two]}),
         "read": Call(bf.read, {"folder": folder / "set"}),
         "import_tracks": Call(
-            bf.import_tracks, {**imported, "data": table, "table_height": 0.76, "file_format": "csv", "force": False}
+            bf.import_tracks,
+            {**imported, "data": table, "table_height": 0.76, "file_format": "csv", "force": False, "flights": False},
         ),
     }
 
@@ -145,6 +146,7 @@ def calls_of_estimates(_folder: Path) -> dict[str, Call]:
         return bf.estimate((times, positions), method="sliding-window")
 
     return {
+        "flights": Call(bf.flights, {"measured": track, "model": None}),
         "estimate": Call(bf.estimate, {"measured": track, **options}),
         "estimate of arrays": Call(arrays, {"times": track.times, "positions": track.positions}),
         "estimate of a dataset": Call(bf.estimate, {"measured": dataset, **options}),

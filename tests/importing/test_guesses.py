@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import ballfg as bf
-from ballfg.importing.bounces import bounce_heights, surface
+from ballfg.importing.bounces import surface, turns_of
 from ballfg.importing.choices import UndecidedError
 from ballfg.importing.fall import AXES, scales
 from ballfg.importing.frame import TURNS
@@ -44,7 +44,7 @@ def test_units_from_the_fall(length: str, size: float, noise: float) -> None:
 def test_a_bounce_between_samples() -> None:
     t, p = thrown()
     keep = np.abs(t - 0.35) > 0.003  # no sample at the contact itself
-    assert bounce_heights(t[keep], p[keep, 2]) == [pytest.approx(0.8, abs=0.002)]
+    assert [turn.height for turn in turns_of(t[keep], p[keep])] == [pytest.approx(0.8, abs=0.002)]
     found = surface([thrown(0.003, seed) for seed in range(20)])
     assert found is not None
     assert found.bounces == 20

@@ -59,7 +59,7 @@ def test_a_run_writes_all_its_files(finished: Path, few_tracks: Path, tmp_path: 
     assert drag["unit"] == "1/m"
     model = load_model(finished / "model.yaml")
     assert values_of(model, ["flight.drag.k"]).tolist() == [drag["after"]]
-    assert "median RMSE" in report["verdict"]
+    assert "Median RMSE" in report["verdict"]
     picture = (finished / "calibration.png").read_bytes()
     assert picture.startswith(b"\x89PNG")
     panels = len(report["coefficients"]) + 1

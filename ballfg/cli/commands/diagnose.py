@@ -26,6 +26,7 @@ def diagnose(
     effects_file: inputs.EffectsFiles = None,
     observations_file: inputs.ObservationsFiles = None,
     name_at: Annotated[float, typer.Option(help="Probability from which on an effect is named.")] = NAME_AT,
+    anyway: inputs.Anyway = False,
     jobs: inputs.Jobs = inputs.CORES,
     cluster: inputs.Cluster = None,
     address: inputs.Address = None,
@@ -60,7 +61,7 @@ def diagnose(
     with reserved(out):  # until the report is written: a diagnosis takes minutes
         check_report_folder(out, force=force)
         inputs.know_observations(observations_file)
-        opened, *others = [inputs.open_inputs(dataset, model, effects_file) for dataset in datasets]
+        opened, *others = [inputs.open_inputs(dataset, model, effects_file).in_flight(anyway) for dataset in datasets]
         if not isinstance(opened.model, AnalyticModel):
             raise ValueError(
                 f"--model must be analytic: a diagnosis adds physical effects to it; {model} is a learned one. "

@@ -59,11 +59,12 @@ def estimate(
     from ballfg.tracks import TableWriter
 
     outcome = inputs.Outcome()
-    rows = hits = 0
+    rows = hits = flying = 0
     with TableWriter(out) as table, inputs.workers(cluster, address, jobs) as workers:
         inputs.check_out(out, dataset)
         inputs.know_observations(observations_file)
         opened = inputs.open_source(source, dataset, model, effects_file, ball=ball)
+        inputs.print_doubts(inputs.filtered(opened.dataset))
         count = len(opened.dataset)
         work = partial(_estimated, opened.model, opened.estimator(method, solver, group))
         results = map_tracks(work, opened.dataset, count, workers)
@@ -71,7 +72,9 @@ def estimate(
             for columns in result.columns:
                 table.write(columns)
             outcome.add(result.name, result.status, result.notes, result.outside)
-            rows, hits = rows + result.rows, hits + result.hits
+            rows, hits, flying = rows + result.rows, hits + result.hits, flying + result.flying
+    if flying < rows:
+        inputs.print_doubts([f"{100 * flying / rows:.0f} % of the samples are flight; the rest is as measured"])
     print(f"{out}: {rows} states of {count} tracks by {method}; {hits} hits found")
     outcome.print()
     outcome.print_outside()
@@ -89,21 +92,23 @@ class _Estimated:
     outside: float | None
     rows: int
     hits: int
+    flying: int
 
 
 def _estimated(model: BallModel, estimator: Estimator, track: Track) -> _Estimated:
+    from ballfg.estimation.flights.estimates import in_sections
     from ballfg.estimation.out_of_distribution import out_of_distribution
 
-    columns, shares, notes, rows, hits = [], list[float](), list[str](), 0, 0
+    columns, shares, notes, rows, hits, flying = [], list[float](), list[str](), 0, 0, 0
     status = None
-    for part in estimator.in_sections(track):
+    for part in in_sections(estimator, track):
         share = out_of_distribution(model, part.states)
         own: dict[str, str | np.ndarray] = {"trajectory": part.name, **part.columns}
         columns.append(own if share is None else own | {"outside": share})
         shares += [] if share is None else [float(share.sum())]
         notes += part.notes
-        rows, hits = rows + len(part.times), hits + len(part.hits)
+        rows, hits, flying = rows + len(part.times), hits + len(part.hits), flying + int((part.labels != 1).sum())
         status = part.status if status is None or part.status.failed else status
     outside = sum(shares) / rows if shares else None
     assert status is not None
-    return _Estimated(part.name, columns, status, tuple(notes), outside, rows, hits)
+    return _Estimated(part.name, columns, status, tuple(notes), outside, rows, hits, flying)

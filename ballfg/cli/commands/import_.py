@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
 
+from ballfg.cli.inputs import print_doubts
 from ballfg.progress import idle
 
 if TYPE_CHECKING:
@@ -38,6 +39,9 @@ def import_(
         str | None, _guess("--key", "--sheet", help="Table, sheet or group, where a source holds several.")
     ] = None,
     topic: Annotated[str | None, _guess(help="Topic of a ROS bag.")] = None,
+    flights: Annotated[
+        bool, _guess("--flights", help="Cut the flights out: one track each, without what is held, rolls or rests.")
+    ] = False,
     name: Annotated[str | None, _file(help="Name of the dataset; that of the folder by default.")] = None,
     format: Annotated[str, _file(help="Format of the tracks: csv or parquet.")] = "csv",
     force: Annotated[bool, _file("--force", help="Replace a dataset.")] = False,
@@ -60,9 +64,10 @@ def import_(
     check_replaceable(out, mark="dataset.yaml", what="a dataset", force=force)
     choices = Choices(
         parse_columns(columns) if columns else {}, length, time, up, flip, table_height, split_gap, ball, rate, key,
-        topic, name or out.resolve().name,
+        topic, name or out.resolve().name, flights,
     )  # fmt: skip
     proposal = _proposed(sources, choices)
+    print_doubts(proposal.info.doubts)
     _show(proposal)
     write_import(out, proposal, cast(Literal["csv", "parquet"], format), force)
     samples = sum(len(track) for track in proposal.tracks)

@@ -130,6 +130,7 @@ def _dataset(folder: Path | None) -> Dataset | None:
     from ballfg.tracks import read_dataset
 
     data = read_dataset(folder)
+    inputs.print_notes(data.info.doubts)  # stdout holds the records
     unused = "is not used: live estimates are made from positions alone"
     inputs.print_notes(f"{name} {unused}" for name in tables_of_readings(folder))
     return data

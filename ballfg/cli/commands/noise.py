@@ -32,6 +32,14 @@ MEANINGS = {
 """Meaning of each number, factor to its printed unit, and that unit."""
 UNKNOWN = 0.7  # Standard deviation of a logarithm beyond which the tracks give hardly more than the order of magnitude
 
+PRIOR = 1.2  # The same of positions from which the tracks say nothing: it is the prior's
+MOST = {
+    "position": 0.5, "memory": 0.5, "stamp_jitter": 0.05, "spin_label": 2000.0, "spin_prior": 2000.0,
+    "acceleration": 100.0, "contact_velocity": 20.0, "contact_tangential": 20.0, "contact_spin": 2000.0,
+    "coefficients": 30.0,
+}  # fmt: skip
+"""Largest noise of a ball that is tracked, by the names of `MEANINGS`, in SI units."""
+
 
 def noise(
     dataset: inputs.DatasetFolder,
@@ -43,6 +51,7 @@ def noise(
         Path | None, typer.Option(metavar="<path>", help="Model file to write: the model with this noise.")
     ] = None,
     write: Annotated[bool, typer.Option("--write", help="Write the noise into the dataset's dataset.yaml.")] = False,
+    anyway: inputs.Anyway = False,
 ) -> None:
     """The noise of the tracker, of flights, bounces, labels and spins that the tracks of a dataset show.
 
@@ -61,6 +70,7 @@ def noise(
     inputs.know_observations(observations_file)
     data = with_readings(read_dataset(dataset))
     ball = inputs.open_model(data, model)
+    data = inputs.flights_only(data, anyway)
     if out is not None and out.resolve() == (dataset / "dataset.yaml").resolve():
         raise ValueError(f"out must be a model file; got {out}. Use --write for dataset.yaml.")
     found = estimate_noise(
@@ -72,6 +82,7 @@ def noise(
     )
     if found is None:
         raise ValueError(f"{dataset} must hold tracks with undisturbed flights of 0.1 s or more; none has one")
+    check_known(found, dataset)
     print(f"{dataset}: noise from {found.tracks} tracks, {found.starts} forecasts of up to 0.3 s in them")
     for line in _table(found):
         print(line)
@@ -80,6 +91,24 @@ def noise(
         f"{100 * found.held_before:.0f} %"
     )
     _write(found, data, ball, out, write)
+
+
+def check_known(found: NoiseEstimate, dataset: Path) -> None:
+    """Refuses noise that the tracks do not show, or that no ball has. Raises: ValueError."""
+    positions = [error for name, error in found.relative_errors.items() if name.startswith("position")]
+    unknown = min(positions, default=0.0) >= PRIOR
+    content: dict[str, Any] = found.noise.to_mapping() | {"coefficients": found.coefficient_factor}
+    held = {name: content.get(name) or 0.0 for name in MOST}
+    largest = {name: max(value) if isinstance(value, list | tuple) else float(value) for name, value in held.items()}
+    absurd = [
+        f"{MEANINGS[name][0].partition(',')[0]} {largest[name]:.2g}" for name in MOST if largest[name] > MOST[name]
+    ]
+    if unknown or absurd:
+        why = f"it would be: {', '.join(absurd)}" if absurd else f"they allow {found.starts} forecasts only"
+        raise ValueError(
+            f"{dataset} must show its noise; its {found.tracks} tracks do not: {why}. Check that they are flights of "
+            "this ball, or give more and longer ones; without, the usual noise is used."
+        )
 
 
 def _table(found: NoiseEstimate) -> list[str]:

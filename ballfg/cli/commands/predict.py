@@ -65,6 +65,7 @@ def predict(
     ] = None,
     apex: Annotated[bool, typer.Option("--apex", help="The same of the next highest point.")] = False,
     next_contact: Annotated[bool, typer.Option("--next-contact", help="The same of the next bounce.")] = False,
+    anyway: inputs.Anyway = False,
     jobs: inputs.Jobs = inputs.CORES,
     cluster: inputs.Cluster = None,
     address: inputs.Address = None,
@@ -106,7 +107,7 @@ def predict(
             if conformal is None:
                 raise ValueError("save_conformal must come with --conformal, whose scales it keeps. Add --conformal.")
         inputs.know_observations(observations_file)
-        opened = inputs.open_source(source, dataset, model, effects_file, observe, ball)
+        opened = inputs.open_source(source, dataset, model, effects_file, observe, ball).in_flight(anyway)
         count = len(opened.dataset)
         estimator = opened.estimator(method, solver, group)
         scales = None
@@ -186,6 +187,7 @@ def _conformal_scales(
     """Scales from the calibration tracks of a folder, or from a file of scales."""
     from ballfg.estimation import ConformalScales, predict_tracks
     from ballfg.estimation.conformal import check_calibration_tracks, load_conformal
+    from ballfg.estimation.flights.dataset import in_flight
     from ballfg.estimation.reading import with_readings
     from ballfg.tracks import read_dataset
 
@@ -193,7 +195,7 @@ def _conformal_scales(
         scales = load_conformal(source)
         scales.check_fits(observe, method)
         return scales
-    calibration = with_readings(read_dataset(source))
+    calibration = in_flight(with_readings(read_dataset(source))).dataset
     check_calibration_tracks(calibration, dataset)
     inputs.print_notes(f"calibration tracks: {note}" for note in calibration.notes)
     count = len(calibration)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg.cli.inputs import print_notes
+from ballfg.cli.inputs import print_doubts, print_notes
 from ballfg.files.whole_file import check_file, whole_file, write_text
 
 if TYPE_CHECKING:
@@ -46,6 +46,7 @@ def show(
 
     _check_outputs(out, png, rerun)
     what, names = recognise(given, _dataset), track or []
+    print_doubts(what.dataset.info.doubts if what.dataset is not None else ())
     print_notes(what.dataset.notes if what.dataset is not None else ())
     if rerun is not None:
         from ballfg.pages.recording import record

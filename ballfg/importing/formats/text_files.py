@@ -12,6 +12,7 @@ from ballfg.checks import one_line
 from ballfg.files.damaged import MAX_LINE, whole_content
 from ballfg.files.spreadsheet import bare
 from ballfg.importing.formats.raw import MISSING, WITH_UNIT, RawTable, table_of
+from ballfg.importing.formats.vendors import capture_table
 from ballfg.importing.names import unit_of_text
 
 SEPARATORS: Final = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
@@ -56,7 +57,7 @@ def _text(path: Path, content: bytes) -> str:
 def text_table(text: str, name: str, source: str) -> RawTable:
     """The table in a text. Raises: ValueError: no rows of numbers, or an enormous cell."""
     try:
-        return _text_table(text, name, source)
+        return capture_table(text, name, source) or _text_table(text, name, source)
     except csv.Error as error:  # more than 131,072 characters without a separator
         what = f"{source} must hold rows of numbers: a time and x, y, z; {one_line(error)}"
         raise ValueError(f"{what}. Export the table as CSV.") from None

@@ -17,7 +17,6 @@ from ballfg.factors.linear.step import weighted
 from ballfg.learning.calibration import run
 from ballfg.learning.calibration.calibrate import calibrate, pose
 from ballfg.learning.calibration.coefficients import with_values
-from ballfg.learning.calibration.report import Comparison, is_worse
 from ballfg.learning.calibration.volume import estimate_with_slopes
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.progress import unwatched
@@ -123,11 +122,3 @@ def test_cut_anywhere_the_same_numbers(folder: Path) -> None:
     problem = pose(read_sighted(folder), nominal_model(), CalibrationConfig(max_iterations=2, tolerance=1e-12))
     steps = list(calibrate(problem))
     assert list(calibrate(problem, steps[:2])) == steps[2:]
-
-
-def test_only_a_sure_rise_is_worse() -> None:
-    rng = np.random.default_rng(0)
-    before = np.exp(rng.standard_normal(40))
-    for rise, worse in ((0.0, False), (0.5, True)):
-        pairs = np.stack([before, before * np.exp(rise + 0.3 * rng.standard_normal(40))], axis=1)
-        assert is_worse(Comparison(None, None, None, None, 0, pairs, 0, one_view=True)) is worse

@@ -1,0 +1,176 @@
+"""Gives the flights of a dataset as a dataset, with what commands that presume flight say about the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import islice, pairwise
+from typing import Final
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.dynamics.nominal import nominal_model
+from ballfg.estimation.flights.cut import Piece, pieces_of
+from ballfg.estimation.flights.falling import contrasts
+from ballfg.estimation.flights.labels import Label, Labels, label_samples
+from ballfg.estimation.segmentation.physics import physics_of
+from ballfg.tracks import Dataset, Track
+
+ENOUGH: Final = 0.5
+"""Share of the samples in flight below which commands that presume flight refuse."""
+SMOOTHED: Final = 1.35
+"""Ratio of the errors over 0.25 s to those from sample to sample beyond which a filter smoothed the positions: on five
+measured sets it is at most 1.18, on simulated recordings (seeds 0 to 83) at most 1.08, after a low-pass of 6 Hz at
+least 1.58."""
+UNDISTURBED: Final = 0.2
+"""Quantile of that ratio: stretches with a bounce or a hit have larger ones."""
+SMOOTHING: Final = "a filter smoothed the positions"
+SPAN: Final = 0.25
+"""s, of the cubics whose residuals show the errors."""
+LEAST_SPAN: Final = 8
+"""Samples, likewise."""
+ROUNDING: Final = 5e-5
+"""m. Errors below are those of rounding."""
+LOOKED_AT: Final = 200
+"""Number of tracks that show whether a filter smoothed the positions."""
+
+
+class FlightsOf(Dataset):
+    """The flights of a dataset as a dataset; tracks that only fly are in it as they are."""
+
+    def __init__(self, whole: Dataset, pieces: dict[str, list[Piece] | None]) -> None:
+        self.__dict__.update(whole.__dict__)
+        self._whole, self._pieces = whole, pieces
+
+    def __len__(self) -> int:
+        return sum(1 if pieces is None else len(pieces) for pieces in self._pieces.values())
+
+    def __iter__(self) -> Iterator[Track]:
+        for track in islice(iter(self._whole), len(self._pieces)):
+            pieces = self._pieces[track.name]
+            if pieces is None:
+                yield track
+            else:
+                yield from (piece.of(track, name) for name, piece in self._named(track.name, pieces))
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the flights, in their order."""
+        found = list[str]()
+        for name, pieces in self._pieces.items():
+            found += [name] if pieces is None else [own for own, _ in self._named(name, pieces)]
+        return found
+
+    def track(self, name: str) -> Track:
+        """One flight by its name; errors as of a dataset."""
+        found = next((track for track in self if track.name == name), None)
+        return self._whole.track(name) if found is None else found
+
+    @staticmethod
+    def _named(name: str, pieces: list[Piece]) -> Iterator[tuple[str, Piece]]:
+        yield from ((f"{name}-{i:03d}", piece) for i, piece in enumerate(pieces))
+
+
+@dataclass(frozen=True)
+class InFlight:
+    """The flights of a dataset, and how much of it they are.
+
+    Attributes:
+        dataset: the flights; the same dataset where nothing else is in it.
+        tracks, mixed: number of tracks, and of those with something else than flight.
+        share: of the samples that are flight, 0 to 1.
+        smoothing: ratio of slow to fast errors of the positions; 1 if they are white; NaN if unknown.
+    """
+
+    dataset: Dataset
+    tracks: int
+    mixed: int
+    share: float
+    smoothing: float
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """Doubts, one sentence each."""
+        said = list[str]()
+        if self.mixed:
+            cut = len(self.dataset) - (self.tracks - self.mixed)
+            said.append(
+                f"{100 * self.share:.0f} % of the samples fall like a ball: {cut} flights of {self.mixed} tracks are "
+                f"used, {self.tracks - self.mixed} tracks whole; the rest is held, rolls, rests or is lost"
+            )
+        return (*said, *self.filtered)
+
+    @property
+    def filtered(self) -> tuple[str, ...]:
+        """A sentence on a filter that smoothed the positions, unless `dataset.yaml` has it."""
+        known = any(SMOOTHING in doubt for doubt in self.dataset.info.doubts)
+        return () if known or not self.smoothing > SMOOTHED else (smoothed(self.smoothing),)
+
+    def check(self, where: object, anyway: bool) -> None:
+        """Refuses a dataset that is mostly no flight. Raises: ValueError."""
+        if self.share < ENOUGH and not anyway:
+            raise ValueError(
+                f"{where} must show flights: only {100 * self.share:.0f} % of its samples fall like a ball. Cut them "
+                "out with ballfg import --flights, check units and axes, or say --anyway."
+            )
+
+
+def smoothed(ratio: float) -> str:
+    """The sentence on positions that a filter smoothed. Args: ratio: of slow to fast errors."""
+    return (
+        f"{SMOOTHING} (errors that last are {ratio:.1f} times those from sample to sample): this "
+        "is no free fall near bounces and throws, velocities lag, and sigmas are too small"
+    )
+
+
+@lru_cache(maxsize=16)
+def in_flight(dataset: Dataset, most: int | None = None) -> InFlight:
+    """The flights of a dataset.
+
+    Args: dataset: of positions.  most: number of its first tracks that are looked at; None: all.
+    """
+    physics = physics_of(nominal_model(dataset.ball))
+    levels = (dataset.table + dataset.ball.radius, dataset.ball.radius)
+    pieces: dict[str, list[Piece] | None] = {}
+    ratios, samples, flying = list[Array](), 0, 0
+    for track in islice(iter(dataset), most):
+        labels = label_samples(track, physics, levels)
+        whole = labels.estimable(track.positions[:, 2], levels).all()
+        pieces[track.name] = None if whole else pieces_of(labels)
+        samples += len(track)
+        flying += len(track) if pieces[track.name] is None else int((labels.values == Label.FLIGHT).sum())
+        if len(pieces) <= LOOKED_AT:
+            ratios.append(error_ratios(track, labels))
+    mixed = sum(found is not None for found in pieces.values())
+    held = np.concatenate(ratios)
+    smoothing = float(np.quantile(held, UNDISTURBED)) if len(held) else np.nan
+    found = FlightsOf(dataset, pieces) if mixed else dataset
+    return InFlight(found, len(pieces), mixed, flying / samples, smoothing)
+
+
+def error_ratios(track: Track, labels: Labels) -> Array:
+    """(w,) ratio of the residuals of cubics over `SPAN` to those through five neighbours, in the flights of a track."""
+    found = list[float]()
+    for first, last in labels.stretches(Label.FLIGHT):
+        edges = [first, *(i + 1 for i in labels.bounces.tolist() if first <= i < last), last + 1]
+        for begin, stop in pairwise(edges):
+            found += _ratios(track.seconds[begin:stop], track.positions[begin:stop])
+    return np.array(found)
+
+
+def _ratios(times: Array, positions: Array) -> list[float]:
+    """`error_ratios` of an arc."""
+    if len(times) < LEAST_SPAN:
+        return []
+    size, found = max(LEAST_SPAN, round(SPAN / float(np.median(np.diff(times))))), list[float]()
+    for begin in range(0, len(times) - size + 1, max(size // 2, 1)):
+        t, p = times[begin : begin + size], positions[begin : begin + size]
+        scaled = (t - t.mean()) / (t[-1] - t[0])
+        basis, _ = np.linalg.qr(scaled[:, None] ** np.arange(4))
+        slow = ((p - basis @ (basis.T @ p)) ** 2).sum() / (size - 4)
+        neighbours = np.stack([p[i : size - 4 + i] for i in range(5)], axis=1)
+        fast = (np.einsum("ni,nix->nx", contrasts(t), neighbours) ** 2).mean(axis=0).sum()
+        found.append(float(np.sqrt((slow + ROUNDING**2) / (fast + ROUNDING**2))))
+    return found

@@ -1,0 +1,249 @@
+"""Explains the samples of a track by the modes of a ball, in machine code: the most likely chain of events."""
+
+import math
+from typing import Any, Final
+
+import numpy as np
+from numba import types
+
+from ballfg.arrays import Array
+from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, FLAG, INDEX, NOTHING, ONE, REAL, TWO
+from ballfg.estimation.flights.modes import (
+    BOUNCE,
+    CARRIED,
+    CHANGE,
+    HAND_SPEED,
+    HANDLED,
+    MODES,
+    QUICK,
+    ROLLING,
+    ROLLING_SLACK,
+    SHIFT,
+    SLOPE,
+    SLOW,
+    STILL,
+    STRIKE,
+    STRIKE_SPEEDS,
+    SWAY,
+    SWAYED,
+    bounce,
+    enter,
+    move,
+    shift,
+    stop,
+    strike,
+)
+from ballfg.estimation.segmentation.bank import (
+    BANK,
+    FLYING,
+    HYPOTHESIS,
+    LOG,
+    LOGGED,
+    NO_EVENT,
+    ONE_HYPOTHESIS,
+    SAMPLE,
+    SCENE,
+    USED,
+    WORK,
+    WRITTEN,
+    Record,
+    Records,
+    Sample,
+    Work,
+    add,
+    pass_through,
+    prune,
+    update,
+)
+
+RATE: Final = 1.0
+"""1/s. Prior rate of every event."""
+SHORTEST: Final = 1e-3
+"""s. Least interval for the price of an event."""
+PRICES: Final = np.array([0.0, 1.0, 4.0, 3.0, 4.0])
+"""nats in addition to the prior rate: none, of a bounce, a strike, a change of the mode, a shift."""
+LETTING_GO: Final = 1.0
+"""nats, besides, of a hand that lets a ball fly or roll."""
+BRIEF: Final = 8.0
+"""nats, the price of the end of a flight in a hand that has just begun."""
+BRIEFLY: Final = 0.1
+"""s. Time constant with which that price fades."""
+BRIEF_HOLD: Final = 20.0
+"""nats, of a flight that begins just after a hold, roll or rest did: what a hand cannot hold as briefly is a strike."""
+BRIEFLY_HELD: Final = 0.05
+"""s."""
+BRANCHES: Final = 6 * 7 + 4
+"""Largest number of hypotheses that events add to a sample."""
+SPARE: Final = 200_000
+"""Rows of the log from which it is compacted."""
+
+
+@machine_code(NOTHING(WORK, COUNT, COUNT, COUNT, REAL))
+def _note(work: Work, row: int, kind: int, index: int, dt: float) -> None:
+    """Lets a hypothesis pass through an event of an interval, at its price; the new mode is written with it."""
+    h = work.bank[row]
+    h.score += math.log(-math.expm1(-RATE * max(dt, SHORTEST))) - PRICES[kind]
+    pass_through(h, work, kind, index, h.surface, 0.0)
+
+
+@machine_code(REAL(ONE_HYPOTHESIS, REAL))
+def _brevity(h: Record, dt: float) -> float:
+    """nats, the price of the change from flight to a hand, or from anything else to flight: brief modes are rare."""
+    if h.surface == FLYING:
+        return BRIEF * math.exp(-h.age * dt / BRIEFLY)
+    return BRIEF_HOLD * math.exp(-h.age * dt / BRIEFLY_HELD)
+
+
+@machine_code(NOTHING(WORK, BANK, COUNT, COUNT, REAL, FLAG, SCENE))
+def _branch(work: Work, kept: Records, place: int, index: int, dt: float, hands: bool, scene: Record) -> None:
+    """Adds the changes and events that the best hypothesis of a mode may have in the interval before a sample."""
+    mode = kept[place].surface
+    brief = _brevity(kept[place], dt)
+    for other in MODES:
+        if other == mode or (HANDLED <= other <= SWAYED and not hands):
+            continue
+        row = add(work, kept, place)
+        enter(work.bank[row], other, scene)
+        _note(work, row, CHANGE, index, dt)
+        if HANDLED <= mode <= SWAYED and HANDLED <= other <= SWAYED:
+            work.bank[row].score += PRICES[CHANGE]
+        if HANDLED <= mode <= SWAYED and other in (ROLLING, FLYING):
+            work.bank[row].score -= LETTING_GO
+        if other <= SWAYED and (mode == FLYING or other == FLYING):
+            work.bank[row].score -= brief
+    if mode == FLYING:
+        for speed in STRIKE_SPEEDS:
+            row = add(work, kept, place)
+            strike(work.bank[row], speed, dt, scene)
+            _note(work, row, STRIKE, index, dt)
+        row = add(work, kept, place)
+        shift(work.bank[row], scene)
+        _note(work, row, SHIFT, index, dt)
+        if hands:
+            row = add(work, kept, place)
+            stop(work.bank[row], dt)
+            enter(work.bank[row], HANDLED, scene)
+            _note(work, row, CHANGE, index, dt)
+            work.bank[row].score -= brief
+        row = add(work, kept, place)
+        if bounce(work.bank[row], dt, scene):
+            _note(work, row, BOUNCE, index, dt)
+        else:
+            work.fill[USED] -= 1
+
+
+@machine_code(NOTHING(WORK, SAMPLE, FLAG, SCENE))
+def _begin(work: Work, sample: Sample, hands: bool, scene: Record) -> None:
+    """One hypothesis for each mode after a first sample."""
+    for mode in MODES:
+        if HANDLED <= mode <= SWAYED and not hands:
+            continue
+        row = work.fill[USED]
+        work.fill[USED] += 1
+        h = work.bank[row]
+        h.surface, h.age, h.score, h.tip = mode, 0, 0.0, NO_EVENT
+        speed = scene.velocity_spread if mode == FLYING else HAND_SPEED if mode != STILL else 0.0
+        pull = QUICK if mode == HANDLED else SLOW if mode == CARRIED else SWAY if mode == SWAYED else 0.0
+        pull = scene.slack if mode == FLYING else ROLLING_SLACK if mode == ROLLING else pull
+        for axis in range(3):
+            h.shift[axis] = 0.0
+            for i in range(3):
+                h.mean[axis, i] = 0.0
+                for k in range(3):
+                    h.cov[axis, i, k] = 0.0
+            h.mean[axis, 0] = sample.position[axis]
+            h.cov[axis, 0, 0] = scene.outlier_spread**2
+            h.cov[axis, 1, 1] = speed * speed
+            h.cov[axis, 2, 2] = pull * pull
+        if mode == ROLLING:
+            h.cov[2, 1, 1], h.cov[2, 2, 2] = SLOPE**2, 0.0
+        pass_through(h, work, CHANGE, -1, mode, 0.0)
+    update(work, 0, sample, scene)
+
+
+@machine_code(COUNT(BANK, LOG, COUNTS))
+def _compact(kept: Records, log: Records, fill: Any) -> int:
+    """Drops events that no hypothesis has; returns how many are left."""
+    written = fill[WRITTEN]
+    needed = np.zeros(written, np.int64)
+    for row in range(len(kept)):
+        tip = kept[row].tip
+        while tip >= 0 and needed[tip] == 0:
+            needed[tip] = 1
+            tip = log[tip].before
+    count = 0
+    for row in range(written):
+        if needed[row]:
+            log[count] = log[row]
+            if log[count].before >= 0:
+                log[count].before = needed[log[count].before] - 2
+            needed[row] = count + 2
+            count += 1
+    for row in range(len(kept)):
+        kept[row].tip = needed[kept[row].tip] - 2
+    fill[WRITTEN] = count
+    return count
+
+
+@machine_code(types.Tuple((INDEX, REAL))(ONE, TWO, TWO, FLAG, SCENE))
+def decode(times: Array, positions: Array, sigmas: Array, hands: bool, scene: Record) -> Any:
+    """The events of the most likely explanation, oldest first.
+
+    Args:
+        times: (n,) s.  positions, sigmas: (n, 3) m.  hands: False if no hand may touch the ball.  scene: of a `Scene`.
+    Returns: (k, 3): kind, index of the interval or sample, and mode from there on; and the log evidence, nats.
+    """
+    n, most = len(times), int(scene.most)
+    room = 2 * (most + BRANCHES)
+    work = Work(np.empty(room, HYPOTHESIS), np.empty(SPARE + 4 * room, LOGGED), np.zeros(2, np.int64))
+    _begin(work, Sample(positions[0], sigmas[0], 0, times[0]), hands, scene)
+    kept = prune(work.bank, work.fill[USED], scene)
+    for i in range(1, n):
+        dt = times[i] - times[i - 1]
+        work.fill[USED] = 0
+        if work.fill[WRITTEN] > SPARE:
+            work = _roomy(kept, work, 4 * room)
+        for row in range(len(kept)):
+            add(work, kept, row)
+        seen = np.zeros(8, np.int64)
+        for row in range(len(kept)):
+            mode = kept[row].surface
+            if seen[mode + 1] == 0:
+                seen[mode + 1] = 1
+                _branch(work, kept, row, i - 1, dt, hands, scene)
+        for row in range(work.fill[USED]):
+            move(work.bank[row], dt, scene)
+        update(work, 0, Sample(positions[i], sigmas[i], i, times[i]), scene)
+        kept = prune(work.bank, work.fill[USED], scene)
+    dt, best, last = (times[n - 1] - times[0]) / max(n - 1, 1), 0, -math.inf
+    for row in range(len(kept)):
+        if kept[row].score - _brevity(kept[row], dt) > last:
+            best, last = row, kept[row].score - _brevity(kept[row], dt)
+    return _chain(kept[best].tip, work.log), last
+
+
+@machine_code(WORK(BANK, WORK, COUNT))
+def _roomy(kept: Records, work: Work, spare: int) -> Any:
+    """The same work with a compacted log, which is made longer where its events fill most of it."""
+    count = _compact(kept, work.log, work.fill)
+    if 2 * count < len(work.log):
+        return work
+    longer = np.empty(2 * len(work.log) + spare, LOGGED)
+    longer[:count] = work.log[:count]
+    return Work(work.bank, longer, work.fill)
+
+
+@machine_code(INDEX(COUNT, LOG))
+def _chain(tip: int, log: Records) -> Any:
+    """(k, 3) kind, index and mode of the events up to one, oldest first."""
+    count, event = 0, tip
+    while event >= 0:
+        count, event = count + 1, log[event].before
+    found = np.empty((count, 3), np.int64)
+    event = tip
+    while event >= 0:
+        count -= 1
+        found[count, 0], found[count, 1], found[count, 2] = log[event].kind, log[event].index, log[event].surface
+        event = log[event].before
+    return found

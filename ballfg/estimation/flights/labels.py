@@ -1,0 +1,163 @@
+"""Labels the samples of a track: flight, held, rolling, resting or lost."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.arrays import Array
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.flights.decode import decode
+from ballfg.estimation.flights.falling import falls_throughout, scatter
+from ballfg.estimation.flights.modes import BOUNCE, CHANGE, ROLLING, STILL, STRIKE
+from ballfg.estimation.segmentation.bank import FLYING, Scene
+from ballfg.estimation.segmentation.physics import SegmentationPhysics
+from ballfg.estimation.segmentation.result import OUTLIER
+from ballfg.estimation.segmentation.settings import SegmentationSettings
+from ballfg.tracks import Track
+
+FEWEST: Final = 5
+"""Least number of samples for labels."""
+SHORTEST: Final = 5
+"""Least number of samples of a flight that is used: fewer show no velocity."""
+LEAST_SIGMA: Final = 1.5e-3
+"""m. Least standard deviation of a sample: slow errors of trackers do not show in the scatter."""
+MERGED: Final = 0.15
+"""s since its last event after which a hypothesis merges with others of its mode."""
+LEAST_MERGED: Final = 12
+"""Samples, likewise, at least."""
+MOST: Final = 400
+"""Largest number of hypotheses."""
+MARGIN: Final = 25.0
+"""nats. Hypotheses this far behind the best are dropped."""
+GAP: Final = 0.5
+"""s. Nothing links the two sides of a longer gap."""
+ROLLED: Final = 0.03
+"""m. A ball that gets less far does not roll."""
+ALIKE: Final = 0.03
+"""m. Places within this height of each other are on one surface."""
+HANDS: Final = 30.0
+"""nats, by which hands must explain a recording better than flights, strikes and bounces alone."""
+
+
+class Label(IntEnum):
+    """What a sample of a track shows."""
+
+    FLIGHT = 0
+    """A ball that flies, bounces or is struck."""
+    HELD = 1
+    """A ball in a hand, that holds, carries, pushes, throws or catches it."""
+    ROLLING = 2
+    """A ball that rolls on something level."""
+    RESTING = 3
+    """A ball that lies on something."""
+    LOST = 4
+    """Something else than the ball."""
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """The labels of a track of n samples, and its bounces.
+
+    Attributes:
+        values: (n,) values of `Label`.
+        bounces: (b,) intervals in which a flying ball bounced on something.
+    """
+
+    values: NDArray[np.int8]
+    bounces: NDArray[np.int64]
+
+    def estimable(self, heights: Array, levels: Sequence[float]) -> NDArray[np.bool_]:
+        """(n,) True for samples of flight, and of rolling or rest on known surfaces: estimators explain them.
+
+        Args: heights: (n,) m, of the samples.  levels: m, heights of the ball's centre on the surfaces.
+        """
+        down = np.isin(self.values, (Label.ROLLING, Label.RESTING))
+        near = np.abs(heights[:, None] - np.array(levels)).min(axis=1) < ALIKE
+        return np.asarray((self.values != Label.HELD) & (~down | near))
+
+    def stretches(self, label: Label) -> list[tuple[int, int]]:
+        """First and last sample, inclusive, of each run of a label; lost samples within a run belong to it."""
+        kept = np.flatnonzero(self.values != Label.LOST)
+        ends = np.flatnonzero(np.diff(self.values[kept], prepend=-1, append=-1))
+        runs = [(int(kept[a]), int(kept[b - 1])) for a, b in pairwise(ends.tolist())]
+        return [run for run in runs if self.values[run[0]] == label]
+
+
+def label_samples(track: Track, physics: SegmentationPhysics, levels: Sequence[float] = ()) -> Labels:
+    """Labels each sample of a track.
+
+    Positions that were computed from cameras, or seen by one, are taken for flight throughout.
+
+    Args: track: of any length.  physics: of the ball.  levels: m, heights at which the ball is known to lie.
+    Source: docs/derivations/flights.md.
+    """
+    times, positions, n = track.seconds, track.positions, len(track)
+    whole = Labels(np.zeros(n, np.int8), np.zeros(0, np.int64))
+    if track.rough or track.one_view or n < FEWEST:
+        return whole
+    sigmas = np.maximum(np.tile(scatter(times, positions), (n, 1)), LEAST_SIGMA)
+    if falls_throughout(times, positions, sigmas[0], physics):
+        return whole
+    values, bounces = np.empty(n, np.int8), list[int]()
+    edges = [0, *(np.flatnonzero(np.diff(times) > GAP) + 1).tolist(), n]
+    for first, stop in pairwise(edges):
+        part = slice(first, stop)
+        found = _explained(times[part], positions[part], sigmas[part], physics, levels)
+        values[part] = found.values
+        bounces += (found.bounces + first).tolist()
+    return Labels(values, np.array(bounces, dtype=np.int64))
+
+
+def _explained(
+    times: Array, positions: Array, sigmas: Array, physics: SegmentationPhysics, levels: Sequence[float]
+) -> Labels:
+    """`label_samples` without gaps."""
+    n, step = len(times), float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+    settings = SegmentationSettings(
+        most=MOST, margin=MARGIN, mature=max(LEAST_MERGED, round(MERGED / step)), slack_drift=0.0
+    )
+    scene = Scene(physics, Surfaces(0.0), settings)
+    given = times - times[0], np.array(positions, order="C"), np.array(sigmas, order="C")
+    (alone, least), (events, most) = (decode(*given, hands, scene.numbers) for hands in (False, True))
+    if most - least < HANDS:
+        events = alone
+    modes, lost = np.zeros(n, np.int64), np.zeros(n, dtype=bool)
+    for kind, index, mode in events.tolist():
+        if kind in (CHANGE, STRIKE):
+            modes[index + 1 :] = mode
+        lost[index] |= kind == OUTLIER
+    bounces = np.array([index for kind, index, _ in events.tolist() if kind == BOUNCE], dtype=np.int64)
+    values = _placed(positions, modes, bounces, levels)
+    values[lost] = Label.LOST
+    return Labels(values, bounces)
+
+
+def _placed(
+    positions: Array, modes: NDArray[np.int64], bounces: NDArray[np.int64], levels: Sequence[float]
+) -> NDArray[np.int8]:
+    """Labels by modes: what does not move lies where the ball bounces or rolls, and is held elsewhere."""
+    values = np.full(len(modes), Label.HELD, np.int8)
+    values[modes == FLYING] = Label.FLIGHT
+    ends = [0, *(np.flatnonzero(np.diff(modes)) + 1).tolist(), len(modes)]
+    heights = [*levels, *(float(min(positions[i, 2], positions[i + 1, 2])) for i in bounces.tolist())]
+    down: list[tuple[int, int]] = []
+    for first, stop in pairwise(ends):
+        way = float(np.hypot(*(positions[stop - 1, :2] - positions[first, :2])))
+        if modes[first] == ROLLING and way > ROLLED:
+            values[first:stop] = Label.ROLLING
+            heights.append(float(np.median(positions[first:stop, 2])))
+        elif modes[first] in (ROLLING, STILL):
+            down.append((first, stop))
+    for first, stop in down:
+        height = float(np.median(positions[first:stop, 2]))
+        whole = stop - first == len(modes)
+        if whole or any(abs(height - other) < ALIKE for other in heights):
+            values[first:stop] = Label.RESTING
+    return values

@@ -1,0 +1,275 @@
+"""Moves hypotheses on the mode of a ball over a time step, and branches them where the mode may change."""
+
+import math
+from typing import Any, Final
+
+import numpy as np
+
+from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.signatures import COUNT, FLAG, NOTHING, REAL, several
+from ballfg.estimation.flights.falling import AIR, STILL_AIR
+from ballfg.estimation.segmentation.bank import FLYING, ONE_HYPOTHESIS, SCENE, Record
+from ballfg.estimation.segmentation.surface_contact import carry
+
+HANDLED: Final = 1
+"""Value of `surface` for a ball that a hand moves quickly: throws, catches, pushes."""
+CARRIED: Final = 2
+"""For a ball that a hand moves slowly."""
+SWAYED: Final = 3
+"""For a ball in a hand that hardly moves."""
+ROLLING: Final = 4
+"""For a ball that rolls at a constant height."""
+STILL: Final = 5
+"""For a ball that does not move."""
+MODES: Final = (FLYING, HANDLED, CARRIED, SWAYED, ROLLING, STILL)
+
+BOUNCE: Final = 1
+"""Kind of an event: a flying ball bounces on something level."""
+STRIKE: Final = 2
+"""A flying ball is hit, and flies on."""
+CHANGE: Final = 3
+"""The mode changes."""
+SHIFT: Final = 4
+"""The measurements of a flying ball jump, its velocity stays: the tracker follows something else."""
+
+AIR_MEMORY: Final = 0.5
+"""s. Time constant of that acceleration."""
+SHORT: Final = 0.02
+"""Time constants up to which a series is exact to 2 % and better than differences of rounded numbers."""
+MOST_AIR: Final = 30.0
+"""m/s^2, of that spread."""
+
+QUICK: Final = 30.0
+"""m/s^2. Spread, per axis, of the acceleration of a hand that throws or catches."""
+QUICK_MEMORY: Final = 0.08
+"""s. Time constant of that acceleration."""
+STOPPING: Final = 120.0
+"""m/s^2. Spread of the acceleration at the start of a catch."""
+SLOW: Final = 8.0
+"""m/s^2. Spread of the acceleration of a hand that carries."""
+SLOW_MEMORY: Final = 0.15
+"""s."""
+SWAY: Final = 1.0
+"""m/s^2. Spread of the acceleration of a hand that holds the ball."""
+SWAY_MEMORY: Final = 0.3
+"""s."""
+HAND_SPEED: Final = 2.0
+"""m/s. Spread of the velocity of a hand, per axis."""
+SLOPE: Final = 0.02
+"""m/s. Spread of the vertical velocity of a rolling ball: the surface or the frame is not quite level."""
+ROLLING_SLACK: Final = 0.3
+"""m/s^2. Spread of the horizontal acceleration of a rolling ball."""
+ROLLING_DRIFT: Final = 0.02
+"""m/s per sqrt(s). Random walk of its horizontal velocity."""
+LANDING: Final = 0.3
+"""m/s. Spread of the vertical speed with which a ball begins to roll or stops."""
+STIR: Final = 1e-3
+"""m per sqrt(s). Random walk of a ball that does not move."""
+
+RESTITUTION: Final = 0.75
+"""Of a bounce of any ball on any surface."""
+RESTITUTION_SIGMA: Final = 0.2
+KEPT: Final = 0.9
+"""Share of the tangential velocity that a bounce leaves."""
+SLIDE: Final = 0.4
+"""Spread of its change, as a share of the normal speed."""
+BOUNCE_JITTER: Final = 0.1
+"""m/s."""
+SLOWEST_FALL: Final = 0.3
+"""m/s. Slower balls are not tried with a bounce."""
+STRIKE_SPEEDS: Final = (8.0,)
+"""m/s. Spread of the velocity after a touch and after a strike, per axis."""
+
+
+@machine_code(NOTHING(ONE_HYPOTHESIS, REAL, SCENE))
+def move(h: Record, dt: float, scene: Record) -> None:
+    """A hypothesis dt s later, in its mode."""
+    if h.surface == FLYING:
+        carry(h, dt, scene)
+        _relax(h, dt)
+    elif h.surface == HANDLED:
+        _wander(h, dt, QUICK, QUICK_MEMORY)
+    elif h.surface == CARRIED:
+        _wander(h, dt, SLOW, SLOW_MEMORY)
+    elif h.surface == SWAYED:
+        _wander(h, dt, SWAY, SWAY_MEMORY)
+    elif h.surface == ROLLING:
+        for axis in range(3):
+            _constant(h, axis, dt)
+        for axis in range(2):
+            h.cov[axis, 1, 1] += ROLLING_DRIFT**2 * dt
+        h.cov[2, 0, 0] += STIR**2 * dt
+    else:
+        for axis in range(3):
+            h.cov[axis, 0, 0] += STIR**2 * dt
+
+
+@machine_code(REAL(ONE_HYPOTHESIS))
+def air(h: Record) -> float:
+    """m/s^2, spread of the acceleration of a flying ball beside gravity and drag: spin and wind act with the air."""
+    return STILL_AIR + AIR * (h.mean[0, 1] ** 2 + h.mean[1, 1] ** 2 + h.mean[2, 1] ** 2)
+
+
+@machine_code(NOTHING(ONE_HYPOTHESIS, REAL))
+def _relax(h: Record, t: float) -> None:
+    """That acceleration forgets itself within t s."""
+    memory, spread = math.exp(-t / AIR_MEMORY), min(air(h), MOST_AIR)
+    for axis in range(3):
+        h.mean[axis, 2] *= memory
+        for k in range(3):
+            h.cov[axis, 2, k] *= memory
+            h.cov[axis, k, 2] *= memory
+        h.cov[axis, 2, 2] += spread * spread * (1.0 - memory * memory)
+
+
+@machine_code(NOTHING(ONE_HYPOTHESIS, COUNT, REAL))
+def _constant(h: Record, axis: int, t: float) -> None:
+    """One axis t s later, with constant acceleration."""
+    _transform(h, axis, t, 0.5 * t * t, t, 1.0)
+
+
+@machine_code(NOTHING(ONE_HYPOTHESIS, COUNT, REAL, REAL, REAL, REAL))
+def _transform(h: Record, axis: int, t: float, half: float, gain: float, memory: float) -> None:
+    """P + t v + half b, v + gain b, memory b; mean and covariance of one axis."""
+    mean, cov = h.mean[axis], h.cov[axis]
+    mean[0] += t * mean[1] + half * mean[2]
+    mean[1] += gain * mean[2]
+    mean[2] *= memory
+    left = np.empty((3, 3))
+    for k in range(3):
+        left[0, k] = cov[0, k] + t * cov[1, k] + half * cov[2, k]
+        left[1, k] = cov[1, k] + gain * cov[2, k]
+        left[2, k] = memory * cov[2, k]
+    for i in range(3):
+        cov[i, 0] = left[i, 0] + t * left[i, 1] + half * left[i, 2]
+        cov[i, 1] = left[i, 1] + gain * left[i, 2]
+        cov[i, 2] = memory * left[i, 2]
+
+
+@machine_code(NOTHING(ONE_HYPOTHESIS, REAL, REAL, REAL))
+def _wander(h: Record, t: float, spread: float, tau: float) -> None:
+    """A hand for t s: its acceleration forgets itself with a time constant tau s and has a spread m/s^2."""
+    memory = math.exp(-t / tau)
+    gain = tau * (1.0 - memory)
+    half = tau * (t - gain)
+    pp, pv, pb, vv, vb, bb = _wandered(t / tau)
+    scale = spread * spread
+    for axis in range(3):
+        _transform(h, axis, t, half, gain, memory)
+        cov = h.cov[axis]
+        cov[0, 0] += scale * tau**4 * pp
+        cov[1, 1] += scale * tau**2 * vv
+        cov[2, 2] += scale * bb
+        for i, k, more in ((0, 1, tau**3 * pv), (0, 2, tau**2 * pb), (1, 2, tau * vb)):
+            cov[i, k] += scale * more
+            cov[k, i] += scale * more
+
+
+@machine_code(several(REAL, 6)(REAL))
+def _wandered(s: float) -> Any:
+    """Covariance of position, velocity and acceleration after s time constants, of an acceleration of spread one.
+
+    Source: R. A. Singer, Estimating optimal tracking filter performance for manned maneuvering targets, 1970, eq. 14.
+    """
+    if s < SHORT:  # the first terms of its series: a random walk of the acceleration
+        return s**5 / 10.0, s**4 / 4.0, s**3 / 3.0, 2.0 * s**3 / 3.0, s * s, 2.0 * s
+    e = math.exp(-s)
+    return (
+        1.0 - e * e + 2.0 * s + 2.0 * s**3 / 3.0 - 2.0 * s * s - 4.0 * s * e,
+        (1.0 - e) ** 2 - 2.0 * s * (1.0 - e) + s * s,
+        1.0 - e * e - 2.0 * s * e,
+        4.0 * e - 3.0 - e * e + 2.0 * s,
+        (1.0 - e) ** 2,
+        1.0 - e * e,
+    )
+
+
+@machine_code(NOTHING(ONE_HYPOTHESIS, COUNT, REAL, REAL))
+def _accelerated(h: Record, axis: int, mean: float, spread: float) -> None:
+    """Forgets the acceleration of an axis: mean and spread m/s^2."""
+    h.mean[axis, 2] = mean
+    for k in range(3):
+        h.cov[axis, 2, k] = h.cov[axis, k, 2] = 0.0
+    h.cov[axis, 2, 2] = spread * spread
+
+
+@machine_code(NOTHING(ONE_HYPOTHESIS, COUNT, REAL, REAL))
+def _moving(h: Record, axis: int, mean: float, spread: float) -> None:
+    """Forgets the velocity of an axis: mean and spread m/s."""
+    h.mean[axis, 1] = mean
+    for k in range(3):
+        h.cov[axis, 1, k] = h.cov[axis, k, 1] = 0.0
+    h.cov[axis, 1, 1] = spread * spread
+
+
+@machine_code(NOTHING(ONE_HYPOTHESIS, COUNT, SCENE))
+def enter(h: Record, mode: int, scene: Record) -> None:
+    """Changes the mode of a hypothesis; place and velocity stay, as far as the new mode has one."""
+    before = h.surface
+    h.surface = mode
+    if not (HANDLED <= before <= SWAYED and HANDLED <= mode <= SWAYED):
+        h.age = 0
+    for axis in range(3):
+        if mode == FLYING:
+            _accelerated(h, axis, 0.0, air(h))
+        elif mode == HANDLED:
+            _accelerated(h, axis, 0.0, STOPPING if before == FLYING else QUICK)
+        elif mode == CARRIED:
+            _accelerated(h, axis, 0.0, SLOW)
+        elif mode == SWAYED:
+            _accelerated(h, axis, 0.0, SWAY)
+        elif mode == ROLLING and axis < 2:
+            _accelerated(h, axis, 0.0, ROLLING_SLACK)
+        else:
+            spread = LANDING * LANDING + h.cov[axis, 1, 1]
+            h.score -= 0.5 * h.mean[axis, 1] ** 2 / spread
+            _moving(h, axis, 0.0, SLOPE if mode == ROLLING else 0.0)
+            _accelerated(h, axis, 0.0, 0.0)
+
+
+@machine_code(NOTHING(ONE_HYPOTHESIS, REAL))
+def stop(h: Record, dt: float) -> None:
+    """A ball stops suddenly in a hand, at some time of the next interval of dt s."""
+    for axis in range(3):
+        h.cov[axis, 0, 0] += (h.mean[axis, 1] * dt) ** 2 / 3.0
+        _moving(h, axis, 0.0, HAND_SPEED)
+
+
+@machine_code(NOTHING(ONE_HYPOTHESIS, REAL, REAL, SCENE))
+def strike(h: Record, speed: float, dt: float, scene: Record) -> None:
+    """A ball is struck at some time of the next interval of dt s, and flies on; speed: m/s, spread of its velocity."""
+    h.surface, h.age = FLYING, 0
+    reach = scene.hit_spread**2 + (speed * min(dt, scene.short_gap)) ** 2
+    for axis in range(3):
+        h.cov[axis, 0, 0] += reach
+        _moving(h, axis, 0.0, speed)
+        _accelerated(h, axis, 0.0, scene.slack)
+
+
+@machine_code(NOTHING(ONE_HYPOTHESIS, SCENE))
+def shift(h: Record, scene: Record) -> None:
+    """The measurements jump by an unknown offset."""
+    h.age = 0
+    for axis in range(3):
+        h.cov[axis, 0, 0] += scene.shift_spread**2
+
+
+@machine_code(FLAG(ONE_HYPOTHESIS, REAL, SCENE))
+def bounce(h: Record, dt: float, scene: Record) -> bool:
+    """A falling ball bounces on something level, at some time of the next interval of dt s; False if it is too slow."""
+    fall = -(h.mean[2, 1] - scene.gravity * 0.5 * dt)
+    if fall < SLOWEST_FALL:
+        return False
+    h.age = 0
+    # the place of the turn within the interval is uniform: the average path between no turn and one at its start
+    turn = (1.0 + RESTITUTION) * fall
+    up = RESTITUTION * fall
+    h.mean[2, 0] -= 0.5 * turn * dt  # `move` adds the new velocity over all of the interval
+    h.cov[2, 0, 0] += (turn * dt) ** 2 / 12.0 + scene.surface_sigma**2
+    _moving(h, 2, up, math.sqrt((RESTITUTION_SIGMA * fall) ** 2 + BOUNCE_JITTER**2 + h.cov[2, 1, 1]))
+    for axis in range(2):
+        h.mean[axis, 1] *= KEPT
+        h.cov[axis, 1, 1] += (SLIDE * fall + BOUNCE_JITTER) ** 2
+    for axis in range(3):
+        h.cov[axis, 2, 2] += air(h) ** 2
+    return True

@@ -1,0 +1,87 @@
+"""Finds the flights in imported recordings, and what is doubtful about them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import chain
+from typing import Final
+
+import numpy as np
+
+from ballfg.estimation.configure import LEAST_TRACKS
+from ballfg.estimation.flights.cut import flies_throughout, pieces_of
+from ballfg.estimation.flights.dataset import ENOUGH, LOOKED_AT, SMOOTHED, UNDISTURBED, error_ratios, smoothed
+from ballfg.estimation.flights.labels import Label, label_samples
+from ballfg.estimation.segmentation.physics import SegmentationPhysics
+from ballfg.importing.choices import Guess
+from ballfg.importing.frame import Frame
+from ballfg.tracks import Track
+
+ANY_BALL: Final = SegmentationPhysics(drag=0.06)
+"""Between the drag of a heavy and of a light ball; the labels leave room for either."""
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """Imported tracks, and the flights in them.
+
+    Attributes:
+        tracks: as they were recorded.  flights: those of each track; the track itself if nothing else is in it.
+        share: of the samples that are flight, 0 to 1.  smoothing: as of `InFlight`.
+    """
+
+    tracks: Sequence[Track]
+    flights: Sequence[Sequence[Track]]
+    share: float
+    smoothing: float
+
+    @property
+    def cut(self) -> list[Track]:
+        """All flights."""
+        return list(chain.from_iterable(self.flights))
+
+    @property
+    def mixed(self) -> int:
+        """Number of tracks with something else than flight."""
+        return sum(list(own) != [track] for own, track in zip(self.flights, self.tracks, strict=True))
+
+    def guess(self, chosen: bool) -> Guess | None:
+        """The line of the proposal, where something else than flight is in the tracks. Args: chosen: cut them."""
+        if not self.mixed:
+            return None
+        rest = f"{100 * self.share:.0f} % of the samples fly; in the others the ball is held, rolls, rests or is lost"
+        if chosen:
+            return Guess("flights", f"{len(self.cut)}, from {self.mixed} tracks", rest, "stated", "")
+        return Guess("flights", "left in their tracks", rest, "likely", "--flights")
+
+    def doubts(self, frame: Frame, cut: bool) -> list[str]:
+        """Sentences for `dataset.yaml`. Args: frame: the units.  cut: True if only flights are kept."""
+        said = list[str]()
+        if self.share < ENOUGH:
+            said.append(
+                f"{'the flights were cut from tracks of which ' if cut else ''}only {100 * self.share:.0f} % of the "
+                f"samples fall like a ball, in {frame.length} and {frame.time} with {frame.up} up: check units and axis"
+            )
+        if self.smoothing > SMOOTHED:
+            said.append(smoothed(self.smoothing))
+        if len(self.cut if cut else self.tracks) < LEAST_TRACKS:
+            said.append("too few tracks to show their noise: that of bounces and coefficients is the usual one")
+        return said
+
+
+def recordings(tracks: Sequence[Track]) -> Recordings:
+    """The flights of imported tracks."""
+    flights, ratios, samples, flying = [], [], 0, 0
+    for i, track in enumerate(tracks):
+        labels = label_samples(track, ANY_BALL)
+        whole = flies_throughout(labels)
+        named = enumerate(pieces_of(labels))
+        flights.append([track] if whole else [piece.of(track, f"{track.name}-{k:03d}") for k, piece in named])
+        samples += len(track)
+        flying += len(track) if whole else int((labels.values == Label.FLIGHT).sum())
+        if i < LOOKED_AT:
+            ratios.append(error_ratios(track, labels))
+    held = np.concatenate(ratios)
+    smoothing = float(np.quantile(held, UNDISTURBED)) if len(held) else np.nan
+    return Recordings(tracks, flights, flying / samples, smoothing)

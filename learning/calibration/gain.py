@@ -1,0 +1,63 @@
+"""Decides if a calibrated model predicts better, by an interval of the change of the errors over tracks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy import stats
+
+from ballfg.arrays import Array
+
+SURE: Final = 0.95
+"""Probability of the interval."""
+LEAST: Final = 0.02
+"""Smallest change, as a share of the errors, that counts: fitted coefficients cost about as much where nothing is
+gained."""
+SMALLEST: Final = 1e-9
+"""m, of an error."""
+
+
+@dataclass(frozen=True)
+class Gain:
+    """The change of the errors from one model to another on the same tracks, as a share; negative is better.
+
+    Attributes:
+        mean: geometric mean over tracks, minus one.  low, high: the ends of its 95 % interval.  tracks: their number.
+    """
+
+    mean: float
+    low: float
+    high: float
+    tracks: int
+
+    @property
+    def word(self) -> str:
+        """Better, worse, or no different: by the interval alone."""
+        if self.high < 0.0 and self.mean < -LEAST:
+            return "better"
+        return "worse" if self.low > 0.0 and self.mean > LEAST else "no different"
+
+    def __str__(self) -> str:
+        return (
+            f"errors change by {100 * self.mean:+.0f} % ({100 * self.low:+.0f} to {100 * self.high:+.0f} %, 95 % "
+            f"interval over {self.tracks} tracks that were not fitted)"
+        )
+
+
+def gain_of(before: Array, after: Array) -> Gain | None:
+    """The change of errors; None with fewer than two tracks.
+
+    The logarithms of the ratios have Student's distribution about their mean.
+
+    Args: before, after: (n,) m, RMSE of the same tracks.
+    """
+    count = len(before)
+    if count < 2:
+        return None
+    change = np.log(np.maximum(after, SMALLEST)) - np.log(np.maximum(before, SMALLEST))
+    reach = float(stats.t.ppf(0.5 + SURE / 2.0, count - 1) * change.std(ddof=1) / np.sqrt(count))
+    mean = float(change.mean())
+    middle, low, high = (float(np.expm1(end)) for end in (mean, mean - reach, mean + reach))
+    return Gain(middle, low, high, count)

@@ -1,0 +1,121 @@
+"""Recordings of several balls, of one coordinate, and of motion capture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ballfg as bf
+from ballfg.importing.choices import UndecidedError
+from tests.importing.throws import thrown
+
+BALLS = {"red": 0.0, "green": 1.0, "blue": 2.0}
+"""Names, and m by which they fly apart along y."""
+
+
+def _paths(noise: float = 0.001) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    made = {name: thrown(noise, seed) for seed, name in enumerate(BALLS)}
+    t = made["red"][0]
+    return t, {name: p + np.array([0.0, BALLS[name], 0.0]) for name, (_, p) in made.items()}
+
+
+def _right(data: bf.Dataset, names: list[str]) -> None:
+    t, paths = _paths()
+    assert data.names == names
+    for track, path in zip(data, paths.values(), strict=False):
+        np.testing.assert_allclose(track.seconds, t, atol=1e-6)
+        np.testing.assert_allclose(track.positions, path, atol=1e-4)
+
+
+@pytest.mark.parametrize("column", ["marker", "ball", "object", "player", "what"])
+@pytest.mark.parametrize("by_time", [True, False])
+def test_a_column_of_identities_makes_tracks(column: str, by_time: bool, tmp_path: Path) -> None:
+    t, paths = _paths()
+    rows = [(name, *row) for name, p in paths.items() for row in np.column_stack((t, p)).tolist()]
+    rows = sorted(rows, key=lambda row: row[1]) if by_time else rows
+    file = tmp_path / "balls.csv"
+    file.write_text(f"{column},t,x,y,z\n" + "\n".join(",".join(map(str, row)) for row in rows))
+    _right(bf.import_tracks(file), list(BALLS))
+
+
+def test_balls_within_shots(tmp_path: Path) -> None:
+    t, paths = _paths()
+    rows = [(shot, name, *row) for shot in ("a", "b") for name, p in paths.items()
+            for row in np.column_stack((t, p)).tolist()]  # fmt: skip
+    file = tmp_path / "balls.csv"
+    file.write_text("shot,ball,t,x,y,z\n" + "\n".join(",".join(map(str, row)) for row in rows))
+    _right(bf.import_tracks(file), [f"{shot}-{name}" for shot in ("a", "b") for name in BALLS])
+
+
+@pytest.mark.parametrize("stamped", [True, False])
+def test_qualisys(stamped: bool, tmp_path: Path) -> None:
+    t, paths = _paths()
+    head = [f"NO_OF_FRAMES\t{len(t)}", "NO_OF_MARKERS\t3", "FREQUENCY\t100", "DATA_INCLUDED\t3D",
+            "MARKER_NAMES\t" + "\t".join(BALLS)]  # fmt: skip
+    columns = [f"{name} {axis}" for name in BALLS for axis in "XYZ"]
+    rows = []
+    for i, stamp in enumerate(t):
+        cells = [f"{1e3 * value:.3f}" for p in paths.values() for value in p[i]]
+        rows.append("\t".join(([str(i + 1), f"{stamp:.5f}"] if stamped else []) + cells))
+    head += ["\t".join(["Frame", "Time", *columns])] if stamped else []
+    file = tmp_path / "capture.tsv"
+    file.write_text("\n".join([*head, *rows]) + "\n")
+    _right(bf.import_tracks(file), list(BALLS))
+
+
+def test_hidden_markers_of_qualisys_are_missing(tmp_path: Path) -> None:
+    t, p = thrown(0.001)
+    rows = [f"{i + 1}\t{s:.5f}\t" + "\t".join(f"{1e3 * v:.3f}" for v in (q if i % 7 else 0 * q))
+            for i, (s, q) in enumerate(zip(t, p, strict=True))]  # fmt: skip
+    file = tmp_path / "capture.tsv"
+    file.write_text(f"NO_OF_FRAMES\t{len(t)}\nFREQUENCY\t100\nMARKER_NAMES\tball\n" + "\n".join(rows))
+    (track,) = bf.import_tracks(file)
+    assert len(track) == len(t) - len(t[::7])
+
+
+def test_motive(tmp_path: Path) -> None:
+    t, paths = _paths()
+    head = ["Format Version,1.23,Take Name,throw,Export Frame Rate,100.000000,Length Units,Meters", "",
+            ",Type," + ",".join(["Marker"] * 9), ",Name," + ",".join(n for n in BALLS for _ in range(3)),
+            ",ID," + ",".join(["1"] * 9), ",," + ",".join(["Position"] * 9),
+            "Frame,Time (Seconds)," + ",".join("XYZ" * 3)]  # fmt: skip
+    turned = {name: np.column_stack((p[:, 0], p[:, 2], -p[:, 1])) for name, p in paths.items()}  # y is up
+    rows = [f"{i},{s:.6f}," + ",".join(f"{v:.6f}" for p in turned.values() for v in p[i]) for i, s in enumerate(t)]
+    file = tmp_path / "take.csv"
+    file.write_text("\n".join([*head, *rows]))
+    _right(bf.import_tracks(file), list(BALLS))
+
+
+def test_vicon(tmp_path: Path) -> None:
+    t, paths = _paths()
+    head = ["Trajectories", "100", ",," + ",,,".join(f"lab:{n}" for n in BALLS) + ",,",
+            "Frame,Sub Frame," + ",".join("XYZ" * 3), ",," + ",".join(["mm"] * 9)]  # fmt: skip
+    rows = [f"{i + 1},0," + ",".join(f"{1e3 * v:.4f}" for p in paths.values() for v in p[i]) for i in range(len(t))]
+    file = tmp_path / "nexus.csv"
+    file.write_text("\n".join([*head, *rows, "", "Events", "100"]))
+    _right(bf.import_tracks(file), list(BALLS))
+
+
+@pytest.mark.parametrize("header", ["t,height [m]", "time,z [m]", "t,x [m],z [m]"])
+def test_one_or_two_coordinates(header: str, tmp_path: Path) -> None:
+    t, p = thrown(0.001)
+    values = np.column_stack((t, *([p[:, 0]] if "x" in header else []), p[:, 2]))
+    file = tmp_path / "drop.csv"
+    file.write_text(header + "\n" + "\n".join(",".join(map(str, row)) for row in values.tolist()))
+    data = bf.import_tracks(file)
+    (track,) = data
+    np.testing.assert_allclose(track.positions[:, 2], p[:, 2], atol=1e-9)
+    assert (track.positions[:, 1] == 0.0).all()
+    assert "not measured" in data.info.doubts[0]
+    assert bf.estimate(data)["000"].status is bf.Status.OK
+
+
+def test_sets_of_columns_are_asked_about(tmp_path: Path) -> None:
+    t, p = thrown(0.001)
+    file = tmp_path / "two.csv"
+    rows = np.column_stack((t, p, p + 1.0)).tolist()
+    file.write_text("t,left_x,left_y,left_z,right_x,right_y,right_z\n" + "\n".join(",".join(map(str, r)) for r in rows))
+    with pytest.raises(UndecidedError, match="sets of columns"):
+        bf.import_tracks(file)
