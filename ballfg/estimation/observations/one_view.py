@@ -209,7 +209,8 @@ def _shares(moments: Array, times: Array, bounces: int, drag: Array, gravity: fl
             since = np.minimum(since, times[:, flight, None] - begin)
         flown = (later >= flight) if flight else (later == 0)
         share[..., 1 + flight] = np.where(flown, _stretched(since, drag[:, flight, None]), 0.0)
-        drop += np.where(flown, 0.5 * gravity * since**2, 0.0)
+        slower = np.maximum(drag[:, flight, None] * since, STRETCH_LIMIT)
+        drop += np.where(flown, 0.5 * gravity * since**2 / (1.0 + slower / 3.0), 0.0)
     return share, drop
 
 
@@ -243,7 +244,8 @@ def _priors(scene: _Scene, times: Array, bounces: int, drag: Array) -> tuple[Arr
             rows[:, law + axis, before + axis] = -KEPT * slowed / FRICTION_SIGMA
         rows[:, law + 2, after + Z] = 1.0 / RESTITUTION_SIGMA
         rows[:, law + 2, before + Z] = scene.physics.restitution * slowed / RESTITUTION_SIGMA
-        targets[:, law + 2] = scene.physics.restitution * g * flown / RESTITUTION_SIGMA
+        fallen = g * flown / (1.0 + drag[:, bounce] * flown / 2.0)
+        targets[:, law + 2] = scene.physics.restitution * fallen / RESTITUTION_SIGMA
         share, drop = _shares(times[:, [bounce]], times, bounces, drag, g)
         rows[:, law + 3, Z::3] = share[:, 0] / PLANE_SIGMA
         targets[:, law + 3] = (scene.plane + drop[:, 0]) / PLANE_SIGMA
@@ -287,7 +289,7 @@ def _velocities(tried: _Paths, row: int, moments: Array, gravity: float) -> Arra
     times = tried.times[row]
     flight = (moments[:, None] > times).sum(axis=1) if tried.bounces else np.zeros(len(moments), dtype=np.int64)
     since = moments - times[np.maximum(flight - 1, 0)]
-    velocities = tried.vectors[row, 1 + flight]
-    velocities /= (1.0 + np.maximum(tried.drag[row, flight] * since, STRETCH_LIMIT))[:, None]
-    velocities[:, Z] -= gravity * since
-    return velocities
+    slower = np.maximum(tried.drag[row, flight] * since, STRETCH_LIMIT)
+    velocities = tried.vectors[row, 1 + flight] / (1.0 + slower)[:, None]
+    velocities[:, Z] -= gravity * since / (1.0 + slower / 2.0)
+    return np.asarray(velocities)

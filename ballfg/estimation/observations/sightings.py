@@ -17,7 +17,7 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.nominal import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.observation import Context, Observation, Unknowns
-from ballfg.estimation.observations.one_view import OneView, one_view, place_prior
+from ballfg.estimation.observations.one_view import LAWS, OneView, one_view, place_prior
 from ballfg.estimation.observations.ray_path import Rays, determined, filled, rough_path
 from ballfg.estimation.observations.rig import cameras_of, check_apart, in_order, true_times_of
 from ballfg.estimation.result import Estimate, Status
@@ -170,8 +170,23 @@ class CameraSightings(Observation):
         """The track with one path and the prior of its place."""
         arrays = (self.sightings, self.cameras, self.state, self.delay, self.moved)
         own = CameraSightings(*arrays, one_view=True, bounces=found.contacts(track.times), place=place)
-        seen = tuple(own if other is self else other for other in track.observations)
-        return replace(track, positions=found.path.positions, sigmas=found.path.sigmas, observations=seen)
+        return replace(self._in_place(track, own), positions=found.path.positions, sigmas=found.path.sigmas)
+
+    def _in_place(self, track: Track, other: CameraSightings) -> Track:
+        """The track with other sightings in place of these."""
+        return replace(track, observations=tuple(other if one is self else one for one in track.observations))
+
+    def loosened(self, track: Track) -> Track | None:
+        """The track with the error of a start's laws added to the noise of one camera's pixels, if that is smaller."""
+        if not self.one_view:
+            return None
+        seen, (camera,) = self.sightings, (self.cameras[number] for number in np.unique(self.sightings.camera))
+        spread = (LAWS / camera.depth(track.positions[self.state])[:, None] * np.diag(camera.matrix)[:2]) ** 2
+        if np.median(spread) < np.median(np.trace(seen.covariances, axis1=1, axis2=2)) / 2.0:
+            return None
+        noisy = replace(seen, covariances=seen.covariances + spread[:, :, None] * np.eye(2))
+        loose = CameraSightings(noisy, self.cameras, self.state, self.delay, self.moved, True, self.bounces, self.place)
+        return self._in_place(track, loose)
 
     def across(self, first: int, positions: Array, covariances: Array) -> tuple[Array, Array]:
         """Errors of positions across the rays of the sightings, with their standard deviations.
