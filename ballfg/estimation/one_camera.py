@@ -35,8 +35,6 @@ TOLERANCE: Final = 5e-3
 """rad, standard deviation of a sighting about a flight without spin: 15 mm at 3 m. A hit misses by far more."""
 EXPLAINED: Final = 10.0
 """Misfit for each sighting up to which flights explain a stroke; strong spin leaves 5, a hit some hundreds."""
-ENOUGH: Final = 40
-"""Sightings that show a hit: of more, some are left out."""
 GRIP: Final = 0.6
 """Change of the horizontal velocity in a bounce, at most, over that of the vertical one: a ball on a table grips with
 0.3. More is a hit."""
@@ -133,7 +131,7 @@ def _explained(seen: Sightings, camera: Camera, smoother: Smoother) -> bool:
         return True
     spread = (TOLERANCE * np.diag(camera.matrix)[:2]) ** 2
     loose = replace(seen, covariances=seen.covariances + np.diag(spread))
-    ordered = in_order(loose, [camera]).select(np.arange(0, len(seen), -(-len(seen) // ENOUGH)))
+    ordered = in_order(loose, [camera])
     times = true_times_of(ordered, [camera])
     times = times - times[0]
     path = one_view(Rays.of(ordered, times, [camera]), times, physics_of(smoother.model), smoother.surfaces)[0]
@@ -142,7 +140,7 @@ def _explained(seen: Sightings, camera: Camera, smoother: Smoother) -> bool:
         *level, rise = path.path.velocities[before + 1] - path.path.velocities[before]
         if np.hypot(*level) > GRIP * abs(rise) + CATCH:
             return False
-    return path.misfit <= EXPLAINED * len(ordered)
+    return path.misfit <= EXPLAINED
 
 
 def _straight(seen: Sightings, camera: Camera) -> bool:

@@ -16,8 +16,9 @@ from ballfg.checks import listed, shown
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.nominal import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.observations.bounced_path import LAWS, place_prior
 from ballfg.estimation.observations.observation import Context, Observation, Unknowns
-from ballfg.estimation.observations.one_view import LAWS, OneView, one_view, place_prior
+from ballfg.estimation.observations.one_view import OneView, one_view
 from ballfg.estimation.observations.ray_path import Rays, determined, filled, rough_path
 from ballfg.estimation.observations.rig import cameras_of, check_apart, in_order, true_times_of
 from ballfg.estimation.result import Estimate, Status
