@@ -20,7 +20,7 @@ from ballfg.vision.camera import Camera
 CAMERAS_FILE: Final = "cameras.yaml"  # its name in the folder of a dataset or a scene
 LENS: Final = ("size", "matrix", "distortion")
 POSE: Final = ("rvec", "tvec")
-FIELDS: Final = (*LENS, *POSE, "time_offset")  # in the file's order; docs/calibrate.md explains them
+FIELDS: Final = (*LENS, *POSE, "time_offset", "covariance")  # in the file's order; docs/calibrate.md explains them
 _MATRIX: Final = "camera_matrix"
 _NODES: Final = {
     "matrix": (_MATRIX,),
@@ -72,7 +72,10 @@ def write_cameras(path: str | PathLike[str], cameras: Iterable[Camera], *, posed
     cameras = _check_names(cameras)
     fields = FIELDS if posed else (*LENS, "time_offset")
     plain = {
-        camera.name: {field: np.asarray(getattr(camera, field)).tolist() for field in fields} for camera in cameras
+        camera.name: {
+            field: np.asarray(value).tolist() for field in fields if (value := getattr(camera, field)) is not None
+        }
+        for camera in cameras
     }
     text = yaml.safe_dump({"cameras": plain}, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
     write_text(path, text)
@@ -155,7 +158,8 @@ def _camera(name: str, content: Any, posed: bool) -> Camera:
         what = f"{where}: time_offset must be a number in s; got {shown(offset)}"
         raise ValueError(f"{what}. Write it like 0.004 or 4.0e-3.")
     rvec, tvec = (np.zeros(3) if missing else fields[field] for field in POSE)
-    return Camera(name, (sides[0], sides[1]), fields["matrix"], fields["distortion"], rvec, tvec, offset)
+    covariance = fields.get("covariance")
+    return Camera(name, (sides[0], sides[1]), fields["matrix"], fields["distortion"], rvec, tvec, offset, covariance)
 
 
 def _fields(node: Mapping[str, Tree], where: str) -> dict[str, Any]:

@@ -28,15 +28,19 @@ from ballfg.estimation.settings import Settings
 from ballfg.factors.batch import FactorBatch
 from ballfg.factors.camera import FIXED, CameraFactors
 from ballfg.factors.prior import PriorFactors
+from ballfg.factors.uncertain_camera import UncertainCameraFactors
 from ballfg.state import POSITION, STATE_DIM
 from ballfg.tracks.sightings import Sightings
 from ballfg.tracks.stamps import elapsed, written
 from ballfg.tracks.track import Label, Track
 from ballfg.vision.camera import Camera
+from ballfg.vision.camera_change import CHANGES
 from ballfg.vision.projection import CameraBank
 
 TIME_OFFSET: Final = "time_offset."
 """Prefix of the name of a camera's time offset among the unknowns of a track."""
+CHANGE: Final = "camera."
+"""Prefix of the names of the seven numbers by which a camera with a covariance may differ, each of prior sigma 1."""
 OFFSET_SETTLED: Final = 1e-5
 """s. An offset that changes by less has converged: the path bends by a nanometre meanwhile."""
 
@@ -105,8 +109,12 @@ class CameraSightings(Observation):
         columns = np.array([context.columns.get(name, FIXED) for name in names])
         seen, unknown = self.sightings, columns if (columns != FIXED).any() else None
         measured, loss = (seen.camera, seen.pixels, seen.covariances), context.settings.sighting_loss
-        radius = (seen.radii, context.model.radius)
-        return CameraFactors(self.state, *measured, _bank(self.cameras), self.delay, unknown, loss, *radius)
+        places = np.array([context.columns.get(f"{CHANGE}{name}.0", FIXED) for name in self.sightings.cameras])
+        if (places == FIXED).all():
+            given = (self.state, *measured, _bank(self.cameras), self.delay, unknown, loss)
+            return CameraFactors(*given, seen.radii, context.model.radius)
+        given = (self.state, *measured, _bank(self.cameras), self.delay, columns, loss)
+        return UncertainCameraFactors(self.cameras, places, *given, seen.radii, context.model.radius)
 
     def unknowns(self, settings: Settings) -> Unknowns:
         """The time offsets that the settings name, s, each counted from that of its camera.
@@ -118,11 +126,14 @@ class CameraSightings(Observation):
             if name not in names:
                 raise ValueError(f"time_offsets must name cameras of the track, {listed(names)}; got {shown(name)}")
         chosen = [names.index(name) for name in settings.time_offsets]
+        loose = [camera.name for camera in self.cameras if camera.covariance is not None]
+        changes = [f"{CHANGE}{name}.{number}" for name in loose for number in range(CHANGES)]
+        rest = np.zeros(len(changes))
         return Unknowns(
-            tuple(TIME_OFFSET + name for name in settings.time_offsets),
-            -self.moved[chosen],
-            np.array(list(settings.time_offsets.values())),
-            self.time_offsets[chosen],
+            (*(TIME_OFFSET + name for name in settings.time_offsets), *changes),
+            np.append(-self.moved[chosen], rest),
+            np.append(np.array(list(settings.time_offsets.values())), rest + 1.0),
+            np.append(self.time_offsets[chosen], rest),
         )
 
     def found_offsets(self, estimate: Estimate) -> tuple[Array, Array]:

@@ -1,0 +1,48 @@
+"""Poses a camera whose focal length is known roughly from table points, with the covariance of all seven numbers."""
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+import torch
+
+from ballfg.arrays import Array
+from ballfg.vision.calibration.extrinsics import calibrate_extrinsics
+from ballfg.vision.calibration.table_points import Marked
+from ballfg.vision.camera import Camera
+from ballfg.vision.camera_change import CHANGES, ZOOM, changed, slopes_of
+from ballfg.vision.projection import CameraBank
+
+ROUNDS: Final = 20
+SETTLED: Final = 1e-6
+"""Standard deviations. A step that is shorter ends the search."""
+
+
+def pose_and_focal(lens: Camera, marked: Marked, focal_sigma: float) -> Camera:
+    """The most probable camera, with its covariance, for a focal length known to a relative standard deviation.
+
+    Args: lens: a camera; its pose has no part.  marked: at least four points, not in one line.
+        focal_sigma: dimensionless, of the logarithm of the focal length.
+    Raises: ValueError: as `calibrate_extrinsics`.
+    """
+    camera = calibrate_extrinsics(lens, marked).camera
+    for _ in range(ROUNDS):
+        slope, missed = _slopes(camera, marked.points), marked.pixels - camera.project(marked.points)
+        information = slope.T @ slope / marked.sigma**2
+        pull = slope.T @ missed.ravel() / marked.sigma**2
+        information[ZOOM, ZOOM] += focal_sigma**-2
+        pull[ZOOM] += np.log(lens.matrix[0, 0] / camera.matrix[0, 0]) / focal_sigma**2
+        step = np.linalg.solve(information, pull)
+        camera = changed(camera, step)
+        if step @ information @ step < SETTLED**2:
+            break
+    return replace(camera, covariance=np.linalg.inv(information))
+
+
+def _slopes(camera: Camera, points: Array) -> Array:
+    """(2 n, 7) px of the pixels of points (n, 3) m by the camera's changes."""
+    here, centre = torch.from_numpy(points), torch.from_numpy(np.tile(camera.centre, (len(points), 1)))
+    pixels, by_point = CameraBank([camera]).jacobian(here, torch.zeros(len(points), dtype=torch.int64))
+    _, by_place = slopes_of(here, centre, torch.zeros(len(points), CHANGES, dtype=torch.float64))
+    grown = pixels - torch.from_numpy(camera.matrix[:2, 2])
+    return np.asarray(torch.cat((by_point @ by_place, grown[..., None]), dim=-1).numpy().reshape(-1, CHANGES))
