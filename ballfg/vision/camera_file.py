@@ -85,7 +85,7 @@ def write_opencv(path: str | PathLike[str], cameras: Iterable[Camera], *, posed:
     """Writes cameras with OpenCV's FileStorage, a map for each; floats read back bit for bit. Never leaves half a file.
 
     Args: path: .xml, .json, .yml or .yaml.  posed: False: without `rvec` and `tvec`.
-    Raises: ValueError: another ending, no cameras, a name twice, or one that FileStorage cannot take.
+    Raises: ValueError: another ending, no cameras, a name twice or one that FileStorage cannot take, a covariance.
         FileNotFoundError: the folder does not exist.
     """
     path = Path(path)
@@ -93,6 +93,9 @@ def write_opencv(path: str | PathLike[str], cameras: Iterable[Camera], *, posed:
         raise ValueError(f"path must end in {', '.join(ENDINGS)}; got {path}. Choose the format by the ending.")
     cameras = _check_names(cameras)
     for camera in cameras:
+        if camera.covariance is not None:
+            rule = f"cameras must be exact in OpenCV's files; {shown(camera.name)} has a covariance"
+            raise ValueError(f"{rule}. Write cameras.yaml, or leave the covariance out.")
         plain = camera.name.replace("_", "a").replace("-", "0")
         if not (plain.isascii() and plain.isalnum() and plain[0].isalpha()):
             rule = "names of cameras must be letters, digits, - and _, a letter first, in OpenCV's files"

@@ -32,6 +32,7 @@ from ballfg.simulation.scene.recording import record
 from ballfg.tracks import read_dataset
 from ballfg.tracks.sightings import Sightings
 from ballfg.vision.camera import Camera
+from ballfg.vision.camera_change import changed
 from tests.estimation.observations.sighted_rig import TABLE, World, looking, world
 from tests.places import DATA
 
@@ -151,6 +152,21 @@ def test_pixels_far_better_than_the_start(ball: World) -> None:
         error = found.states[:, :3] - states[:, :3]
         assert np.linalg.norm(error, axis=1).max() < 0.15
         assert (np.abs(error) < 3.5 * found.sigmas[:, :3]).all()
+
+
+def test_an_uncertain_camera_widens_the_states(ball: World) -> None:
+    """Cameras that are wrong by draws from a covariance: intervals hold with it, and do not without."""
+    surfaces = replace(ball.surfaces, extent=(-1.37, 1.37, -0.76, 0.76))
+    estimator, inside = Smoother(ball.model, surfaces), []
+    sigmas = np.repeat((np.deg2rad(0.3), 0.05, 0.03), (3, 3, 1))
+    for seed in range(12):
+        times, states = stroke(ball, seed)
+        wrong = changed(SIDE, sigmas * np.random.default_rng(seed).standard_normal(7))
+        for camera in (replace(wrong, covariance=np.diag(sigmas**2)), wrong):
+            found = estimator.estimate(sighted_track("a", pixels_of(states[:, :3], times, SIDE, 1.0, seed), [camera]))
+            inside.append((np.abs(found.states[:, :3] - states[:, :3]) < 1.645 * found.sigmas[:, :3]).mean())
+    assert np.mean(inside[::2]) > 0.82
+    assert np.mean(inside[1::2]) < 0.7
 
 
 def test_covariances_are_honest() -> None:
