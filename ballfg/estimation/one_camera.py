@@ -35,6 +35,8 @@ TOLERANCE: Final = 5e-3
 """rad, standard deviation of a sighting about a flight without spin: 15 mm at 3 m. A hit misses by far more."""
 EXPLAINED: Final = 10.0
 """Misfit for each sighting up to which flights explain a stroke; strong spin leaves 5, a hit some hundreds."""
+ENOUGH: Final = 30
+"""Sightings that show a hit: of more, some are left out."""
 GRIP: Final = 0.6
 """Change of the horizontal velocity in a bounce, at most, over that of the vertical one: a ball on a table grips with
 0.3. More is a hit."""
@@ -109,13 +111,15 @@ def _fits(estimate: Estimate) -> bool:
 
 def _cut(chain: Sequence[Sightings], camera: Camera, smoother: Smoother) -> list[Sightings]:
     """The strokes of a chain: pieces in order of time, together as long as flights explain them."""
-    strokes, grown = list[Sightings](), list[Sightings]()
-    for piece in chain:
-        if grown and not _explained(_joined([*grown, piece]), camera, smoother):
-            strokes.append(_joined(grown))
-            grown = []
-        grown.append(piece)
-    found = [one for one in (*strokes, _joined(grown)) if _explained(one, camera, smoother)]
+    found, grown, flies = list[Sightings](), chain[0], _explained(chain[0], camera, smoother)
+    for piece in chain[1:]:
+        longer = _joined([grown, piece])
+        if _explained(longer, camera, smoother):
+            grown, flies = longer, True
+            continue
+        found += [grown] if flies else []
+        grown, flies = piece, _explained(piece, camera, smoother)
+    found += [grown] if flies else []
     return [one for one in found if not _straight(one, camera)]
 
 
@@ -131,7 +135,7 @@ def _explained(seen: Sightings, camera: Camera, smoother: Smoother) -> bool:
         return True
     spread = (TOLERANCE * np.diag(camera.matrix)[:2]) ** 2
     loose = replace(seen, covariances=seen.covariances + np.diag(spread))
-    ordered = in_order(loose, [camera])
+    ordered = in_order(loose, [camera]).select(np.arange(0, len(seen), -(-len(seen) // ENOUGH)))
     times = true_times_of(ordered, [camera])
     times = times - times[0]
     path = one_view(Rays.of(ordered, times, [camera]), times, physics_of(smoother.model), smoother.surfaces)[0]

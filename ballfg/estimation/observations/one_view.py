@@ -22,6 +22,8 @@ from ballfg.state import Z
 
 STEPS: Final = 0.25
 """Of the camera's period, between guessed times of a bounce; the smoother finds the time itself."""
+WIDEST: Final = 1.0
+"""m, largest standard deviation that is stated of a rough position: what is beyond is not known at all."""
 LEAST_STEP: Final = 4e-3
 """s, least of these steps."""
 ENOUGH: Final = 60
@@ -139,7 +141,11 @@ def _path(scene: Scene, tried: Paths, row: int, moments: Array) -> OneView:
     spare = max(2 * len(scene.rays.times) - 3 * share.shape[1], 1)
     bounces = tuple(times[0].tolist()) if tried.bounces else ()
     return OneView(
-        Path(positions, velocities_of(tried, row, moments, g), np.sqrt(max(misfit / spare, 1.0) * variance)),
+        Path(
+            positions,
+            velocities_of(tried, row, moments, g),
+            np.minimum(np.sqrt(max(misfit / spare, 1.0) * variance), WIDEST),
+        ),
         bounces,
         scene.height,
         misfit / len(scene.rays.times),
