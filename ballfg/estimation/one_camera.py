@@ -5,8 +5,10 @@ it; the first piece that they do not explain begins a new stroke, as after a hit
 The smoother then estimates each stroke.
 """
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -48,6 +50,8 @@ STRAIGHT: Final = 0.3
 """s. What moves so long in a straight line does not fall."""
 NEAREST: Final = 0.5
 """m from the camera; a ball nearer by fills much of the picture."""
+LONGEST_TIME: Final = 3.0
+"""s, of a stroke: a lob with its bounces."""
 LEAST_TIME: Final = 0.15
 """s, of a stroke: gravity shows in 0.1 m."""
 
@@ -110,17 +114,34 @@ def _fits(estimate: Estimate) -> bool:
 
 
 def _cut(chain: Sequence[Sightings], camera: Camera, smoother: Smoother) -> list[Sightings]:
-    """The strokes of a chain: pieces in order of time, together as long as flights explain them."""
-    found, grown, flies = list[Sightings](), chain[0], _explained(chain[0], camera, smoother)
-    for piece in chain[1:]:
-        longer = _joined([grown, piece])
-        if _explained(longer, camera, smoother):
-            grown, flies = longer, True
+    """The strokes of a chain: pieces in order of time, together as long as flights explain them.
+
+    A piece that no flight explains may go on smoothly through a hit: what still fits belongs to the stroke before.
+    """
+    explained = partial(_explained, camera=camera, smoother=smoother)
+    found, left, grown = list[Sightings](), deque(chain), list[Sightings]()
+    while left:
+        piece = left.popleft()
+        whole = _joined([*grown, piece])
+        if explained(whole):
+            grown = [whole]
             continue
-        found += [grown] if flies else []
-        grown, flies = piece, _explained(piece, camera, smoother)
-    found += [grown] if flies else []
-    return [one for one in found if not _straight(one, camera)]
+        known = sum(map(len, grown))
+        at = known if grown and explained(piece) else _first_unexplained(whole, known, explained)
+        found += [whole.select(np.arange(at))] if at else []
+        grown = []
+        if known or np.ptp(whole.times[:at]) >= LEAST_TIME:  # else it is no ball
+            left.appendleft(whole.select(np.arange(at, len(whole))))
+    return [one for one in (*found, *grown) if not _straight(one, camera)]
+
+
+def _first_unexplained(whole: Sightings, known: int, explained: Callable[[Sightings], bool]) -> int:
+    """Number of first sightings that flights explain, by bisection; known: such a number, or 0."""
+    low, high = known, len(whole)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if explained(whole.select(np.arange(middle))) else (low, middle)
+    return low
 
 
 def _joined(pieces: Sequence[Sightings]) -> Sightings:
@@ -133,6 +154,8 @@ def _explained(seen: Sightings, camera: Camera, smoother: Smoother) -> bool:
     """True if flights with bounces pass near enough to all sightings, or too few were seen for saying."""
     if len(seen) < LEAST_SEEN:
         return True
+    if np.ptp(seen.times) > LONGEST_TIME:
+        return False
     spread = (TOLERANCE * np.diag(camera.matrix)[:2]) ** 2
     loose = replace(seen, covariances=seen.covariances + np.diag(spread))
     ordered = in_order(loose, [camera]).select(np.arange(0, len(seen), -(-len(seen) // ENOUGH)))
