@@ -122,6 +122,8 @@ def _cut(chain: Sequence[Sightings], camera: Camera, smoother: Smoother) -> list
     found, left, grown = list[Sightings](), deque(chain), list[Sightings]()
     while left:
         piece = left.popleft()
+        if _straight(piece, camera):
+            continue
         whole = _joined([*grown, piece])
         if explained(whole):
             grown = [whole]
