@@ -27,7 +27,8 @@ def changed(camera: Camera, change: Array) -> Camera:
     matrix = camera.matrix.copy()
     matrix[[0, 1], [0, 1]] *= np.exp(change[ZOOM])
     centre = camera.centre + change[MOVE]
-    return replace(camera, matrix=matrix, rvec=cv2.Rodrigues(turned)[0], tvec=-turned @ centre)
+    rvec = np.asarray(cv2.Rodrigues(turned)[0], dtype=np.float64)
+    return replace(camera, matrix=matrix, rvec=rvec, tvec=-turned @ centre)
 
 
 def seen_at(points: Tensor, centre: Tensor, change: Tensor) -> Tensor:

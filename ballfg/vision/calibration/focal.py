@@ -38,23 +38,23 @@ def pose_and_focal(lens: Camera, marked: Marked, focal_sigma: float) -> Extrinsi
         pull = slope.T @ missed.ravel() / marked.sigma**2
         information[ZOOM, ZOOM] += focal_sigma**-2
         pull[ZOOM] += np.log(lens.matrix[0, 0] / camera.matrix[0, 0]) / focal_sigma**2
-        step = np.linalg.solve(information, pull)
+        step = np.asarray(np.linalg.solve(information, pull), dtype=np.float64)
         camera = changed(camera, step)
         if step @ information @ step < SETTLED**2:
             break
-    covariance = np.linalg.inv(information)
+    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
     return Extrinsics(replace(camera, covariance=covariance), marked, covariance[:ZOOM, :ZOOM])
 
 
 def _first(lens: Camera, marked: Marked, focal_sigma: float) -> Camera:
     """A camera that explains the points, of a likely focal length."""
-    refused = None
+    refused = list[ValueError]()
     for zoom in focal_sigma * np.array(TRIED):
         try:
             return calibrate_extrinsics(changed(lens, np.append(np.zeros(ZOOM), zoom)), marked).camera
         except ValueError as error:
-            refused = error if refused is None else refused
-    raise refused
+            refused.append(error)
+    raise refused[0]
 
 
 def _slopes(camera: Camera, points: Array) -> Array:
