@@ -52,8 +52,8 @@ NEAREST: Final = 0.5
 """m from the camera; a ball nearer by fills much of the picture."""
 LONGEST_TIME: Final = 3.0
 """s, of a stroke: a lob with its bounces."""
-LEAST_TIME: Final = 0.15
-"""s, of a stroke: gravity shows in 0.1 m."""
+LEAST_TIME: Final = 0.25
+"""s, of a stroke: gravity shows in 0.3 m. Shorter pieces of two rallies were fragments or chance."""
 
 
 @dataclass(frozen=True, eq=False)
