@@ -88,22 +88,36 @@ class CameraFactors(FactorBatch):
         tau = self.delay[rows] - _own(inputs[1:], column)
         velocity = state[:, VELOCITY]
         points = torch.from_numpy(state[:, POSITION] + tau[:, None] * velocity)
-        pixels, by_point = self.bank.jacobian(points, torch.from_numpy(self.camera[rows]))
-        residual = (root @ (pixels.numpy() - self.pixels[rows])[..., None])[..., 0]
-        slope = root @ by_point.numpy()
+        numbers, by_point, by_change = self._seen(points, rows, inputs[1:])
+        residual = (root @ (numbers[:, :2] - self.pixels[rows])[..., None])[..., 0]
+        slope, change = root @ by_point[:, :2], root @ by_change[:, :2]
         if self.dim == 3:
-            (radius, sharp), numbers = self.radii[rows].T, torch.from_numpy(self.camera[rows])
-            seen, by_place = (t.numpy() for t in self.bank.radius(points, numbers, self.ball))
-            residual = np.concatenate((residual, (sharp * (seen - radius))[:, None]), axis=1)
-            slope = np.concatenate((slope, (sharp[:, None] * by_place)[:, None]), axis=1)
+            radius, sharp = self.radii[rows].T
+            residual = np.concatenate((residual, (sharp * (numbers[:, 2] - radius))[:, None]), axis=1)
+            slope = np.concatenate((slope, sharp[:, None, None] * by_point[:, 2:]), axis=1)
+            change = np.concatenate((change, sharp[:, None, None] * by_change[:, 2:]), axis=1)
         by_state = np.zeros((len(state), self.dim, STATE_DIM))
         by_state[..., POSITION], by_state[..., VELOCITY] = slope, slope * tau[:, None, None]
         if len(inputs) == 1:
             return residual, (by_state,)
-        by_offset = np.zeros((len(state), self.dim, inputs[1].shape[-1]))
+        by_coefficient = np.zeros((len(state), self.dim, inputs[1].shape[-1]))
         (free,) = np.nonzero(column != FIXED)
-        by_offset[free, :, column[free]] = -(slope[free] @ velocity[free, :, None])[..., 0]
-        return residual, (by_state, by_offset)
+        by_coefficient[free, :, column[free]] = -(slope[free] @ velocity[free, :, None])[..., 0]
+        self._add(by_coefficient, rows, change)
+        return residual, (by_state, by_coefficient)
+
+    def _seen(self, points: Tensor, rows: Index | slice, coefficients: tuple[Array, ...]) -> tuple[Array, Array, Array]:
+        """Pixels and radius (k, r) of points (k, 3) m, derivatives (k, r, 3), and those by changes of the camera."""
+        camera = torch.from_numpy(self.camera[rows])
+        numbers, slope = (t.numpy() for t in self.bank.jacobian(points, camera))
+        if self.dim == 3:
+            seen, by_place = (t.numpy() for t in self.bank.radius(points, camera, self.ball))
+            numbers = np.concatenate((numbers, seen[:, None]), axis=1)
+            slope = np.concatenate((slope, by_place[:, None]), axis=1)
+        return numbers, slope, np.zeros((len(points), self.dim, 0))
+
+    def _add(self, by_coefficient: Array, rows: Index | slice, change: Array) -> None:
+        """Adds derivatives by changes of the cameras to those by coefficients (k, r, p): exact cameras have none."""
 
     def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
         """(m, r) whitened residuals in torch."""
@@ -113,14 +127,21 @@ class CameraFactors(FactorBatch):
             own = inputs[1].gather(1, column.clamp(min=0)[:, None])[:, 0]
             tau = tau - torch.where(column != FIXED, own, 0.0)
         points = inputs[0][:, POSITION] + tau[:, None] * inputs[0][:, VELOCITY]
-        camera = torch.from_numpy(self.camera)
-        pixels = self.bank.project(points, camera)
-        residual = (torch.from_numpy(self.root) @ (pixels - torch.from_numpy(self.pixels))[..., None])[..., 0]
+        numbers = self._projected(points, inputs[1:])
+        off = numbers[:, :2] - torch.from_numpy(self.pixels)
+        residual = (torch.from_numpy(self.root) @ off[..., None])[..., 0]
         if self.dim == 2:
             return residual
-        seen, _ = self.bank.radius(points, camera, self.ball)
         radius, sharp = torch.from_numpy(self.radii).unbind(-1)
-        return torch.cat((residual, (sharp * (seen - radius))[:, None]), dim=-1)
+        return torch.cat((residual, (sharp * (numbers[:, 2] - radius))[:, None]), dim=-1)
+
+    def _projected(self, points: Tensor, coefficients: tuple[Tensor, ...]) -> Tensor:
+        """Pixels and radius (m, r) of points (m, 3) m."""
+        camera = torch.from_numpy(self.camera)
+        pixels = self.bank.project(points, camera)
+        if self.dim == 2:
+            return pixels
+        return torch.cat((pixels, self.bank.radius(points, camera, self.ball)[0][:, None]), dim=-1)
 
 
 def _own(coefficients: tuple[Array, ...], column: Index) -> Array:

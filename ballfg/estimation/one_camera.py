@@ -5,8 +5,10 @@ it; the first piece that they do not explain begins a new stroke, as after a hit
 The smoother then estimates each stroke.
 """
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -35,7 +37,7 @@ TOLERANCE: Final = 5e-3
 """rad, standard deviation of a sighting about a flight without spin: 15 mm at 3 m. A hit misses by far more."""
 EXPLAINED: Final = 10.0
 """Misfit for each sighting up to which flights explain a stroke; strong spin leaves 5, a hit some hundreds."""
-ENOUGH: Final = 40
+ENOUGH: Final = 30
 """Sightings that show a hit: of more, some are left out."""
 GRIP: Final = 0.6
 """Change of the horizontal velocity in a bounce, at most, over that of the vertical one: a ball on a table grips with
@@ -48,8 +50,10 @@ STRAIGHT: Final = 0.3
 """s. What moves so long in a straight line does not fall."""
 NEAREST: Final = 0.5
 """m from the camera; a ball nearer by fills much of the picture."""
-LEAST_TIME: Final = 0.15
-"""s, of a stroke: gravity shows in 0.1 m."""
+LONGEST_TIME: Final = 3.0
+"""s, of a stroke: a lob with its bounces."""
+LEAST_TIME: Final = 0.25
+"""s, of a stroke: gravity shows in 0.3 m. Shorter pieces of two rallies were fragments or chance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,15 +114,36 @@ def _fits(estimate: Estimate) -> bool:
 
 
 def _cut(chain: Sequence[Sightings], camera: Camera, smoother: Smoother) -> list[Sightings]:
-    """The strokes of a chain: pieces in order of time, together as long as flights explain them."""
-    strokes, grown = list[Sightings](), list[Sightings]()
-    for piece in chain:
-        if grown and not _explained(_joined([*grown, piece]), camera, smoother):
-            strokes.append(_joined(grown))
-            grown = []
-        grown.append(piece)
-    found = [one for one in (*strokes, _joined(grown)) if _explained(one, camera, smoother)]
-    return [one for one in found if not _straight(one, camera)]
+    """The strokes of a chain: pieces in order of time, together as long as flights explain them.
+
+    A piece that no flight explains may go on smoothly through a hit: what still fits belongs to the stroke before.
+    """
+    explained = partial(_explained, camera=camera, smoother=smoother)
+    found, left, grown = list[Sightings](), deque(chain), list[Sightings]()
+    while left:
+        piece = left.popleft()
+        if _straight(piece, camera):
+            continue
+        whole = _joined([*grown, piece])
+        if explained(whole):
+            grown = [whole]
+            continue
+        known = sum(map(len, grown))
+        at = known if grown and explained(piece) else _first_unexplained(whole, known, explained)
+        found += [whole.select(np.arange(at))] if at else []
+        grown = []
+        if known or np.ptp(whole.times[:at]) >= LEAST_TIME:  # else it is no ball
+            left.appendleft(whole.select(np.arange(at, len(whole))))
+    return [one for one in (*found, *grown) if not _straight(one, camera)]
+
+
+def _first_unexplained(whole: Sightings, known: int, explained: Callable[[Sightings], bool]) -> int:
+    """Number of first sightings that flights explain, by bisection; known: such a number, or 0."""
+    low, high = known, len(whole)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if explained(whole.select(np.arange(middle))) else (low, middle)
+    return low
 
 
 def _joined(pieces: Sequence[Sightings]) -> Sightings:
@@ -131,6 +156,8 @@ def _explained(seen: Sightings, camera: Camera, smoother: Smoother) -> bool:
     """True if flights with bounces pass near enough to all sightings, or too few were seen for saying."""
     if len(seen) < LEAST_SEEN:
         return True
+    if np.ptp(seen.times) > LONGEST_TIME:
+        return False
     spread = (TOLERANCE * np.diag(camera.matrix)[:2]) ** 2
     loose = replace(seen, covariances=seen.covariances + np.diag(spread))
     ordered = in_order(loose, [camera]).select(np.arange(0, len(seen), -(-len(seen) // ENOUGH)))
@@ -142,7 +169,7 @@ def _explained(seen: Sightings, camera: Camera, smoother: Smoother) -> bool:
         *level, rise = path.path.velocities[before + 1] - path.path.velocities[before]
         if np.hypot(*level) > GRIP * abs(rise) + CATCH:
             return False
-    return path.misfit <= EXPLAINED * len(ordered)
+    return path.misfit <= EXPLAINED
 
 
 def _straight(seen: Sightings, camera: Camera) -> bool:

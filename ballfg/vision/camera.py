@@ -47,6 +47,8 @@ class Camera:
     """(3,) m, the world's origin in the camera's frame."""
     time_offset: float = 0.0
     """s, delay of the camera's stamps: an event stamped t happened at t - time_offset."""
+    covariance: Array | None = None
+    """(7, 7) of the errors of turn (about the world's axes, rad), centre (m) and log focal length; None: exact."""
 
     def __post_init__(self) -> None:
         check_name("a camera's name", self.name)
@@ -74,6 +76,8 @@ class Camera:
         if not (k[0, 0] > 0 and k[1, 1] > 0 and k[1, 0] == 0 and (k[2] == (0, 0, 1)).all() and k[0, 1] == 0):
             rule = "matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0"
             raise ValueError(f"{where}: {rule}; got {k.tolist()}")
+        if self.covariance is not None:
+            object.__setattr__(self, "covariance", _checked_covariance(where, self.covariance))
         object.__setattr__(self, "time_offset", check_number(f"{where}: time_offset", self.time_offset, "s"))
 
     @cached_property
@@ -155,3 +159,13 @@ class Camera:
         """
         pixels = np.nan_to_num(self.project(points), nan=-1e9)
         return np.asarray(((pixels >= -0.5) & (pixels < np.array(self.size) - 0.5)).all(axis=-1))
+
+
+def _checked_covariance(where: str, given: Array) -> Array:
+    remedy = "Let 'ballfg calibrate-cameras' write it, or leave it out."
+    array = check_array(f"{where}: covariance", given, (7, 7), remedy)
+    whole = np.isfinite(array).all() and np.allclose(array, array.T, rtol=1e-6, atol=0.0)
+    if not whole or np.linalg.eigvalsh(array).min() <= 0.0:
+        raise ValueError(f"{where}: covariance must be symmetric and positive definite. {remedy}")
+    array.setflags(write=False)
+    return array

@@ -20,7 +20,7 @@ from ballfg.vision.camera import Camera
 CAMERAS_FILE: Final = "cameras.yaml"  # its name in the folder of a dataset or a scene
 LENS: Final = ("size", "matrix", "distortion")
 POSE: Final = ("rvec", "tvec")
-FIELDS: Final = (*LENS, *POSE, "time_offset")  # in the file's order; docs/calibrate.md explains them
+FIELDS: Final = (*LENS, *POSE, "time_offset", "covariance")  # in the file's order; docs/calibrate.md explains them
 _MATRIX: Final = "camera_matrix"
 _NODES: Final = {
     "matrix": (_MATRIX,),
@@ -72,7 +72,10 @@ def write_cameras(path: str | PathLike[str], cameras: Iterable[Camera], *, posed
     cameras = _check_names(cameras)
     fields = FIELDS if posed else (*LENS, "time_offset")
     plain = {
-        camera.name: {field: np.asarray(getattr(camera, field)).tolist() for field in fields} for camera in cameras
+        camera.name: {
+            field: np.asarray(value).tolist() for field in fields if (value := getattr(camera, field)) is not None
+        }
+        for camera in cameras
     }
     text = yaml.safe_dump({"cameras": plain}, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
     write_text(path, text)
@@ -82,7 +85,7 @@ def write_opencv(path: str | PathLike[str], cameras: Iterable[Camera], *, posed:
     """Writes cameras with OpenCV's FileStorage, a map for each; floats read back bit for bit. Never leaves half a file.
 
     Args: path: .xml, .json, .yml or .yaml.  posed: False: without `rvec` and `tvec`.
-    Raises: ValueError: another ending, no cameras, a name twice, or one that FileStorage cannot take.
+    Raises: ValueError: another ending, no cameras, a name twice or one that FileStorage cannot take, a covariance.
         FileNotFoundError: the folder does not exist.
     """
     path = Path(path)
@@ -90,6 +93,9 @@ def write_opencv(path: str | PathLike[str], cameras: Iterable[Camera], *, posed:
         raise ValueError(f"path must end in {', '.join(ENDINGS)}; got {path}. Choose the format by the ending.")
     cameras = _check_names(cameras)
     for camera in cameras:
+        if camera.covariance is not None:
+            rule = f"cameras must be exact in OpenCV's files; {shown(camera.name)} has a covariance"
+            raise ValueError(f"{rule}. Write cameras.yaml, or leave the covariance out.")
         plain = camera.name.replace("_", "a").replace("-", "0")
         if not (plain.isascii() and plain.isalnum() and plain[0].isalpha()):
             rule = "names of cameras must be letters, digits, - and _, a letter first, in OpenCV's files"
@@ -155,7 +161,8 @@ def _camera(name: str, content: Any, posed: bool) -> Camera:
         what = f"{where}: time_offset must be a number in s; got {shown(offset)}"
         raise ValueError(f"{what}. Write it like 0.004 or 4.0e-3.")
     rvec, tvec = (np.zeros(3) if missing else fields[field] for field in POSE)
-    return Camera(name, (sides[0], sides[1]), fields["matrix"], fields["distortion"], rvec, tvec, offset)
+    covariance = fields.get("covariance")
+    return Camera(name, (sides[0], sides[1]), fields["matrix"], fields["distortion"], rvec, tvec, offset, covariance)
 
 
 def _fields(node: Mapping[str, Tree], where: str) -> dict[str, Any]:

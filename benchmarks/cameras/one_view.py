@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
+from ballfg.benchmarks.cameras.rough_camera import roughly_known
 from ballfg.benchmarks.metrics import bootstrap, inside, median_and_quartiles, share
 from ballfg.benchmarks.results import Results
 from ballfg.dynamics import nominal_model
@@ -24,6 +25,9 @@ from ballfg.tracks import Dataset, Track
 
 METHOD: Final = "smoother, one camera"
 CALIBRATED: Final = "smoother, one camera, calibrated by the view's other strokes"
+ROUGH: Final = "smoother, one camera, roughly known"
+CLICKED: Final = 8
+"""Cameras whose errors and clicks are drawn, for the same strokes."""
 FAILED: Final = 1.0
 """m, error of a stroke from which it counts as a failure, as one without states does."""
 LEVEL: Final = 0.9
@@ -51,6 +55,8 @@ class Stroke:
 def run_views(results: Results, views: Sequence[SightedDataset], truth: Dataset) -> None:
     """Adds the rows of each view, with the nominal ball and with one that the view's other half calibrated.
 
+    If the view states the table's ends, also those with a camera that is known roughly.
+
     The case is the name of the view. Every second stroke calibrates for the others, and the others for it.
 
     Args: views: strokes of one camera each.  truth: their measured tracks, under the same names.
@@ -74,6 +80,10 @@ def run_views(results: Results, views: Sequence[SightedDataset], truth: Dataset)
 
         watched = progress(tracks, len(tracks), f"strokes of {view.info.name}")
         _add(results, view.info.name, METHOD, [judged(nominal, track) for track in watched])
+        if view.info.table_extent is not None:
+            rough = (track for number in range(CLICKED) for track in roughly_known(view, tracks, results.seed + number))
+            watched = progress(rough, CLICKED * len(tracks), f"strokes of {view.info.name}, camera roughly known")
+            _add(results, view.info.name, ROUGH, [judged(nominal, track) for track in watched])
         if len(tracks) < LEAST:
             continue
         found = list[Stroke]()

@@ -104,6 +104,11 @@ def test_lenses_first_and_places_later(calib: Path, tmp_path: Path, capsys: pyte
     for lens, camera in zip(known, placed, strict=True):
         np.testing.assert_array_equal(lens.matrix, camera.matrix)
         assert np.linalg.norm(camera.centre - CENTRES[camera.name]) < 0.02
+    rough = tmp_path / "rough.yaml"
+    assert status("--intrinsics", lenses, "--table", calib / "table.yaml", "--focal-sigma", 0.05, "--out", rough) == 0
+    assert "focal length " in capsys.readouterr().out
+    for lens, camera in zip(known, read_cameras(rough), strict=True):
+        assert abs(np.log(camera.matrix[0, 0] / lens.matrix[0, 0])) < 3.0 * np.sqrt(camera.covariance[6, 6])
 
 
 def test_the_same_bytes_twice(calib: Path, tmp_path: Path) -> None:
@@ -132,6 +137,10 @@ def test_bad_input_is_one_line_and_nothing_is_written(
         ((*BOARD, *images(calib), "--out", tmp_path / "no" / "c.yaml"), "out must be in an existing folder"),
         ((*BOARD, *images(calib), "--intrinsics", "c.yaml", *table, *out), "and not both"),
         (("--intrinsics", calib / "lenses.yaml", *out), "--intrinsics must come with --table"),
+        (
+            (*BOARD, *images(calib), *table, "--focal-sigma", 0.05, "--out", tmp_path / "c.xml"),
+            "--focal-sigma must come with --table and with an --out of .yaml",
+        ),
         (("--intrinsics", calib / "lenses.yaml", *table, *out), "must be a file with cameras; there is none"),
         (
             (*BOARD, *images(calib), *table, "--view", f"top={calib / 'left' / '00.png'}", *out),

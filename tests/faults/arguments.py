@@ -226,7 +226,7 @@ def calls_of_cameras(_folder: Path) -> dict[str, Call]:
     stream = bf.Online(bf.nominal_model(), 0.76, cameras=[one])
     sighting = {"time": 0.0, "camera": "a", "pixel": [320.0, 240.0], "covariance": np.eye(2)}
     return {
-        "Camera": Call(vision.Camera, _example(one)),
+        "Camera": Call(vision.Camera, _example(replace(one, covariance=np.eye(7)))),
         "CameraBank": Call(CameraBank, {"cameras": [one]}),
         "DetectorSettings": Call(vision.DetectorSettings, _example(vision.DetectorSettings())),
         "AssociationSettings": Call(vision.AssociationSettings, _example(vision.AssociationSettings())),

@@ -94,6 +94,8 @@ def test_view_ends_at_the_image() -> None:
         ({"size": (0, 720)}, "size must be width and height in pixels; got .*Correct it."),
         ({"name": " "}, "printable text"),
         ({"time_offset": np.inf}, "time_offset must be finite"),
+        ({"covariance": np.eye(6)}, "covariance must have shape"),
+        ({"covariance": -np.eye(7)}, "covariance must be symmetric and positive definite"),
     ],
 )
 def test_refuses(changes: dict[str, object], message: str) -> None:

@@ -44,6 +44,15 @@ def test_what_is_written_reads_back_bit_for_bit(tmp_path: Path, write: Callable[
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
+def test_a_covariance_reads_back_and_opencv_has_no_place_for_it(tmp_path: Path) -> None:
+    root = np.tril(np.random.default_rng(0).uniform(0.1, 1.0, (7, 7)))
+    loose = replace(camera("left"), covariance=root @ root.T)
+    write_cameras(tmp_path / "a.yaml", [loose])
+    np.testing.assert_array_equal(read_cameras(tmp_path / "a.yaml")[0].covariance, loose.covariance)
+    with pytest.raises(ValueError, match="cameras must be exact in OpenCV's files; 'left' has a covariance"):
+        write_opencv(tmp_path / "a.xml", [loose])
+
+
 def test_the_file_is_as_documented(tmp_path: Path) -> None:
     plain = Camera("left", (1280, 720), [[1000, 0, 640], [0, 1000, 360], [0, 0, 1]], [], [0, 0, 0], [0, 0, 3])
     write_cameras(tmp_path / "c.yaml", [plain])

@@ -54,6 +54,13 @@ def calibrate_cameras(
         Path | None, typer.Option(help="Camera file with known lenses, in place of --images.")
     ] = None,
     table: Annotated[Path | None, _place_option(help="File with pixels of the table's corners by camera.")] = None,
+    focal_sigma: Annotated[
+        float | None,
+        _place_option(
+            help="Relative standard deviation of focal lengths that are known roughly; they are then found with the "
+            "place, and OUT states how well."
+        ),
+    ] = None,
     view: Annotated[
         list[str] | None, _place_option(help="Image of a camera for the drawn table, NAME=IMAGE; may be repeated.")
     ] = None,
@@ -78,18 +85,20 @@ def calibrate_cameras(
         raise ValueError("either --images or --intrinsics must be given, and not both. Lenses come from one of them.")
     if intrinsics is not None and table is None:
         raise ValueError("--intrinsics must come with --table; got no --table. Without it there is nothing to find.")
+    if focal_sigma is not None and (table is None or out.suffix.lower() not in OURS):
+        raise ValueError(f"--focal-sigma must come with --table and with an --out of {' or '.join(OURS)}. Give both.")
     places = _grouped("images", images or ())
     shown = {name: read_grey(Path(paths[-1])) for name, paths in _grouped("view", view or ()).items()}
     marked = None if table is None else read_table(table)
     if intrinsics is not None:
         lenses = {camera.name: camera for camera in read_cameras(intrinsics, posed=False)}
         _check_same(lenses, str(intrinsics), marked, table, shown)
-        found = [_placed(camera, None, marked) for camera in lenses.values()]
+        found = [_placed(camera, None, marked, focal_sigma) for camera in lenses.values()]
     else:
         _check_same(places, "--images", marked, table, shown)
         pattern = _board(board, squares, square, marker, dictionary, legacy)
         fitted = [_lens(name, where, pattern, distortion) for name, where in places.items()]
-        found = [_placed(lens.camera, lens, marked) for lens in fitted]
+        found = [_placed(lens.camera, lens, marked, focal_sigma) for lens in fitted]
     _write(out, found, shown, marked)
 
 
@@ -144,13 +153,17 @@ def _lens(name: str, places: Iterable[str], board: Board, distortion: int) -> In
     return calibrate_intrinsics(name, views, distortion)
 
 
-def _placed(camera: Camera, lens: Intrinsics | None, marked: TableFile | None) -> Calibration:
+def _placed(
+    camera: Camera, lens: Intrinsics | None, marked: TableFile | None, focal_sigma: float | None
+) -> Calibration:
     from ballfg.vision.calibration.extrinsics import calibrate_extrinsics
+    from ballfg.vision.calibration.focal import pose_and_focal
     from ballfg.vision.calibration.report import Calibration
 
     if marked is None:
         return Calibration(camera, lens, None)
-    place = calibrate_extrinsics(camera, marked.cameras[camera.name])
+    points = marked.cameras[camera.name]
+    place = calibrate_extrinsics(camera, points) if focal_sigma is None else pose_and_focal(camera, points, focal_sigma)
     return Calibration(place.camera, lens, place)
 
 

@@ -90,7 +90,9 @@ def track(
         files = " ".join(Path(text).name for text in recordings)
         info = DatasetInfo(name or out.resolve().name, height, kind.ball, source=f"ballfg track {files}")
         rig = others(read_cameras(cameras), without or ())
-        surfaces = replace(kind.surfaces, table_height=height)
+        floor = kind.surfaces.floor_height
+        floor = None if floor is None else floor + height - kind.surfaces.table_height
+        surfaces = replace(kind.surfaces, table_height=height, floor_height=floor)
         if len(rig) != 1:
             check_rig(rig)
         elif time_offsets:

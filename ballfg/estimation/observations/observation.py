@@ -149,6 +149,13 @@ class Observation(ABC):
         """
         return (track,)
 
+    def loosened(self, track: Track) -> Track | None:
+        """The track with the larger noise at which a search from its start converges; None, the default: its own.
+
+        Args: track: of the observation, one of its `starts`.
+        """
+        return None
+
     def segmentation(self) -> Segmentation | None:
         """The events that the observation itself shows; None, the default: the positions show them."""
         return None

@@ -94,6 +94,12 @@ class Rays:
         depth_row = np.concatenate((rotation[:, 2], tvec[:, 2:]), axis=1)
         return cls(times, sightings.camera, matrix, target, root, depth_row, max(periods, default=0.0))
 
+    def thinned(self, most: int) -> Rays:
+        """At most so many of these rays, evenly chosen."""
+        every = -(-len(self.times) // most)
+        arrays = {f.name: getattr(self, f.name)[::every] for f in fields(self) if f.name != "period"}
+        return replace(self, **arrays, period=every * self.period)
+
     def joined(self, later: Rays, most: int, period: float) -> Rays:
         """These rays and later ones, the newest `most` of them, with a new period, s."""
         arrays = [f.name for f in fields(self) if f.name != "period"]

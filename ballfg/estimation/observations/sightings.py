@@ -16,8 +16,9 @@ from ballfg.checks import listed, shown
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.nominal import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.observations.bounced_path import LAWS, place_prior
 from ballfg.estimation.observations.observation import Context, Observation, Unknowns
-from ballfg.estimation.observations.one_view import OneView, one_view, place_prior
+from ballfg.estimation.observations.one_view import OneView, one_view
 from ballfg.estimation.observations.ray_path import Rays, determined, filled, rough_path
 from ballfg.estimation.observations.rig import cameras_of, check_apart, in_order, true_times_of
 from ballfg.estimation.result import Estimate, Status
@@ -27,15 +28,19 @@ from ballfg.estimation.settings import Settings
 from ballfg.factors.batch import FactorBatch
 from ballfg.factors.camera import FIXED, CameraFactors
 from ballfg.factors.prior import PriorFactors
+from ballfg.factors.uncertain_camera import UncertainCameraFactors
 from ballfg.state import POSITION, STATE_DIM
 from ballfg.tracks.sightings import Sightings
 from ballfg.tracks.stamps import elapsed, written
 from ballfg.tracks.track import Label, Track
 from ballfg.vision.camera import Camera
+from ballfg.vision.camera_change import CHANGES
 from ballfg.vision.projection import CameraBank
 
 TIME_OFFSET: Final = "time_offset."
 """Prefix of the name of a camera's time offset among the unknowns of a track."""
+CHANGE: Final = "camera."
+"""Prefix of the names of the seven numbers by which a camera with a covariance may differ, each of prior sigma 1."""
 OFFSET_SETTLED: Final = 1e-5
 """s. An offset that changes by less has converged: the path bends by a nanometre meanwhile."""
 
@@ -104,8 +109,12 @@ class CameraSightings(Observation):
         columns = np.array([context.columns.get(name, FIXED) for name in names])
         seen, unknown = self.sightings, columns if (columns != FIXED).any() else None
         measured, loss = (seen.camera, seen.pixels, seen.covariances), context.settings.sighting_loss
-        radius = (seen.radii, context.model.radius)
-        return CameraFactors(self.state, *measured, _bank(self.cameras), self.delay, unknown, loss, *radius)
+        places = np.array([context.columns.get(f"{CHANGE}{name}.0", FIXED) for name in self.sightings.cameras])
+        if (places == FIXED).all():
+            given = (self.state, *measured, _bank(self.cameras), self.delay, unknown, loss)
+            return CameraFactors(*given, seen.radii, context.model.radius)
+        given = (self.state, *measured, _bank(self.cameras), self.delay, columns, loss)
+        return UncertainCameraFactors(self.cameras, places, *given, seen.radii, context.model.radius)
 
     def unknowns(self, settings: Settings) -> Unknowns:
         """The time offsets that the settings name, s, each counted from that of its camera.
@@ -117,11 +126,14 @@ class CameraSightings(Observation):
             if name not in names:
                 raise ValueError(f"time_offsets must name cameras of the track, {listed(names)}; got {shown(name)}")
         chosen = [names.index(name) for name in settings.time_offsets]
+        loose = [camera.name for camera in self.cameras if camera.covariance is not None]
+        changes = [f"{CHANGE}{name}.{number}" for name in loose for number in range(CHANGES)]
+        rest = np.zeros(len(changes))
         return Unknowns(
-            tuple(TIME_OFFSET + name for name in settings.time_offsets),
-            -self.moved[chosen],
-            np.array(list(settings.time_offsets.values())),
-            self.time_offsets[chosen],
+            (*(TIME_OFFSET + name for name in settings.time_offsets), *changes),
+            np.append(-self.moved[chosen], rest),
+            np.append(np.array(list(settings.time_offsets.values())), rest + 1.0),
+            np.append(self.time_offsets[chosen], rest),
         )
 
     def found_offsets(self, estimate: Estimate) -> tuple[Array, Array]:
@@ -170,8 +182,23 @@ class CameraSightings(Observation):
         """The track with one path and the prior of its place."""
         arrays = (self.sightings, self.cameras, self.state, self.delay, self.moved)
         own = CameraSightings(*arrays, one_view=True, bounces=found.contacts(track.times), place=place)
-        seen = tuple(own if other is self else other for other in track.observations)
-        return replace(track, positions=found.path.positions, sigmas=found.path.sigmas, observations=seen)
+        return replace(self._in_place(track, own), positions=found.path.positions, sigmas=found.path.sigmas)
+
+    def _in_place(self, track: Track, other: CameraSightings) -> Track:
+        """The track with other sightings in place of these."""
+        return replace(track, observations=tuple(other if one is self else one for one in track.observations))
+
+    def loosened(self, track: Track) -> Track | None:
+        """The track with the error of a start's laws added to the noise of one camera's pixels, if that is smaller."""
+        if not self.one_view:
+            return None
+        seen, (camera,) = self.sightings, (self.cameras[number] for number in np.unique(self.sightings.camera))
+        spread = (LAWS / camera.depth(track.positions[self.state])[:, None] * np.diag(camera.matrix)[:2]) ** 2
+        if np.median(spread) < np.median(np.trace(seen.covariances, axis1=1, axis2=2)) / 2.0:
+            return None
+        noisy = replace(seen, covariances=seen.covariances + spread[:, :, None] * np.eye(2))
+        loose = CameraSightings(noisy, self.cameras, self.state, self.delay, self.moved, True, self.bounces, self.place)
+        return self._in_place(track, loose)
 
     def across(self, first: int, positions: Array, covariances: Array) -> tuple[Array, Array]:
         """Errors of positions across the rays of the sightings, with their standard deviations.

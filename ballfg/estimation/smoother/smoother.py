@@ -200,6 +200,11 @@ class Smoother(Estimator):
         """
         rough = replace(self.optimizer, tolerance=max(ROUGH, self.optimizer.tolerance))
         segmentation, before = problem.segmentation, None
+        loose = self._loosened(problem) if earlier is None else None
+        if loose is not None:
+            near = self.settle(loose)
+            earlier = Earlier(near.minimum.values)
+            segmentation = replace(near.events.segmentation, contacts=near.events.contacts)
         for left in range(MAX_UNSEEN_HITS if self.settings.find_events else 0, -1, -1):
             search = ContactSearch(problem, self.surfaces, segmentation)
             if earlier is None:
@@ -233,6 +238,14 @@ class Smoother(Estimator):
         if found.convergence is Convergence.CONVERGED and found.distance >= self.optimizer.tolerance:
             found = self.optimizer.minimize(solution.graph, found)
         return replace(solution, minimum=found.bare())
+
+    def _loosened(self, problem: TrackProblem) -> TrackProblem | None:
+        """The problem with more noise in an observation that asks for it, to be solved first."""
+        for observation in problem.observations:
+            loose = observation.loosened(problem.track)
+            if loose is not None:
+                return self.problem(loose, problem.segmentation)
+        return None
 
     def result(self, problem: TrackProblem, solution: Solution) -> Estimate:
         """The estimate of a track from a solution."""

@@ -50,6 +50,8 @@ def summary(found: Calibration) -> Iterator[str]:
             f"    at ({x:.3f}, {y:.3f}, {z:.3f}) m ± {1e3 * place.centre_sigma:.1f} mm, "
             f"turned ± {np.degrees(place.turn_sigma):.3f} degrees"
         )
+        if (covariance := place.camera.covariance) is not None:
+            yield f"    focal length {place.camera.matrix[0, 0]:.1f} px ± {np.sqrt(covariance[-1, -1]):.1%}"
         yield "    px: " + ", ".join(f"{name} {error:.2f}" for name, error in errors)
 
 
@@ -100,6 +102,9 @@ def content(found: Calibration) -> dict[str, Any]:
             "turn_sigma": float(np.degrees(place.turn_sigma)),
             "residuals": errors,
         }
+        if place.camera.covariance is not None:
+            result["place"]["focal"] = float(place.camera.matrix[0, 0])
+            result["place"]["focal_sigma"] = float(place.camera.matrix[0, 0] * np.sqrt(place.camera.covariance[-1, -1]))
     return result
 
 

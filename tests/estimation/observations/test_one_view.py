@@ -26,9 +26,13 @@ from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate
 from ballfg.simulation import MotionNoise as TrueNoise
+from ballfg.simulation.cameras import table_rig
+from ballfg.simulation.scene.config import SceneConfig
+from ballfg.simulation.scene.recording import record
 from ballfg.tracks import read_dataset
 from ballfg.tracks.sightings import Sightings
 from ballfg.vision.camera import Camera
+from ballfg.vision.camera_change import changed
 from tests.estimation.observations.sighted_rig import TABLE, World, looking, world
 from tests.places import DATA
 
@@ -128,6 +132,41 @@ def test_the_balls_radius_shows_its_depth(ball: World) -> None:
         errors.append([np.sqrt(((one.states[:, :3] - states[:, :3]) ** 2).sum(axis=1).mean()) for one in both])
     plain, better = np.median(errors, axis=0)
     assert better < 0.8 * plain
+
+
+def test_pixels_far_better_than_the_start(ball: World) -> None:
+    """Balls with sidespin at 60 Hz and 0.05 px: the start, without spin, is decimetres off, and its bounces frames."""
+    (far,) = (camera for camera in table_rig() if camera.name == "far")
+    recording = record(SceneConfig(shots=10, seed=131, rate=60.0), [far])
+    model, surfaces = recording.config.ball.model, recording.config.ball.surfaces
+    estimator = Smoother(model, surfaces, Settings.for_measured(model))
+    for number in (6, 8, 9):
+        flight = recording.flights[number]
+        frames = recording.passages[0][number].frames
+        times = recording.frames[0].times[frames[far.in_view(recording.passages[0][number].centres)]]
+        states = flight.states(times)
+        seen = pixels_of(states[:, :3], times, far, 0.05, number)
+        track = sighted_track("a", seen, [far], model=model, surfaces=surfaces)
+        found = estimator.estimate(track)
+        assert found.status is Status.OK
+        error = found.states[:, :3] - states[:, :3]
+        assert np.linalg.norm(error, axis=1).max() < 0.15
+        assert (np.abs(error) < 3.5 * found.sigmas[:, :3]).all()
+
+
+def test_an_uncertain_camera_widens_the_states(ball: World) -> None:
+    """Cameras that are wrong by draws from a covariance: intervals hold with it, and do not without."""
+    surfaces = replace(ball.surfaces, extent=(-1.37, 1.37, -0.76, 0.76))
+    estimator, inside = Smoother(ball.model, surfaces), []
+    sigmas = np.repeat((np.deg2rad(0.3), 0.05, 0.03), (3, 3, 1))
+    for seed in range(12):
+        times, states = stroke(ball, seed)
+        wrong = changed(SIDE, sigmas * np.random.default_rng(seed).standard_normal(7))
+        for camera in (replace(wrong, covariance=np.diag(sigmas**2)), wrong):
+            found = estimator.estimate(sighted_track("a", pixels_of(states[:, :3], times, SIDE, 1.0, seed), [camera]))
+            inside.append((np.abs(found.states[:, :3] - states[:, :3]) < 1.645 * found.sigmas[:, :3]).mean())
+    assert np.mean(inside[::2]) > 0.82
+    assert np.mean(inside[1::2]) < 0.7
 
 
 def test_covariances_are_honest() -> None:

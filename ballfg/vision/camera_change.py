@@ -1,0 +1,50 @@
+"""Small changes of a camera: its turn, its move and the growth of its focal length, as seven numbers.
+
+A camera with a covariance is uncertain by such a change. A point X is seen by the changed camera where the camera as it
+is sees X' = C + p + p x turn, p = X - C - move, with the centre C; pixels then grow about the principal point by
+exp(zoom). The turn is of first order in X', exact in `changed`.
+"""
+
+from dataclasses import replace
+from typing import Final
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from ballfg.arrays import Array
+from ballfg.vision.camera import Camera
+
+CHANGES: Final = 7
+"""Three rad about the world's axes, three m of the centre, the logarithm of the ratio of focal lengths."""
+TURN, MOVE, ZOOM = slice(0, 3), slice(3, 6), 6
+
+
+def changed(camera: Camera, change: Array) -> Camera:
+    """The camera after a change (7,); its covariance stays."""
+    turned = camera.rotation @ cv2.Rodrigues(-change[TURN])[0]
+    matrix = camera.matrix.copy()
+    matrix[[0, 1], [0, 1]] *= np.exp(change[ZOOM])
+    centre = camera.centre + change[MOVE]
+    rvec = np.asarray(cv2.Rodrigues(turned)[0], dtype=np.float64)
+    return replace(camera, matrix=matrix, rvec=rvec, tvec=-turned @ centre)
+
+
+def seen_at(points: Tensor, centre: Tensor, change: Tensor) -> Tensor:
+    """(n, 3) m, X' of points (n, 3) m for cameras at (n, 3) m after changes (n, 7)."""
+    away = points - centre - change[:, MOVE]
+    return centre + away + torch.linalg.cross(away, change[:, TURN])
+
+
+def slopes_of(points: Tensor, centre: Tensor, change: Tensor) -> tuple[Tensor, Tensor]:
+    """Derivatives of X' by the points (n, 3, 3), and by turn and move (n, 3, 6)."""
+    by_point = torch.eye(3, dtype=points.dtype) - skew(change[:, TURN])
+    return by_point, torch.cat((skew(points - centre - change[:, MOVE]), -by_point), dim=-1)
+
+
+def skew(vectors: Tensor) -> Tensor:
+    """(n, 3, 3) whose products with b are the cross products of vectors (n, 3) and b."""
+    x, y, z = vectors.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), dim=-1).reshape(*vectors.shape, 3)

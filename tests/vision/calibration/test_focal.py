@@ -1,0 +1,49 @@
+"""Pose and focal length from table points: planted cameras come back, and the covariance is that of the scatter."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from ballfg.vision.calibration.focal import pose_and_focal
+from ballfg.vision.camera import Camera
+from ballfg.vision.camera_change import ZOOM, changed
+from tests.vision.calibration.test_extrinsics import AT, PLACES, marked, shaken, standing, turned
+
+
+def grown(camera: Camera, zoom: float) -> Camera:
+    return changed(camera, np.append(np.zeros(ZOOM), zoom))
+
+
+@pytest.mark.parametrize("place", PLACES[:3])
+def test_a_planted_camera_comes_back(place: tuple[float, float, float]) -> None:
+    """Nine points without noise correct a focal length that is 5 % off, if it is known to 5 %."""
+    camera = standing(place)
+    found = pose_and_focal(grown(camera, 0.05), marked(camera, tuple(AT), 0.1), 0.05).camera
+    np.testing.assert_allclose(found.centre, place, atol=0.01)
+    assert found.matrix[0, 0] == pytest.approx(camera.matrix[0, 0], rel=3e-3)
+    assert found.matrix[1, 1] / found.matrix[0, 0] == pytest.approx(camera.matrix[1, 1] / camera.matrix[0, 0])
+
+
+def test_covariances_are_those_of_the_scatter() -> None:
+    """Corners at 1 px, focal lengths off by 5 %: squares of whitened errors are of chi-square with seven degrees."""
+    camera, rng, squares = standing(PLACES[1]), np.random.default_rng(0), []
+    for _ in range(150):
+        lens = grown(camera, 0.05 * rng.standard_normal())
+        found = pose_and_focal(lens, shaken(marked(camera, sigma=1.0), rng), 0.05).camera
+        error = np.concatenate(
+            (-turned(camera, found), found.centre - camera.centre, [np.log(found.matrix[0, 0] / camera.matrix[0, 0])])
+        )
+        squares.append(error @ np.linalg.solve(found.covariance, error))
+    low, high = chi2.ppf([0.001, 0.999], 7 * 150) / 150
+    assert low < np.mean(squares) < high
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.5, np.nan])
+def test_bad_sigmas_are_refused(sigma: float) -> None:
+    camera = standing(PLACES[1])
+    with pytest.raises(ValueError, match=r"focal_sigma must be at least 0\.0001, at most 0\.3"):
+        pose_and_focal(replace(camera), marked(camera), sigma)
