@@ -73,8 +73,10 @@ def calibrate_cameras(
     OUT_calibration.json and .png show how accurate the calibration is. Without --table only the lenses are written, for
     a later --intrinsics.
     """
+    from ballfg.checks import check_range
     from ballfg.files.whole_file import check_file
     from ballfg.vision.calibration.boards import read_grey
+    from ballfg.vision.calibration.focal import ROUGHLY
     from ballfg.vision.calibration.table_points import read_table
     from ballfg.vision.camera_file import read_cameras
 
@@ -85,6 +87,8 @@ def calibrate_cameras(
         raise ValueError("either --images or --intrinsics must be given, and not both. Lenses come from one of them.")
     if intrinsics is not None and table is None:
         raise ValueError("--intrinsics must come with --table; got no --table. Without it there is nothing to find.")
+    if focal_sigma is not None:
+        check_range("--focal-sigma", focal_sigma, *ROUGHLY)
     if focal_sigma is not None and (table is None or out.suffix.lower() not in OURS):
         raise ValueError(f"--focal-sigma must come with --table and with an --out of {' or '.join(OURS)}. Give both.")
     places = _grouped("images", images or ())

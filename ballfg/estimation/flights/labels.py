@@ -96,7 +96,7 @@ def label_samples(track: Track, physics: SegmentationPhysics, levels: Sequence[f
     Positions that were computed from cameras, or seen by one, are taken for flight throughout.
 
     Args: track: of any length.  physics: of the ball.  levels: m, heights at which the ball is known to lie.
-    Source: docs/derivations/flights.md.
+    Source: docs/derivations/segmentation.md.
     """
     times, positions, n = track.seconds, track.positions, len(track)
     whole = Labels(np.zeros(n, np.int8), np.zeros(0, np.int64))
