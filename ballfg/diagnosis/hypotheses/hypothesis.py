@@ -160,7 +160,8 @@ def scene_of(fit: Fit) -> Scene:
     for i, row in enumerate(fit.predicted.contacts):
         for time in row[np.isfinite(row)]:
             first, last = np.searchsorted(times[i], (time - AROUND, time + AROUND))
-            falls.append(-velocities[i, first : last + 1, 2].min())
+            before = min(first, times.shape[1] - 1)  # the last sample, of a contact just after it
+            falls.append(-velocities[i, before : last + 1, 2].min())
     impacts = [fall for fall in falls if fall > 0.0]
     low, high, middle = (
         cast(Vector, tuple(place.tolist()))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -140,6 +142,16 @@ def test_impact_speeds_are_found_with_heights_that_lag_behind_the_stamps(
     # from 0.3 m above the table, less the ball's radius; two balls bounce a second time
     assert 1.9 < scene_of(fit).impact_speed < 2.8
     assert scene_of(fit).contacts == 8
+
+
+def test_a_contact_after_the_last_sample_has_the_speed_of_that_sample(windy_fit):
+    """A refit may move a bounce out of its track."""
+    positions, times = windy_fit.predicted.positions, windy_fit.problem.stretches.times.numpy()
+    after = SimpleNamespace(positions=positions, contacts=times[:, -1:] + 0.2)
+    scene = scene_of(SimpleNamespace(problem=windy_fit.problem, predicted=after, noise=windy_fit.noise))
+    falls = -(np.diff(positions[:, -2:, 2], axis=1) / np.diff(times[:, -2:], axis=1))
+    assert scene.contacts == (falls > 0.0).sum() > 0
+    assert scene.impact_speed == pytest.approx(float(np.median(falls[falls > 0.0])))
 
 
 def test_regions_of_a_gust_lie_evenly_over_the_data() -> None:
