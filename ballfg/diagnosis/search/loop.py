@@ -200,7 +200,8 @@ class _Found:
         if winner is None or not added:
             tell("nothing makes the model more probable")
             return False
-        tell(f"{' and '.join(names)} added")
+        gone = [h.name for h in best.named if h not in winner.named]
+        tell(" and ".join((*(f"{name} added" for name in names), *(f"{name} removed" for name in gone))))
         self.best = winner
         self._better_minimum(best, winner)
         self._pruned()
