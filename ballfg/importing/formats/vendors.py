@@ -12,6 +12,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.importing.formats.raw import MISSING, RawTable, table_of
 from ballfg.importing.names import unit_of_text
+from ballfg.tracks.csv_files import is_number
 
 AXES: Final = ("X", "Y", "Z")
 _HEAD: Final = 40  # number of lines within which a header ends
@@ -77,7 +78,7 @@ def _qualisys(lines: Sequence[str]) -> Capture | None:
     rows = _rows(lines, "\t")
     keys = {row[0]: row[1:] for row in rows[:_HEAD] if row and row[0].isupper() and row[0].replace("_", "").isalpha()}
     names = [name for name in keys.get("MARKER_NAMES", []) if name]
-    start = next((i for i, row in enumerate(rows) if row and _is_number(row[0])), None)
+    start = next((i for i, row in enumerate(rows) if row and is_number(row[0])), None)
     if not names or start is None:
         return None
     data = [row for row in rows[start:] if any(row)]
@@ -104,14 +105,14 @@ def _motive(lines: Sequence[str]) -> Capture | None:
             places.setdefault(named[k], []).append(k)
     unit = unit_of_text(keys.get("Length Units", "")) or "m"
     whole = {name: (found[0], found[1], found[2]) for name, found in places.items() if len(found) == 3}
-    data = [row for row in rows[end + 1 :] if row and _is_number(row[0])]
+    data = [row for row in rows[end + 1 :] if row and is_number(row[0])]
     return Capture(None, unit, whole, 1, data)
 
 
 def _vicon(lines: Sequence[str]) -> Capture | None:
     """Rate, names above every third column, axes, units, then rows with frame and subframe; other sections follow."""
     rows = _rows(lines, ",")
-    if len(rows) < 6 or not _is_number(rows[1][0] if rows[1] else ""):
+    if len(rows) < 6 or not is_number(rows[1][0] if rows[1] else ""):
         return None
     names, axes, units = rows[2], rows[3], rows[4]
     marked = [(name.rpartition(":")[2], k) for k, name in enumerate(names) if name]
@@ -123,14 +124,6 @@ def _vicon(lines: Sequence[str]) -> Capture | None:
 def _section(rows: Sequence[Sequence[str]]) -> Iterator[Sequence[str]]:
     """The rows up to the end of a section."""
     for row in rows:
-        if not row or not _is_number(row[0]):
+        if not row or not is_number(row[0]):
             return
         yield row
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
