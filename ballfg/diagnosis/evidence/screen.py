@@ -66,9 +66,14 @@ class Screen:
     @cached_property
     def gains(self) -> list[float]:
         """What each candidate adds to the evidence, at the model's noise, as far as the other half bears it out."""
-        weights = {one: self._with(one, self.model.weight) for one in range(len(self.candidates))}
-        names = {one: self._names((one,)) for one in weights}
-        return [tempered(names[one], weights[one], self._alone) - self.model.evidence for one in weights]
+        alone = self._alone
+        found = (tempered(self._names((one,)), weight, alone) for one, weight in enumerate(self._singles))
+        return [evidence - self.model.evidence for evidence in found]
+
+    @cached_property
+    def _singles(self) -> list[Weight]:
+        """The weight of the model with each candidate."""
+        return [self._with(one, self.model.weight) for one in range(len(self.candidates))]
 
     @property
     def _alone(self) -> dict[frozenset[str], tuple[Weight, float]]:
@@ -145,7 +150,7 @@ class Screen:
     def neighbours(self) -> dict[frozenset[str], Weight]:
         """The weight of every model with a further candidate, or with one in place of an effect, by its names."""
         found: dict[frozenset[str], Weight] = {}
-        further = {("", one): self._with(one, self.model.weight) for one in range(len(self.candidates))}
+        further = {("", one): weight for one, weight in enumerate(self._singles)}
         for (gone, one), weight in (further | self.exchanges).items():
             names = self.model.names - {gone} | {self.candidates[one].name}
             if names not in found or weight.score > found[names].score:
