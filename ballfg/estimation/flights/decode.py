@@ -24,7 +24,6 @@ from ballfg.estimation.flights.modes import (
     SLOW,
     STILL,
     STRIKE,
-    STRIKE_SPEEDS,
     SWAY,
     SWAYED,
     bounce,
@@ -113,10 +112,9 @@ def _branch(work: Work, kept: Records, place: int, index: int, dt: float, hands:
         if other <= SWAYED and (mode == FLYING or other == FLYING):
             work.bank[row].score -= brief
     if mode == FLYING:
-        for speed in STRIKE_SPEEDS:
-            row = add(work, kept, place)
-            strike(work.bank[row], speed, dt, scene)
-            _note(work, row, STRIKE, index, dt)
+        row = add(work, kept, place)
+        strike(work.bank[row], dt, scene)
+        _note(work, row, STRIKE, index, dt)
         row = add(work, kept, place)
         shift(work.bank[row], scene)
         _note(work, row, SHIFT, index, dt)

@@ -77,8 +77,8 @@ BOUNCE_JITTER: Final = 0.1
 """m/s."""
 SLOWEST_FALL: Final = 0.3
 """m/s. Slower balls are not tried with a bounce."""
-STRIKE_SPEEDS: Final = (8.0,)
-"""m/s. Spread of the velocity after a touch and after a strike, per axis."""
+STRIKE_SPEED: Final = 8.0
+"""m/s. Spread of the velocity after a strike, per axis."""
 
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, REAL, SCENE))
@@ -235,14 +235,14 @@ def stop(h: Record, dt: float) -> None:
         _moving(h, axis, 0.0, HAND_SPEED)
 
 
-@machine_code(NOTHING(ONE_HYPOTHESIS, REAL, REAL, SCENE))
-def strike(h: Record, speed: float, dt: float, scene: Record) -> None:
-    """A ball is struck at some time of the next interval of dt s, and flies on; speed: m/s, spread of its velocity."""
+@machine_code(NOTHING(ONE_HYPOTHESIS, REAL, SCENE))
+def strike(h: Record, dt: float, scene: Record) -> None:
+    """A ball is struck at some time of the next interval of dt s, and flies on."""
     h.surface, h.age = FLYING, 0
-    reach = scene.hit_spread**2 + (speed * min(dt, scene.short_gap)) ** 2
+    reach = scene.hit_spread**2 + (STRIKE_SPEED * min(dt, scene.short_gap)) ** 2
     for axis in range(3):
         h.cov[axis, 0, 0] += reach
-        _moving(h, axis, 0.0, speed)
+        _moving(h, axis, 0.0, STRIKE_SPEED)
         _accelerated(h, axis, 0.0, scene.slack)
 
 
