@@ -89,8 +89,10 @@ def calibrate_cameras(
         raise ValueError("--intrinsics must come with --table; got no --table. Without it there is nothing to find.")
     if focal_sigma is not None:
         check_range("--focal-sigma", focal_sigma, *ROUGHLY)
-    if focal_sigma is not None and (table is None or out.suffix.lower() not in OURS):
-        raise ValueError(f"--focal-sigma must come with --table and with an --out of {' or '.join(OURS)}. Give both.")
+        if table is None or out.suffix.lower() not in OURS:
+            raise ValueError(
+                f"--focal-sigma must come with --table and with an --out of {' or '.join(OURS)}. Give both."
+            )
     places = _grouped("images", images or ())
     shown = {name: read_grey(Path(paths[-1])) for name, paths in _grouped("view", view or ()).items()}
     marked = None if table is None else read_table(table)
