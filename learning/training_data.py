@@ -73,17 +73,17 @@ def read_training_data(config: TrainConfig) -> TrainingData:
     return TrainingData(shots, train, validation, analytic, embedding)
 
 
-def open_dataset(folder: str, anyway: bool = False) -> Dataset:
+def open_dataset(folder: str, anyway: bool | None = None) -> Dataset:
     """The flights of a folder with all readings beside its positions; notes on repairs and on the table go to stderr.
 
-    Args: anyway: True for tracks of which less than half falls like a ball.
+    Args: anyway: True for tracks of which less than half falls like a ball; None: the config has no such key.
     Raises: ValueError, FileNotFoundError: as in reading; ValueError: such tracks otherwise.
     """
     dataset = noted(with_readings(read_dataset(folder)))
     found = in_flight(dataset)
     for doubt in found.lines:
         print(f"doubt: {doubt}", flush=True)
-    found.check(folder, anyway)
+    found.check(folder, bool(anyway), "" if anyway is None else ", or set anyway: true")
     return found.dataset
 
 

@@ -6,7 +6,7 @@ import enum
 import operator
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +25,19 @@ if TYPE_CHECKING:
     from ballfg.estimation.smoother.track_graph import TrackGraph
 
 
-LABELS: Final = ("flight", "held", "rolling", "resting", "lost")
-"""What a sample may show, by its index in `Estimate.labels`."""
+class Label(enum.IntEnum):
+    """What a sample of a track shows, by its number in `Estimate.labels`; the name is the word in tables."""
+
+    FLIGHT = 0
+    """A ball that flies, bounces or is struck."""
+    HELD = 1
+    """A ball in a hand, that holds, carries, pushes, throws or catches it."""
+    ROLLING = 2
+    """A ball that rolls on something level."""
+    RESTING = 3
+    """A ball that lies on something."""
+    LOST = 4
+    """Something else than the ball."""
 
 
 class Status(enum.Enum):
@@ -96,7 +107,7 @@ class Estimate:
         iterations: linear solutions of a minimisation, 0 for methods without one.
         world: model, surfaces and process noise of the estimate; predictions use them.
         notes: doubts about the track: an axis that does not fall, bounces where no surface is declared.
-        labels: (n,) index of what each sample shows (docs/import.md): 0 flight, 1 held, 2 rolling, 3 resting, 4 lost;
+        labels: (n,) numbers of what samples show, as in `Label` (docs/import.md);
             empty for an estimator that is called by itself. What is no flight has its measured position.
     """
 
@@ -214,7 +225,8 @@ class Estimate:
         """The columns of `ballfg estimate`, (n,) each: t (s), the state, its standard deviations, what samples show."""
         states = dict(zip(STATE_NAMES, self.states.T, strict=True))
         sigmas = dict(zip(SIGMA_NAMES, self.sigmas.T, strict=True))
-        shown = np.array(LABELS, dtype=object)[self.labels if len(self.labels) else np.zeros(len(self), np.int8)]
+        words = np.array([label.name.lower() for label in Label], dtype=object)
+        shown = words[self.labels if len(self.labels) else np.zeros(len(self), np.int8)]
         return {"t": self.times, **states, **sigmas, "label": shown}
 
     def plot(self) -> Figure:

@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import Final
 
-import numpy as np
-
 from ballfg.estimation.configure import LEAST_TRACKS
-from ballfg.estimation.flights.cut import flies_throughout, pieces_of
-from ballfg.estimation.flights.dataset import ENOUGH, LOOKED_AT, SMOOTHED, UNDISTURBED, error_ratios, smoothed
-from ballfg.estimation.flights.labels import Label, label_samples
+from ballfg.estimation.flights.cut import flies_throughout, tracks_of
+from ballfg.estimation.flights.dataset import ENOUGH, SMOOTHED, Contents, smoothed
+from ballfg.estimation.flights.labels import label_samples
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.importing.choices import Guess
 from ballfg.importing.frame import Frame
@@ -72,16 +70,8 @@ class Recordings:
 
 def recordings(tracks: Sequence[Track]) -> Recordings:
     """The flights of imported tracks."""
-    flights, ratios, samples, flying = [], [], 0, 0
-    for i, track in enumerate(tracks):
-        labels = label_samples(track, ANY_BALL)
-        whole = flies_throughout(labels)
-        named = enumerate(pieces_of(labels))
-        flights.append([track] if whole else [piece.of(track, f"{track.name}-{k:03d}") for k, piece in named])
-        samples += len(track)
-        flying += len(track) if whole else int((labels.values == Label.FLIGHT).sum())
-        if i < LOOKED_AT:
-            ratios.append(error_ratios(track, labels))
-    held = np.concatenate(ratios)
-    smoothing = float(np.quantile(held, UNDISTURBED)) if len(held) else np.nan
-    return Recordings(tracks, flights, flying / samples, smoothing)
+    labelled = ((track, label_samples(track, ANY_BALL)) for track in tracks)
+    found = Contents.of(labelled, lambda _, labels: flies_throughout(labels))
+    pieces = (found.pieces[track.name] for track in tracks)
+    flights = [[track] if own is None else tracks_of(track, own) for track, own in zip(tracks, pieces, strict=True)]
+    return Recordings(tracks, flights, found.share, found.smoothing)

@@ -98,6 +98,7 @@ class _Estimated:
 def _estimated(model: BallModel, estimator: Estimator, track: Track) -> _Estimated:
     from ballfg.estimation.flights.estimates import in_sections
     from ballfg.estimation.out_of_distribution import out_of_distribution
+    from ballfg.estimation.result import Label
 
     columns, shares, notes, rows, hits, flying = [], list[float](), list[str](), 0, 0, 0
     status = None
@@ -107,7 +108,11 @@ def _estimated(model: BallModel, estimator: Estimator, track: Track) -> _Estimat
         columns.append(own if share is None else own | {"outside": share})
         shares += [] if share is None else [float(share.sum())]
         notes += part.notes
-        rows, hits, flying = rows + len(part.times), hits + len(part.hits), flying + int((part.labels != 1).sum())
+        rows, hits, flying = (
+            rows + len(part.times),
+            hits + len(part.hits),
+            flying + int((part.labels != Label.HELD).sum()),
+        )
         status = part.status if status is None or part.status.failed else status
     outside = sum(shares) / rows if shares else None
     assert status is not None

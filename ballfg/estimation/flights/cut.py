@@ -8,7 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.estimation.flights.labels import SHORTEST, Label, Labels, label_samples
+from ballfg.estimation.flights.labels import SHORTEST, Labels, label_samples
+from ballfg.estimation.result import Label
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.tracks import Track
 from ballfg.tracks.track import Label as TrackLabel
@@ -55,7 +56,17 @@ def flights_of(track: Track, physics: SegmentationPhysics, levels: Sequence[floa
     labels = label_samples(track, physics, levels)
     if flies_throughout(labels):
         return [track]
-    return [piece.of(track, f"{track.name}-{i:03d}") for i, piece in enumerate(pieces_of(labels))]
+    return tracks_of(track, pieces_of(labels))
+
+
+def names_of(track: str, pieces: Sequence[Piece]) -> list[str]:
+    """The names of the flights in a track of a name."""
+    return [f"{track}-{i:03d}" for i in range(len(pieces))]
+
+
+def tracks_of(track: Track, pieces: Sequence[Piece]) -> list[Track]:
+    """The flights in a track as tracks."""
+    return [piece.of(track, name) for name, piece in zip(names_of(track.name, pieces), pieces, strict=True)]
 
 
 def flies_throughout(labels: Labels) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice, pairwise
@@ -12,9 +12,10 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.dynamics.nominal import nominal_model
-from ballfg.estimation.flights.cut import Piece, pieces_of
+from ballfg.estimation.flights.cut import Piece, names_of, pieces_of, tracks_of
 from ballfg.estimation.flights.falling import contrasts
-from ballfg.estimation.flights.labels import Label, Labels, label_samples
+from ballfg.estimation.flights.labels import Labels, label_samples
+from ballfg.estimation.result import Label
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.tracks import Dataset, Track
 
@@ -53,24 +54,20 @@ class FlightsOf(Dataset):
             if pieces is None:
                 yield track
             else:
-                yield from (piece.of(track, name) for name, piece in self._named(track.name, pieces))
+                yield from tracks_of(track, pieces)
 
     @property
     def names(self) -> list[str]:
         """The names of the flights, in their order."""
         found = list[str]()
         for name, pieces in self._pieces.items():
-            found += [name] if pieces is None else [own for own, _ in self._named(name, pieces)]
+            found += [name] if pieces is None else names_of(name, pieces)
         return found
 
     def track(self, name: str) -> Track:
         """One flight by its name; errors as of a dataset."""
         found = next((track for track in self if track.name == name), None)
         return self._whole.track(name) if found is None else found
-
-    @staticmethod
-    def _named(name: str, pieces: list[Piece]) -> Iterator[tuple[str, Piece]]:
-        yield from ((f"{name}-{i:03d}", piece) for i, piece in enumerate(pieces))
 
 
 @dataclass(frozen=True)
@@ -108,12 +105,12 @@ class InFlight:
         known = any(SMOOTHING in doubt for doubt in self.dataset.info.doubts)
         return () if known or not self.smoothing > SMOOTHED else (smoothed(self.smoothing),)
 
-    def check(self, where: object, anyway: bool) -> None:
-        """Refuses a dataset that is mostly no flight. Raises: ValueError."""
+    def check(self, where: object, anyway: bool, say: str = ", or say --anyway") -> None:
+        """Refuses a dataset that is mostly no flight. Args: say: how to use it anyway. Raises: ValueError."""
         if self.share < ENOUGH and not anyway:
             raise ValueError(
                 f"{where} must show flights: only {100 * self.share:.0f} % of its samples fall like a ball. Cut them "
-                "out with ballfg import --flights, check units and axes, or say --anyway."
+                f"out with ballfg import --flights, check units and axes{say}."
             )
 
 
@@ -133,21 +130,45 @@ def in_flight(dataset: Dataset, most: int | None = None) -> InFlight:
     """
     physics = physics_of(nominal_model(dataset.ball))
     levels = (dataset.table + dataset.ball.radius, dataset.ball.radius)
-    pieces: dict[str, list[Piece] | None] = {}
-    ratios, samples, flying = list[Array](), 0, 0
-    for track in islice(iter(dataset), most):
-        labels = label_samples(track, physics, levels)
-        whole = labels.estimable(track.positions[:, 2], levels).all()
-        pieces[track.name] = None if whole else pieces_of(labels)
-        samples += len(track)
-        flying += len(track) if pieces[track.name] is None else int((labels.values == Label.FLIGHT).sum())
-        if len(pieces) <= LOOKED_AT:
-            ratios.append(error_ratios(track, labels))
-    mixed = sum(found is not None for found in pieces.values())
-    held = np.concatenate(ratios)
-    smoothing = float(np.quantile(held, UNDISTURBED)) if len(held) else np.nan
-    found = FlightsOf(dataset, pieces) if mixed else dataset
-    return InFlight(found, len(pieces), mixed, flying / samples, smoothing)
+
+    def whole(track: Track, labels: Labels) -> bool:
+        return bool(labels.estimable(track.positions[:, 2], levels).all())
+
+    labelled = ((track, label_samples(track, physics, levels)) for track in islice(iter(dataset), most))
+    found = Contents.of(labelled, whole)
+    mixed = sum(pieces is not None for pieces in found.pieces.values())
+    flights = FlightsOf(dataset, found.pieces) if mixed else dataset
+    return InFlight(flights, len(found.pieces), mixed, found.share, found.smoothing)
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What tracks hold.
+
+    Attributes:
+        pieces: flights by name of the track; None where a track is used as a whole.
+        share: of the samples that are flight, 0 to 1.
+        smoothing: as of `InFlight`.
+    """
+
+    pieces: dict[str, list[Piece] | None]
+    share: float
+    smoothing: float
+
+    @classmethod
+    def of(cls, labelled: Iterable[tuple[Track, Labels]], whole: Callable[[Track, Labels], bool]) -> Contents:
+        """Of labelled tracks. Args: whole: True for a track that is used as a whole."""
+        pieces: dict[str, list[Piece] | None] = {}
+        ratios, samples, flying = list[Array](), 0, 0
+        for track, labels in labelled:
+            own = pieces[track.name] = None if whole(track, labels) else pieces_of(labels)
+            samples += len(track)
+            flying += len(track) if own is None else int((labels.values == Label.FLIGHT).sum())
+            if len(pieces) <= LOOKED_AT:
+                ratios.append(error_ratios(track, labels))
+        held = np.concatenate(ratios)
+        smoothing = float(np.quantile(held, UNDISTURBED)) if len(held) else np.nan
+        return cls(pieces, flying / samples, smoothing)
 
 
 def error_ratios(track: Track, labels: Labels) -> Array:

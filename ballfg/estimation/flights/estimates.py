@@ -11,8 +11,8 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.estimation.estimator import Estimator
-from ballfg.estimation.flights.labels import SHORTEST, Label, Labels, label_samples
-from ballfg.estimation.result import Estimate, Status
+from ballfg.estimation.flights.labels import SHORTEST, Labels, label_samples
+from ballfg.estimation.result import Estimate, Label, Status
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.settings import sample_sigmas
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 from itertools import pairwise
 from typing import Final
 
@@ -16,6 +15,7 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.flights.decode import decode
 from ballfg.estimation.flights.falling import falls_throughout, scatter
 from ballfg.estimation.flights.modes import BOUNCE, CHANGE, ROLLING, STILL, STRIKE
+from ballfg.estimation.result import Label
 from ballfg.estimation.segmentation.bank import FLYING, Scene
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.estimation.segmentation.result import OUTLIER
@@ -44,21 +44,6 @@ ALIKE: Final = 0.03
 """m. Places within this height of each other are on one surface."""
 HANDS: Final = 30.0
 """nats, by which hands must explain a recording better than flights, strikes and bounces alone."""
-
-
-class Label(IntEnum):
-    """What a sample of a track shows."""
-
-    FLIGHT = 0
-    """A ball that flies, bounces or is struck."""
-    HELD = 1
-    """A ball in a hand, that holds, carries, pushes, throws or catches it."""
-    ROLLING = 2
-    """A ball that rolls on something level."""
-    RESTING = 3
-    """A ball that lies on something."""
-    LOST = 4
-    """Something else than the ball."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from ballfg.estimation.flights.cut import pieces_of
 from ballfg.estimation.flights.dataset import ENOUGH, SMOOTHED, UNDISTURBED, error_ratios
-from ballfg.estimation.flights.labels import Label, label_samples
-from ballfg.estimation.result import LABELS
+from ballfg.estimation.flights.labels import label_samples
+from ballfg.estimation.result import Label
 from ballfg.importing.recordings import ANY_BALL
 from tests.estimation.flights.recordings import FLIGHT, KINDS, Recording, recording
 
@@ -81,7 +81,7 @@ def hidden(one: Recording, end: int, found: int) -> bool:
 def take(one: Recording, count: Count) -> None:
     """Adds a recording."""
     labels = label_samples(one.track, ANY_BALL)
-    names = np.array(LABELS)[labels.values]
+    names = np.array([label.name.lower() for label in Label])[labels.values]
     truth, flying = np.array(one.labels), np.array(one.labels) == FLIGHT
     count.samples, count.right = count.samples + len(names), count.right + int((names == truth).sum())
     found = labels.stretches(Label.FLIGHT)

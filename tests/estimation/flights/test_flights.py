@@ -15,8 +15,9 @@ from ballfg.estimation.flights.dataset import error_ratios, in_flight
 from ballfg.estimation.flights.decode import _compact
 from ballfg.estimation.flights.estimates import estimated
 from ballfg.estimation.flights.falling import falls_throughout, scatter
-from ballfg.estimation.flights.labels import Label, label_samples
+from ballfg.estimation.flights.labels import label_samples
 from ballfg.estimation.flights.modes import _wandered
+from ballfg.estimation.result import Label
 from ballfg.estimation.segmentation.bank import HYPOTHESIS, LOGGED, WRITTEN
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.tracks import TABLE_TENNIS, Track, read_dataset, write_dataset
