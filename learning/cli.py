@@ -43,8 +43,8 @@ def train(
     groups and one with a learned correction of drag and lift, and writes the best.
 
     The exit status is 1 if no epoch predicts the validation tracks better than the model before the first step, a
-    calibrated model does not predict the judging tracks better than the one before, or kind: auto keeps that one.
-    After Ctrl-C the best model so far is written.
+    calibrated model does not predict the judging tracks better than the one before, or kind: auto keeps that one
+    or chooses one that predicts them worse. After Ctrl-C the best model so far is written.
 
     Example: ballfg-train train.yaml --data data/ballgun --out ballgun-model kind=mnn+gs optimizer.epochs=30
     """

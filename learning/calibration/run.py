@@ -4,6 +4,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -67,8 +68,7 @@ def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jo
     """Calibrate coefficients and write the folder of the run; to `resume` is to continue after the last finished step.
 
     Args: jobs: number of processes where the config has none.
-    Returns: the exit status of `ballfg-train`: 0 if the calibrated model predicts the judging tracks better than the
-        model before, else 1, as if `kind: auto` keeps the nominal model.
+    Returns: the exit status of `ballfg-train`, as of `status_of`; 1 if `kind: auto` keeps the nominal model.
     Raises: ValueError, FileNotFoundError: bad input. KeyboardInterrupt: after Ctrl-C; finished steps are kept.
     """
     with files.running(folder, config, resume=resume):
@@ -83,6 +83,7 @@ def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jo
         fit, judge = len(problem.split.fit), len(problem.split.judge)
         print(f"{folder / files.CONFIG}: the config; {fit} tracks fit, {judge} judge")
         found: dict[str, Fitted] = {}
+        finish = partial(_finish, folder=folder, watch=watch, proven=config.kind == AUTO)
         if config.kind == AUTO:
             chosen, found = _chosen(problem, folder, resume, watch)
             if chosen in UNLEARNED:
@@ -104,11 +105,11 @@ def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jo
         try:
             _steps(problem, calibrated, folder, watch)  # none are left of a candidate that was just compared
             if not problem.config.correction:
-                return _finish(problem, calibrated, folder, watch)
+                return finish(problem, calibrated)
             last = last or pose_correction(problem, calibrated[-1], watch)
             _check_follows(corrected, last, folder / files.STEPS)
             _steps(last, corrected, folder, watch, (problem, calibrated))
-            return _finish(last, [calibrated[0], *corrected], folder, watch)
+            return finish(last, [calibrated[0], *corrected])
         except KeyboardInterrupt:
             kept = len(calibrated) + len(corrected)
             print(f"{kept} steps are kept; continue with --resume {folder}", file=sys.stderr)
@@ -181,10 +182,18 @@ def _line(problem: Problem, step: Step, left: float) -> str:
     return "; ".join(parts)
 
 
-def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch) -> int:
+def status_of(word: str, *, proven: bool) -> int:
+    """The exit status: 0 for a model that predicts the judging tracks better than the one before, else 1.
+
+    Args: word: as of `outcome`.  proven: True if the fitted tracks chose the model, which is then 0 unless it is worse.
+    """
+    return 0 if word == "better" or (proven and word != "worse") else NOT_BETTER
+
+
+def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch, proven: bool) -> int:
     """Judge once more with the spread as the prior and with the noise, write the results and print their paths.
 
-    Returns: the exit status.
+    Returns: the exit status. Args: proven: as of `status_of`.
     """
     last = steps[-1]
     population, model = population_settings(problem, last), population_model(problem, last)
@@ -204,7 +213,7 @@ def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch)
     print(f"\n{found['verdict']}\n\n{table(problem, last, comparison)}\n")
     print(f"{folder / files.MODEL}: the calibrated model, for the --model of other commands")
     print(f"{folder / files.REPORT}: all numbers\n{folder / files.PICTURE}")
-    return 0 if outcome(comparison) == "better" else NOT_BETTER
+    return status_of(outcome(comparison), proven=proven)
 
 
 def write_checkpoint(folder: Path, problem: Problem, steps: Sequence[Step], corrected: Sequence[Step] = ()) -> None:

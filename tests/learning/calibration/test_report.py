@@ -12,6 +12,7 @@ from ballfg.dynamics import nominal_model
 from ballfg.learning.calibration.calibrate import Problem, Step, pose
 from ballfg.learning.calibration.gain import gain_of
 from ballfg.learning.calibration.report import Comparison, outcome, report, table, verdict
+from ballfg.learning.calibration.run import status_of
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import Summary
 from ballfg.tracks import read_dataset
@@ -55,6 +56,12 @@ def test_whether_it_predicts_better_is_said_first(problem: Problem, change: floa
     judged = report(problem, step(problem), comparison, None)["judged"]
     assert (judged["outcome"], judged["worse"]) == (word, word == "worse")
     assert outcome(NONE) == "not known"
+
+
+def test_status_of_a_model_that_the_fitted_tracks_chose_is_1_only_if_it_is_worse() -> None:
+    words = ("better", "no different", "not known", "worse")
+    assert [status_of(word, proven=False) for word in words] == [0, 1, 1, 1]
+    assert [status_of(word, proven=True) for word in words] == [0, 0, 0, 1]
 
 
 def test_interval_is_students() -> None:
