@@ -12,11 +12,11 @@ import torch
 import torch.autograd.forward_ad as forward
 from torch import Tensor
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Index
 from ballfg.diagnosis.fit.dual import dual_level, make_dual
 from ballfg.diagnosis.fit.moved_shot import Coefficients, shoot_compiled
 from ballfg.diagnosis.fit.shooting import shoot
-from ballfg.diagnosis.fit.stretches import Stretches
+from ballfg.diagnosis.fit.stretches import Stretches, of_similar_length
 from ballfg.diagnosis.fit.tangents import MovedArc, RepeatedMotion
 from ballfg.dynamics import BallModel
 from ballfg.dynamics.compiled.functions import CompiledModel, compiled
@@ -111,7 +111,12 @@ def sensitivity(
     # a fit takes many steps with one model, a score test one step each with many
     functions = compiled(model) if by_start and not shapes else None
     if functions is not None:
-        return _compiled_derivatives(functions, model, stretches, starts, values, wanted)
+        positions, labels = np.zeros((*stretches.positions.shape, len(wanted))), np.zeros((len(starts), 3, len(wanted)))
+        for rows, count in of_similar_length(stretches.used.numpy()):
+            part, own = stretches.take(rows).cropped(count), {n: _of_rows(value, rows) for n, value in values.items()}
+            found = _compiled_derivatives(functions, model, part, starts[rows], own, wanted)
+            positions[rows, :count], labels[rows] = found.positions, found.labels
+        return Sensitivity(positions, labels)
     size = max(1, most_rows // len(stretches))
     parts = [
         _derivatives(model, stretches, starts, values, wanted[first : first + size])
@@ -119,6 +124,11 @@ def sensitivity(
     ]
     positions, labels = ([getattr(part, name) for part in parts] for name in ("positions", "labels"))
     return Sensitivity(np.concatenate(positions, axis=-1), np.concatenate(labels, axis=-1))
+
+
+def _of_rows(value: float | Array, rows: Index) -> float | Array:
+    """A coefficient of some rows: one number for all, or (n,) one for each."""
+    return value[rows] if isinstance(value, np.ndarray) and value.ndim else value
 
 
 def _compiled_derivatives(

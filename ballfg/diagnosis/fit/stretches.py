@@ -28,6 +28,8 @@ MOST_CONTACTS = 3
 sensitive to its start, while the last small hops of a ball carry little information."""
 LEAST_DURATION = 0.08
 """s. A shorter stretch also carries little information."""
+SIMILAR = 1.3
+"""Ratio of the numbers of samples of stretches that are computed together."""
 TENSORS = ("times", "positions", "sigmas", "starts", "heights", "contacts", "labels")
 """Names of the tensors of `Stretches`."""
 PADDING = {"sigmas": math.inf, "heights": math.nan, "contacts": math.nan}
@@ -87,6 +89,20 @@ class Stretches:
         tensors = {name: getattr(self, name)[where] for name in TENSORS}
         names = tuple(self.names[i] for i in index)
         return replace(self, names=names, track=self.track[index], settings=self.settings[index], **tensors)
+
+    def cropped(self, count: int) -> Self:
+        """The first `count` samples of each."""
+        return replace(self, **{name: getattr(self, name)[:, :count] for name in ("times", "positions", "sigmas")})
+
+
+def of_similar_length(used: Mask) -> list[tuple[Index, int]]:
+    """Rows of stretches with about as many samples, and the number of samples of the longest of them.
+
+    One long stretch would pad all others to its length. Args: used: (n, k) True for samples, which come first.
+    """
+    counts = used.sum(axis=1)
+    sizes = np.ceil(np.log(np.maximum(counts, 1)) / math.log(SIMILAR))
+    return [(rows, int(counts[rows].max())) for rows in (np.flatnonzero(sizes == size) for size in np.unique(sizes))]
 
 
 def stretches_of(smoother: Smoother, tracks: Iterable[Track], launcher: Launcher, jobs: int = 1) -> Stretches:

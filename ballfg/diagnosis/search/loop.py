@@ -15,7 +15,7 @@ from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.weighed import WORTH_A_STEP, Weighed, weighed
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.holdout import Holdout
-from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.fit.problem import Fit, Problem
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, without_effect
 from ballfg.diagnosis.hypotheses.varying import Grouping, groupings
 from ballfg.diagnosis.result import Candidate, Errors, Finding
@@ -226,7 +226,7 @@ class _Found:
                 continue
             tell(f"fitting with {other.name} in place of {gone}")
             candidate = next(s for s in scored if s.hypothesis is other)
-            refitted = refit(without_named(best.fit, own, self.first), candidate)
+            refitted = refit(without_named(best.fit, [own], self.first), candidate)
             named = (*(h for h in best.named if h is not own), other)
             found = weighed(refitted.fit, named, self.motion, self.halves, best.noise)
             self.models[found.names] = found
@@ -294,9 +294,7 @@ class _Found:
         poor = known is not None and names in model.nested and known.score < model.nested[names].score - WORTH_A_STEP
         if known is None or (poor and (model.names, names) not in self.tried):
             self.tried.add((model.names, names))
-            fit = model.fit
-            for hypothesis in gone:
-                fit = without_named(fit, hypothesis, self.first)
+            fit = without_named(model.fit, gone, self.first)
             found = weighed(fit, kept, self.motion, self.halves, model.noise)
             self.models[names] = found if known is None else max(known, found, key=_score)
         return self.models[names]
@@ -334,9 +332,7 @@ class _Found:
         Only if the later one's linearisation says that they have.
         """
         if before.names in after.nested and after.nested[before.names].score > before.score:
-            fit = after.fit
-            for hypothesis in after.named[len(before.named) :]:
-                fit = without_named(fit, hypothesis, self.first)
+            fit = without_named(after.fit, after.named[len(before.named) :], self.first)
             again = weighed(fit, before.named, self.motion, self.halves, before.noise)
             if again.score > before.score:
                 self.models[before.names] = again
@@ -356,10 +352,18 @@ def _score(model: Weighed) -> float:
     return model.score
 
 
-def without_named(fit: Fit, hypothesis: Hypothesis, first: Fit) -> Fit:
-    """The fit without one of the effects added to the first one's model, at the same noise."""
-    problem, name = fit.problem, hypothesis.effect.name
-    gone = set(hypothesis.columns)
+def without_named(fit: Fit, gone: Sequence[Hypothesis], first: Fit) -> Fit:
+    """The fit without some of the effects added to the first one's model, at the same noise."""
+    problem = fit.problem
+    for hypothesis in gone:
+        problem = _problem_without(problem, hypothesis, first)
+    unknowns = replace(fit.unknowns, values={n: fit.unknowns.values[n] for n in problem.free})
+    return fit_problem(problem, unknowns, fit.noise, settle_noise=False)
+
+
+def _problem_without(problem: Problem, hypothesis: Hypothesis, first: Fit) -> Problem:
+    """The problem without an effect that the first fit's model lacks, or without its free coefficients."""
+    name, gone = hypothesis.effect.name, set(hypothesis.columns)
     needed = has_effect(first.problem.model, name)
     if hypothesis.deviations():  # the effect itself may have been named too, the same for all tracks
         needed |= any(n.startswith(f"{hypothesis.effect.kind}.{name}.") for n in problem.free if n not in gone)
@@ -367,6 +371,4 @@ def without_named(fit: Fit, hypothesis: Hypothesis, first: Fit) -> Fit:
     left = dict(model.named_parameters())
     deviations = {n: d for n, d in problem.deviations.items() if d.coefficient in left and n not in gone}
     free = {n: c for n, c in problem.free.items() if (n in left or n in deviations) and n not in gone}
-    unknowns = replace(fit.unknowns, values={n: fit.unknowns.values[n] for n in free})
-    problem = replace(problem, model=model, free=free, deviations=deviations)
-    return fit_problem(problem, unknowns, fit.noise, settle_noise=False)
+    return replace(problem, model=model, free=free, deviations=deviations)

@@ -108,7 +108,7 @@ def test_values_that_a_model_declares_are_fitted(found, two_balls, holdout, make
 
 def test_without_it_the_fit_is_the_one_before(found, before):
     best = found[1][0]
-    alone = without_named(best.fit, best.scored.hypothesis, before)
+    alone = without_named(best.fit, [best.scored.hypothesis], before)
     assert alone.problem.deviations == {}
     assert set(alone.problem.free) == set(before.problem.free)
     assert alone.cost == pytest.approx(before.cost, rel=1e-4)
@@ -119,7 +119,7 @@ def test_an_absent_effect_that_differs_leaves_the_model_with_its_deviations(befo
     hypothesis = Varying.of(EFFECTS["wind"], ("x", "y"), ways[0])
     fitted = refit(before, Scored(hypothesis, None, 1.0)).fit
     assert "wind" in fitted.problem.model.flight
-    assert "wind" not in without_named(fitted, hypothesis, before).problem.model.flight
+    assert "wind" not in without_named(fitted, [hypothesis], before).problem.model.flight
 
 
 def test_columns_are_the_differences_of_predictions(before, holdout):
