@@ -32,6 +32,7 @@ from ballfg.estimation.noise.estimate import NoiseEstimate, spread_over
 from ballfg.estimation.noise.parameters import with_noise
 from ballfg.estimation.observations.sighted_dataset import SightedDataset
 from ballfg.estimation.registry import make_estimator
+from ballfg.factors.loss import Loss
 from ballfg.learning.calibration.coefficients import ONE_VIEW, USUAL, Chosen, choose, with_values
 from ballfg.learning.calibration.correction import Correction, doubt_sigmas, set_doubts, with_correction, with_weights
 from ballfg.learning.calibration.groups import Groups, GroupSpin
@@ -177,11 +178,13 @@ def pose_correction(
     model, settings, names = population_model(problem, last), population_settings(problem, last), problem.split.fit
     noise = noise or fitted_noise(problem, model, settings, watch, errors=False)
     settings = settings if noise is None else noise.settings
+    # a wrong lift contradicts right labels: how fast the balls spin, and so what the functions span, is theirs to say
+    settings = replace(settings, spin_label_noise=problem.settings.spin_label_noise, label_loss=Loss("squared"))
     smoother = make_estimator("smoother", model, problem.surfaces, settings)
     estimates = estimate_tracks(smoother, tracks_of(problem.dataset, names), len(names), problem.jobs)
-    corrected, terms = with_correction(model, watch(estimates, len(names), "tracks estimated"))
-    corrected.variations = dict(problem.model.variations)  # those of groups are found anew
     labelled = problem.groups is not None and bool(problem.groups.labelled)
+    corrected, terms = with_correction(model, watch(estimates, len(names), "tracks estimated"), labelled=labelled)
+    corrected.variations = dict(problem.model.variations)  # those of groups are found anew
     chosen = with_weights(corrected, problem.chosen, labelled=labelled)
     mean = np.concatenate((last.mean, np.zeros(len(chosen.shared))))
     config = problem.config.model_copy(update={"tolerance": max(problem.config.tolerance, ROUGHLY)})
@@ -253,7 +256,7 @@ def score(
 def population_settings(problem: Problem, step: Step) -> Settings:
     """Settings with the population's distribution of a new track as the prior of each calibrated number."""
     learned = {name: step.next_track[k] for k, name in problem.chosen.listed}
-    learned |= {} if problem.correction is None else doubt_sigmas()
+    learned |= {} if problem.correction is None else doubt_sigmas(problem.model)
     settings = replace(problem.settings, coefficients={**problem.settings.coefficients, **learned})
     groups = problem.groups
     return settings if groups is None else groups.settings(settings, groups.population(step.spins))
@@ -291,12 +294,11 @@ def fitted_noise(
         watch=watch,
         jobs=problem.jobs,
     )
-    return found if found is None or problem.correction is None else _with_doubts(found)
+    return found if found is None or problem.correction is None else _with_doubts(found, doubt_sigmas(problem.model))
 
 
-def _with_doubts(found: NoiseEstimate) -> NoiseEstimate:
+def _with_doubts(found: NoiseEstimate, doubts: dict[str, float]) -> NoiseEstimate:
     """The noise with doubts as wide as their posterior: tracks that taught the weights show less of them."""
-    doubts = doubt_sigmas()
     spreads = {name: sigma for name, sigma in found.noise.coefficients.items() if name not in doubts}
     settings = replace(found.settings, coefficients={**found.settings.coefficients, **doubts})
     return replace(found, noise=replace(found.noise, coefficients=spreads), settings=settings)

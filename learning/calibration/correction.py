@@ -17,7 +17,15 @@ import torch
 from ballfg.arrays import Array
 from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.effect import Effect
-from ballfg.dynamics.effects.generic import DOUBTS, FUNCTIONS, WEIGHTS, AirCorrection, correction_terms
+from ballfg.dynamics.effects.generic import (
+    DOUBT,
+    DOUBTS,
+    FORCES,
+    FUNCTIONS,
+    WEIGHTS,
+    AirCorrection,
+    correction_terms,
+)
 from ballfg.estimation import Estimate, Status
 from ballfg.learning.calibration.coefficients import Chosen, choose, values_of
 from ballfg.learning.calibration.groups import GroupSpin
@@ -60,20 +68,29 @@ class Correction:
     terms: Array
 
     def doubts(self, covariance: Array) -> tuple[tuple[float, ...], ...]:
-        """`DOUBTS` directions of the weights, those that move drag and lift most at the samples.
+        """`DOUBTS` directions of the weights of each force, first of drag, those that move it most at the samples.
+
+        Each force has its own, for one of them would take most of those that both shared.
 
         Args: covariance: (7, 7) of the weights of drag, or (14, 14) with those of lift.
         """
-        values, vectors = np.linalg.eigh(covariance)
-        root = vectors * np.sqrt(np.maximum(values, 0.0))
-        metric = np.kron(np.eye(len(covariance) // len(FUNCTIONS)), self.terms + ELSEWHERE * np.eye(len(FUNCTIONS)))
-        _, turns = np.linalg.eigh(root.T @ metric @ root)
-        return tuple(tuple(row) for row in (root @ turns[:, ::-1][:, :DOUBTS]).T.tolist())
+        count, found = len(FUNCTIONS), list[tuple[float, ...]]()
+        metric = self.terms + ELSEWHERE * np.eye(count)
+        for first in range(0, len(covariance), count):
+            own = slice(first, first + count)
+            values, vectors = np.linalg.eigh(covariance[own, own])
+            root = vectors * np.sqrt(np.maximum(values, 0.0))
+            _, turns = np.linalg.eigh(root.T @ metric @ root)
+            found += [tuple(row) for row in (root @ turns[:, ::-1][:, :DOUBTS]).T.tolist()]
+        return tuple(found)
 
 
-def with_correction(model: AnalyticModel, estimates: Iterable[Estimate]) -> tuple[AnalyticModel, Array]:
+def with_correction(
+    model: AnalyticModel, estimates: Iterable[Estimate], *, labelled: bool
+) -> tuple[AnalyticModel, Array]:
     """A copy of the model with a correction of zero, whose functions span the samples of some estimates.
 
+    Args: labelled: as for `with_weights`; without it, lift has no doubts.
     Returns: the model, and `Correction.terms`.
     Raises: ValueError: if the model has a correction or no drag or Magnus force, or no estimate converged.
     """
@@ -93,7 +110,8 @@ def with_correction(model: AnalyticModel, estimates: Iterable[Estimate]) -> tupl
         places.append(torch.from_numpy((values - shape[name]) / shape[f"{name}_scale"])[:, None])
     terms = correction_terms(places[0], places[1]).numpy()
     effect = AirCorrection(**shape)
-    effect.set_sigmas(**dict.fromkeys(WEIGHTS, LINEAR))
+    known = [] if labelled else [f"{DOUBT['lift']}_{k}" for k in range(1, DOUBTS + 1)]
+    effect.set_sigmas(**dict.fromkeys(WEIGHTS, LINEAR), **dict.fromkeys(known, 0.0))
     effects = [
         copy.deepcopy(cast(Effect, one))
         for group in (model.flight, model.bounce, model.measurement)
@@ -104,12 +122,13 @@ def with_correction(model: AnalyticModel, estimates: Iterable[Estimate]) -> tupl
 
 
 def set_doubts(model: AnalyticModel, doubts: Sequence[Sequence[float]]) -> None:
-    """Put the directions of the weights' uncertainty into a model with a correction."""
+    """Put the directions of the weights' uncertainty into a model with a correction; as of `Correction.doubts`."""
     parameters = dict(model.named_parameters())
     with torch.no_grad():
-        for k, direction in enumerate(doubts, start=1):
-            for name, value in zip(ALL, direction, strict=False):  # those of drag come first
-                parameters[f"{name}_{k}"].fill_(value)
+        for number, direction in enumerate(doubts):
+            force, k = FORCES[number // DOUBTS], number % DOUBTS + 1
+            for term, value in zip(FUNCTIONS, direction, strict=True):
+                parameters[f"{SECTION}.{force}_{term}_{k}"].fill_(value)
 
 
 def learned(model: AnalyticModel, force: str, speed: Array, ratio: Array) -> tuple[Array, Array]:
@@ -152,9 +171,11 @@ def places(model: AnalyticModel) -> tuple[Array, Array]:
     return np.array([speed, *ends["speed"], speed, speed]), np.array([ratio, ratio, ratio, *ends["ratio"]])
 
 
-def doubt_sigmas() -> dict[str, float]:
-    """Prior standard deviations of the doubts, by name."""
-    return {f"{SECTION}.doubt_{k}": 1.0 for k in range(1, DOUBTS + 1)}
+def doubt_sigmas(model: AnalyticModel) -> dict[str, float]:
+    """Prior standard deviations of the doubts, by name; model: with a correction."""
+    known = model.declared_coefficients()
+    names = (f"{SECTION}.{prefix}_{k}" for prefix in DOUBT.values() for k in range(1, DOUBTS + 1))
+    return {name: known[name].sigma for name in names if known[name].sigma > 0.0}
 
 
 def with_weights(model: AnalyticModel, chosen: Chosen, *, labelled: bool) -> Chosen:

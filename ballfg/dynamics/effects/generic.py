@@ -54,8 +54,10 @@ MEASUREMENT_BOUND: Final = 100.0
 FUNCTIONS: Final = ("one", "v", "s", "vv", "vs", "ss", "far")
 """Functions of one correction: v and s are speed and spin ratio from their centres."""
 FORCES: Final = ("drag", "lift")
-DOUBTS: Final = 4
-"""Number of directions of the weights whose uncertainty an estimate carries."""
+DOUBTS: Final = 5
+"""Number of directions of the weights of a force whose uncertainty an estimate carries."""
+DOUBT: Final = {"drag": "doubt", "lift": "lift_doubt"}
+"""Prefix of the names of a force's doubts."""
 SLOWEST: Final = 1e-9
 """m/s. Keeps the spin ratio finite at rest, where the correction is that of `far` and the forces are zero."""
 LEAST_REST: Final = 1e-12
@@ -203,7 +205,9 @@ def _shape() -> tuple[Coefficient, ...]:
 def _numbers() -> tuple[Coefficient, ...]:
     weights = tuple(Coefficient(name, 0.0, 0.0, "1", -LIMIT, LIMIT) for name in WEIGHTS)
     doubts = tuple(
-        Coefficient(f"doubt_{k}", 0.0, 1.0, "1", -1e3, 1e3, varies=True, absent=None) for k in range(1, DOUBTS + 1)
+        Coefficient(f"{prefix}_{k}", 0.0, 1.0, "1", -1e3, 1e3, varies=True, absent=None)
+        for prefix in DOUBT.values()
+        for k in range(1, DOUBTS + 1)
     )
     directions = tuple(
         Coefficient(f"{name}_{k}", 0.0, 0.0, "1", -LIMIT, LIMIT, absent=None)
@@ -222,8 +226,8 @@ class AirCorrection(FlightEffect):
     deviation is s at every speed and spin. Far from the data only that last function is left: the correction is zero
     with the prior's width (C. Rasmussen, C. Williams, "Gaussian Processes for Machine Learning", 2006, 2.1 and 4.3).
 
-    Each weight is its mean plus the doubts, of standard deviation 1, times their directions: the leading part of the
-    posterior that `ballfg-train` found. Estimates carry the doubts as coefficients of each track.
+    Each weight is its mean plus the doubts of its force, of standard deviation 1, times their directions: the leading
+    part of the posterior that `ballfg-train` found. Estimates carry the doubts as coefficients of each track.
     """
 
     name = "air_correction"
@@ -252,5 +256,5 @@ class AirCorrection(FlightEffect):
         total = vector(*(getattr(self, name) for name in names))
         for k in range(1, DOUBTS + 1):
             direction = vector(*(getattr(self, f"{name}_{k}") for name in names))
-            total = total + getattr(self, f"doubt_{k}") * direction
+            total = total + getattr(self, f"{DOUBT[force]}_{k}") * direction
         return total

@@ -11,7 +11,7 @@ import torch
 from ballfg.dynamics import AnalyticModel, load_model, nominal_model, save_model
 from ballfg.dynamics.effects import generic, registry
 from ballfg.dynamics.effects.flight import Drag, Gravity, Magnus
-from ballfg.dynamics.effects.generic import DOUBTS, WEIGHTS, AirCorrection, correction_terms
+from ballfg.dynamics.effects.generic import DOUBT, DOUBTS, WEIGHTS, AirCorrection, correction_terms
 from ballfg.state import STANDARD_GRAVITY
 
 LOW, HIGH = -4.0, 4.0
@@ -24,7 +24,7 @@ def column(values: np.ndarray) -> torch.Tensor:
 def random_correction(seed: int = 3) -> AirCorrection:
     rng = np.random.default_rng(seed)
     numbers = {f"{name}_{k}": 0.1 * rng.normal() for name in WEIGHTS for k in range(1, DOUBTS + 1)}
-    doubts = {f"doubt_{k}": rng.normal() for k in range(1, DOUBTS + 1)}
+    doubts = {f"{prefix}_{k}": rng.normal() for prefix in DOUBT.values() for k in range(1, DOUBTS + 1)}
     return AirCorrection(**{name: 0.3 * rng.normal() for name in WEIGHTS}, **numbers, **doubts)
 
 
@@ -79,7 +79,7 @@ def test_the_gains_are_those_of_the_formula() -> None:
     gains = []
     for force in ("drag", "lift"):
         weights = [
-            values[name] + sum(values[f"{name}_{k}"] * values[f"doubt_{k}"] for k in range(1, DOUBTS + 1))
+            values[name] + sum(values[f"{name}_{k}"] * values[f"{DOUBT[force]}_{k}"] for k in range(1, DOUBTS + 1))
             for name in WEIGHTS
             if name.startswith(force)
         ]
@@ -119,7 +119,7 @@ def test_a_model_file_keeps_it(tmp_path: Path) -> None:
     assert isinstance(kept, AirCorrection)
     assert kept.values() == effect.values()
     assert {name for name, c in found.declared_coefficients().items() if "doubt" in name and c.varies} == {
-        f"flight.air_correction.doubt_{k}" for k in range(1, DOUBTS + 1)
+        f"flight.air_correction.{prefix}_{k}" for prefix in DOUBT.values() for k in range(1, DOUBTS + 1)
     }
 
 

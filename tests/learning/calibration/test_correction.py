@@ -9,6 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
+from scipy import linalg
 
 from ballfg.dynamics import AnalyticModel, Surfaces, load_model, nominal_model
 from ballfg.dynamics.effects.flight import Drag, DragSpeed, Gravity, Magnus
@@ -170,10 +171,11 @@ def test_all_tracks_share_the_weights(curved: tuple[Problem, Step, Problem, Step
 
 def test_directions_keep_the_variance_that_matters_at_the_samples() -> None:
     rng = np.random.default_rng(1)
-    root, samples = rng.normal(size=(14, 3)), rng.normal(size=(7, 30))
-    covariance = root @ root.T  # of rank three, so that four directions keep all of it
+    drag, lift, samples = rng.normal(size=(7, 3)), rng.normal(size=(7, 3)), rng.normal(size=(7, 30))
+    covariance = linalg.block_diag(drag @ drag.T, lift @ lift.T)  # of rank three each: five directions keep all of it
     kept = np.array(Correction(np.zeros(1), (), samples @ samples.T / 30.0).doubts(covariance))
-    np.testing.assert_allclose(kept.T @ kept, covariance, atol=1e-9)
+    of_drag, of_lift = kept[:DOUBTS], kept[DOUBTS:]
+    np.testing.assert_allclose(linalg.block_diag(of_drag.T @ of_drag, of_lift.T @ of_lift), covariance, atol=1e-9)
 
 
 def test_a_run_writes_the_correction_and_continues(tmp_path: Path) -> None:
@@ -195,11 +197,11 @@ def test_a_run_writes_the_correction_and_continues(tmp_path: Path) -> None:
 
 def test_a_second_correction_is_refused() -> None:
     model = AnalyticModel([Gravity(), Drag(), Magnus(), AirCorrection()])
-    set_doubts(model, [[0.1] * len(WEIGHTS)] * DOUBTS)
+    set_doubts(model, [[0.1] * len(FUNCTIONS)] * 2 * DOUBTS)
     with pytest.raises(ValueError, match=r"must not have flight\.air_correction yet"):
-        with_correction(model, [])
+        with_correction(model, [], labelled=True)
     with pytest.raises(ValueError, match="every one failed"):
-        with_correction(nominal_model(), [])
+        with_correction(nominal_model(), [], labelled=False)
 
 
 def test_a_correction_needs_groups() -> None:
