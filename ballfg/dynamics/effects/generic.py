@@ -54,7 +54,7 @@ MEASUREMENT_BOUND: Final = 100.0
 FUNCTIONS: Final = ("one", "v", "s", "vv", "vs", "ss", "far")
 """Functions of one correction: v and s are speed and spin ratio from their centres."""
 FORCES: Final = ("drag", "lift")
-DOUBTS: Final = 5
+DOUBTS: Final = 4
 """Number of directions of the weights of a force whose uncertainty an estimate carries."""
 DOUBT: Final = {"drag": "doubt", "lift": "lift_doubt"}
 """Prefix of the names of a force's doubts."""

@@ -172,7 +172,7 @@ def test_all_tracks_share_the_weights(curved: tuple[Problem, Step, Problem, Step
 def test_directions_keep_the_variance_that_matters_at_the_samples() -> None:
     rng = np.random.default_rng(1)
     drag, lift, samples = rng.normal(size=(7, 3)), rng.normal(size=(7, 3)), rng.normal(size=(7, 30))
-    covariance = linalg.block_diag(drag @ drag.T, lift @ lift.T)  # of rank three each: five directions keep all of it
+    covariance = linalg.block_diag(drag @ drag.T, lift @ lift.T)  # of rank three each: four directions keep all of it
     kept = np.array(Correction(np.zeros(1), (), samples @ samples.T / 30.0).doubts(covariance))
     of_drag, of_lift = kept[:DOUBTS], kept[DOUBTS:]
     np.testing.assert_allclose(linalg.block_diag(of_drag.T @ of_drag, of_lift.T @ of_lift), covariance, atol=1e-9)
