@@ -316,7 +316,10 @@ class _Question:
 
     def moved(self, point: _Point, model: Weighed, step: Step) -> _Point | None:
         """The point after a step; None if it lowers the evidence at the same noise: it left the linear range."""
-        fit = Fit.at(point.fit.problem, step.taken(point.fit), point.fit.noise, point.fit.steps)
+        unknowns = step.taken(point.fit)
+        if not np.isfinite(unknowns.starts).all():
+            return None
+        fit = Fit.at(point.fit.problem, unknowns, point.fit.noise, point.fit.steps)
         if not np.isfinite(fit.cost):
             return None
         after = self.point(fit)
