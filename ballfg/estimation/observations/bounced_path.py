@@ -188,6 +188,13 @@ def possible(scene: Scene, tried: Paths) -> NDArray[np.bool_]:
     return np.asarray(fine)
 
 
+def narrowed(scene: Scene, tried: Paths, row: int) -> float:
+    """Logarithm of the share of its prior volume that a path has left: the factor of Occam in its evidence."""
+    rows, _ = _priors(scene, tried.times[[row]], tried.bounces, tried.drag[[row]])
+    before = float(np.linalg.slogdet(rows[0].T @ rows[0])[1])
+    return 0.5 * (before + float(np.linalg.slogdet(tried.covariance[row])[1]))
+
+
 def velocities_of(tried: Paths, row: int, moments: Array, gravity: float) -> Array:
     """(n, 3) m/s at moments (n,) s."""
     times = tried.times[row]
