@@ -17,7 +17,7 @@ from ballfg.arrays import Array, Index
 from ballfg.estimation.rally.strokes import Grower, Stroke
 from ballfg.progress import Watch, unwatched
 
-KEPT: Final = 40
+KEPT: Final = 25
 """Arcs with the highest scores in each picture, of which strokes are grown."""
 COMPARED: Final = 40
 """Strokes with the highest scores in each picture, of which sequences are made."""
@@ -29,6 +29,12 @@ HIT_SIGMA: Final = 0.08
 """m, between the paths before and after a hit: the racket holds the ball for a millisecond; paths bend."""
 ROOM: Final = 30.0
 """m^3, in which a stroke begins that no hit joins to another."""
+MOST_BOUNCES: Final = 2
+"""Of a stroke: a service has two."""
+GAINED: Final = 0.1
+"""Least gain of an exchange."""
+ROUNDS: Final = 6
+"""Of exchanges in a sequence, until nothing improves."""
 LONGEST_HIT: Final = 0.4
 """s without a candidate about a hit, behind a player."""
 SAME_WAY: Final = 5.0
@@ -52,10 +58,40 @@ def hypotheses(grower: Grower, seeds: Sequence[Index], watch: Watch = unwatched)
     for flight in watch(chosen, len(chosen), "possible flights followed"):
         whole = _variants(grower, flight)
         for stroke in (*whole, *(part for one in whole for part in grower.shortened(one))):
-            key = (*stroke.rows.tolist(), -len(stroke.bounces))
-            if grower.plausible(stroke) and (key not in found or stroke.score > found[key].score):
-                found[key] = stroke
+            known = found.get(_key(stroke))
+            if (known is None or stroke.score > known.score) and grower.plausible(stroke):
+                found[_key(stroke)] = stroke
     return _best_in_each(grower, sorted(found.values(), key=lambda one: -one.score), COMPARED)
+
+
+def rally(grower: Grower, seeds: Sequence[Index], watch: Watch = unwatched) -> Sequence_:
+    """The likeliest strokes of a rally, after exchanges of candidates and bounces in which nothing improves it."""
+    known = {_key(stroke): stroke for stroke in hypotheses(grower, seeds, watch)}
+    done = set[tuple[int, ...]]()
+    for _ in range(ROUNDS):
+        chosen = best_sequence(grower, list(known.values()))
+        fresh = [stroke for stroke in chosen.strokes if _key(stroke) not in done]
+        for stroke in fresh:
+            done.add(_key(stroke))
+            for better in _exchanged(grower, stroke):
+                old = known.get(_key(better))
+                known[_key(better)] = better if old is None or better.score > old.score else old
+        if not fresh:
+            break
+    return best_sequence(grower, list(known.values()))
+
+
+def _key(stroke: Stroke) -> tuple[int, ...]:
+    """What tells strokes apart: their candidates and the number of their bounces."""
+    return (*stroke.rows.tolist(), -len(stroke.bounces) - 1)
+
+
+def _exchanged(grower: Grower, stroke: Stroke) -> list[Stroke]:
+    """Better strokes than one, that have a bounce more or other candidates at an end."""
+    parts = [stroke, *grower.shortened(stroke)]
+    tried = [bounced for part in parts for way in (1, -1) for bounced in _bounced(grower, part, way)]
+    tried += [grower.timed(grower.grown(grower.grown(part, 1), -1)) for part in parts]
+    return [one for one in tried if one.score > stroke.score + GAINED and grower.plausible(one)]
 
 
 def _variants(grower: Grower, flight: Stroke) -> list[Stroke]:
@@ -70,6 +106,8 @@ def _variants(grower: Grower, flight: Stroke) -> list[Stroke]:
 
 def _bounced(grower: Grower, flight: Stroke, way: int) -> list[Stroke]:
     """The best stroke with one more bounce, if there is any."""
+    if len(flight.bounces) == MOST_BOUNCES:
+        return []
     best = max(grower.bounced(flight, way), key=lambda one: one.score, default=None)
     return [] if best is None else [grower.grown(grower.grown(grower.timed(best), way), -way)]
 
@@ -95,13 +133,15 @@ def best_sequence(grower: Grower, strokes: Sequence[Stroke]) -> Sequence_:
     if not count:
         return Sequence_((), np.zeros(0), ())
     first, last = (grower.field.frame[[one.rows[end] for one in ordered]] for end in (0, -1))
+    times = grower.rays.times[0] + grower.field.step * (np.arange(last.max() + 1) - grower.field.frame[0])
     score = np.array([one.score for one in ordered])
     begins = np.where([one.path.bounces > 0 for one in ordered], -BEGINS, -np.inf)  # else it may be anything
     link = np.full((count, count), -np.inf)
     for i in range(count):
-        for j in np.flatnonzero(first > last[i]):
+        later = first > last[i]
+        link[i, later] = begins[later]
+        for j in np.flatnonzero(later & (times[first] - times[last[i]] < LONGEST_HIT)):
             link[i, j] = max(begins[j], _hit(grower, ordered[i], ordered[j]))
-    link[last[:, None] >= first] = -np.inf
     best, before = score + begins, np.full(count, -1)
     forward, backward = score + begins, np.zeros(count)
     for j in range(count):
@@ -126,8 +166,6 @@ def best_sequence(grower: Grower, strokes: Sequence[Stroke]) -> Sequence_:
 def _hit(grower: Grower, before: Stroke, after: Stroke) -> float:
     """Logarithm of the likelihood that a hit joins two strokes, by how near their paths come between them."""
     start, end = grower.rays.times[before.rows[-1]], grower.rays.times[after.rows[0]]
-    if end - start > LONGEST_HIT:
-        return -np.inf
     moments = np.linspace(start, end, 9)
     (one, spread), (other, wide) = (grower.places_of(stroke.path, moments) for stroke in (before, after))
     off, both = other - one, spread + wide + HIT_SIGMA**2 * np.eye(3)
