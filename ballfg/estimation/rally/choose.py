@@ -42,7 +42,7 @@ SAME_WAY: Final = 5.0
 
 
 @dataclass(frozen=True, eq=False)
-class Sequence_:
+class Chosen:
     """The strokes of the best sequence, the probability of each, and whether a hit joins each to the one before."""
 
     strokes: tuple[Stroke, ...]
@@ -64,7 +64,7 @@ def hypotheses(grower: Grower, seeds: Sequence[Index], watch: Watch = unwatched)
     return _best_in_each(grower, sorted(found.values(), key=lambda one: -one.score), COMPARED)
 
 
-def rally(grower: Grower, seeds: Sequence[Index], watch: Watch = unwatched) -> Sequence_:
+def rally(grower: Grower, seeds: Sequence[Index], watch: Watch = unwatched) -> Chosen:
     """The likeliest strokes of a rally, after exchanges of candidates and bounces in which nothing improves it."""
     known = {_key(stroke): stroke for stroke in hypotheses(grower, seeds, watch)}
     done = set[tuple[int, ...]]()
@@ -119,19 +119,21 @@ def _best_in_each(grower: Grower, strokes: Sequence[Stroke], most: int, alike: i
     taken, kept = np.zeros(len(grower.field.first), dtype=np.int64), list[Stroke]()
     for stroke in sorted(strokes, key=lambda one: -one.score):
         first, last = grower.field.frame[stroke.rows[[0, -1]]]
-        if taken[first : last + 1].min() < most and not any(len(stroke.rows) - len(used & set(stroke.rows.tolist())) <= alike for used in sets):
+        if taken[first : last + 1].min() < most and not any(
+            len(stroke.rows) - len(used & set(stroke.rows.tolist())) <= alike for used in sets
+        ):
             kept.append(stroke)
             sets.append(set(stroke.rows.tolist()))
             taken[first : last + 1] += 1
     return kept
 
 
-def best_sequence(grower: Grower, strokes: Sequence[Stroke]) -> Sequence_:
+def best_sequence(grower: Grower, strokes: Sequence[Stroke]) -> Chosen:
     """The likeliest sequence of strokes that follow each other."""
     ordered = sorted(strokes, key=lambda one: int(grower.field.frame[one.rows[-1]]))
     count = len(ordered)
     if not count:
-        return Sequence_((), np.zeros(0), ())
+        return Chosen((), np.zeros(0), ())
     first, last = (grower.field.frame[[one.rows[end] for one in ordered]] for end in (0, -1))
     times = grower.rays.times[0] + grower.field.step * (np.arange(last.max() + 1) - grower.field.frame[0])
     score = np.array([one.score for one in ordered])
@@ -160,7 +162,7 @@ def best_sequence(grower: Grower, strokes: Sequence[Stroke]) -> Sequence_:
     chain.reverse()
     probabilities = np.exp(np.minimum(forward[chain] + backward[chain] - total, 0.0))
     joined = (False, *(bool(link[i, j] > begins[j]) for i, j in zip(chain[:-1], chain[1:], strict=True)))[: len(chain)]
-    return Sequence_(tuple(ordered[i] for i in chain), probabilities, joined)
+    return Chosen(tuple(ordered[i] for i in chain), probabilities, joined)
 
 
 def _hit(grower: Grower, before: Stroke, after: Stroke) -> float:

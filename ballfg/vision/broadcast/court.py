@@ -102,7 +102,7 @@ def _court(
         ends[border, :, axis] -= 0.5 * width * np.sign(ends[border, :, axis])
     if net is not None:
         ends = np.concatenate((ends, [[[0.0, -net[1], net[0]], [0.0, net[1], net[0]]]]))
-    surfaces = Surfaces(0.0, floor, None if floor is None else (-half[0], half[0], -half[1], half[1]))
+    surfaces = Surfaces(0.0, floor, (-half[0], half[0], -half[1], half[1]))
     return Court(corners, ends, 0.0 if net is None else net[0], surfaces)
 
 

@@ -51,7 +51,7 @@ def find_court(image: Image, court: Court) -> list[tuple[Pinhole, float]]:
     """
     lines = joined_segments(image)
     quads = quadrilaterals(lines, image.shape[1], image.shape[0])
-    cameras = _cameras(quads, court, (image.shape[1], image.shape[0]))
+    cameras = cameras_of(quads, court, (image.shape[1], image.shape[0]))
     slopes = slopes_of(image)
     rated = [(camera, support(slopes, camera, court)) for camera in cameras]
     return sorted(rated, key=lambda pair: -pair[1])
@@ -142,7 +142,7 @@ def quadrilaterals(lines: Array, width: int, height: int) -> Array:
     return np.unique(np.round(kept, 2), axis=0) if len(kept) else kept
 
 
-def _cameras(quads: Array, court: Court, size: tuple[int, int]) -> list[Pinhole]:
+def cameras_of(quads: Array, court: Court, size: tuple[int, int]) -> list[Pinhole]:
     """The cameras above the court that see its corners near those of quadrilaterals (q, 4, 2) px."""
     middle, found = (np.array(size) - 1.0) / 2.0, list[Pinhole]()
     flat = court.corners[:, :2].astype(np.float32)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -13,7 +14,7 @@ from ballfg.progress import Watch, unwatched
 from ballfg.vision.arrays import Image
 from ballfg.vision.broadcast.background import ALIKE, Match, matches
 from ballfg.vision.broadcast.court import Court
-from ballfg.vision.broadcast.find import find_court
+from ballfg.vision.broadcast.find import cameras_of, find_court
 from ballfg.vision.broadcast.graph import Solved, solve
 from ballfg.vision.broadcast.lines import Ridges, corrected, moved, ridges, slopes
 from ballfg.vision.broadcast.pinhole import Pinhole
@@ -67,22 +68,25 @@ class Motion:
 
 
 def find_motion(
-    frames: Frames, court: Court, corners: dict[int, Array] | None = None, watch: Watch = unwatched
+    frames: Frames, court: Court, count: int, corners: dict[int, Array] | None = None, watch: Watch = unwatched
 ) -> Motion:
     """The camera of each picture.
 
-    Args: corners: (4, 2) px of the court's corners in some pictures; None: the court is found.
+    Args: count: pictures, about.  corners: (4, 2) px of the court's corners in some pictures; None: the court is found.
     Raises: ValueError: no picture shows the court.
     """
-    times, links, seeds = _first_pass(frames, court, corners, watch)
+    times, links, seeds = _first_pass(
+        frames, court, corners, lambda images: watch(images, count, "pictures searched for the court")
+    )
     cuts = [0, *(k + 1 for k, link in enumerate(links) if link is None), len(times)]
     shots = list[Shot]()
-    for first, end in zip(cuts[:-1], cuts[1:], strict=True):
+    for first, end in pairwise(cuts):
         mine = {k: seed for k, seed in seeds.items() if first <= k < end}
         if mine and end - first >= SHORTEST:
             chain = [link for link in links[first : end - 1] if link is not None]
             shots.append(_followed(frames, court, first, mine, chain))
-    shots = [shot for shot in shots if np.median(shot.fit) > FOLLOWED]
+    if corners is None:
+        shots = [shot for shot in shots if np.median(shot.fit) > FOLLOWED]
     if not shots:
         tried = f"{len(times)} pictures, {len(cuts) - 1} shots"
         raise ValueError(
@@ -93,7 +97,10 @@ def find_motion(
 
 
 def _first_pass(
-    frames: Frames, court: Court, corners: dict[int, Array] | None, watch: Watch
+    frames: Frames,
+    court: Court,
+    corners: dict[int, Array] | None,
+    watched: Callable[[Iterator[Image]], Iterable[Image]],
 ) -> tuple[Array, list[Match | None], dict[int, list[tuple[Pinhole, float]]]]:
     """Stamps, matches of neighbours, and the cameras in the pictures in which the court was found."""
     times, seeds = list[float](), dict[int, list[tuple[Pinhole, float]]]()
@@ -106,25 +113,37 @@ def _first_pass(
 
     links = list[Match | None]()
     last: Image | None = None
-    for k, image in enumerate(watch(images(), None, "pictures searched for the court")):
+    for k, image in enumerate(watched(images())):
         if k:
             assert last is not None
             links.append(next(matches((last, image))))
             if links[-1] is None:
                 found, looked = 0, -np.inf
         last = image
-        if found < SEEDS and times[-1] - looked >= EVERY:
+        if corners is not None:
+            here = _of_corners(image, court, corners[k]) if k in corners else []
+            seeds |= {k: here} if here else {}
+        elif found < SEEDS and times[-1] - looked >= EVERY:
             looked = times[-1]
-            here = likely(image, court)
+            here = likely(image, find_court(image, court)[:TRIED], court)
             if here:
                 found, seeds[k] = found + 1, here
     return np.array(times), links, seeds
 
 
-def likely(image: Image, court: Court) -> list[tuple[Pinhole, float]]:
+def _of_corners(image: Image, court: Court, corners: Array) -> list[tuple[Pinhole, float]]:
+    """The cameras that see a court's corners (4, 2) px, those first whose lines fit."""
+    away = corners - corners.mean(axis=0)
+    quad = corners[np.argsort(np.arctan2(away[:, 1], away[:, 0]))]  # clockwise as seen
+    cameras = cameras_of(quad[None], court, (image.shape[1], image.shape[0]))
+    better = likely(image, [(camera, 0.0) for camera in cameras], court)
+    return better or [(camera, 0.0) for camera in cameras]
+
+
+def likely(image: Image, tried: Sequence[tuple[Pinhole, float]], court: Court) -> list[tuple[Pinhole, float]]:
     """The cameras whose lines fit a picture, best first, and how well; those at about one place once only."""
     fine = list[tuple[Pinhole, float]]()
-    for camera, _ in find_court(image, court)[:TRIED]:
+    for camera, _ in tried:
         better, fit = corrected(image, camera, court)
         if fit > FITS and better.place[2] > 0.0:
             fine.append((better, fit))

@@ -59,7 +59,9 @@ class Pinhole:
         """The same as a camera of the other rooms; covariance: (7, 7) of turn, place and log focal length."""
         rvec = np.asarray(cv2.Rodrigues(self.turn)[0], dtype=np.float64).ravel()
         tvec = -self.turn @ self.place
-        return Camera(name, self.size, self.matrix, np.array([self.bend, 0.0, 0.0, 0.0]), rvec, tvec, covariance=covariance)
+        return Camera(
+            name, self.size, self.matrix, np.array([self.bend, 0.0, 0.0, 0.0]), rvec, tvec, covariance=covariance
+        )
 
 
 def undone(seen: Array, bend: float) -> Array:
