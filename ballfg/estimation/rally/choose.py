@@ -17,7 +17,7 @@ from ballfg.arrays import Array, Index
 from ballfg.estimation.rally.strokes import Grower, Stroke
 from ballfg.progress import Watch, unwatched
 
-KEPT: Final = 25
+KEPT: Final = 15
 """Arcs with the highest scores in each picture, of which strokes are grown."""
 COMPARED: Final = 40
 """Strokes with the highest scores in each picture, of which sequences are made."""

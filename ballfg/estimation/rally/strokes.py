@@ -40,7 +40,7 @@ INSIDE, AHEAD = 3.0, 4.0
 """Pictures before and beyond the last candidate in which a bounce is guessed: an arc may pass a low one."""
 ALIKE: Final = 10.0
 """Misfit above the best guess's, of guesses that are followed."""
-FOLLOWED: Final = 6
+FOLLOWED: Final = 4
 """Guesses that are followed."""
 CUT: Final = 4
 """Candidates at an end of a stroke that may belong to the next one, or to clutter."""

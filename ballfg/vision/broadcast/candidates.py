@@ -8,7 +8,6 @@ place is a candidate; a ball that moves while the shutter is open is a bar, whos
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
 from typing import Final
 
 import cv2
@@ -16,7 +15,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.progress import Watch, unwatched
-from ballfg.vision.arrays import Array32, Image
+from ballfg.vision.arrays import Image
 from ballfg.vision.broadcast.court import Court
 from ballfg.vision.broadcast.motion import Frames, Shot
 from ballfg.vision.broadcast.pinhole import Pinhole
@@ -32,6 +31,8 @@ THIN, THICK = 0.4, 2.2
 """Width of a candidate in diameters of the ball at that place, at least and at most: blur and compression widen it."""
 LONGEST: Final = 60.0
 """px, of a bar."""
+LEAST: Final = 3
+"""Pixels of a candidate."""
 MOST: Final = 60
 """Candidates of a picture, those with the highest scores."""
 ROOM: Final = (3.5, 3.0)
@@ -87,15 +88,16 @@ def _diameters(shot: Shot, court: Court, radius: float) -> Array:
 def aligned_candidates(window: list[Image], index: int, cameras: tuple[Pinhole, ...], size: Array) -> Candidates:
     """The candidates of the picture `index` of a window, with the cameras of all of it and diameters (2,) px."""
     here = window[index]
-    rise: Array32 | None = None
+    rise: Image | None = None
     for apart in (NEAR, FAR):
         beside = [index + step for step in (-apart, apart) if 0 <= index + step < len(window)]
         if not beside:
             continue
         others = [_warped(window[i], cameras[i], cameras[index]) for i in beside]
-        most = others[0] if len(others) == 1 else np.maximum(*others)
-        change = cv2.subtract(here, most).min(axis=2).astype(np.float32)
-        rise = change if rise is None else np.maximum(rise, change)
+        most = others[0] if len(others) == 1 else cv2.max(*others)
+        blue, green, red = cv2.split(cv2.subtract(here, most))
+        change = cv2.min(cv2.min(blue, green), red)
+        rise = change if rise is None else cv2.max(rise, change)
     return Candidates.none() if rise is None else _regions(cv2.GaussianBlur(rise, (3, 3), 0), size)
 
 
@@ -111,14 +113,14 @@ def _warped(image: Image, camera: Pinhole, onto: Pinhole) -> Image:
     return cv2.warpPerspective(image, homography, (width, height), flags=cv2.INTER_LINEAR, borderValue=white)
 
 
-def _regions(rise: Array32, size: Array) -> Candidates:
+def _regions(rise: Image, size: Array) -> Candidates:
     """Connected regions of a ball's width, as bars."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats((rise > BRIGHTER).astype(np.uint8), connectivity=8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(cv2.threshold(rise, BRIGHTER, 1.0, cv2.THRESH_BINARY)[1], connectivity=8)
     pixels, covariances, scores, streaks = [], [], [], []
-    for k in range(1, count):
+    sides, areas = stats[1:, 2:4], stats[1:, 4]
+    fine = (areas >= LEAST) & (sides.max(axis=1) < LONGEST + THICK * size[1]) & (sides.max(axis=1) >= THIN * size[0])
+    for k in np.flatnonzero(fine) + 1:
         x, y, w, h, area = stats[k]
-        if area < 3 or max(w, h) > LONGEST + THICK * size[1]:
-            continue
         patch = np.where(labels[y : y + h, x : x + w] == k, rise[y : y + h, x : x + w], 0.0).astype(np.float64)
         if patch.max() < PEAK:
             continue
@@ -153,9 +155,3 @@ def _bar(patch: Array) -> tuple[Array, float, Array]:
     (small, large), axes = np.linalg.eigh(np.array([[xx, xy], [xy, yy]]))
     half = 0.5 * np.sqrt(12.0 * max(large - small, 0.0)) * axes[:, 1]
     return centre, float(4.0 * np.sqrt(max(small, 0.0) + 1.0 / 24.0)), half
-
-
-def each_frame(detections: Detections) -> Iterator[Candidates]:
-    """The candidates of each picture in turn."""
-    for number in range(len(detections.frames)):
-        yield detections.in_frame(number)
