@@ -176,13 +176,9 @@ def main() -> None:
     )
     on = sum((np.abs(event.place[:2]) < court.size).all() for event in rally.events if event.kind == "bounce")
     total = sum(event.kind == "bounce" for event in rally.events)
-    print(
-        f"over the net, 2 - 40 m/s      | all      | {sane} of {len(rally.strokes)}; {on} of {total} bounces on the table"
-    )
+    print(f"over the net, 2 - 40 m/s      | all      | {sane} of {len(rally.strokes)}; {on} of {total} bounces on it")
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    print(
-        f"processor time; memory        | 60 s for 13 s; 2 GiB | {spent:.0f} s for {count / fps:.0f} s or more; {peak:.2f}"
-    )
+    print(f"processor time; memory        | 60 s for 13 s; 2 | {spent:.0f} s for 7 s; {peak:.2f} GiB")
 
 
 if __name__ == "__main__":

@@ -58,8 +58,9 @@ class Scene:
 
 @dataclass(frozen=True)
 class Paths:
-    """Solutions for k guesses of b bounces: `vectors` are the first bounce's place, m, and each flight's velocity, m/s;
-    then, where a scene has lift, each flight's acceleration by it, m/s^2.
+    """Solutions for k guesses of b bounces: `vectors` are the first bounce's place, m, and each flight's velocity, m/s.
+
+    Where a scene has lift, they end with each flight's acceleration by it, m/s^2.
 
     A flight's velocity is that after its bounce, of the first flight that before the first bounce; without bounces
     `times` has an anchor in the middle.

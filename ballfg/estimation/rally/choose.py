@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -113,17 +114,17 @@ def _bounced(grower: Grower, flight: Stroke, way: int) -> list[Stroke]:
 
 
 def _best_in_each(grower: Grower, strokes: Sequence[Stroke], most: int, alike: int = -1) -> list[Stroke]:
-    """Those among the best `most` in one of their pictures, best first; those are left out all of whose candidates but
-    `alike` belong to a better one."""
-    sets = list[set[int]]()
-    taken, kept = np.zeros(len(grower.field.first), dtype=np.int64), list[Stroke]()
+    """Those among the best `most` in one of their pictures, best first, without repeats of better ones.
+
+    Args: alike: number of candidates, at most, by which a stroke differs from a better one that it repeats.
+    """
+    taken, kept, sets = np.zeros(len(grower.field.first), dtype=np.int64), list[Stroke](), list[set[int]]()
     for stroke in sorted(strokes, key=lambda one: -one.score):
         first, last = grower.field.frame[stroke.rows[[0, -1]]]
-        if taken[first : last + 1].min() < most and not any(
-            len(stroke.rows) - len(used & set(stroke.rows.tolist())) <= alike for used in sets
-        ):
+        mine = set(stroke.rows.tolist())
+        if taken[first : last + 1].min() < most and not any(len(mine - used) <= alike for used in sets):
             kept.append(stroke)
-            sets.append(set(stroke.rows.tolist()))
+            sets.append(mine)
             taken[first : last + 1] += 1
     return kept
 
@@ -161,7 +162,7 @@ def best_sequence(grower: Grower, strokes: Sequence[Stroke]) -> Chosen:
         at = int(before[at])
     chain.reverse()
     probabilities = np.exp(np.minimum(forward[chain] + backward[chain] - total, 0.0))
-    joined = (False, *(bool(link[i, j] > begins[j]) for i, j in zip(chain[:-1], chain[1:], strict=True)))[: len(chain)]
+    joined = (False, *(bool(link[i, j] > begins[j]) for i, j in pairwise(chain)))[: len(chain)]
     return Chosen(tuple(ordered[i] for i in chain), probabilities, joined)
 
 

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
-from ballfg.arrays import Array, Index
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.rally.arcs import Field, arcs, with_exposure
+from ballfg.estimation.rally.arcs import arcs, with_exposure
 from ballfg.estimation.rally.choose import Chosen, rally
+from ballfg.estimation.rally.field import SEEN_RANGE, Field
 from ballfg.estimation.rally.smoothed import rally_track
 from ballfg.estimation.rally.strokes import Grower
 from ballfg.estimation.result import Estimate
@@ -27,6 +26,9 @@ from ballfg.vision.detection.detections import Detections
 
 FRAME_SIGMA: Final = 0.3
 """px, of a picture's camera beside the error that all of a shot share."""
+
+ROUNDS, SETTLED = 3, 0.1
+"""In which the probability to see the ball is found, and its change that ends them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +84,15 @@ def reconstruct(
     pinhole, camera = fixed_camera(shot, name)
     seen = on_fixed_camera(found, shot, pinhole, name)
     field = Field.of(seen, pinhole.focal / float(np.linalg.norm(pinhole.place)))
-    seeds = arcs(field)
+    seeds, field = arcs(field)
     field = with_exposure(field, seeds)
-    grower = Grower.of(field, seen.times, camera, physics_of(model), surfaces)
-    chosen = rally(grower, seeds, watch)
+    for _ in range(ROUNDS):
+        grower = Grower.of(field, seen.times, camera, physics_of(model), surfaces)
+        chosen = rally(grower, seeds, watch)
+        share = field.seen if not chosen.strokes else _seen_share(field, chosen)
+        if abs(share - field.seen) < SETTLED:
+            break
+        field = replace(field, seen=share)
     smoother = Smoother(model, surfaces, Settings.for_measured(model, find_events=False))
     estimates = list[Estimate]()
     for number, stroke in enumerate(watch(chosen.strokes, len(chosen.strokes), "strokes estimated")):
@@ -94,11 +101,8 @@ def reconstruct(
     return ShotRally(camera, seen, chosen, tuple(estimates), field.exposure)
 
 
-def rows_of(rallies: Sequence[ShotRally]) -> list[Index]:
-    """Numbers of the candidates of each stroke, shot by shot."""
-    return [stroke.rows for one in rallies for stroke in one.chosen.strokes]
-
-
-def stamps_of(one: ShotRally, number: int) -> Array:
-    """(n,) s, stamps of the candidates of a stroke."""
-    return np.asarray(one.seen.times[one.chosen.strokes[number].rows])
+def _seen_share(field: Field, chosen: Chosen) -> float:
+    """Share of the pictures of strokes in which the ball is among the candidates."""
+    pictures = sum(int(np.ptp(field.frame[stroke.rows])) + 1 for stroke in chosen.strokes)
+    share = sum(len(stroke.rows) for stroke in chosen.strokes) / pictures
+    return float(np.clip(share, *SEEN_RANGE))

@@ -9,6 +9,8 @@ from typing import Final
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.bounced_path import place_prior
 from ballfg.estimation.observations.sightings import CameraSightings
 from ballfg.estimation.rally.strokes import Grower, Stroke
@@ -17,8 +19,6 @@ from ballfg.estimation.segmentation.result import Contact, Quality, Segmentation
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.tracks.sightings import Sightings
 from ballfg.tracks.track import Track
-from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.surfaces import Surfaces
 from ballfg.vision.camera import Camera
 
 KINK: Final = 2.0

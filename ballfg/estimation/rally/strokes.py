@@ -17,7 +17,7 @@ from ballfg.arrays import Array, Index
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.bounced_path import Paths, Scene, narrowed, possible, shares_of, solved
 from ballfg.estimation.observations.ray_path import Rays
-from ballfg.estimation.rally.arcs import LEAST, SEEN, Field
+from ballfg.estimation.rally.field import Field
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.state import Z
 from ballfg.vision.camera import Camera
@@ -42,6 +42,8 @@ ALIKE: Final = 10.0
 """Misfit above the best guess's, of guesses that are followed."""
 FOLLOWED: Final = 4
 """Guesses that are followed."""
+LEAST: Final = 4
+"""Candidates of a shortened stroke."""
 CUT: Final = 4
 """Candidates at an end of a stroke that may belong to the next one, or to clutter."""
 SPEEDS: Final = (2.0, 40.0)
@@ -107,7 +109,7 @@ class Grower:
         half = 0.5 * SHORT * self.field.step
         ends = self.foretold(path, np.concatenate((moments - half, moments + half)))[0][0]
         gain = self.field.gain(rows, (ends[len(rows) :] - ends[: len(rows)]) / SHORT)
-        hidden = (frames[-1] - frames[0] + 1 - len(rows)) * np.log(1.0 - SEEN)
+        hidden = (frames[-1] - frames[0] + 1 - len(rows)) * np.log(1.0 - self.field.seen)
         price = BOUNCE * len(bounces) + UNBOUNCED * (len(bounces) != 1) - narrowed(self.scene(rows), path, 0)
         return Stroke(rows, bounces, path, gain + hidden - 0.5 * float(path.misfit[0]) - price)
 
@@ -202,7 +204,7 @@ class Grower:
         scene = self.scene(stroke.rows)
         tried = solved(scene, together, together.shape[1])
         passed = np.floor(np.maximum(way * (guesses - end), 0.0) / self.field.step)  # pictures without a candidate
-        misfit = tried.misfit - 2.0 * np.log(1.0 - SEEN) * passed
+        misfit = tried.misfit - 2.0 * np.log(1.0 - self.field.seen) * passed
         misfit = np.where(possible(scene, tried), misfit, np.inf)
         for row in np.argsort(misfit, kind="stable")[:FOLLOWED]:
             if misfit[row] > misfit.min() + ALIKE or not np.isfinite(misfit[row]):

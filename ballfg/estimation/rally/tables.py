@@ -1,4 +1,4 @@
-"""Writes what a video of one moving camera shows: camera_motion.csv, events.csv, strokes.csv beside a dataset's files."""
+"""Writes what a video of one moving camera shows: camera motion, events and strokes beside a dataset's files."""
 
 from __future__ import annotations
 

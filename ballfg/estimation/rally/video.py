@@ -55,7 +55,7 @@ def track_moving_camera(
     """The strokes in a video of one camera that stands at one place.
 
     Args:
-        frames: opens the video, each time anew.  count: of its pictures, about.  court: in the picture.  model: the ball.
+        frames: opens the video, each time anew.  count: of its pictures, about.  court: in them.  model: the ball.
         corners: number of a picture -> (4, 2) px of the court's corners, in any order; None: the court is found.
         candidates: of a detector of one's own; None: bright moving spots.
     Raises: ValueError: no picture shows the court.

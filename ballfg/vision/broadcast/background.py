@@ -21,7 +21,7 @@ BACK: Final = 0.7
 ALIKE: Final = 1.5
 """px about a homography within which a point is background."""
 FEWEST, SHARE = 25, 0.35
-"""Background points, and their share of those that were followed, without which two pictures do not follow each other."""
+"""Background points, and their share of those that were followed, at least, of pictures that follow each other."""
 KEPT: Final = 60
 """Background points of a pair that are kept, spread over the picture."""
 WINDOW, LEVELS = (21, 21), 4

@@ -115,7 +115,8 @@ def _warped(image: Image, camera: Pinhole, onto: Pinhole) -> Image:
 
 def _regions(rise: Image, size: Array) -> Candidates:
     """Connected regions of a ball's width, as bars."""
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(cv2.threshold(rise, BRIGHTER, 1.0, cv2.THRESH_BINARY)[1], connectivity=8)
+    bright = cv2.threshold(rise, BRIGHTER, 1.0, cv2.THRESH_BINARY)[1]
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(bright, connectivity=8)
     pixels, covariances, scores, streaks = [], [], [], []
     sides, areas = stats[1:, 2:4], stats[1:, 4]
     fine = (areas >= LEAST) & (sides.max(axis=1) < LONGEST + THICK * size[1]) & (sides.max(axis=1) >= THIN * size[0])
@@ -127,7 +128,7 @@ def _regions(rise: Image, size: Array) -> Candidates:
         centre, width, half = _bar(patch)
         if not THIN * size[0] < width < THICK * size[1]:
             continue
-        centre = centre + (x, y)
+        centre += (x, y)
         length = 2.0 * np.hypot(*half)
         unit = half / max(np.hypot(*half), 1e-9)
         spread = SIGMA**2 * np.eye(2) + (ALONG * length) ** 2 * np.outer(unit, unit)

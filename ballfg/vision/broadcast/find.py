@@ -36,6 +36,8 @@ UPRIGHT: Final = 0.35
 """rad by which a camera may be tilted to the side."""
 DISTANCES: Final = (1.0, 60.0)
 """Of the court's half length."""
+ALONG: Final = 2.0
+"""Ratio of x to y from which a camera looks along the court."""
 SAMPLES: Final = 24
 """Along a line of the court."""
 EDGE: Final = 12.0
@@ -160,8 +162,13 @@ def cameras_of(quads: Array, court: Court, size: tuple[int, int]) -> list[Pinhol
             best = int(np.argmin(missed))
             if missed[best] < MISSED * scale:
                 found.append(Pinhole(turn[best], place[best], float(focal[best]), size))
-    # a court turned by half a turn looks the same: the camera at the side of -y, or else of -x, is taken
-    return [one for one in found if one.place[1] < 0.0]
+    return [one for one in found if _in_front(one.place)]
+
+
+def _in_front(place: Array) -> bool:
+    """True for a camera at the side of -y, or of -x if it looks along the court: half a turn changes no picture."""
+    x, y, _ = place
+    return bool(x < 0.0 if abs(x) > ALONG * abs(y) else y < 0.0)
 
 
 def _possible(turn: Array, place: Array, at: Array, court: Court) -> Array:

@@ -51,7 +51,7 @@ def read_candidates(path: Path, shot: Shot, stamps: Array) -> Detections:
         stamps: (f,) s, of all pictures.
     Raises: FileNotFoundError: there is no such file. ValueError: a column that is missing, a cell out of its range.
     """
-    header, texts, values = detections_file.read_columns(path, ("t", "u", "v"))
+    _, _, values = detections_file.read_columns(path, ("t", "u", "v"))
     count = len(values["t"])
     detections_file.check_values(path, values, np.arange(count), _RULES)
     values |= {name: np.full(count, value) for name, value in detections_file.UNSTATED.items() if name not in values}

@@ -38,7 +38,7 @@ lenses of broadcasts have up to 0.2."""
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """The cameras of a shot, with covariances (n, 7, 7) of turn (rad, in the camera's frame), place, log focal length."""
+    """Cameras of a shot; covariances (n, 7, 7) of turn (rad, in the camera's frame), place (m), log focal length."""
 
     cameras: tuple[Pinhole, ...]
     covariances: Array
@@ -116,7 +116,7 @@ def _court_factor(k: int, like: Pinhole, lines: Ridges) -> gtsam.CustomFactor:
 
 def _match_factor(k: int, like: Pinhole, match: Match) -> gtsam.CustomFactor:
     """The background of picture k, where that of picture k - 1 turns to: of a direction d, R_k^T R_(k-1) d."""
-    sigma, middle = MATCH_SIGMA * np.sqrt(SHARED), like.middle
+    sigma = MATCH_SIGMA * np.sqrt(SHARED)
     keys = [_turn(k - 1), _turn(k), _zoom(k - 1), _zoom(k), LENS]
 
     def error(_: Any, values: gtsam.Values, H: list[Array] | None) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
@@ -88,10 +88,9 @@ def find_motion(
     if corners is None:
         shots = [shot for shot in shots if np.median(shot.fit) > FOLLOWED]
     if not shots:
-        tried = f"{len(times)} pictures, {len(cuts) - 1} shots"
         raise ValueError(
-            f"the video must show the whole court in at least {SHORTEST} pictures in a row; none of {tried} does. "
-            "Give its corners in some pictures with --corners FILE (frame,corner,u,v), or cut the video."
+            f"the video must show the whole court in {SHORTEST} pictures in a row; frames 0 to {len(times) - 1} do "
+            "not. Give its corners in some of them with --corners FILE (frame,u,v), or check --court."
         )
     return Motion(tuple(shots), times, tuple(cuts[1:-1]))
 
