@@ -164,7 +164,7 @@ def _moving_camera(
     import numpy as np
 
     from ballfg.estimation.rally.tables import FILES, write_rally
-    from ballfg.estimation.rally.video import track_moving_camera
+    from ballfg.estimation.rally.video import surfaces_of, track_moving_camera
     from ballfg.files.whole_folder import reserved
     from ballfg.tracks.info import DatasetInfo
     from ballfg.vision.broadcast.court import read_court
@@ -195,11 +195,11 @@ def _moving_camera(
         rate = float(f"{1.0 / np.median(np.diff(found.motion.times)):.6g}")
         info = DatasetInfo(
             name or out.resolve().name,
-            ground.surfaces.table_height,
+            surfaces_of(ground).table_height,
             kind.ball,
             rate=rate,
             source=f"ballfg track {path.name}",
-            table_extent=ground.surfaces.extent,
+            table_extent=surfaces_of(ground).extent,
         )
         written = write_rally(out, info, found.motion, found.shots, found.events, found.strokes)
         bounces = sum(event.kind == "bounce" for event in found.events)

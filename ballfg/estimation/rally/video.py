@@ -10,6 +10,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.rally.events import Event, events_of, stroke_row
 from ballfg.estimation.rally.reconstruct import ShotRally, reconstruct
 from ballfg.progress import Watch, unwatched
@@ -42,6 +43,12 @@ class Rally:
         return notes
 
 
+def surfaces_of(court: Court) -> Surfaces:
+    """What a ball bounces on: the court at z = 0 within its ends, and the floor below it, if there is one."""
+    x, y = court.size.tolist()
+    return Surfaces(0.0, court.floor, (-x, x, -y, y))
+
+
 def track_moving_camera(
     frames: Frames,
     court: Court,
@@ -61,6 +68,7 @@ def track_moving_camera(
     Raises: ValueError: no picture shows the court.
     """
     motion = find_motion(frames, court, count, corners, watch)
+    surfaces = surfaces_of(court)
     step = float(np.median(np.diff(motion.times)))
     shots, events, rows = list[ShotRally](), list[Event](), list[dict[str, Any]]()
     for shot in motion.shots:
@@ -68,8 +76,8 @@ def track_moving_camera(
             found = find_candidates(frames, shot, court, model.radius, motion.times, watch)
         else:
             found = candidates(shot, motion.times)
-        one = reconstruct(found, shot, model, court.surfaces, first=len(rows), watch=watch)
-        mine = events_of(one, model, court.surfaces, step)
+        one = reconstruct(found, shot, model, surfaces, first=len(rows), watch=watch)
+        mine = events_of(one, model, surfaces, step)
         shots.append(one)
         events += mine
         rows += [stroke_row(estimate, mine, model, court.net) for estimate in one.estimates]

@@ -8,8 +8,8 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.checks import check_keys, is_number, shown
-from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR, TABLE_LENGTH, TABLE_WIDTH, Surfaces
 from ballfg.files.strict_yaml import mapping, read_mapping
+from ballfg.vision.calibration.table_points import TABLE_HEIGHT, TABLE_LENGTH, TABLE_WIDTH
 
 TABLE_TENNIS: Final = "table-tennis"
 LINE_WIDTH: Final = 0.02
@@ -28,13 +28,13 @@ class Court:
     Attributes:
         corners: (4, 3) m, around the court; of its longest rectangle, to the outer edges of its lines.
         lines: (l, 2, 3) m, ends of the middles of its lines.  net: m, height of the net at x = 0; 0 for none.
-        surfaces: where a ball bounces.
+        floor: m, z of a floor below a table; None: there is none.
     """
 
     corners: Array
     lines: Array
     net: float
-    surfaces: Surfaces
+    floor: float | None
 
     @property
     def size(self) -> Array:
@@ -52,7 +52,7 @@ def table_tennis() -> Court:
         + [(np.array([-x, 0.0, 0.0]), np.array([x, 0.0, 0.0]))],
         LINE_WIDTH,
         (NET_HEIGHT, y + NET_REACH),
-        -TABLE_ABOVE_FLOOR,
+        -TABLE_HEIGHT,
     )
 
 
@@ -102,8 +102,7 @@ def _court(
         ends[border, :, axis] -= 0.5 * width * np.sign(ends[border, :, axis])
     if net is not None:
         ends = np.concatenate((ends, [[[0.0, -net[1], net[0]], [0.0, net[1], net[0]]]]))
-    surfaces = Surfaces(0.0, floor, (-half[0], half[0], -half[1], half[1]))
-    return Court(corners, ends, 0.0 if net is None else net[0], surfaces)
+    return Court(corners, ends, 0.0 if net is None else net[0], floor)
 
 
 def _named(where: str, names: Any, count: int, known: dict[str, Array]) -> list[Array]:
