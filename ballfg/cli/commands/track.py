@@ -18,6 +18,7 @@ from ballfg.progress import progress
 if TYPE_CHECKING:
     from ballfg.arrays import Array
     from ballfg.dynamics import AnalyticModel, Surfaces
+    from ballfg.simulation.balls import BallKind
     from ballfg.vision import Camera
     from ballfg.vision.detection.detections import Detections
     from ballfg.vision.detection.detector import Colour as BallColour
@@ -40,8 +41,19 @@ def track(
             help="Videos or folders of images, each named as its camera or as NAME=PATH; or one detections.csv.",
         ),
     ],
-    cameras: Annotated[Path, typer.Option(help="File of the calibrated cameras (cameras.yaml).")],
     out: Annotated[Path, typer.Option(help="Output folder of the dataset: new or empty.")],
+    cameras: Annotated[
+        Path | None, typer.Option(help="File of the calibrated cameras (cameras.yaml); without: one moving camera.")
+    ] = None,
+    court: Annotated[
+        str, typer.Option(help="Without --cameras: table-tennis, or a YAML file of a court.")
+    ] = "table-tennis",
+    corners: Annotated[
+        Path | None, typer.Option(help="Without --cameras: the court's corners, a table frame,u,v (px).")
+    ] = None,
+    candidates: Annotated[
+        Path | None, typer.Option(help="Without --cameras: candidates of another detector, a table t,u,v,score.")
+    ] = None,
     stamps: Annotated[
         list[str] | None,
         typer.Option(help="Frame stamps of a camera, NAME=FILE.csv with a column t; may be repeated."),
@@ -65,6 +77,8 @@ def track(
 
     Example: ballfg track left.mp4 middle.mp4 right.mp4 --cameras cameras.yaml --out shots
 
+    Example: ballfg track rally.mp4 --out rally
+
     The dataset holds tracks.csv, detections.csv (all candidates) and cameras.yaml; of one camera states.csv in place of
     tracks.csv.
     overlay.mp4 shows the views with what was found, contact_sheet.png each track.
@@ -84,6 +98,12 @@ def track(
     from ballfg.vision.tracking.report import blind_cameras, disagreement, no_ball, summary
 
     kind = ball_kind(ball)
+    if cameras is None:
+        _refuse_moving(stamps=stamps, without=without, colour=colour, detector=detector, table_height=table_height)
+        _moving_camera(recordings, out, kind, court, corners, candidates, name, force=force)
+        return
+    if (corners, candidates) != (None, None):
+        raise ValueError("--corners and --candidates are for a moving camera, without --cameras. Leave them out.")
     height = kind.surfaces.table_height if table_height is None else table_height
     with reserved(out):  # refuses an unusable folder before the search
         check_result_folder(out, [cameras, *(Path(text) for text in recordings)], force=force)
@@ -127,6 +147,71 @@ def track(
         points = sum(len(ball.times) for ball in tracking.balls)
         print(f"{out}: {len(tracking.balls)} tracks of {points} points; wrote {', '.join(written)}")
         print(*summary(tracking), sep="\n")
+
+
+def _moving_camera(
+    recordings: Sequence[str],
+    out: Path,
+    kind: BallKind,
+    court: str,
+    corners: Path | None,
+    candidates: Path | None,
+    name: str | None,
+    *,
+    force: bool,
+) -> None:
+    """Tracks the ball in one video of a camera that pans and zooms."""
+    import numpy as np
+
+    from ballfg.estimation.rally.tables import FILES, write_rally
+    from ballfg.estimation.rally.video import surfaces_of, track_moving_camera
+    from ballfg.files.whole_folder import reserved
+    from ballfg.tracks.info import DatasetInfo
+    from ballfg.vision.broadcast.court import read_court
+    from ballfg.vision.broadcast.given import read_candidates, read_corners
+    from ballfg.vision.detection.video import open_video
+    from ballfg.vision.tracking.dataset import check_result_folder
+
+    if len(recordings) != 1 or recordings[0].lower().endswith(".csv"):
+        raise ValueError(
+            f"without --cameras exactly one video must be given; got {len(recordings)} recordings, "
+            f"{recordings[0]} the first. Give one video, or --cameras."
+        )
+    path, given = Path(recordings[0]), [file for file in (corners, candidates) if file is not None]
+    with reserved(out):
+        check_result_folder(out, [path, *given], force=force, files=FILES)
+        video, ground = open_video(path), read_court(court)
+        own = None if candidates is None else partial(read_candidates, candidates)
+        marked = None if corners is None else read_corners(corners)
+        found = track_moving_camera(
+            video.frames, ground, kind.model, count=video.count, corners=marked, candidates=own, watch=progress
+        )
+        print_notes(found.notes)
+        if not found.strokes:
+            raise ValueError(
+                f"{path} must show strokes of a ball on the court; none was found. Give candidates of a better "
+                "detector with --candidates, or check --court."
+            )
+        rate = float(f"{1.0 / np.median(np.diff(found.motion.times)):.6g}")
+        info = DatasetInfo(
+            name or out.resolve().name,
+            surfaces_of(ground).table_height,
+            kind.ball,
+            rate=rate,
+            source=f"ballfg track {path.name}",
+            table_extent=surfaces_of(ground).extent,
+        )
+        written = write_rally(out, info, found.motion, found.shots, found.events, found.strokes)
+        bounces = sum(event.kind == "bounce" for event in found.events)
+        print(f"{out}: {len(found.strokes)} strokes, {bounces} bounces; wrote {', '.join(written)}")
+
+
+def _refuse_moving(**options: object) -> None:
+    """Raises ValueError for an option that calibrated cameras need."""
+    for name, value in options.items():
+        if value:
+            option = name.replace("_", "-")
+            raise ValueError(f"--{option} must not be given without --cameras; got {value}. Leave it out.")
 
 
 def _refuse(**options: object) -> None:

@@ -2,7 +2,7 @@
 
 Each sighting gives two equations that are linear in the place of the first bounce and in the velocity of each flight.
 Drag stretches a flight's time s to ln(1 + k v s) / (k v), with the speed v of the last solution, and shortens the fall
-g s^2 / 2 by 1 + k v s / 3.
+g s^2 / 2 by 1 + k v s / 3. Spin, where a scene has it, accelerates each flight evenly.
 """
 
 from __future__ import annotations
@@ -47,6 +47,8 @@ class Scene:
     physics: SegmentationPhysics
     surfaces: Surfaces
     height: float
+    lift: float | None = None
+    """m/s^2, prior standard deviation of each component of a flight's constant acceleration by spin; None: no spin."""
 
     @property
     def plane(self) -> float:
@@ -58,6 +60,8 @@ class Scene:
 class Paths:
     """Solutions for k guesses of b bounces: `vectors` are the first bounce's place, m, and each flight's velocity, m/s.
 
+    Where a scene has lift, they end with each flight's acceleration by it, m/s^2.
+
     A flight's velocity is that after its bounce, of the first flight that before the first bounce; without bounces
     `times` has an anchor in the middle.
     """
@@ -65,20 +69,20 @@ class Paths:
     times: Array  # (k, max(b, 1)) s
     bounces: int
     misfit: Array  # (k,)
-    vectors: Array  # (k, b + 2, 3)
+    vectors: Array  # (k, c, 3), c = b + 2, or 2 b + 3 with lift
     drag: Array  # (k, b + 1) 1/s, k |v| of each flight
-    covariance: Array  # (k, 3 (b + 2), 3 (b + 2))
+    covariance: Array  # (k, 3 c, 3 c)
 
 
 def solved(scene: Scene, times: Array, bounces: int) -> Paths:
     """The paths with bounces at guessed times (k, b) s, or of one flight about an anchor (k, 1) s."""
     rays, physics = scene.rays, scene.physics
-    k, m, size = len(times), len(rays.times), 3 * (bounces + 2)
+    k, m, size = len(times), len(rays.times), 3 * columns_of(scene, bounces)
     drag, depth, weight = np.zeros((k, bounces + 1)), np.ones((k, m)), np.ones((k, m))
     precision = LAWS**2 * np.linalg.det(rays.root)  # (m,) of a sighting, at 1 m, beside that of the laws
     for _ in range(ROUNDS):
         prior, target = _priors(scene, times, bounces, drag)
-        share, drop = shares_of(rays.times[None], times, bounces, drag, physics.gravity)
+        share, drop = shares_of(rays.times[None], times, bounces, drag, physics.gravity, lift=scene.lift is not None)
         root = rays.root / np.sqrt(depth**2 + precision)[..., None, None]
         seen = (root @ rays.matrix)[:, :, :, None, :] * share[:, :, None, :, None]
         seen = seen.reshape(k, 2 * m, size)
@@ -90,8 +94,8 @@ def solved(scene: Scene, times: Array, bounces: int) -> Paths:
         unknown: Array = np.asarray(np.linalg.solve(information, side), dtype=np.float64)
         square = (((seen @ unknown)[..., 0] - wanted).reshape(k, m, 2) ** 2).sum(axis=-1)
         weight = 1.0 / (1.0 + square / ROBUST**2)
-        vectors = unknown.reshape(k, bounces + 2, 3)
-        drag = physics.drag * np.minimum(np.linalg.norm(vectors[:, 1:], axis=-1), 2.0 * SPEED)
+        vectors = unknown.reshape(k, -1, 3)
+        drag = physics.drag * np.minimum(np.linalg.norm(vectors[:, 1 : bounces + 2], axis=-1), 2.0 * SPEED)
         point = share @ vectors
         point[..., Z] -= drop
         depth = np.maximum((rays.depth_row[:, :3] * point).sum(axis=-1) + rays.depth_row[:, 3], NEAREST)
@@ -100,10 +104,17 @@ def solved(scene: Scene, times: Array, bounces: int) -> Paths:
     return Paths(times, bounces, misfit, vectors, drag, np.asarray(np.linalg.inv(information), dtype=np.float64))
 
 
-def shares_of(moments: Array, times: Array, bounces: int, drag: Array, gravity: float) -> tuple[Array, Array]:
-    """Positions at moments (1 or k, n) s as sums: shares (k, n, b + 2) of the vectors, drops (k, n) m by gravity."""
+def columns_of(scene: Scene, bounces: int) -> int:
+    """Number of vectors of a path."""
+    return bounces + 2 + (0 if scene.lift is None else bounces + 1)
+
+
+def shares_of(
+    moments: Array, times: Array, bounces: int, drag: Array, gravity: float, *, lift: bool = False
+) -> tuple[Array, Array]:
+    """Positions at moments (1 or k, n) s as sums: shares (k, n, c) of the vectors, drops (k, n) m by gravity."""
     later = (moments[..., None] > times[:, None, :]).sum(axis=2) * (bounces > 0)
-    share = np.zeros((*later.shape, bounces + 2))
+    share = np.zeros((*later.shape, (2 if lift else 1) * (bounces + 1) + 1))
     drop = np.zeros(share.shape[:2])
     share[..., 0] = 1.0
     for flight in range(bounces + 1):
@@ -113,6 +124,8 @@ def shares_of(moments: Array, times: Array, bounces: int, drag: Array, gravity: 
             since = np.minimum(since, times[:, flight, None] - begin)
         flown = (later >= flight) if flight else (later == 0)
         share[..., 1 + flight] = np.where(flown, _stretched(since, drag[:, flight, None]), 0.0)
+        if lift:
+            share[..., bounces + 2 + flight] = np.where(flown, 0.5 * since**2, 0.0)
         slower = np.maximum(drag[:, flight, None] * since, STRETCH_LIMIT)
         drop += np.where(flown, 0.5 * gravity * since**2 / (1.0 + slower / 3.0), 0.0)
     return share, drop
@@ -135,9 +148,10 @@ def place_prior(surfaces: Surfaces) -> tuple[Array, float]:
 def _priors(scene: Scene, times: Array, bounces: int, drag: Array) -> tuple[Array, Array]:
     """Whitened rows (k, r, 3 (b + 2)) and their targets (k, r): wide priors, and the plane and laws of each bounce."""
     (centre, spread), g, k = place_prior(scene.surfaces), scene.physics.gravity, len(times)
-    size = 3 * (bounces + 2)
+    size, straight = 3 * columns_of(scene, bounces), 3 * (bounces + 2)
     rows, targets = np.zeros((k, size + 4 * bounces, size)), np.zeros((k, size + 4 * bounces))
-    rows[:, range(size), range(size)] = np.append(np.full(3, 1.0 / spread), np.full(size - 3, 1.0 / SPEED))
+    sigmas = np.repeat((spread, SPEED, scene.lift or np.inf), (3, straight - 3, size - straight))
+    rows[:, range(size), range(size)] = 1.0 / sigmas
     targets[:, :3] = centre / spread
     for bounce in range(bounces):
         law, before, after = size + 4 * bounce, 3 + 3 * bounce, 6 + 3 * bounce
@@ -150,7 +164,11 @@ def _priors(scene: Scene, times: Array, bounces: int, drag: Array) -> tuple[Arra
         rows[:, law + 2, before + Z] = scene.physics.restitution * slowed / RESTITUTION_SIGMA
         fallen = g * flown / (1.0 + drag[:, bounce] * flown / 2.0)
         targets[:, law + 2] = scene.physics.restitution * fallen / RESTITUTION_SIGMA
-        share, drop = shares_of(times[:, [bounce]], times, bounces, drag, g)
+        if bounce and scene.lift is not None:
+            turned = straight + 3 * bounce
+            rows[:, law, turned], rows[:, law + 1, turned + 1] = (-KEPT * flown / FRICTION_SIGMA,) * 2
+            rows[:, law + 2, turned + Z] = scene.physics.restitution * flown / RESTITUTION_SIGMA
+        share, drop = shares_of(times[:, [bounce]], times, bounces, drag, g, lift=scene.lift is not None)
         rows[:, law + 3, Z::3] = share[:, 0] / PLANE_SIGMA
         targets[:, law + 3] = (scene.plane + drop[:, 0]) / PLANE_SIGMA
     return rows, targets
@@ -158,15 +176,24 @@ def _priors(scene: Scene, times: Array, bounces: int, drag: Array) -> tuple[Arra
 
 def possible(scene: Scene, tried: Paths) -> NDArray[np.bool_]:
     """(k,) True if all bounces rise, the first from above, and lie within the ends of the table, if it is the table."""
-    fine = (tried.vectors[:, 1, Z] < 0.0) & (tried.vectors[:, 2:, Z] > 0.0).all(axis=1)
+    fine = (tried.vectors[:, 1, Z] < 0.0) & (tried.vectors[:, 2 : tried.bounces + 2, Z] > 0.0).all(axis=1)
     ends = scene.surfaces.extent
     if scene.height != scene.surfaces.table_height or ends is None:
         return np.asarray(fine)
     for bounce in range(tried.bounces):
-        share, _ = shares_of(tried.times[:, [bounce]], tried.times, tried.bounces, tried.drag, scene.physics.gravity)
+        at = tried.times[:, [bounce]]
+        lift = scene.lift is not None
+        share, _ = shares_of(at, tried.times, tried.bounces, tried.drag, scene.physics.gravity, lift=lift)
         x, y, _ = (share @ tried.vectors)[:, 0].T
         fine &= (x >= ends[0] - ASIDE) & (x <= ends[1] + ASIDE) & (y >= ends[2] - ASIDE) & (y <= ends[3] + ASIDE)
     return np.asarray(fine)
+
+
+def narrowed(scene: Scene, tried: Paths, row: int) -> float:
+    """Logarithm of the share of its prior volume that a path has left: the factor of Occam in its evidence."""
+    rows, _ = _priors(scene, tried.times[[row]], tried.bounces, tried.drag[[row]])
+    before = float(np.linalg.slogdet(rows[0].T @ rows[0])[1])
+    return 0.5 * (before + float(np.linalg.slogdet(tried.covariance[row])[1]))
 
 
 def velocities_of(tried: Paths, row: int, moments: Array, gravity: float) -> Array:

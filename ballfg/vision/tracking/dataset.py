@@ -29,17 +29,18 @@ STATES: Final = "states.csv"
 FILES: Final = (INFO_FILE, TRACKS, STATES, DETECTIONS_FILE, CAMERAS_FILE, OVERLAY, SHEET)  # all written files
 
 
-def check_result_folder(folder: Path, inputs: Sequence[Path], *, force: bool) -> None:
+def check_result_folder(folder: Path, inputs: Sequence[Path], *, force: bool, files: Sequence[str] = FILES) -> None:
     """Refuses a folder in which content would be lost.
 
     Args: folder: for the dataset.  inputs: files that are read.  force: an earlier result may be replaced.
+        files: names that an earlier result may have.
     Raises: ValueError: a file; an input that lies in it; other files; an earlier result and no `force`.
         FileNotFoundError: its parent does not exist.
     """
     for path in inputs:
         if path.resolve().parent == folder.resolve():
             raise ValueError(f"out must not hold what is read; {path} lies in {folder}. Choose another folder.")
-    check_replaceable(folder, mark=INFO_FILE, what="an earlier result", only=FILES, force=force)
+    check_replaceable(folder, mark=INFO_FILE, what="an earlier result", only=files, force=force)
 
 
 def write_tracking(

@@ -1,0 +1,132 @@
+"""Finds smooth arcs among the candidates of successive pictures: the seeds of flights.
+
+Three candidates whose second difference a ball may have begin an arc; it goes on to both sides where a parabola through
+its last points meets a candidate. Where candidates are few, arcs may begin over pictures without one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from ballfg.arrays import Index
+from ballfg.estimation.rally.field import Field
+
+FASTEST: Final = 40.0
+"""m/s, of a ball."""
+SLOWEST: Final = 0.7
+"""m/s: what is slower is not followed."""
+TURNING: Final = 45.0
+"""m/s^2, acceleration of a ball in flight: gravity, drag at 15 m/s, lift."""
+NOISE: Final = 2.0
+"""px, of a second difference, and of a point about a parabola."""
+MEMORY: Final = 5
+"""Last points that foretell the next one."""
+MISSED: Final = 2
+"""Pictures that an arc may pass without a candidate."""
+LEAST: Final = 4
+"""Points of an arc, where candidates are many."""
+FEW: Final = 30.0
+"""Candidates a picture up to which arcs have three points or more, up to `APART` pictures apart."""
+APART: Final = 3
+EXPOSURES: Final = np.linspace(0.0, 1.0, 41)
+"""Of the step, that are tried."""
+
+
+@dataclass
+class Tally:
+    """How often a candidate was near where three others foretold it, and the area, px^2, in which it was looked for."""
+
+    met: int = 0
+    area: float = 0.0
+
+
+def with_exposure(field: Field, found: Sequence[Index]) -> Field:
+    """The field with the exposure for which the likeliest arcs that follow each other explain the bars best."""
+    if not found:
+        return field
+    rows, motion = np.concatenate(found), np.concatenate([field.motion(one) for one in found])
+    begin = np.cumsum([0, *(len(one) for one in found[:-1])])
+    first, last = (field.frame[[one[end] for one in found]] for end in (0, -1))
+    order = np.argsort(last, kind="stable")
+    spot = np.log(field.seen / (field.density[rows] * 2.0 * np.pi * np.sqrt(np.linalg.det(field.covariances[rows]))))
+    sums = list[float]()
+    for exposure in EXPOSURES:
+        gain = np.add.reduceat(spot + field.bar_gain(rows, motion, exposure), begin)
+        best, done = np.zeros(len(field.first) + 1), 0  # of arcs that end before a picture
+        for arc in order:
+            best[done + 1 : last[arc] + 2] = best[done]
+            done = int(last[arc]) + 1
+            best[done] = max(best[done], best[first[arc]] + gain[arc])
+        sums.append(float(best.max()))
+    return replace(field, exposure=float(EXPOSURES[int(np.argmax(sums))]))
+
+
+def arcs(field: Field) -> tuple[list[Index], Field]:
+    """Numbers of the candidates of each arc, in order of time, longest arcs first; arcs may share candidates.
+
+    Returns: the arcs, and the field with the density of smooth clutter that they show.
+    """
+    used, found, tally = set[tuple[int, int]](), list[Index](), Tally()
+    count = len(field.first) - 1
+    few = len(field.frame) <= FEW * count
+    gaps = range(1, APART + 1) if few else (1,)
+    bend = TURNING * field.step**2 * field.scale
+    for frame in range(1, count - 1):
+        for triple in (one for a in gaps for c in gaps for one in _triples(field, frame, a, c, bend)):
+            if (triple[0], triple[1]) in used and (triple[1], triple[2]) in used:
+                continue
+            rows = list(triple)
+            _extend(field, rows, 1, bend, tally)
+            rows.reverse()
+            _extend(field, rows, -1, bend, tally)
+            rows.reverse()
+            used.update(pairwise(rows))
+            if len(rows) >= (3 if few else LEAST):
+                found.append(np.array(rows))
+    density = tally.met / tally.area if tally.area else 0.0
+    return sorted(found, key=lambda rows: -len(rows)), field.smooth(density)
+
+
+def _triples(field: Field, frame: int, before: int, after: int, bend: float) -> Iterator[tuple[int, int, int]]:
+    """Candidates of `frame`, of one `before` and one `after` it that may be one ball, smoothest first."""
+    a, b, c = field.rows(frame - before), field.rows(frame), field.rows(frame + after)
+    if not (len(a) and len(b) and len(c)):
+        return
+    step = (field.pixels[b][None] - field.pixels[a][:, None]) / before
+    length = np.linalg.norm(step, axis=2)
+    i, j = np.nonzero((length < FASTEST * field.step * field.scale) & (length > SLOWEST * field.step * field.scale))
+    bent = field.pixels[c][None] - field.pixels[b[j]][:, None] - after * step[i, j][:, None]
+    off = np.linalg.norm(bent, axis=2)
+    pair, k = np.nonzero(off < 0.5 * bend * after * (before + after) + NOISE)
+    rows = np.stack((a[i[pair]], b[j[pair]], c[k]), axis=1)
+    motion = (field.pixels[rows[:, 2]] - field.pixels[rows[:, 0]]) / (before + after)
+    good = np.all([field.along(rows[:, n], motion) for n in range(3)], axis=0)
+    yield from rows[good][np.argsort(off[pair, k][good], kind="stable")].tolist()
+
+
+def _extend(field: Field, rows: list[int], way: int, bend: float, tally: Tally) -> None:
+    """Goes on with rows in the order of `way`, 1 or -1, as long as candidates continue them."""
+    missed, frame = 0, int(field.frame[rows[-1]])
+    while missed <= MISSED:
+        frame += way
+        if not 0 <= frame < len(field.first) - 1:
+            return
+        last = np.array(rows[-MEMORY:])
+        since = (field.frame[last] - frame).astype(np.float64)
+        design = np.stack([since**n for n in range(min(len(last), 3))], axis=1)
+        place = np.linalg.lstsq(design, field.pixels[last])[0]
+        here, reach = field.rows(frame), NOISE + 0.35 * (bend + NOISE) * (1 + missed) ** 2
+        off = np.linalg.norm(field.pixels[here] - place[0], axis=1)
+        off[~field.along(here, np.tile(place[1], (len(here), 1)))] = np.inf
+        near = len(here) > 0 and bool(off.min() < reach)
+        if len(rows) == 3 and not missed:
+            tally.met += near
+            tally.area += np.pi * reach**2
+        if near:
+            rows.append(int(here[np.argmin(off)]))
+        missed = 0 if near else missed + 1

@@ -1,0 +1,178 @@
+"""Chooses the strokes of a rally: hypotheses from the likeliest arcs, and their best sequence, joined at hits.
+
+The score of a sequence is the logarithm of its probability against clutter alone. Sums over all sequences (forward and
+backward, as for a hidden Markov model) give the probability of each stroke.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from scipy.special import logsumexp
+
+from ballfg.arrays import Array, Index
+from ballfg.estimation.rally.strokes import Grower, Stroke
+from ballfg.progress import Watch, unwatched
+
+KEPT: Final = 15
+"""Arcs with the highest scores in each picture, of which strokes are grown."""
+COMPARED: Final = 40
+"""Strokes with the highest scores in each picture, of which sequences are made."""
+BEGINS: Final = 8.0
+"""Logarithm of what a stroke costs that no hit joins to the one before."""
+HIT: Final = 3.0
+"""The same of a hit."""
+HIT_SIGMA: Final = 0.08
+"""m, between the paths before and after a hit: the racket holds the ball for a millisecond; paths bend."""
+ROOM: Final = 30.0
+"""m^3, in which a stroke begins that no hit joins to another."""
+MOST_BOUNCES: Final = 2
+"""Of a stroke: a service has two."""
+GAINED: Final = 0.1
+"""Least gain of an exchange."""
+ROUNDS: Final = 6
+"""Of exchanges in a sequence, until nothing improves."""
+LONGEST_HIT: Final = 0.4
+"""s without a candidate about a hit, behind a player."""
+SAME_WAY: Final = 5.0
+"""Logarithm of what it costs that the ball goes on along the court after a hit: players alternate."""
+
+
+@dataclass(frozen=True, eq=False)
+class Chosen:
+    """The strokes of the best sequence, the probability of each, and whether a hit joins each to the one before."""
+
+    strokes: tuple[Stroke, ...]
+    probabilities: Array
+    joined: tuple[bool, ...]
+
+
+def hypotheses(grower: Grower, seeds: Sequence[Index], watch: Watch = unwatched) -> list[Stroke]:
+    """The strokes that grow from arcs, highest scores first; of those with the same candidates only the best."""
+    flights = [grower.flown(rows, ()) for rows in seeds]
+    found = dict[tuple[int, ...], Stroke]()
+    chosen = _best_in_each(grower, flights, KEPT, 1)
+    for flight in watch(chosen, len(chosen), "possible flights followed"):
+        whole = _variants(grower, flight)
+        for stroke in (*whole, *(part for one in whole for part in grower.shortened(one))):
+            known = found.get(_key(stroke))
+            if (known is None or stroke.score > known.score) and grower.plausible(stroke):
+                found[_key(stroke)] = stroke
+    return _best_in_each(grower, sorted(found.values(), key=lambda one: -one.score), COMPARED)
+
+
+def rally(grower: Grower, seeds: Sequence[Index], watch: Watch = unwatched) -> Chosen:
+    """The likeliest strokes of a rally, after exchanges of candidates and bounces in which nothing improves it."""
+    known = {_key(stroke): stroke for stroke in hypotheses(grower, seeds, watch)}
+    done = set[tuple[int, ...]]()
+    for _ in range(ROUNDS):
+        chosen = best_sequence(grower, list(known.values()))
+        fresh = [stroke for stroke in chosen.strokes if _key(stroke) not in done]
+        for stroke in fresh:
+            done.add(_key(stroke))
+            for better in _exchanged(grower, stroke):
+                old = known.get(_key(better))
+                known[_key(better)] = better if old is None or better.score > old.score else old
+        if not fresh:
+            break
+    return best_sequence(grower, list(known.values()))
+
+
+def _key(stroke: Stroke) -> tuple[int, ...]:
+    """What tells strokes apart: their candidates and the number of their bounces."""
+    return (*stroke.rows.tolist(), -len(stroke.bounces) - 1)
+
+
+def _exchanged(grower: Grower, stroke: Stroke) -> list[Stroke]:
+    """Better strokes than one, that have a bounce more or other candidates at an end."""
+    parts = [stroke, *grower.shortened(stroke)]
+    tried = [bounced for part in parts for way in (1, -1) for bounced in _bounced(grower, part, way)]
+    tried += [grower.timed(grower.grown(grower.grown(part, 1), -1)) for part in parts]
+    return [one for one in tried if one.score > stroke.score + GAINED and grower.plausible(one)]
+
+
+def _variants(grower: Grower, flight: Stroke) -> list[Stroke]:
+    """A flight without bounce, with one after or before it, and with one after and one before it."""
+    found = [grower.grown(grower.grown(flight, 1), -1)]
+    for way in (1, -1):
+        for stroke in _bounced(grower, flight, way):
+            found.append(stroke)
+            found += _bounced(grower, stroke, -1) if way > 0 else []
+    return found
+
+
+def _bounced(grower: Grower, flight: Stroke, way: int) -> list[Stroke]:
+    """The best stroke with one more bounce, if there is any."""
+    if len(flight.bounces) == MOST_BOUNCES:
+        return []
+    best = max(grower.bounced(flight, way), key=lambda one: one.score, default=None)
+    return [] if best is None else [grower.grown(grower.grown(grower.timed(best), way), -way)]
+
+
+def _best_in_each(grower: Grower, strokes: Sequence[Stroke], most: int, alike: int = -1) -> list[Stroke]:
+    """Those among the best `most` in one of their pictures, best first, without repeats of better ones.
+
+    Args: alike: number of candidates, at most, by which a stroke differs from a better one that it repeats.
+    """
+    taken, kept, sets = np.zeros(len(grower.field.first), dtype=np.int64), list[Stroke](), list[set[int]]()
+    for stroke in sorted(strokes, key=lambda one: -one.score):
+        first, last = grower.field.frame[stroke.rows[[0, -1]]]
+        mine = set(stroke.rows.tolist())
+        if taken[first : last + 1].min() < most and not any(len(mine - used) <= alike for used in sets):
+            kept.append(stroke)
+            sets.append(mine)
+            taken[first : last + 1] += 1
+    return kept
+
+
+def best_sequence(grower: Grower, strokes: Sequence[Stroke]) -> Chosen:
+    """The likeliest sequence of strokes that follow each other."""
+    ordered = sorted(strokes, key=lambda one: int(grower.field.frame[one.rows[-1]]))
+    count = len(ordered)
+    if not count:
+        return Chosen((), np.zeros(0), ())
+    first, last = (grower.field.frame[[one.rows[end] for one in ordered]] for end in (0, -1))
+    times = grower.rays.times[0] + grower.field.step * (np.arange(last.max() + 1) - grower.field.frame[0])
+    score = np.array([one.score for one in ordered])
+    begins = np.where([one.path.bounces > 0 for one in ordered], -BEGINS, -np.inf)  # else it may be anything
+    link = np.full((count, count), -np.inf)
+    for i in range(count):
+        later = first > last[i]
+        link[i, later] = begins[later]
+        for j in np.flatnonzero(later & (times[first] - times[last[i]] < LONGEST_HIT)):
+            link[i, j] = max(begins[j], _hit(grower, ordered[i], ordered[j]))
+    best, before = score + begins, np.full(count, -1)
+    forward, backward = score + begins, np.zeros(count)
+    for j in range(count):
+        ways = best[:j] + link[:j, j]
+        if j and ways.max() > begins[j]:
+            before[j] = int(np.argmax(ways))
+            best[j] = ways.max() + score[j]
+        forward[j] = score[j] + logsumexp(np.append(forward[:j] + link[:j, j], begins[j]))
+    for i in range(count - 1, -1, -1):
+        backward[i] = logsumexp(np.append(link[i] + score + backward, 0.0))
+    total = logsumexp(np.append(forward, 0.0))
+    chain, at = list[int](), int(np.argmax(best))
+    while best.max() > 0.0 and at >= 0:
+        chain.append(at)
+        at = int(before[at])
+    chain.reverse()
+    probabilities = np.exp(np.minimum(forward[chain] + backward[chain] - total, 0.0))
+    joined = (False, *(bool(link[i, j] > begins[j]) for i, j in pairwise(chain)))[: len(chain)]
+    return Chosen(tuple(ordered[i] for i in chain), probabilities, joined)
+
+
+def _hit(grower: Grower, before: Stroke, after: Stroke) -> float:
+    """Logarithm of the likelihood that a hit joins two strokes, by how near their paths come between them."""
+    start, end = grower.rays.times[before.rows[-1]], grower.rays.times[after.rows[0]]
+    moments = np.linspace(start, end, 9)
+    (one, spread), (other, wide) = (grower.places_of(stroke.path, moments) for stroke in (before, after))
+    off, both = other - one, spread + wide + HIT_SIGMA**2 * np.eye(3)
+    likelihood = -0.5 * np.einsum("ni,nij,nj->n", off, np.linalg.inv(both), off)
+    likelihood -= 0.5 * np.linalg.slogdet(2.0 * np.pi * both)[1]
+    onward = before.path.vectors[0, before.path.bounces + 1, 0] * after.path.vectors[0, 1, 0] > 0.0
+    return float(likelihood.max() + np.log(ROOM) - HIT - SAME_WAY * onward)

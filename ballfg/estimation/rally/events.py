@@ -1,0 +1,183 @@
+"""The events of a rally, hits, bounces and the ball lost, and the numbers of each stroke, with standard deviations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import torch
+
+from ballfg.arrays import Array
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.rally.reconstruct import ShotRally
+from ballfg.estimation.result import Estimate
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ, Z
+
+STEPS: Final = 81
+"""Moments between two strokes at which their paths are compared."""
+RACKET: Final = 0.05
+"""m, standard deviation between the paths before and after a hit."""
+BEHIND: Final = (0.2, 0.25)
+"""m behind the end of the court where a first stroke is hit, and its standard deviation."""
+
+
+@dataclass(frozen=True, eq=False)
+class Event:
+    """What happened to the ball: `kind` is hit, bounce or lost.
+
+    Attributes: trajectory: name of the stroke, that after a hit.  t: s.  place: (3,) m.  sigma_t: s.
+        sigmas: (3,) m.  probability: of the strokes that the event belongs to.
+    """
+
+    trajectory: str
+    t: float
+    kind: str
+    place: Array
+    sigma_t: float
+    sigmas: Array
+    probability: float
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """A state (9,) and its covariance (9, 9) at a time, s."""
+
+    t: float
+    state: Array
+    covariance: Array
+
+
+def carried(model: BallModel, estimate: Estimate, sample: int, t: float) -> Moment:
+    """A sample's state carried to a time, s, nearby, before or after it, by an even acceleration, without contacts."""
+    state, dt = estimate.states[sample], t - float(estimate.times[sample])
+    with torch.no_grad():
+        rates = model.rates(torch.from_numpy(state[None].copy()))[0]
+    accelerated = np.asarray(rates)[0]
+    later, carry = state.copy(), np.eye(STATE_DIM)
+    later[POSITION] += state[VELOCITY] * dt + 0.5 * accelerated * dt**2
+    later[VELOCITY] += accelerated * dt
+    carry[POSITION, VELOCITY] = dt * np.eye(3)
+    return Moment(t, later, carry @ estimate.covariances[sample] @ carry.T)
+
+
+def events_of(one: ShotRally, model: BallModel, surfaces: Surfaces, step: float) -> list[Event]:
+    """The events of a shot in order of time. Args: step: s between pictures."""
+    found, last = list[Event](), len(one.estimates) - 1
+    for number, estimate in enumerate(one.estimates):
+        chance = float(one.chosen.probabilities[number])
+        if one.chosen.joined[number]:
+            before = one.estimates[number - 1]
+            both = chance * float(one.chosen.probabilities[number - 1])
+            found.append(replace(hit_between(model, before, estimate, step), probability=both))
+        else:
+            found.append(replace(first_hit(model, estimate, surfaces, step), probability=chance))
+        found += [replace(event, probability=chance) for event in bounces_of(model, estimate)]
+        if number == last or not one.chosen.joined[number + 1]:
+            end = carried(model, estimate, -1, float(estimate.times[-1]))
+            sigmas = np.sqrt(np.diag(end.covariance))[POSITION]
+            found.append(Event(estimate.name, end.t, "lost", end.state[POSITION], step / 2.0, sigmas, chance))
+    return sorted(found, key=lambda event: event.t)
+
+
+def bounces_of(model: BallModel, estimate: Estimate) -> list[Event]:
+    """The bounces of a stroke, from the states before them."""
+    found = list[Event]()
+    for contact in estimate.contacts:
+        sample = max(int(np.searchsorted(estimate.times, contact.time, side="right")) - 1, 0)
+        at = carried(model, estimate, sample, contact.time)
+        fall = max(abs(float(at.state[VZ])), 0.1)
+        sigma_t = float(np.sqrt(at.covariance[Z, Z])) / fall
+        slip = np.eye(STATE_DIM)[POSITION]  # on the surface, whenever it is met
+        slip[:2, Z] = -at.state[VELOCITY][:2] / at.state[VZ] if abs(at.state[VZ]) > 0.1 else 0.0
+        sigmas = np.sqrt(np.diag(slip @ at.covariance @ slip.T))
+        found.append(
+            Event(estimate.name, at.t, "bounce", at.state[POSITION], sigma_t, np.append(sigmas[:2], 1e-3), 1.0)
+        )
+    return found
+
+
+def hit_between(model: BallModel, before: Estimate, after: Estimate, step: float) -> Event:
+    """The hit at which the path of a stroke meets that of the next one, most likely."""
+    times = np.linspace(before.times[-1] - 0.5 * step, after.times[0] + 0.5 * step, STEPS)
+    cost, places, spreads = [], [], []
+    for t in times:
+        one, other = carried(model, before, -1, float(t)), carried(model, after, 0, float(t))
+        first, second = (state.covariance[POSITION, POSITION] for state in (one, other))
+        off = other.state[POSITION] - one.state[POSITION]
+        both = first + second + RACKET**2 * np.eye(3)
+        cost.append(float(off @ np.linalg.solve(both, off) + np.linalg.slogdet(both)[1]))
+        gain = first @ np.linalg.inv(both)
+        places.append(one.state[POSITION] + gain @ off)
+        spreads.append(first - gain @ first)
+    weight = np.exp(-0.5 * (np.array(cost) - min(cost)))
+    weight /= weight.sum()
+    mean = float(weight @ times)
+    sigma_t = float(np.sqrt(weight @ (times - mean) ** 2 + (times[1] - times[0]) ** 2 / 12.0))
+    place = weight @ np.array(places)
+    spread = np.einsum("n,nij->ij", weight, np.array(spreads))
+    apart = np.array(places) - place
+    spread += (apart * weight[:, None]).T @ apart
+    return Event(after.name, mean, "hit", place, sigma_t, np.sqrt(np.diag(spread)), 1.0)
+
+
+def first_hit(model: BallModel, estimate: Estimate, surfaces: Surfaces, step: float) -> Event:
+    """The hit of a stroke that follows none: behind the end of the court that the ball comes from."""
+    x, speed = float(estimate.states[0, 0]), float(estimate.states[0, VELOCITY][0])
+    ends = surfaces.extent or (-np.inf, np.inf, -np.inf, np.inf)
+    behind = ends[0] - BEHIND[0] if speed > 0.0 else ends[1] + BEHIND[0]
+    back = (x - behind) / speed if np.isfinite(behind) and abs(speed) > 0.5 else 0.5 * step
+    back, sigma_t = max(back, 0.5 * step), max(BEHIND[1] / max(abs(speed), 0.5), 0.5 * step)
+    at = carried(model, estimate, 0, float(estimate.times[0]) - back)
+    spread = at.covariance[POSITION, POSITION] + sigma_t**2 * np.outer(at.state[VELOCITY], at.state[VELOCITY])
+    return Event(estimate.name, at.t, "hit", at.state[POSITION], sigma_t, np.sqrt(np.diag(spread)), 1.0)
+
+
+def stroke_row(estimate: Estimate, events: list[Event], model: BallModel, net: float) -> dict[str, float | str]:
+    """The numbers of a stroke, with sigmas; NaN where it does not show one.
+
+    Args: events: of the shot.  net: m, height of the net at x = 0.
+    """
+    mine = [event for event in events if event.trajectory == estimate.name]
+    hit = next(event for event in mine if event.kind == "hit")
+    bounces = [event for event in mine if event.kind == "bounce"]
+    start = carried(model, estimate, 0, hit.t)
+    row: dict[str, float | str] = {"stroke": estimate.name, "t_start": hit.t, "t_end": float(estimate.times[-1])}
+    row["end"] = "+x" if start.state[VELOCITY][0] < 0.0 else "-x"
+    row |= _speed("speed_hit", start)
+    nothing = Moment(0.0, np.full(STATE_DIM, np.nan), np.full((STATE_DIM, STATE_DIM), np.nan))
+    before = nothing
+    if bounces:
+        sample = max(int(np.searchsorted(estimate.times, bounces[0].t, side="right")) - 1, 0)
+        before = carried(model, estimate, sample, bounces[0].t)
+    row |= _speed("speed_bounce", before)
+    for axis, place in zip("xyz", range(SPIN.start, SPIN.stop), strict=True):
+        row[f"spin_{axis}"] = float(start.state[place])
+        row[f"sigma_spin_{axis}"] = float(np.sqrt(start.covariance[place, place]))
+    row["net_clearance"], row["sigma_net_clearance"] = _clearance(estimate, model, net)
+    place = bounces[-1].place if bounces else np.full(3, np.nan)
+    sigmas = bounces[-1].sigmas if bounces else np.full(3, np.nan)
+    for i, axis in enumerate("xy"):
+        row[f"bounce_{axis}"], row[f"sigma_bounce_{axis}"] = float(place[i]), float(sigmas[i])
+    return row | {"status": estimate.status.name.lower()}
+
+
+def _speed(name: str, moment: Moment) -> dict[str, float]:
+    """A speed, m/s, and its sigma."""
+    velocity = moment.state[VELOCITY]
+    speed = float(np.linalg.norm(velocity))
+    unit = velocity / max(speed, 1e-9)
+    return {name: speed, f"sigma_{name}": float(np.sqrt(unit @ moment.covariance[VELOCITY, VELOCITY] @ unit))}
+
+
+def _clearance(estimate: Estimate, model: BallModel, net: float) -> tuple[float, float]:
+    """m, height of the ball's lowest point over the net where it crosses x = 0, and its sigma; NaN if it does not."""
+    x = estimate.states[:, 0]
+    crossed = np.flatnonzero(np.diff(np.sign(x)) != 0)
+    if not len(crossed):
+        return np.nan, np.nan
+    sample = int(crossed[0])
+    t = float(estimate.times[sample] - x[sample] / estimate.states[sample, VELOCITY][0])
+    at = carried(model, estimate, sample, t)
+    return float(at.state[Z]) - net - model.radius, float(np.sqrt(at.covariance[Z, Z]))

@@ -1,0 +1,108 @@
+"""Reconstructs the strokes of a shot: candidates as a fixed camera would see them, strokes, estimates and events."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.rally.arcs import arcs, with_exposure
+from ballfg.estimation.rally.choose import Chosen, rally
+from ballfg.estimation.rally.field import SEEN_RANGE, Field
+from ballfg.estimation.rally.smoothed import rally_track
+from ballfg.estimation.rally.strokes import Grower
+from ballfg.estimation.result import Estimate
+from ballfg.estimation.segmentation.physics import physics_of
+from ballfg.estimation.settings import Settings
+from ballfg.estimation.smoother.smoother import Smoother
+from ballfg.progress import Watch, unwatched
+from ballfg.vision.broadcast.motion import Shot
+from ballfg.vision.broadcast.pinhole import Pinhole
+from ballfg.vision.camera import Camera
+from ballfg.vision.detection.detections import Detections
+
+FRAME_SIGMA: Final = 0.3
+"""px, of a picture's camera beside the error that all of a shot share."""
+
+ROUNDS, SETTLED = 3, 0.1
+"""In which the probability to see the ball is found, and its change that ends them."""
+
+
+@dataclass(frozen=True, eq=False)
+class ShotRally:
+    """The strokes of a shot.
+
+    Attributes:
+        camera: fixed, at the shot's place, with the covariance of its turn, place and focal length.
+        seen: the candidates as that camera sees them.  chosen: strokes with their probabilities.
+        estimates: of each stroke, in the same order.  exposure: of the time between pictures.
+    """
+
+    camera: Camera
+    seen: Detections
+    chosen: Chosen
+    estimates: tuple[Estimate, ...]
+    exposure: float
+
+
+def fixed_camera(shot: Shot, name: str) -> tuple[Pinhole, Camera]:
+    """A camera without distortion that looks where the shot looks on the whole, and the same with its covariance."""
+    axes = np.array([camera.turn[2] for camera in shot.cameras])
+    middle = int(np.argmin(np.linalg.norm(axes - np.median(axes, axis=0), axis=1)))
+    one = replace(shot.cameras[middle], bend=0.0)
+    to_world = np.eye(7)
+    to_world[:3, :3] = one.turn.T
+    covariance = to_world @ shot.covariances[middle] @ to_world.T
+    return one, one.camera(name, 0.5 * (covariance + covariance.T))
+
+
+def on_fixed_camera(found: Detections, shot: Shot, onto: Pinhole, name: str) -> Detections:
+    """The candidates of a moving camera where a fixed one at the same place sees them."""
+    pixels, streaks, spread = found.pixels.copy(), found.streaks.copy(), found.covariances.copy()
+    for number, camera in enumerate(shot.cameras):
+        rows = slice(*np.searchsorted(found.frame, (number, number + 1)))
+        pixels[rows], streaks[rows] = camera.onto(found.pixels[rows], onto), camera.onto(found.streaks[rows], onto)
+        spread[rows] *= (onto.focal / camera.focal) ** 2
+    seen = np.isfinite(pixels).all(axis=1)  # of a pan by more than a right angle something lies behind
+    spread += FRAME_SIGMA**2 * np.eye(2)
+    return replace(found, camera=name, pixels=np.nan_to_num(pixels), covariances=spread, streaks=streaks).select(seen)
+
+
+def reconstruct(
+    found: Detections, shot: Shot, model: BallModel, surfaces: Surfaces, *, first: int = 0, watch: Watch = unwatched
+) -> ShotRally:
+    """The strokes of a shot, with the estimate of each.
+
+    Args:
+        found: candidates in the pictures of the shot.  model: the ball.  surfaces: with the court's ends.
+        first: number of the first stroke; strokes are named by three digits.
+    """
+    name = f"shot{shot.first}"
+    pinhole, camera = fixed_camera(shot, name)
+    seen = on_fixed_camera(found, shot, pinhole, name)
+    field = Field.of(seen, pinhole.focal / float(np.linalg.norm(pinhole.place)))
+    seeds, field = arcs(field)
+    field = with_exposure(field, seeds)
+    for _ in range(ROUNDS):
+        grower = Grower.of(field, seen.times, camera, physics_of(model), surfaces)
+        chosen = rally(grower, seeds, watch)
+        share = field.seen if not chosen.strokes else _seen_share(field, chosen)
+        if abs(share - field.seen) < SETTLED:
+            break
+        field = replace(field, seen=share)
+    smoother = Smoother(model, surfaces, Settings.for_measured(model, find_events=False))
+    estimates = list[Estimate]()
+    for number, stroke in enumerate(watch(chosen.strokes, len(chosen.strokes), "strokes estimated")):
+        track = rally_track(f"{first + number:03d}", [stroke], grower, camera, seen.times)
+        estimates.append(smoother.estimate(track))
+    return ShotRally(camera, seen, chosen, tuple(estimates), field.exposure)
+
+
+def _seen_share(field: Field, chosen: Chosen) -> float:
+    """Share of the pictures of strokes in which the ball is among the candidates."""
+    pictures = sum(int(np.ptp(field.frame[stroke.rows])) + 1 for stroke in chosen.strokes)
+    share = sum(len(stroke.rows) for stroke in chosen.strokes) / pictures
+    return float(np.clip(share, *SEEN_RANGE))

@@ -1,0 +1,84 @@
+"""Turns a video of one camera that pans and zooms into strokes: camera, candidates, strokes, events."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.rally.events import Event, events_of, stroke_row
+from ballfg.estimation.rally.reconstruct import ShotRally, reconstruct
+from ballfg.progress import Watch, unwatched
+from ballfg.vision.broadcast.candidates import find_candidates
+from ballfg.vision.broadcast.court import Court
+from ballfg.vision.broadcast.motion import Frames, Motion, Shot, find_motion
+from ballfg.vision.detection.detections import Detections
+
+OwnCandidates = Callable[[Shot, Array], Detections]
+"""Gives the candidates of a user's detector in the pictures of a shot, from the stamps (f,) s of all pictures."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rally:
+    """What a video shows: its shots with their cameras, their strokes, the events, and a row of numbers a stroke."""
+
+    motion: Motion
+    shots: tuple[ShotRally, ...]
+    events: tuple[Event, ...]
+    strokes: tuple[dict[str, Any], ...]
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences on what is left out or not sure."""
+        seen = sum(len(shot) for shot in self.motion.shots)
+        notes = [] if seen == len(self.motion.times) else [f"{len(self.motion.times) - seen} pictures show no court"]
+        for one in self.shots:
+            unsure = (estimate for estimate in one.estimates if estimate.status.name != "OK")
+            notes += [f"stroke {estimate.name}: {estimate.status.value}" for estimate in unsure]
+        return notes
+
+
+def surfaces_of(court: Court) -> Surfaces:
+    """What a ball bounces on: the court at z = 0 within its ends, and the floor below it, if there is one."""
+    x, y = court.size.tolist()
+    return Surfaces(0.0, court.floor, (-x, x, -y, y))
+
+
+def track_moving_camera(
+    frames: Frames,
+    court: Court,
+    model: BallModel,
+    *,
+    count: int,
+    corners: dict[int, Array] | None = None,
+    candidates: OwnCandidates | None = None,
+    watch: Watch = unwatched,
+) -> Rally:
+    """The strokes in a video of one camera that stands at one place.
+
+    Args:
+        frames: opens the video, each time anew.  count: of its pictures, about.  court: in them.  model: the ball.
+        corners: number of a picture -> (4, 2) px of the court's corners, in any order; None: the court is found.
+        candidates: of a detector of one's own; None: bright moving spots.
+    Raises: ValueError: no picture shows the court.
+    """
+    motion = find_motion(frames, court, count, corners, watch)
+    surfaces = surfaces_of(court)
+    step = float(np.median(np.diff(motion.times)))
+    shots, events, rows = list[ShotRally](), list[Event](), list[dict[str, Any]]()
+    for shot in motion.shots:
+        if candidates is None:
+            found = find_candidates(frames, shot, court, model.radius, motion.times, watch)
+        else:
+            found = candidates(shot, motion.times)
+        one = reconstruct(found, shot, model, surfaces, first=len(rows), watch=watch)
+        mine = events_of(one, model, surfaces, step)
+        shots.append(one)
+        events += mine
+        rows += [stroke_row(estimate, mine, model, court.net) for estimate in one.estimates]
+    return Rally(motion, tuple(shots), tuple(events), tuple(rows))

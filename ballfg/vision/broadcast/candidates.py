@@ -1,0 +1,158 @@
+"""Finds what may be the ball in pictures that the camera's motion aligns.
+
+A moving ball is brighter, in each of the three colours, than the same place in the pictures before and after it; where
+it hardly moves, brighter than in pictures some frames away. What is left in connected regions of a ball's size at that
+place is a candidate; a ball that moves while the shutter is open is a bar, whose second moments give its ends.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Final
+
+import cv2
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.progress import Watch, unwatched
+from ballfg.vision.arrays import Image
+from ballfg.vision.broadcast.court import Court
+from ballfg.vision.broadcast.motion import Frames, Shot
+from ballfg.vision.broadcast.pinhole import Pinhole
+from ballfg.vision.detection.detections import Candidates, Detections
+
+NEAR, FAR = 1, 4
+"""Pictures before and after, with which a picture is compared."""
+BRIGHTER: Final = 14.0
+"""Grey levels by which a pixel of a candidate is brighter, in the least of the three colours."""
+PEAK: Final = 24.0
+"""The same for its brightest pixel: a fast ball over white letters has 40."""
+THIN, THICK = 0.4, 2.2
+"""Width of a candidate in diameters of the ball at that place, at least and at most: blur and compression widen it."""
+LONGEST: Final = 60.0
+"""px, of a bar."""
+LEAST: Final = 3
+"""Pixels of a candidate."""
+MOST: Final = 60
+"""Candidates of a picture, those with the highest scores."""
+ROOM: Final = (3.5, 3.0)
+"""Half lengths and half widths of the court about which balls are seen: they bound the ball's size."""
+SIGMA: Final = 0.6
+"""px, standard deviation of a candidate's centre across a bar; along it a share of the bar's length is added."""
+ALONG: Final = 0.06
+VISIBLE: Final = 3.0
+"""px, of a bar whose direction shows."""
+
+
+def find_candidates(
+    frames: Frames, shot: Shot, court: Court, radius: float, stamps: Array, watch: Watch = unwatched
+) -> Detections:
+    """The candidates in the pictures of a shot.
+
+    Args: frames: opens the video.  radius: m, of the ball.  stamps: (f,) s, of all pictures.
+    Returns: pixels as in the pictures, with camera `main`; frames are those of the shot.
+    """
+    window, found = deque[Image](), list[tuple[float, Candidates]]()
+    size = _diameters(shot, court, radius)
+    last = shot.first + len(shot)
+
+    def centre(index: int) -> None:
+        number = len(found)
+        here = aligned_candidates(list(window), index, shot.cameras[number - index :][: len(window)], size[number])
+        found.append((float(stamps[shot.first + number]), here))
+
+    for k, (_, image) in enumerate(watch(frames(), len(stamps), "pictures searched for the ball")):
+        if not shot.first <= k < last:
+            continue
+        window.append(image)
+        if len(window) > 2 * FAR + 1:
+            window.popleft()
+        if len(window) > FAR and k - shot.first >= FAR:
+            centre(len(window) - 1 - FAR)
+    while len(found) < len(shot):
+        centre(len(window) - (len(shot) - len(found)))
+    return Detections.of_frames("main", found)
+
+
+def _diameters(shot: Shot, court: Court, radius: float) -> Array:
+    """(n, 2) px, least and largest diameter of a ball about the court in each picture."""
+    x, y = court.size * ROOM
+    corners = np.array([(i * x, j * y, 0.0) for i in (-1, 1) for j in (-1, 1)])
+    sizes = list[tuple[float, float]]()
+    for camera in shot.cameras:
+        depth = np.maximum(((corners - camera.place) @ camera.turn.T)[:, 2], 0.3 * np.linalg.norm(camera.place))
+        sizes.append((2.0 * radius * camera.focal / depth.max(), 2.0 * radius * camera.focal / depth.min()))
+    return np.array(sizes)
+
+
+def aligned_candidates(window: list[Image], index: int, cameras: tuple[Pinhole, ...], size: Array) -> Candidates:
+    """The candidates of the picture `index` of a window, with the cameras of all of it and diameters (2,) px."""
+    here = window[index]
+    rise: Image | None = None
+    for apart in (NEAR, FAR):
+        beside = [index + step for step in (-apart, apart) if 0 <= index + step < len(window)]
+        if not beside:
+            continue
+        others = [_warped(window[i], cameras[i], cameras[index]) for i in beside]
+        most = others[0] if len(others) == 1 else cv2.max(*others)
+        blue, green, red = cv2.split(cv2.subtract(here, most))
+        change = cv2.min(cv2.min(blue, green), red)
+        rise = change if rise is None else cv2.max(rise, change)
+    return Candidates.none() if rise is None else _regions(cv2.GaussianBlur(rise, (3, 3), 0), size)
+
+
+def _warped(image: Image, camera: Pinhole, onto: Pinhole) -> Image:
+    """A picture as another camera at the same place sees it; what it does not see is white."""
+    width, height = camera.size
+    grid = np.stack(np.meshgrid(np.linspace(0, width - 1, 5), np.linspace(0, height - 1, 5)), axis=-1).reshape(-1, 2)
+    there = camera.onto(grid, onto)
+    if np.abs(there - grid).max() < 0.05:
+        return image
+    homography = cv2.findHomography(grid, there, 0)[0]
+    white = (255.0, 255.0, 255.0)
+    return cv2.warpPerspective(image, homography, (width, height), flags=cv2.INTER_LINEAR, borderValue=white)
+
+
+def _regions(rise: Image, size: Array) -> Candidates:
+    """Connected regions of a ball's width, as bars."""
+    bright = cv2.threshold(rise, BRIGHTER, 1.0, cv2.THRESH_BINARY)[1]
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(bright, connectivity=8)
+    pixels, covariances, scores, streaks = [], [], [], []
+    sides, areas = stats[1:, 2:4], stats[1:, 4]
+    fine = (areas >= LEAST) & (sides.max(axis=1) < LONGEST + THICK * size[1]) & (sides.max(axis=1) >= THIN * size[0])
+    for k in np.flatnonzero(fine) + 1:
+        x, y, w, h, area = stats[k]
+        patch = np.where(labels[y : y + h, x : x + w] == k, rise[y : y + h, x : x + w], 0.0).astype(np.float64)
+        if patch.max() < PEAK:
+            continue
+        centre, width, half = _bar(patch)
+        if not THIN * size[0] < width < THICK * size[1]:
+            continue
+        centre += (x, y)
+        length = 2.0 * np.hypot(*half)
+        unit = half / max(np.hypot(*half), 1e-9)
+        spread = SIGMA**2 * np.eye(2) + (ALONG * length) ** 2 * np.outer(unit, unit)
+        pixels.append(centre)
+        covariances.append(spread)
+        streaks.append(np.stack((centre - half, centre + half)) if length > VISIBLE else np.full((2, 2), np.nan))
+        filled = min(1.0, area / max(width * (length + width), 1.0))
+        scores.append(float(np.clip(patch.max() / (patch.max() + 60.0) * filled, 0.0, 1.0)))
+    order = np.argsort(-np.array(scores), kind="stable")[:MOST]
+    if not len(order):
+        return Candidates.none()
+    return Candidates(*(np.array(one)[order] for one in (pixels, covariances, scores, streaks)))
+
+
+def _bar(patch: Array) -> tuple[Array, float, Array]:
+    """Centre (2,) px, width px and half of the length (2,) px of a bar with weights (h, w).
+
+    A swept disc of diameter w and length l has the variances w^2 / 16 across it and w^2 / 16 + l^2 / 12 along it.
+    """
+    y, x = np.mgrid[: patch.shape[0], : patch.shape[1]]
+    total = patch.sum()
+    centre = np.array([(patch * x).sum(), (patch * y).sum()]) / total
+    dx, dy = x - centre[0], y - centre[1]
+    xx, xy, yy = (patch * dx * dx).sum() / total, (patch * dx * dy).sum() / total, (patch * dy * dy).sum() / total
+    (small, large), axes = np.linalg.eigh(np.array([[xx, xy], [xy, yy]]))
+    half = 0.5 * np.sqrt(12.0 * max(large - small, 0.0)) * axes[:, 1]
+    return centre, float(4.0 * np.sqrt(max(small, 0.0) + 1.0 / 24.0)), half

@@ -1,0 +1,154 @@
+"""Measures how far the lines of a court lie from where a camera should see them, and corrects the camera by it.
+
+A painted line is brighter than the ground on both sides. Along the normal of a line as a camera should see it, the
+place of the ridge is measured at points of the line (Harris and Stennett, "RAPID", 1990): one number for each, since
+nothing shows a shift along a line.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import cv2
+import numpy as np
+
+from ballfg.arrays import Array, Index, Mask
+from ballfg.vision.arrays import Array32, Image
+from ballfg.vision.broadcast.court import Court
+from ballfg.vision.broadcast.pinhole import Pinhole
+
+SAMPLES: Final = 24
+"""Along a line of the court."""
+STEP: Final = 0.5
+"""px between values along a normal."""
+FLANK: Final = 3.0
+"""px from the middle of a line to the ground beside it."""
+RIDGE: Final = 12.0
+"""Grey levels by which a line is brighter than the ground, at least."""
+SIGMA: Final = 0.7
+"""px, standard deviation of a ridge's place: compression, and the width of lines."""
+ROBUST: Final = 2.0
+"""Scale of Cauchy's loss on a ridge, in standard deviations."""
+FOCAL_SIGMA: Final = 0.5
+"""Of the logarithm of a focal length in one picture, about the first value."""
+REACHES: Final = (8.0, 5.0, 3.0, 3.0)
+"""px, in which ridges are looked for, turn by turn."""
+CLOSE: Final = 1.5
+"""px within which a ridge fits."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ridges:
+    """Places (n, 3) m on lines of the court, and where their ridges were seen: `offset` px along `normal` (n, 2).
+
+    `line` (n,) is the number of each one's line, `asked` (l,) the number of places of each line within the picture.
+    """
+
+    points: Array
+    offset: Array
+    normal: Array
+    line: Index
+    asked: Index
+
+    @property
+    def fit(self) -> float:
+        """Share of the places in the picture with a ridge at most `CLOSE` away, the mean of the lines."""
+        seen = self.asked > 0
+        close = np.bincount(self.line[np.abs(self.offset) < CLOSE], minlength=len(self.asked))
+        return float((close[seen] / self.asked[seen]).mean()) if seen.sum() >= 3 else 0.0
+
+
+def ridges(image: Array32, camera: Pinhole, court: Court, reach: float) -> Ridges:
+    """The ridges of a picture (h, w, 3) within `reach` px of the lines of a court as a camera should see them."""
+    share = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    points = court.lines[:, None, 0] + share[:, None] * (court.lines[:, None, 1] - court.lines[:, None, 0])
+    pixels = camera.project(points)
+    along = pixels[:, -1] - pixels[:, 0]
+    length = np.linalg.norm(along, axis=1)
+    normal = np.stack((-along[:, 1], along[:, 0]), axis=1) / length[:, None]
+    normals = np.broadcast_to(normal[:, None], pixels.shape)
+    limit = np.array(camera.size) - 1.0
+    inside = ((pixels > FLANK) & (pixels < limit - FLANK)).all(axis=2) & (length > 2 * SAMPLES)[:, None]
+    line = np.broadcast_to(np.arange(len(court.lines))[:, None], inside.shape)[inside]
+    offset, good = _brightest(image, pixels[inside], normals[inside], reach)
+    asked = inside.sum(axis=1)
+    return Ridges(points[inside][good], offset[good], normals[inside][good], line[good], asked)
+
+
+def _brightest(image: Array32, pixels: Array, normal: Array, reach: float) -> tuple[Array, Mask]:
+    """(n,) px, the middle of the strongest ridge along each normal, and whether there is one (n,)."""
+    steps = np.arange(-reach - FLANK, reach + FLANK + STEP / 2, STEP)
+    if not len(pixels):
+        return np.zeros(0), np.zeros(0, dtype=bool)
+    at = (pixels[:, None] + steps[:, None] * normal[:, None]).astype(np.float32)
+    values = cv2.remap(image, at, None, cv2.INTER_LINEAR).reshape(len(pixels), len(steps), 3)
+    flank = round(FLANK / STEP)
+    rise = values[:, flank:-flank] - np.maximum(values[:, : -2 * flank], values[:, 2 * flank :])
+    rise = rise.max(axis=2)
+    top = np.argmax(rise, axis=1)
+    rows = np.arange(len(top))
+    good = (rise[rows, top] > RIDGE) & (top > 0) & (top < rise.shape[1] - 1)
+    top = np.clip(top, 1, rise.shape[1] - 2)
+    before, here, after = rise[rows, top - 1], rise[rows, top], rise[rows, top + 1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shift = np.where(good, 0.5 * (before - after) / (before - 2.0 * here + after), 0.0)
+    return -reach + STEP * (top + np.clip(np.nan_to_num(shift), -0.5, 0.5)), good
+
+
+def slopes(camera: Pinhole, points: Array) -> tuple[Array, Array]:
+    """Pixels (n, 2) of points (n, 3) m, and derivatives (n, 2, 8) by turn, place, log focal length and distortion.
+
+    A turn w changes the camera's rotation to the world into R exp(w).
+    """
+    at = (points - camera.place) @ camera.turn.T
+    x, y, z = at.T
+    none, plane = np.zeros_like(z), at[:, :2] / z[:, None]
+    square = (plane**2).sum(axis=1)
+    by_plane = camera.focal * bending(plane, camera.bend)
+    by_at = np.stack((none + 1.0, none, -x / z, none, none + 1.0, -y / z), axis=1).reshape(-1, 2, 3) / z[:, None, None]
+    cross = np.stack((none, -z, y, z, none, -x, -y, x, none), axis=1).reshape(-1, 3, 3)
+    grown = camera.focal * plane * (1.0 + camera.bend * square)[:, None]
+    bent = camera.focal * plane * square[:, None]
+    by_at = by_plane @ by_at
+    slope = np.concatenate((by_at @ cross, -by_at @ camera.turn, grown[..., None], bent[..., None]), axis=2)
+    return grown + camera.middle, slope
+
+
+def bending(plane: Array, bend: float) -> Array:
+    """(n, 2, 2), derivative of distorted x/z and y/z by the undistorted ones (n, 2)."""
+    straight = (1.0 + bend * (plane**2).sum(axis=1))[:, None, None] * np.eye(2)
+    return np.asarray(straight + 2.0 * bend * plane[:, :, None] * plane[:, None, :])
+
+
+def moved(camera: Pinhole, step: Array) -> Pinhole:
+    """The camera after a step (7,) of turn, place and log focal length."""
+    turn = (camera.turn.T @ cv2.Rodrigues(step[:3])[0]).T
+    return replace(camera, turn=turn, place=camera.place + step[3:6], focal=float(camera.focal * np.exp(step[6])))
+
+
+def corrected(image: Image, camera: Pinhole, court: Court, free: slice = slice(0, 7)) -> tuple[Pinhole, float]:
+    """The camera that fits the ridges of a picture, and the share of the court's lines that then fit.
+
+    Args: free: numbers of the seven that are corrected; the others stay.
+    """
+    picture = image.astype(np.float32)
+    unknown = np.r_[free] if isinstance(free, slice) else free
+    first = camera.focal
+    for reach in REACHES:
+        seen = ridges(picture, camera, court, reach)
+        if len(seen.offset) < 2 * len(unknown):
+            return camera, 0.0
+        row = np.einsum("na,nab->nb", seen.normal, slopes(camera, seen.points)[1][..., :7]) / SIGMA
+        weight = 1.0 / (1.0 + (seen.offset / SIGMA / ROBUST) ** 2)
+        information = (row * weight[:, None]).T @ row + 1e-6 * np.eye(7)
+        pull = row.T @ (weight * seen.offset / SIGMA)
+        information[6, 6] += FOCAL_SIGMA**-2
+        pull[6] += np.log(first / camera.focal) / FOCAL_SIGMA**2
+        step = np.zeros(7)
+        step[unknown] = np.linalg.solve(information[np.ix_(unknown, unknown)], pull[unknown])
+        step *= min(1.0, 0.2 / np.abs(step[[0, 1, 2, 6]]).max())
+        camera = moved(camera, step)
+    if not np.isfinite(camera.project(court.corners)).all():
+        return camera, 0.0
+    return camera, ridges(picture, camera, court, REACHES[-1]).fit

@@ -1,0 +1,194 @@
+"""Finds the camera of each picture of a video from the court: shots between cuts, and the camera's turn and zoom."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.progress import Watch, unwatched
+from ballfg.vision.arrays import Image
+from ballfg.vision.broadcast.background import ALIKE, Match, matches
+from ballfg.vision.broadcast.court import Court
+from ballfg.vision.broadcast.find import cameras_of, find_court
+from ballfg.vision.broadcast.graph import Solved, solve
+from ballfg.vision.broadcast.lines import Ridges, corrected, moved, ridges, slopes
+from ballfg.vision.broadcast.pinhole import Pinhole
+
+Frames = Callable[[], Iterator[tuple[float, Image]]]
+"""Opens a video and gives stamps (s) and images (h, w, 3), BGR."""
+EVERY: Final = 0.5
+"""s between the pictures in which the court is looked for."""
+SEEDS: Final = 4
+"""Pictures of a shot in which it is found, after which it is followed only."""
+TRIED: Final = 30
+"""Quadrilaterals of a picture that are compared by all lines."""
+FITS: Final = 0.7
+"""Share of the court's lines without which a picture does not show the court."""
+FOLLOWED: Final = 0.45
+"""The same where the camera before and the background foretell it: a player may stand before a line."""
+SHORTEST: Final = 10
+"""Pictures of a shot; a shorter one is not used."""
+TURNED: Final = np.r_[0:3, 6]
+"""Numbers of turn and log focal length among the seven of a camera."""
+ROUNDS: Final = 6
+"""Steps in which a camera takes over the motion of the background."""
+REACH: Final = 4.0
+"""px, in which ridges are looked for at last."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """Pictures first, first + 1, ... between two cuts, and their cameras at one place.
+
+    Attributes: cameras: one a picture.  covariances: (n, 7, 7) of turn (rad, in the camera's frame), place (m), log
+        focal length.  fit: (n,) share of the court's lines that fit.
+    """
+
+    first: int
+    cameras: tuple[Pinhole, ...]
+    covariances: Array
+    fit: Array
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """The shots that show the court, stamps (f,) s of all pictures, and the numbers of those that follow a cut."""
+
+    shots: tuple[Shot, ...]
+    times: Array
+    cuts: tuple[int, ...]
+
+
+def find_motion(
+    frames: Frames, court: Court, count: int, corners: dict[int, Array] | None = None, watch: Watch = unwatched
+) -> Motion:
+    """The camera of each picture.
+
+    Args: count: pictures, about.  corners: (4, 2) px of the court's corners in some pictures; None: the court is found.
+    Raises: ValueError: no picture shows the court.
+    """
+    times, links, seeds = _first_pass(
+        frames, court, corners, lambda images: watch(images, count, "pictures searched for the court")
+    )
+    cuts = [0, *(k + 1 for k, link in enumerate(links) if link is None), len(times)]
+    shots = list[Shot]()
+    for first, end in pairwise(cuts):
+        mine = {k: seed for k, seed in seeds.items() if first <= k < end}
+        if mine and end - first >= SHORTEST:
+            chain = [link for link in links[first : end - 1] if link is not None]
+            shots.append(_followed(frames, court, first, mine, chain))
+    if corners is None:
+        shots = [shot for shot in shots if np.median(shot.fit) > FOLLOWED]
+    if not shots:
+        raise ValueError(
+            f"the video must show the whole court in {SHORTEST} pictures in a row; frames 0 to {len(times) - 1} do "
+            "not. Give its corners in some of them with --corners FILE (frame,u,v), or check --court."
+        )
+    return Motion(tuple(shots), times, tuple(cuts[1:-1]))
+
+
+def _first_pass(
+    frames: Frames,
+    court: Court,
+    corners: dict[int, Array] | None,
+    watched: Callable[[Iterator[Image]], Iterable[Image]],
+) -> tuple[Array, list[Match | None], dict[int, list[tuple[Pinhole, float]]]]:
+    """Stamps, matches of neighbours, and the cameras in the pictures in which the court was found."""
+    times, seeds = list[float](), dict[int, list[tuple[Pinhole, float]]]()
+    found, looked = 0, -np.inf
+
+    def images() -> Iterator[Image]:
+        for stamp, image in frames():
+            times.append(stamp)
+            yield image
+
+    links = list[Match | None]()
+    last: Image | None = None
+    for k, image in enumerate(watched(images())):
+        if k:
+            assert last is not None
+            links.append(next(matches((last, image))))
+            if links[-1] is None:
+                found, looked = 0, -np.inf
+        last = image
+        if corners is not None:
+            here = _of_corners(image, court, corners[k]) if k in corners else []
+            seeds |= {k: here} if here else {}
+        elif found < SEEDS and times[-1] - looked >= EVERY:
+            looked = times[-1]
+            here = likely(image, find_court(image, court)[:TRIED], court)
+            if here:
+                found, seeds[k] = found + 1, here
+    return np.array(times), links, seeds
+
+
+def _of_corners(image: Image, court: Court, corners: Array) -> list[tuple[Pinhole, float]]:
+    """The cameras that see a court's corners (4, 2) px, those first whose lines fit."""
+    away = corners - corners.mean(axis=0)
+    quad = corners[np.argsort(np.arctan2(away[:, 1], away[:, 0]))]  # clockwise as seen
+    cameras = cameras_of(quad[None], court, (image.shape[1], image.shape[0]))
+    better = likely(image, [(camera, 0.0) for camera in cameras], court)
+    return better or [(camera, 0.0) for camera in cameras]
+
+
+def likely(image: Image, tried: Sequence[tuple[Pinhole, float]], court: Court) -> list[tuple[Pinhole, float]]:
+    """The cameras whose lines fit a picture, best first, and how well; those at about one place once only."""
+    fine = list[tuple[Pinhole, float]]()
+    for camera, _ in tried:
+        better, fit = corrected(image, camera, court)
+        if fit > FITS and better.place[2] > 0.0:
+            fine.append((better, fit))
+    fine.sort(key=lambda pair: -pair[1])
+    apart = list[tuple[Pinhole, float]]()
+    for camera, fit in fine:
+        if all(np.linalg.norm(camera.place - other.place) > 0.2 * np.linalg.norm(other.place) for other, _ in apart):
+            apart.append((camera, fit))
+    return apart
+
+
+def _followed(
+    frames: Frames, court: Court, first: int, seeds: dict[int, list[tuple[Pinhole, float]]], links: Sequence[Match]
+) -> Shot:
+    """The shot from picture `first` on, with the place of the camera that fits best."""
+    ranked = sorted(((fit, k, camera) for k, found in seeds.items() for camera, fit in found), key=lambda one: -one[0])
+    _, at, camera = ranked[0]
+    for k in range(at - first, 0, -1):
+        camera = carried(camera, links[k - 1].now, links[k - 1].before)
+    cameras, seen, fits = list[Pinhole](), list[Ridges | None](), list[float]()
+    count = len(links) + 1
+    for k, (_, image) in enumerate(frames()):
+        if not first <= k < first + count:
+            continue
+        if k > first:
+            camera = carried(camera, links[k - first - 1].before, links[k - first - 1].now)
+        better, fit = corrected(image, camera, court, TURNED)
+        camera = better if fit > FOLLOWED else camera
+        lines = ridges(image.astype(np.float32), camera, court, REACH)
+        cameras.append(camera)
+        seen.append(lines if fit > FOLLOWED else None)
+        fits.append(lines.fit)
+    found: Solved = solve(cameras, seen, links)
+    return Shot(first, found.cameras, found.covariances, np.array(fits))
+
+
+def carried(camera: Pinhole, before: Array, now: Array) -> Pinhole:
+    """The camera after the turn and the zoom that move points (n, 2) px of the background from `before` to `now`."""
+    points, one = camera.place + camera.directions(before) @ camera.turn, camera
+    for _ in range(ROUNDS):
+        pixels, slope = slopes(one, points)
+        left, slope = now - pixels, slope[..., TURNED]
+        weight = 1.0 / (1.0 + (left**2).sum(axis=1) / ALIKE**2)
+        pulled = slope * weight[:, None, None]
+        step = np.zeros(7)
+        information = np.einsum("nai,naj->ij", pulled, slope)
+        step[TURNED] = np.linalg.solve(information, np.einsum("nai,na->i", pulled, left))
+        one = moved(one, step)
+    return one

@@ -1,0 +1,160 @@
+"""Rendered rallies of one camera that pans and zooms, with truth: what is found, and how far off it is.
+
+    python -m tests.estimation.rendered --count 2 --seed 0 [--rate 60]
+
+renders rallies (strokes of `tests.estimation.rallies`) from the side and from behind a player, with bars of motion
+blur, players as moving shapes with white shoes, noise and video compression, and prints a line for each and the sums.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.estimation.rally.video import Rally, track_moving_camera
+from ballfg.state import POSITION, SPIN
+from ballfg.vision.arrays import Image
+from ballfg.vision.broadcast.pinhole import Pinhole
+from ballfg.vision.detection.video import open_video
+from tests.estimation.observations.sighted_rig import TABLE
+from tests.estimation.rallies import MODEL, Stroke, flown, stroke
+from tests.vision.broadcast.scene import COURT, looking, panned, picture
+
+EXPOSURE, LENGTH = 0.45, 6.0  # of the time between pictures; s
+VIEWS = {"side": ((0.4, -8.0, 3.6), 1000.0), "behind": ((-8.5, -0.8, 3.2), 1350.0)}
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Strokes with times in the video, s, and the cameras of its pictures."""
+
+    strokes: tuple[Stroke, ...]
+    cameras: tuple[Pinhole, ...]
+
+    def at(self, t: float) -> Array | None:
+        """(9,) state with the table's surface at z = 0; None where no ball is in play."""
+        for one in self.strokes:
+            if one.begin < t <= one.end:
+                state = flown(one.state, np.array([t - one.begin]))[0]
+                state[2] -= TABLE
+                return state
+        return None
+
+
+def truth(view: str, rate: float, seed: int) -> Truth:
+    """Strokes of a rally, each from where the one before ends, and a camera that follows a little."""
+    rng, now, found = np.random.default_rng(seed), 0.6, list[Stroke]()
+    side = float(rng.choice([-1, 1]))
+    place = np.array([side * 1.5, rng.uniform(-0.4, 0.4), TABLE + 0.25])
+    while now < LENGTH - 1.0 and (drawn := stroke(place, -side, rng)) is not None:
+        found.append(Stroke(now, now + drawn[1], drawn[0]))
+        place, now, side = flown(drawn[0], np.array([drawn[1]]))[0, POSITION], now + drawn[1], -side
+    centre, focal = VIEWS[view]
+    first = looking(np.add(centre, rng.normal(0.0, 0.3, 3)), (0.0, 0.0, 0.1), focal * rng.uniform(0.95, 1.05))
+    return Truth(tuple(found), tuple(panned(first, int(LENGTH * rate), rng.normal(0.0, 0.06), rng.normal(0.0, 0.05))))
+
+
+def pictures(of: Truth, rate: float, seed: int) -> Iterator[Image]:
+    """The pictures, with two players who sway behind the ends of the table."""
+    rng = np.random.default_rng([seed, 1])
+    half = 0.5 * EXPOSURE / rate
+    for number, camera in enumerate(of.cameras):
+        t = number / rate
+        ends = [of.at(t - half), of.at(t + half)]
+        bar = [one[POSITION] for one in ends if one is not None]
+        image = picture(camera, rng, [np.stack(bar)] if len(bar) == len(ends) else [])
+        for end in (-1.0, 1.0):
+            sway = 0.35 * np.sin(2.0 * t + end) + 0.1 * np.sin(7.0 * t)
+            for low, high, wide, level in ((-0.7, 0.75, 0.2, 45), (-0.76, -0.66, 0.14, 235)):
+                box = [(end * 2.3, sway + y, z) for y, z in ((-wide, low), (wide, low), (wide, high), (-wide, high))]
+                pixels = camera.project(np.array(box))
+                nearer = end < 0.0 and camera.place[0] < -4.0
+                if not nearer:
+                    cv2.fillPoly(image, [np.round(pixels).astype(np.int32)], (level, level, level))
+        yield image
+
+
+def film(of: Truth, path: Path, rate: float, seed: int) -> None:
+    """Writes the pictures as a compressed video."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), rate, of.cameras[0].size)
+    for image in pictures(of, rate, seed):
+        writer.write(image)
+    writer.release()
+
+
+@dataclass
+class Score:
+    """Sums over rallies: strokes and those found, false ones, errors (m) of samples, whether 90 % intervals hold."""
+
+    strokes: int
+    found: int
+    false: int
+    errors: Sequence[float]
+    held: Sequence[bool]
+    spins: tuple[int, int]
+
+
+def judged(rally: Rally, of: Truth) -> Score:
+    """A rally against the truth."""
+    found, false, errors, held, spins = set[int](), 0, list[float](), list[bool](), [0, 0]
+    for estimate in (one for shot in rally.shots for one in shot.estimates):
+        middle = float(np.median(estimate.times))
+        numbers = [i for i, one in enumerate(of.strokes) if one.begin < middle <= one.end]
+        states = [of.at(float(t)) for t in estimate.times]
+        good = [i for i, state in enumerate(states) if state is not None]
+        off = np.array([estimate.states[i, POSITION] - states[i][POSITION] for i in good])
+        if not numbers or not len(off) or np.median(np.linalg.norm(off, axis=1)) > 0.5:
+            false += 1
+            continue
+        found.add(numbers[0])
+        errors.append(float(np.sqrt((off**2).sum(axis=1).mean())))
+        sigmas = np.array([np.sqrt(np.diag(estimate.covariances[i]))[POSITION] for i in good])
+        held += (np.abs(off) < 1.645 * sigmas).ravel().tolist()
+        true = states[good[0]][SPIN]
+        if abs(true[1]) > 60.0:
+            spins[0] += bool(np.sign(true[1]) == np.sign(estimate.states[good[0], SPIN][1]))
+            spins[1] += 1
+    return Score(len(of.strokes), len(found), false, errors, held, (spins[0], spins[1]))
+
+
+def main() -> None:
+    """Prints a line for each rally and view, and the sums."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--count", type=int, default=2, help="number of rallies")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--rate", type=float, default=25.0, help="Hz")
+    given = parser.parse_args()
+    scores = list[Score]()
+    for seed in range(given.seed, given.seed + given.count):
+        for view in VIEWS:
+            of = truth(view, given.rate, seed)
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder) / "rally.mp4"
+                film(of, path, given.rate, seed)
+                video = open_video(path)
+                rally = track_moving_camera(video.frames, COURT, MODEL, count=video.count)
+            camera, true = rally.motion.shots[0].cameras[0], of.cameras[rally.motion.shots[0].first]
+            place = 100 * np.linalg.norm(camera.place - true.place) / np.linalg.norm(true.place)
+            focal = 100 * abs(camera.focal / true.focal - 1.0)
+            scores.append(one := judged(rally, of))
+            print(
+                f"{seed} {view}: place {place:.2f} %, focal {focal:.2f} %, {one.found} of {one.strokes} strokes, "
+                f"{one.false} false, median {1e3 * np.median(one.errors or [np.nan]):.0f} mm, spins {one.spins}",
+                flush=True,
+            )
+    strokes, found, false = (sum(getattr(one, name) for one in scores) for name in ("strokes", "found", "false"))
+    errors, held = (np.concatenate([getattr(one, name) for one in scores]) for name in ("errors", "held"))
+    right, asked = np.sum([one.spins for one in scores], axis=0)
+    print(f"found {found} of {strokes}, false {false}, median {1e3 * np.median(errors):.0f} mm")
+    print(f"90 % intervals hold {100 * held.mean():.0f} %, spin's sign {right} of {asked}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,40 @@
+"""The camera of rendered pictures of a table, against the truth."""
+
+import numpy as np
+import pytest
+
+from ballfg.vision.broadcast.lines import moved, slopes
+from ballfg.vision.broadcast.motion import find_motion
+from tests.vision.broadcast.scene import COURT, looking, panned, picture
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [looking((0.5, -8.0, 3.5), (0.0, 0.0, 0.0), 1000.0, 0.05), looking((-9.0, 0.0, 3.5), (0.5, 0.0, 0.0), 1500.0)],
+    ids=["side", "behind"],
+)
+def test_a_panned_and_zoomed_camera_is_found(camera):
+    rng = np.random.default_rng(1)
+    cameras = panned(camera, 14, 0.06, -0.1)
+    images = [picture(one, rng) for one in cameras]
+    (shot,) = find_motion(lambda: iter([(0.04 * k, image) for k, image in enumerate(images)]), COURT, 14).shots
+    assert len(shot) == 14
+    for found, true, covariance in zip(shot.cameras, cameras, shot.covariances, strict=True):
+        assert np.linalg.norm(found.place - true.place) < 0.02 * np.linalg.norm(true.place)
+        assert found.focal == pytest.approx(true.focal, rel=0.02)
+        assert np.abs(found.project(COURT.corners) - true.project(COURT.corners)).max() < 1.5
+        assert (np.linalg.eigvalsh(covariance) > 0.0).all()
+
+
+def test_nothing_is_made_out_of_pictures_without_a_court():
+    with pytest.raises(ValueError, match="the whole court"):
+        find_motion(lambda: ((0.04 * k, np.zeros((360, 640, 3), np.uint8)) for k in range(12)), COURT, 12)
+
+
+def test_derivatives_of_pixels_are_those_of_differences():
+    camera, points, step = looking((1.0, -8.0, 4.0), (0.0, 0.0, 0.0), 1200.0, -0.1), COURT.corners, 1e-6
+    _, slope = slopes(camera, points)
+    for number in range(7):
+        change = step * np.eye(7)[number]
+        ahead, back = (moved(camera, way * change).project(points) for way in (1.0, -1.0))
+        np.testing.assert_allclose(slope[..., number], (ahead - back) / (2.0 * step), atol=1e-5)
