@@ -122,8 +122,8 @@ def sensitivity(
         _derivatives(model, stretches, starts, values, wanted[first : first + size])
         for first in range(0, len(wanted), size)
     ]
-    positions, labels = ([getattr(part, name) for part in parts] for name in ("positions", "labels"))
-    return Sensitivity(np.concatenate(positions, axis=-1), np.concatenate(labels, axis=-1))
+    both = ([getattr(part, name) for part in parts] for name in ("positions", "labels"))
+    return Sensitivity(*(np.concatenate(one, axis=-1) for one in both))
 
 
 def _of_rows(value: float | Array, rows: Index) -> float | Array:

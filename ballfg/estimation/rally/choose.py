@@ -143,7 +143,7 @@ def best_sequence(grower: Grower, strokes: Sequence[Stroke]) -> Chosen:
     for i in range(count):
         later = first > last[i]
         link[i, later] = begins[later]
-        for j in np.flatnonzero(later & (times[first] - times[last[i]] < LONGEST_HIT)):
+        for j in map(int, np.flatnonzero(later & (times[first] - times[last[i]] < LONGEST_HIT))):
             link[i, j] = max(begins[j], _hit(grower, ordered[i], ordered[j]))
     best, before = score + begins, np.full(count, -1)
     forward, backward = score + begins, np.zeros(count)

@@ -152,9 +152,9 @@ def stroke_row(estimate: Estimate, events: list[Event], model: BallModel, net: f
         sample = max(int(np.searchsorted(estimate.times, bounces[0].t, side="right")) - 1, 0)
         before = carried(model, estimate, sample, bounces[0].t)
     row |= _speed("speed_bounce", before)
-    for axis, place in zip("xyz", range(SPIN.start, SPIN.stop), strict=True):
-        row[f"spin_{axis}"] = float(start.state[place])
-        row[f"sigma_spin_{axis}"] = float(np.sqrt(start.covariance[place, place]))
+    for axis, number in zip("xyz", range(SPIN.start, SPIN.stop), strict=True):
+        row[f"spin_{axis}"] = float(start.state[number])
+        row[f"sigma_spin_{axis}"] = float(np.sqrt(start.covariance[number, number]))
     row["net_clearance"], row["sigma_net_clearance"] = _clearance(estimate, model, net)
     place = bounces[-1].place if bounces else np.full(3, np.nan)
     sigmas = bounces[-1].sigmas if bounces else np.full(3, np.nan)

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.arrays import Array, Index
+from ballfg.arrays import Array, Index, Mask
 from ballfg.vision.detection.detections import Detections
 
 SEEN: Final = 0.9
@@ -74,7 +74,7 @@ class Field:
         inside = 0 <= frame < len(self.first) - 1
         return np.arange(self.first[frame], self.first[frame + 1]) if inside else np.zeros(0, dtype=np.int64)
 
-    def along(self, rows: Index, motion: Array) -> Array:
+    def along(self, rows: Index, motion: Array) -> Mask:
         """(n,) bool: the bars of rows (n,) lie along motions (n, 2) px, or one of both is short."""
         bars = self.bars[rows]
         cross = np.abs(bars[:, 0] * motion[:, 1] - bars[:, 1] * motion[:, 0])

@@ -7,6 +7,7 @@ from typing import Final
 
 import numpy as np
 
+from ballfg.arrays import Mask
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.rally.arcs import arcs, with_exposure
@@ -66,7 +67,7 @@ def on_fixed_camera(found: Detections, shot: Shot, onto: Pinhole, name: str) -> 
         rows = slice(*np.searchsorted(found.frame, (number, number + 1)))
         pixels[rows], streaks[rows] = camera.onto(found.pixels[rows], onto), camera.onto(found.streaks[rows], onto)
         spread[rows] *= (onto.focal / camera.focal) ** 2
-    seen = np.isfinite(pixels).all(axis=1)  # of a pan by more than a right angle something lies behind
+    seen: Mask = np.asarray(np.isfinite(pixels).all(axis=1))  # a wide pan leaves something behind
     spread += FRAME_SIGMA**2 * np.eye(2)
     return replace(found, camera=name, pixels=np.nan_to_num(pixels), covariances=spread, streaks=streaks).select(seen)
 

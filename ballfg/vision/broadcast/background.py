@@ -53,9 +53,8 @@ def matched(before: Image, now: Image) -> Match | None:
     if corners is None or len(corners) < FEWEST:
         return None
     start = corners.reshape(-1, 1, 2)
-    way = {"winSize": WINDOW, "maxLevel": LEVELS}
-    end, found, _ = cv2.calcOpticalFlowPyrLK(before, now, start, None, **way)
-    again, back, _ = cv2.calcOpticalFlowPyrLK(now, before, end, None, **way)
+    end, found, _ = cv2.calcOpticalFlowPyrLK(before, now, start, start.copy(), winSize=WINDOW, maxLevel=LEVELS)
+    again, back, _ = cv2.calcOpticalFlowPyrLK(now, before, end, end.copy(), winSize=WINDOW, maxLevel=LEVELS)
     steady = (np.linalg.norm(again - start, axis=2) < BACK) & (found > 0) & (back > 0)
     rows = np.flatnonzero(steady.reshape(-1))
     if len(rows) < max(FEWEST, SHARE * len(start)):

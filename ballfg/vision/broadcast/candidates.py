@@ -96,9 +96,11 @@ def aligned_candidates(window: list[Image], index: int, cameras: tuple[Pinhole, 
         others = [_warped(window[i], cameras[i], cameras[index]) for i in beside]
         most = others[0] if len(others) == 1 else cv2.max(*others)
         blue, green, red = cv2.split(cv2.subtract(here, most))
-        change = cv2.min(cv2.min(blue, green), red)
-        rise = change if rise is None else cv2.max(rise, change)
-    return Candidates.none() if rise is None else _regions(cv2.GaussianBlur(rise, (3, 3), 0), size)
+        change = np.minimum(np.minimum(blue, green), red).astype(np.uint8)
+        rise = change if rise is None else np.maximum(rise, change)
+    if rise is None:
+        return Candidates.none()
+    return _regions(np.asarray(cv2.GaussianBlur(rise, (3, 3), 0), dtype=np.uint8), size)
 
 
 def _warped(image: Image, camera: Pinhole, onto: Pinhole) -> Image:
@@ -110,7 +112,8 @@ def _warped(image: Image, camera: Pinhole, onto: Pinhole) -> Image:
         return image
     homography = cv2.findHomography(grid, there, 0)[0]
     white = (255.0, 255.0, 255.0)
-    return cv2.warpPerspective(image, homography, (width, height), flags=cv2.INTER_LINEAR, borderValue=white)
+    seen = cv2.warpPerspective(image, homography, (width, height), flags=cv2.INTER_LINEAR, borderValue=white)
+    return np.asarray(seen, dtype=np.uint8)
 
 
 def _regions(rise: Image, size: Array) -> Candidates:

@@ -13,7 +13,7 @@ from typing import Final
 import cv2
 import numpy as np
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Mask
 from ballfg.vision.arrays import Image
 from ballfg.vision.broadcast.court import Court
 from ballfg.vision.broadcast.pinhole import Pinhole, posed
@@ -171,7 +171,7 @@ def _in_front(place: Array) -> bool:
     return bool(x < 0.0 if abs(x) > ALONG * abs(y) else y < 0.0)
 
 
-def _possible(turn: Array, place: Array, at: Array, court: Court) -> Array:
+def _possible(turn: Array, place: Array, at: Array, court: Court) -> Mask:
     """(m,) bool: cameras above the court, upright, at a distance from which courts are filmed."""
     up = -turn[:, 1, 2]  # of the world's z, upwards in the picture
     tilted = np.abs(np.arctan2(turn[:, 0, 2], up))

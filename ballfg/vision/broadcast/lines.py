@@ -82,7 +82,7 @@ def _brightest(image: Array32, pixels: Array, normal: Array, reach: float) -> tu
     if not len(pixels):
         return np.zeros(0), np.zeros(0, dtype=bool)
     at = (pixels[:, None] + steps[:, None] * normal[:, None]).astype(np.float32)
-    values = cv2.remap(image, at, None, cv2.INTER_LINEAR).reshape(len(pixels), len(steps), 3)
+    values = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR).reshape(len(pixels), len(steps), 3)
     flank = round(FLANK / STEP)
     rise = values[:, flank:-flank] - np.maximum(values[:, : -2 * flank], values[:, 2 * flank :])
     rise = rise.max(axis=2)
