@@ -130,7 +130,8 @@ def _laws(name: str, model: BallModel, functions: CompiledModel, tables: list[st
     def law(part: str, function: Function, weights: Numbers) -> Law:
         def table(of: str, values: Sequence[float], shape: tuple[int, ...]) -> Array:
             if values:
-                tables.append(f"static const double {name}_{part}_{of}[{len(values)}] = {{{', '.join(_written(values))}}};")
+                listed = _in_lines(values) if any(values) else "0.0"
+                tables.append(f"static const double {name}_{part}_{of}[{len(values)}] = {{{listed}}};")
             return Array(f"{name}_{part}_{of}", shape, "", fixed=of == WEIGHTS)
 
         routine: Any = Routine.of_source(part, function.source, KNOWN)
@@ -148,6 +149,11 @@ def _laws(name: str, model: BallModel, functions: CompiledModel, tables: list[st
     return Laws(*(law(*one) for one in named))
 
 
+def _in_lines(values: Sequence[float]) -> str:
+    texts = [text.replace("0.", ".", 1) if text.lstrip("-").startswith("0.") else text for text in _written(values)]
+    return ",\n".join(",".join(texts[i : i + 6]) for i in range(0, len(texts), 6))
+
+
 def _written(values: Sequence[float]) -> list[str]:
     """Numbers as C has them."""
-    return [text_of(Constant(float(value))).strip("()") for value in values]
+    return [text_of(Constant(float(value))) for value in values]

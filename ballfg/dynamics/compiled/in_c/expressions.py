@@ -13,8 +13,12 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from ballfg.dynamics.compiled.in_c.values import (
+    ANY,
+    ATOM,
     DOUBLE,
     INT,
+    PLUS,
+    TIMES,
     Array,
     Constant,
     Scalar,
@@ -37,6 +41,8 @@ BINARY: Final[dict[type[ast.operator], tuple[str, Callable[[Any, Any], Any]]]] =
     ast.BitAnd: ("&", lambda a, b: a & b),
     ast.Pow: ("**", lambda a, b: a**b),
 }
+IDLE: Final = ((ast.Add, Constant(0)), (ast.Mult, Constant(1.0)))
+"""Operators and left operands that change nothing, not even the sign of a zero."""
 COMPARED: Final[dict[type[ast.cmpop], tuple[str, Callable[[Any, Any], bool]]]] = {
     ast.Eq: ("==", lambda a, b: a == b),
     ast.NotEq: ("!=", lambda a, b: a != b),
@@ -114,7 +120,7 @@ def _named(body: Body, name: str) -> Value:
 def _attribute(owner: Value, name: str) -> Value:
     if isinstance(owner, Array):
         if name == "shape":
-            return tuple(None if n is None else Constant(n) for n in owner.shape)
+            return tuple(Scalar(n, INT) if isinstance(n, str) else lifted(n) for n in owner.shape)
         return owner, name  # a method, for `_called`
     if isinstance(owner, ModuleType | tuple):
         return lifted(getattr(owner, name))
@@ -123,14 +129,14 @@ def _attribute(owner: Value, name: str) -> Value:
 
 def _unary(body: Body, operator: ast.unaryop, value: Value) -> Value:
     if isinstance(operator, ast.Not):
-        return Constant(not value.value) if isinstance(value, Constant) else Scalar(f"(!{text_of(value)})", INT)
+        return Constant(not value.value) if isinstance(value, Constant) else Scalar(f"!{text_of(value, ATOM)}", INT, ANY)
     if not isinstance(operator, ast.USub):
         raise UntranslatableError(f"{operator!r} has no translation to C")
     if isinstance(value, Array):
         opposite = body.storage(value.shape, None)
         body.copy(opposite, value, "-")
         return opposite
-    return Constant(-value.value) if isinstance(value, Constant) else Scalar(f"(-{text_of(value)})", kind_of(value))
+    return Constant(-value.value) if isinstance(value, Constant) else Scalar(f"-{text_of(value, ATOM)}", kind_of(value), ANY)
 
 
 def _binary(body: Body, operator: type[ast.operator], a: Value, b: Value) -> Value:
@@ -139,39 +145,45 @@ def _binary(body: Body, operator: type[ast.operator], a: Value, b: Value) -> Val
         return Constant(compute(a.value, b.value))
     if operator is ast.Pow:
         return _power(body, a, constant_of(b))
+    if (operator, a) in IDLE and kind_of(a) == kind_of(b):
+        return b
+    rank = PLUS if operator in (ast.Add, ast.Sub) else TIMES if operator in (ast.Mult, ast.Div) else ANY
     kind = DOUBLE if operator is ast.Div else common((a, b))
-    left = f"(double){text_of(a)}" if operator is ast.Div and common((a, b)) == INT else text_of(a)
-    return Scalar(f"({left} {sign} {text_of(b)})", kind)
+    left = f"(double){text_of(a, ATOM)}" if operator is ast.Div and common((a, b)) == INT else text_of(a, _within(rank))
+    return Scalar(f"{left} {sign} {text_of(b, _within(rank) - 1)}", kind, rank)
+
+
+def _within(rank: int) -> int:
+    """The highest rank of a left operand that needs no brackets."""
+    return rank if rank in (TIMES, PLUS) else TIMES
 
 
 def _power(body: Body, base: Value, exponent: int | float) -> Value:
     if isinstance(exponent, int) and exponent > 0:
-        return Scalar(f"({' * '.join([text_of(body.kept(base))] * exponent)})", kind_of(base))
+        return Scalar(" * ".join([text_of(body.kept(base), ATOM)] * exponent), kind_of(base), TIMES)
     return Scalar(f"pow({text_of(base)}, {text_of(Constant(exponent))})", DOUBLE)
 
 
 def _joined(every: bool, parts: Sequence[Callable[[], Value]]) -> Value:
     """Truth of all or of any; a constant that decides ends it."""
-    texts = []
+    values: list[Value] = []
     for part in parts:
         value = part()
-        if not isinstance(value, Constant):
-            texts.append(text_of(value))
-        elif bool(value.value) is not every:
-            if not texts:
-                return Constant(not every)
-            texts.append(text_of(Constant(not every)))
+        decides = isinstance(value, Constant) and bool(value.value) is not every
+        if decides or not isinstance(value, Constant):
+            values.append(value)
+        if decides:
             break
-    if len(texts) <= 1:
-        return Scalar(texts[0], INT) if texts else Constant(every)
-    return Scalar(f"({(' && ' if every else ' || ').join(texts)})", INT)
+    if len(values) <= 1:
+        return values[0] if values else Constant(every)
+    return Scalar((" && " if every else " || ").join(text_of(value, PLUS) for value in values), INT, ANY)
 
 
 def _compared(operator: type[ast.cmpop], a: Value, b: Value) -> Value:
     sign, compute = COMPARED[operator]
     if isinstance(a, Constant) and isinstance(b, Constant):
         return Constant(compute(a.value, b.value))
-    return Scalar(f"({text_of(a)} {sign} {text_of(b)})", INT)
+    return Scalar(f"{text_of(a, PLUS)} {sign} {text_of(b, PLUS)}", INT, ANY)
 
 
 def _chosen(body: Body, node: ast.IfExp) -> Value:
@@ -179,7 +191,7 @@ def _chosen(body: Body, node: ast.IfExp) -> Value:
     if isinstance(test, Constant):
         return expression(body, node.body if test.value else node.orelse)
     a, b = expression(body, node.body), expression(body, node.orelse)
-    return Scalar(f"({text_of(test)} ? {text_of(a)} : {text_of(b)})", common((a, b)))
+    return Scalar(f"{text_of(test, PLUS)} ? {text_of(a, PLUS)} : {text_of(b, PLUS)}", common((a, b)), ANY)
 
 
 def _element(body: Body, node: ast.Subscript) -> Value:
@@ -194,21 +206,21 @@ def _element(body: Body, node: ast.Subscript) -> Value:
 
 def element(body: Body, owner: Array, parts: Sequence[ast.expr]) -> Array | Scalar:
     """An entry of an array, or a part of it that lies in one piece."""
-    places, shape, fixed, moving = [], [], 0, list[str]()
+    shape, fixed, moving = list[int | str | None](), 0, list[str]()
     for part, length, stride in zip(parts, owner.shape, owner.strides(), strict=False):
         if isinstance(part, ast.Slice):
             low, high = _bounds(body, part, length)
-            if any(n != 1 for n in shape):
+            if any(n != 1 for n in shape) or not isinstance(stride, int):
                 raise UntranslatableError(f"{owner.pointer}: a part that does not lie in one piece")
             fixed += low * stride
             shape.append(max(high - low, 0))
             continue
         index = expression(body, part)
-        if isinstance(index, Constant):
+        if isinstance(index, Constant) and isinstance(stride, int):
             fixed += int(index.value) * stride
-        else:
-            moving.append(text_of(index) if stride == 1 else f"{text_of(index)} * {stride}")
-        places.append(index)
+        elif not isinstance(index, Constant) or index.value:
+            one = isinstance(index, Constant) and index.value == 1
+            moving.append(text_of(index, PLUS) if stride == 1 else stride if one else f"{text_of(index, TIMES)} * {stride}")
     shape += owner.shape[len(parts) :]
     offset = " + ".join([*moving, *([str(fixed)] if fixed or not moving else [])])
     if not shape:
@@ -218,10 +230,10 @@ def element(body: Body, owner: Array, parts: Sequence[ast.expr]) -> Array | Scal
     return body.pointed(part_of) if moving else part_of
 
 
-def _bounds(body: Body, part: ast.Slice, length: int | None) -> tuple[int, int]:
+def _bounds(body: Body, part: ast.Slice, length: int | str | None) -> tuple[int, int]:
     low = 0 if part.lower is None else int(constant_of(expression(body, part.lower)))
     high = length if part.upper is None else int(constant_of(expression(body, part.upper)))
-    if length is None or high is None:
+    if not isinstance(length, int) or not isinstance(high, int):
         raise UntranslatableError(f"{ast.unparse(part)}: a part of an array without a known length")
     return min(low, length), min(high, length)
 
@@ -251,7 +263,8 @@ def _called(body: Body, node: ast.Call) -> Value:
 def _extreme(body: Body, sign: str, given: Sequence[Value]) -> Value:
     """Minimum or maximum, of numbers that are not there as numba has it: the first one."""
     a, b = map(body.kept, given)
-    return Scalar(f"({text_of(b)} {sign} {text_of(a)} ? {text_of(b)} : {text_of(a)})", common(given))
+    first, second = text_of(a, PLUS), text_of(b, PLUS)
+    return Scalar(f"{second} {sign} {first} ? {second} : {first}", common(given), ANY)
 
 
 def _method(body: Body, owner: Array, name: str, given: Sequence[Value]) -> Array:

@@ -39,6 +39,11 @@ RESERVED: Final = frozenset(
 
 SMALL: Final = 9
 """Largest number of entries of an array that begins with zeros."""
+WRAPPED: Final[Mapping[str, Any]] = {"break_long_words": False, "break_on_hyphens": False, "drop_whitespace": True}
+TANGENTS: Final = 3
+"""Place of an array of tangents among the arguments of a function of a model."""
+WIDTH: Final = "d"
+"""Name of their number there."""
 CONSTANT: Final = re.compile(r" *const \w+ (\w+) = (?!.*\w_\w+\().*;")
 """A line that declares one without a call of another function of the text, which may have effects."""
 Blocks = tuple[int, ...]
@@ -49,13 +54,17 @@ Blocks = tuple[int, ...]
 class Routine:
     """A Python function as syntax.
 
-    Attributes: name: in C.  tree: of the function.  known: the names of its module.  changing: of its numbers.
+    Attributes:
+        name: in C.  tree: of the function.  known: the names of its module.
+        changing: names of numbers that are variables.
+        generated: true for a function of a model: one in C serves any number of tangents.
     """
 
     name: str
     tree: ast.FunctionDef
     known: Mapping[str, Any]
     changing: Set[str]
+    generated: bool = False
 
     @classmethod
     def of(cls, function: Callable[..., Any]) -> Routine:
@@ -69,7 +78,7 @@ class Routine:
         """Of the one function in a generated text, which computes a number anew in each loop that needs it."""
         (tree,) = ast.parse(source).body
         assert isinstance(tree, ast.FunctionDef)
-        return cls(name, tree, known, frozenset())
+        return cls(name, tree, known, frozenset(), generated=True)
 
     def returns(self) -> list[ast.Return]:
         """Its statements that return a value."""
@@ -179,13 +188,15 @@ class Translator:
             else f"{a.kind} {a.text}"
             for a in arguments
         ]
+        passed += [f"int {WIDTH}" for a in arguments[:1] if routine.generated and not given[TANGENTS].empty]
         passed += [f"{one} *out{k}" for k, one in enumerate(outputs)]
-        told = f"/* {(ast.get_docstring(routine.tree) or f'The {routine.name} of the model.').splitlines()[0]} */"
+        told = (ast.get_docstring(routine.tree) or f"The {routine.name} of the model.").splitlines()[0]
         head = f"static inline {kind or 'void'} {name}({', '.join(passed) or 'void'}) {{"
         lines = body.finished()
         words = set(re.findall(r"\w+", "\n".join(lines)))
         unused = [leaf for leaf in map(_name, arguments) if leaf not in words]
-        self.texts.append("\n".join([told, head, *(f"  (void){leaf};" for leaf in unused), *lines, "}"]))
+        above = [f"/* {told} */"] if number == 1 else []
+        self.texts.append("\n".join([*above, head, *(f" (void){leaf};" for leaf in unused), *lines, "}"]))
         return Made(name, kind, outputs, [isinstance(a, Array) and a.root in body.written for a in arguments])
 
 
@@ -207,18 +218,21 @@ class Body:
         self._declared: dict[str, str] = {} if outer is None else outer._declared
         self._kept: set[str] = set() if outer is None else outer._kept
         self._returned: list[Value] = []
+        self._texts: dict[str, str] = {}
 
     def line(self, text: str) -> None:
         """Write a line."""
-        self.lines.append("  " * self._depth[0] + text)
+        self.lines.append(" " * self._depth[0] + text)
 
     @contextmanager
     def indented(self) -> Iterator[None]:
         """Lines of an inner block: what is named there is gone after it, but for numbers that change."""
-        before = dict(self.names)
+        before, used = dict(self.names), Counter(self._used)
         self._depth[0] += 1
         yield
         self._depth[0] -= 1
+        self._used.clear()
+        self._used.update(used | Counter(dict.fromkeys(self._declared, 1)))  # others may be named so again
         if moved := [name for name, value in before.items() if leaves_block(value) and self.names[name] is not value]:
             raise UntranslatableError(f"{moved[0]} of {self.routine.name} becomes another array within a block")
         kept = {n: v for n, v in self.names.items() if isinstance(v, Scalar) and v.text in self._declared}
@@ -241,7 +255,8 @@ class Body:
     def _argument(self, name: str, value: Value) -> Value:
         if isinstance(value, tuple):
             fields = getattr(value, "_fields", range(len(value)))
-            parts = [self._argument(f"{name}_{part}", one) for part, one in zip(fields, value, strict=True)]
+            named = [str(p) if isinstance(one, tuple) else f"{name}_{p}" for p, one in zip(fields, value, strict=True)]
+            parts = [self._argument(part, one) for part, one in zip(named, value, strict=True)]
             return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
         if leaves(value) and not isinstance(value, Array):
             return Scalar(self.fresh(name), kind_of(value))
@@ -257,7 +272,9 @@ class Body:
             self.names[name] = value
             return
         if not changes:
-            self.names[name] = self.kept(value, name)
+            again = self.routine.generated and name in self.names and self._texts.get(name) == value.text
+            if not again:  # generated code computes a number anew in each of its loops
+                self.names[name], self._texts[name] = self.kept(value, name), value.text
             return
         known = self.names.get(name)
         if not isinstance(known, Scalar):
@@ -284,7 +301,7 @@ class Body:
         self.line(f"<{array.root}>double *const {name} = {array.pointer};")
         return replace(array, pointer=name)
 
-    def storage(self, shape: Sequence[int | None], filled: Value | None) -> Array:
+    def storage(self, shape: Sequence[int | str | None], filled: Value | None) -> Array:
         """A new array. Args: filled: the number in all places; None: none yet."""
         array = Array("", tuple(shape), "")
         if array.empty:
@@ -343,9 +360,13 @@ class Body:
         routine = self.translator.routine(function)
         if routine.is_inlined():
             return self._inlined(routine, given)
-        made, passed = self.translator.made(routine, given), [leaf for value in given for leaf in leaves(value)]
+        passed = [leaf for value in given for leaf in leaves(value)]
         if routine.name in BY_HAND:
             passed = [*given, *(Constant(one.size) for one in given[-1:] if isinstance(one, Array))]
+        if routine.generated and (width := given[TANGENTS].shape[2]):
+            passed.append(Constant(width))
+            given = [replace(v, shape=(*v.shape[:2], WIDTH)) if len(v.shape) > 2 else v for v in given]
+        made = self.translator.made(routine, given)
         for one, written in zip(passed, made.written, strict=False):
             if written and isinstance(one, Array):
                 self.written.add(one.root)
@@ -370,12 +391,12 @@ class Body:
 
     def finished(self) -> list[str]:
         """All lines: the variables first."""
-        lines = [f"  {kind} {name} = 0;" for name, kind in self._declared.items()]
+        lines = [f" {kind} {name} = 0;" for name, kind in self._declared.items()]
         roots = {line[line.index("<") + 1 : line.index(">")] for line in self.lines if line.lstrip().startswith("<")}
         texts = "\n".join(self.lines)
         for root in sorted(roots):
             texts = texts.replace(f"<{root}>double *const", f"{'' if root in self.written else 'const '}double *const")
-        return _used([*lines, *texts.split("\n")])
+        return _joined(_used([*lines, *texts.split("\n")]))
 
 
 def _used(lines: list[str]) -> list[str]:
@@ -386,6 +407,18 @@ def _used(lines: list[str]) -> list[str]:
         if len(read) == len(lines):
             return read
         lines = read
+
+
+def _joined(lines: Sequence[str]) -> list[str]:
+    """The lines with constants of one type that follow one another in one declaration."""
+    joined: list[str] = []
+    for line in lines:
+        start, declared = re.match(r" *const \w+ ", line), CONSTANT.fullmatch(line)
+        if joined and declared and start and joined[-1].startswith(start[0]) and CONSTANT.fullmatch(joined[-1]):
+            joined[-1] = f"{joined[-1][:-1]}, {line[start.end() :]}"
+        else:
+            joined.append(line)
+    return [part for line in joined for part in textwrap.wrap(line, 118, **WRAPPED) or [""]]
 
 
 def _name(argument: Scalar | Array) -> str:

@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Sequence
-from itertools import accumulate
 from typing import TYPE_CHECKING
 
 from ballfg.dynamics.compiled.in_c.expressions import constant_of, element, expression
-from ballfg.dynamics.compiled.in_c.values import DOUBLE, INT, Array, Constant, Scalar, UntranslatableError, text_of
+from ballfg.dynamics.compiled.in_c.values import (
+    ATOM,
+    DOUBLE,
+    INT,
+    PLUS,
+    Array,
+    Constant,
+    Scalar,
+    UntranslatableError,
+    text_of,
+)
 
 if TYPE_CHECKING:
     from ballfg.dynamics.compiled.in_c.routines import Body
@@ -42,7 +51,7 @@ def _statement(body: Body, node: ast.stmt) -> bool:
         case ast.While():
             body.line("while (1) {")
             with body.indented():
-                body.line(f"if (!{text_of(expression(body, node.test))}) break;")
+                body.line(f"if (!{text_of(expression(body, node.test), ATOM)}) break;")
                 block(body, node.body)
             body.line("}")
         case ast.Return():
@@ -86,8 +95,7 @@ def _if(body: Body, node: ast.If) -> bool:
     test = expression(body, node.test)
     if isinstance(test, Constant):
         return block(body, node.body if test.value else node.orelse)
-    text = text_of(test)
-    body.line(f"if {text} {{" if _in_brackets(text) else f"if ({text}) {{")
+    body.line(f"if ({text_of(test)}) {{")
     with body.indented():
         left = block(body, node.body)
     if node.orelse:
@@ -96,12 +104,6 @@ def _if(body: Body, node: ast.If) -> bool:
             left = block(body, node.orelse) and left
     body.line("}")
     return left and bool(node.orelse)
-
-
-def _in_brackets(text: str) -> bool:
-    """True if the first bracket of a text closes with its last one."""
-    depth = list(accumulate({"(": 1, ")": -1}.get(letter, 0) for letter in text))
-    return text[0] == "(" and 0 not in depth[:-1]
 
 
 def _for(body: Body, node: ast.For) -> None:
@@ -128,15 +130,19 @@ def _for(body: Body, node: ast.For) -> None:
 
 
 def _counted(body: Body, node: ast.For, low: Value, high: Value) -> None:
-    """A loop over numbers; of one number it is written without a loop, of none not at all."""
+    """A loop over numbers; of one number it is its body alone, of none nothing."""
     assert isinstance(node.target, ast.Name)
     known = isinstance(low, Constant) and isinstance(high, Constant)
     if known and constant_of(high) <= constant_of(low):
         return
     once = known and constant_of(high) == constant_of(low) + 1
+    if once and not any(isinstance(inner, ast.Break | ast.Continue) for inner in ast.walk(node)):
+        body.names[node.target.id] = low
+        block(body, node.body)
+        return
     index = body.fresh(node.target.id)
     body.names[node.target.id] = low if once else Scalar(index, INT)
-    body.line("do {" if once else f"for (int {index} = {text_of(low)}; {index} < {text_of(high)}; ++{index}) {{")
+    body.line("do {" if once else f"for (int {index} = {text_of(low)}; {index} < {text_of(high, PLUS)}; ++{index}) {{")
     with body.indented():
         block(body, node.body)
     body.line("} while (0);" if once else "}")

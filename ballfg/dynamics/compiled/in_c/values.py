@@ -13,6 +13,10 @@ INT: Final = "int"
 """C's types of numbers; truth values are int."""
 
 
+ATOM, TIMES, PLUS, ANY = range(4)
+"""Ranks of operators: none, products, sums, and all that bind less than these."""
+
+
 class UntranslatableError(Exception):
     """A function uses what has no translation to C."""
 
@@ -26,10 +30,14 @@ class Constant:
 
 @dataclass(frozen=True)
 class Scalar:
-    """A C expression without effects, and its type."""
+    """A C expression without effects.
+
+    Attributes: text: without brackets around it.  kind: its type.  rank: of its operator; more binds less.
+    """
 
     text: str
     kind: str
+    rank: int = ATOM
 
 
 @dataclass(frozen=True)
@@ -37,31 +45,38 @@ class Array:
     """Numbers that lie one behind another.
 
     Attributes:
-        pointer: C expression.  shape: a length that nobody knows is None; only the first may be.
+        pointer: C expression.  shape: a length is a number, the name of an int of the function, or None, which nobody
+            knows; only the first may be.
         root: name of the storage, to tell which arguments a function writes to.
         fixed: true for a table of the whole text, which functions read without an argument.
     """
 
     pointer: str
-    shape: tuple[int | None, ...]
+    shape: tuple[int | str | None, ...]
     root: str
     fixed: bool = False
 
     @property
     def size(self) -> int:
-        """Number of entries."""
-        if None in self.shape:
+        """Number of entries. Raises: UntranslatableError: if it is not known."""
+        known = [n for n in self.shape if isinstance(n, int)]
+        if len(known) < len(self.shape):
             raise UntranslatableError(f"the length of {self.pointer} is not known")
-        return prod(n for n in self.shape if n is not None)
+        return prod(known)
 
     @property
     def empty(self) -> bool:
         """True if there are no entries, and so no storage."""
         return 0 in self.shape
 
-    def strides(self) -> list[int]:
+    def strides(self) -> list[int | str]:
         """How many numbers further the next entry along each dimension lies."""
-        return [prod(n for n in self.shape[i + 1 :] if n is not None) for i in range(len(self.shape))]
+        return [_product(self.shape[i + 1 :]) for i in range(len(self.shape))]
+
+
+def _product(lengths: Sequence[int | str | None]) -> int | str:
+    number, names = prod(n for n in lengths if isinstance(n, int)), [n for n in lengths if isinstance(n, str)]
+    return " * ".join([*([str(number)] if number != 1 else []), *names]) if names else number
 
 
 Value: TypeAlias = Any
@@ -77,20 +92,20 @@ def kind_of(value: Value) -> str:
     raise UntranslatableError(f"{value!r} is no number")
 
 
-def text_of(value: Value) -> str:
-    """C expression of a number, safe within a larger one."""
+def text_of(value: Value, rank: int = ANY) -> str:
+    """C expression of a number. Args: rank: of an operator; in brackets if its own binds less."""
     if isinstance(value, Scalar):
-        return value.text
+        return value.text if value.rank <= rank else f"({value.text})"
     if not isinstance(value, Constant):
         raise UntranslatableError(f"{value!r} is no number")
     number = value.value
-    if not isinstance(number, float):
-        return str(int(number)) if number >= 0 else f"({int(number)})"
-    if math.isnan(number):
+    if isinstance(number, float) and math.isnan(number):
         return "NAN"
-    sign, size = math.copysign(1.0, number), abs(number)
-    written = "INFINITY" if math.isinf(size) else repr(size)
-    return written if sign > 0 else f"(-{written})"
+    size = abs(number)
+    written = "INFINITY" if math.isinf(size) else repr(size) if isinstance(size, float) else str(int(size))
+    if math.copysign(1.0, number) > 0:
+        return written
+    return f"-{written}" if rank == ANY else f"(-{written})"
 
 
 def common(values: Sequence[Value]) -> str:
