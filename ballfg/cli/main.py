@@ -15,6 +15,7 @@ from ballfg.cli.commands.design import design
 from ballfg.cli.commands.diagnose import diagnose
 from ballfg.cli.commands.estimate import estimate
 from ballfg.cli.commands.example import example
+from ballfg.cli.commands.export import export
 from ballfg.cli.commands.import_ import import_
 from ballfg.cli.commands.info import balls, effects, info
 from ballfg.cli.commands.live import live
@@ -52,6 +53,7 @@ app.command()(render)
 app.command()(track)
 app.command(name="calibrate-cameras")(calibrate_cameras)
 app.command(name="compile")(compile_ahead)
+app.command()(export)
 app.command()(balls)
 app.command()(effects)
 app.command()(info)

@@ -12,7 +12,7 @@ from ballfg.dynamics.compiled.beliefs.events import FOUND, INSTANT, NONE, find
 from ballfg.dynamics.compiled.beliefs.mixture import mix
 from ballfg.dynamics.compiled.contacts import meet
 from ballfg.dynamics.compiled.flight import fly_one, put, value_of
-from ballfg.dynamics.motion.limits import LONGEST_MOTION, steps_over
+from ballfg.dynamics.motion.limits import LONGEST_FALL, LONGEST_MOTION, steps_over
 
 
 def unit(jacobian):
@@ -33,11 +33,15 @@ def fly(laws, state, dt, after, jacobian):
 
 
 def contact(laws, radius, state, height, longest, tau, after, jacobian):
-    """The next contact of a ball with a surface at a height, or the last one if it is below, up to `longest` s away."""
-    time, no_change = np.empty(1), np.empty((1, 9))
-    moved = np.empty((9, 9))
+    """The next contact of a ball with a surface at a height, or the last one if it is below, up to `longest` s away.
+
+    Returns 1; 0: none within that time or within 20 s, or an argument that is no number.
+    """
+    time, no_change, moved = np.empty(1), np.empty((1, 9)), np.empty((9, 9))
+    if not longest > 0.0:
+        return False
     unit(moved)
-    heights, furthest = np.full(1, height), np.full(1, longest)
+    heights, furthest = np.full(1, height), np.full(1, min(longest, LONGEST_FALL))
     meet(
         laws, state.reshape((1, 9)), moved.reshape((1, 9, 9)), heights, furthest, radius,
         time, no_change, after.reshape((1, 9)), jacobian.reshape((1, 9, 9)),
@@ -49,7 +53,9 @@ def contact(laws, radius, state, height, longest, tau, after, jacobian):
 def predict(laws, world, noise, state, covariance, count, times, states, covariances):
     """States and covariances of a ball at `count` times (s from now, not decreasing), through plain bounces."""
     rates, impact, surface = laws
-    mean, spread, beside, besides = np.empty((2, 1, 9)), np.empty((2, 1, 9, 9)), np.empty((2, 1, 9)), np.empty((2, 1, 9, 9))
+    mean, spread, beside, besides = (
+        np.empty((2, 1, 9)), np.empty((2, 1, 9, 9)), np.empty((2, 1, 9)), np.empty((2, 1, 9, 9)),
+    )  # fmt: skip
     level, age, hard, h = np.full((2, 1), np.nan), np.full((2, 1), np.nan), np.zeros(1), np.empty((1, 1))
     mean[0, 0], spread[0, 0] = state, covariance
     beside[0], besides[0] = mean[0], spread[0]
@@ -61,19 +67,19 @@ def predict(laws, world, noise, state, covariance, count, times, states, covaria
         h[0, 0] = (times[k] - before) / steps
         before = times[k]
         for _ in range(steps):
-            if 1 != carry(
+            if carry(
                 rates.compute, impact.compute, surface.compute, rates.c, rates.ct, impact.c, impact.ct,
                 surface.c, surface.ct, rates.w, impact.w, surface.w,
                 h, world, noise, mean, spread, beside, besides, level, age, hard,
-            ):  # fmt: skip
+            ) != 1:  # fmt: skip
                 return k
             mean[0], spread[0], beside[0], besides[0] = mean[1], spread[1], beside[1], besides[1]
             level[0], age[0] = level[1], age[1]
         states[k], covariances[k] = mean[1, 0], spread[1, 0]
         mix(
             rates.compute, impact.compute, surface.compute, rates.c, rates.ct, impact.c, impact.ct,
-            surface.c, surface.ct, rates.w, impact.w, surface.w, world, noise,
-            states[k].reshape((1, 1, 9)), covariances[k].reshape((1, 1, 9, 9)), beside[1:], besides[1:], level[1:], age[1:],
+            surface.c, surface.ct, rates.w, impact.w, surface.w, world, noise, states[k].reshape((1, 1, 9)),
+            covariances[k].reshape((1, 1, 9, 9)), beside[1:], besides[1:], level[1:], age[1:],
         )  # fmt: skip
     return count
 
@@ -88,7 +94,7 @@ def cross_plane(
     line, rate, moved = np.zeros(9), np.empty(9), np.zeros(9)
     length = math.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
     sign = -1.0 if direction > 0 else 1.0
-    if not (length > 0.0 and math.isfinite(length + offset) and 0.0 < horizon and math.isfinite(horizon)):
+    if not (length > 0.0 and math.isfinite(length + offset) and horizon > 0.0 and math.isfinite(horizon)):
         return -1
     for i in range(3):
         line[i] = sign * (normal[i] / length)

@@ -129,14 +129,20 @@ def _attribute(owner: Value, name: str) -> Value:
 
 def _unary(body: Body, operator: ast.unaryop, value: Value) -> Value:
     if isinstance(operator, ast.Not):
-        return Constant(not value.value) if isinstance(value, Constant) else Scalar(f"!{text_of(value, ATOM)}", INT, ANY)
+        return (
+            Constant(not value.value) if isinstance(value, Constant) else Scalar(f"!{text_of(value, ATOM)}", INT, ANY)
+        )
     if not isinstance(operator, ast.USub):
         raise UntranslatableError(f"{operator!r} has no translation to C")
     if isinstance(value, Array):
         opposite = body.storage(value.shape, None)
         body.copy(opposite, value, "-")
         return opposite
-    return Constant(-value.value) if isinstance(value, Constant) else Scalar(f"-{text_of(value, ATOM)}", kind_of(value), ANY)
+    return (
+        Constant(-value.value)
+        if isinstance(value, Constant)
+        else Scalar(f"-{text_of(value, ATOM)}", kind_of(value), ANY)
+    )
 
 
 def _binary(body: Body, operator: type[ast.operator], a: Value, b: Value) -> Value:
@@ -220,7 +226,9 @@ def element(body: Body, owner: Array, parts: Sequence[ast.expr]) -> Array | Scal
             fixed += int(index.value) * stride
         elif not isinstance(index, Constant) or index.value:
             one = isinstance(index, Constant) and index.value == 1
-            moving.append(text_of(index, PLUS) if stride == 1 else stride if one else f"{text_of(index, TIMES)} * {stride}")
+            moving.append(
+                text_of(index, PLUS) if stride == 1 else stride if one else f"{text_of(index, TIMES)} * {stride}"
+            )
     shape += owner.shape[len(parts) :]
     offset = " + ".join([*moving, *([str(fixed)] if fixed or not moving else [])])
     if not shape:

@@ -29,14 +29,6 @@ from ballfg.dynamics.compiled.in_c.values import (
     text_of,
 )
 
-RESERVED: Final = frozenset(
-    "auto break case char class const continue default delete do double else enum extern float for goto if inline int "
-    "long new operator private public register short signed sizeof static struct switch template this typedef union "
-    "unsigned using virtual void volatile while near far".split()
-)
-"""Words of C and C++, and of some of their compilers, that are names in Python."""
-
-
 SMALL: Final = 9
 """Largest number of entries of an array that begins with zeros."""
 WRAPPED: Final[Mapping[str, Any]] = {"break_long_words": False, "break_on_hyphens": False, "drop_whitespace": True}
@@ -213,7 +205,7 @@ class Body:
         self._outer = outer
         self.lines: list[str] = [] if outer is None else outer.lines
         self.written: set[str] = set() if outer is None else outer.written
-        self._used: Counter[str] = Counter(RESERVED) if outer is None else outer._used
+        self._used: Counter[str] = Counter() if outer is None else outer._used
         self._depth = [1] if outer is None else outer._depth
         self._declared: dict[str, str] = {} if outer is None else outer._declared
         self._kept: set[str] = set() if outer is None else outer._kept

@@ -123,7 +123,7 @@ def lifted(value: object) -> Value:
 
 
 def leaves(value: Value) -> list[Any]:
-    """The parts of a value that C passes as arguments: arrays and numbers, truth values that are known not among them."""
+    """The parts of a value that C passes as arguments: arrays and numbers, but for known truth values."""
     if isinstance(value, tuple):
         return [leaf for part in value for leaf in leaves(part)]
     if isinstance(value, Constant):
