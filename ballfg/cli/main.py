@@ -10,12 +10,11 @@ from typing import Annotated
 import typer
 
 from ballfg.cli.commands.calibrate_cameras import calibrate_cameras
-from ballfg.cli.commands.compile import compile_ahead
+from ballfg.cli.commands.compile import compile_ahead, export
 from ballfg.cli.commands.design import design
 from ballfg.cli.commands.diagnose import diagnose
 from ballfg.cli.commands.estimate import estimate
 from ballfg.cli.commands.example import example
-from ballfg.cli.commands.export import export
 from ballfg.cli.commands.import_ import import_
 from ballfg.cli.commands.info import balls, effects, info
 from ballfg.cli.commands.live import live

@@ -56,8 +56,8 @@ TEXT: Final = """\
      its time tau (s) and the state after it. The Jacobian holds the change of that time. Returns 1; 0: there is none.
    int {p}_predict(world, noise, state, covariance, count, times, states, covariances)
      States and covariances at `count` times (s from now, not decreasing), without measurement noise. Near a contact
-     they hold the balls that have bounced and those that have not. Returns how many are written: fewer where the ball comes
-     to rest or bounces several times within 20 ms, or where a time decreases.
+     they hold the balls that have bounced and those that have not. Returns how many are written: fewer where the ball
+     comes to rest or bounces several times within 20 ms, or where a time decreases.
    int {p}_cross_plane(world, noise, state, covariance, normal, offset, direction, horizon,
                        time, time_sigma, there, spread)
      The next crossing of normal . p = offset (m) by the centre within `horizon` s: its time and the standard deviation

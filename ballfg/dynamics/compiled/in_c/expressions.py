@@ -7,6 +7,7 @@ import builtins
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Final
 
@@ -83,11 +84,11 @@ def expression(body: Body, node: ast.expr) -> Value:
         case ast.BinOp():
             return _binary(body, type(node.op), expression(body, node.left), expression(body, node.right))
         case ast.BoolOp():
-            return _joined(isinstance(node.op, ast.And), [lambda v=v: expression(body, v) for v in node.values])
+            return _joined(isinstance(node.op, ast.And), [partial(expression, body, v) for v in node.values])
         case ast.Compare():
             values = [expression(body, part) for part in (node.left, *node.comparators)]
             pairs = zip(node.ops, values, values[1:], strict=False)
-            return _joined(True, [lambda o=o, a=a, b=b: _compared(type(o), a, b) for o, a, b in pairs])
+            return _joined(True, [partial(_compared, type(o), a, b) for o, a, b in pairs])
         case ast.IfExp():
             return _chosen(body, node)
         case ast.Subscript():
@@ -226,9 +227,8 @@ def element(body: Body, owner: Array, parts: Sequence[ast.expr]) -> Array | Scal
             fixed += int(index.value) * stride
         elif not isinstance(index, Constant) or index.value:
             one = isinstance(index, Constant) and index.value == 1
-            moving.append(
-                text_of(index, PLUS) if stride == 1 else stride if one else f"{text_of(index, TIMES)} * {stride}"
-            )
+            times = str(stride) if one else f"{text_of(index, TIMES)} * {stride}"
+            moving.append(text_of(index, PLUS) if stride == 1 else times)
     shape += owner.shape[len(parts) :]
     offset = " + ".join([*moving, *([str(fixed)] if fixed or not moving else [])])
     if not shape:
@@ -249,7 +249,8 @@ def _bounds(body: Body, part: ast.Slice, length: int | str | None) -> tuple[int,
 def _called(body: Body, node: ast.Call) -> Value:
     function, given = expression(body, node.func), _several(body, node.args)
     if isinstance(function, tuple):
-        return _method(body, *function, given)
+        owner, name = function
+        return _method(body, owner, name, given)
     if function is len:
         return Constant(given[0].shape[0])
     if function in (np.empty, np.zeros, np.full):

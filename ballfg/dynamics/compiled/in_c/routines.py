@@ -87,7 +87,8 @@ def _changing(tree: ast.FunctionDef) -> set[str]:
 
     A block is the body of a loop or of a condition: what C declares in it is gone after it.
     """
-    stores, loads = [(a.arg, ()) for a in tree.args.args], list[tuple[str, Blocks]]()
+    stores: list[tuple[str, Blocks]] = [(a.arg, ()) for a in tree.args.args]
+    loads = list[tuple[str, Blocks]]()
     counters: set[str] = set()
 
     def visit(node: ast.AST, blocks: Blocks) -> None:
@@ -206,7 +207,7 @@ class Body:
         self.lines: list[str] = [] if outer is None else outer.lines
         self.written: set[str] = set() if outer is None else outer.written
         self._used: Counter[str] = Counter() if outer is None else outer._used
-        self._depth = [1] if outer is None else outer._depth
+        self._depth: list[int] = [1] if outer is None else outer._depth
         self._declared: dict[str, str] = {} if outer is None else outer._declared
         self._kept: set[str] = set() if outer is None else outer._kept
         self._returned: list[Value] = []
@@ -236,7 +237,7 @@ class Body:
         number = self._used[name]
         return name if number == 1 else self.fresh(f"{name}_{number}")
 
-    def take(self, given: Sequence[Value]) -> list[Scalar | Array]:
+    def take(self, given: Sequence[Value]) -> list[Any]:
         """Name the arguments of a C function; returns those that C passes."""
         arguments = [a.arg for a in self.routine.tree.args.args if a.arg not in self.names]
         named = [self._argument(name, value) for name, value in zip(arguments, given, strict=True)]
@@ -258,18 +259,20 @@ class Body:
         return value
 
     def name(self, name: str, value: Value) -> None:
-        """Give a name a value. A number becomes a variable, unless it is a constant given once."""
+        """Give a name a value. A number becomes a variable, unless it is given once."""
         changes = name in self.routine.changing
         if name == "_" or not (isinstance(value, Scalar) or (isinstance(value, Constant) and changes)):
             self.names[name] = value
             return
-        if not changes:
+        if isinstance(value, Scalar) and not changes:
             again = self.routine.generated and name in self.names and self._texts.get(name) == value.text
             if not again:  # generated code computes a number anew in each of its loops
                 self.names[name], self._texts[name] = self.kept(value, name), value.text
             return
-        known = self.names.get(name)
-        if not isinstance(known, Scalar):
+        before = self.names.get(name)
+        if isinstance(before, Scalar):
+            known = before
+        else:
             known = Scalar(self.fresh(name), kind_of(value))
             self._declared[known.text], self.names[name] = known.kind, known
         if known.kind == INT and kind_of(value) == DOUBLE:
@@ -363,11 +366,11 @@ class Body:
             if written and isinstance(one, Array):
                 self.written.add(one.root)
         texts = [one.pointer if isinstance(one, Array) else text_of(one) for one in passed]
+        if not made.name:  # it does nothing with such arguments
+            return ()
         outputs = [Scalar(self.fresh("r"), kind) for kind in made.outputs]
         for output in outputs:
             self.line(f"{output.kind} {output.text};")
-        if not made.name:
-            return ()
         call = f"{made.name}({', '.join([*texts, *(f'&{output.text}' for output in outputs)])})"
         if made.kind is not None:
             return Scalar(call, made.kind)
