@@ -21,7 +21,7 @@ from ballfg.progress import progress
 if TYPE_CHECKING:
     from ballfg.dynamics import BallModel
     from ballfg.dynamics.surfaces import Surfaces
-    from ballfg.estimation import Estimator, Status
+    from ballfg.estimation import Estimator, Settings, Status
     from ballfg.estimation.observations.sighted_dataset import SightedDataset
     from ballfg.estimation.settings import Solver
     from ballfg.tracks import Dataset
@@ -276,6 +276,27 @@ def open_model(data: Dataset | SightedDataset, model: Path | None, ball: str | N
         return nominal_model(data.ball)
     inertia = inertia_factor(data.ball)
     return load_model(model, radius=data.ball.radius, inertia_factor=inertia, room=data.info.name)
+
+
+def model_alone(model: Path | None, ball: str | None) -> tuple[BallModel, Settings]:
+    """A model without a dataset, and its settings: of a file, else the nominal one.
+
+    Args: ball: name of the known ball that gives radius and inertia; None: table tennis.
+    """
+    from ballfg.dynamics import load_model, nominal_model
+    from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball
+    from ballfg.estimation import Settings
+    from ballfg.estimation.configure import learned_process
+    from ballfg.estimation.noise.parameters import with_noise
+
+    name = known_ball(ball or "table_tennis")
+    known = KNOWN_BALLS[name]
+    inertia = known.inertia_factor
+    loaded = load_model(model, radius=known.ball.radius, inertia_factor=inertia) if model else nominal_model(name)
+    settings = Settings.for_measured(loaded)
+    if loaded.trained is not None:
+        settings = Settings(position_scale=loaded.trained.position_scale, process=learned_process(loaded.trained))
+    return loaded, settings if loaded.noise is None else with_noise(settings, loaded.noise)
 
 
 def check_out(out: Path, dataset: Path) -> None:

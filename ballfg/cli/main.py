@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from ballfg.cli.commands.calibrate_cameras import calibrate_cameras
-from ballfg.cli.commands.compile import compile_ahead
+from ballfg.cli.commands.compile import compile_ahead, export
 from ballfg.cli.commands.design import design
 from ballfg.cli.commands.diagnose import diagnose
 from ballfg.cli.commands.estimate import estimate
@@ -52,6 +52,7 @@ app.command()(render)
 app.command()(track)
 app.command(name="calibrate-cameras")(calibrate_cameras)
 app.command(name="compile")(compile_ahead)
+app.command()(export)
 app.command()(balls)
 app.command()(effects)
 app.command()(info)

@@ -148,11 +148,8 @@ def _scene(
     from dataclasses import replace
 
     from ballfg.checks import check_number
-    from ballfg.dynamics import Surfaces, load_model, nominal_model
-    from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball
-    from ballfg.estimation import Settings, dataset_settings, dataset_surfaces
-    from ballfg.estimation.configure import learned_process
-    from ballfg.estimation.noise.parameters import with_noise
+    from ballfg.dynamics import Surfaces
+    from ballfg.estimation import dataset_settings, dataset_surfaces
 
     if data is not None:
         ball = inputs.open_model(data, model, named)
@@ -161,15 +158,8 @@ def _scene(
         import torch
 
         torch.set_num_threads(1)
-        name = known_ball(named or "table_tennis")
-        known = KNOWN_BALLS[name]
-        inertia = known.inertia_factor
-        ball = load_model(model, radius=known.ball.radius, inertia_factor=inertia) if model else nominal_model(name)
-        surfaces, settings = Surfaces.table_tennis(0.0), Settings.for_measured(ball)
-        if ball.trained is not None:
-            settings = Settings(position_scale=ball.trained.position_scale, process=learned_process(ball.trained))
-        if ball.noise is not None:
-            settings = with_noise(settings, ball.noise)
+        ball, settings = inputs.model_alone(model, named)
+        surfaces = Surfaces.table_tennis(0.0)
     if table is not None:
         surfaces = Surfaces.table_tennis(check_number("table", table, "m", limit=50.0, instead="mm"))
     if noise is not None:

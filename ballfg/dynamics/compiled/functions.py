@@ -45,12 +45,14 @@ class Function:
             tangents xt (n, 9, d) and ct (n, p, d); writes the results y (n, m) and their tangents yt (n, m, d).
         names: of the p coefficients that the function uses, as in `model.named_parameters()`.  size: m.
         weigh: computes the weights from a model's tables; None if there are none.
+        source: of `compute`; empty where torch computes.
     """
 
     compute: Code
     names: tuple[str, ...]
     size: int
     weigh: Recipe | None = None
+    source: str = ""
 
 
 @dataclass(frozen=True)
@@ -199,18 +201,18 @@ def _function(model: BallModel, function: Callable[[BallModel, Tensor], Tensor],
     kept = None if known is None else read_note(known)
     if kept is not None:
         weigh = None if kept["weights"] is None else Recipe(**kept["weights"])
-        made = Function(built(kept["source"]), tuple(kept["names"]), kept["size"], weigh)
+        made = Function(built(kept["source"]), tuple(kept["names"]), kept["size"], weigh, kept["source"])
         try:
             _compare(model, function, made)
         except NotTheSameError:  # its source has changed since
             pass
         else:
             return made
-    source, made = _traced(model, function)
+    made = _traced(model, function)
     _compare(model, function, made)
     if known is not None:
         weights = None if made.weigh is None else asdict(made.weigh)
-        write_note(known, {"source": source, "names": made.names, "size": made.size, "weights": weights})
+        write_note(known, {"source": made.source, "names": made.names, "size": made.size, "weights": weights})
     return made
 
 
@@ -232,8 +234,8 @@ def _files_of(model: BallModel) -> str | None:
     return ",".join(sorted(found))
 
 
-def _traced(model: BallModel, function: Callable[[BallModel, Tensor], Tensor]) -> tuple[str, Function]:
-    """A newly traced function, and its source."""
+def _traced(model: BallModel, function: Callable[[BallModel, Tensor], Tensor]) -> Function:
+    """A newly traced function."""
     from ballfg.dynamics.compiled.translation.source import function_source
     from ballfg.dynamics.compiled.translation.trace import trace  # torch's tracer takes a second to import
     from ballfg.dynamics.networks.layers import MNN
@@ -255,7 +257,7 @@ def _traced(model: BallModel, function: Callable[[BallModel, Tensor], Tensor]) -
     used = [(name, number) for name, number in zip(scalars, coefficients, strict=True) if number in needed]
     source = function_source(traced, state, [number for _, number in used])
     names = tuple(name for name, _ in used)
-    return source, Function(built(source), names, len(traced.outputs), traced.weights)
+    return Function(built(source), names, len(traced.outputs), traced.weights, source)
 
 
 def _compare(model: BallModel, function: Callable[[BallModel, Tensor], Tensor], made: Function) -> None:

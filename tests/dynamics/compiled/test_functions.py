@@ -130,9 +130,9 @@ def test_code_that_differs_from_torch_is_refused(monkeypatch) -> None:
     right = functions._traced
 
     def wrong(*args):
-        source, made = right(*args)
-        source = source.replace("y[r, 0] = ", "y[r, 0] = 1e-6 + ")
-        return source, replace(made, compute=built(source))
+        made = right(*args)
+        source = made.source.replace("y[r, 0] = ", "y[r, 0] = 1e-6 + ")
+        return replace(made, source=source, compute=built(source))
 
     monkeypatch.setattr(functions, "_traced", wrong)
     with pytest.warns(UserWarning, match="differs from torch"):

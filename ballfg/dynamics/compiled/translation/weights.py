@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass, field
 from math import prod
 from typing import Any, Final
@@ -37,14 +38,25 @@ class Weights:
 
     taken: dict[Node, int] = field(default_factory=dict)
     length: int = 0
+    _first: dict[Hashable, Node] = field(default_factory=dict)
+    _known: dict[Node, Node] = field(default_factory=dict)
 
     def take(self, known: Known) -> View:
-        """Places of the numbers of a tensor among the weights."""
+        """Places of the numbers of a tensor among the weights; one that is computed twice lies there once."""
         shape = tuple(known.example.shape)
-        if known.node not in self.taken:
-            self.taken[known.node] = self.length
+        node = self._same(known.node)
+        if node not in self.taken:
+            self.taken[node] = self.length
             self.length += prod(shape)
-        return View.whole(None, shape, self.taken[known.node])
+        return View.whole(None, shape, self.taken[node])
+
+    def _same(self, node: Node) -> Node:
+        """The first node with the same operation on the same operands."""
+        if node not in self._known:
+            operands = torch.fx.node.map_arg((node.args, node.kwargs), lambda n: self._same(n).name)
+            computed = (str(node.target), repr(operands)) if node.op == "call_function" else node
+            self._known[node] = self._first.setdefault(computed, node)
+        return self._known[node]
 
     def recipe(self, graph: GraphModule, vectors: int) -> Recipe | None:
         """The recipe of the weights from the tables, which are placeholders after `vectors` vectors; None: no weights.
