@@ -6,7 +6,7 @@ backward, as for a hidden Markov model) give the probability of each stroke.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
@@ -55,7 +55,9 @@ def hypotheses(grower: Grower, seeds: Sequence[Index], watch: Watch = unwatched)
     """The strokes that grow from arcs, highest scores first; of those with the same candidates only the best."""
     flights = [grower.flown(rows, ()) for rows in seeds]
     found = dict[tuple[int, ...], Stroke]()
-    chosen = _best_in_each(grower, flights, KEPT, 1)
+    # a swaying shoe is no flight, however smooth; an arc through a bounce becomes one with its bounce
+    whole = _best_in_each(grower, flights, KEPT, 1, grower.plausible)
+    chosen = list({id(one): one for one in (*_best_in_each(grower, flights, KEPT, 1), *whole)}.values())
     for flight in watch(chosen, len(chosen), "possible flights followed"):
         whole = _variants(grower, flight)
         for stroke in (*whole, *(part for one in whole for part in grower.shortened(one))):
@@ -113,16 +115,25 @@ def _bounced(grower: Grower, flight: Stroke, way: int) -> list[Stroke]:
     return [] if best is None else [grower.grown(grower.grown(grower.timed(best), way), -way)]
 
 
-def _best_in_each(grower: Grower, strokes: Sequence[Stroke], most: int, alike: int = -1) -> list[Stroke]:
+def _best_in_each(
+    grower: Grower,
+    strokes: Sequence[Stroke],
+    most: int,
+    alike: int = -1,
+    taken_for: Callable[[Stroke], bool] = lambda stroke: True,
+) -> list[Stroke]:
     """Those among the best `most` in one of their pictures, best first, without repeats of better ones.
 
-    Args: alike: number of candidates, at most, by which a stroke differs from a better one that it repeats.
+    Args:
+        alike: number of candidates, at most, by which a stroke differs from a better one that it repeats.
+        taken_for: says whether a stroke may take a place.
     """
     taken, kept, sets = np.zeros(len(grower.field.first), dtype=np.int64), list[Stroke](), list[set[int]]()
     for stroke in sorted(strokes, key=lambda one: -one.score):
         first, last = grower.field.frame[stroke.rows[[0, -1]]]
         mine = set(stroke.rows.tolist())
-        if taken[first : last + 1].min() < most and not any(len(mine - used) <= alike for used in sets):
+        repeats = any(len(mine - used) <= alike for used in sets)
+        if taken[first : last + 1].min() < most and not repeats and taken_for(stroke):
             kept.append(stroke)
             sets.append(mine)
             taken[first : last + 1] += 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -15,7 +16,7 @@ from ballfg.estimation.rally.choose import Chosen, rally
 from ballfg.estimation.rally.field import SEEN_RANGE, Field
 from ballfg.estimation.rally.smoothed import rally_track
 from ballfg.estimation.rally.strokes import Grower
-from ballfg.estimation.result import Estimate
+from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
@@ -96,10 +97,22 @@ def reconstruct(
         field = replace(field, seen=share)
     smoother = Smoother(model, surfaces, Settings.for_measured(model, find_events=False))
     estimates = list[Estimate]()
-    for number, stroke in enumerate(watch(chosen.strokes, len(chosen.strokes), "strokes estimated")):
-        track = rally_track(f"{first + number:03d}", [stroke], grower, camera, seen.times)
-        estimates.append(smoother.estimate(track))
-    return ShotRally(camera, seen, chosen, tuple(estimates), field.exposure)
+    for stroke in watch(chosen.strokes, len(chosen.strokes), "strokes estimated"):
+        estimates.append(smoother.estimate(rally_track("stroke", [stroke], grower, camera, seen.times)))
+    begun, end = _in_play(estimates)
+    named = [replace(one, name=f"{first + number:03d}") for number, one in enumerate(estimates[begun:end])]
+    parts = (chosen.strokes[begun:end], chosen.probabilities[begun:end], (False, *chosen.joined[begun + 1 : end]))
+    return ShotRally(camera, seen, Chosen(*parts) if named else chosen, tuple(named), field.exposure)
+
+
+def _in_play(estimates: Sequence[Estimate]) -> tuple[int, int]:
+    """Numbers of the first stroke of a rally and of the one after its last.
+
+    Before a service and after a rally a ball is tossed, bounced and picked up: what a flight does not explain, or shows
+    from nowhere near, is no stroke there. Between two strokes it is one.
+    """
+    sure = [number for number, one in enumerate(estimates) if one.status is Status.OK]
+    return (sure[0], sure[-1] + 1) if sure else (0, len(estimates))
 
 
 def _seen_share(field: Field, chosen: Chosen) -> float:
