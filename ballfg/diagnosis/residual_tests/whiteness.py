@@ -65,15 +65,7 @@ def whiteness(fit: Fit, system: System, tracker: TrackNoise | None = None) -> Wh
     else:  # the fit has weighted its samples as if their errors were white
         system = _whitened(fit, system, kept, tracker)
         projected = system.projected()
-        problem, values = fit.problem, np.array([fit.unknowns.values[name] for name in fit.problem.free])
-        away, precision = (
-            np.concatenate((problem.centres - values, -fit.unknowns.launcher.ravel())),
-            problem.common_precision,
-        )
-        free = np.full(len(away), np.inf)
-        projected[..., -1] -= projected[..., :-1] @ system.eliminated().common_step(
-            precision, precision * away, -free, free
-        )
+        projected[..., -1] -= projected[..., :-1] @ _common_step(fit, system)
     residual = projected[:, : 3 * k, -1].reshape(n, k, 3)
     taken = _absorbed(fit, system, projected[..., :-1]).reshape(n, k, 3, -1)
     sums, spreads, p_values, products = [], [], [], []

@@ -56,8 +56,8 @@ def hypotheses(grower: Grower, seeds: Sequence[Index], watch: Watch = unwatched)
     flights = [grower.flown(rows, ()) for rows in seeds]
     found = dict[tuple[int, ...], Stroke]()
     # a swaying shoe is no flight, however smooth; an arc through a bounce becomes one with its bounce
-    whole = _best_in_each(grower, flights, KEPT, 1, grower.plausible)
-    chosen = list({id(one): one for one in (*_best_in_each(grower, flights, KEPT, 1), *whole)}.values())
+    alone = _best_in_each(grower, flights, KEPT, 1, grower.plausible)
+    chosen = list({id(one): one for one in (*_best_in_each(grower, flights, KEPT, 1), *alone)}.values())
     for flight in watch(chosen, len(chosen), "possible flights followed"):
         whole = _variants(grower, flight)
         for stroke in (*whole, *(part for one in whole for part in grower.shortened(one))):
@@ -120,20 +120,20 @@ def _best_in_each(
     strokes: Sequence[Stroke],
     most: int,
     alike: int = -1,
-    taken_for: Callable[[Stroke], bool] = lambda stroke: True,
+    admitted: Callable[[Stroke], bool] = lambda stroke: True,
 ) -> list[Stroke]:
     """Those among the best `most` in one of their pictures, best first, without repeats of better ones.
 
     Args:
         alike: number of candidates, at most, by which a stroke differs from a better one that it repeats.
-        taken_for: says whether a stroke may take a place.
+        admitted: says whether a stroke may take a place; asked of those alone that would take one.
     """
     taken, kept, sets = np.zeros(len(grower.field.first), dtype=np.int64), list[Stroke](), list[set[int]]()
     for stroke in sorted(strokes, key=lambda one: -one.score):
         first, last = grower.field.frame[stroke.rows[[0, -1]]]
         mine = set(stroke.rows.tolist())
         repeats = any(len(mine - used) <= alike for used in sets)
-        if taken[first : last + 1].min() < most and not repeats and taken_for(stroke):
+        if taken[first : last + 1].min() < most and not repeats and admitted(stroke):
             kept.append(stroke)
             sets.append(mine)
             taken[first : last + 1] += 1

@@ -13,6 +13,7 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.rally.events import Event, events_of, stroke_row
 from ballfg.estimation.rally.reconstruct import ShotRally, reconstruct
+from ballfg.estimation.result import Status
 from ballfg.progress import Watch, unwatched
 from ballfg.vision.broadcast.candidates import find_candidates
 from ballfg.vision.broadcast.court import Court
@@ -38,7 +39,7 @@ class Rally:
         seen = sum(len(shot) for shot in self.motion.shots)
         notes = [] if seen == len(self.motion.times) else [f"{len(self.motion.times) - seen} pictures show no court"]
         for one in self.shots:
-            unsure = (estimate for estimate in one.estimates if estimate.status.name != "OK")
+            unsure = (estimate for estimate in one.estimates if estimate.status is not Status.OK)
             notes += [f"stroke {estimate.name}: {estimate.status.value}" for estimate in unsure]
         return notes
 
