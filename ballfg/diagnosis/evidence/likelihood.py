@@ -23,8 +23,8 @@ from ballfg.state import STATE_DIM
 LEAST, MOST = -5.0, 5.0
 """Bounds of the logarithm of a size over its unit."""
 MOST_STEPS, TOLERANCE = 30, 1e-6
-ROUNDS = 3
-"""Number of turns of robust weights and sizes."""
+MOST_ROUNDS, SETTLED = 12, 0.1
+"""Largest number of turns of robust weights and sizes, and the step of every size, in its errors, that ends them."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,8 @@ class Likelihood:
         triangle = np.asarray(np.linalg.cholesky(total), dtype=np.float64)
         lower, solved = triangle[:, :end, :end], triangle[:, end:, :end]
         narrow = np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)
-        return Reduced(logs - narrow - self.penalty, gram - solved @ solved.swapaxes(1, 2)), Local(lower, solved)
+        constant = logs + self.rows.volume - narrow - self.penalty
+        return Reduced(constant, gram - solved @ solved.swapaxes(1, 2)), Local(lower, solved)
 
     def slope(self, noise: Noise, local: Local, found: Posterior, precision: Array, away: Array) -> Array:
         """(6,) derivative of the evidence by the logarithms of the sizes: expected squares less their number.
@@ -256,7 +257,7 @@ def settled(rows: Rows, precision: Array, away: Array, start: Noise | None = Non
     options = {"maxiter": MOST_STEPS, "ftol": TOLERANCE}
     # sizes in units of their error, as if all that they scale were known: the search then needs a third of the steps
     unit = np.sqrt(2.0 * np.maximum(rows.counts, 1.0))
-    for turn in range(1 if start else 0, ROUNDS):
+    for turn in range(1 if start else 0, MOST_ROUNDS):
         likelihood = likelihood.reweighted(now, step) if turn else likelihood
 
         def missing(scaled: Array, likelihood: Likelihood = likelihood) -> tuple[float, Array]:
@@ -269,8 +270,10 @@ def settled(rows: Rows, precision: Array, away: Array, start: Noise | None = Non
         found = optimize.minimize(
             missing, now.vector * unit, method="L-BFGS-B", jac=True, bounds=bounds, options=options
         )
-        now = Noise.of(found.x / unit)
+        before, now = now, Noise.of(found.x / unit)
         step = posterior(likelihood.reduced(now)[0], precision, away).mean
+        if turn > 1 and (np.abs(now.vector - before.vector) * unit).max() < SETTLED:
+            break
     return likelihood, now
 
 

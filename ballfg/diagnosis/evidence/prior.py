@@ -12,7 +12,7 @@ from scipy import special
 
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.free import spread
-from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
+from ballfg.diagnosis.hypotheses.hypothesis import TWINS, Hypothesis
 from ballfg.diagnosis.hypotheses.varying import Varying, varied
 from ballfg.dynamics import AnalyticModel
 
@@ -43,8 +43,13 @@ def centres(hypothesis: Hypothesis, model: AnalyticModel) -> Array:
 
 def log_odds(hypotheses: Sequence[Hypothesis], nameless: bool = False) -> float:
     """Logarithm of the prior odds of a model with these effects to one without any; nameless: and patterns."""
-    chances = [VARIES if isinstance(h, Varying) else THERE for h in hypotheses] + [THERE] * nameless
+    chances = [VARIES if isinstance(h, Varying) else _there(h) for h in hypotheses] + [THERE] * nameless
     return float(sum(np.log(p / (1.0 - p)) for p in chances))
+
+
+def _there(hypothesis: Hypothesis) -> float:
+    """Prior probability of an effect, or of one of those that do exactly the same."""
+    return THERE * (1 + len(TWINS.get(hypothesis.name, ())))
 
 
 def choice_odds(hypotheses: Sequence[Hypothesis]) -> float:

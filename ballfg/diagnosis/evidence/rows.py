@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Collection
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -17,6 +18,7 @@ import numpy as np
 from ballfg.arrays import Array, Index, Mask
 from ballfg.diagnosis.fit.free_motion import ACCELERATION, CONTACT_SPIN, CONTACT_VELOCITY, free_motion
 from ballfg.diagnosis.fit.problem import Fit
+from ballfg.state import SPIN
 
 ACCELERATIONS, VELOCITIES, SPINS, COEFFICIENTS = range(4)
 """Kinds of random columns; each kind has one size for all tracks."""
@@ -66,6 +68,20 @@ class Rows:
         kinds = self.motion.kinds
         random = [(kinds == kind).sum() for kind in range(KINDS)]
         return np.array([3 * self.used.sum(), 3 * len(kinds), *random], dtype=np.float64)
+
+    @cached_property
+    def volume(self) -> Array:
+        """(n,) half the log determinant of the information on first places and velocities, at the stated noise.
+
+        It is the density of their prior: they are uniform in what the samples show of them (H. Jeffreys, "An invariant
+        form for the prior probability in estimation problems", Proc. R. Soc. A 186, 1946). Uniform in metres per
+        second, a slower clock would be more probable than less gravity, which samples alone cannot tell from it, by
+        the cube of its rate for each track. Spins have a prior of their own.
+        """
+        shown = self.by_start[:, :-3, : SPIN.start]
+        information, diagonal = shown.swapaxes(1, 2) @ shown, np.arange(SPIN.start)
+        information[:, diagonal, diagonal] += information[:, diagonal, diagonal] == 0.0
+        return np.asarray(0.5 * np.linalg.slogdet(information)[1])
 
     def with_common(self, by_common: Array) -> Rows:
         """The rows with other common unknowns; by_common: (n, m, q)."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import linalg
@@ -35,7 +37,10 @@ def prior(rows):
 
 
 def dense(likelihood, noise, precision, away):
-    """The density of all rows at once, its noise a full matrix, first states free and common unknowns random."""
+    """The density of all rows at once, its noise a full matrix, common unknowns random, first spins free.
+
+    Places and velocities have the density that makes them uniform in what the samples show.
+    """
     rows, parts, logs = likelihood.rows, [], 0.0
     sizes = np.exp(2.0 * np.append(noise.random, -np.inf))
     for i, used in enumerate(rows.used):
@@ -45,7 +50,8 @@ def dense(likelihood, noise, precision, away):
         motion = rows.motion.columns[i][kept] * np.sqrt(sizes[rows.motion.kinds[i]])
         # a robust weight divides the variance in the square of the residual, and leaves the normalisation alone
         parts.append((rows.residual[i][kept], rows.by_start[i][kept], rows.by_common[i][kept], motion, white / weights))
-        logs += 0.5 * np.log(weights).sum() + likelihood.penalty[i]
+        shown = np.linalg.svd(rows.by_start[i][kept][:-3, :6], compute_uv=False)
+        logs += 0.5 * np.log(weights).sum() + likelihood.penalty[i] - np.log(shown).sum()
     residual = np.concatenate([p[0] for p in parts])
     common = np.concatenate([p[2] for p in parts])
     starts = linalg.block_diag(*(p[1] for p in parts))
@@ -63,6 +69,16 @@ def test_value_is_that_of_a_dense_gaussian(likelihood, prior):
     reduced, _ = likelihood.reduced(NOISE)
     found = posterior(reduced, *prior).evidence
     assert found == pytest.approx(dense(likelihood, NOISE, *prior), rel=1e-8)
+
+
+def test_value_is_the_same_in_other_units_of_place_and_velocity(likelihood, prior):
+    """A slower clock or a longer metre alone makes no first state more probable."""
+    units = np.eye(9)
+    units[:6, :6] = np.random.default_rng(3).normal(size=(6, 6))
+    rows = likelihood.rows
+    other = replace(likelihood, rows=replace(rows, by_start=rows.by_start @ units))
+    values = [posterior(one.reduced(NOISE)[0], *prior).evidence for one in (likelihood, other)]
+    assert values[1] == pytest.approx(values[0], abs=1e-6)
 
 
 def test_derivative_is_that_of_differences(likelihood, prior):

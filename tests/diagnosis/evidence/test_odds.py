@@ -74,6 +74,26 @@ def test_a_strength_of_five_times_the_usual_one_costs_two_nats():
     assert np.log(density(5.0) / density(1.0)) > -3.0
 
 
+def test_a_slower_clock_is_as_probable_as_less_gravity(make_ball, make_launches, make_shots, make_fit):
+    """Without spin labels no sample tells them apart: what differs is how far each is from what is usual."""
+    shots = make_shots(make_ball(gravity={"g": 9.0}), make_launches(32, 4), 4, labelled=False)
+    declared, found, usual = make_fit(make_ball(), shots.stretches), [], []
+    for name, strength, unit in (("gravity", "g", 1.0), ("time_scale", "s", 2.0 * 9.81)):
+        hypothesis = Hypothesis(EFFECTS[name], {}, (strength,))
+        weighed = weigh(refit(declared, Scored(hypothesis, None, 0.0)).fit, [hypothesis])
+        away = float(weighed.strengths[name].mean[0]) - (9.81 if name == "gravity" else 0.0)
+        spreads = np.array(WIDTHS) * scales(hypothesis)
+        found.append(weighed.evidence)
+        usual.append(np.log(norm.pdf(away, scale=spreads).mean() / unit))
+    assert found[1] - found[0] == pytest.approx(usual[1] - usual[0], abs=0.7)
+
+
+def test_an_effect_with_a_twin_has_the_prior_of_both():
+    both, one = ([Hypothesis(EFFECTS[name], {}, (strength,))] for name, strength in (("gravity", "g"), ("scale", "x")))
+    assert np.exp(log_odds(one)) == pytest.approx(THERE / (1.0 - THERE))
+    assert np.exp(log_odds(both)) == pytest.approx(2.0 * THERE / (1.0 - 2.0 * THERE))
+
+
 def test_probabilities_follow_evidence_and_prior():
     nothing, wind, tilt = model([], 0.0), model(["wind"], 6.0), model(["frame_tilt"], 4.0)
     odds = odds_of([nothing, wind, tilt])
