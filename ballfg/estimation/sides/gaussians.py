@@ -44,9 +44,8 @@ class GaussianMixture:
     @property
     def log_weight(self) -> float:
         """The logarithm of the sum of all weights; -inf without Gaussians."""
-        from scipy import special  # few tracks end near a contact, and it takes a tenth of a second to import
-
-        return float(special.logsumexp(self.log_weights)) if len(self) else -np.inf
+        largest = float(self.log_weights.max(initial=-np.inf))
+        return largest if largest == -np.inf else largest + float(np.log(np.exp(self.log_weights - largest).sum()))
 
     def selected(self, rows: NDArray[np.bool_]) -> GaussianMixture:
         """A part of the Gaussians, by a mask (n,)."""
@@ -84,7 +83,7 @@ class GaussianMixture:
 
     def truncated(self, gaps: Array, gradients: Array) -> GaussianMixture:
         """The part above a surface, from gaps (n,) m and gradients (n, d); weighted by the remaining shares."""
-        from scipy import special
+        from scipy import special  # few tracks end near a contact, and it takes a tenth of a second to import
 
         along = (self.covariances @ gradients[..., None])[..., 0]
         sigma = np.sqrt(np.maximum((gradients * along).sum(axis=1), LEAST_SPREAD**2))

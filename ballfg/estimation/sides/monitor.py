@@ -212,7 +212,7 @@ class ContactMonitor:
 
         assert self._hypotheses is not None
         before = self._hypotheses
-        new = before.sides()[0].log_weight > np.log(NEGLIGIBLE)  # the bounce may lie in this interval
+        new = before.sides[0].log_weight > np.log(NEGLIGIBLE)  # the bounce may lie in this interval
         after = before.step(dt, measured)
         self._rejected = self._rejected + 1 if after.nearest > special.chdtri(3, GATE_CHANCE) else 0
         if self._rejected:
@@ -228,7 +228,7 @@ class ContactMonitor:
         self, hypotheses: ContactHypotheses, bounced: Callable[[int], bool], *, new: bool
     ) -> ContactState | None:
         """None if hypotheses and estimator agree on which side is certain, or if no state is possible."""
-        sides = hypotheses.sides()
+        sides = hypotheses.sides
         chances = np.exp([side.log_weight for side in sides])
         if not np.isfinite(chances).all():
             return None

@@ -82,7 +82,7 @@ def test_both_sides_against_draws(dt: float) -> None:
     hypotheses = ContactHypotheses.start(hypothesis_model(), FALLING, np.diag(SIGMAS**2)).step(
         dt, SampleMeasurement(position, np.full(3, noise))
     )
-    flying, risen = hypotheses.sides()
+    flying, risen = hypotheses.sides
     rng = np.random.default_rng(3)
     drawn = torch.from_numpy(FALLING + SIGMAS * rng.standard_normal((30_000, 9)))
     with torch.no_grad():
