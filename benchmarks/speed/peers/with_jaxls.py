@@ -27,9 +27,9 @@ class Spin(jaxls.Var[jax.Array], default_factory=lambda: jnp.zeros(3)):
 
 
 def estimate(problem: Problem):
-    """One compiled function of the measurements: analysis and solution of a track, one track after another.
+    """One compiled function of the measurements: analysis and solution, of several tracks as one problem.
 
-    All tracks as one problem, or side by side by `jax.vmap`, take longer: each then takes the steps of the slowest.
+    One track after another takes as long, and tracks side by side by `jax.vmap` longer.
     """
     acceleration, dt, step_sigma = acceleration_of(problem), float(problem.dt), jnp.asarray(problem.step_sigma)
     tracks, n, _ = problem.measured.shape
@@ -52,25 +52,29 @@ def estimate(problem: Problem):
     def labelled(values, spin: Spin, label: jax.Array) -> jax.Array:
         return (values[spin] - label) / float(problem.label_sigma)
 
-    def solve_track(measured: jax.Array, label: jax.Array, begin: jax.Array, turn: jax.Array):
-        states, spin = State(jnp.arange(n)), Spin(jnp.zeros(1, dtype=int))
+    number = np.arange(tracks * n).reshape(tracks, n)
+    before, after, owner = number[:, :-1].ravel(), number[:, 1:].ravel(), np.repeat(np.arange(tracks), n - 1)
+
+    def solve_all(measured: jax.Array, label: jax.Array, begin: jax.Array, turn: jax.Array):
+        states, spins = State(jnp.arange(tracks * n)), Spin(jnp.arange(tracks))
         costs = [
-            step(State(jnp.arange(n - 1)), State(jnp.arange(1, n)), Spin(jnp.zeros(n - 1, dtype=int))),
-            seen(states, measured),
-            labelled(spin, label[None]),
+            step(State(jnp.asarray(before)), State(jnp.asarray(after)), Spin(jnp.asarray(owner))),
+            seen(states, measured.reshape(-1, 3)),
+            labelled(spins, label),
         ]
-        analyzed = jaxls.LeastSquaresProblem(costs, [states, spin]).analyze()
-        start = jaxls.VarValues.make([states.with_value(begin), spin.with_value(turn[None])])
+        analyzed = jaxls.LeastSquaresProblem(costs, [states, spins]).analyze()
+        start = jaxls.VarValues.make([states.with_value(begin.reshape(-1, 6)), spins.with_value(turn)])
         options = {"trust_region": None, "termination": termination, "verbose": False}
         found = analyzed.solve(start, linear_solver=linear, **options)
-        return found[states], found[spin][0]
+        return found[states], found[spins]
 
     p, v, w = problem.start()
     given = [jnp.asarray(part) for part in (problem.measured, problem.label, np.concatenate((p, v), axis=2), w)]
-    compiled = jax.jit(lambda *parts: jax.lax.map(lambda part: solve_track(*part), parts))
+    compiled = jax.jit(solve_all)
 
     def solve() -> dict[str, Array]:
         states, spins = (np.asarray(part) for part in compiled(*given))
+        states = states.reshape(tracks, n, 6)
         return {"position": states[..., :3], "velocity": states[..., 3:], "spin": spins}
 
     return solve
