@@ -95,7 +95,9 @@ weights of rates, impact and surface that were computed from them."""
 _weights: weakref.WeakKeyDictionary[BallModel, _Weighed] = weakref.WeakKeyDictionary()
 _OF_TORCH: Final = frozenset(vars(nn.Module()))
 """Attributes of every module; its parameters, buffers and parts are compared by themselves."""
-_BESIDE: Final = frozenset({"trained", "noise", "variations", "measurement", "spins", "coefficients"})
+_BESIDE: Final = frozenset(
+    {"trained", "noise", "variations", "measurement", "spins", "coefficients", "parameter_count"}
+)
 """Attributes of a ball model and of its effects that do not belong to its motion: priors among them."""
 
 
@@ -252,8 +254,14 @@ def _files_of(model: BallModel) -> str | None:
 
 
 def _is_of_package(model: BallModel) -> bool:
-    """True if ballfg and torch define all parts of a model."""
-    return all(type(part).__module__.startswith(("ballfg.", "torch.nn.")) for part in model.modules())
+    """True if ballfg and torch define all parts of a model, and nobody has replaced a method of ballfg's since."""
+    kinds = {type(part) for part in model.modules()}
+    own = {kind for each in kinds for kind in each.__mro__ if kind.__module__.startswith("ballfg.")}
+    methods = [
+        (sys.modules[kind.__module__], getattr(f, "__code__", None)) for kind in own for f in vars(kind).values()
+    ]
+    as_written = all(code is None or code.co_filename == module.__file__ for module, code in methods)
+    return as_written and all(kind.__module__.startswith(("ballfg.", "torch.nn.")) for kind in kinds)
 
 
 def _traced(model: BallModel, function: Callable[[BallModel, Tensor], Tensor]) -> Function:
