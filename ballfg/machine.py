@@ -11,7 +11,8 @@ from functools import wraps
 from importlib import metadata
 from typing import Final, ParamSpec, TypeVar
 
-P, R = ParamSpec("P"), TypeVar("R")
+P = ParamSpec("P")
+R = TypeVar("R")
 
 DATE: Final = "SOURCE_DATE_EPOCH"
 """Environment variable with a date in seconds since 1970 that replaces the present one, so that a page can be
