@@ -6,9 +6,13 @@ import gc
 import os
 import platform
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import wraps
 from importlib import metadata
-from typing import Final
+from typing import Final, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 DATE: Final = "SOURCE_DATE_EPOCH"
 """Environment variable with a date in seconds since 1970 that replaces the present one, so that a page can be
@@ -42,3 +46,22 @@ def collect_rarely() -> None:
     takes a tenth of a command's start.
     """
     gc.set_threshold(MADE, *gc.get_threshold()[1:])
+
+
+def collecting_later(function: Callable[P, R]) -> Callable[P, R]:
+    """A function during which Python collects no garbage; a collection that falls due waits for its end.
+
+    Where collection is off, it stays off. Other threads collect nothing in this time either.
+    """
+
+    @wraps(function)
+    def without_collection(*args: P.args, **kwargs: P.kwargs) -> R:
+        if not gc.isenabled():
+            return function(*args, **kwargs)
+        gc.disable()
+        try:
+            return function(*args, **kwargs)
+        finally:
+            gc.enable()
+
+    return without_collection

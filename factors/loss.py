@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-import gtsam
 import numpy as np
 import torch
 from torch import Tensor
 
 from ballfg.arrays import Array
 from ballfg.checks import check_choice, check_number
+
+if TYPE_CHECKING:
+    import gtsam
 
 LEAST_STRETCH = 0.05
 """Least curvature along the residual, for a finite step where the loss is straight or concave."""
@@ -88,6 +90,8 @@ class Loss:
 
     def noise_model(self, dim: int) -> gtsam.noiseModel.Base:
         """GTSAM's model of this loss on a whitened residual of `dim` numbers."""
+        import gtsam  # it takes a tenth of a second to import, and the own solver needs none of it
+
         unit = gtsam.noiseModel.Unit.Create(dim)
         if self.name == "squared":
             return unit

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
-from scipy import special
 
 from ballfg.arrays import Array
 from ballfg.checks import shown
@@ -100,6 +99,8 @@ def falls(value: Array, sigma: Array) -> float:
 
     Args: value, sigma: (k,) mean and standard deviation at k times.
     """
+    from scipy import special  # it takes a tenth of a second to import
+
     above = special.ndtr(value / np.maximum(sigma, np.finfo(float).tiny))
     lowest = np.minimum.accumulate(above[::-1])[::-1]  # from each time on
     covered, reached = 0.0, np.inf
@@ -134,6 +135,8 @@ class Path:
 
     def contact(self, since: float = -np.inf) -> EventAhead:
         """The next contact after a time, s, and the probability that its uncertain time lies within the horizon."""
+        from scipy import special
+
         found = next_contact(*self.carried, self.horizon + LATER, after=since)
         if found is None:
             return EventAhead(None, 0.0)

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -14,7 +13,7 @@ from ballfg.checks import check_array, check_name, check_number, shown
 MOST_PIXELS: Final = 1_000_000  # largest number of px of one side of an image
 DISTORTIONS: Final = (0, 4, 5, 8, 12, 14)
 """Lengths of distortion vectors in OpenCV: none; k1 k2 p1 p2; k3; k4 k5 k6; thin prism s1-s4; tilt tau_x tau_y."""
-_PRECISELY: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-12)
+_PRECISELY: Final = (3, 60, 1e-12)  # cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS
 """OpenCV undoes distortion by five steps of a fixed point by default: 0.1 pixel off in a wide lens."""
 WIDEST_ASKED: Final = 6.0  # tangent of the angle from the axis up to which a lens is tested: 80 degrees
 WIDEST_STEPS: Final = 6001
@@ -83,6 +82,8 @@ class Camera:
     @cached_property
     def rotation(self) -> Array:
         """(3, 3) dimensionless, from the world to the camera."""
+        import cv2  # a dataset without cameras needs none of it
+
         return np.asarray(cv2.Rodrigues(self.rvec)[0], dtype=np.float64)
 
     @cached_property
@@ -114,6 +115,8 @@ class Camera:
         flat = np.ascontiguousarray(points.reshape(-1, 3))
         if len(flat) == 0:
             return np.zeros((*points.shape[:-1], 2))
+        import cv2
+
         pixels, _ = cv2.projectPoints(flat, self.rvec, self.tvec, self.matrix, self.distortion)
         pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
         x, y, depth = (flat @ self.rotation.T + self.tvec).T
@@ -138,6 +141,8 @@ class Camera:
         flat = np.ascontiguousarray(pixels.reshape(-1, 1, 2))
         if len(flat) == 0:
             return np.zeros(pixels.shape)
+        import cv2
+
         plane = cv2.undistortPoints(flat, self.matrix, self.distortion, criteria=_PRECISELY)
         return np.asarray(plane, dtype=np.float64).reshape(pixels.shape)
 

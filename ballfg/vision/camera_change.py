@@ -8,7 +8,6 @@ exp(zoom). The turn is of first order in X', exact in `changed`.
 from dataclasses import replace
 from typing import Final
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -23,6 +22,8 @@ TURN, MOVE, ZOOM = slice(0, 3), slice(3, 6), 6
 
 def changed(camera: Camera, change: Array) -> Camera:
     """The camera after a change (7,); its covariance stays."""
+    import cv2  # a dataset without cameras needs none of it
+
     turned = camera.rotation @ cv2.Rodrigues(-change[TURN])[0]
     matrix = camera.matrix.copy()
     matrix[[0, 1], [0, 1]] *= np.exp(change[ZOOM])

@@ -7,7 +7,6 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Final
 
-import cv2
 import numpy as np
 import yaml
 
@@ -100,6 +99,8 @@ def write_opencv(path: str | PathLike[str], cameras: Iterable[Camera], *, posed:
         if not (plain.isascii() and plain.isalnum() and plain[0].isalpha()):
             rule = "names of cameras must be letters, digits, - and _, a letter first, in OpenCV's files"
             raise ValueError(f"{rule}; got {shown(camera.name)}. Rename it, or write cameras.yaml.")
+    import cv2  # reading takes none of it
+
     with whole_file(path) as temporary:
         storage = cv2.FileStorage(str(temporary), cv2.FILE_STORAGE_WRITE)
         for camera in cameras:

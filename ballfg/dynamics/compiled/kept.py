@@ -192,7 +192,7 @@ def _digest(content: bytes) -> bytes:
 
 
 @cache
-def _stamp(file: str) -> str:
+def source_stamp(file: str) -> str:
     """Digest of a source file and of all ballfg files that it imports, since their functions are compiled in."""
     found, waiting = dict[str, bytes](), [file]
     while waiting:
@@ -215,7 +215,8 @@ class _Cache(FunctionCache):
     def __init__(self, function: Any) -> None:
         super().__init__(function)
         file = function.__code__.co_filename
-        stamp = _stamp(file) if os.path.exists(file) else str(self._impl.locator.get_source_stamp())  # or a notebook's
+        cell = not os.path.exists(file)  # of a notebook
+        stamp = str(self._impl.locator.get_source_stamp()) if cell else source_stamp(file)
         self._cache_file = _Checked(self.cache_path, self._impl.filename_base, stamp)
 
 

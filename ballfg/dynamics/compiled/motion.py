@@ -18,7 +18,7 @@ from ballfg.dynamics.compiled.roll_out import roll_out as roll_out_rows
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.limits import BEYOND, step_count
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.state import STATE_DIM
+from ballfg.state import STATE_DIM, Z
 
 
 class Moving:
@@ -75,6 +75,15 @@ class Moving:
         radius = self.functions.radius
         contact_times(rates.compute, surface.compute, self.states, c, s, w, ws, height, longest, radius, tau)
         return tau
+
+    def gaps(self, height: float) -> tuple[Array, Array]:
+        """(n,) m from a surface up to the balls' lowest points, and the derivatives (n, d)."""
+        n, _, width = self.moved.shape
+        surface, offset, moved = self.functions.surface, np.zeros((n, 3)), np.zeros((n, 3, width))
+        values, tangents = self.coefficients(surface)
+        surface.compute(self.states, values, self.weights[2], self.moved, tangents, offset, moved)
+        gap = self.states[:, Z] - height - offset[:, 0] - self.functions.radius
+        return gap, self.moved[:, Z] - moved[:, 0]
 
     def whole(self) -> Tensor:
         """(n, 9 + p) states with their coefficients."""

@@ -130,9 +130,14 @@ def contact_step(state: Array, rise: float, dt: float) -> int:
     return 1 if time > (1 + MOVE_MARGIN) * dt else 0
 
 
-def first_difference(samples: Sequence[Sample], motions: Sequence[Motion], factors: Array) -> int | None:
-    """The first sample whose motion or usability differs; None if only noise levels do: they do not go back."""
-    for k, sample in enumerate(samples):
+def first_difference(
+    samples: Sequence[Sample], motions: Sequence[Motion], factors: Array, begin: int = 0
+) -> int | None:
+    """The first sample from `begin` on whose motion or usability differs; None if only noise levels do.
+
+    These do not go back.
+    """
+    for k, sample in enumerate(samples[begin:], begin):
         if k and not sample.motion.same(motions[k - 1]):
             return k
         if (sample.factor >= UNUSABLE) != (factors[k] >= UNUSABLE):
@@ -156,7 +161,7 @@ def explain(window: StreamWindow, samples: list[Sample], events: EventTracker) -
     settled = max(held - LATEST_CHANGE, 0)
     motions[: max(settled - 1, 0)] = [s.motion for s in samples[1:settled]]
     factors[:settled] = [s.factor for s in samples[:settled]]
-    start = first_difference(samples[:held], motions, factors)
+    start = first_difference(samples[:held], motions, factors, settled)
     reweighed = [k for k in range(held) if samples[k].factor != factors[k]]
     for k, sample in enumerate(samples):
         sample.factor = float(factors[k])

@@ -38,6 +38,7 @@ from ballfg.estimation.smoother.problem import coefficient_means, trackwise_mode
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.batch import FactorBatch
 from ballfg.factors.linear.definite import definite, variances_positive
+from ballfg.machine import collecting_later
 from ballfg.state import STATE_DIM
 from ballfg.tracks import Ball, Track
 from ballfg.tracks.stamps import StreamOrigin
@@ -144,10 +145,11 @@ class Online(Estimator):
         gc.collect()
         gc.freeze()
 
+    @collecting_later
     def push(
         self, time: float, position: ArrayLike, sigma: ArrayLike | None = None, observations: Sequence[Observation] = ()
     ) -> OnlineState:
-        """Takes in a measured position, and other measurements of that time.
+        """Takes in a measured position, and other measurements of that time; Python collects garbage after it.
 
         Args:
             time: s, later than the last.
@@ -183,6 +185,7 @@ class Online(Estimator):
         """The stamp on the clock of the stream, s, of a moment that the window counts from its first sample."""
         return self._origin.written(seconds)
 
+    @collecting_later
     def push_sighting(self, time: float, camera: str, pixel: ArrayLike, covariance: ArrayLike) -> OnlineState | None:
         """Takes in one camera's sighting, at its own stamp.
 

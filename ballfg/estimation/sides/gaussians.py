@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import log_ndtr, logsumexp
 
 from ballfg.arrays import Array
 from ballfg.estimation.observations.innovation import FilterInnovation
@@ -45,7 +44,8 @@ class GaussianMixture:
     @property
     def log_weight(self) -> float:
         """The logarithm of the sum of all weights; -inf without Gaussians."""
-        return float(logsumexp(self.log_weights)) if len(self) else -np.inf
+        largest = float(self.log_weights.max(initial=-np.inf))
+        return largest if largest == -np.inf else largest + float(np.log(np.exp(self.log_weights - largest).sum()))
 
     def selected(self, rows: NDArray[np.bool_]) -> GaussianMixture:
         """A part of the Gaussians, by a mask (n,)."""
@@ -83,10 +83,12 @@ class GaussianMixture:
 
     def truncated(self, gaps: Array, gradients: Array) -> GaussianMixture:
         """The part above a surface, from gaps (n,) m and gradients (n, d); weighted by the remaining shares."""
+        from scipy import special  # few tracks end near a contact, and it takes a tenth of a second to import
+
         along = (self.covariances @ gradients[..., None])[..., 0]
         sigma = np.sqrt(np.maximum((gradients * along).sum(axis=1), LEAST_SPREAD**2))
         along, cut = along / sigma[:, None], -gaps / sigma
-        log_share = log_ndtr(-cut)
+        log_share = special.log_ndtr(-cut)
         shift = np.exp(-0.5 * cut**2 - 0.5 * np.log(2.0 * np.pi) - log_share)  # mean of a standard normal above the cut
         narrowing = shift * (cut - shift)
         means = self.means + shift[:, None] * along

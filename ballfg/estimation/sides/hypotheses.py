@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from ballfg.arrays import Array
+from ballfg.dynamics.compiled.motion import Moving, functions_of
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import fly_through_jacobian
 from ballfg.dynamics.motion.integrate import fly_jacobian
@@ -92,13 +93,17 @@ class HypothesisModel:
 
     def gaps(self, means: Array, level: float) -> tuple[Array, Array]:
         """(n,) m between balls (n, d) and a surface, and its gradients (n, d)."""
-        leaf = torch.from_numpy(np.ascontiguousarray(means[:, : self.width])).requires_grad_(True)
-        with torch.enable_grad():
-            gaps = self.ball.gap(leaf, level)
-            (slopes,) = torch.autograd.grad(gaps.sum(), leaf)
         gradients = np.zeros(means.shape)
+        states = torch.from_numpy(np.ascontiguousarray(means[:, : self.width]))
+        if (functions := functions_of(self.ball)) is not None:
+            gaps, gradients[:, : self.width] = Moving(self.ball, functions, states, self.width).gaps(level)
+            return gaps, gradients
+        leaf = states.requires_grad_(True)
+        with torch.enable_grad():
+            heights = self.ball.gap(leaf, level)
+            (slopes,) = torch.autograd.grad(heights.sum(), leaf)
         gradients[:, : self.width] = slopes.numpy()
-        return gaps.detach().numpy(), gradients
+        return heights.detach().numpy(), gradients
 
     def may_touch(self, mean: Array, covariance: Array, dt: float) -> bool:
         """True if a ball may come down to a surface within dt s; most are far: a coarse bound is first."""
@@ -217,6 +222,7 @@ class ContactHypotheses:
         bounced, other = self.model.update(self.bounced, measured)
         return replace(self, flying=flying, bounced=bounced, nearest=min(nearest, other))
 
+    @cached_property
     def sides(self) -> tuple[GaussianMixture, GaussianMixture]:
         """A Gaussian for each side of the contact, not yet bounced and bounced; the weights are probabilities."""
         first = np.arange(len(self._above)) == 0

@@ -10,7 +10,6 @@ from typing import Final
 
 import numpy as np
 import torch
-from scipy.special import chdtri
 
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
@@ -209,11 +208,13 @@ class ContactMonitor:
         self._samples = self._rejected = 0
 
     def _step(self, dt: float, measured: SampleMeasurement, bounced: Callable[[int], bool]) -> ContactState | None:
+        from scipy import special  # it takes a tenth of a second to import
+
         assert self._hypotheses is not None
         before = self._hypotheses
-        new = before.sides()[0].log_weight > np.log(NEGLIGIBLE)  # the bounce may lie in this interval
+        new = before.sides[0].log_weight > np.log(NEGLIGIBLE)  # the bounce may lie in this interval
         after = before.step(dt, measured)
-        self._rejected = self._rejected + 1 if after.nearest > chdtri(3, GATE_CHANCE) else 0
+        self._rejected = self._rejected + 1 if after.nearest > special.chdtri(3, GATE_CHANCE) else 0
         if self._rejected:
             after = before.step(dt, SampleMeasurement())
         self._samples += 1
@@ -227,7 +228,7 @@ class ContactMonitor:
         self, hypotheses: ContactHypotheses, bounced: Callable[[int], bool], *, new: bool
     ) -> ContactState | None:
         """None if hypotheses and estimator agree on which side is certain, or if no state is possible."""
-        sides = hypotheses.sides()
+        sides = hypotheses.sides
         chances = np.exp([side.log_weight for side in sides])
         if not np.isfinite(chances).all():
             return None

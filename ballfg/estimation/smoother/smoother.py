@@ -39,7 +39,6 @@ from ballfg.estimation.smoother.settle import (
 )
 from ballfg.factors.batch import FactorBatch, Values
 from ballfg.factors.graph import Convergence, LevenbergMarquardt
-from ballfg.factors.gtsam_solver import GtsamLevenbergMarquardt
 from ballfg.factors.linear.covariance import Covariances
 from ballfg.state import STATE_DIM
 from ballfg.tracks import Ball, Track
@@ -84,9 +83,16 @@ class Smoother(Estimator):
         optimizer: LevenbergMarquardt | None = None,
     ) -> None:
         super().__init__(model, surfaces, settings)
-        usual = GtsamLevenbergMarquardt if self.settings.solver == "gtsam" else LevenbergMarquardt
-        self.optimizer = usual() if optimizer is None else optimizer
+        self.optimizer = self._usual_optimizer() if optimizer is None else optimizer
         check_instance("optimizer", self.optimizer, LevenbergMarquardt, "Leave it out for the usual one.")
+
+    def _usual_optimizer(self) -> LevenbergMarquardt:
+        """That of the settings' solver."""
+        if self.settings.solver != "gtsam":
+            return LevenbergMarquardt()
+        from ballfg.factors.gtsam_solver import GtsamLevenbergMarquardt  # a tenth of a second, for this solver alone
+
+        return GtsamLevenbergMarquardt()
 
     def estimate(self, track: Track, factors: Sequence[FactorBatch] = (), *, move_stamps: bool = True) -> Estimate:
         """The states of a track, one per stamp, with the covariances of the Laplace approximation.

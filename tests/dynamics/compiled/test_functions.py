@@ -151,6 +151,34 @@ def test_an_effect_that_was_edited_is_traced_again(monkeypatch, tmp_path) -> Non
         cache_folder.cache_clear()
 
 
+def test_what_agreed_is_compared_again_for_classes_of_others_alone(monkeypatch, tmp_path) -> None:
+    """The sources of ballfg's classes are in the key of the note; a user's class, or a replaced method, is compared."""
+    monkeypatch.setenv("BALLFG_CACHE", str(tmp_path))
+    cache_folder.cache_clear()
+    try:
+        own, other = nominal_model().requires_grad_(False), ball(Pull(4))
+        asked: list[AnalyticModel] = []
+        functions._by_structure.clear()
+        first = compiled(own), compiled(other)
+        monkeypatch.setattr(functions, "_compare", lambda model, *_: asked.append(model))
+        monkeypatch.setattr(functions, "_compare_steps", lambda model, _: asked.append(model))
+        for _ in range(2):
+            functions._by_structure.clear()
+            asked.clear()
+            again = compiled(copy.deepcopy(own)), compiled(copy.deepcopy(other))
+            assert [known.rates.source for known in again] == [known.rates.source for known in first]
+            assert len(asked) == 4
+            assert all("pull" in dict(model.flight.named_children()) for model in asked)
+        drag = type(own.flight["drag"])
+        monkeypatch.setattr(drag, "acceleration", lambda self, flight: -self.k * flight.velocity)
+        functions._by_structure.clear()
+        asked.clear()
+        compiled(copy.deepcopy(own))
+        assert len(asked) == 4
+    finally:
+        cache_folder.cache_clear()
+
+
 def test_another_effect_or_radius_is_seen() -> None:
     model = nominal_model().requires_grad_(False)
     start = torch.tensor([[0.0, 0.0, 0.3, 3.0, 0.5, 2.0, 0.0, 80.0, 20.0]], dtype=torch.float64)

@@ -18,7 +18,7 @@ import pytest
 
 from ballfg.dynamics.compiled import kept
 from ballfg.dynamics.compiled.build import read_note, write_note
-from ballfg.dynamics.compiled.kept import NOTED, _is_trusted, _read, _stamp, cache_folder, keep, readable
+from ballfg.dynamics.compiled.kept import NOTED, _is_trusted, _read, cache_folder, keep, readable, source_stamp
 from tests.places import ROOT
 
 FUNCTION_FILE = """
@@ -307,7 +307,7 @@ def test_a_change_of_another_file_that_is_built_in_is_noticed(tmp_path: Path, mo
         module.__dict__.update(FACTOR=factor, __file__=str(other))
         monkeypatch.setitem(sys.modules, "ballfg.made_up", module)
         for hits in (False, True):
-            for asked in (_stamp, _read):
+            for asked in (source_stamp, _read):
                 asked.cache_clear()
             found = declared_in(tmp_path / "some_function.py").twice
             assert found(2.0) == 2.0 * factor

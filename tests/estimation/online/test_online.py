@@ -1,5 +1,7 @@
 """Online: iSAM2 in a window against the minimum of the same graph, events as they come, bounded memory, repairs."""
 
+import gc
+
 import numpy as np
 import pytest
 import torch
@@ -37,6 +39,42 @@ LIVE_ROBUST = 0.5
 
 def misses(online):
     return sum(i.bridge.misses for i in online.window.intervals if i is not None)
+
+
+@pytest.mark.parametrize("solver", ["gtsam", "ballfg"])
+def test_no_garbage_is_collected_within_a_push(solver, monkeypatch):
+    """Though a collection is due at every object; it comes after the push, and after a refused one too."""
+    online, (track, _) = Online(nominal_model(), TABLE, settings(solver=solver)), make_track(BOUNCING)
+    pushing, collected, before, observe = False, [], gc.get_threshold(), online._observe
+
+    def notice(*_):
+        collected.append(pushing)
+
+    def observed(sample):
+        nonlocal pushing
+        pushing = True
+        state = observe(sample)
+        pushing = False
+        return state
+
+    monkeypatch.setattr(online, "_observe", observed)
+    gc.callbacks.append(notice)
+    gc.set_threshold(1, 1, 1)
+    try:
+        for time, position in zip(track.times, track.positions, strict=True):
+            online.push(time, position)
+        with pytest.raises(ValueError, match="increase"):
+            online.push(track.times[0], track.positions[0])
+        assert gc.isenabled()
+        gc.disable()
+        online.push(track.times[-1] + 0.01, track.positions[-1])
+        assert not gc.isenabled()
+    finally:
+        gc.enable()
+        gc.set_threshold(*before)
+        gc.callbacks.remove(notice)
+    assert False in collected
+    assert True not in collected
 
 
 @pytest.mark.parametrize("start", [FLYING, BOUNCING])

@@ -10,8 +10,10 @@ import torch
 from scipy.stats import multivariate_normal, norm
 
 from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces
+from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.motion.rollout import advance
 from ballfg.estimation.settings import Settings
+from ballfg.estimation.sides import hypotheses
 from ballfg.estimation.sides.gaussians import GaussianMixture
 from ballfg.estimation.sides.hypotheses import ContactHypotheses, HypothesisModel, SampleMeasurement
 from ballfg.estimation.sides.monitor import ContactMonitor
@@ -27,6 +29,21 @@ DT = 0.006
 
 def hypothesis_model(model=None) -> HypothesisModel:
     return HypothesisModel(model or table_tennis().model, Surfaces(0.0), QUIET)
+
+
+def test_gaps_by_machine_code_and_by_torch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over a tilted surface that lies too high, whose rise travels with the state."""
+    effects = [EFFECTS[name]() for name in ("gravity", "restitution", "table_tilt", "table_height")]
+    ball = AugmentedModel(AnalyticModel(effects).requires_grad_(False), ("bounce.table_height.offset",))
+    with torch.no_grad():
+        for parameter in ball.parameters():
+            parameter += 0.01
+    means = np.random.default_rng(4).normal(size=(5, 10))
+    found = hypothesis_model(ball).gaps(means, 0.3)
+    monkeypatch.setattr(hypotheses, "functions_of", lambda _: None)
+    for own, right in zip(found, hypothesis_model(ball).gaps(means, 0.3), strict=True):
+        np.testing.assert_allclose(own, right, rtol=1e-13, atol=1e-13)
+    assert np.abs(found[1][:, [0, 1, 9]]).min() > 0.0
 
 
 def test_a_gaussian_is_cut_as_an_integral_over_it_says() -> None:
@@ -82,7 +99,7 @@ def test_both_sides_against_draws(dt: float) -> None:
     hypotheses = ContactHypotheses.start(hypothesis_model(), FALLING, np.diag(SIGMAS**2)).step(
         dt, SampleMeasurement(position, np.full(3, noise))
     )
-    flying, risen = hypotheses.sides()
+    flying, risen = hypotheses.sides
     rng = np.random.default_rng(3)
     drawn = torch.from_numpy(FALLING + SIGMAS * rng.standard_normal((30_000, 9)))
     with torch.no_grad():

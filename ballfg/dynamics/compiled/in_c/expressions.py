@@ -32,7 +32,7 @@ from ballfg.dynamics.compiled.in_c.values import (
 )
 
 if TYPE_CHECKING:
-    from ballfg.dynamics.compiled.in_c.routines import Body
+    from ballfg.dynamics.compiled.in_c.body import Body
 
 BINARY: Final[dict[type[ast.operator], tuple[str, Callable[[Any, Any], Any]]]] = {
     ast.Add: ("+", lambda a, b: a + b),

@@ -20,7 +20,7 @@ from ballfg.dynamics.compiled.in_c.values import (
 )
 
 if TYPE_CHECKING:
-    from ballfg.dynamics.compiled.in_c.routines import Body
+    from ballfg.dynamics.compiled.in_c.body import Body
     from ballfg.dynamics.compiled.in_c.values import Value
 
 

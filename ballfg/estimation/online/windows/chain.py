@@ -118,7 +118,8 @@ class ChainWindow(StreamWindow):
         """Drops all but the newest states; the triangle at the cut keeps their information."""
         leaving = len(self.samples) - keep
         self._relinearize(None)
-        self._solve()
+        if self._stale:
+            self._solve()
         w, p, linked = self.width, self.p, self.intervals[leaving - 1] is not None
         carries, shared, _ = self._chain
         known = np.concatenate((carries[leaving] if linked else carries[leaving, :0], shared[leaving]))
@@ -132,9 +133,14 @@ class ChainWindow(StreamWindow):
         self.theta, self.delta = self.theta[leaving:], self.delta[leaving:]
         if self.biased and not linked:
             self._priors[0].append(BiasStartFactors(np.zeros(1, dtype=np.int64), self.settings.bias_sigmas))
-        self._room(0)
-        self._renew([0], moved=False)  # only the first one's rows change; all are eliminated again
-        self._solve()
+            self._room(0)
+            self._renew([0], moved=False)
+            self._solve()
+            return
+        carries, shared, root = (held[leaving:].copy() for held in self._chain)  # what stays is eliminated already
+        carries[0], shared[0] = 0.0, 0.0  # the summary holds it
+        self._chain = carries, shared, root
+        self._rows[0] = self._rows_of(0, moved=False)
 
     def joint_covariances(self, count: int) -> list[Array]:
         """(w + p, w + p) of each of the oldest states, with its bias and the coefficients."""

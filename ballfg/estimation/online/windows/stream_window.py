@@ -79,6 +79,7 @@ class StreamWindow(ABC):
         self.maker = IntervalMaker(model, settings.process)
         self.p = model_width(model)
         self._filter = WindowFilter(settings, self.width)
+        self._order = np.r_[:STATE_DIM, self.width : self.width + self.p, STATE_DIM : self.width]
         self._own_means = coefficient_means(model.model, settings) if self.p else np.zeros(0)  # type: ignore[arg-type]
         self._own_sigmas = np.array(list(settings.coefficients.values()))
         self.first = 0
@@ -176,8 +177,8 @@ class StreamWindow(ABC):
     @property
     def newest_in_order(self) -> tuple[Array, Array]:
         """Mean (w + p,) and covariance of the newest state, the coefficients and the bias, in this order."""
-        order = np.r_[:STATE_DIM, self.width : self.width + self.p, STATE_DIM : self.width]
-        return np.concatenate((self.points[-1], self.coefficients))[order], self.newest_covariance[np.ix_(order, order)]
+        mean = np.concatenate((self.theta[-1] + self.delta[-1], self.coefficients))
+        return mean[self._order], self.newest_covariance[self._order[:, None], self._order]
 
     @property
     def coefficients(self) -> Array:
@@ -207,7 +208,7 @@ class StreamWindow(ABC):
 
     def _append_linked(self, samples: Sequence[Sample]) -> Update:
         """Takes in samples that are linked to the newest one and to each other."""
-        mean, covariance = np.concatenate((self.points[-1], self.coefficients)), self.newest_covariance
+        mean, covariance = np.concatenate((self.theta[-1] + self.delta[-1], self.coefficients)), self.newest_covariance
         points, intervals, pieces = list[Array](), list[Interval](), list[Array]()
         for before, sample in pairwise((self.samples[-1], *samples)):
             number = self.first + len(self.samples) + len(intervals)

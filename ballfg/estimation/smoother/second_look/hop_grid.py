@@ -14,13 +14,15 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.motion.limits import REST_SPEED
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 SPEEDS: Final = 64
 """Number of take-off speeds in the grid."""
@@ -182,6 +184,8 @@ class HopGrid:
     def _step(self, ticks: int) -> tuple[csr_array, csr_array]:
         """(k, k) probabilities of the cells over some ticks, and these times the number of bounces on the way."""
         if ticks not in self._steps:
+            from scipy.sparse import csr_array  # few tracks hop low, and it takes a tenth of a second to import
+
             pairs = itertools.product(POINTS, POINTS)
             parts = [self._moved(ticks * self.tick, push, kick, a * b) for (push, a), (kick, b) in pairs]
             target, weight, bounces = (np.concatenate(column) for column in zip(*parts, strict=True))
