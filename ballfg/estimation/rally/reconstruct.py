@@ -11,7 +11,7 @@ import numpy as np
 from ballfg.arrays import Mask
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.rally.arcs import arcs, with_exposure
+from ballfg.estimation.rally.arcs import arcs
 from ballfg.estimation.rally.choose import Chosen, rally
 from ballfg.estimation.rally.field import SEEN_RANGE, Field
 from ballfg.estimation.rally.smoothed import rally_track
@@ -87,7 +87,6 @@ def reconstruct(
     seen = on_fixed_camera(found, shot, pinhole, name)
     field = Field.of(seen, pinhole.focal / float(np.linalg.norm(pinhole.place)))
     seeds, field = arcs(field)
-    field = with_exposure(field, seeds)
     for _ in range(ROUNDS):
         grower = Grower.of(field, seen.times, camera, physics_of(model), surfaces)
         chosen = rally(grower, seeds, watch)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from scipy.special import ndtr
 
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.surfaces import Surfaces
@@ -42,8 +43,13 @@ ALIKE: Final = 10.0
 """Misfit above the best guess's, of guesses that are followed."""
 FOLLOWED: Final = 4
 """Guesses that are followed."""
+OTHER_HALF: Final = 5.0
+"""The same of a bounce on the half on which it scores for nobody: a stroke bounces on the other player's, a service on
+its own first."""
 LEAST: Final = 4
 """Candidates of a shortened stroke."""
+BETWEEN: Final = 0.1
+"""s between two bounces of a service, at least: a ball that rests longer on the court is not in play."""
 CUT: Final = 4
 """Candidates at an end of a stroke that may belong to the next one, or to clutter."""
 SPEEDS: Final = (2.0, 40.0)
@@ -111,7 +117,17 @@ class Grower:
         gain = self.field.gain(rows, (ends[len(rows) :] - ends[: len(rows)]) / SHORT)
         hidden = (frames[-1] - frames[0] + 1 - len(rows)) * np.log(1.0 - self.field.seen)
         price = BOUNCE * len(bounces) + UNBOUNCED * (len(bounces) != 1) - narrowed(self.scene(rows), path, 0)
+        price += self._halves(path) if bounces else 0.0
         return Stroke(rows, bounces, path, gain + hidden - 0.5 * float(path.misfit[0]) - price)
+
+    def _halves(self, path: Paths) -> float:
+        """Logarithm of what the halves of the court cost on which a path bounces, as well as these are known."""
+        ends = self.surfaces.extent or (0.0, 0.0)
+        places, spread = self.places_of(path, path.times[0])
+        ahead = (places[:, 0] - 0.5 * (ends[0] + ends[1])) * np.sign(path.vectors[0, 1, 0])
+        ahead[: len(ahead) - 1] *= -1.0  # a service bounces on the server's half first
+        right = ndtr(ahead / np.sqrt(spread[:, 0, 0]))
+        return float(-np.log(right + np.exp(-OTHER_HALF) * (1.0 - right)).sum())
 
     def places(self, path: Paths, moments: Array) -> tuple[Array, Array]:
         """Positions (k, n, 3) m of paths at moments (n,) s, and shares (k, n, c) of their vectors."""
@@ -148,6 +164,8 @@ class Grower:
         if stroke.bounces and not times[0] < stroke.bounces[0] <= stroke.bounces[-1] < times[-1]:
             return False
         if stroke.bounces and not possible(scene, stroke.path)[0]:
+            return False
+        if (np.diff(stroke.bounces) < BETWEEN).any():
             return False
         velocities = stroke.path.vectors[0, 1 : stroke.path.bounces + 2]
         if not (np.abs(velocities[:, 0]).max() > SPEEDS[0] and np.linalg.norm(velocities, axis=1).max() < SPEEDS[1]):
