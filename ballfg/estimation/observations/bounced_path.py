@@ -47,8 +47,8 @@ class Scene:
     physics: SegmentationPhysics
     surfaces: Surfaces
     height: float
-    lift: float | None = None
-    """m/s^2, prior standard deviation of each component of a flight's constant acceleration by spin; None: no spin."""
+    lift: tuple[float, float, float] | None = None
+    """m/s^2, prior standard deviations of a flight's constant acceleration by spin; None: no spin."""
 
     @property
     def plane(self) -> float:
@@ -150,7 +150,7 @@ def _priors(scene: Scene, times: Array, bounces: int, drag: Array) -> tuple[Arra
     (centre, spread), g, k = place_prior(scene.surfaces), scene.physics.gravity, len(times)
     size, straight = 3 * columns_of(scene, bounces), 3 * (bounces + 2)
     rows, targets = np.zeros((k, size + 4 * bounces, size)), np.zeros((k, size + 4 * bounces))
-    sigmas = np.repeat((spread, SPEED, scene.lift or np.inf), (3, straight - 3, size - straight))
+    sigmas = np.concatenate((np.repeat((spread, SPEED), (3, straight - 3)), (scene.lift or ()) * (bounces + 1)))
     rows[:, range(size), range(size)] = 1.0 / sigmas
     targets[:, :3] = centre / spread
     for bounce in range(bounces):

@@ -42,11 +42,18 @@ EXPOSURES: Final = np.linspace(0.0, 1.0, 41)
 
 
 @dataclass
-class Tally:
-    """How often a candidate was near where three others foretold it, and the area, px^2, in which it was looked for."""
+class Foretold:
+    """Where three candidates foretell a fourth: their rows, whether one was there, and the area, px^2, of the search."""
 
-    met: int = 0
-    area: float = 0.0
+    rows: list[list[int]]
+    met: list[bool]
+    area: list[float]
+
+    def density(self, ball: Index) -> float:
+        """1/px^2, of smooth clutter: of candidates that others foretell, without those (n,) that are the ball."""
+        clutter = ~np.isin(np.array(self.rows).reshape(-1, 3), ball).any(axis=1)
+        area = float(np.array(self.area)[clutter].sum())
+        return (float(np.array(self.met)[clutter].sum()) + 1.0) / area if area else 0.0
 
 
 def with_exposure(field: Field, found: Sequence[Index]) -> Field:
@@ -70,25 +77,25 @@ def with_exposure(field: Field, found: Sequence[Index]) -> Field:
     return replace(field, exposure=float(EXPOSURES[int(np.argmax(sums))]))
 
 
-def arcs(field: Field) -> tuple[list[Index], Field]:
+def arcs(field: Field) -> tuple[list[Index], Field, Foretold]:
     """Numbers of the candidates of each arc, in order of time, longest arcs first; arcs may share candidates.
 
-    Returns: the arcs, and the field with the exposure and the density of smooth clutter that they show.
+    Returns: the arcs, the field with the exposure that they show, and how often they foretell candidates.
     """
-    used, tally = set[tuple[int, int]](), Tally()
+    used, tally = set[tuple[int, int]](), Foretold([], [], [])
     every = [field.rows(frame) for frame in range(len(field.first) - 1)]
     found = _begun(field, every, (1,), used, tally)
-    density = tally.met / tally.area if tally.area else 0.0
     long = sorted((rows for rows in found if len(rows) >= LEAST), key=lambda rows: -len(rows))
-    field = with_exposure(field.smooth(density), long)
+    none = np.zeros(0, dtype=np.int64)
+    field = replace(field, exposure=with_exposure(field.smooth(tally.density(none)), long).exposure)
     likeliest = [rows[np.argsort(field.density[rows], kind="stable")[:LIKELIEST]] for rows in every]
     found += _begun(field, likeliest, range(1, APART + 1), used, tally)
     found = [rows for rows in found if len(rows) >= LEAST or field.agree(rows, AGREE)]
-    return sorted(found, key=lambda rows: -len(rows)), field
+    return sorted(found, key=lambda rows: -len(rows)), field, tally
 
 
 def _begun(
-    field: Field, rows_of: Sequence[Index], gaps: Sequence[int], used: set[tuple[int, int]], tally: Tally
+    field: Field, rows_of: Sequence[Index], gaps: Sequence[int], used: set[tuple[int, int]], tally: Foretold
 ) -> list[Index]:
     """Arcs that begin with three of the rows of pictures, so many pictures apart, and were not used before."""
     found, bend = list[Index](), TURNING * field.step**2 * field.scale
@@ -130,7 +137,7 @@ def _triples(
     yield from three[good][np.argsort(off[pair, k][good], kind="stable")].tolist()
 
 
-def _extend(field: Field, rows: list[int], way: int, bend: float, tally: Tally) -> None:
+def _extend(field: Field, rows: list[int], way: int, bend: float, tally: Foretold) -> None:
     """Goes on with rows in the order of `way`, 1 or -1, as long as candidates continue them."""
     missed, frame = 0, int(field.frame[rows[-1]])
     while missed <= MISSED:
@@ -146,8 +153,9 @@ def _extend(field: Field, rows: list[int], way: int, bend: float, tally: Tally) 
         off[~field.along(here, np.tile(place[1], (len(here), 1)))] = np.inf
         near = len(here) > 0 and bool(off.min() < reach)
         if len(rows) == 3 and not missed:
-            tally.met += near
-            tally.area += np.pi * reach**2
+            tally.rows.append(rows[:])
+            tally.met.append(near)
+            tally.area.append(np.pi * reach**2)
         if near:
             rows.append(int(here[np.argmin(off)]))
         missed = 0 if near else missed + 1

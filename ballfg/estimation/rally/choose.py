@@ -27,6 +27,9 @@ BEGINS: Final = 8.0
 """Logarithm of what a stroke costs that no hit joins to the one before."""
 MOST_BOUNCES: Final = 2
 """Of a stroke: a service has two."""
+SERVED, PAUSE = 8.0, 0.5
+"""Logarithm of what a second bounce costs so many s or less after another stroke: a service begins a rally. From behind
+a player a hit at the far end may look like a bounce."""
 GAINED: Final = 0.1
 """Least gain of an exchange."""
 ROUNDS: Final = 6
@@ -49,12 +52,12 @@ def hypotheses(grower: Grower, seeds: Sequence[Index], watch: Watch = unwatched)
     # a swaying shoe is no flight, however smooth; an arc through a bounce becomes one with its bounce
     alone = _best_in_each(grower, flights, KEPT, 1, grower.plausible)
     chosen = list({id(one): one for one in (*_best_in_each(grower, flights, KEPT, 1), *alone)}.values())
-    for flight in watch(chosen, len(chosen), "possible flights followed"):
-        whole = _variants(grower, flight)
-        for stroke in (*whole, *(part for one in whole for part in grower.shortened(one))):
-            known = found.get(_key(stroke))
-            if (known is None or stroke.score > known.score) and grower.plausible(stroke):
-                found[_key(stroke)] = stroke
+    whole = [one for flight in watch(chosen, len(chosen), "possible flights followed") for one in _variants(grower, flight)]
+    likely = _best_in_each(grower, list({_key(one): one for one in whole}.values()), COMPARED)
+    for stroke in (*whole, *(part for one in likely for part in grower.shortened(one))):
+        known = found.get(_key(stroke))
+        if (known is None or stroke.score > known.score) and grower.plausible(stroke):
+            found[_key(stroke)] = stroke
     return _best_in_each(grower, sorted(found.values(), key=lambda one: -one.score), COMPARED)
 
 
@@ -144,6 +147,8 @@ def best_sequence(grower: Grower, hits: Hits, strokes: Sequence[Stroke]) -> Chos
     begins = np.where([one.path.bounces > 0 for one in ordered], -BEGINS, -np.inf)  # else it may be anything
     later = first > last[:, None]
     link = np.where(later, np.maximum(begins, hits.between(ordered)), -np.inf)
+    soon = grower.field.stamps[first] - grower.field.stamps[last][:, None] < PAUSE
+    link -= SERVED * (soon & np.array([one.path.bounces == MOST_BOUNCES for one in ordered]))
     best, before = score + begins, np.full(count, -1)
     forward, backward = score + begins, np.zeros(count)
     for j in range(count):

@@ -23,12 +23,13 @@ from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.state import Z
 from ballfg.vision.camera import Camera
 
-LIFT: Final = 6.0
-"""m/s^2, prior standard deviation of the acceleration by spin: 12 m/s and 170 rad/s."""
+LIFT: Final = (2.0, 6.0, 6.0)
+"""m/s^2, prior standard deviation of the acceleration by spin: 12 m/s and 170 rad/s; it stands across the flight, which
+goes along x."""
 SHORT: Final = 0.4
 """Of a picture's time, over which a path shows its motion."""
-MISSED: Final = 3
-"""Pictures that a flight may pass without a candidate."""
+MISSED, RARE = 3, 0.02
+"""Pictures that a flight may pass without a candidate, at least; more, as long as that is not rarer than this."""
 GATE: Final = 12.0
 """Squared Mahalanobis distance of a candidate from where it is foretold."""
 BOUNCE: Final = 2.0
@@ -50,8 +51,9 @@ LEAST: Final = 4
 """Candidates of a shortened stroke."""
 BETWEEN: Final = 0.1
 """s between two bounces of a service, at least: a ball that rests longer on the court is not in play."""
-CUT: Final = 4
-"""Candidates at an end of a stroke that may belong to the next one, or to clutter."""
+CUT: Final = 8
+"""Candidates at an end of a stroke that may belong to the next one, or to clutter: seen from behind a player, a flight
+goes on smoothly for some pictures after a hit."""
 SPEEDS: Final = (2.0, 40.0)
 """m/s, of a stroke, along the court at least and in all at most."""
 ROOM: Final = (3.6, 3.6, 5.0)
@@ -182,7 +184,8 @@ class Grower:
     def grown(self, stroke: Stroke, way: int) -> Stroke:
         """The stroke with further candidates after it (way 1) or before it (-1), as long as they agree."""
         missed, frame = 0, int(self.field.frame[stroke.rows[-1 if way > 0 else 0]])
-        while missed <= MISSED:
+        most = max(MISSED, int(np.log(RARE) / np.log(1.0 - self.field.seen)))
+        while missed <= most:
             frame += way
             here = self.field.rows(frame)
             if not len(here):
