@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import pairwise, product
 from typing import Final
 
 import numpy as np
 
-from ballfg.arrays import Index
+from ballfg.arrays import Array, Index
 from ballfg.estimation.rally.field import Field
 
 FASTEST: Final = 40.0
@@ -145,9 +146,7 @@ def _extend(field: Field, rows: list[int], way: int, bend: float, tally: Foretol
         if not 0 <= frame < len(field.first) - 1:
             return
         last = np.array(rows[-MEMORY:])
-        since = (field.frame[last] - frame).astype(np.float64)
-        design = np.stack([since**n for n in range(min(len(last), 3))], axis=1)
-        place = np.linalg.lstsq(design, field.pixels[last])[0]
+        place = _ahead(tuple((field.frame[last] - frame).tolist())) @ field.pixels[last]
         here, reach = field.rows(frame), NOISE + 0.35 * (bend + NOISE) * (1 + missed) ** 2
         off = np.linalg.norm(field.pixels[here] - place[0], axis=1)
         off[~field.along(here, np.tile(place[1], (len(here), 1)))] = np.inf
@@ -159,3 +158,10 @@ def _extend(field: Field, rows: list[int], way: int, bend: float, tally: Foretol
         if near:
             rows.append(int(here[np.argmin(off)]))
         missed = 0 if near else missed + 1
+
+
+@lru_cache(maxsize=1024)
+def _ahead(since: tuple[int, ...]) -> Array:
+    """(2, n) weights of points so many pictures away, in their place and motion now: those of a parabola's fit."""
+    design = np.stack([np.array(since, dtype=np.float64) ** n for n in range(min(len(since), 3))], axis=1)
+    return np.asarray(np.linalg.pinv(design)[:2])

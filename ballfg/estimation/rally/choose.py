@@ -32,6 +32,8 @@ SERVED, PAUSE = 8.0, 0.5
 a player a hit at the far end may look like a bounce."""
 GAINED: Final = 0.1
 """Least gain of an exchange."""
+EXCHANGED: Final = 4
+"""Candidates at an end of a chosen stroke that are exchanged for others."""
 ROUNDS: Final = 6
 """Of exchanges in a sequence, until nothing improves."""
 
@@ -85,7 +87,7 @@ def _key(stroke: Stroke) -> tuple[int, ...]:
 
 def _exchanged(grower: Grower, stroke: Stroke) -> list[Stroke]:
     """Better strokes than one, that have a bounce more or other candidates at an end."""
-    parts = [stroke, *grower.shortened(stroke)]
+    parts = [stroke, *grower.shortened(stroke, EXCHANGED)]
     tried = [bounced for part in parts for way in (1, -1) for bounced in _bounced(grower, part, way)]
     tried += [grower.timed(grower.grown(grower.grown(part, 1), -1)) for part in parts]
     return [one for one in tried if one.score > stroke.score + GAINED and grower.plausible(one)]

@@ -232,9 +232,9 @@ class Grower:
                 return
             yield self.grown(self._rated(stroke.rows, tried, int(row)), way)
 
-    def shortened(self, stroke: Stroke) -> Iterator[Stroke]:
-        """The stroke without its last or its first one to `CUT` candidates, as long as enough are left."""
-        for count in range(1, min(CUT, len(stroke.rows) - LEAST) + 1):
+    def shortened(self, stroke: Stroke, most: int = CUT) -> Iterator[Stroke]:
+        """The stroke without its last or its first one to `most` candidates, as long as enough are left."""
+        for count in range(1, min(most, len(stroke.rows) - LEAST) + 1):
             for rows in (stroke.rows[:-count], stroke.rows[count:]):
                 times = self.rays.times[rows]
                 inside = tuple(time for time in stroke.bounces if times[0] < time < times[-1])
