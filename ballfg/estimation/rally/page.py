@@ -46,7 +46,7 @@ def rally_page(folder: Path, video: Path | None, out: Path) -> tuple[str, list[s
     Args: folder: of `ballfg track`.  video: the file it was found in; None: looked for by its name.  out: of the page.
     Raises: FileNotFoundError: the video does not exist. ValueError: a table of the folder that cannot be read.
     """
-    info = read_info(folder / INFO_FILE)
+    info, _ = read_info(folder / INFO_FILE)
     motion, events, strokes, states = (_read(folder / name) for name in (MOTION, EVENTS, STROKES, STATES))
     cameras = {one.name: one for one in read_cameras(folder / CAMERAS_FILE)}
     size = next(iter(cameras.values())).size

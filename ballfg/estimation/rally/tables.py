@@ -61,10 +61,17 @@ def write_rally(
         if strokes:
             with TableWriter(stage / STATES) as states:
                 for estimate in (estimate for one in rallies for estimate in one.estimates):
-                    states.write({KEY: estimate.name, **estimate.columns})
+                    states.write({KEY: estimate.name, **estimate.columns, **_correlations(estimate.covariances)})
             with TableWriter(stage / STROKES) as table:
                 table.write({name: np.array([row[name] for row in strokes]) for name in strokes[0]})
         return [name for name in FILES if (stage / name).is_file()]
+
+
+def _correlations(covariances: Array) -> dict[str, Array]:
+    """The correlations of positions: along a ray of the one camera the place is less sure than across it."""
+    pairs = {"rho_xy": (0, 1), "rho_xz": (0, 2), "rho_yz": (1, 2)}
+    sigmas = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    return {name: covariances[:, i, j] / (sigmas[:, i] * sigmas[:, j]) for name, (i, j) in pairs.items()}
 
 
 def _write_motion(path: Path, motion: Motion) -> None:
