@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Final
 
@@ -17,6 +18,7 @@ from scipy.special import logsumexp
 from ballfg.arrays import Array, Index
 from ballfg.estimation.rally.hits import Hits
 from ballfg.estimation.rally.strokes import Grower, Stroke
+from ballfg.parallel.parts import in_parts
 from ballfg.progress import Watch, unwatched
 
 KEPT: Final = 15
@@ -34,6 +36,8 @@ GAINED: Final = 0.1
 """Least gain of an exchange."""
 EXCHANGED: Final = 4
 """Candidates at an end of a chosen stroke that are exchanged for others."""
+TOGETHER: Final = 16
+"""Flights that a process follows in turn."""
 ROUNDS: Final = 6
 """Of exchanges in a sequence, until nothing improves."""
 
@@ -54,7 +58,8 @@ def hypotheses(grower: Grower, seeds: Sequence[Index], watch: Watch = unwatched)
     # a swaying shoe is no flight, however smooth; an arc through a bounce becomes one with its bounce
     alone = _best_in_each(grower, flights, KEPT, 1, grower.plausible)
     chosen = list({id(one): one for one in (*_best_in_each(grower, flights, KEPT, 1), *alone)}.values())
-    whole = [one for flight in watch(chosen, len(chosen), "possible flights followed") for one in _variants(grower, flight)]
+    grown = watch(in_parts(partial(_variants, grower), chosen, TOGETHER), len(chosen), "possible flights followed")
+    whole = [one for some in grown for one in some]
     likely = _best_in_each(grower, list({_key(one): one for one in whole}.values()), COMPARED)
     for stroke in (*whole, *(part for one in likely for part in grower.shortened(one))):
         known = found.get(_key(stroke))
@@ -70,9 +75,9 @@ def rally(grower: Grower, seeds: Sequence[Index], watch: Watch = unwatched) -> C
     for _ in range(ROUNDS):
         chosen = best_sequence(grower, hits, list(known.values()))
         fresh = [stroke for stroke in chosen.strokes if _key(stroke) not in done]
-        for stroke in fresh:
-            done.add(_key(stroke))
-            for better in _exchanged(grower, stroke):
+        done.update(map(_key, fresh))
+        for some in in_parts(partial(_exchanged, grower), fresh, 1):
+            for better in some:
                 old = known.get(_key(better))
                 known[_key(better)] = better if old is None or better.score > old.score else old
         if not fresh:
