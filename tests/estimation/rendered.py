@@ -170,8 +170,8 @@ def main() -> None:
         focal = 100 * abs(camera.focal / true.focal - 1.0)
         scores.append(one := judged(rally, of))
         print(
-            f"{seed} {view}, light {of.light:.1f}, focal length {true.focal:.0f}, quality {of.quality}: place {place:.2f} "
-            f"%, focal length {focal:.2f} %, {one.found} of {one.strokes} strokes, {one.false} false, median "
+            f"{seed} {view}, light {of.light:.1f}, {true.focal:.0f} px, quality {of.quality}: place {place:.2f} %, "
+            f"focal length {focal:.2f} %, {one.found} of {one.strokes} strokes, {one.false} false, median "
             f"{1e3 * np.median(one.errors or [np.nan]):.0f} mm, spins {one.spins}, {time.process_time() - begun:.0f} s",
             flush=True,
         )

@@ -71,7 +71,9 @@ def track(
     name: Annotated[str | None, typer.Option(help="Dataset name.", show_default="the folder's")] = None,
     overlay: Annotated[bool, typer.Option(help="Overlay video.")] = True,
     force: Annotated[bool, typer.Option("--force", help="Replace an earlier result.")] = False,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes.", show_default="one per camera, or core")] = None,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Number of processes.", show_default="one per camera, or core")
+    ] = None,
 ) -> None:
     """Turn videos of calibrated cameras into a dataset of tracks, with pictures to check them.
 

@@ -1,8 +1,8 @@
 """Finds smooth arcs among the candidates of successive pictures: the seeds of flights.
 
 Three candidates whose second difference a ball may have begin an arc; it goes on to both sides where a parabola through
-its last points meets a candidate. Over pictures without the ball arcs begin with the likeliest candidates only, and bars
-must agree with the motion.
+its last points meets a candidate. Over pictures without the ball arcs begin with the likeliest candidates only, and
+bars must agree with the motion.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ EXPOSURES: Final = np.linspace(0.0, 1.0, 41)
 
 @dataclass
 class Foretold:
-    """Where three candidates foretell a fourth: their rows, whether one was there, and the area, px^2, of the search."""
+    """Where three candidates foretell a fourth: their rows, whether one was there, the area, px^2, of the search."""
 
     rows: list[list[int]]
     met: list[bool]

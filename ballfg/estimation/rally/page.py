@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
@@ -85,7 +84,9 @@ def _video(folder: Path, source: str, given: Path | None, out: Path) -> tuple[st
     places = [given] if given is not None else [at / name for at in (folder, folder.absolute().parent, Path())]
     found = next((one for one in places if name and one.is_file() and one.suffix.lower() in VIDEOS), None)
     if found is None:
-        return "", [f"The video {name or 'of the rally'} was not found. Name it: ballfg show {folder} VIDEO --out {out}"]
+        return "", [
+            f"The video {name or 'of the rally'} was not found. Name it: ballfg show {folder} VIDEO --out {out}"
+        ]
     if found.stat().st_size <= SMALL:
         return f"data:video/mp4;base64,{base64.b64encode(found.read_bytes()).decode('ascii')}", []
     link = os.path.relpath(found.absolute(), out.absolute().parent).replace(os.sep, "/")
@@ -131,7 +132,7 @@ def _pinhole(row: Mapping[str, Any], size: tuple[int, int]) -> Pinhole:
 
 
 def _candidates(path: Path, motion: Rows, cameras: Mapping[str, Any]) -> list[list[list[float]]]:
-    """u, v px in the picture itself, and score of the likeliest candidates of each picture; 1 behind those chosen."""
+    """u, v px in the picture itself, score, and whether a flight has it, of each picture's likeliest candidates."""
     by_frame = dict[tuple[str, float], Rows]()
     for row in _read(path):
         by_frame.setdefault((row["camera"], round(row["t"], 4)), []).append(row)
@@ -141,11 +142,11 @@ def _candidates(path: Path, motion: Rows, cameras: Mapping[str, Any]) -> list[li
         here = sorted(here, key=lambda row: (row["trajectory"] == "", -row["score"]))[:DRAWN]
         seen = cameras[picture["camera"]]
         fixed = Pinhole(seen.rotation, seen.centre, float(seen.matrix[0, 0]), seen.size)
-        pixels = fixed.onto(np.array([(row["u"], row["v"]) for row in here]).reshape(-1, 2), _pinhole(picture, seen.size))
-        chosen = [float(row["trajectory"] != "") for row in here]
-        found.append(
-            [[round(u, 1), round(v, 1), row["score"], one] for (u, v), row, one in zip(pixels.tolist(), here, chosen, strict=True)]
+        pixels = fixed.onto(
+            np.array([(row["u"], row["v"]) for row in here]).reshape(-1, 2), _pinhole(picture, seen.size)
         )
+        places = np.round(pixels, 1).tolist()
+        found.append([[*at, row["score"], row["trajectory"] != ""] for at, row in zip(places, here, strict=True)])
     return found
 
 
