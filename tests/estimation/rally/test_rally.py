@@ -87,7 +87,7 @@ def test_strokes_are_found_from_behind_with_a_fifth_of_the_sightings_missing(see
 
 
 def test_nothing_is_found_among_clutter_alone() -> None:
-    of, motion, found = planted("side", 21, missing=1.0, false=12)
+    _, motion, found = planted("side", 21, missing=1.0, false=12)
     one = reconstruct(found, motion.shots[0], MODEL, SURFACES)
     assert not [stroke for stroke, p in zip(one.chosen.strokes, one.chosen.probabilities, strict=True) if p > 0.5]
 
@@ -175,10 +175,11 @@ PLAY = """
 const frame = document.querySelector("iframe");
 frame.addEventListener("load", () => setTimeout(() => {
   const inside = frame.contentDocument, rows = inside.querySelectorAll("#strokes tbody tr");
-  const drawn = id => { const c = inside.getElementById(id), d = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
+  const drawn = id => { const c = inside.getElementById(id);
+                        const d = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
                         return d.reduce((count, value, i) => count + (i % 4 === 3 && value > 0), 0); };
   const found = {rows: rows.length, bounces: inside.querySelectorAll("#above ellipse").length,
-                 bars: inside.querySelectorAll("#line rect").length, before: inside.getElementById("readout").textContent,
+                 bars: inside.querySelectorAll("#line rect").length,
                  wide: inside.documentElement.scrollWidth - inside.documentElement.clientWidth};
   rows[1].click();
   found.clicked = inside.getElementById("readout").textContent;
