@@ -81,7 +81,8 @@ def _write_motion(path: Path, motion: Motion) -> None:
             numbers = np.arange(shot.first, shot.first + len(shot))
             values = np.array([_pose(camera) for camera in shot.cameras])
             sigmas = np.array([_sigmas(*pair) for pair in zip(shot.cameras, shot.covariances, strict=True)])
-            columns: dict[str, Any] = {"frame": numbers, "t": motion.times[numbers], "camera": f"shot{shot.first}"}
+            in_video = numbers if motion.numbers is None else motion.numbers[numbers]
+            columns: dict[str, Any] = {"frame": in_video, "t": motion.times[numbers], "camera": f"shot{shot.first}"}
             columns |= dict(zip(POSE, values.T, strict=True))
             columns["k1"] = np.array([camera.bend for camera in shot.cameras])
             table.write(columns | {f"sigma_{name}": column for name, column in zip(POSE, sigmas.T, strict=True)})
