@@ -90,7 +90,7 @@ def track_moving_camera(
         else:
             found = candidates(shot, motion.times)
         one = reconstruct(found, shot, model, surfaces, first=len(rows), watch=watch)
-        mine = events_of(one, model, surfaces, step)
+        mine = events_of(one, model, surfaces, step, court.net)
         shots.append(one)
         events += mine
         rows += [stroke_row(estimate, mine, model, court.net) for estimate in one.estimates]

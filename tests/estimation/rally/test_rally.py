@@ -5,17 +5,19 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import read_sighted
-from ballfg.estimation.rally.events import events_of, stroke_row
+from ballfg.estimation.rally.events import end_of, events_of, net_touches, stroke_row
 from ballfg.estimation.rally.page import between, is_rally, rally_page
 from ballfg.estimation.rally.reconstruct import reconstruct
 from ballfg.estimation.rally.tables import write_rally
 from ballfg.estimation.rally.video import Rally
+from ballfg.estimation.result import Estimate
 from ballfg.state import POSITION
 from ballfg.tracks import TABLE_TENNIS
 from ballfg.tracks.info import DatasetInfo
@@ -32,7 +34,7 @@ NET = 0.1525
 def found_in(view: str, seed: int, missing: float = 0.0) -> tuple[Truth, Rally]:
     of, motion, found = planted(view, seed, missing=missing)
     one = reconstruct(found, motion.shots[0], MODEL, SURFACES)
-    events = events_of(one, MODEL, SURFACES, 0.04)
+    events = events_of(one, MODEL, SURFACES, 0.04, NET)
     rows = [stroke_row(estimate, events, MODEL, NET) for estimate in one.estimates]
     return of, Rally(motion, (one,), tuple(events), tuple(rows))
 
@@ -103,6 +105,47 @@ def test_what_is_written_is_a_dataset_that_other_commands_read(made: tuple[Truth
     assert {"rho_xy", "rho_xz", "rho_yz"} <= set(header)
     kinds = {line.split(",")[2] for line in (folder / "events.csv").read_text(encoding="utf-8").splitlines()[1:]}
     assert kinds <= {"hit", "bounce", "lost", "net", "floor", "cut"}
+
+
+def falling(state: list[float], times: list[float]) -> Estimate:
+    """A ball in free fall, sure to 1 cm, from a first state (6,)."""
+    t = np.array(times)
+    place = np.array(state[:3]) + np.outer(t, state[3:]) - 0.5 * 9.81 * np.outer(t**2, [0.0, 0.0, 1.0])
+    velocity = np.array(state[3:]) - 9.81 * np.outer(t, [0.0, 0.0, 1.0])
+    states = np.column_stack((place, velocity, np.zeros((len(t), 3))))
+    return SimpleNamespace(name="000", times=t, states=states, covariances=np.tile(1e-4 * np.eye(9), (len(t), 1, 1)))  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize(
+    ("state", "last", "kinds"),
+    [
+        ([-0.5, 0.0, 0.10, 8.0, 0.0, 0.3], 0.12, ["net"]),  # through the net's height
+        ([-0.5, 0.0, 0.40, 8.0, 0.0, 0.3], 0.12, []),  # over it
+        ([-0.5, 1.5, 0.10, 8.0, 0.0, 0.3], 0.12, []),  # beside its posts
+        ([-0.5, 0.0, 0.10, 8.0, 0.0, 0.3], 0.04, ["net"]),  # last seen two pictures before it
+        ([-0.9, 0.0, 0.10, 8.0, 0.0, 0.3], 0.02, []),  # last seen far before it
+    ],
+)
+def test_a_net_is_touched_where_the_path_meets_it(state: list[float], last: float, kinds: list[str]) -> None:
+    estimate = falling(state, np.linspace(0.0, last, 4).tolist())
+    touches = net_touches(MODEL, estimate, SURFACES, NET, 0.08)
+    assert [touch.kind for touch in touches] == kinds
+    for touch in touches:
+        assert touch.t == pytest.approx(0.5 / 8.0, abs=0.003)
+        assert touch.place[0] == pytest.approx(0.0, abs=0.02)
+        assert 0.9 < touch.probability <= 1.0
+
+
+def test_a_ball_that_falls_to_the_floor_ends_there_and_one_in_the_air_is_lost() -> None:
+    low = falling([2.5, 0.3, -0.55, 3.0, 0.0, -2.0], [0.0, 0.02, 0.04])
+    end = end_of(MODEL, low, SURFACES, 0.04)
+    height = 0.55 - 0.76 + MODEL.radius  # of the start under the place where it lands, negative
+    true = (-2.0 + np.sqrt(4.0 - 2.0 * 9.81 * height)) / 9.81
+    assert (end.kind, end.t) == ("floor", pytest.approx(true, abs=0.004))
+    assert end.place[2] == pytest.approx(-0.76 + MODEL.radius, abs=0.02)
+    high = falling([2.5, 0.3, 0.5, 3.0, 0.0, -2.0], [0.0, 0.02, 0.04])
+    lost = end_of(MODEL, high, SURFACES, 0.04)
+    assert (lost.kind, lost.t) == ("lost", pytest.approx(0.04))
 
 
 def test_a_path_between_knots_meets_them_and_falls_freely() -> None:
