@@ -17,6 +17,7 @@ from ballfg.estimation.rally.tables import EVENTS, MOTION, POSE, STATES, STROKES
 from ballfg.pages.html import Html, items, section, tag
 from ballfg.pages.outline import NET_HEIGHT, outline
 from ballfg.pages.page import own, whole_page
+from ballfg.state import STANDARD_GRAVITY
 from ballfg.tracks import csv_files
 from ballfg.tracks.detections_file import DETECTIONS_FILE
 from ballfg.tracks.info import INFO_FILE, read_info
@@ -27,6 +28,8 @@ SMALL: Final = 8 * 2**20
 """Bytes of a video, at most, that goes into the page; a larger one is linked, relative to the page."""
 STEP: Final = 0.005
 """s between drawn points of a flight."""
+LONGEST: Final = 0.5
+"""s to the next hit, up to which a flight is drawn beyond its last sample."""
 DRAWN: Final = 20
 """Candidates of a picture that are drawn, those with the highest scores."""
 VIDEOS: Final = (".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi")
@@ -154,10 +157,11 @@ def _stroke(row: Mapping[str, Any], states: Rows, events: Rows) -> dict[str, Any
     """The numbers of a stroke, its path [t, x, y, z], and times and covariances of its samples."""
     name = row["stroke"]
     mine = [state for state in states if state["trajectory"] == name]
-    after = [event for event in events if event["t"] > mine[-1]["t"] and event["kind"] == "hit"]
+    following = [event["t"] for event in events if event["kind"] == "hit" and event["t"] > mine[-1]["t"]]
     knots = [_knot(state, moves=True) for state in mine]
-    knots += [_knot(event, moves=False) for event in events if event["trajectory"] == name and event["kind"] != "lost"]
-    knots += [_knot(event, moves=False) for event in after[:1] if event["t"] - mine[-1]["t"] < 0.5]
+    begin, end = row["t_start"], min([*following, knots[-1][0] + LONGEST])
+    knots = [_carried(knots[0], begin), *knots, *([_carried(knots[-1], end)] if following[:1] == [end] else [])]
+    knots += [_knot(one, moves=False) for one in events if one["trajectory"] == name and one["kind"] == "bounce"]
     knots.sort(key=lambda knot: knot[0])
     path = [point for pair in pairwise(knots) for point in between(*pair)]
     return {
@@ -174,6 +178,13 @@ Knot = tuple[float, Array, Array | None]
 def _knot(row: Mapping[str, Any], *, moves: bool) -> Knot:
     place = np.array([row[axis] for axis in "xyz"])
     return row["t"], place, np.array([row[f"v{axis}"] for axis in "xyz"]) if moves else None
+
+
+def _carried(knot: Knot, t: float) -> Knot:
+    """A knot in free fall to another time, s."""
+    _, place, velocity = knot
+    dt, fall = t - knot[0], np.array([0.0, 0.0, STANDARD_GRAVITY])
+    return t, place + (0.0 if velocity is None else velocity * dt) - 0.5 * fall * dt**2, None
 
 
 def between(before: Knot, after: Knot) -> list[list[float]]:
