@@ -29,7 +29,7 @@ BEGINS: Final = 8.0
 """Logarithm of what a stroke costs that no hit joins to the one before."""
 MOST_BOUNCES: Final = 2
 """Of a stroke: a service has two."""
-SERVED, PAUSE = 8.0, 0.5
+SERVED, PAUSE = 20.0, 0.5
 """Logarithm of what a second bounce costs so many s or less after another stroke: a service begins a rally. From behind
 a player a hit at the far end may look like a bounce."""
 GAINED: Final = 0.1

@@ -51,7 +51,7 @@ LEAST: Final = 4
 """Candidates of a shortened stroke."""
 BETWEEN: Final = 0.1
 """s between two bounces of a service, at least: a ball that rests longer on the court is not in play."""
-CUT: Final = 8
+CUT: Final = 12
 """Candidates at an end of a stroke that may belong to the next one, or to clutter: seen from behind a player, a flight
 goes on smoothly for some pictures after a hit."""
 SPEEDS: Final = (2.0, 40.0)
