@@ -74,7 +74,8 @@ class Hits:
             end = int(self.grower.field.frame[stroke.rows[-1 if way > 0 else 0]])
             other = stamps[np.clip(end + way * np.arange(1, count + 1), 0, len(stamps) - 1)]
             begin = np.full(count, stamps[end])
-            moments = np.linspace(*((begin, other) if way > 0 else (other, begin)), MOMENTS, axis=1)
+            earlier, later = (begin, other) if way > 0 else (other, begin)
+            moments = np.linspace(earlier, later, MOMENTS, axis=1)
             places, spread = self.grower.places_of(stroke.path, moments.ravel())
             self.ends[stroke, way] = Ahead(places.reshape(count, -1, 3), spread.reshape(count, -1, 3, 3))
         return self.ends[stroke, way]

@@ -9,7 +9,7 @@ from typing import Final
 import cv2
 import numpy as np
 
-from ballfg.arrays import Array, Index
+from ballfg.arrays import Array, Index, Mask
 from ballfg.progress import Watch, unwatched
 from ballfg.vision.arrays import Image
 from ballfg.vision.broadcast.motion import Frames
@@ -55,7 +55,7 @@ def without_doubled(frames: Frames, count: int, watch: Watch = unwatched) -> Kep
         times.append(stamp)
         last = small
     least = min(SAME, SHARE * float(np.median(changes))) if changes else 0.0
-    repeats = np.append(False, np.array(changes) < least)
+    repeats: Mask = np.append(False, np.array(changes) < least)
     numbers = np.flatnonzero(~repeats)
     if len(numbers) == len(times):
         return Kept(frames, numbers, 0)
@@ -70,7 +70,7 @@ def without_doubled(frames: Frames, count: int, watch: Watch = unwatched) -> Kep
     return Kept(kept, numbers, int(repeats.sum()))
 
 
-def _even(times: Array, repeats: Array) -> Array:
+def _even(times: Array, repeats: Mask) -> Array:
     """(f,) s, stamps of all pictures: those between doubled ones were taken evenly, if these come at even distances."""
     apart = np.diff(np.flatnonzero(repeats))
     if len(apart) < 2 or np.ptp(apart) > UNEVEN:
