@@ -21,8 +21,8 @@ def show(
         list[Path],
         typer.Argument(
             metavar="WHAT...",
-            help="Dataset, states of estimate, predictions of predict, folder or report.json of diagnose; "
-            "one or more, in any order.",
+            help="Dataset, states of estimate, predictions of predict, folder or report.json of diagnose, video of a "
+            "rally; one or more, in any order.",
         ),
     ],
     out: Annotated[Path | None, typer.Option(help="Page to write, .html; everything is inside.")] = None,
@@ -38,6 +38,10 @@ def show(
 
     Example: ballfg show data/ballgun states.csv predictions.csv --out page.html
 
+    Example: ballfg show rally rally.mp4 --out rally.html
+
+    Of a rally (`ballfg track` of one moving camera) the page shows the video with its flights beside the table.
+
     The page is one file without links: it opens without a network, on a computer or a phone.
     """
     from ballfg.pages.given import recognise
@@ -45,6 +49,14 @@ def show(
     from ballfg.pages.shown import collect
 
     _check_outputs(out, png, rerun)
+    if out is not None and (rally := _rally(given)) is not None:
+        from ballfg.estimation.rally.page import rally_page
+
+        page, notes = rally_page(*rally, out)
+        print_notes(notes)
+        write_text(out, page)
+        print(f"{out}: the rally of {rally[0]}")
+        return
     what, names = recognise(given, _dataset), track or []
     print_doubts(what.dataset.info.doubts if what.dataset is not None else ())
     print_notes(what.dataset.notes if what.dataset is not None else ())
@@ -64,6 +76,17 @@ def show(
     if out is not None:
         write_text(out, show_page(shown))
         print(f"{out}: {len(shown.shots)} of {shown.count} shots")
+
+
+def _rally(given: list[Path]) -> tuple[Path, Path | None] | None:
+    """The folder of a rally and its video, if these are what is given."""
+    from ballfg.estimation.rally.page import VIDEOS, is_rally
+
+    videos = [path for path in given if path.suffix.lower() in VIDEOS]
+    folders = [path for path in given if path not in videos]
+    if len(folders) != 1 or len(videos) > 1 or not is_rally(folders[0]):
+        return None
+    return folders[0], videos[0] if videos else None
 
 
 def _dataset(folder: Path) -> Dataset | SightedDataset:

@@ -71,7 +71,9 @@ def track(
     name: Annotated[str | None, typer.Option(help="Dataset name.", show_default="the folder's")] = None,
     overlay: Annotated[bool, typer.Option(help="Overlay video.")] = True,
     force: Annotated[bool, typer.Option("--force", help="Replace an earlier result.")] = False,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes.", show_default="one per camera")] = None,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Number of processes.", show_default="one per camera, or core")
+    ] = None,
 ) -> None:
     """Turn videos of calibrated cameras into a dataset of tracks, with pictures to check them.
 
@@ -100,7 +102,7 @@ def track(
     kind = ball_kind(ball)
     if cameras is None:
         _refuse_moving(stamps=stamps, without=without, colour=colour, detector=detector, table_height=table_height)
-        _moving_camera(recordings, out, kind, court, corners, candidates, name, force=force)
+        _moving_camera(recordings, out, kind, court, corners, candidates, name, jobs=jobs, force=force)
         return
     if (corners, candidates) != (None, None):
         raise ValueError("--corners and --candidates are for a moving camera, without --cameras. Leave them out.")
@@ -158,14 +160,17 @@ def _moving_camera(
     candidates: Path | None,
     name: str | None,
     *,
+    jobs: int | None,
     force: bool,
 ) -> None:
     """Tracks the ball in one video of a camera that pans and zooms."""
     import numpy as np
 
     from ballfg.estimation.rally.tables import FILES, write_rally
-    from ballfg.estimation.rally.video import surfaces_of, track_moving_camera
+    from ballfg.estimation.rally.video import Rally, surfaces_of, track_moving_camera
     from ballfg.files.whole_folder import reserved
+    from ballfg.machine import usable_cores
+    from ballfg.parallel.parts import with_jobs
     from ballfg.tracks.info import DatasetInfo
     from ballfg.vision.broadcast.court import read_court
     from ballfg.vision.broadcast.given import read_candidates, read_corners
@@ -183,9 +188,13 @@ def _moving_camera(
         video, ground = open_video(path), read_court(court)
         own = None if candidates is None else partial(read_candidates, candidates)
         marked = None if corners is None else read_corners(corners)
-        found = track_moving_camera(
-            video.frames, ground, kind.model, count=video.count, corners=marked, candidates=own, watch=progress
-        )
+
+        def tracked(count: int) -> Rally:
+            return track_moving_camera(
+                video.frames, ground, kind.model, count=count, corners=marked, candidates=own, watch=progress
+            )
+
+        found = with_jobs(jobs or usable_cores(), tracked, video.count)
         print_notes(found.notes)
         if not found.strokes:
             raise ValueError(

@@ -8,6 +8,7 @@ g s^2 / 2 by 1 + k v s / 3. Spin, where a scene has it, accelerates each flight 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -47,8 +48,8 @@ class Scene:
     physics: SegmentationPhysics
     surfaces: Surfaces
     height: float
-    lift: float | None = None
-    """m/s^2, prior standard deviation of each component of a flight's constant acceleration by spin; None: no spin."""
+    lift: tuple[float, float, float] | None = None
+    """m/s^2, prior standard deviations of a flight's constant acceleration by spin; None: no spin."""
 
     @property
     def plane(self) -> float:
@@ -113,30 +114,21 @@ def shares_of(
     moments: Array, times: Array, bounces: int, drag: Array, gravity: float, *, lift: bool = False
 ) -> tuple[Array, Array]:
     """Positions at moments (1 or k, n) s as sums: shares (k, n, c) of the vectors, drops (k, n) m by gravity."""
-    later = (moments[..., None] > times[:, None, :]).sum(axis=2) * (bounces > 0)
-    share = np.zeros((*later.shape, (2 if lift else 1) * (bounces + 1) + 1))
-    drop = np.zeros(share.shape[:2])
-    share[..., 0] = 1.0
-    for flight in range(bounces + 1):
-        begin = times[:, max(flight - 1, 0), None]
-        since = moments - begin
-        if 0 < flight < bounces:  # a whole flight for all later moments
-            since = np.minimum(since, times[:, flight, None] - begin)
-        flown = (later >= flight) if flight else (later == 0)
-        share[..., 1 + flight] = np.where(flown, _stretched(since, drag[:, flight, None]), 0.0)
-        if lift:
-            share[..., bounces + 2 + flight] = np.where(flown, 0.5 * since**2, 0.0)
-        slower = np.maximum(drag[:, flight, None] * since, STRETCH_LIMIT)
-        drop += np.where(flown, 0.5 * gravity * since**2 / (1.0 + slower / 3.0), 0.0)
-    return share, drop
+    later = (moments[..., None] > times[:, None, :]).sum(axis=2)[..., None] * (bounces > 0)
+    flight = np.arange(bounces + 1)
+    begin = times[:, None, np.maximum(flight - 1, 0)]
+    since = moments[..., None] - begin
+    for whole in range(1, bounces):  # a whole flight for all later moments
+        since[..., whole] = np.minimum(since[..., whole], times[:, whole, None] - times[:, whole - 1, None])
+    flown = np.where(flight > 0, later >= flight, later == 0)
+    square, slower = np.where(flown, 0.5 * since**2, 0.0), np.maximum(drag[:, None] * since, STRETCH_LIMIT)
+    # the time in which a ball without drag covers the same way
+    stretched = np.where(drag[:, None] > 0.0, np.log1p(slower) / np.where(drag > 0.0, drag, 1.0)[:, None], since)
+    parts = (np.ones_like(since[..., :1]), np.where(flown, stretched, 0.0), *((square,) if lift else ()))
+    return np.concatenate(parts, axis=2), gravity * (square / (1.0 + slower / 3.0)).sum(axis=2)
 
 
-def _stretched(since: Array, drag: Array) -> Array:
-    """(k, n) s: the time in which a ball without drag covers the same way, for drag k v (k, 1) 1/s."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(drag > 0.0, np.log1p(np.maximum(drag * since, STRETCH_LIMIT)) / drag, since)
-
-
+@lru_cache(maxsize=8)
 def place_prior(surfaces: Surfaces) -> tuple[Array, float]:
     """Mean (3,) m and standard deviation, m, of the place of a ball in play: about the table, if its ends are known."""
     if surfaces.extent is None or not np.isfinite(surfaces.extent).all():
@@ -150,7 +142,7 @@ def _priors(scene: Scene, times: Array, bounces: int, drag: Array) -> tuple[Arra
     (centre, spread), g, k = place_prior(scene.surfaces), scene.physics.gravity, len(times)
     size, straight = 3 * columns_of(scene, bounces), 3 * (bounces + 2)
     rows, targets = np.zeros((k, size + 4 * bounces, size)), np.zeros((k, size + 4 * bounces))
-    sigmas = np.repeat((spread, SPEED, scene.lift or np.inf), (3, straight - 3, size - straight))
+    sigmas = np.concatenate((np.repeat((spread, SPEED), (3, straight - 3)), (scene.lift or ()) * (bounces + 1)))
     rows[:, range(size), range(size)] = 1.0 / sigmas
     targets[:, :3] = centre / spread
     for bounce in range(bounces):
@@ -168,9 +160,10 @@ def _priors(scene: Scene, times: Array, bounces: int, drag: Array) -> tuple[Arra
             turned = straight + 3 * bounce
             rows[:, law, turned], rows[:, law + 1, turned + 1] = (-KEPT * flown / FRICTION_SIGMA,) * 2
             rows[:, law + 2, turned + Z] = scene.physics.restitution * flown / RESTITUTION_SIGMA
-        share, drop = shares_of(times[:, [bounce]], times, bounces, drag, g, lift=scene.lift is not None)
-        rows[:, law + 3, Z::3] = share[:, 0] / PLANE_SIGMA
-        targets[:, law + 3] = (scene.plane + drop[:, 0]) / PLANE_SIGMA
+    if bounces:
+        share, drop = shares_of(times, times, bounces, drag, g, lift=scene.lift is not None)
+        rows[:, size + 3 :: 4, Z::3] = share / PLANE_SIGMA
+        targets[:, size + 3 :: 4] = (scene.plane + drop) / PLANE_SIGMA
     return rows, targets
 
 

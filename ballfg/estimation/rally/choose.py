@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Final
 
@@ -15,7 +16,9 @@ import numpy as np
 from scipy.special import logsumexp
 
 from ballfg.arrays import Array, Index
+from ballfg.estimation.rally.hits import Hits
 from ballfg.estimation.rally.strokes import Grower, Stroke
+from ballfg.parallel.parts import in_parts
 from ballfg.progress import Watch, unwatched
 
 KEPT: Final = 15
@@ -24,22 +27,19 @@ COMPARED: Final = 40
 """Strokes with the highest scores in each picture, of which sequences are made."""
 BEGINS: Final = 8.0
 """Logarithm of what a stroke costs that no hit joins to the one before."""
-HIT: Final = 3.0
-"""The same of a hit."""
-HIT_SIGMA: Final = 0.08
-"""m, between the paths before and after a hit: the racket holds the ball for a millisecond; paths bend."""
-ROOM: Final = 30.0
-"""m^3, in which a stroke begins that no hit joins to another."""
 MOST_BOUNCES: Final = 2
 """Of a stroke: a service has two."""
+SERVED, PAUSE = 20.0, 0.5
+"""Logarithm of what a second bounce costs so many s or less after another stroke: a service begins a rally. From behind
+a player a hit at the far end may look like a bounce."""
 GAINED: Final = 0.1
 """Least gain of an exchange."""
+EXCHANGED: Final = 4
+"""Candidates at an end of a chosen stroke that are exchanged for others."""
+TOGETHER: Final = 16
+"""Flights that a process follows in turn."""
 ROUNDS: Final = 6
 """Of exchanges in a sequence, until nothing improves."""
-LONGEST_HIT: Final = 0.4
-"""s without a candidate about a hit, behind a player."""
-SAME_WAY: Final = 5.0
-"""Logarithm of what it costs that the ball goes on along the court after a hit: players alternate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,30 +58,31 @@ def hypotheses(grower: Grower, seeds: Sequence[Index], watch: Watch = unwatched)
     # a swaying shoe is no flight, however smooth; an arc through a bounce becomes one with its bounce
     alone = _best_in_each(grower, flights, KEPT, 1, grower.plausible)
     chosen = list({id(one): one for one in (*_best_in_each(grower, flights, KEPT, 1), *alone)}.values())
-    for flight in watch(chosen, len(chosen), "possible flights followed"):
-        whole = _variants(grower, flight)
-        for stroke in (*whole, *(part for one in whole for part in grower.shortened(one))):
-            known = found.get(_key(stroke))
-            if (known is None or stroke.score > known.score) and grower.plausible(stroke):
-                found[_key(stroke)] = stroke
+    grown = watch(in_parts(partial(_variants, grower), chosen, TOGETHER), len(chosen), "possible flights followed")
+    whole = [one for some in grown for one in some]
+    likely = _best_in_each(grower, list({_key(one): one for one in whole}.values()), COMPARED)
+    for stroke in (*whole, *(part for one in likely for part in grower.shortened(one))):
+        known = found.get(_key(stroke))
+        if (known is None or stroke.score > known.score) and grower.plausible(stroke):
+            found[_key(stroke)] = stroke
     return _best_in_each(grower, sorted(found.values(), key=lambda one: -one.score), COMPARED)
 
 
 def rally(grower: Grower, seeds: Sequence[Index], watch: Watch = unwatched) -> Chosen:
     """The likeliest strokes of a rally, after exchanges of candidates and bounces in which nothing improves it."""
     known = {_key(stroke): stroke for stroke in hypotheses(grower, seeds, watch)}
-    done = set[tuple[int, ...]]()
+    done, hits = set[tuple[int, ...]](), Hits(grower)
     for _ in range(ROUNDS):
-        chosen = best_sequence(grower, list(known.values()))
+        chosen = best_sequence(grower, hits, list(known.values()))
         fresh = [stroke for stroke in chosen.strokes if _key(stroke) not in done]
-        for stroke in fresh:
-            done.add(_key(stroke))
-            for better in _exchanged(grower, stroke):
+        done.update(map(_key, fresh))
+        for some in in_parts(partial(_exchanged, grower), fresh, 1):
+            for better in some:
                 old = known.get(_key(better))
                 known[_key(better)] = better if old is None or better.score > old.score else old
         if not fresh:
             break
-    return best_sequence(grower, list(known.values()))
+    return best_sequence(grower, hits, list(known.values()))
 
 
 def _key(stroke: Stroke) -> tuple[int, ...]:
@@ -91,7 +92,7 @@ def _key(stroke: Stroke) -> tuple[int, ...]:
 
 def _exchanged(grower: Grower, stroke: Stroke) -> list[Stroke]:
     """Better strokes than one, that have a bounce more or other candidates at an end."""
-    parts = [stroke, *grower.shortened(stroke)]
+    parts = [stroke, *grower.shortened(stroke, EXCHANGED)]
     tried = [bounced for part in parts for way in (1, -1) for bounced in _bounced(grower, part, way)]
     tried += [grower.timed(grower.grown(grower.grown(part, 1), -1)) for part in parts]
     return [one for one in tried if one.score > stroke.score + GAINED and grower.plausible(one)]
@@ -128,34 +129,33 @@ def _best_in_each(
         alike: number of candidates, at most, by which a stroke differs from a better one that it repeats.
         admitted: says whether a stroke may take a place; asked of those alone that would take one.
     """
-    taken, kept, sets = np.zeros(len(grower.field.first), dtype=np.int64), list[Stroke](), list[set[int]]()
+    taken, kept, sets = np.zeros(len(grower.field.first), dtype=np.int64), list[Stroke](), list[int]()
     for stroke in sorted(strokes, key=lambda one: -one.score):
         first, last = grower.field.frame[stroke.rows[[0, -1]]]
-        mine = set(stroke.rows.tolist())
-        repeats = any(len(mine - used) <= alike for used in sets)
-        if taken[first : last + 1].min() < most and not repeats and admitted(stroke):
+        if taken[first : last + 1].min() >= most:
+            continue
+        mine = sum(1 << row for row in stroke.rows.tolist())  # a set as bits: there are thousands of pairs
+        repeats = any((mine & ~used).bit_count() <= alike for used in sets)
+        if not repeats and admitted(stroke):
             kept.append(stroke)
             sets.append(mine)
             taken[first : last + 1] += 1
     return kept
 
 
-def best_sequence(grower: Grower, strokes: Sequence[Stroke]) -> Chosen:
+def best_sequence(grower: Grower, hits: Hits, strokes: Sequence[Stroke]) -> Chosen:
     """The likeliest sequence of strokes that follow each other."""
     ordered = sorted(strokes, key=lambda one: int(grower.field.frame[one.rows[-1]]))
     count = len(ordered)
     if not count:
         return Chosen((), np.zeros(0), ())
     first, last = (grower.field.frame[[one.rows[end] for one in ordered]] for end in (0, -1))
-    times = grower.rays.times[0] + grower.field.step * (np.arange(last.max() + 1) - grower.field.frame[0])
     score = np.array([one.score for one in ordered])
     begins = np.where([one.path.bounces > 0 for one in ordered], -BEGINS, -np.inf)  # else it may be anything
-    link = np.full((count, count), -np.inf)
-    for i in range(count):
-        later = first > last[i]
-        link[i, later] = begins[later]
-        for j in map(int, np.flatnonzero(later & (times[first] - times[last[i]] < LONGEST_HIT))):
-            link[i, j] = max(begins[j], _hit(grower, ordered[i], ordered[j]))
+    later = first > last[:, None]
+    link = np.where(later, np.maximum(begins, hits.between(ordered)), -np.inf)
+    soon = grower.field.stamps[first] - grower.field.stamps[last][:, None] < PAUSE
+    link -= SERVED * (soon & np.array([one.path.bounces == MOST_BOUNCES for one in ordered]))
     best, before = score + begins, np.full(count, -1)
     forward, backward = score + begins, np.zeros(count)
     for j in range(count):
@@ -175,15 +175,3 @@ def best_sequence(grower: Grower, strokes: Sequence[Stroke]) -> Chosen:
     probabilities = np.exp(np.minimum(forward[chain] + backward[chain] - total, 0.0))
     joined = (False, *(bool(link[i, j] > begins[j]) for i, j in pairwise(chain)))[: len(chain)]
     return Chosen(tuple(ordered[i] for i in chain), probabilities, joined)
-
-
-def _hit(grower: Grower, before: Stroke, after: Stroke) -> float:
-    """Logarithm of the likelihood that a hit joins two strokes, by how near their paths come between them."""
-    start, end = grower.rays.times[before.rows[-1]], grower.rays.times[after.rows[0]]
-    moments = np.linspace(start, end, 9)
-    (one, spread), (other, wide) = (grower.places_of(stroke.path, moments) for stroke in (before, after))
-    off, both = other - one, spread + wide + HIT_SIGMA**2 * np.eye(3)
-    likelihood = -0.5 * np.einsum("ni,nij,nj->n", off, np.linalg.inv(both), off)
-    likelihood -= 0.5 * np.linalg.slogdet(2.0 * np.pi * both)[1]
-    onward = before.path.vectors[0, before.path.bounces + 1, 0] * after.path.vectors[0, 1, 0] > 0.0
-    return float(likelihood.max() + np.log(ROOM) - HIT - SAME_WAY * onward)

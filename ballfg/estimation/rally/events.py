@@ -1,4 +1,4 @@
-"""The events of a rally, hits, bounces and the ball lost, and the numbers of each stroke, with standard deviations."""
+"""Finds the events of a rally: hits, bounces, net, floor, where the ball is lost; and the numbers of each stroke."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from typing import Final
 
 import numpy as np
 import torch
+from scipy.special import ndtr
 
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.rally.reconstruct import ShotRally
 from ballfg.estimation.result import Estimate
-from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ, Z
+from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, STATE_DIM, VELOCITY, VZ, Z
 
 STEPS: Final = 81
 """Moments between two strokes at which their paths are compared."""
@@ -21,11 +22,15 @@ RACKET: Final = 0.05
 """m, standard deviation between the paths before and after a hit."""
 BEHIND: Final = (0.2, 0.25)
 """m behind the end of the court where a first stroke is hit, and its standard deviation."""
+LANDS: Final = 2.0
+"""Pictures after the last sighting in which a ball that is not hit meets the floor, or the net."""
+TOUCHES: Final = 0.5
+"""Least probability of a touch of the net that is an event."""
 
 
 @dataclass(frozen=True, eq=False)
 class Event:
-    """What happened to the ball: `kind` is hit, bounce or lost.
+    """What happened to the ball: `kind` is hit, bounce, net, floor, lost or cut.
 
     Attributes: trajectory: name of the stroke, that after a hit.  t: s.  place: (3,) m.  sigma_t: s.
         sigmas: (3,) m.  probability: of the strokes that the event belongs to.
@@ -62,8 +67,8 @@ def carried(model: BallModel, estimate: Estimate, sample: int, t: float) -> Mome
     return Moment(t, later, carry @ estimate.covariances[sample] @ carry.T)
 
 
-def events_of(one: ShotRally, model: BallModel, surfaces: Surfaces, step: float) -> list[Event]:
-    """The events of a shot in order of time. Args: step: s between pictures."""
+def events_of(one: ShotRally, model: BallModel, surfaces: Surfaces, step: float, net: float) -> list[Event]:
+    """The events of a shot in order of time. Args: step: s between pictures.  net: m, its height at x = 0; 0: none."""
     found, last = list[Event](), len(one.estimates) - 1
     for number, estimate in enumerate(one.estimates):
         chance = float(one.chosen.probabilities[number])
@@ -74,10 +79,13 @@ def events_of(one: ShotRally, model: BallModel, surfaces: Surfaces, step: float)
         else:
             found.append(replace(first_hit(model, estimate, surfaces, step), probability=chance))
         found += [replace(event, probability=chance) for event in bounces_of(model, estimate)]
-        if number == last or not one.chosen.joined[number + 1]:
-            end = carried(model, estimate, -1, float(estimate.times[-1]))
-            sigmas = np.sqrt(np.diag(end.covariance))[POSITION]
-            found.append(Event(estimate.name, end.t, "lost", end.state[POSITION], step / 2.0, sigmas, chance))
+        ends = number == last or not one.chosen.joined[number + 1]
+        found += [
+            replace(touch, probability=chance * touch.probability)
+            for touch in net_touches(model, estimate, surfaces, net, LANDS * step if ends else 0.0)
+        ]
+        if ends:
+            found.append(replace(end_of(model, estimate, surfaces, step), probability=chance))
     return sorted(found, key=lambda event: event.t)
 
 
@@ -173,11 +181,50 @@ def _speed(name: str, moment: Moment) -> dict[str, float]:
 
 def _clearance(estimate: Estimate, model: BallModel, net: float) -> tuple[float, float]:
     """m, height of the ball's lowest point over the net where it crosses x = 0, and its sigma; NaN if it does not."""
-    x = estimate.states[:, 0]
-    crossed = np.flatnonzero(np.diff(np.sign(x)) != 0)
-    if not len(crossed):
+    at = _crossing(model, estimate)
+    if at is None:
         return np.nan, np.nan
-    sample = int(crossed[0])
-    t = float(estimate.times[sample] - x[sample] / estimate.states[sample, VELOCITY][0])
-    at = carried(model, estimate, sample, t)
     return float(at.state[Z]) - net - model.radius, float(np.sqrt(at.covariance[Z, Z]))
+
+
+def _crossing(model: BallModel, estimate: Estimate, beyond: float = 0.0) -> Moment | None:
+    """The ball where it first crosses x = 0, at most so many s beyond its last sample."""
+    x, crossed = estimate.states[:, 0], np.flatnonzero(np.diff(np.sign(estimate.states[:, 0])) != 0)
+    sample = int(crossed[0]) if len(crossed) else len(x) - 1
+    speed = float(estimate.states[sample, VELOCITY][0])
+    ahead = -float(x[sample]) / speed if speed else np.inf
+    if not len(crossed) and not 0.0 <= ahead <= beyond:
+        return None
+    return carried(model, estimate, sample, float(estimate.times[sample]) + ahead)
+
+
+def net_touches(model: BallModel, estimate: Estimate, surfaces: Surfaces, net: float, beyond: float) -> list[Event]:
+    """The touch of the net, if one is likelier than none: the ball's lowest point passes x = 0 below the net's edge.
+
+    Args: net: m, its height; 0 for none.  beyond: s after the last sample in which the ball may meet it.
+    """
+    at = _crossing(model, estimate, beyond) if net > 0.0 else None
+    if at is None:
+        return []
+    reach = net + (surfaces.extent[3] if surfaces.extent else np.inf)  # posts stand as far outside as the net is high
+    sigmas = np.sqrt(np.diag(at.covariance))
+    chance = float(ndtr((net + model.radius - at.state[Z]) / sigmas[Z]))
+    if abs(at.state[1]) > reach or chance < TOUCHES:
+        return []
+    sigma_t = float(sigmas[0] / max(abs(at.state[VELOCITY][0]), 0.1))
+    return [Event(estimate.name, at.t, "net", at.state[POSITION], sigma_t, sigmas[POSITION], chance)]
+
+
+def end_of(model: BallModel, estimate: Estimate, surfaces: Surfaces, step: float) -> Event:
+    """The end of a stroke that no hit follows: on the floor, if it falls there at once, else where the ball is lost."""
+    end = carried(model, estimate, -1, float(estimate.times[-1]))
+    kind, sigma_t = "lost", step / 2.0
+    if surfaces.floor_height is not None:
+        height = float(end.state[Z]) - surfaces.floor_height - model.radius
+        speed = float(end.state[VZ])
+        fall = (speed + np.sqrt(max(speed**2 + 2.0 * STANDARD_GRAVITY * height, 0.0))) / STANDARD_GRAVITY
+        if fall <= LANDS * step:
+            end, kind = carried(model, estimate, -1, end.t + max(fall, 0.0)), "floor"
+            sigma_t = float(np.sqrt(end.covariance[Z, Z])) / max(abs(float(end.state[VZ])), 0.1)
+    sigmas = np.sqrt(np.diag(end.covariance))[POSITION]
+    return Event(estimate.name, end.t, kind, end.state[POSITION], sigma_t, sigmas, 1.0)

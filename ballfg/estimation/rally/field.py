@@ -35,7 +35,7 @@ class Field:
         bars: (n, 2) px from end to end, zero where not blurred.
         density: (n,) 1/px^2, of clutter that looks as much like a ball.
         usual: (n,) 1/px^2, density of a bar like each one's among all candidates.
-        first: (f + 1,) where each picture's begin.  step: s between pictures.
+        first: (f + 1,) where each picture's begin.  stamps: (f,) s, of the pictures.  step: s between them, the median.
         scale: px for a m at the court.  exposure: of the step, during which the shutter is open.
         seen: probability that the ball is among the candidates of a picture.
     """
@@ -47,6 +47,7 @@ class Field:
     density: Array
     usual: Array
     first: Index
+    stamps: Array
     step: float
     scale: float
     exposure: float = 0.0
@@ -63,7 +64,7 @@ class Field:
         number = (np.linalg.norm(bars, axis=1) // RING).astype(np.int64)
         share = (np.bincount(number) + 1.0) / (len(bars) + number.max(initial=0) + 1.0)
         usual = share[number] / (np.pi * RING**2 * (2.0 * number + 1.0))  # of rings about a bar of no length
-        return cls(seen.frame, seen.pixels, seen.covariances, bars, density, usual, first, step, scale)
+        return cls(seen.frame, seen.pixels, seen.covariances, bars, density, usual, first, seen.frames, step, scale)
 
     def smooth(self, density: float) -> Field:
         """The field whose clutter moves smoothly: where its motion foretells a candidate, it has a density, 1/px^2."""
@@ -91,11 +92,24 @@ class Field:
 
     def bar_gain(self, rows: Index, motion: Array, exposure: float) -> Array:
         """(n,) of the bars alone: a ball's is as long as its motion while the shutter is open, either way around."""
-        bars, true = self.bars[rows], exposure * motion
-        off = np.minimum(((bars - true) ** 2).sum(axis=1), ((bars + true) ** 2).sum(axis=1))
-        variance = BAR_SIGMA**2 + BAR_SHARE**2 * (true**2).sum(axis=1)
+        off, variance = self._bar_errors(rows, motion, exposure)
         ratio = np.exp(-0.5 * off / variance) / (2.0 * np.pi * variance) / self.usual[rows]
         return np.asarray(np.log(STRAY + (1.0 - STRAY) * ratio))
+
+    def bar_off(self, rows: Index, motion: Array) -> Array:
+        """(n,) standard deviations between bars and motions (n, 2) px a picture."""
+        off, variance = self._bar_errors(rows, motion, self.exposure)
+        return np.asarray(np.sqrt(off / variance))
+
+    def agree(self, rows: Index, most: float) -> bool:
+        """True if all bars of an arc lie within so many standard deviations of its motion."""
+        return bool((self.bar_off(rows, self.motion(rows)) < most).all())
+
+    def _bar_errors(self, rows: Index, motion: Array, exposure: float) -> tuple[Array, Array]:
+        """(n,) px^2, squared distances of bars from motions while the shutter is open, and their variances."""
+        bars, true = self.bars[rows], exposure * motion
+        off = np.minimum(((bars - true) ** 2).sum(axis=1), ((bars + true) ** 2).sum(axis=1))
+        return off, BAR_SIGMA**2 + BAR_SHARE**2 * (true**2).sum(axis=1)
 
     def motion(self, rows: Index) -> Array:
         """(n, 2) px a picture, of an arc."""

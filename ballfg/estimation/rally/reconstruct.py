@@ -11,7 +11,7 @@ import numpy as np
 from ballfg.arrays import Mask
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.rally.arcs import arcs, with_exposure
+from ballfg.estimation.rally.arcs import arcs
 from ballfg.estimation.rally.choose import Chosen, rally
 from ballfg.estimation.rally.field import SEEN_RANGE, Field
 from ballfg.estimation.rally.smoothed import rally_track
@@ -31,6 +31,8 @@ FRAME_SIGMA: Final = 0.3
 
 ROUNDS, SETTLED = 3, 0.1
 """In which the probability to see the ball is found, and its change that ends them."""
+THINNER: Final = 3.0
+"""Ratio of the densities of smooth clutter with and without the ball, above which another round follows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,15 +88,19 @@ def reconstruct(
     pinhole, camera = fixed_camera(shot, name)
     seen = on_fixed_camera(found, shot, pinhole, name)
     field = Field.of(seen, pinhole.focal / float(np.linalg.norm(pinhole.place)))
-    seeds, field = arcs(field)
-    field = with_exposure(field, seeds)
+    seeds, plain, foretold = arcs(field)
+    density = foretold.density(np.zeros(0, dtype=np.int64))  # with the ball, which is not known yet
     for _ in range(ROUNDS):
+        field = plain.smooth(density)
         grower = Grower.of(field, seen.times, camera, physics_of(model), surfaces)
         chosen = rally(grower, seeds, watch)
-        share = field.seen if not chosen.strokes else _seen_share(field, chosen)
-        if abs(share - field.seen) < SETTLED:
+        if not chosen.strokes:
             break
-        field = replace(field, seen=share)
+        share, before = _seen_share(field, chosen), density
+        density = foretold.density(np.concatenate([stroke.rows for stroke in chosen.strokes]))
+        if abs(share - field.seen) < SETTLED and before < THINNER * density:
+            break
+        plain = replace(plain, seen=share)
     smoother = Smoother(model, surfaces, Settings.for_measured(model, find_events=False))
     estimates = list[Estimate]()
     for stroke in watch(chosen.strokes, len(chosen.strokes), "strokes estimated"):

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from scipy.special import ndtr
 
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.surfaces import Surfaces
@@ -22,12 +23,13 @@ from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.state import Z
 from ballfg.vision.camera import Camera
 
-LIFT: Final = 6.0
-"""m/s^2, prior standard deviation of the acceleration by spin: 12 m/s and 170 rad/s."""
+LIFT: Final = (2.0, 6.0, 6.0)
+"""m/s^2, prior standard deviation of the acceleration by spin: 12 m/s and 170 rad/s; it stands across the flight, which
+goes along x."""
 SHORT: Final = 0.4
 """Of a picture's time, over which a path shows its motion."""
-MISSED: Final = 3
-"""Pictures that a flight may pass without a candidate."""
+MISSED, RARE = 3, 0.02
+"""Pictures that a flight may pass without a candidate, at least; more, as long as that is not rarer than this."""
 GATE: Final = 12.0
 """Squared Mahalanobis distance of a candidate from where it is foretold."""
 BOUNCE: Final = 2.0
@@ -42,10 +44,16 @@ ALIKE: Final = 10.0
 """Misfit above the best guess's, of guesses that are followed."""
 FOLLOWED: Final = 4
 """Guesses that are followed."""
+OTHER_HALF: Final = 5.0
+"""The same of a bounce on the half on which it scores for nobody: a stroke bounces on the other player's, a service on
+its own first."""
 LEAST: Final = 4
 """Candidates of a shortened stroke."""
-CUT: Final = 4
-"""Candidates at an end of a stroke that may belong to the next one, or to clutter."""
+BETWEEN: Final = 0.1
+"""s between two bounces of a service, at least: a ball that rests longer on the court is not in play."""
+CUT: Final = 12
+"""Candidates at an end of a stroke that may belong to the next one, or to clutter: seen from behind a player, a flight
+goes on smoothly for some pictures after a hit."""
 SPEEDS: Final = (2.0, 40.0)
 """m/s, of a stroke, along the court at least and in all at most."""
 ROOM: Final = (3.6, 3.6, 5.0)
@@ -111,7 +119,17 @@ class Grower:
         gain = self.field.gain(rows, (ends[len(rows) :] - ends[: len(rows)]) / SHORT)
         hidden = (frames[-1] - frames[0] + 1 - len(rows)) * np.log(1.0 - self.field.seen)
         price = BOUNCE * len(bounces) + UNBOUNCED * (len(bounces) != 1) - narrowed(self.scene(rows), path, 0)
+        price += self._halves(path) if bounces else 0.0
         return Stroke(rows, bounces, path, gain + hidden - 0.5 * float(path.misfit[0]) - price)
+
+    def _halves(self, path: Paths) -> float:
+        """Logarithm of what the halves of the court cost on which a path bounces, as well as these are known."""
+        ends = self.surfaces.extent or (0.0, 0.0)
+        places, spread = self.places_of(path, path.times[0])
+        ahead = (places[:, 0] - 0.5 * (ends[0] + ends[1])) * np.sign(path.vectors[0, 1, 0])
+        ahead[: len(ahead) - 1] *= -1.0  # a service bounces on the server's half first
+        right = ndtr(ahead / np.sqrt(spread[:, 0, 0]))
+        return float(-np.log(right + np.exp(-OTHER_HALF) * (1.0 - right)).sum())
 
     def places(self, path: Paths, moments: Array) -> tuple[Array, Array]:
         """Positions (k, n, 3) m of paths at moments (n,) s, and shares (k, n, c) of their vectors."""
@@ -149,6 +167,8 @@ class Grower:
             return False
         if stroke.bounces and not possible(scene, stroke.path)[0]:
             return False
+        if (np.diff(stroke.bounces) < BETWEEN).any():
+            return False
         velocities = stroke.path.vectors[0, 1 : stroke.path.bounces + 2]
         if not (np.abs(velocities[:, 0]).max() > SPEEDS[0] and np.linalg.norm(velocities, axis=1).max() < SPEEDS[1]):
             return False
@@ -164,7 +184,8 @@ class Grower:
     def grown(self, stroke: Stroke, way: int) -> Stroke:
         """The stroke with further candidates after it (way 1) or before it (-1), as long as they agree."""
         missed, frame = 0, int(self.field.frame[stroke.rows[-1 if way > 0 else 0]])
-        while missed <= MISSED:
+        most = max(MISSED, int(np.log(RARE) / np.log(1.0 - self.field.seen)))
+        while missed <= most:
             frame += way
             here = self.field.rows(frame)
             if not len(here):
@@ -211,9 +232,9 @@ class Grower:
                 return
             yield self.grown(self._rated(stroke.rows, tried, int(row)), way)
 
-    def shortened(self, stroke: Stroke) -> Iterator[Stroke]:
-        """The stroke without its last or its first one to `CUT` candidates, as long as enough are left."""
-        for count in range(1, min(CUT, len(stroke.rows) - LEAST) + 1):
+    def shortened(self, stroke: Stroke, most: int = CUT) -> Iterator[Stroke]:
+        """The stroke without its last or its first one to `most` candidates, as long as enough are left."""
+        for count in range(1, min(most, len(stroke.rows) - LEAST) + 1):
             for rows in (stroke.rows[:-count], stroke.rows[count:]):
                 times = self.rays.times[rows]
                 inside = tuple(time for time in stroke.bounces if times[0] < time < times[-1])

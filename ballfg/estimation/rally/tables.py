@@ -61,10 +61,17 @@ def write_rally(
         if strokes:
             with TableWriter(stage / STATES) as states:
                 for estimate in (estimate for one in rallies for estimate in one.estimates):
-                    states.write({KEY: estimate.name, **estimate.columns})
+                    states.write({KEY: estimate.name, **estimate.columns, **_correlations(estimate.covariances)})
             with TableWriter(stage / STROKES) as table:
                 table.write({name: np.array([row[name] for row in strokes]) for name in strokes[0]})
         return [name for name in FILES if (stage / name).is_file()]
+
+
+def _correlations(covariances: Array) -> dict[str, Array]:
+    """The correlations of positions: along a ray of the one camera the place is less sure than across it."""
+    pairs = {"rho_xy": (0, 1), "rho_xz": (0, 2), "rho_yz": (1, 2)}
+    sigmas = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    return {name: covariances[:, i, j] / (sigmas[:, i] * sigmas[:, j]) for name, (i, j) in pairs.items()}
 
 
 def _write_motion(path: Path, motion: Motion) -> None:
@@ -74,7 +81,8 @@ def _write_motion(path: Path, motion: Motion) -> None:
             numbers = np.arange(shot.first, shot.first + len(shot))
             values = np.array([_pose(camera) for camera in shot.cameras])
             sigmas = np.array([_sigmas(*pair) for pair in zip(shot.cameras, shot.covariances, strict=True)])
-            columns: dict[str, Any] = {"frame": numbers, "t": motion.times[numbers], "camera": f"shot{shot.first}"}
+            in_video = numbers if motion.numbers is None else motion.numbers[numbers]
+            columns: dict[str, Any] = {"frame": in_video, "t": motion.times[numbers], "camera": f"shot{shot.first}"}
             columns |= dict(zip(POSE, values.T, strict=True))
             columns["k1"] = np.array([camera.bend for camera in shot.cameras])
             table.write(columns | {f"sigma_{name}": column for name, column in zip(POSE, sigmas.T, strict=True)})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from ballfg.estimation.result import Status
 from ballfg.progress import Watch, unwatched
 from ballfg.vision.broadcast.candidates import find_candidates
 from ballfg.vision.broadcast.court import Court
+from ballfg.vision.broadcast.doubled import without_doubled
 from ballfg.vision.broadcast.motion import Frames, Motion, Shot, find_motion
 from ballfg.vision.detection.detections import Detections
 
@@ -26,18 +27,24 @@ OwnCandidates = Callable[[Shot, Array], Detections]
 
 @dataclass(frozen=True, eq=False)
 class Rally:
-    """What a video shows: its shots with their cameras, their strokes, the events, and a row of numbers a stroke."""
+    """What a video shows: its shots with their cameras, their strokes, the events, and a row of numbers a stroke.
+
+    Attributes: doubled: number of pictures that repeat the one before and were left out.
+    """
 
     motion: Motion
     shots: tuple[ShotRally, ...]
     events: tuple[Event, ...]
     strokes: tuple[dict[str, Any], ...]
+    doubled: int = 0
 
     @property
     def notes(self) -> list[str]:
         """Sentences on what is left out or not sure."""
         seen = sum(len(shot) for shot in self.motion.shots)
         notes = [] if seen == len(self.motion.times) else [f"{len(self.motion.times) - seen} pictures show no court"]
+        if self.doubled:
+            notes.append(f"{self.doubled} pictures repeat the one before, as after a change of frame rate: left out")
         for one in self.shots:
             unsure = (estimate for estimate in one.estimates if estimate.status is not Status.OK)
             notes += [f"stroke {estimate.name}: {estimate.status.value}" for estimate in unsure]
@@ -68,7 +75,12 @@ def track_moving_camera(
         candidates: of a detector of one's own; None: bright moving spots.
     Raises: ValueError: no picture shows the court.
     """
-    motion = find_motion(frames, court, count, corners, watch)
+    kept = without_doubled(frames, count, watch)
+    if corners is not None:
+        places = np.searchsorted(kept.numbers, list(corners), side="right") - 1
+        corners = {int(place): four for place, four in zip(places, corners.values(), strict=True)}
+    frames = kept.frames
+    motion = replace(find_motion(frames, court, len(kept.numbers), corners, watch), numbers=kept.numbers)
     surfaces = surfaces_of(court)
     step = float(np.median(np.diff(motion.times)))
     shots, events, rows = list[ShotRally](), list[Event](), list[dict[str, Any]]()
@@ -78,8 +90,8 @@ def track_moving_camera(
         else:
             found = candidates(shot, motion.times)
         one = reconstruct(found, shot, model, surfaces, first=len(rows), watch=watch)
-        mine = events_of(one, model, surfaces, step)
+        mine = events_of(one, model, surfaces, step, court.net)
         shots.append(one)
         events += mine
         rows += [stroke_row(estimate, mine, model, court.net) for estimate in one.estimates]
-    return Rally(motion, tuple(shots), tuple(events), tuple(rows))
+    return Rally(motion, tuple(shots), tuple(events), tuple(rows), kept.doubled)

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Index
 from ballfg.progress import Watch, unwatched
 from ballfg.vision.arrays import Image
 from ballfg.vision.broadcast.background import ALIKE, Match, matches
@@ -60,11 +60,17 @@ class Shot:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The shots that show the court, stamps (f,) s of all pictures, and the numbers of those that follow a cut."""
+    """The shots that show the court.
+
+    Attributes:
+        times: (f,) s, stamps of all pictures.  cuts: numbers of the pictures that follow a cut.
+        numbers: (f,) of the pictures in the video; None: all of them are there.
+    """
 
     shots: tuple[Shot, ...]
     times: Array
     cuts: tuple[int, ...]
+    numbers: Index | None = None
 
 
 def find_motion(

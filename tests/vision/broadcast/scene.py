@@ -34,8 +34,16 @@ def panned(camera: Pinhole, count: int, turn: float, zoom: float) -> list[Pinhol
     return [moved(camera, np.array([0.0, turn * s, 0.0, 0.0, 0.0, 0.0, zoom * s])) for s in shares]
 
 
-def picture(camera: Pinhole, rng: np.random.Generator, balls: Sequence[Array] = ()) -> Image:
-    """A blue table with white lines and a net, on a dark floor with marks; balls (2, 3) m, ends of their bars."""
+def picture(
+    camera: Pinhole,
+    rng: np.random.Generator,
+    balls: Sequence[Array] = (),
+    others: Sequence[tuple[Array, float]] = (),
+) -> Image:
+    """A blue table with white lines and a net, on a dark floor with marks; balls (2, 3) m, ends of their bars.
+
+    Args: others: polygons (n, 3) m and their grey levels, of what stands before or behind the table.
+    """
     image = np.full((SIZE[1], SIZE[0], 3), (60, 50, 48), dtype=np.uint8)
     marks = np.random.default_rng(5)
     for _ in range(150):
@@ -43,6 +51,10 @@ def picture(camera: Pinhole, rng: np.random.Generator, balls: Sequence[Array] = 
         level = marks.uniform(70, 170)
         corners = np.array([[x, y], [x + 0.5, y], [x + 0.4, y + 0.3], [x, y + 0.3]]) + marks.uniform(-0.1, 0.1, (4, 2))
         _filled(image, camera, np.column_stack((corners, np.full(4, -0.76))), (level, level, level))
+    far = float(np.linalg.norm(camera.place))
+    for shown, level in others:
+        if np.linalg.norm(shown.mean(axis=0) - camera.place) > far:
+            _filled(image, camera, shown, (level, level, level))
     _filled(image, camera, COURT.corners, (150, 80, 30))
     for first, second in COURT.lines:
         along = (second - first) / np.linalg.norm(second - first)
@@ -59,6 +71,9 @@ def picture(camera: Pinhole, rng: np.random.Generator, balls: Sequence[Array] = 
         radius = 0.02 * camera.focal / depth
         start, end = (tuple(int(v) for v in np.round(one * 2**FINE)) for one in ends)
         cv2.line(image, start, end, (235, 240, 240), max(1, round(2 * radius)), cv2.LINE_AA, FINE)
+    for shown, level in others:
+        if np.linalg.norm(shown.mean(axis=0) - camera.place) <= far:
+            _filled(image, camera, shown, (level, level, level))
     noisy = cv2.GaussianBlur(image, (3, 3), 0.7).astype(np.float32) + rng.normal(0.0, 2.0, image.shape)
     return np.asarray(np.clip(noisy, 0, 255), dtype=np.uint8)
 

@@ -1,0 +1,186 @@
+"""Arcs, strokes, hits and their best sequence, against planted truth, closed forms and all sequences one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import combinations, pairwise
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
+
+from ballfg.estimation.rally import hits as hits_of
+from ballfg.estimation.rally.arcs import Foretold
+from ballfg.estimation.rally.choose import BEGINS, MOST_BOUNCES, PAUSE, SERVED, best_sequence
+from ballfg.estimation.rally.hits import Hits
+from ballfg.estimation.rally.strokes import LEAST, Grower, Stroke
+from ballfg.state import POSITION
+from ballfg.vision.broadcast.motion import Shot
+from tests.estimation.rally.planted import grower_of, planted, true_stroke
+from tests.estimation.rendered import Truth
+
+
+@pytest.fixture(scope="module", params=["side", "behind"])
+def made(request: pytest.FixtureRequest) -> tuple[Truth, Shot, Grower, list[Any]]:
+    of, motion, found = planted(request.param, 11)
+    return of, motion.shots[0], *grower_of(found, motion.shots[0])
+
+
+def test_the_path_through_a_balls_candidates_is_where_it_flew(made: tuple[Truth, Shot, Grower, list[Any]]) -> None:
+    of, shot, grower, _ = made
+    for number in range(3):
+        stroke, bounce = true_stroke(of, number, grower, shot)
+        times = grower.rays.times[stroke.rows]
+        assert len(times) >= 8
+        true = np.array([state[POSITION] for state in map(of.at, times.tolist()) if state is not None])
+        places, spread = grower.places_of(stroke.path, times)
+        assert np.median(np.linalg.norm(places - true, axis=1)) < 0.12
+        assert (np.linalg.eigvalsh(spread) > 0.0).all()
+        pixels, _ = grower.foretold(stroke.path, times)
+        assert np.sqrt(((pixels[0] - shot.cameras[0].project(true)) ** 2).mean()) < 1.5
+        assert grower.plausible(stroke)
+        # its bounce is found again from a picture beside it
+        moved = grower.timed(grower.flown(stroke.rows, (bounce + 0.03,)))
+        assert moved.bounces[0] == pytest.approx(bounce, abs=0.012)
+
+
+def test_most_arcs_of_a_ball_are_found_and_they_are_smooth(made: tuple[Truth, Shot, Grower, list[Any]]) -> None:
+    of, shot, grower, seeds = made
+    for number in range(3):
+        rows = set(true_stroke(of, number, grower, shot)[0].rows.tolist())
+        assert max(len(rows & set(seed.tolist())) for seed in seeds) >= 0.4 * len(rows)
+    assert all((np.diff(grower.field.frame[seed]) > 0).all() for seed in seeds)
+
+
+def test_a_stroke_that_flies_past_the_wrong_half_costs_as_much_as_it_says(
+    made: tuple[Truth, Shot, Grower, list[Any]],
+) -> None:
+    of, shot, grower, _ = made
+    stroke, _ = true_stroke(of, 0, grower, shot)
+    back = replace(stroke.path, vectors=stroke.path.vectors * np.array([-1.0, 1.0, 1.0]))  # as far on the other half
+    back.vectors[0, 1:] *= np.array([-1.0, 1.0, 1.0])
+    assert grower._halves(stroke.path) == pytest.approx(0.0, abs=0.05)
+    assert grower._halves(back) == pytest.approx(5.0, abs=0.2)
+
+
+def test_shortened_strokes_lose_one_end_each(made: tuple[Truth, Shot, Grower, list[Any]]) -> None:
+    of, shot, grower, _ = made
+    stroke, _ = true_stroke(of, 0, grower, shot)
+    parts = list(grower.shortened(stroke, 3))
+    assert len(parts) == 6
+    for part in parts:
+        assert len(part.rows) >= LEAST
+        assert part.rows[0] == stroke.rows[0] or part.rows[-1] == stroke.rows[-1]
+        assert set(part.rows.tolist()) < set(stroke.rows.tolist())
+
+
+def test_a_hit_is_as_likely_as_the_normal_density_of_what_parts_the_paths(
+    made: tuple[Truth, Shot, Grower, list[Any]],
+) -> None:
+    of, shot, grower, _ = made
+    strokes = [true_stroke(of, number, grower, shot)[0] for number in range(3)]
+    found = Hits(grower).between(strokes)
+    assert np.isneginf(found[np.tril_indices(3)]).all()
+    for i in range(2):
+        one, other = strokes[i], strokes[i + 1]
+        moments = np.linspace(grower.rays.times[one.rows[-1]], grower.rays.times[other.rows[0]], hits_of.MOMENTS)
+        pairs = [grower.places_of(stroke.path, moments) for stroke in (one, other)]
+        density = [
+            multivariate_normal(place, first + second + hits_of.HIT_SIGMA**2 * np.eye(3)).logpdf(other_place)
+            for place, first, other_place, second in zip(*pairs[0], *pairs[1], strict=True)
+        ]
+        onward = one.path.vectors[0, 2, 0] * other.path.vectors[0, 1, 0] > 0.0
+        assert not onward
+        assert found[i, i + 1] == pytest.approx(max(density) + np.log(hits_of.ROOM) - hits_of.HIT)
+    assert found[0, 1] > 0.0
+    again = replace(strokes[1], path=replace(strokes[1].path, vectors=-strokes[1].path.vectors))
+    assert Hits(grower).between([strokes[0], again])[0, 1] < found[0, 1]
+
+
+class Links:
+    """Hits whose likelihoods are given."""
+
+    def __init__(self, table: Any) -> None:
+        self.table = table
+
+    def between(self, strokes: list[Any]) -> Any:
+        rows = [one.number for one in strokes]
+        return self.table[np.ix_(rows, rows)]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_best_sequence_and_its_probabilities_are_those_of_all_sequences(seed: int) -> None:
+    rng, count = np.random.default_rng(seed), 7
+    first = rng.integers(0, 30, count)
+    last = first + rng.integers(3, 9, count)
+    frame, stamps = np.arange(50), 0.04 * np.arange(50)
+    grower: Any = SimpleNamespace(field=SimpleNamespace(frame=frame, stamps=stamps))
+    table = rng.normal(0.0, 6.0, (count, count))
+    strokes: list[Any] = [
+        SimpleNamespace(
+            rows=np.array([a, b]),
+            score=float(rng.uniform(0.0, 12.0)),
+            path=SimpleNamespace(bounces=int(rng.integers(0, 3))),
+            number=number,
+        )
+        for number, (a, b) in enumerate(zip(first, last, strict=True))
+    ]
+    hits: Any = Links(table)
+    chosen = best_sequence(grower, hits, strokes)
+
+    def begins(one: Any) -> float:
+        return -BEGINS if one.path.bounces else -np.inf
+
+    def value(chain: tuple[Any, ...]) -> float:
+        total = begins(chain[0]) + chain[0].score
+        for before, after in pairwise(chain):
+            pause = stamps[after.rows[0]] - stamps[before.rows[-1]]
+            link = max(begins(after), table[before.number, after.number])
+            total += link - SERVED * (pause < PAUSE and after.path.bounces == MOST_BOUNCES) + after.score
+        return total
+
+    def chains() -> Iterator[tuple[Any, ...]]:
+        ordered = sorted(strokes, key=lambda one: one.rows[-1])
+        for size in range(1, count + 1):
+            for some in combinations(ordered, size):
+                if all(after.rows[0] > before.rows[-1] for before, after in pairwise(some)):
+                    yield some
+
+    values = {chain: value(chain) for chain in ((*map(Hashable, one),) for one in chains())}
+    best = max(values, key=lambda chain: values[chain])
+    total = logsumexp([*values.values(), 0.0])
+    if values[best] <= 0.0:
+        assert not chosen.strokes
+        return
+    assert [one.number for one in chosen.strokes] == [one.number for one in best]
+    for one, chance in zip(chosen.strokes, chosen.probabilities, strict=True):
+        mine = [score for chain, score in values.items() if one.number in {other.number for other in chain}]
+        assert chance == pytest.approx(np.exp(logsumexp(mine) - total), abs=1e-9)
+
+
+class Hashable:
+    """A stroke as a key."""
+
+    def __init__(self, one: Any) -> None:
+        self.rows, self.score, self.path, self.number = one.rows, one.score, one.path, one.number
+
+
+def test_the_density_of_clutter_leaves_the_ball_out() -> None:
+    rows = [[0, 1, 2], [1, 2, 3], [10, 11, 12], [20, 21, 22]]
+    counted = Foretold(rows, [True, True, False, True], [4.0, 4.0, 5.0, 5.0])
+    assert counted.density(np.array([], dtype=np.int64)) == pytest.approx((3 + 1) / 18.0)
+    assert counted.density(np.array([2])) == pytest.approx((1 + 1) / 10.0)
+
+
+def test_strokes_are_told_apart_by_their_score(made: tuple[Truth, Shot, Grower, list[Any]]) -> None:
+    """Candidates that are the ball beat as many false ones of the same pictures."""
+    of, shot, grower, _ = made
+    stroke, bounce = true_stroke(of, 1, grower, shot)
+    false = np.array([grower.field.rows(int(frame))[0] for frame in grower.field.frame[stroke.rows]])
+    wrong: Stroke = grower.flown(false, (bounce,))
+    assert stroke.score > 20.0
+    assert wrong.score < 0.0
