@@ -25,7 +25,7 @@ def show(
             "rally; one or more, in any order.",
         ),
     ],
-    out: Annotated[Path | None, typer.Option(help="Page to write, .html; everything is inside.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Page to write, .html.")] = None,
     png: Annotated[Path | None, typer.Option(help="Picture for papers, .png, .pdf or .svg, of the first shot.")] = None,
     rerun: Annotated[
         Path | None, typer.Option(help="Recording .rrd for the viewer rerun, of all shots however long.")
@@ -42,7 +42,7 @@ def show(
 
     Of a rally (`ballfg track` of one moving camera) the page shows the video with its flights beside the table.
 
-    The page is one file without links: it opens without a network, on a computer or a phone.
+    The page is one file: it opens without a network, on a computer or a phone. A large video stays beside it.
     """
     from ballfg.pages.given import recognise
     from ballfg.pages.show_page import show_page
@@ -50,6 +50,9 @@ def show(
 
     _check_outputs(out, png, rerun)
     if out is not None and (rally := _rally(given)) is not None:
+        beside = {"--png": png, "--rerun": rerun, "--track": track}
+        if others := [option for option, value in beside.items() if value]:
+            raise ValueError(f"the page of a rally must be asked for alone; got {', '.join(others)}. Leave it out.")
         from ballfg.estimation.rally.page import rally_page
 
         page, notes = rally_page(*rally, out)
@@ -80,7 +83,7 @@ def show(
 
 def _rally(given: list[Path]) -> tuple[Path, Path | None] | None:
     """The folder of a rally and its video, if these are what is given."""
-    from ballfg.estimation.rally.page import VIDEOS, is_rally
+    from ballfg.estimation.rally.files import VIDEOS, is_rally  # light: most pages are of no rally
 
     videos = [path for path in given if path.suffix.lower() in VIDEOS]
     folders = [path for path in given if path not in videos]

@@ -166,7 +166,8 @@ def _moving_camera(
     """Tracks the ball in one video of a camera that pans and zooms."""
     import numpy as np
 
-    from ballfg.estimation.rally.tables import FILES, write_rally
+    from ballfg.estimation.rally.files import FILES
+    from ballfg.estimation.rally.tables import write_rally
     from ballfg.estimation.rally.video import Rally, surfaces_of, track_moving_camera
     from ballfg.files.whole_folder import reserved
     from ballfg.machine import usable_cores

@@ -55,10 +55,11 @@ class Hits:
         ways = np.array([(one.path.vectors[0, one.path.bounces + 1, 0], one.path.vectors[0, 1, 0]) for one in strokes])
         onward = ways[before, 0] * ways[after, 1] > 0.0
         pair = gap[before, after] - 1
-        starts = np.stack([self._ahead(one, 1).places for one in strokes])[before, pair]
-        ends = np.stack([self._ahead(one, -1).places for one in strokes])[after, pair]
-        spread = np.stack([self._ahead(one, 1).covariances for one in strokes])[before, pair]
-        spread += np.stack([self._ahead(one, -1).covariances for one in strokes])[after, pair]
+        beyond, toward = ([self._ahead(one, way) for one in strokes] for way in (1, -1))
+        starts = np.stack([one.places for one in beyond])[before, pair]
+        ends = np.stack([one.places for one in toward])[after, pair]
+        spread = np.stack([one.covariances for one in beyond])[before, pair]
+        spread += np.stack([one.covariances for one in toward])[after, pair]
         near = _log_normal(ends - starts, spread + HIT_SIGMA**2 * np.eye(3)).max(axis=1)
         found[before, after] = near + np.log(ROOM) - HIT - SAME_WAY * onward
         return found

@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.estimation.rally.tables import EVENTS, MOTION, POSE, STATES, STROKES
+from ballfg.estimation.rally.files import EVENTS, MOTION, STATES, STROKES, VIDEOS
+from ballfg.estimation.rally.tables import POSE
 from ballfg.pages.html import Html, items, section, tag
 from ballfg.pages.outline import NET_HEIGHT, outline
 from ballfg.pages.page import own, whole_page
@@ -32,14 +33,8 @@ LONGEST: Final = 0.5
 """s to the next hit, up to which a flight is drawn beyond its last sample."""
 DRAWN: Final = 20
 """Candidates of a picture that are drawn, those with the highest scores."""
-VIDEOS: Final = (".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi")
 
 Rows = list[dict[str, Any]]
-
-
-def is_rally(folder: Path) -> bool:
-    """True for a folder that `ballfg track` wrote of one moving camera."""
-    return all((folder / name).is_file() for name in (INFO_FILE, MOTION, EVENTS, CAMERAS_FILE))
 
 
 def rally_page(folder: Path, video: Path | None, out: Path) -> tuple[str, list[str]]:
@@ -181,10 +176,11 @@ def _knot(row: Mapping[str, Any], *, moves: bool) -> Knot:
 
 
 def _carried(knot: Knot, t: float) -> Knot:
-    """A knot in free fall to another time, s."""
-    _, place, velocity = knot
-    dt, fall = t - knot[0], np.array([0.0, 0.0, STANDARD_GRAVITY])
-    return t, place + (0.0 if velocity is None else velocity * dt) - 0.5 * fall * dt**2, None
+    """A knot with a velocity in free fall to another time, s."""
+    begin, place, velocity = knot
+    assert velocity is not None
+    dt, fall = t - begin, np.array([0.0, 0.0, STANDARD_GRAVITY])
+    return t, place + velocity * dt - 0.5 * fall * dt**2, None
 
 
 def between(before: Knot, after: Knot) -> list[list[float]]:

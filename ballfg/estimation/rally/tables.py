@@ -11,6 +11,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.estimation.rally.events import Event
+from ballfg.estimation.rally.files import EVENTS, FILES, MOTION, STATES, STROKES
 from ballfg.estimation.rally.reconstruct import ShotRally
 from ballfg.files.whole_folder import whole_folder
 from ballfg.tracks import TableWriter
@@ -22,9 +23,6 @@ from ballfg.vision.broadcast.motion import Motion
 from ballfg.vision.broadcast.pinhole import Pinhole
 from ballfg.vision.camera_file import CAMERAS_FILE, write_cameras
 
-STATES, MOTION, EVENTS, STROKES = "states.csv", "camera_motion.csv", "events.csv", "strokes.csv"
-FILES: Final = (INFO_FILE, STATES, DETECTIONS_FILE, CAMERAS_FILE, MOTION, EVENTS, STROKES)
-"""All written files."""
 POSE: Final = ("focal", "rx", "ry", "rz", "tx", "ty", "tz")
 TINY: Final = 1e-6
 """Step of numerical derivatives, rad, m or a part of the focal length."""

@@ -13,7 +13,8 @@ import pytest
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import read_sighted
 from ballfg.estimation.rally.events import end_of, events_of, net_touches, stroke_row
-from ballfg.estimation.rally.page import between, is_rally, rally_page
+from ballfg.estimation.rally.files import is_rally
+from ballfg.estimation.rally.page import between, rally_page
 from ballfg.estimation.rally.reconstruct import reconstruct
 from ballfg.estimation.rally.tables import write_rally
 from ballfg.estimation.rally.video import Rally
@@ -201,6 +202,15 @@ def test_a_video_that_is_not_there_is_named(folder: Path, tmp_path: Path, capsys
     assert status("show", folder, tmp_path / "no.mp4", "--out", tmp_path / "page.html") == 2
     assert "no.mp4 does not exist" in capsys.readouterr().err
     assert not (tmp_path / "page.html").exists()
+
+
+def test_what_a_page_of_a_rally_leaves_out_is_refused(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--png", tmp_path / "shot.png", "--track", "000"]
+    assert status("show", folder, "--out", tmp_path / "page.html", *words) == 2
+    assert "got --png, --track. Leave it out." in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_small_video_is_inside_and_a_large_one_is_linked(folder: Path, tmp_path: Path) -> None:

@@ -1,0 +1,20 @@
+"""Names the files of a rally, so that a command knows one without the rest of this room."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+from ballfg.tracks.detections_file import DETECTIONS_FILE
+from ballfg.tracks.info import INFO_FILE
+from ballfg.vision.camera_file import CAMERAS_FILE
+
+STATES, MOTION, EVENTS, STROKES = "states.csv", "camera_motion.csv", "events.csv", "strokes.csv"
+FILES: Final = (INFO_FILE, STATES, DETECTIONS_FILE, CAMERAS_FILE, MOTION, EVENTS, STROKES)
+"""All written files."""
+VIDEOS: Final = (".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi")
+
+
+def is_rally(folder: Path) -> bool:
+    """True for a folder that `ballfg track` wrote of one moving camera."""
+    return all((folder / name).is_file() for name in (INFO_FILE, MOTION, EVENTS, CAMERAS_FILE))
