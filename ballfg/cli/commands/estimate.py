@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ballfg.cli import inputs
+from ballfg.cli.outcome import Outcome
 from ballfg.progress import progress
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ def estimate(
     from ballfg.estimation.batch import map_tracks
     from ballfg.tracks import TableWriter
 
-    outcome = inputs.Outcome()
+    outcome = Outcome()
     rows = hits = flying = 0
     with TableWriter(out) as table, inputs.workers(cluster, address, jobs) as workers:
         inputs.check_out(out, dataset)

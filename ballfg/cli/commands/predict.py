@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ballfg.cli import inputs
+from ballfg.cli.outcome import Outcome
 from ballfg.progress import progress
 
 if TYPE_CHECKING:
@@ -238,7 +239,7 @@ class _Outcome:
     held_by_own: int = 0
     finite: int = 0
     infinite: int = 0
-    tracks: inputs.Outcome = field(default_factory=inputs.Outcome)
+    tracks: Outcome = field(default_factory=Outcome)
 
     def add(self, result: TrackPrediction, own_sigmas: np.ndarray) -> None:
         """Counts a track, with the coordinates inside their finite 90 % intervals."""
