@@ -7,6 +7,7 @@ approximation.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -246,11 +247,23 @@ def held_out(tracks: Reduced, precision: Array, away: Array, halves: Mask) -> Ar
     return found
 
 
-def settled(rows: Rows, precision: Array, away: Array, start: Noise | None = None) -> tuple[Likelihood, Noise]:
+def settled(
+    rows: Rows, precision: Array, away: Array, starts: Sequence[Noise | None] = (None,)
+) -> tuple[Likelihood, Noise]:
     """The likelihood with the robust weights and sizes of noise that maximise the evidence.
 
-    Args: precision, away: as in `posterior`.  start: noise of a similar model, whose weights are good from the start.
+    It has several maxima: noise that a wrong model needed can keep a right one from showing that it needs none.
+
+    Args:
+        precision, away: as in `posterior`.
+        starts: noise of similar models, whose weights are good from the start; None: usual noise. The best end counts.
     """
+    ends = [_settled(rows, precision, away, start) for start in starts]
+    return max(ends, key=lambda end: posterior(end[0].reduced(end[1])[0], precision, away).evidence)
+
+
+def _settled(rows: Rows, precision: Array, away: Array, start: Noise | None) -> tuple[Likelihood, Noise]:
+    """The maximum from one start."""
     now = start or Noise()
     likelihood = weighted(rows, np.zeros_like(rows.residual), np.zeros((len(rows.residual), 3)))
     step = np.zeros(len(precision))

@@ -24,8 +24,10 @@ HELD = 1e-5
 """Width of the prior of strengths that are held, in usual strengths."""
 WIDTH_ROUNDS = 2
 """Number of turns in which each effect gets its most probable width."""
-MOST_STEPS = 4
+MOST_STEPS = 8
 """Largest number of steps from a deterministic fit to the most probable unknowns."""
+SHARES = (1.0, 0.5, 0.25, 0.125)
+"""Of a step, tried in turn."""
 WORTH_A_STEP = 0.5
 """Least expected gain of a step, natural units."""
 
@@ -106,6 +108,17 @@ class Weighed:
     def score(self) -> float:
         """As of its weight."""
         return self.weight.score
+
+    def without(self, gain: float) -> Weighed:
+        """With strengths where its fit has them, and less evidence, also of the models that it holds.
+
+        Args: gain: what a step promises that leads nowhere.
+        """
+        values = self.fit.unknowns.values
+        own = {h.name: np.array([values[column] for column in h.columns]) for h in self.named}
+        strengths = {name: replace(found, mean=own[name]) for name, found in self.strengths.items()}
+        nested = {names: replace(weight, evidence=weight.evidence - gain) for names, weight in self.nested.items()}
+        return replace(self, evidence=self.evidence - gain, strengths=strengths, nested=nested)
 
 
 @dataclass(frozen=True)
@@ -213,7 +226,7 @@ def weighed(
     """
     question = _Question(named, motion, halves, nameless)
     point = question.point(fit)
-    found, step = question.at(point, start)
+    found, step = question.at(point, (start, None) if start else (None,))
     for number in range(MOST_STEPS):
         if step.gain < WORTH_A_STEP and (number or not nameless):  # noise and widths of patterns need a second turn
             break
@@ -221,12 +234,8 @@ def weighed(
         if moved is None:
             break
         point = moved
-        again, after = question.at(point, found.noise, found.widths)
-        # patterns take the place of strengths far from the fit: there the foretold gain is only believed if it comes
-        if again.evidence < found.evidence - step.gain * nameless:
-            break
-        found, step = again, after
-    return found
+        found, step = question.at(point, (found.noise,), found.widths)
+    return found.without(step.gain) if step.gain > WORTH_A_STEP else found
 
 
 @dataclass(frozen=True)
@@ -240,15 +249,20 @@ class Step:
     common: Array
     gain: float
 
-    def taken(self, fit: Fit) -> Unknowns:
-        """The unknowns of a fit after the step; coefficients stay within their bounds."""
-        unknowns, free = fit.unknowns, fit.problem.free
+    def taken(self, fit: Fit, share: float = 1.0) -> Unknowns:
+        """The unknowns of a fit after a share of the step; coefficients stay within their bounds."""
+        unknowns, free, common = fit.unknowns, fit.problem.free, share * self.common
         values = {
             name: float(np.clip(unknowns.values[name] + step, c.low, c.high))
-            for (name, c), step in zip(free.items(), self.common[: len(free)].tolist(), strict=True)
+            for (name, c), step in zip(free.items(), common[: len(free)].tolist(), strict=True)
         }
-        launcher = unknowns.launcher + self.common[len(free) :].reshape(-1, 3)
-        return Unknowns(unknowns.starts + self.starts, values, launcher)
+        launcher = unknowns.launcher + common[len(free) :].reshape(-1, 3)
+        return Unknowns(unknowns.starts + share * self.starts, values, launcher)
+
+
+def foretold_gain(step: Array, covariance: Array) -> float:
+    """Gain in the logarithm of a normal density by a step (c,) to its mean; covariance: (c, c)."""
+    return 0.5 * float(step @ np.linalg.solve(covariance, step))
 
 
 @dataclass(frozen=True)
@@ -275,16 +289,18 @@ class _Question:
         beside = rows if patterns is None else patterns.beside(rows)
         return _Point(fit, beside, Priors.of(fit, self.named, patterns))
 
-    def at(self, point: _Point, start: Noise | None, widths: Sequence[int] = ()) -> tuple[Weighed, Step]:
+    def at(self, point: _Point, starts: Sequence[Noise | None], widths: Sequence[int] = ()) -> tuple[Weighed, Step]:
         """The model at the unknowns of a point, and the step to more probable ones.
 
-        Args: start, widths: noise, and widths of the patterns after those of the effects, of a similar model.
+        Args:
+            starts: as in `settled`.
+            widths: of the effects, then of the patterns, of a similar model.
         """
         fit, rows, priors = point.fit, point.rows, point.priors
         own, effects = len(fit.problem.free) + fit.unknowns.launcher.size, [h for h in self.named if h.strengths]
         of_patterns = list(widths[len(effects) :]) or [0] * (len(priors.places) - len(effects))
         first = priors.precision([len(WIDTHS) - 1] * len(effects) + of_patterns)
-        likelihood, noise = settled(rows, first, priors.away, start)
+        likelihood, noise = settled(rows, first, priors.away, starts)
         total = likelihood.reduced(noise)[0].by_track(rows.track)
         whole = total.of(np.full(len(self.halves), True))
         best, mixed = priors.widths(whole)
@@ -297,7 +313,7 @@ class _Question:
             mixed[number] += within(hypothesis, centre, found.mean, sigmas, WIDTHS[best[number]])
             strengths[hypothesis.name] = found
         away, spread = result.mean[:own], result.covariance[:own, :own]
-        gain = 0.5 * float(away @ np.linalg.solve(spread, away))
+        gain = foretold_gain(away, spread)
         weighed = Weighed(
             tuple(self.named),
             replace(fit),  # without what can be computed again: a search keeps dozens of models
@@ -315,22 +331,32 @@ class _Question:
         return weighed, Step(likelihood.local_step(noise, result.mean)[:, :STATE_DIM], away, gain)
 
     def moved(self, point: _Point, model: Weighed, step: Step) -> _Point | None:
-        """The point after a step; None if it lowers the evidence at the same noise: it left the linear range."""
-        unknowns = step.taken(point.fit)
-        if not np.isfinite(unknowns.starts).all():
-            return None
-        fit = Fit.at(point.fit.problem, unknowns, point.fit.noise, point.fit.steps)
-        if not np.isfinite(fit.cost):
-            return None
-        after = self.point(fit)
-        return after if self._evidence(after, model) > self._evidence(point, model) else None
+        """The point after the share of a step that leads to the most probable unknowns; None if all are less probable.
 
-    def _evidence(self, point: _Point, model: Weighed) -> float:
-        """The evidence at a point, with noise and widths of a model."""
+        A step may leave the linear range: where samples cannot tell a clock from gravity, say, or hardly show spins.
+        """
+        before = most = self._density(point, model)
+        best = None
+        for share in SHARES:
+            unknowns = step.taken(point.fit, share)
+            if np.isfinite(unknowns.starts).all():
+                fit = Fit.at(point.fit.problem, unknowns, point.fit.noise, point.fit.steps)
+                if np.isfinite(fit.cost) and (density := self._density(after := self.point(fit), model)) > most:
+                    best, most = after, density
+            if most > before + step.gain - WORTH_A_STEP:  # as foretold
+                break
+        return best
+
+    def _density(self, point: _Point, model: Weighed) -> float:
+        """Logarithm of the density at the unknowns of a point, up to a constant, with noise and widths of a model.
+
+        The evidence is what it would be at the end of the step from there, if that were linear.
+        """
         rows, none = point.rows, np.zeros(point.rows.by_common.shape[-1])
         plain = weighted(rows, np.zeros_like(rows.residual), np.zeros((len(rows.residual), 3)))
         reduced, _ = plain.reweighted(model.noise, none).reduced(model.noise)
-        return point.priors.posterior(reduced, model.widths).evidence
+        found = point.priors.posterior(reduced, model.widths)
+        return found.evidence - foretold_gain(found.mean, found.covariance)
 
     def _nested(
         self, priors: Priors, tracks: Reduced, widths: Sequence[int], mixed: Sequence[float]

@@ -124,3 +124,13 @@ def test_sizes_of_noise_come_back(make_ball, make_launches, make_shots, make_fit
     _, plain = settled(rows, precision, np.zeros(len(precision)))
     assert noise.white - plain.white == pytest.approx(np.log(2.0), abs=0.05)
     assert max(noise.random[0], plain.random[0]) < -1.5
+
+
+def test_the_best_of_several_starts_counts(rows, prior):
+    """A start with noise that the samples do not have may end elsewhere; beside the usual one it does no harm."""
+    starts = (Noise(-1.0, 1.0, (2.0, 2.0, 2.0, 1.0)), None)
+    values = [
+        posterior(one.reduced(noise)[0], *prior).evidence
+        for one, noise in (settled(rows, *prior, s) for s in ((starts[0],), (None,), starts))
+    ]
+    assert values[2] == max(values)

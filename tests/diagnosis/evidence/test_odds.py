@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,6 +15,7 @@ from ballfg.diagnosis.evidence.prior import THERE, WIDTHS, choice_odds, log_odds
 from ballfg.diagnosis.evidence.rows import random_motion
 from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.weighed import Weight, weigh
+from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.hypotheses.signatures import columns_of
 from ballfg.diagnosis.search.candidates import Scored, refit
@@ -86,6 +88,20 @@ def test_a_slower_clock_is_as_probable_as_less_gravity(make_ball, make_launches,
         found.append(weighed.evidence)
         usual.append(np.log(norm.pdf(away, scale=spreads).mean() / unit))
     assert found[1] - found[0] == pytest.approx(usual[1] - usual[0], abs=0.7)
+
+
+def test_a_step_that_leads_nowhere_promises_no_evidence(make_ball, make_launches, make_shots, make_fit):
+    """A model with both is no more probable than one of them, from whatever values it is weighed.
+
+    From a clock that is off, all the way to gravity in its place is beyond the linear range.
+    """
+    shots = make_shots(make_ball(gravity={"g": 9.0}), make_launches(32, 4), 4, labelled=False)
+    clock, gravity = (Hypothesis(EFFECTS[name], {}, (n,)) for name, n in (("time_scale", "s"), ("gravity", "g")))
+    with_clock = refit(make_fit(make_ball(), shots.stretches), Scored(clock, None, 0.0)).fit
+    problem, values = refit(with_clock, Scored(gravity, None, 0.0)).fit.problem, with_clock.unknowns.values
+    both = {name: {**values, "flight.gravity.g": 9.81}[name] for name in problem.free}
+    from_clock = Fit.at(problem, replace(with_clock.unknowns, values=both), with_clock.noise)
+    assert weigh(from_clock, [clock, gravity]).evidence < weigh(with_clock, [clock]).evidence + 0.5
 
 
 def test_an_effect_with_a_twin_has_the_prior_of_both():
