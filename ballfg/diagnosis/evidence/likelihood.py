@@ -256,38 +256,50 @@ def settled(
 
     Args:
         precision, away: as in `posterior`.
-        starts: noise of similar models, whose weights are good from the start; None: usual noise. The best end counts.
+        starts: noise of similar models, or None for the usual noise; the best after one turn goes on.
     """
-    ends = [_settled(rows, precision, away, start) for start in starts]
-    return max(ends, key=lambda end: posterior(end[0].reduced(end[1])[0], precision, away).evidence)
 
+    def evidence(end: tuple[Likelihood, Noise]) -> float:
+        return posterior(end[0].reduced(end[1])[0], precision, away).evidence
 
-def _settled(rows: Rows, precision: Array, away: Array, start: Noise | None) -> tuple[Likelihood, Noise]:
-    """The maximum from one start."""
-    now = start or Noise()
-    likelihood = weighted(rows, np.zeros_like(rows.residual), np.zeros((len(rows.residual), 3)))
-    step = np.zeros(len(precision))
-    options = {"maxiter": MOST_STEPS, "ftol": TOLERANCE}
-    # sizes in units of their error, as if all that they scale were known: the search then needs a third of the steps
-    unit = np.sqrt(2.0 * np.maximum(rows.counts, 1.0))
-    for turn in range(1 if start else 0, MOST_ROUNDS):
-        likelihood = likelihood.reweighted(now, step) if turn else likelihood
-
-        def missing(scaled: Array, likelihood: Likelihood = likelihood) -> tuple[float, Array]:
-            noise = Noise.of(scaled / unit)
-            reduced, local = likelihood.reduced(noise)
-            found = posterior(reduced, precision, away)
-            return -found.evidence, -likelihood.slope(noise, local, found, precision, away) / unit
-
-        bounds = optimize.Bounds(LEAST * unit, MOST * unit)
-        found = optimize.minimize(
-            missing, now.vector * unit, method="L-BFGS-B", jac=True, bounds=bounds, options=options
-        )
-        before, now = now, Noise.of(found.x / unit)
-        step = posterior(likelihood.reduced(now)[0], precision, away).mean
-        if turn > 1 and (np.abs(now.vector - before.vector) * unit).max() < SETTLED:
+    plain, none = (
+        weighted(rows, np.zeros_like(rows.residual), np.zeros((len(rows.residual), 3))),
+        np.zeros(len(precision)),
+    )
+    begun = [(plain.reweighted(start, none) if start else plain, start or Noise()) for start in starts]
+    turns = [_turned(*one, precision, away) for one in begun]
+    likelihood, now = max(turns, key=evidence) if len(turns) > 1 else turns[0]
+    for _ in range(1, MOST_ROUNDS):
+        before = now
+        likelihood, now = _turned(likelihood, before, precision, away)
+        if (np.abs(now.vector - before.vector) * _units(rows)).max() < SETTLED:
             break
     return likelihood, now
+
+
+def _turned(likelihood: Likelihood, noise: Noise, precision: Array, away: Array) -> tuple[Likelihood, Noise]:
+    """The sizes of noise that maximise the evidence at the present weights, then the weights beside these sizes."""
+    unit = _units(likelihood.rows)
+
+    def missing(scaled: Array) -> tuple[float, Array]:
+        noise = Noise.of(scaled / unit)
+        reduced, local = likelihood.reduced(noise)
+        found = posterior(reduced, precision, away)
+        return -found.evidence, -likelihood.slope(noise, local, found, precision, away) / unit
+
+    options = {"maxiter": MOST_STEPS, "ftol": TOLERANCE}
+    bounds = optimize.Bounds(LEAST * unit, MOST * unit)
+    best = optimize.minimize(missing, noise.vector * unit, method="L-BFGS-B", jac=True, bounds=bounds, options=options)
+    found = Noise.of(best.x / unit)
+    return likelihood.reweighted(found, posterior(likelihood.reduced(found)[0], precision, away).mean), found
+
+
+def _units(rows: Rows) -> Array:
+    """(6,) inverse errors of the logarithms of the sizes, as if all that they scale were known.
+
+    In these units their maximum is found in a third of the steps.
+    """
+    return np.sqrt(2.0 * np.maximum(rows.counts, 1.0))
 
 
 def inverses(lower: Array) -> Array:
