@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from ballfg.dynamics.earlier_names import todays_names
 from ballfg.learning.config.training import Count, Positive, Section, Share
@@ -13,6 +13,13 @@ Coefficients = Annotated[
     Field(min_length=1, strict=False),
     AfterValidator(todays_names),
 ]
+
+
+def _one_folder(data: object) -> object:
+    """A folder as it is. Raises: ValueError: several."""
+    if isinstance(data, list):
+        raise ValueError("must be one folder: a calibration belongs to one room. Calibrate the datasets one by one.")
+    return data
 
 
 class CalibrationConfig(Section):
@@ -33,7 +40,7 @@ class CalibrationConfig(Section):
     model: str | None = None
     """Model file to start from; null: the nominal model of the dataset's ball."""
 
-    data: str | None = None
+    data: Annotated[str | None, BeforeValidator(_one_folder)] = None
     """Folder of the dataset. `--data` replaces it."""
 
     out: str = "calibration"

@@ -54,6 +54,7 @@ def test_the_earlier_name_of_the_observed_share_is_read(tmp_path: Path) -> None:
         ("observe: 1.0", "'observed_share' must be less than 1; got 1.0"),
         ("observe: 0.3\nobserved_share: 0.3", "'observe' is the earlier name of 'observed_share'; got both. Delete"),
         ("workers: 3", "unknown key 'workers'"),
+        ("data: [a, b]", "'data' must be one folder: a calibration belongs to one room. Calibrate the datasets one"),
         ("seed: 1\nseed: 2", "'seed' stands twice"),
         ("[1, 2]", "a config maps keys to values; got [1, 2]"),
         ("seed: [", "not readable as YAML"),
