@@ -17,7 +17,6 @@ from scipy import linalg, optimize
 from ballfg.arrays import Array, Index, Mask
 from ballfg.diagnosis.evidence.rows import Rows
 from ballfg.diagnosis.fit.problem import LABEL_LOSS, POSITION_LOSS
-from ballfg.diagnosis.fit.stretches import of_similar_length
 from ballfg.diagnosis.fit.system import by_track
 from ballfg.state import STATE_DIM
 
@@ -120,15 +119,8 @@ class Likelihood:
     @cached_property
     def grams(self) -> tuple[Array, Array]:
         """Two (n, d, d): of the samples, and of the spin rows; columns start, random, common, residual."""
-        r, spins = self.rows, self.spin_columns
-        root = np.sqrt(np.repeat(self.samples * r.used, 3, axis=1))[..., None]
-        of_samples = np.zeros((len(spins), *spins.shape[2:] * 2))
-        for rows, count in of_similar_length(r.used):
-            own = (r.by_start, r.motion.columns, r.by_common, r.residual[..., None])
-            positions = np.concatenate([columns[rows, : 3 * count] for columns in own], axis=-1)
-            positions *= root[rows, : 3 * count]
-            of_samples[rows] = positions.swapaxes(1, 2) @ positions
-        return of_samples, spins.swapaxes(1, 2) @ spins
+        spins = self.spin_columns
+        return self.rows.gram - self.rows.inner_products(1.0 - self.samples), spins.swapaxes(1, 2) @ spins
 
     def inner(self, noise: Noise) -> tuple[Array, Array]:
         """(n, d, d) information with priors of the random columns, and (n,) logarithms of the sizes."""

@@ -18,6 +18,7 @@ import numpy as np
 from ballfg.arrays import Array, Index, Mask
 from ballfg.diagnosis.fit.free_motion import ACCELERATION, CONTACT_SPIN, CONTACT_VELOCITY, free_motion
 from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.fit.stretches import of_similar_length
 from ballfg.state import SPIN
 
 ACCELERATIONS, VELOCITIES, SPINS, COEFFICIENTS = range(4)
@@ -82,6 +83,26 @@ class Rows:
         information, diagonal = shown.swapaxes(1, 2) @ shown, np.arange(SPIN.start)
         information[:, diagonal, diagonal] += information[:, diagonal, diagonal] == 0.0
         return np.asarray(0.5 * np.linalg.slogdet(information)[1])
+
+    @cached_property
+    def gram(self) -> Array:
+        """(n, d, d) inner products of the rows of samples; columns start, random, common, residual."""
+        return self.inner_products(np.ones(self.used.shape))
+
+    def inner_products(self, weights: Array) -> Array:
+        """(n, d, d) the same of weighted samples; weights: (n, k), not negative. It is fast where few are not zero."""
+        listed = (self.by_start, self.motion.columns, self.by_common, self.residual[..., None])
+        size, used = sum(columns.shape[-1] for columns in listed), (weights != 0.0) & self.used
+        first = np.argsort(~used, axis=1, kind="stable")
+        found = np.zeros((len(used), size, size))
+        for stretches, count in of_similar_length(used):
+            samples = first[stretches, :count]
+            root = np.sqrt(weights[stretches[:, None], samples] * used[stretches[:, None], samples])
+            places = (3 * samples[..., None] + np.arange(3)).reshape(len(stretches), -1)
+            alike = [columns[stretches[:, None], places] for columns in listed]
+            rows = np.concatenate(alike, axis=-1) * np.repeat(root, 3, axis=1)[..., None]
+            found[stretches] = rows.swapaxes(1, 2) @ rows
+        return found
 
     def with_common(self, by_common: Array) -> Rows:
         """The rows with other common unknowns; by_common: (n, m, q)."""
