@@ -273,6 +273,11 @@ class _Point:
     rows: Rows
     priors: Priors
 
+    @property
+    def own(self) -> int:
+        """Number of the common unknowns that the fit has; those of patterns come after them."""
+        return len(self.fit.problem.free) + self.fit.unknowns.launcher.size
+
 
 @dataclass(frozen=True)
 class _Question:
@@ -297,7 +302,7 @@ class _Question:
             widths: of the effects, then of the patterns, of a similar model.
         """
         fit, rows, priors = point.fit, point.rows, point.priors
-        own, effects = len(fit.problem.free) + fit.unknowns.launcher.size, [h for h in self.named if h.strengths]
+        own, effects = point.own, [h for h in self.named if h.strengths]
         of_patterns = list(widths[len(effects) :]) or [0] * (len(priors.places) - len(effects))
         first = priors.precision([len(WIDTHS) - 1] * len(effects) + of_patterns)
         likelihood, noise = settled(rows, first, priors.away, starts)
@@ -355,8 +360,8 @@ class _Question:
         rows, none = point.rows, np.zeros(point.rows.by_common.shape[-1])
         plain = weighted(rows, np.zeros_like(rows.residual), np.zeros((len(rows.residual), 3)))
         reduced, _ = plain.reweighted(model.noise, none).reduced(model.noise)
-        found = point.priors.posterior(reduced, model.widths)
-        return found.evidence - foretold_gain(found.mean, found.covariance)
+        found, own = point.priors.posterior(reduced, model.widths), point.own
+        return found.evidence - foretold_gain(found.mean[:own], found.covariance[:own, :own])
 
     def _nested(
         self, priors: Priors, tracks: Reduced, widths: Sequence[int], mixed: Sequence[float]
