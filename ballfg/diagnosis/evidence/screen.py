@@ -18,8 +18,9 @@ from ballfg.arrays import Array, Index
 from ballfg.diagnosis.evidence.likelihood import Likelihood, Posterior, Reduced, held_out, posterior
 from ballfg.diagnosis.evidence.odds import tempered
 from ballfg.diagnosis.evidence.prior import WIDTHS, centres, choice_odds, log_odds, scales, within
+from ballfg.diagnosis.evidence.priors_of_fit import Priors
 from ballfg.diagnosis.evidence.rows import Motion, roots, rows_of
-from ballfg.diagnosis.evidence.weighed import Priors, Step, Weighed, Weight
+from ballfg.diagnosis.evidence.weighed import Step, Weighed, Weight
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.state import STATE_DIM
 

@@ -7,23 +7,18 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
-from scipy import special
 
-from ballfg.arrays import Array, Index, Mask
+from ballfg.arrays import Array, Mask
 from ballfg.diagnosis.evidence.halves import unlike_halves
-from ballfg.diagnosis.evidence.likelihood import Noise, Posterior, Reduced, held_out, posterior, settled, weighted
-from ballfg.diagnosis.evidence.nameless import NAMELESS, USUAL, Patterns
-from ballfg.diagnosis.evidence.prior import WIDTHS, centres, choice_odds, log_odds, scales, within
+from ballfg.diagnosis.evidence.likelihood import Noise, Reduced, held_out, posterior, settled, weighted
+from ballfg.diagnosis.evidence.nameless import NAMELESS, Patterns
+from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, log_odds, within
+from ballfg.diagnosis.evidence.priors_of_fit import Priors
 from ballfg.diagnosis.evidence.rows import Motion, Rows, random_motion, rows_of
 from ballfg.diagnosis.fit.problem import Fit, Unknowns
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.state import STATE_DIM
 
-MIDDLE = WIDTHS.index(1.0)
-HELD = 1e-5
-"""Width of the prior of strengths that are held, in usual strengths."""
-WIDTH_ROUNDS = 2
-"""Number of turns in which each effect gets its most probable width."""
 MOST_STEPS = 8
 """Largest number of steps from a deterministic fit to the most probable unknowns."""
 SHARES = (1.0, 0.5, 0.25, 0.125)
@@ -119,76 +114,6 @@ class Weighed:
         strengths = {name: replace(found, mean=own[name]) for name, found in self.strengths.items()}
         nested = {names: replace(weight, evidence=weight.evidence - gain) for names, weight in self.nested.items()}
         return replace(self, evidence=self.evidence - gain, strengths=strengths, nested=nested)
-
-
-@dataclass(frozen=True)
-class Priors:
-    """Normal priors of the common unknowns of a fit, with widths for the strengths of its named effects.
-
-    Attributes:
-        base: (c,) precision of the others, zero for strengths.
-        away: (c,) prior mean less present value.
-        places, sizes: for each effect, then for each block of patterns, where its strengths are and their usual sizes.
-    """
-
-    base: Array
-    away: Array
-    places: tuple[Index, ...]
-    sizes: tuple[Array, ...]
-
-    @classmethod
-    def of(cls, fit: Fit, named: Sequence[Hypothesis], patterns: Patterns | None = None) -> Priors:
-        """The priors at a fit, beside patterns."""
-        problem, listed = fit.problem, list(fit.problem.free)
-        with_strengths = [h for h in named if h.strengths]
-        places = tuple(np.array([listed.index(c) for c in h.columns]) for h in with_strengths)
-        values = np.array([fit.unknowns.values[name] for name in listed])
-        middles = problem.centres.copy()
-        for hypothesis, place in zip(with_strengths, places, strict=True):
-            middles[place] = centres(hypothesis, problem.model)
-        base = problem.common_precision.copy()
-        for place in places:
-            base[place] = 0.0
-        away = np.concatenate((middles - values, -fit.unknowns.launcher.ravel()))
-        sizes = tuple(scales(h) for h in with_strengths)
-        if patterns is None:
-            return cls(base, away, places, sizes)
-        none = np.zeros(patterns.columns.shape[-1])
-        more = tuple(len(base) + block for block in patterns.blocks)
-        usual = tuple(np.full(len(block), USUAL) for block in patterns.blocks)
-        return cls(np.append(base, none), np.append(away, none), (*places, *more), (*sizes, *usual))
-
-    def precision(self, widths: Sequence[int]) -> Array:
-        """(c,) with one of `WIDTHS` for each effect."""
-        found = self.base.copy()
-        for place, size, width in zip(self.places, self.sizes, widths, strict=True):
-            found[place] = (WIDTHS[width] * size) ** -2
-        return found
-
-    def widths(self, reduced: Reduced) -> tuple[list[int], list[float]]:
-        """The most probable widths, and for each the logarithm of the mean evidence over all less that at the best.
-
-        Effects are taken one after the other, the others at their best width.
-        """
-        chosen, mixed = [MIDDLE] * len(self.places), [0.0] * len(self.places)
-        for _ in range(WIDTH_ROUNDS):
-            for effect in range(len(chosen)):
-                every = ([*chosen[:effect], width, *chosen[effect + 1 :]] for width in range(len(WIDTHS)))
-                evidence = np.array([self.posterior(reduced, widths).evidence for widths in every])
-                chosen[effect] = int(evidence.argmax())
-                mixed[effect] = float(special.logsumexp(evidence - evidence.max()) - np.log(len(WIDTHS)))
-        return chosen, mixed
-
-    def posterior(self, reduced: Reduced, widths: Sequence[int]) -> Posterior:
-        """The posterior of all common unknowns."""
-        return posterior(reduced, self.precision(widths), self.away)
-
-    def held(self, effects: Sequence[int], widths: Sequence[int]) -> Array:
-        """(c,) the precision that holds the strengths of some effects where they are absent."""
-        precision = self.precision(widths)
-        for effect in effects:
-            precision[self.places[effect]] = (HELD * self.sizes[effect]) ** -2
-        return precision
 
 
 def weigh(fit: Fit, named: Sequence[Hypothesis] = (), *, nameless: bool = False) -> Weighed:
