@@ -20,9 +20,7 @@ _SAME: Final = 0.04  # m: bounces within this distance of each other are on one 
 _SHARE: Final = 0.3  # of the most frequent surface's bounces that make a higher one the table: balls bounce on below it
 _RESTITUTION: Final = np.linspace(0.15, 0.95, 17)  # of a surface: it is passive, a hand, a foot or a racket is not
 _SPREAD: Final = 0.06  # standard deviation of the restitutions of bounces on one surface
-_STRENGTHS: Final = np.array([0.1, 0.2, 0.35, 0.6])[
-    :, None
-]  # of their logarithms, for hits
+_STRENGTHS: Final = np.array([0.1, 0.2, 0.35, 0.6])[:, None]  # of their logarithms, for hits
 _ODD: Final = 0.1  # share of the turns near a surface's height that are none of its bounces
 _LEVEL: Final = np.array([0.003, 0.006, 0.012])[:, None]  # m, standard deviations of the heights of its bounces
 _UNEVEN: Final = np.array([0.01, 0.02, 0.04])[:, None]  # m, of those of hits that are near each other

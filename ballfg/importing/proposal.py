@@ -72,7 +72,7 @@ def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
         rate=rate,
         source=source[:200],
         imported={guess.what: f"{guess.value} ({guess.sure}: {guess.why})" for guess in guesses},
-        doubts=(*_unseen(roles), *recorded.doubts(frame, choices.flights)),
+        doubts=(*_unseen(roles), *frame.doubts, *recorded.doubts(frame, choices.flights)),
     )
     used = (*roles.time, *roles.places, roles.frame)
     doubts = [[*table.notes, *(said for name, said in table.doubts.items() if name in used)] for table in chosen]

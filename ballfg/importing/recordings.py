@@ -7,7 +7,10 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import Final
 
-from ballfg.estimation.configure import LEAST_TRACKS
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.estimation.configure import FEW_TRACKS, LEAST_TRACKS
 from ballfg.estimation.flights.cut import flies_throughout, tracks_of
 from ballfg.estimation.flights.dataset import ENOUGH, SMOOTHED, Contents, smoothed
 from ballfg.estimation.flights.labels import label_samples
@@ -16,6 +19,10 @@ from ballfg.importing.choices import Guess
 from ballfg.importing.frame import Frame
 from ballfg.tracks import Track
 
+STUCK: Final = 4
+"""Samples in a row that are exactly the largest or smallest of all: no moving ball does that."""
+AGAIN: Final = 2
+"""Times that it happens where a limit clips; once is a ball at rest."""
 ANY_BALL: Final = SegmentationPhysics(drag=0.06)
 """Between the drag of a heavy and of a light ball; the labels leave room for either."""
 
@@ -26,13 +33,14 @@ class Recordings:
 
     Attributes:
         tracks: as they were recorded.  flights: those of each track; the track itself if nothing else is in it.
-        share: of the samples that are flight, 0 to 1.  smoothing: as of `InFlight`.
+        share: of the samples that are flight, 0 to 1.  smoothing, others: as of `InFlight`.
     """
 
     tracks: Sequence[Track]
     flights: Sequence[Sequence[Track]]
     share: float
     smoothing: float
+    others: str
 
     @property
     def cut(self) -> list[Track]:
@@ -63,9 +71,32 @@ class Recordings:
             )
         if self.smoothing > SMOOTHED:
             said.append(smoothed(self.smoothing))
+        said += filter(None, [self.others])
         if len(self.cut if cut else self.tracks) < LEAST_TRACKS:
-            said.append("too few tracks to show their noise: that of bounces and coefficients is the usual one")
-        return said
+            said.append(FEW_TRACKS)
+        return [*said, *clipped(self.tracks)]
+
+
+def clipped(tracks: Sequence[Track]) -> list[str]:
+    """A sentence on places that stick to a limit: the largest or smallest of all, again and again, sample by sample.
+
+    The lowest place is none: balls lie and roll there.
+    """
+    said = list[str]()
+    for axis, letter in enumerate("xyz"):
+        for sign in (1.0,) if letter == "z" else (1.0, -1.0):
+            most = max(float((sign * track.positions[:, axis]).max()) for track in tracks)
+            lengths = [_run_lengths(sign * track.positions[:, axis] == most) for track in tracks]
+            stuck = sum(int((own >= STUCK).sum()) for own in lengths)
+            if stuck >= AGAIN:
+                said.append(f"{letter} is clipped: {stuck} times it stays at {sign * most:.6g} m")
+    return said
+
+
+def _run_lengths(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """(k,) lengths of the runs of True in a mask (n,)."""
+    ends = np.flatnonzero(np.diff(mask, prepend=False, append=False))
+    return ends[1::2] - ends[::2]
 
 
 def recordings(tracks: Sequence[Track]) -> Recordings:
@@ -74,4 +105,4 @@ def recordings(tracks: Sequence[Track]) -> Recordings:
     found = Contents.of(labelled, lambda _, labels: flies_throughout(labels))
     pieces = (found.pieces[track.name] for track in tracks)
     flights = [[track] if own is None else tracks_of(track, own) for track, own in zip(tracks, pieces, strict=True)]
-    return Recordings(tracks, flights, found.share, found.smoothing)
+    return Recordings(tracks, flights, found.share, found.smoothing, found.others)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.pages.html import Html, explained, items, section, table, tag
+from ballfg.pages.html import Html, doubtful, explained, items, section, table, tag
 from ballfg.pages.outline import NET_HEIGHT, Outline
 from ballfg.pages.page import own, whole_page
 from ballfg.pages.shot import GAP, HALF_WIDTH, LEVEL, ShownShot
@@ -24,7 +24,7 @@ CANDIDATES = 10  # Number of effects of a diagnosis in the drawing, those that e
 def show_page(shown: Shown) -> str:
     """The whole page, self-contained. Args: shown: result of `collect`."""
     name = _name(shown)
-    header = tag("header", tag("p", name), tag("h1", _sentence(shown)), items(shown.notes))
+    header = tag("header", tag("p", name), tag("h1", _sentence(shown)), _doubts(shown), items(shown.notes))
     parts = [_flight(shown), _measured_and_predicted(shown), _residuals(shown), _coverage(shown), _diagnosis(shown)]
     return whole_page(
         f"{name}: shots",
@@ -35,6 +35,10 @@ def show_page(shown: Shown) -> str:
         scripts=(own("show.js"),),
         plotly=True,
     )
+
+
+def _doubts(shown: Shown) -> Html:
+    return Html() if shown.given.dataset is None else doubtful(shown.given.dataset.info.doubts)
 
 
 def _name(shown: Shown) -> str:

@@ -12,6 +12,7 @@ import torch
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from ballfg.dynamics import save_model
+from ballfg.dynamics.domain import Domain
 from ballfg.dynamics.model_file import model_to_dict
 from ballfg.files.damaged import whole_content
 from ballfg.learning.calibration.auto import (
@@ -46,6 +47,7 @@ from ballfg.learning.run import run_folder as files
 from ballfg.learning.run.record import NOT_BETTER
 from ballfg.learning.training_data import analytic_model, open_source
 from ballfg.progress import Watch
+from ballfg.tracks import Dataset
 from ballfg.tracks.noise import TrackNoise
 
 
@@ -207,6 +209,8 @@ def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch,
     if problem.dataset.one_view:  # its tracks cannot correct a drag: the model file states how sure it is
         model.noise = TrackNoise(coefficients={name: last.next_track[k] for k, name in problem.chosen.listed})
     model.spins = population.spins
+    if isinstance(problem.dataset, Dataset):
+        model.domain = Domain.of(track for track in problem.dataset if track.name in problem.split.fit)
     save_model(model, folder / files.MODEL)
     files.write_json(folder / files.REPORT, found)
     draw(problem, last, comparison, folder / files.PICTURE)

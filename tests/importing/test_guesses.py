@@ -198,3 +198,14 @@ def test_files_under_other_names(tmp_path: Path) -> None:
     (tmp_path / "b.npz").rename(tmp_path / "b.data")
     for name in ("a.npy", "b.data"):
         np.testing.assert_allclose(bf.import_tracks(tmp_path / name)["000"].positions, p, atol=1e-12)
+
+
+def test_places_that_stick_to_a_limit_and_stated_units_that_do_not_fall_are_doubts() -> None:
+    shots = [thrown(0.003, seed) for seed in range(6)]
+    rows = [np.column_stack((t, np.minimum(p, [0.9, 9.0, 9.0]))) for t, p in shots]
+    clipped = bf.import_tracks(rows, length="m", time="s", up="z").info.doubts
+    assert any(one.startswith("x is clipped: 6 times it stays at 0.9 m") for one in clipped)
+    plain = [np.column_stack(shot) for shot in shots]
+    assert bf.import_tracks(plain, length="m", time="s", up="z").info.doubts == ()
+    wrong = bf.import_tracks(plain, length="ft", time="s", up="z", table_height=0.0).info.doubts
+    assert any("in m and s with z up, not in ft" in one for one in wrong)
