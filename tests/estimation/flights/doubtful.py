@@ -74,7 +74,7 @@ def wrong_unit(rng: np.random.Generator) -> Case:
     """Metres that are called feet, or centimetres that are called inches."""
     shots, (unit, size) = throws(rng, 8, (2.5, 5.0)), [("ft", 1.0), ("in", 100.0)][int(rng.integers(2))]
     scaled = [shot * np.array([1.0, size, size, size]) for shot in shots]
-    return Case(scaled, ("--length", unit, "--table-height", "0"), f"{unit}")
+    return Case(scaled, ("--length", unit, "--time", "s", "--up", "z", "--table-height", "0"), f"in {unit} ")
 
 
 def wrong_axis(rng: np.random.Generator) -> Case:
