@@ -2,8 +2,8 @@
 
     python -m tests.prediction.questions --sets 12 --tracks 100 --seed 1
 
-simulates sets of shots with random accelerations and kicks at bounces, measures them at 100 Hz, predicts each from its
-first 0.15 to 0.3 s with the noise that the seen parts show, and compares with the true path at 1000 Hz: the share of 90 %
+simulates sets of shots with random accelerations and kicks at bounces, measures them at 100 Hz, predicts each from 0.15
+to 0.3 s of it with the noise that the seen parts show, and compares with the true path at 1000 Hz: the share of 90 %
 intervals that hold the time and the place of an event; and, in ten bins of the stated probability, the share of balls
 that have it. Planes are placed about where each ball may just pass them, by its own prediction.
 """
