@@ -15,6 +15,7 @@ _SURE: Final = 4.0
 _AGAINST: Final = 4.0  # odds against a stated unit from which it is doubted
 _LEAST_SCORE: Final = 0.12  # least score of a falling ball
 _CLEAR_SCORE: Final = 0.3  # the same of a reading that is proposed against a stated one
+_CHANCE: Final = 5  # stretches that fall as well by chance at one of many rates
 RATES: Final = (24, 25, 30, 50, 60, 90, 100, 120, 125, 150, 180, 200, 240, 250, 300, 360, 400, 480, 500, 600, 960, 1000)
 """Hz, of usual cameras."""
 _NAMES: Final = {"length": "unit of length", "time": "unit of time", "up": "up axis"}
@@ -125,8 +126,9 @@ def likely_rate(shots: Sequence[Shot], length: str | None) -> int | None:
     """The usual camera rate at which balls fall with gravity, of frames (n,) and positions (n, 3) in a unit."""
     lengths = (length,) if length in LENGTHS else _DECIMAL
     found = {rate: scales([(t / rate, p) for t, p in shots], lengths, ("s",)) for rate in RATES}
-    score, rate = max(((best[0].score, rate) for rate, best in found.items() if best), default=(0.0, 0))
-    return rate if score >= _LEAST_SCORE else None
+    known = {rate: best[0] for rate, best in found.items() if best and best[0].score >= _LEAST_SCORE}
+    shrunk = {rate: one.score * one.windows / (one.windows + _CHANCE) for rate, one in known.items()}
+    return max(shrunk, key=shrunk.__getitem__, default=None)
 
 
 def _line(
