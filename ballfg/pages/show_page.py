@@ -9,7 +9,7 @@ from ballfg.arrays import Array
 from ballfg.pages.html import Html, doubtful, explained, items, section, table, tag
 from ballfg.pages.outline import NET_HEIGHT, Outline
 from ballfg.pages.page import own, whole_page
-from ballfg.pages.shot import GAP, HALF_WIDTH, LEVEL, ShownShot
+from ballfg.pages.shot import FLIGHT, GAP, HALF_WIDTH, LEVEL, ShownShot
 from ballfg.pages.shown import Shown
 from ballfg.state import POSITION, SPIN, VELOCITY
 
@@ -92,6 +92,8 @@ def _flight(shown: Shown) -> Html:
     )
     if shown.given.states is not None and shown.given.dataset is not None:
         words += " Contacts and hits are read off the states: where the ball turns up at a surface, and where it jumps."
+    if any((shot.labels != FLIGHT).any() for shot in shown.shots):
+        words += " Where the ball is held, rolls, rests or is lost the samples are drawn as measured, in other colours."
     space = _figure("space", "In space", words, "plot space")
     return section("The shot", choice, running, tag("p", "", kind="readout quiet", id="readout"), space)
 
@@ -242,6 +244,7 @@ def _shot(shot: ShownShot) -> dict[str, Any]:
         "residuals": _plain(shot.residuals().T, LENGTH_DECIMALS) if known else [],
         "state_t": _plain(shot.state_times - start, TIME_DECIMALS),
         "states": states,
+        "labels": shot.labels.tolist() if (shot.labels != FLIGHT).any() else [],
         "state_sigmas": _plain(shot.state_sigmas[:, :3].T, SIGMA_DECIMALS),
         "predicted_t": _plain(shot.predicted_times - start, TIME_DECIMALS),
         "predicted": _plain(shot.predicted.T, LENGTH_DECIMALS),

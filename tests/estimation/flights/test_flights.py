@@ -174,7 +174,7 @@ def test_estimates_and_predictions_of_recordings(
     doubt, noise, share = capsys.readouterr().out.splitlines()[:3]
     assert doubt == "doubt: the frame may be mirrored"
     assert "usual one" in noise
-    assert share.endswith("of the samples are flight; the rest is as measured")
+    assert share.endswith("of the samples are flight; the rest is held, rolls, rests or is lost")
     assert {line.rpartition(",")[2] for line in (tmp_path / "s.csv").read_text().splitlines()[1:]} >= {"flight", "held"}
     assert status("predict", folder, "--observe", "0.2", "--out", tmp_path / "p.csv", "--anyway") == 0
     names = {line.partition(",")[0] for line in (tmp_path / "p.csv").read_text().splitlines()[1:]}
