@@ -208,12 +208,12 @@ def table_of(tracks: Sequence[Track], flights: Sequence[Track], ball: Ball, choi
     if found is None:
         heights = [turn.height for flight in flights for turn in turns_of(flight.seconds, flight.positions)]
         lowest = min(float(track.positions[:, 2].min()) for track in tracks)
-        what, likely = f"the lowest sample is at {lowest:.2f} m", lowest if lowest > 0.5 else 0.76 + ball.radius
+        what, likely = f"the lowest sample is at {lowest:.2f} m", lowest
         if heights:
             likely = float(np.median(heights))
             many = "one turn" if len(heights) == 1 else f"{len(heights)} turns"
             what = f"{many} at {min(heights):.2f} to {max(heights):.2f} m may be bounces or hits"
-        what = f"no bounces show the height of the table (m, along the up axis); {what}"
+        what = f"no bounces show the height of the table (m, along the up axis; of none, one below all samples); {what}"
         raise UndecidedError(what, "table-height", (), f"{likely - ball.radius:.2f}")
     height = round(found.centre - ball.radius, 4)
     others = "".join(f"; also at {other - ball.radius:.2f} m" for other in found.others)

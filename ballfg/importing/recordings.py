@@ -56,7 +56,7 @@ class Recordings:
         """The line of the proposal, where something else than flight is in the tracks. Args: chosen: cut them."""
         if not self.mixed:
             return None
-        rest = f"{100 * self.share:.0f} % of the samples fly; in the others the ball is held, rolls, rests or is lost"
+        rest = f"{int(100 * self.share)} % of the samples fly; in the others the ball is held, rolls, rests or is lost"
         if chosen:
             return Guess("flights", f"{len(self.cut)}, from {self.mixed} tracks", rest, "stated", "")
         return Guess("flights", "left in their tracks", rest, "likely", "--flights")
@@ -72,7 +72,7 @@ class Recordings:
         if self.smoothing > SMOOTHED:
             said.append(smoothed(self.smoothing))
         said += filter(None, [self.others])
-        if len(self.cut if cut else self.tracks) < LEAST_TRACKS:
+        if len(self.cut) < LEAST_TRACKS:
             said.append(FEW_TRACKS)
         return [*said, *clipped(self.tracks)]
 
@@ -86,8 +86,8 @@ def clipped(tracks: Sequence[Track]) -> list[str]:
     for axis, letter in enumerate("xyz"):
         for sign in (1.0,) if letter == "z" else (1.0, -1.0):
             most = max(float((sign * track.positions[:, axis]).max()) for track in tracks)
-            lengths = [_run_lengths(sign * track.positions[:, axis] == most) for track in tracks]
-            stuck = sum(int((own >= STUCK).sum()) for own in lengths)
+            stays = [sign * track.positions[:, axis] == most for track in tracks]
+            stuck = sum(int((_run_lengths(own) >= STUCK).sum()) for own in stays if not own.all())
             if stuck >= AGAIN:
                 said.append(f"{letter} is clipped: {stuck} times it stays at {sign * most:.6g} m")
     return said

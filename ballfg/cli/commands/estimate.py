@@ -76,7 +76,7 @@ def estimate(
             rows, hits, flying = rows + result.rows, hits + result.hits, flying + result.flying
     if flying < rows:
         inputs.print_doubts(
-            [f"{100 * flying / rows:.0f} % of the samples are flight; the rest is held, rolls, rests or is lost"]
+            [f"{100 * flying // rows} % of the samples are flight; the rest is held, rolls, rests or is lost"]
         )
     print(f"{out}: {rows} states of {count} tracks by {method}; {hits} hits found")
     outcome.print()

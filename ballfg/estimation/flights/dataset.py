@@ -101,7 +101,7 @@ class InFlight:
         if self.mixed:
             cut = len(self.dataset) - (self.tracks - self.mixed)
             said.append(
-                f"{100 * self.share:.0f} % of the samples fall like a ball: {cut} flights of {self.mixed} tracks are "
+                f"{int(100 * self.share)} % of the samples fall like a ball: {cut} flights of {self.mixed} tracks are "
                 f"used, {self.tracks - self.mixed} tracks whole; the rest is held, rolls, rests or is lost"
             )
         return (*said, *self.filtered)
