@@ -268,7 +268,7 @@ def open_model(data: Dataset | SightedDataset, model: Path | None, ball: str | N
             f"{own.radius:g} m and {own.mass:g} kg. Leave --ball out, or correct ball in dataset.yaml."
         )
     torch.set_num_threads(1)  # the batches are small: threads cost more time than they save
-    found = nominal_model(data.ball)
+    found: BallModel = nominal_model(data.ball)
     if model is not None:
         inertia = inertia_factor(data.ball)
         found = load_model(model, radius=data.ball.radius, inertia_factor=inertia, room=data.info.name)

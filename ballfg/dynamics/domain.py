@@ -26,10 +26,8 @@ FEW: Final = 0.05
 
 @dataclass(frozen=True)
 class Domain:
-    """The tracks that a model was fitted on, by their ranges.
+    """The tracks that a model was fitted on: smallest and largest value of the quantities of `UNITS` that are known.
 
-    Attributes:
-        ranges: smallest and largest value of the quantities of `UNITS` that are known.
     Raises: ValueError: an unknown quantity, or a range that is not a pair of growing numbers.
     """
 
@@ -37,63 +35,51 @@ class Domain:
 
     def __post_init__(self) -> None:
         check_instance("domain", self.ranges, Mapping, "Write domain: {speed: [2.0, 9.0]}.")
-        for name, limits in self.ranges.items():
-            pair = isinstance(limits, list | tuple) and len(limits) == 2
-            if name not in UNITS or not pair or not check_number(name, limits[0]) <= check_number(name, limits[1]):
+        for name, ends in self.ranges.items():
+            pair = isinstance(ends, list | tuple) and len(ends) == 2
+            if name not in UNITS or not pair or not check_number(name, ends[0]) <= check_number(name, ends[1]):
                 rule = f"domain must map {', '.join(UNITS)} to pairs of growing numbers"
-                raise ValueError(f"{rule}; got {shown(name)}: {shown(limits)}. Write domain: {{speed: [2.0, 9.0]}}.")
-        object.__setattr__(
-            self, "ranges", {name: (float(low), float(high)) for name, (low, high) in self.ranges.items()}
-        )
+                raise ValueError(f"{rule}; got {shown(name)}: {shown(ends)}. Write domain: {{speed: [2.0, 9.0]}}.")
+        object.__setattr__(self, "ranges", {name: (float(a), float(b)) for name, (a, b) in self.ranges.items()})
 
     @classmethod
     def of(cls, tracks: Iterable[Track]) -> Domain | None:
         """The ranges of tracks; None without samples."""
-        held: dict[str, list[Array]] = {}
-        for track in tracks:
-            for name, values in quantities(track).items():
-                held.setdefault(name, []).append(values)
-        limits = {name: np.quantile(np.concatenate(values), (RARE, 1.0 - RARE)) for name, values in held.items()}
-        ranges = {name: (float(f"{low:.4g}"), float(f"{high:.4g}")) for name, (low, high) in limits.items()}
-        return cls(ranges) if ranges else None
+        found = [quantities(track) for track in tracks]
+        held = {name: [own[name] for own in found if name in own] for name in UNITS}
+        ends = {n: np.quantile(np.concatenate(v), (RARE, 1.0 - RARE)) for n, v in held.items() if v}
+        return cls({name: (float(f"{a:.4g}"), float(f"{b:.4g}")) for name, (a, b) in ends.items()}) if ends else None
 
     def to_mapping(self) -> dict[str, list[float]]:
         """The section of a model file."""
-        return {name: list(limits) for name, limits in self.ranges.items()}
+        return {name: list(ends) for name, ends in self.ranges.items()}
 
     def doubts(self, tracks: Iterable[Track], model: object) -> list[str]:
         """A sentence on samples of tracks outside of the ranges, if they are more than `FEW`. Args: model: its name."""
-        count, outside, by_name = 0, 0, dict.fromkeys(self.ranges, 0)
-        for track in tracks:
-            held = quantities(track)
-            beyond = {name: self._beyond(name, held[name]) for name in self.ranges if name in held}
-            count, outside = count + len(track), outside + int(np.any(list(beyond.values()), axis=0).sum())
-            for name, values in beyond.items():
-                by_name[name] += int(values.sum())
-        if outside <= FEW * count:
+        found = [quantities(track) for track in tracks]
+        beyond = [{name: self._beyond(name, own[name]) for name in self.ranges if name in own} for own in found]
+        outside = np.concatenate([np.any(list(own.values()), axis=0) for own in beyond]).mean() if beyond else 0.0
+        if not outside > FEW:
             return []
-        far = [name for name, number in by_name.items() if number > FEW * count]
-        ranges = ", ".join(
-            f"{name} {self.ranges[name][0]:.3g} to {self.ranges[name][1]:.3g} {UNITS[name]}" for name in far
-        )
-        return [f"{100 * outside / count:.0f} % of the samples lie outside of what {model} was fitted on ({ranges})"]
+        far = [
+            name for name in self.ranges if np.mean([own[name].mean() for own in beyond if name in own] or [0]) > FEW
+        ]
+        words = (f"{n} {self.ranges[n][0]:.3g} to {self.ranges[n][1]:.3g} {UNITS[n]}" for n in far)
+        return [f"{100 * outside:.0f} % of the samples lie outside of what {model} was fitted on ({', '.join(words)})"]
 
     def _beyond(self, name: str, values: Array) -> Any:
         """Whether values (n,) of a quantity lie outside of its range."""
         low, high = self.ranges[name]
-        margin = BESIDE * (high - low)
-        return (values < low - margin) | (values > high + margin)
+        return np.abs(values - 0.5 * (low + high)) > (0.5 + BESIDE) * (high - low)
 
 
 def quantities(track: Track) -> dict[str, Array]:
     """(n,) places m, speed m/s and, where it is labelled, spin rad/s at the n samples of a track."""
-    found = dict(zip("xyz", track.positions.T, strict=True))
-    after = np.minimum(np.searchsorted(track.seconds, track.seconds + SPAN), len(track) - 1)
-    before = np.searchsorted(track.seconds, track.seconds[after] - SPAN)
-    before = np.minimum(before, np.maximum(after - 1, 0))
-    if len(track) > 1:
-        way = np.linalg.norm(track.positions[after] - track.positions[before], axis=1)
-        found["speed"] = way / np.maximum(track.seconds[after] - track.seconds[before], 1e-9)
+    t, found = track.seconds, dict(zip("xyz", track.positions.T, strict=True))
+    after = np.minimum(np.searchsorted(t, t + SPAN), len(t) - 1)
+    before = np.minimum(np.searchsorted(t, t[after] - SPAN), np.maximum(after - 1, 0))
+    way = np.linalg.norm(track.positions[after] - track.positions[before], axis=1)
+    found["speed"] = way / np.maximum(t[after] - t[before], 1e-9)
     if track.spin_label is not None:
-        found["spin"] = np.full(len(track), float(np.linalg.norm(track.spin_label)))
+        found["spin"] = np.full(len(t), float(np.linalg.norm(track.spin_label)))
     return found

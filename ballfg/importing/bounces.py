@@ -29,8 +29,8 @@ _MOST_GAIN: Final = 0.2  # likewise of its growth, by topspin: at most 0.18 on f
 _FEW: Final = 10  # number of bounces that shows a surface beside hits at other heights
 _FEW_SHARE: Final = 0.5  # least share of all turns that fewer bounces are
 _UNHANDLED: Final = 4.0  # nats for a surface where nothing else changes the motion
-_SURE: Final = 3.0  # nats by which bounces must explain the turns at a height better than hits
 _REVERSED: Final = 1.0  # m/s, of a horizontal motion before and after a wall or a racket reverses it
+_SURE: Final = 3.0  # nats by which bounces must explain the turns at a height better than hits
 _GRAVITY: Final = 10.0  # m/s^2, of the fitted arcs: gravity and a little topspin. An error of 5 moves a bounce by 2 mm.
 BALLS: Final = {"table-tennis": TABLE_TENNIS, "tennis": TENNIS}
 _TENNIS_DRAG: Final = 0.045  # 1/m; halfway, in ratio, between the drags of the two balls
@@ -122,11 +122,9 @@ def _log_mean(logs: Array) -> float:
 def reverses(times: Array, positions: Array) -> bool:
     """True if the horizontal motion of a ball turns back, as at a wall or a racket; of (n,) s and (n, 3) m."""
     ahead = np.searchsorted(times, times + _ARM)
-    first = np.flatnonzero(ahead < len(times))
-    way = (positions[ahead[first], :2] - positions[first, :2]) / (times[ahead[first]] - times[first])[:, None]
-    second = ahead[first]
-    kept = second < len(way)
-    before, after = way[kept], way[second[kept]]
+    ahead = ahead[ahead < len(times)]
+    way = (positions[ahead, :2] - positions[: len(ahead), :2]) / _ARM
+    before, after = way[: int((ahead < len(way)).sum())], way[ahead[ahead < len(way)]]
     fast = np.minimum(np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1)) > _REVERSED
     return bool((fast & ((before * after).sum(axis=1) < 0.0)).any())
 

@@ -8,7 +8,6 @@ from itertools import chain
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ballfg.estimation.configure import FEW_TRACKS, LEAST_TRACKS
 from ballfg.estimation.flights.cut import flies_throughout, tracks_of
@@ -87,16 +86,11 @@ def clipped(tracks: Sequence[Track]) -> list[str]:
         for sign in (1.0,) if letter == "z" else (1.0, -1.0):
             most = max(float((sign * track.positions[:, axis]).max()) for track in tracks)
             stays = [sign * track.positions[:, axis] == most for track in tracks]
-            stuck = sum(int((_run_lengths(own) >= STUCK).sum()) for own in stays if not own.all())
+            ends = [np.flatnonzero(np.diff(own, prepend=False, append=False)) for own in stays if not own.all()]
+            stuck = sum(int((own[1::2] - own[::2] >= STUCK).sum()) for own in ends)
             if stuck >= AGAIN:
                 said.append(f"{letter} is clipped: {stuck} times it stays at {sign * most:.6g} m")
     return said
-
-
-def _run_lengths(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """(k,) lengths of the runs of True in a mask (n,)."""
-    ends = np.flatnonzero(np.diff(mask, prepend=False, append=False))
-    return ends[1::2] - ends[::2]
 
 
 def recordings(tracks: Sequence[Track]) -> Recordings:

@@ -51,12 +51,7 @@ class Gain:
         return (
             f"errors change by {100 * self.mean:+.0f} % ({100 * self.low:+.0f} to {100 * self.high:+.0f} %, 95 % "
             f"interval over {self.tracks} tracks that were not fitted)"
-        ) + ("" if self.density is None else f"; with intervals, what was measured is {self._times} times as probable")
-
-    @property
-    def _times(self) -> str:
-        assert self.density is not None
-        return f"{np.exp(self.density[0]):.2f}"
+        ) + ("" if self.density is None else f"; what was measured is {np.exp(self.density[0]):.2f} times as probable")
 
 
 def denser(before: Array, after: Array) -> tuple[float, float]:
