@@ -105,9 +105,7 @@ def noted(dataset: D) -> D:
 
 
 def _print_doubts(doubts: Sequence[str]) -> None:
-    """Prints what is not sure about the tracks in one line."""
-    if doubts:
-        print(f"doubt: {'; '.join(doubts)}", flush=True)
+    print(f"doubt: {'; '.join(doubts)}\n" if doubts else "", end="", flush=True)
 
 
 def analytic_model(path: str | None, ball: Ball) -> AnalyticModel:

@@ -14,14 +14,10 @@ from ballfg.tracks import Track
 
 UNITS: Final = {"x": "m", "y": "m", "z": "m", "speed": "m/s", "spin": "rad/s"}
 """Quantities with their units; a spin is known of labelled tracks alone."""
-SPAN: Final = 0.1
-"""s, over which a speed is measured: 5 mm of noise are 0.07 m/s."""
-RARE: Final = 0.002
-"""Share of the samples at either end that are no part of the range: outliers of trackers."""
-BESIDE: Final = 0.1
-"""Share of its width by which a range may be left: tracks of the same shots do."""
-FEW: Final = 0.05
-"""Share of samples outside that is not worth a word."""
+SPAN: Final = 0.1  # s, over which a speed is measured: 5 mm of noise are 0.07 m/s
+RARE: Final = 0.002  # share of the samples at either end that are no part of the range: outliers of trackers
+BESIDE: Final = 0.1  # share of its width by which a range may be left: tracks of the same shots do
+FEW: Final = 0.05  # share of samples outside that is not worth a word
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,8 @@ from ballfg.importing.choices import Guess
 from ballfg.importing.frame import Frame
 from ballfg.tracks import Track
 
-STUCK: Final = 4
-"""Samples in a row that are exactly the largest or smallest of all: no moving ball does that."""
-AGAIN: Final = 2
-"""Times that it happens where a limit clips; once is a ball at rest."""
+STUCK: Final = 4  # samples in a row that are exactly the largest or smallest of all: no moving ball does that
+AGAIN: Final = 2  # times that it happens where a limit clips; once is a ball at rest
 ANY_BALL: Final = SegmentationPhysics(drag=0.06)
 """Between the drag of a heavy and of a light ball; the labels leave room for either."""
 

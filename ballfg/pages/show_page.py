@@ -24,7 +24,8 @@ CANDIDATES = 10  # Number of effects of a diagnosis in the drawing, those that e
 def show_page(shown: Shown) -> str:
     """The whole page, self-contained. Args: shown: result of `collect`."""
     name = _name(shown)
-    header = tag("header", tag("p", name), tag("h1", _sentence(shown)), _doubts(shown), items(shown.notes))
+    doubts = doubtful(() if shown.given.dataset is None else shown.given.dataset.info.doubts)
+    header = tag("header", tag("p", name), tag("h1", _sentence(shown)), doubts, items(shown.notes))
     parts = [_flight(shown), _measured_and_predicted(shown), _residuals(shown), _coverage(shown), _diagnosis(shown)]
     return whole_page(
         f"{name}: shots",
@@ -35,10 +36,6 @@ def show_page(shown: Shown) -> str:
         scripts=(own("show.js"),),
         plotly=True,
     )
-
-
-def _doubts(shown: Shown) -> Html:
-    return Html() if shown.given.dataset is None else doubtful(shown.given.dataset.info.doubts)
 
 
 def _name(shown: Shown) -> str:

@@ -131,7 +131,7 @@ def _shot(given: Given, name: str, track: Track | None) -> ShownShot:
     if given.states is not None:
         rows = _rows(given.states, name, track)
         shot = replace(shot, state_times=rows[:, 0], states=rows[:, 1:10], state_sigmas=rows[:, 10:])
-        shot = replace(shot, labels=given.states.labels_of(name))
+        shot = replace(shot, labels=given.states.labels[given.states.rows.get(name, slice(0))])
     if given.predictions is not None:
         rows = _rows(given.predictions, name, track)
         shot = replace(shot, predicted_times=rows[:, 0], predicted=rows[:, 1:4], predicted_sigmas=rows[:, 4:])

@@ -50,10 +50,6 @@ class ResultTable:
         """(k, 1 + c) rows of a track in the units of the columns; empty for an unknown track."""
         return self.values[self.rows.get(name, slice(0))]
 
-    def labels_of(self, name: str) -> NDArray[np.str_]:
-        """(k,) labels of a track; empty without any."""
-        return self.labels[self.rows.get(name, slice(0))]
-
 
 def kind_of(columns: Sequence[str]) -> Kind | None:
     """The kind of a table with these columns; None for another table."""
