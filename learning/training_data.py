@@ -81,8 +81,7 @@ def open_dataset(folder: str, anyway: bool | None = None) -> Dataset:
     """
     dataset = noted(with_readings(read_dataset(folder)))
     found = in_flight(dataset)
-    for doubt in found.lines:
-        print(f"doubt: {doubt}", flush=True)
+    _print_doubts(found.lines)
     found.check(folder, bool(anyway), "" if anyway is None else ", or set anyway: true")
     return found.dataset
 
@@ -99,11 +98,14 @@ def open_source(folder: str, source: str | None, anyway: bool = False) -> Datase
 
 def noted(dataset: D) -> D:
     """The dataset, after its doubts and, on stderr, its notes."""
-    for doubt in dataset.info.doubts:
-        print(f"doubt: {doubt}", flush=True)
+    _print_doubts(dataset.info.doubts)
     for note in (*dataset.notes, *filter(None, [table_note(dataset)])):
         print(f"note: {note}", file=sys.stderr)
     return dataset
+
+
+def _print_doubts(doubts: Sequence[str]) -> None:
+    print(f"doubt: {'; '.join(doubts)}\n" if doubts else "", end="", flush=True)
 
 
 def analytic_model(path: str | None, ball: Ball) -> AnalyticModel:

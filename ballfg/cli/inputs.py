@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
 
@@ -125,6 +126,7 @@ class Inputs(Generic[D]):
     model: BallModel
     surfaces: Surfaces
     observed: float  # s from the start of each track that a noise estimate may use
+    doubts: tuple[str, ...] = ()
 
     def in_flight(self, anyway: bool) -> Inputs[D]:
         """The same of flights alone, after what is said about the rest; sightings stay as they are.
@@ -132,10 +134,13 @@ class Inputs(Generic[D]):
         Args: anyway: True for a dataset that hardly holds any flight.
         Raises: ValueError: for such a dataset otherwise.
         """
+        from ballfg.estimation.flights.dataset import in_flight
         from ballfg.tracks import Dataset
 
         data = self.dataset
-        return replace(self, dataset=flights_only(data, anyway)) if isinstance(data, Dataset) else self
+        if not isinstance(data, Dataset):
+            return self
+        return replace(self, dataset=flights_only(data, anyway), doubts=(*self.doubts, *in_flight(data).lines))
 
     def estimator(self, method: str, solver: Solver | None = None, group: str | None = None) -> Estimator:
         """The estimator of a name, with the noise of the dataset.
@@ -146,12 +151,13 @@ class Inputs(Generic[D]):
         Raises: ValueError: if there is no such estimator or group, or the solver cannot solve it.
         """
         from ballfg.estimation import Settings
-        from ballfg.estimation.configure import fitted_settings
+        from ballfg.estimation.configure import fitted_settings, usual_noise
         from ballfg.estimation.registry import make_estimator
 
         # both refuse before any long work
         make_estimator(method, self.model, self.surfaces, Settings(solver=solver))
         Settings(spins=self.model.spins, group=group)
+        print_doubts(usual_noise(self.dataset, self.model))
         settings = fitted_settings(self.dataset, self.model, self.observed, progress)
         return make_estimator(method, self.model, self.surfaces, replace(settings, solver=solver, group=group))
 
@@ -167,7 +173,7 @@ def flights_only(data: Dataset, anyway: bool) -> Any:
 
 
 def filtered(data: Dataset | SightedDataset) -> tuple[str, ...]:
-    """A sentence on a filter that smoothed the positions of a dataset, if one did."""
+    """Sentences on a filter that smoothed the positions of a dataset, and on samples of other balls."""
     from ballfg.estimation.configure import TRACKS_FOR_TABLE
     from ballfg.estimation.flights.dataset import in_flight
     from ballfg.tracks import Dataset
@@ -210,7 +216,8 @@ def open_inputs(
 
     know_effects(effects_files)
     data = with_readings(read_dataset(dataset))
-    return Inputs(data, open_model(data, model, ball), dataset_surfaces(data), observed)
+    opened = open_model(data, model, ball)
+    return Inputs(data, opened, dataset_surfaces(data), observed, doubts_of(data, opened, model))
 
 
 def open_sighted(
@@ -261,15 +268,25 @@ def open_model(data: Dataset | SightedDataset, model: Path | None, ball: str | N
             f"{own.radius:g} m and {own.mass:g} kg. Leave --ball out, or correct ball in dataset.yaml."
         )
     torch.set_num_threads(1)  # the batches are small: threads cost more time than they save
-    print_doubts(data.info.doubts)
+    found: BallModel = nominal_model(data.ball)
+    if model is not None:
+        inertia = inertia_factor(data.ball)
+        found = load_model(model, radius=data.ball.radius, inertia_factor=inertia, room=data.info.name)
+    print_doubts(doubts_of(data, found, model))
     notes = [*data.notes, *filter(None, [table_note(data)])]
     if model is None:
         notes += [note for note in (nominal_note(data.ball), *unused_model(data.path, data.ball)) if note]
     print_notes(notes)
-    if model is None:
-        return nominal_model(data.ball)
-    inertia = inertia_factor(data.ball)
-    return load_model(model, radius=data.ball.radius, inertia_factor=inertia, room=data.info.name)
+    return found
+
+
+def doubts_of(data: Dataset | SightedDataset, model: BallModel, file: Path | None) -> tuple[str, ...]:
+    """What is not sure about a dataset, and how far it lies outside of what a model was fitted on."""
+    from ballfg.estimation.flights.dataset import LOOKED_AT
+
+    if model.domain is None or data.rough:
+        return data.info.doubts
+    return (*data.info.doubts, *model.domain.doubts(islice(iter(data), LOOKED_AT), file))
 
 
 def model_alone(model: Path | None, ball: str | None) -> tuple[BallModel, Settings]:
@@ -300,11 +317,11 @@ def check_out(out: Path, dataset: Path) -> None:
 
 
 def print_doubts(doubts: Iterable[str]) -> None:
-    """Prints what is not sure about the tracks, before any result."""
+    """Prints what is not sure about the tracks in one line, before any result: further lines push it out of sight."""
     from ballfg.checks import visible
 
-    for doubt in doubts:
-        print(f"doubt: {visible(doubt)}", flush=True)
+    if line := "; ".join(visible(doubt) for doubt in doubts):
+        print(f"doubt: {line}", flush=True)
 
 
 def print_notes(notes: Iterable[str]) -> None:

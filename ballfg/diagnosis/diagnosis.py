@@ -26,6 +26,7 @@ from ballfg.diagnosis.search.plausible import at_bound, implausible
 from ballfg.diagnosis.search.process_noise import calibrated_model, noise_about, predictive_model
 from ballfg.diagnosis.search.stamp_effects import as_declared
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel
+from ballfg.dynamics.domain import Domain
 from ballfg.dynamics.effect import Effect
 from ballfg.estimation import dataset_settings
 from ballfg.tracks import Dataset
@@ -86,6 +87,7 @@ def diagnose(
     calibrated = values_of(search.whole, [name for name in search.whole.problem.free if name in declared], declared)
     whole = calibrated_model(search.whole, holdout.launcher.embedding)
     whole.noise = corrected.noise
+    whole.domain = Domain.of(dataset) if search.findings else model.domain
     after = search.judged if helped is None else helped.after
     budget = budget_of(corrected, holdout, search.before.prediction_rmse_mm, after.prediction_rmse_mm, jobs)
     return Diagnosis(

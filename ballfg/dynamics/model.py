@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ballfg.checks import as_float
+from ballfg.dynamics.domain import Domain
 from ballfg.dynamics.effect import Coefficient
 from ballfg.dynamics.measurement import Later
 from ballfg.dynamics.motion.impact import slip_velocity
@@ -54,6 +55,7 @@ class BallModel(nn.Module, ABC):
         noise: the scatter of tracks about the model; None if unknown.
         variations: coefficients that differ between tracks, by name as in `named_parameters()`.
         spins: the spins of groups of shots; None if unknown.
+        domain: the speeds, spins and places of the tracks that it was fitted on; None if unknown.
         random: True if the model draws random numbers, so that the same state has another future each time; machine
             code then uses its `in_flight`.
 
@@ -77,6 +79,7 @@ class BallModel(nn.Module, ABC):
         self.noise: TrackNoise | None = None
         self.variations: Mapping[str, Variation] = {}
         self.spins: SpinPopulation | None = None
+        self.domain: Domain | None = None
 
     def for_track(self, track: "Track") -> Self:
         """The model with the coefficients of one track; the model itself if none differ between tracks."""

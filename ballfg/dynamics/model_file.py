@@ -9,6 +9,7 @@ import yaml
 
 from ballfg.checks import check_path, check_range, shown
 from ballfg.dynamics.analytic import AnalyticModel, after_needs
+from ballfg.dynamics.domain import Domain
 from ballfg.dynamics.effect import Effect, Kind
 from ballfg.dynamics.effects.registry import effect_class
 from ballfg.dynamics.model import THIN_SHELL, BallModel
@@ -24,7 +25,8 @@ VARIATIONS: Final = "variations"
 POPULATIONS: Final = "populations"
 SPIN: Final = "spin"
 """Entry of the section `populations`."""
-SECTIONS = (*KINDS, VARIATIONS, POPULATIONS, "learned")
+DOMAIN: Final = "domain"
+SECTIONS = (*KINDS, VARIATIONS, POPULATIONS, DOMAIN, "learned")
 LONGEST_NAME: Final = 255
 """Characters of a folder's name."""
 NOISE: Final = "noise"
@@ -38,8 +40,8 @@ def load_model(
     """Read a model file.
 
     Args:
-        path: YAML file with the sections `flight`, `bounce`, `measurement`, `variations`, `populations`, `learned`
-            (docs/models.md).
+        path: YAML file with the sections `flight`, `bounce`, `measurement`, `variations`, `populations`, `domain`,
+            `learned` (docs/models.md).
         radius: m, of the ball, usually from the dataset.
         inertia_factor: moment of inertia divided by m R^2.
         room: name of the dataset to estimate. In a room outside of its training a network that fades keeps half of its
@@ -85,7 +87,7 @@ def model_from_dict(
     """The model of a parsed model file without a learned part.
 
     Args:
-        content: the sections `flight`, `bounce`, `measurement`, `variations` and `populations` (docs/models.md).
+        content: the sections `flight`, `bounce`, `measurement`, `variations`, `populations`, `domain` (docs/models.md).
         radius: m, of the ball.  inertia_factor: moment of inertia divided by m R^2.
         where: start of the error messages.
     Raises: ValueError: if it names a section, effect or coefficient that does not exist, or a value out of its bounds.
@@ -116,7 +118,16 @@ def model_from_dict(
     model.noise = noise
     model.variations = _variations(content.get(VARIATIONS), model, where)
     model.spins = _spins(content.get(POPULATIONS), where)
+    model.domain = _domain(content.get(DOMAIN), where)
     return model
+
+
+def _domain(section: Any, where: str) -> Domain | None:
+    """What the model was fitted on."""
+    try:
+        return None if section is None else Domain(section)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{where}: {error}") from error
 
 
 def _spins(section: Any, where: str) -> SpinPopulation | None:
@@ -189,7 +200,8 @@ def model_to_dict(model: AnalyticModel) -> dict[str, Any]:
     if model.noise is not None:
         content["measurement"][NOISE] = model.noise.to_mapping()
     populations = {} if model.spins is None else {POPULATIONS: {SPIN: model.spins.to_mapping()}}
-    return content | _listed(model.variations) | populations | {"learned": None}
+    domain = {} if model.domain is None else {DOMAIN: model.domain.to_mapping()}
+    return content | _listed(model.variations) | populations | domain | {"learned": None}
 
 
 def _listed(variations: Mapping[str, Variation]) -> dict[str, Any]:

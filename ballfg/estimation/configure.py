@@ -37,6 +37,7 @@ KEPT = 8
 """Number of datasets whose noise is cached: their tracks may be estimated one by one."""
 LEAST_TRACKS = 5
 """Least number of tracks that shows how much tracks differ."""
+FEW_TRACKS = "too few tracks to show their noise: that of bounces and coefficients is the usual one"
 STATED_EDGE_SIGMA = 0.01
 """m, of a stated table end: a ball touches an edge up to its radius beside it."""
 TRACKS_FOR_TABLE = 200
@@ -97,9 +98,7 @@ def fitted_settings(
     if isinstance(dataset, Dataset):
         dataset = in_flight(dataset, TRACKS_FOR_TABLE).dataset
     settings = dataset_settings(dataset, model)
-    at_home = model.trained is not None and not model.trained.is_foreign(dataset.info.name)
-    stated = dataset.info.noise is not None or model.noise is not None or at_home
-    if stated or dataset.rough or len(dataset) < LEAST_TRACKS:
+    if _noise_is_stated(dataset, model) or dataset.rough or len(dataset) < LEAST_TRACKS:
         return settings
     key = (dataset, _content(model), observed)
     if key not in _FITTED:
@@ -108,6 +107,17 @@ def fitted_settings(
         with doing("looking for the noise that the tracks show"):
             _FITTED[key] = _fitted(dataset, model, observed, watch)
     return _FITTED[key] or settings
+
+
+def _noise_is_stated(dataset: Dataset | SightedDataset, model: BallModel) -> bool:
+    at_home = model.trained is not None and not model.trained.is_foreign(dataset.info.name)
+    return dataset.info.noise is not None or model.noise is not None or at_home
+
+
+def usual_noise(dataset: Dataset | SightedDataset, model: BallModel) -> tuple[str, ...]:
+    """A sentence where tracks are too few to show their noise, unless `dataset.yaml` has it."""
+    known = dataset.rough or _noise_is_stated(dataset, model) or FEW_TRACKS in dataset.info.doubts
+    return () if known or len(dataset) >= LEAST_TRACKS else (FEW_TRACKS,)
 
 
 _FITTED: dict[tuple[Dataset | SightedDataset, Hashable, float], Settings | None] = {}

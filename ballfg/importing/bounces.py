@@ -18,12 +18,19 @@ _LEAST_SPEED: Final = 0.7  # m/s, of the fall before and the rise after a bounce
 _MOST_RESIDUAL: Final = 0.02  # m, root mean square about the two flights; more means a hit, an outlier, or two balls
 _SAME: Final = 0.04  # m: bounces within this distance of each other are on one surface
 _SHARE: Final = 0.3  # of the most frequent surface's bounces that make a higher one the table: balls bounce on below it
-_RESTITUTIONS: Final = (0.15, 0.98)  # of a bounce; a hand, a foot or a racket gives back more, or nothing
-_MOST_SCATTER: Final = 0.015  # m, standard deviation of bounces on a surface; hits at any height scatter by more
-_MOST_SPREAD: Final = 0.15  # standard deviation of the restitutions of bounces on a surface; hits are of any strength
+_RESTITUTION: Final = np.linspace(0.15, 0.95, 17)  # of a surface: it is passive, a hand, a foot or a racket is not
+_SPREAD: Final = 0.06  # standard deviation of the restitutions of bounces on one surface
+_STRENGTHS: Final = np.array([0.1, 0.2, 0.35, 0.6])[:, None]  # of their logarithms, for hits
+_ODD: Final = 0.1  # share of the turns near a surface's height that are none of its bounces
+_LEVEL: Final = np.array([0.003, 0.006, 0.012])[:, None]  # m, standard deviations of the heights of its bounces
+_UNEVEN: Final = np.array([0.01, 0.02, 0.04])[:, None]  # m, of those of hits that are near each other
 _MOST_SWERVE: Final = 0.6  # friction changes the horizontal velocity by less than this share of the vertical change
-_FEW: Final = 10  # number of bounces that shows a surface beside hits; fewer must not scatter at all
+_MOST_GAIN: Final = 0.2  # likewise of its growth, by topspin: at most 0.18 on five measured sets
+_FEW: Final = 10  # number of bounces that shows a surface beside hits at other heights
 _FEW_SHARE: Final = 0.5  # least share of all turns that fewer bounces are
+_UNHANDLED: Final = 4.0  # nats for a surface where nothing else changes the motion
+_REVERSED: Final = 1.0  # m/s, of a horizontal motion before and after a wall or a racket reverses it
+_SURE: Final = 3.0  # nats by which bounces must explain the turns at a height better than hits
 _GRAVITY: Final = 10.0  # m/s^2, of the fitted arcs: gravity and a little topspin. An error of 5 moves a bounce by 2 mm.
 BALLS: Final = {"table-tennis": TABLE_TENNIS, "tennis": TENNIS}
 _TENNIS_DRAG: Final = 0.045  # 1/m; halfway, in ratio, between the drags of the two balls
@@ -47,26 +54,36 @@ class Turn:
     height: float  # m, of the ball's centre
     restitution: float  # vertical speed after over that before
     swerve: float  # change of the horizontal velocity over that of the vertical one
+    gain: float = 0.0  # likewise of its component forwards
 
     @property
     def bounce(self) -> bool:
         """True if something level and at rest can do it."""
-        return _RESTITUTIONS[0] <= self.restitution <= _RESTITUTIONS[1] and self.swerve <= _MOST_SWERVE
+        low, high = _RESTITUTION[0] - _SPREAD, _RESTITUTION[-1] + _SPREAD
+        return bool(low <= self.restitution <= high and self.swerve <= _MOST_SWERVE and self.gain <= _MOST_GAIN)
 
 
-def surface(shots: Iterable[tuple[Array, Array]]) -> Surface | None:
-    """The surface of most bounces, or a higher one with nearly as many; of times (n,) s and positions (n, 3) m."""
+def surface(shots: Iterable[tuple[Array, Array]], handled: bool = False) -> Surface | None:
+    """The surface of most bounces, or a higher one with nearly as many; of times (n,) s and positions (n, 3) m.
+
+    Args: handled: True if hands or rackets also move the ball.
+    """
+    shots = list(shots)
     turns = [turn for t, p in shots for turn in turns_of(t, p)]
-    left = sorted((turn for turn in turns if turn.bounce), key=lambda turn: turn.height)
+    odd = sum(not turn.bounce for turn in turns) > _ODD * len(turns)
+    prior = 0.0 if handled or odd or any(reverses(t, p) for t, p in shots) else _UNHANDLED
+    left = sorted(turns, key=lambda turn: turn.height)
     groups: list[Array] = []
-    while left:
-        heights = np.array([turn.height for turn in left])
+    while any(turn.bounce for turn in left):
+        heights = np.array([turn.height for turn in left if turn.bounce])
         near = np.searchsorted(heights, heights + _SAME, side="right") - np.searchsorted(heights, heights - _SAME)
-        apart = np.abs(heights - heights[int(np.argmax(near))])
-        group = [turn for turn, off in zip(left, apart, strict=True) if off <= _SAME]
-        if _is_surface(group, len(turns)):
-            groups.append(np.array([turn.height for turn in group]))
-        left = [turn for turn, off in zip(left, apart, strict=True) if off > 2.0 * _SAME]
+        middle = heights[int(np.argmax(near))]
+        group = [turn for turn in left if abs(turn.height - middle) <= _SAME]
+        bounces = np.array([turn.height for turn in group if turn.bounce])
+        enough = len(bounces) >= min(_FEW, _FEW_SHARE * len(turns))
+        if enough and evidence(group) + prior > _SURE:
+            groups.append(bounces)
+        left = [turn for turn in left if abs(turn.height - middle) > 2.0 * _SAME]
     if not groups:
         return None
     often = [group for group in groups if len(group) >= max(_SHARE * len(groups[0]), 1.0)]
@@ -75,14 +92,41 @@ def surface(shots: Iterable[tuple[Array, Array]]) -> Surface | None:
     return Surface(float(np.median(table)), _scatter(table), len(table), others)
 
 
-def _is_surface(group: Sequence[Turn], turns: int) -> bool:
-    """True if bounces at one height are on one surface; few of them among many hits are chance."""
-    if len(group) < _FEW:
-        return _FEW_SHARE * turns <= len(group)
-    heights, restitutions = (
-        np.array(values) for values in zip(*((t.height, t.restitution) for t in group), strict=True)
-    )
-    return _scatter(heights) <= _MOST_SCATTER and _scatter(restitutions) <= _MOST_SPREAD
+def evidence(turns: Sequence[Turn]) -> float:
+    """Nats by which one level surface, of any restitution, explains turns near a height better than hits.
+
+    Hits return a ball on average: the logarithms of their restitutions are normal about zero, with a spread that they
+    share, as do their heights.
+    """
+    restitutions = np.array([turn.restitution for turn in turns])
+    heights = np.array([turn.height for turn in turns if turn.bounce])
+    hits = _normal(np.log(restitutions), _STRENGTHS) / restitutions
+    level = np.array([turn.bounce for turn in turns])
+    bounces = level * _normal(restitutions - _RESTITUTION[:, None], _SPREAD)
+    mixed = (1.0 - _ODD) * bounces[:, None] + _ODD * hits
+    off = heights - (heights.mean() + np.linspace(-_SAME, _SAME, 81))[:, None]
+    even, uneven = (_log_mean(np.log(_normal(off[:, None], spread)).sum(axis=2)) for spread in (_LEVEL, _UNEVEN))
+    return _log_mean(np.log(mixed).sum(axis=2)) - _log_mean(np.log(hits).sum(axis=1)) + even - uneven
+
+
+def _normal(off: Array, spread: Array | float) -> Array:
+    """Density at distances from the mean of a normal distribution."""
+    return np.asarray(np.exp(-0.5 * (off / spread) ** 2) / (np.sqrt(2.0 * np.pi) * spread))
+
+
+def _log_mean(logs: Array) -> float:
+    """Logarithm of the mean of the exponentials of an array."""
+    return float(logs.max() + np.log(np.mean(np.exp(logs - logs.max()))))
+
+
+def reverses(times: Array, positions: Array) -> bool:
+    """True if the horizontal motion of a ball turns back, as at a wall or a racket; of (n,) s and (n, 3) m."""
+    ahead = np.searchsorted(times, times + _ARM)
+    ahead = ahead[ahead < len(times)]
+    way = (positions[ahead, :2] - positions[: len(ahead), :2]) / _ARM
+    before, after = way[: int((ahead < len(way)).sum())], way[ahead[ahead < len(way)]]
+    fast = np.minimum(np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1)) > _REVERSED
+    return bool((fast & ((before * after).sum(axis=1) < 0.0)).any())
 
 
 def _scatter(values: Array) -> float:
@@ -113,8 +157,9 @@ def turns_of(times: Array, positions: Array) -> list[Turn]:
             height = before[0] + before[1] * when - 0.5 * _GRAVITY * when**2
             fall = max(_GRAVITY * when - before[1], _LEAST_SPEED)
             along = [np.polyfit(times[part] - times[i], positions[part, :2], 1)[0] for part in arms]
-            swerve = float(np.linalg.norm(along[1] - along[0])) / (after[1] - before[1])
-            turn = Turn(height, (after[1] - _GRAVITY * when) / fall, swerve)
+            change = (along[1] - along[0]) / (after[1] - before[1])
+            gain = float(change @ along[0]) / max(float(np.linalg.norm(along[0])), 1e-9)
+            turn = Turn(height, (after[1] - _GRAVITY * when) / fall, float(np.linalg.norm(change)), gain)
             found.append((before[2] + after[2], times[i] + when, turn))
     kept: list[tuple[float, float, Turn]] = []
     for one in sorted(found, key=lambda one: one[:2]):  # the best-fitting of turns less than an arm apart
@@ -156,11 +201,18 @@ def table_of(tracks: Sequence[Track], flights: Sequence[Track], ball: Ball, choi
     if choices.table_height is not None:
         height = choices.table_height
         return height, Guess("table height", f"{height:g} m", "as given", "stated", f"--table-height {height:g}")
-    found = surface((track.seconds, track.positions) for track in flights)
+    handled = len(flights) != len(tracks) or any(a is not b for a, b in zip(flights, tracks, strict=True))
+    found = surface(((track.seconds, track.positions) for track in flights), handled)
     if found is None:
+        heights = [turn.height for flight in flights for turn in turns_of(flight.seconds, flight.positions)]
         lowest = min(float(track.positions[:, 2].min()) for track in tracks)
-        what = f"no bounce shows the height of the table (m, along the up axis); the lowest sample is at {lowest:.2f} m"
-        raise UndecidedError(what, "table-height", (), f"{lowest - ball.radius:.2f}" if lowest > 0.5 else "0.76")
+        what, likely = f"the lowest sample is at {lowest:.2f} m", lowest
+        if heights:
+            likely = float(np.median(heights))
+            many = "one turn" if len(heights) == 1 else f"{len(heights)} turns"
+            what = f"{many} at {min(heights):.2f} to {max(heights):.2f} m may be bounces or hits"
+        what = f"no bounces show the height of the table (m, along the up axis; of none, one below all samples); {what}"
+        raise UndecidedError(what, "table-height", (), f"{likely - ball.radius:.2f}")
     height = round(found.centre - ball.radius, 4)
     others = "".join(f"; also at {other - ball.radius:.2f} m" for other in found.others)
     one = "1 bounce" if found.bounces == 1 else f"{found.bounces} bounces"

@@ -1,8 +1,8 @@
 """Holds a user's choices for an import, the guesses in their place, and the questions without a safe guess."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Final
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
 
 from ballfg.checks import check_choice, check_instance, check_number, check_text, short_text, shown
 from ballfg.importing.fall import AXES, LENGTHS, TIMES
@@ -14,15 +14,25 @@ MAX_CHOICE: Final = 240  # largest number of characters of a choice in it, for t
 
 
 class UndecidedError(ValueError):
-    """An unsafe guess: its option and the possible values."""
+    """An unsafe guess: its option, the possible values, and the one to go on with where further guesses are unsafe."""
 
     def __init__(self, what: str, option: str, choices: Sequence[str], example: str | None = None) -> None:
         self.option, self.choices = option, tuple(choices)
-        first = example or (choices[0] if choices else "...")
+        self.first = first = example or (choices[0] if choices else "...")
         # with names of columns, which may be of any length
         remedy, *others = [short_text(choice, MAX_CHOICE) for choice in (first, *choices[1:4])]
         many = f" (or {', '.join(others)})" if others else ""
         super().__init__(f"{short_text(what, MAX_WHAT)}. Decide it with --{option} {remedy}{many}.")
+
+
+class AllUndecidedError(UndecidedError):
+    """Several unsafe guesses; `questions` has each, the later ones under the first values of the earlier ones."""
+
+    def __init__(self, questions: Sequence[UndecidedError]) -> None:
+        self.questions = tuple(questions)
+        self.option, self.choices, self.first = questions[0].option, questions[0].choices, questions[0].first
+        listed = " ".join(f"({i}) {question}" for i, question in enumerate(questions, 1))
+        ValueError.__init__(self, f"{len(questions)} decisions are needed. {listed}")
 
 
 @dataclass(frozen=True)
@@ -66,6 +76,16 @@ class Choices:
             check_number("--table-height", self.table_height, "m")
         for option in ("ball", "key", "topic", "name"):
             check_text(f"--{option}", getattr(self, option), optional=True)
+
+
+def decided(choices: Choices, option: str, answer: str) -> Choices:
+    """The choices with the value of one option, as typed. Raises: ValueError: an impossible value."""
+    name = option.replace("-", "_")
+    if name == "columns":
+        return replace(choices, columns={**choices.columns, **parse_columns(answer)})
+    value: str | float = float(answer) if name in ("table_height", "rate", "split_gap") else answer
+    known: dict[str, Any] = {name: value}
+    return replace(choices, **known)
 
 
 @dataclass(frozen=True)

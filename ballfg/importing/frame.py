@@ -14,6 +14,8 @@ _LIKELY: Final = 2.0  # least odds of the best reading against the next
 _SURE: Final = 4.0
 _AGAINST: Final = 4.0  # odds against a stated unit from which it is doubted
 _LEAST_SCORE: Final = 0.12  # least score of a falling ball
+_CLEAR_SCORE: Final = 0.3  # the same of a reading that is proposed against a stated one
+_CHANCE: Final = 5  # stretches that fall as well by chance at one of many rates
 RATES: Final = (24, 25, 30, 50, 60, 90, 100, 120, 125, 150, 180, 200, 240, 250, 300, 360, 400, 480, 500, 600, 960, 1000)
 """Hz, of usual cameras."""
 _NAMES: Final = {"length": "unit of length", "time": "unit of time", "up": "up axis"}
@@ -40,6 +42,7 @@ class Frame:
     flip: str | None
     drag: float | None  # 1/m, from the falls
     windows: int = 0
+    doubts: tuple[str, ...] = ()
 
     def metres(self, positions: Array) -> Array:
         """(n, 3) m, in the axes of the source."""
@@ -99,7 +102,9 @@ def find_frame(
         _line("up", best, found, choices.up, None, ""),
     ]
     drag = best.drag if best.score >= _LEAST_SCORE else None
-    frame = Frame(best.length, best.time, best.up, choices.flip, drag, best.windows)
+    doubts = [f"the {line.what} is likely {line.value}: {line.why}" for line in lines if line.sure == "likely"]
+    doubts += _better(shots, best) if choices.length or choices.time or choices.up else []
+    frame = Frame(best.length, best.time, best.up, choices.flip, drag, best.windows, tuple(doubts))
     hand, sure = "taken for right-handed: positions cannot show it", "likely"
     if choices.flip:
         hand, sure = f"mirrored along {choices.flip} as stated", "stated"
@@ -107,12 +112,23 @@ def find_frame(
     return frame, lines
 
 
+def _better(shots: Sequence[Shot], chosen: Scale) -> list[str]:
+    """A sentence where the balls fall in another reading than the stated one."""
+    free = scales(shots)
+    if not free or free[0].score < _CLEAR_SCORE or odds(free[0].score, chosen.score) < _AGAINST:
+        return []
+    best = free[0]
+    given = f"{chosen.length} and {chosen.time} with {chosen.up} up as given"
+    return [f"balls fall at 9.81 m/s^2 in {best.length} and {best.time} with {best.up} up, not in {given}"]
+
+
 def likely_rate(shots: Sequence[Shot], length: str | None) -> int | None:
     """The usual camera rate at which balls fall with gravity, of frames (n,) and positions (n, 3) in a unit."""
     lengths = (length,) if length in LENGTHS else _DECIMAL
     found = {rate: scales([(t / rate, p) for t, p in shots], lengths, ("s",)) for rate in RATES}
-    score, rate = max(((best[0].score, rate) for rate, best in found.items() if best), default=(0.0, 0))
-    return rate if score >= _LEAST_SCORE else None
+    known = {rate: best[0] for rate, best in found.items() if best and best[0].score >= _LEAST_SCORE}
+    shrunk = {rate: one.score * one.windows / (one.windows + _CHANCE) for rate, one in known.items()}
+    return max(shrunk, key=shrunk.__getitem__, default=None)
 
 
 def _line(

@@ -108,7 +108,7 @@ def split(shots: list[SourceShot], roles: Roles, frame: Frame, choices: Choices)
         why = f"cut at gaps of {given:g} s, as given"
         return done, Guess("shots", str(len(done)), why, "stated", f"--split-gap {given:g}")
     if roles.trajectory is not None:
-        why = f"one for each value of {shown(roles.trajectory)}"
+        why = f"one for each value of {' and '.join(map(shown, (roles.trajectory, *roles.identities)))}"
         return shots, Guess("shots", str(count), why, "sure", f"--columns trajectory={roles.trajectory}")
     steps = [np.diff(shot.stamps).astype(np.float64) * unit for shot in shots]
     typical = float(np.median(np.concatenate(steps)))

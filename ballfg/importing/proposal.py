@@ -1,14 +1,14 @@
 """A proposal holds the tracks of a source in SI units with z up, and every guess on the way."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from ballfg.checks import short_text
 from ballfg.importing.bounces import ball_of, table_of
-from ballfg.importing.choices import Choices, Guess, UndecidedError
+from ballfg.importing.choices import AllUndecidedError, Choices, Guess, UndecidedError, decided
 from ballfg.importing.columns import UNMEASURED, Roles
 from ballfg.importing.formats.raw import RawTable
 from ballfg.importing.formats.sources import tables_of
@@ -22,6 +22,9 @@ from ballfg.tracks.checks import Findings, tidy
 from ballfg.tracks.grouping import RowGroup
 from ballfg.tracks.info import DatasetInfo
 
+MOST_QUESTIONS: Final = 8
+"""Largest number of questions about one source; with more, something else is wrong."""
+
 
 @dataclass(frozen=True)
 class Proposal:
@@ -34,15 +37,36 @@ class Proposal:
 
 
 def propose(data: Any, choices: Choices) -> Proposal:
-    """Reads a source and guesses open choices. Raises: UndecidedError. FileNotFoundError. ValueError: unreadable."""
+    """Reads a source and guesses open choices.
+
+    Raises: UndecidedError, AllUndecidedError: unsafe guesses, all at once. FileNotFoundError. ValueError: unreadable.
+    """
     tables = tables_of(data, choices.topic, choices.key)
     try:
         return _proposed(tables, choices)
-    except UndecidedError:
-        raise
+    except UndecidedError as question:
+        questions = [question, *_further(tables, choices, question)]
+        raise question if len(questions) == 1 else AllUndecidedError(questions) from None
     except ValueError as error:
         where = short_text(", ".join(dict.fromkeys(table.source for table in tables)))
         raise error if where in str(error) else ValueError(f"{where}: {error}") from None
+
+
+def _further(tables: list[RawTable], choices: Choices, question: UndecidedError) -> Iterator[UndecidedError]:
+    """The questions that follow if the first value of a question is its answer."""
+    for _ in range(MOST_QUESTIONS):
+        try:
+            choices = decided(choices, question.option, question.first)
+            _proposed(tables, choices)
+        except UndecidedError as following:
+            if following.option == question.option:
+                return
+            question = following
+            yield question
+        except ValueError:  # that value does not lead on
+            return
+        else:
+            return
 
 
 def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
@@ -72,7 +96,7 @@ def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
         rate=rate,
         source=source[:200],
         imported={guess.what: f"{guess.value} ({guess.sure}: {guess.why})" for guess in guesses},
-        doubts=(*_unseen(roles), *recorded.doubts(frame, choices.flights)),
+        doubts=(*_unseen(roles), *frame.doubts, *recorded.doubts(frame, choices.flights)),
     )
     used = (*roles.time, *roles.places, roles.frame)
     doubts = [[*table.notes, *(said for name, said in table.doubts.items() if name in used)] for table in chosen]

@@ -9,7 +9,7 @@ import numpy as np
 
 from ballfg.files.whole_folder import check_replaceable, whole_folder
 from ballfg.importing.proposal import Proposal
-from ballfg.pages.html import Html, items, section, table, tag, typed
+from ballfg.pages.html import Html, doubtful, items, section, table, tag, typed
 from ballfg.pages.page import whole_page
 from ballfg.tracks import Track, write_dataset
 from ballfg.tracks.info import INFO_FILE
@@ -45,6 +45,7 @@ def page(proposal: Proposal) -> str:
         f"{info.name}: import",
         tag("h1", info.name),
         tag("p", words),
+        doubtful(info.doubts),
         tag("figure", _drawing(proposal.tracks, info.table_height), kind="drawing"),
         section("Guesses", table(("what", "guess", "why", "how sure", "change it with"), rows)),
         section("Left out or repaired", items(proposal.notes)),

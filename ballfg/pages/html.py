@@ -66,6 +66,12 @@ def items(lines: Iterable[str]) -> Html:
     return tag("ul", *rows) if rows else Html()
 
 
+def doubtful(doubts: Iterable[str]) -> Html:
+    """What is not sure about the tracks, for the top of a page; empty without doubts."""
+    line = "; ".join(doubts)
+    return tag("p", f"Doubtful: {line}.", kind="unsure") if line else Html()
+
+
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Html:
     """A table that scrolls within itself on a narrow screen; empty without rows."""
     lines = [tag("tr", *(tag("td", cell) for cell in row)) for row in rows]

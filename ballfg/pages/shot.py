@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from statistics import NormalDist
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ballfg.arrays import Array, Index
 from ballfg.state import POSITION, STANDARD_GRAVITY, VELOCITY, VZ, Z
@@ -16,6 +17,8 @@ LARGEST_ACCELERATION = 150.0
 """m/s^2. Air and gravity change a velocity less than this: drag of a table-tennis ball at 25 m/s is 80 m/s^2."""
 SUDDEN = 1.5
 """m/s. A smaller jump is not taken for a hit: velocities err, and bounces change them at the edge of a step."""
+FLIGHT, LOST = "flight", "lost"
+"""Labels of the states that are drawn as the estimate; the others are drawn by what the ball does."""
 GAP = 0.1  # s. During a longer step the motion is unknown: the ball may have bounced several times.
 
 
@@ -28,16 +31,19 @@ class Mark:
     place: tuple[float, float, float]
 
 
-def marks(times: Array, states: Array, surfaces: Sequence[float], radius: float) -> Iterator[Mark]:
+def marks(
+    times: Array, states: Array, surfaces: Sequence[float], radius: float, flying: Sequence[bool] | None = None
+) -> Iterator[Mark]:
     """Contacts and hits between the states of a track.
 
     A contact is a turn of the vertical velocity from down to up near a surface, a hit is a jump of the velocity beyond
     air, gravity or a contact. Steps of more than `GAP` have none.
 
     Args: times: (m,) s.  states: (m, 9).  surfaces: m, heights of table and floor.  radius: m, of the ball.
+        flying: (m,) False where it is held, rolls or rests; None if it always flies.
     """
     for i, step in enumerate(np.diff(times)):
-        if step > GAP:
+        if step > GAP or (flying is not None and not all(flying[i : i + 2])):
             continue
         before, after = states[i], states[i + 1]
         contact = _contact(before, after, float(step), surfaces, radius)
@@ -77,7 +83,7 @@ class ShownShot:
         noise: (n, 3) m, standard deviation of each measured coordinate; NaN if unknown.  state_times: (m,) s.
         states: (m, 9) position m, velocity m/s, spin rad/s.  state_sigmas: (m, 9) in the same units.
         predicted_times: (k,) s.  predicted: (k, 3) m.  predicted_sigmas: (k, 3) m, of a measured position.
-        marks: contacts and hits in the states.
+        marks: contacts and hits in the states.  labels: (m,) what the ball does at each state; empty if unknown.
     """
 
     name: str
@@ -91,6 +97,12 @@ class ShownShot:
     predicted: Array = field(default_factory=lambda: np.zeros((0, 3)))
     predicted_sigmas: Array = field(default_factory=lambda: np.zeros((0, 3)))
     marks: tuple[Mark, ...] = ()
+    labels: NDArray[np.str_] = field(default_factory=lambda: np.zeros(0, np.str_))
+
+    @property
+    def flying(self) -> list[bool] | None:
+        """(m,) True at states of flight, a lost sample within it included; None without labels."""
+        return [label in (FLIGHT, LOST) for label in self.labels.tolist()] if len(self.labels) else None
 
     @property
     def start(self) -> float:

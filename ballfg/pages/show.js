@@ -7,6 +7,7 @@ const colour = name => getComputedStyle(document.documentElement).getPropertyVal
 const AXES = ["x", "y", "z"];
 const AXIS_COLOURS = ["#0072b2", "#e69f00", "#009e73"];
 const ESTIMATE = "#0072b2", PREDICTION = "#d55e00", SPIN = "#aa4499", TABLE = "#2f7d6b";
+const LABELS = {held: "#cc79a7", rolling: "#999933", resting: "#666666", lost: "#dd3311"};  // what is no flight
 const BAND = page.half_width;
 const RING = 12;            // corners of a tube's cross-section
 const ARROWS = 14;          // spin axes that are drawn along a shot
@@ -131,7 +132,7 @@ function spinArrows() {
   const x = [], y = [], z = [], heads = {x: [], y: [], z: [], u: [], v: [], w: [], text: []};
   for (let i = 0; i < count; i += every) {
     const spin = shot.states.slice(6, 9).map(s => s[i]);
-    if (spin.some(s => s === null)) continue;
+    if (spin.some(s => s === null) || !flies(i)) continue;
     const from = shot.states.slice(0, 3).map(p => p[i]), to = from.map((p, a) => p + SPIN_LENGTH * spin[a]);
     x.push(from[0], to[0], null); y.push(from[1], to[1], null); z.push(from[2], to[2], null);
     heads.x.push(to[0]); heads.y.push(to[1]); heads.z.push(to[2]);
@@ -160,6 +161,16 @@ function marks() {
   return traces;
 }
 
+// Rows of the states with a label, or of flight where none has one.
+const labelled = label => shot.state_t.map((_, i) => i).filter(i => (shot.labels[i] ?? "flight") === label);
+const flies = i => ["flight", "lost"].includes(shot.labels[i] ?? "flight");
+const flying = row => shot.labels.length ? row.map((value, i) => flies(i) ? value : null) : row;
+
+function others(place) {
+  return Object.entries(LABELS).map(([label, tint]) => [label, tint, labelled(label)]).filter(one => one[2].length)
+    .map(([label, tint, rows]) => place(label, tint, rows));
+}
+
 // From where to where each axis goes: about the samples, the estimate and the table. A prediction past a hit goes anywhere.
 function room() {
   const table = page.table === null ? [[], [], []] : [page.table.extent.slice(0, 2), page.table.extent.slice(2),
@@ -182,8 +193,10 @@ function drawSpace() {
     const words = (t, i) => `estimate at ${t.toFixed(4)} s<br>${placeWords(places, i)}<br>speed ` +
       `${Math.hypot(...velocity.map(v => v[i])).toFixed(2)} m/s${spread(shot.state_sigmas, i)}`;
     const style = {mode: "lines", name: "estimate", line: {color: ESTIMATE, width: 5}};
-    traces.push(broken(cloud(places, shot.state_t, words, style), shot.state_t));
-    traces.push(...tube(shot.state_t, places, shot.state_sigmas, scale, {color: ESTIMATE, name: "its 90 % tube"}));
+    traces.push(broken(cloud(places.map(flying), shot.state_t, words, style), shot.state_t));
+    traces.push(...tube(shot.state_t, places, shot.state_sigmas.map(flying), scale, {color: ESTIMATE, name: "its 90 % tube"}));
+    traces.push(...others((label, tint, rows) => cloud(places.map(p => rows.map(i => p[i])), rows.map(i => shot.state_t[i]),
+      t => `${label} at ${t.toFixed(4)} s`, {mode: "markers", name: label, marker: {size: 3.5, color: tint}})));
   }
   if (hasPredictions()) {
     const words = (t, i) => `predicted for ${t.toFixed(4)} s<br>${placeWords(shot.predicted, i)}${spread(shot.predicted_sigmas, i)}`;
@@ -245,9 +258,11 @@ function drawByAxis() {
       traces.push(broken(line(shot.predicted_t, shot.predicted[a], style), shot.predicted_t));
     }
     if (hasStates()) {
-      traces.push(band(shot.state_t, shot.states[a], shot.state_sigmas[a], ESTIMATE, on));
+      traces.push(band(shot.state_t, shot.states[a], flying(shot.state_sigmas[a]), ESTIMATE, on));
       const style = {mode: "lines", line: {color: ESTIMATE, width: 1.5}, ...first("estimate")};
-      traces.push(broken(line(shot.state_t, shot.states[a], style), shot.state_t));
+      traces.push(broken(line(shot.state_t, flying(shot.states[a]), style), shot.state_t));
+      traces.push(...others((label, tint, rows) => line(rows.map(i => shot.state_t[i]), rows.map(i => shot.states[a][i]),
+        {mode: "markers", marker: {size: 4, color: tint}, ...first(label)})));
     }
   }
   Plotly.react("axes", traces, stacked(AXES, "m"), CONFIG);
@@ -325,8 +340,9 @@ function showMoment() {
   if (hasStates()) {
     const [velocity, spin] = [shot.states.slice(3, 6), shot.states.slice(6, 9)].map(part => part.map(row => row[i]));
     words[1] += ` (± ${shot.state_sigmas.map(s => mm(s[i])).join(", ")})`;
-    if (!velocity.includes(null)) words.push(`speed ${Math.hypot(...velocity).toFixed(2)} m/s`);
-    if (!spin.includes(null)) words.push(`spin ${Math.hypot(...spin).toFixed(0)} rad/s`);
+    if (shot.labels.length) words.push(shot.labels[i]);
+    if (flies(i) && !velocity.includes(null)) words.push(`speed ${Math.hypot(...velocity).toFixed(2)} m/s`);
+    if (flies(i) && !spin.includes(null)) words.push(`spin ${Math.hypot(...spin).toFixed(0)} rad/s`);
   }
   element("readout").textContent = words.join(" · ");
   Plotly.restyle("space", {x: [[places[0][i]]], y: [[places[1][i]]], z: [[places[2][i]]]}, [ballTrace]);

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.pages.html import Html, explained, items, section, table, tag
+from ballfg.pages.html import Html, doubtful, explained, items, section, table, tag
 from ballfg.pages.outline import NET_HEIGHT, Outline
 from ballfg.pages.page import own, whole_page
-from ballfg.pages.shot import GAP, HALF_WIDTH, LEVEL, ShownShot
+from ballfg.pages.shot import FLIGHT, GAP, HALF_WIDTH, LEVEL, ShownShot
 from ballfg.pages.shown import Shown
 from ballfg.state import POSITION, SPIN, VELOCITY
 
@@ -24,7 +24,8 @@ CANDIDATES = 10  # Number of effects of a diagnosis in the drawing, those that e
 def show_page(shown: Shown) -> str:
     """The whole page, self-contained. Args: shown: result of `collect`."""
     name = _name(shown)
-    header = tag("header", tag("p", name), tag("h1", _sentence(shown)), items(shown.notes))
+    doubts = doubtful(() if shown.given.dataset is None else shown.given.dataset.info.doubts)
+    header = tag("header", tag("p", name), tag("h1", _sentence(shown)), doubts, items(shown.notes))
     parts = [_flight(shown), _measured_and_predicted(shown), _residuals(shown), _coverage(shown), _diagnosis(shown)]
     return whole_page(
         f"{name}: shots",
@@ -88,6 +89,8 @@ def _flight(shown: Shown) -> Html:
     )
     if shown.given.states is not None and shown.given.dataset is not None:
         words += " Contacts and hits are read off the states: where the ball turns up at a surface, and where it jumps."
+    if any((shot.labels != FLIGHT).any() for shot in shown.shots):
+        words += " Where the ball is held, rolls, rests or is lost the samples are drawn as measured, in other colours."
     space = _figure("space", "In space", words, "plot space")
     return section("The shot", choice, running, tag("p", "", kind="readout quiet", id="readout"), space)
 
@@ -238,6 +241,7 @@ def _shot(shot: ShownShot) -> dict[str, Any]:
         "residuals": _plain(shot.residuals().T, LENGTH_DECIMALS) if known else [],
         "state_t": _plain(shot.state_times - start, TIME_DECIMALS),
         "states": states,
+        "labels": shot.labels.tolist() if (shot.labels != FLIGHT).any() else [],
         "state_sigmas": _plain(shot.state_sigmas[:, :3].T, SIGMA_DECIMALS),
         "predicted_t": _plain(shot.predicted_times - start, TIME_DECIMALS),
         "predicted": _plain(shot.predicted.T, LENGTH_DECIMALS),

@@ -75,7 +75,9 @@ def collect(given: Given, names: Sequence[str] = (), limited: bool = True) -> Sh
     if given.dataset is not None and shots:
         table = outline(given.dataset.info, np.concatenate([shot.positions for shot in shots]))
         radius = given.dataset.ball.radius
-        shots = [replace(s, marks=tuple(marks(s.state_times, s.states, table.surfaces, radius))) for s in shots]
+        shots = [
+            replace(s, marks=tuple(marks(s.state_times, s.states, table.surfaces, radius, s.flying))) for s in shots
+        ]
         notes.append(table.words)
     return Shown(given, tuple(shots), len(known), table, held, noise, tuple(notes))
 
@@ -129,6 +131,7 @@ def _shot(given: Given, name: str, track: Track | None) -> ShownShot:
     if given.states is not None:
         rows = _rows(given.states, name, track)
         shot = replace(shot, state_times=rows[:, 0], states=rows[:, 1:10], state_sigmas=rows[:, 10:])
+        shot = replace(shot, labels=given.states.labels[given.states.rows.get(name, slice(0))])
     if given.predictions is not None:
         rows = _rows(given.predictions, name, track)
         shot = replace(shot, predicted_times=rows[:, 0], predicted=rows[:, 1:4], predicted_sigmas=rows[:, 4:])

@@ -19,6 +19,7 @@ from ballfg.tracks import csv_files
 from ballfg.tracks.rows import distinct
 
 KEYS = ("trajectory", "t")
+LABEL = "label"
 LARGEST = 1e12  # Largest number in a table, in SI units; sums and squares of larger ones overflow a page's numbers
 
 
@@ -36,12 +37,14 @@ class ResultTable:
     Attributes:
         path: of the file.  kind: of the table.  rows: of each track, in the order in which the tracks first appear.
         values: (rows, 1 + c) t in s and the columns of the kind, sorted by track and time.
+        labels: (rows,) what the ball does at each state; empty without the column `label`.
     """
 
     path: Path
     kind: Kind
     rows: Mapping[str, slice]
     values: Array
+    labels: NDArray[np.str_]
 
     def of(self, name: str) -> Array:
         """(k, 1 + c) rows of a track in the units of the columns; empty for an unknown track."""
@@ -70,16 +73,19 @@ def read_table(path: Path, kind: Kind) -> ResultTable:
     Raises: ValueError: no rows, text in place of a number, or a stamp that is not finite.
     """
     names = [*KEYS, *kind.value]
-    types = {"trajectory": pa.dictionary(pa.int32(), pa.string())} | dict.fromkeys(names[1:], pa.float64())
+    labelled = kind is Kind.STATES and LABEL in columns_of(path)
+    text = pa.dictionary(pa.int32(), pa.string())
+    types = {"trajectory": text} | dict.fromkeys(names[1:], pa.float64())
+    types |= {LABEL: text} if labelled else {}
     is_csv = path.suffix.lower() != ".parquet"
     try:
         if not is_csv:
             with open_parquet(path) as file:
-                found = file.read(columns=names).select(names)
-            found = pa.table({name: _as(found[name], types[name]) for name in names})
+                found = file.read(columns=[*types]).select([*types])
+            found = pa.table({name: _as(found[name], types[name]) for name in types})
         else:
             options = pa_csv.ConvertOptions(
-                column_types=types, include_columns=names, strings_can_be_null=False, null_values=["", "nan", "NaN"]
+                column_types=types, include_columns=[*types], strings_can_be_null=False, null_values=["", "nan", "NaN"]
             )
             found = pa_csv.read_csv(path, convert_options=options)
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
@@ -103,7 +109,8 @@ def read_table(path: Path, kind: Kind) -> ResultTable:
     order = np.lexsort((values[:, 0], codes))
     ends = np.cumsum(np.bincount(codes, minlength=len(tracks))).tolist()
     rows = map(slice, [0, *ends], ends)
-    return ResultTable(path, kind, dict(zip(tracks, rows, strict=True)), values[order])
+    labels = np.array(found[LABEL].to_pylist() if labelled else [], dtype=np.str_)
+    return ResultTable(path, kind, dict(zip(tracks, rows, strict=True)), values[order], labels[order[: len(labels)]])
 
 
 def _as(column: pa.ChunkedArray, kind: pa.DataType) -> pa.ChunkedArray:

@@ -15,6 +15,9 @@ SURE: Final = 0.95
 LEAST: Final = 0.02
 """Smallest change, as a share of the errors, that counts: fitted coefficients cost about as much where nothing is
 gained."""
+DENSER: Final = 0.1
+"""Smallest rise of the logarithm of a coordinate's density that counts where errors do not decide: a population that is
+known narrows intervals by 0.01 to 0.06 where nothing is gained (16 simulated sets, seeds 600 to 615)."""
 SMALLEST: Final = 1e-9
 """m, of an error."""
 
@@ -25,17 +28,22 @@ class Gain:
 
     Attributes:
         mean: geometric mean over tracks, minus one.  low, high: the ends of its 95 % interval.  tracks: their number.
+        density: mean and lower end of the rise of the logarithm of a measured coordinate's density, both models with
+            the noise that the fitted tracks show; None if unknown.
     """
 
     mean: float
     low: float
     high: float
     tracks: int
+    density: tuple[float, float] | None = None
 
     @property
     def word(self) -> str:
-        """Better, worse, or no different: by the interval alone."""
+        """Better, worse, or no different: by the interval of the errors, then by that of the density."""
         if self.high < 0.0 and self.mean < -LEAST:
+            return "better"
+        if self.density is not None and self.density[1] > DENSER and self.low <= 0.0:
             return "better"
         return "worse" if self.low > 0.0 and self.mean > LEAST else "no different"
 
@@ -43,7 +51,14 @@ class Gain:
         return (
             f"errors change by {100 * self.mean:+.0f} % ({100 * self.low:+.0f} to {100 * self.high:+.0f} %, 95 % "
             f"interval over {self.tracks} tracks that were not fitted)"
-        )
+        ) + ("" if self.density is None else f"; what was measured is {np.exp(self.density[0]):.2f} times as probable")
+
+
+def denser(before: Array, after: Array) -> tuple[float, float]:
+    """Mean rise of log scores (n,) of the same tracks, n > 1, and the lower end of its 95 % interval."""
+    rise = after - before
+    reach = float(stats.t.ppf(0.5 + SURE / 2.0, len(rise) - 1) * rise.std(ddof=1) / np.sqrt(len(rise)))
+    return float(rise.mean()), float(rise.mean()) - reach
 
 
 def gain_of(before: Array, after: Array) -> Gain | None:

@@ -1,7 +1,7 @@
 """Reports a calibration as `report.json` and as text: coefficients and errors before and after."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,7 @@ class Comparison:
         pairs: (n, 2) m, RMSE before and after of each track.
         failed: number of tracks that could not be judged each time.
         written: (n,) m, RMSE of each track with the model that is written, with its population and noise.
+        density: as of `Gain`; None where the errors alone decide.
     """
 
     before: Summary | None
@@ -38,6 +39,7 @@ class Comparison:
     pairs: np.ndarray
     failed: int
     written: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    density: tuple[float, float] | None = None
 
     @property
     def gain(self) -> Gain | None:
@@ -47,7 +49,9 @@ class Comparison:
         """
         written = gain_of(self.pairs[: len(self.written), 0], self.written)
         plain = gain_of(self.pairs[:, 0], self.pairs[:, 1])
-        return written if written is not None and written.word == "worse" else plain
+        if written is not None and written.word == "worse":
+            return written
+        return None if plain is None else replace(plain, density=self.density)
 
 
 def compare(

@@ -8,10 +8,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from ballfg.dynamics import save_model
+from ballfg.dynamics.domain import Domain
 from ballfg.dynamics.model_file import model_to_dict
 from ballfg.files.damaged import whole_content
 from ballfg.learning.calibration.auto import (
@@ -37,15 +39,17 @@ from ballfg.learning.calibration.calibrate import (
     with_scores,
     with_shown_noise,
 )
+from ballfg.learning.calibration.gain import denser
 from ballfg.learning.calibration.picture import draw
 from ballfg.learning.calibration.report import compare, outcome, report, table
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.config_file import AUTO
-from ballfg.learning.evaluation import summary
+from ballfg.learning.evaluation import TrackScore, summary
 from ballfg.learning.run import run_folder as files
 from ballfg.learning.run.record import NOT_BETTER
 from ballfg.learning.training_data import analytic_model, open_source
 from ballfg.progress import Watch
+from ballfg.tracks import Dataset
 from ballfg.tracks.noise import TrackNoise
 
 
@@ -202,11 +206,15 @@ def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch,
     shown = spread if noise is None else score(problem, model, watch, noise.settings)
     after = last.scores if problem.correction is None else spread  # a correction goes with its spins
     comparison = compare(steps[0].scores, after, spread, shown)
+    if comparison.gain is not None and comparison.gain.word == "no different" and noise is not None:
+        comparison = replace(comparison, density=_density(problem, shown, watch))
     found = report(problem, last, comparison, noise)
     model.noise = None if noise is None else noise.noise
     if problem.dataset.one_view:  # its tracks cannot correct a drag: the model file states how sure it is
         model.noise = TrackNoise(coefficients={name: last.next_track[k] for k, name in problem.chosen.listed})
     model.spins = population.spins
+    if isinstance(problem.dataset, Dataset):
+        model.domain = Domain.of(track for track in problem.dataset if track.name in problem.split.fit)
     save_model(model, folder / files.MODEL)
     files.write_json(folder / files.REPORT, found)
     draw(problem, last, comparison, folder / files.PICTURE)
@@ -214,6 +222,16 @@ def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch,
     print(f"{folder / files.MODEL}: the calibrated model, for the --model of other commands")
     print(f"{folder / files.REPORT}: all numbers\n{folder / files.PICTURE}")
     return status_of(outcome(comparison), proven=proven)
+
+
+def _density(problem: Problem, written: Sequence[TrackScore | None], watch: Watch) -> tuple[float, float] | None:
+    """The rise of the density from the model before, with the noise that tracks show about it, to the written one."""
+    noise = fitted_noise(problem, problem.model, problem.settings, watch, errors=False)
+    if noise is None:
+        return None
+    before = score(problem, problem.model, watch, noise.settings)
+    pairs = [(b.log_score, a.log_score) for b, a in zip(before, written, strict=True) if b and a]
+    return denser(*np.array(pairs).T) if len(pairs) > 1 else None
 
 
 def write_checkpoint(folder: Path, problem: Problem, steps: Sequence[Step], corrected: Sequence[Step] = ()) -> None:

@@ -23,6 +23,7 @@ from ballfg.learning.run.metrics import Epoch, epoch_line, read_metrics, write_m
 from ballfg.learning.run.training_page import beside_untrained, improved, page, verdict
 from ballfg.learning.trainee import PredictedShot
 from ballfg.machine import date, versions
+from ballfg.tracks import read_dataset
 
 SCALARS = {
     "loss/train": ("loss", 1.0),
@@ -129,8 +130,9 @@ class Record:
         following = shlex.join(words) if model.is_file() else ""
         origin = {"made on": date()} | ({"command": self.command} if self.command else {}) | {"data": ", ".join(data)}
         origin["with"] = ", ".join(f"{name} {version}" for name, version in versions(files.PACKAGES).items())
+        doubts = [doubt for folder in data for doubt in read_dataset(folder).info.doubts]
         drawn, learned = curves(self.epochs, self.title), self.training.task.trainee.learned()
-        text = page(self.title, self.epochs, best, drawn, learned, shot, following, origin, untrained)
+        text = page(self.title, self.epochs, best, drawn, learned, shot, following, origin, untrained, doubts)
         write_text(self.folder / files.PAGE, text)
 
     def median_shot(self) -> PredictedShot | None:

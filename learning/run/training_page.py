@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from ballfg.arrays import Array
 from ballfg.learning.run.metrics import Epoch
 from ballfg.learning.trainee import Learned, PredictedShot
-from ballfg.pages.html import Html, explained, items, meanings, picture, section, table, tag, typed
+from ballfg.pages.html import Html, doubtful, explained, items, meanings, picture, section, table, tag, typed
 from ballfg.pages.page import whole_page
 
 MEASURED, PREDICTED = "#8c8c8c", "#0072b2"
@@ -74,6 +74,7 @@ def page(
     next_command: str,
     origin: Mapping[str, str],
     untrained: float | None = None,
+    doubts: Sequence[str] = (),
 ) -> str:
     """The whole page.
 
@@ -84,6 +85,7 @@ def page(
         next_command: the command to type next, or empty.
         origin: date, versions, command: what the page comes from, by its name.
         untrained: RMSE of the analytic model on the validation tracks, m; None where it is not known.
+        doubts: what is not sure about the tracks.
     """
     first = f"{verdict(epochs, best_epoch)} {beside_untrained(epochs, best_epoch, untrained)}".strip()
     caption = "Loss (a pure number) and root mean square errors (mm) after each epoch. An axis of powers of ten is "
@@ -93,7 +95,7 @@ def page(
     head = ("number", "before", "after", "unit", "what it is")
     return whole_page(
         f"training: {title}",
-        tag("header", tag("p", title), tag("h1", first)),
+        tag("header", tag("p", title), tag("h1", first), doubtful(doubts)),
         section("What to do next", *_next(improved(epochs, best_epoch), next_command)),
         _numbers(epochs, best_epoch),
         section("The course of the training", picture(curves, f"{caption}logarithmic.")),

@@ -12,6 +12,7 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 import pytest
 
+from ballfg.estimation.configure import FEW_TRACKS
 from ballfg.estimation.registry import ESTIMATORS
 from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.tracks import read_dataset
@@ -47,7 +48,8 @@ def test_one_row_of_finite_numbers_for_each_stamp(
     said = capsys.readouterr()
     notes = [line for line in said.err.splitlines() if not line.endswith("tracks estimated")]  # progress may show
     assert notes == []
-    assert said.out.startswith(f"{out}: ")
+    assert said.out.splitlines()[0] == f"doubt: {FEW_TRACKS}"
+    assert said.out.splitlines()[1].startswith(f"{out}: ")
     assert f"states of 4 tracks by {method}" in said.out
     assert "  4 tracks: converged\n" in said.out
     table = pa_csv.read_csv(out, convert_options=pa_csv.ConvertOptions(column_types={"trajectory": "string"}))
@@ -118,7 +120,7 @@ def test_from_any_folder_with_relative_paths(
     monkeypatch.chdir(tmp_path / "elsewhere")
     options = ("--method", "sliding-window", "--model", "../my shots/model.yaml", "--out", "my states.csv")
     assert status("estimate", "../my shots", *options) == 0
-    assert capsys.readouterr().out.startswith("my states.csv: ")
+    assert "\nmy states.csv: " in capsys.readouterr().out
     assert (tmp_path / "elsewhere" / "my states.csv").is_file()
 
 

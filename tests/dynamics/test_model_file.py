@@ -93,13 +93,13 @@ def test_missing_file(tmp_path):
         (b"\xff\xfe\x00", r"not readable as YAML \("),
         (
             "- 1\n- 2\n",
-            r"a mapping with the sections flight, bounce, measurement, variations, populations, learned; got \[1, 2\]$",
+            r"with the sections flight, bounce, measurement, variations, populations, domain, learned; got \[1, 2\]$",
         ),
         ("", r"a model is a mapping with the sections .*; got None$"),
         ("flights: {}\nbounce: {}", r"unknown section 'flights'; did you mean 'flight'\?$"),
         (
             "flight: {}\nbounce: {}\nradius: 2",
-            r"unknown section 'radius'; known ones: flight, bounce, measurement, variations, populations, learned$",
+            r"section 'radius'; known ones: flight, bounce, measurement, variations, populations, domain, learned$",
         ),
         ("1: {}", r"unknown section '1'; known ones: "),
         ("flight: {}", r"section 'bounce' is missing; write 'bounce: \{\}' for no effects$"),

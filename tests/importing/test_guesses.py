@@ -6,13 +6,14 @@ import os
 import pty
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import ballfg as bf
-from ballfg.importing.bounces import surface, turns_of
+from ballfg.importing.bounces import Turn, evidence, reverses, surface, turns_of
 from ballfg.importing.choices import UndecidedError
 from ballfg.importing.fall import AXES, scales
 from ballfg.importing.frame import TURNS
@@ -49,6 +50,25 @@ def test_a_bounce_between_samples() -> None:
     assert found is not None
     assert found.bounces == 20
     assert found.centre == pytest.approx(0.8, abs=0.003)
+
+
+def test_a_surface_has_one_restitution_and_hits_keep_the_ball_in_the_air() -> None:
+    rng = np.random.default_rng(4)
+    bounces = [Turn(0.8 + h, 0.75 + e, 0.2) for h, e in zip(*rng.normal(0.0, [[0.003], [0.03]], (2, 8)), strict=True)]
+    speeds = rng.uniform(2.0, 4.5, 9)
+    hits = [Turn(0.8, up / down, 0.2) for down, up in pairwise(speeds)]
+    kept_up = [Turn(turn.height, turn.restitution + 0.25, 0.2) for turn in bounces]
+    assert evidence(bounces) > 5.0
+    assert max(evidence(hits), evidence(kept_up)) < -5.0
+    assert evidence(bounces[:1]) < 3.0  # one turn shows neither one height nor one restitution
+
+
+def test_walls_and_rackets_reverse_a_motion() -> None:
+    t, p = thrown(0.003)
+    back = p.copy()
+    back[t > 0.5, 0] = 2.0 * p[np.searchsorted(t, 0.5), 0] - p[t > 0.5, 0]
+    assert not reverses(t, p)
+    assert reverses(t, back)
 
 
 @pytest.mark.parametrize(
@@ -178,3 +198,14 @@ def test_files_under_other_names(tmp_path: Path) -> None:
     (tmp_path / "b.npz").rename(tmp_path / "b.data")
     for name in ("a.npy", "b.data"):
         np.testing.assert_allclose(bf.import_tracks(tmp_path / name)["000"].positions, p, atol=1e-12)
+
+
+def test_places_that_stick_to_a_limit_and_stated_units_that_do_not_fall_are_doubts() -> None:
+    shots = [thrown(0.003, seed) for seed in range(6)]
+    rows = [np.column_stack((t, np.minimum(p, [0.9, 9.0, 9.0]))) for t, p in shots]
+    clipped = bf.import_tracks(rows, length="m", time="s", up="z").info.doubts
+    assert any(one.startswith("x is clipped: 6 times it stays at 0.9 m") for one in clipped)
+    plain = [np.column_stack(shot) for shot in shots]
+    assert bf.import_tracks(plain, length="m", time="s", up="z").info.doubts == ()
+    wrong = bf.import_tracks(plain, length="ft", time="s", up="z", table_height=0.0).info.doubts
+    assert any("in m and s with z up, not in ft" in one for one in wrong)

@@ -49,6 +49,18 @@ def test_balls_within_shots(tmp_path: Path) -> None:
     _right(bf.import_tracks(file), [f"{shot}-{name}" for shot in ("a", "b") for name in BALLS])
 
 
+@pytest.mark.parametrize("column", ["ball", "what"])
+def test_numbered_shots_of_each_ball(column: str, tmp_path: Path) -> None:
+    t, paths = _paths()
+    rows = [(name, drop, s, h) for name, p in paths.items() for drop in (1, 2)
+            for s, h in np.column_stack((t, p[:, 2])).tolist()]  # fmt: skip
+    file = tmp_path / "drops.csv"
+    file.write_text(f"{column},drop,time (s),height (m)\n" + "\n".join(",".join(map(str, row)) for row in rows))
+    data = bf.import_tracks(file)
+    assert data.names == [f"{name}-{drop}" for name in BALLS for drop in (1, 2)]
+    assert all(len(track) == len(t) for track in data)
+
+
 @pytest.mark.parametrize("stamped", [True, False])
 def test_qualisys(stamped: bool, tmp_path: Path) -> None:
     t, paths = _paths()

@@ -39,6 +39,13 @@ def test_the_floor_counts_and_one_state_has_no_marks() -> None:
     assert not list(marks(fall.times[:1], states[:1], (TABLE, 0.0), RADIUS))
 
 
+def test_nothing_is_marked_where_the_ball_is_held() -> None:
+    fall = Fall()
+    held = np.abs(fall.times - fall.contact) < 0.02
+    assert not list(marks(fall.times, fall.states(), (TABLE,), RADIUS, (~held).tolist()))
+    assert len(list(marks(fall.times, fall.states(), (TABLE,), RADIUS, np.ones(60, bool).tolist()))) == 1
+
+
 def test_nothing_is_marked_in_a_gap() -> None:
     fall = Fall()
     seen = np.abs(fall.times - fall.contact) > 0.06

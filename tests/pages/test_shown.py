@@ -5,10 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pa_csv
+import pyarrow.parquet as pq
 import pytest
 
 from ballfg.pages import shown as room
 from ballfg.pages.given import recognise
+from ballfg.pages.show_page import _shot
 from ballfg.pages.shown import collect
 from tests.pages.made import NOISE, Fall, Made, make
 
@@ -44,6 +48,22 @@ def test_noise_that_the_dataset_states_of_each_axis_comes_first(tmp_path: Path, 
     np.testing.assert_allclose(shown.shots[0].noise, np.broadcast_to(sigma, (60, 3)))
     x, y, z = (f"{1e3 * s:.2g}" for s in sigma)
     assert f"those of dataset.yaml: {x} mm in x, {y} mm in y, {z} mm in z." in shown.noise
+
+
+@pytest.mark.parametrize("ending", [".csv", ".parquet"])
+def test_labels_of_states_are_shown(made: Made, tmp_path: Path, ending: str) -> None:
+    table = pa_csv.read_csv(
+        made.states, convert_options=pa_csv.ConvertOptions(column_types={"trajectory": pa.string()})
+    )
+    labels = ["held" if t < 0.1 else "flight" for t in table["t"].to_pylist()]
+    for column, path in ((labels, tmp_path / f"s{ending}"), (["flight"] * len(labels), tmp_path / f"plain{ending}")):
+        whole = table.append_column("label", pa.array(column))
+        pa_csv.write_csv(whole, path) if ending == ".csv" else pq.write_table(whole, path)
+    (shot, *_), (plain, *_) = (
+        collect(recognise([made.dataset, tmp_path / f"{n}{ending}"])).shots for n in ("s", "plain")
+    )
+    assert shot.labels.tolist() == ["held"] * 10 + ["flight"] * 50
+    assert [_shot(one)["labels"] for one in (shot, plain)] == [shot.labels.tolist(), []]
 
 
 def test_results_without_a_dataset(made: Made) -> None:

@@ -77,7 +77,9 @@ def diagnose(
                 diagnosis = find(opened.dataset, opened.model, jobs=processes, watch=announce, name_at=name_at)
         typed = _typed(datasets, model, effects_file, observations_file, name_at, out)
         models = tuple(map(room_file, rooms)) or (MODEL,)
-        origin = Origin(typed, tuple(map(str, datasets)), "" if model is None else str(model), str(out), models)
+        origin = Origin(
+            typed, tuple(map(str, datasets)), "" if model is None else str(model), str(out), models, opened.doubts
+        )
         write_report(diagnosis, out, rooms, origin)
     print(*_summary(diagnosis), sep="\n")
     if rooms:

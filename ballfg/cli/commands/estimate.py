@@ -75,7 +75,9 @@ def estimate(
             outcome.add(result.name, result.status, result.notes, result.outside)
             rows, hits, flying = rows + result.rows, hits + result.hits, flying + result.flying
     if flying < rows:
-        inputs.print_doubts([f"{100 * flying / rows:.0f} % of the samples are flight; the rest is as measured"])
+        inputs.print_doubts(
+            [f"{100 * flying // rows} % of the samples are flight; the rest is held, rolls, rests or is lost"]
+        )
     print(f"{out}: {rows} states of {count} tracks by {method}; {hits} hits found")
     outcome.print()
     outcome.print_outside()
@@ -112,7 +114,7 @@ def _estimated(model: BallModel, estimator: Estimator, track: Track) -> _Estimat
         rows, hits, flying = (
             rows + len(part.times),
             hits + len(part.hits),
-            flying + int((part.labels != Label.HELD).sum()),
+            flying + int((part.labels == Label.FLIGHT).sum()),
         )
         status = part.status if status is None or part.status.failed else status
     outside = sum(shares) / rows if shares else None

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import typer
 
@@ -19,7 +18,6 @@ if TYPE_CHECKING:
     from ballfg.importing.proposal import Proposal
 
 _guess, _file = (partial(typer.Option, rich_help_panel=panel) for panel in ("Instead of a guess", "Files"))
-MOST_QUESTIONS = 8  # Largest number of questions on a terminal; after more something else is wrong
 WIDTH = 160  # Number of characters in a line of the proposal without a terminal
 
 
@@ -76,8 +74,8 @@ def import_(
 
 def _proposed(sources: list[Path], choices: Choices) -> Proposal:
     """The proposal; on a terminal the user answers the unsafe guesses."""
-    from ballfg.importing.choices import UndecidedError
-    from ballfg.importing.proposal import propose
+    from ballfg.importing.choices import AllUndecidedError, UndecidedError
+    from ballfg.importing.proposal import MOST_QUESTIONS, propose
 
     for _ in range(MOST_QUESTIONS):
         try:
@@ -85,21 +83,18 @@ def _proposed(sources: list[Path], choices: Choices) -> Proposal:
         except UndecidedError as question:
             if not (sys.stdin.isatty() and sys.stderr.isatty()):
                 raise
-            choices = _answered(question, choices)
+            one = question.questions[0] if isinstance(question, AllUndecidedError) else question
+            choices = _answered(one, choices)
     return propose(sources, choices)
 
 
 def _answered(question: UndecidedError, choices: Choices) -> Choices:
-    from ballfg.importing.choices import parse_columns
+    from ballfg.importing.choices import decided
 
     default = question.choices[0] if question.choices else None
     with idle():  # the user may take time to answer
         answer = typer.prompt(f"{question}\n--{question.option}", default=default, err=True)
-    field = question.option.replace("-", "_")
-    if field == "columns":
-        return replace(choices, columns={**choices.columns, **parse_columns(answer)})
-    decided: dict[str, Any] = {field: float(answer) if field in ("table_height", "rate", "split_gap") else answer}
-    return replace(choices, **decided)
+    return decided(choices, question.option, answer)
 
 
 def _show(proposal: Proposal) -> None:

@@ -32,6 +32,8 @@ MEANINGS = {
 """Meaning of each number, factor to its printed unit, and that unit."""
 UNKNOWN = 0.7  # Standard deviation of a logarithm beyond which the tracks give hardly more than the order of magnitude
 
+MOST_ERROR = 3.0  # The same that is printed at most, a factor of 20: beyond, the limits say what is known
+
 PRIOR = 1.2  # The same of positions from which the tracks say nothing: it is the prior's
 MOST = {
     "position": 0.5, "memory": 0.5, "stamp_jitter": 0.05, "spin_label": 2000.0, "spin_prior": 2000.0,
@@ -121,7 +123,8 @@ def _table(found: NoiseEstimate) -> list[str]:
         number = factor * (value["xyz".index(axis)] if axis else value)
         doubt = "  (hardly known)" if error >= UNKNOWN else ""
         limits = _limits(*(factor * limit for limit in found.intervals[name]))
-        lines.append(f"  {meaning.format(axis):52} {number:8.3g} x/: {math.exp(error):4.2f}  {unit}{limits}{doubt}")
+        factor_of_error = math.exp(min(error, MOST_ERROR))
+        lines.append(f"  {meaning.format(axis):52} {number:8.3g} x/: {factor_of_error:4.2f}  {unit}{limits}{doubt}")
     return lines
 
 

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 EVENTS_WITHIN, LONGEST, STEP = 3.0, 60.0, 0.005
 """s: range of the search for events, the largest one, and steps of the path that gives their probability."""
+LEAST_HELD, LEAST_JUDGED = 0.8, 5
+"""Share of what was measured that 90 % intervals hold, the mean over tracks, below which they are doubted; tracks."""
 
 
 def predict(
@@ -135,6 +137,8 @@ def predict(
             columns |= dict(zip(("sigma_x", "sigma_y", "sigma_z"), result.sigmas.T, strict=True))
             table.write(columns if result.outside is None else columns | {"outside": result.outside})
             outcome.add(result, plain.sigmas)
+    if scales is None:
+        inputs.print_doubts(outcome.contradicted())
     print(f"{out}: {outcome.rows} positions of {count} tracks, from the first {observe:g} s of each by {method}")
     outcome.print(observe)
     outcome.tracks.print_outside()
@@ -239,6 +243,8 @@ class _Outcome:
     held_by_own: int = 0
     finite: int = 0
     infinite: int = 0
+    judged: int = 0
+    shares: float = 0.0
     tracks: Outcome = field(default_factory=Outcome)
 
     def add(self, result: TrackPrediction, own_sigmas: np.ndarray) -> None:
@@ -256,10 +262,20 @@ class _Outcome:
         self.ended += len(result.times) == 0
         self.finite += int(finite.sum())
         self.infinite += int(np.isinf(result.sigmas).sum())
-        self.held += int((finite & (errors <= HALF_WIDTH * result.sigmas)).sum())
+        held = finite & (errors <= HALF_WIDTH * result.sigmas)
+        self.held += int(held.sum())
+        if finite.any():
+            self.judged, self.shares = self.judged + 1, self.shares + held.sum() / finite.sum()
         self.held_by_own += int((finite & (errors <= HALF_WIDTH * own_sigmas)).sum())
         outside = None if result.outside is None or not len(result.outside) else float(result.outside.mean())
         self.tracks.add(result.name, result.status, result.estimate.notes, outside)
+
+    def contradicted(self) -> tuple[str, ...]:
+        """A sentence on intervals that hold clearly less of what was measured than they state, by their mean share."""
+        if self.judged < LEAST_JUDGED or (mean := self.shares / self.judged) >= LEAST_HELD:
+            return ()
+        said = f"90 % intervals hold {100 * mean:.0f} % of what was measured there; widen them with --conformal"
+        return (f"{said} and calibration tracks of the same kind",)
 
     def print(self, observe: float) -> None:
         """Prints the counts of tracks by status and the errors of their predictions."""

@@ -14,6 +14,7 @@ class Origin:
 
     Attributes:
         model: the declared model's file; empty for the nominal model.
+        doubts: what is not sure about the tracks.
         models: file of the corrected model of each dataset, in the folder `out` of the report.
     """
 
@@ -22,6 +23,7 @@ class Origin:
     model: str
     out: str
     models: tuple[str, ...] = ("model.yaml",)
+    doubts: tuple[str, ...] = ()
 
 
 def packages() -> str:

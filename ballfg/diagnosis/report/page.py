@@ -18,7 +18,7 @@ from ballfg.diagnosis.report.wording import NONE, capital, fixed, joined, number
 from ballfg.diagnosis.result import Diagnosis, Finding, Residuals, Value, Verdict
 from ballfg.dynamics import EFFECTS
 from ballfg.machine import date
-from ballfg.pages.html import Html, items, picture, section, table, tag, typed
+from ballfg.pages.html import Html, doubtful, items, picture, section, table, tag, typed
 from ballfg.pages.page import whole_page
 
 BADGES = {Verdict.FOUND: "found", Verdict.NOTHING: "nothing", Verdict.UNEXPLAINED: "unexplained"}
@@ -29,12 +29,13 @@ def page(diagnosis: Diagnosis, origin: Origin | None = None) -> str:
     """The whole page; origin: its command and files, if known."""
     badge = tag("span", answer(diagnosis), kind=f"badge {BADGES[diagnosis.verdict]}")
     question = tag("p", f"{diagnosis.dataset} · what does the model lack? ", badge)
+    doubts = doubtful(origin.doubts if origin is not None else ())
     values = (term("coefficient"), "declared", "fitted" + (" with the added effects" if diagnosis.findings else ""))
     calibrated = table(values, _values(diagnosis.calibrated))
     noise = table(("position noise along", "stated", "estimated"), _values(_in_mm(diagnosis.noise)))
     return whole_page(
         f"{diagnosis.dataset}: diagnosis",
-        tag("header", question, tag("h1", headline(diagnosis)), _in_short(diagnosis)),
+        tag("header", question, tag("h1", headline(diagnosis)), doubts, _in_short(diagnosis)),
         section("What to do next", *_next(diagnosis, origin)),
         errors(diagnosis),
         parts_of_error(diagnosis),

@@ -139,7 +139,7 @@ class SearchLoop:
             judged,
             whole,
             (*stamp_hypotheses(stamps), *final.named),
-            (*stamp_findings(first, stamps), *findings),
+            (*stamp_findings(first, stamps, whole), *findings),
             tuple(ranking(r.scored, r.refits, r.added, odds) for r in found.rounds),
             odds,
         )

@@ -9,6 +9,7 @@ from ballfg.diagnosis.fit.problem import Fit, Problem
 from ballfg.diagnosis.fit.stamps import Stamps
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, with_effects, without_effect
 from ballfg.diagnosis.result import Finding
+from ballfg.diagnosis.search.ranking import fitted_values
 from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.effects.measurement import CountedFrames, TimeScale
 
@@ -51,9 +52,9 @@ def as_declared(model: AnalyticModel, stamps: Stamps) -> AnalyticModel:
     return bare
 
 
-def stamp_findings(fit: Fit, stamps: Stamps) -> tuple[Finding, ...]:
-    """Effects on stamps with their evidence; their coefficients come from the last fit of a search."""
-    tracks = len(np.unique(fit.problem.stretches.track))
+def stamp_findings(first: Fit, stamps: Stamps, whole: Fit) -> tuple[Finding, ...]:
+    """Effects on stamps with their evidence in the first fit, and their coefficients in the last one of a search."""
+    tracks = len(np.unique(first.problem.stretches.track))
     findings = []
     for hypothesis in stamp_hypotheses(stamps):
         own, held_out = stamps.found[hypothesis.name]
@@ -61,7 +62,7 @@ def stamp_findings(fit: Fit, stamps: Stamps) -> tuple[Finding, ...]:
             Finding(
                 name=hypothesis.name,
                 kind=hypothesis.effect.kind,
-                parameters={},
+                parameters=fitted_values(whole, hypothesis),
                 p_value=own.p_value,
                 delta_bic=float(np.log(tracks)) - 2.0 * tracks * own.gain,
                 indistinguishable_from=(),

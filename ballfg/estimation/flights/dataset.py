@@ -13,8 +13,8 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.dynamics.nominal import nominal_model
 from ballfg.estimation.flights.cut import Piece, names_of, pieces_of, tracks_of
-from ballfg.estimation.flights.falling import contrasts
-from ballfg.estimation.flights.labels import Labels, label_samples
+from ballfg.estimation.flights.falling import contrasts, scatter
+from ballfg.estimation.flights.labels import FEWEST, Labels, label_samples
 from ballfg.estimation.result import Label
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.tracks import Dataset, Track
@@ -25,9 +25,14 @@ SMOOTHED: Final = 1.35
 """Ratio of the errors over 0.25 s to those from sample to sample beyond which a filter smoothed the positions: on five
 measured sets it is at most 1.18, on simulated recordings (seeds 0 to 83) at most 1.08, after a low-pass of 6 Hz at
 least 1.58."""
+OTHERS: Final = 0.1
+"""Share of the samples that no motion of the ball explains from which they are worth a doubt."""
+FARTHEST: Final = 0.1
+"""m. Scatter from sample to sample beyond that of trackers."""
 UNDISTURBED: Final = 0.2
 """Quantile of that ratio: stretches with a bounce or a hit have larger ones."""
 SMOOTHING: Final = "a filter smoothed the positions"
+OTHER: Final = "of another ball, or outliers"
 SPAN: Final = 0.25
 """s, of the cubics whose residuals show the errors."""
 LEAST_SPAN: Final = 8
@@ -79,6 +84,7 @@ class InFlight:
         tracks, mixed: number of tracks, and of those with something else than flight.
         share: of the samples that are flight, 0 to 1.
         smoothing: ratio of slow to fast errors of the positions; 1 if they are white; NaN if unknown.
+        others: sentence on samples that are not of the ball; empty without.
     """
 
     dataset: Dataset
@@ -86,6 +92,7 @@ class InFlight:
     mixed: int
     share: float
     smoothing: float
+    others: str
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -94,16 +101,18 @@ class InFlight:
         if self.mixed:
             cut = len(self.dataset) - (self.tracks - self.mixed)
             said.append(
-                f"{100 * self.share:.0f} % of the samples fall like a ball: {cut} flights of {self.mixed} tracks are "
+                f"{int(100 * self.share)} % of the samples fall like a ball: {cut} flights of {self.mixed} tracks are "
                 f"used, {self.tracks - self.mixed} tracks whole; the rest is held, rolls, rests or is lost"
             )
         return (*said, *self.filtered)
 
     @property
     def filtered(self) -> tuple[str, ...]:
-        """A sentence on a filter that smoothed the positions, unless `dataset.yaml` has it."""
-        known = any(SMOOTHING in doubt for doubt in self.dataset.info.doubts)
-        return () if known or not self.smoothing > SMOOTHED else (smoothed(self.smoothing),)
+        """Sentences on a filter that smoothed the positions and on other balls, unless `dataset.yaml` has them."""
+        found = {SMOOTHING: smoothed(self.smoothing)} if self.smoothing > SMOOTHED else {}
+        found |= {OTHER: self.others} if self.others else {}
+        known = " ".join(self.dataset.info.doubts)
+        return tuple(said for sign, said in found.items() if sign not in known)
 
     def check(self, where: object, anyway: bool, say: str = ", or say --anyway") -> None:
         """Refuses a dataset that is mostly no flight. Args: say: how to use it anyway. Raises: ValueError."""
@@ -122,6 +131,13 @@ def smoothed(ratio: float) -> str:
     )
 
 
+def others(lost: float, jump: float) -> str:
+    """The sentence on samples of other balls; empty without. Args: lost: their share.  jump: m, scatter of samples."""
+    if jump > FARTHEST:
+        return f"positions jump by {jump:.2g} m from sample to sample: they are {OTHER}"
+    return f"{100 * lost:.0f} % of the samples lie off the ball's path: they are {OTHER}" if lost > OTHERS else ""
+
+
 @lru_cache(maxsize=16)
 def in_flight(dataset: Dataset, most: int | None = None) -> InFlight:
     """The flights of a dataset.
@@ -138,7 +154,7 @@ def in_flight(dataset: Dataset, most: int | None = None) -> InFlight:
     found = Contents.of(labelled, whole)
     mixed = sum(pieces is not None for pieces in found.pieces.values())
     flights = FlightsOf(dataset, found.pieces) if mixed else dataset
-    return InFlight(flights, len(found.pieces), mixed, found.share, found.smoothing)
+    return InFlight(flights, len(found.pieces), mixed, found.share, found.smoothing, found.others)
 
 
 @dataclass(frozen=True)
@@ -148,27 +164,30 @@ class Contents:
     Attributes:
         pieces: flights by name of the track; None where a track is used as a whole.
         share: of the samples that are flight, 0 to 1.
-        smoothing: as of `InFlight`.
+        smoothing, others: as of `InFlight`.
     """
 
     pieces: dict[str, list[Piece] | None]
     share: float
     smoothing: float
+    others: str
 
     @classmethod
     def of(cls, labelled: Iterable[tuple[Track, Labels]], whole: Callable[[Track, Labels], bool]) -> Contents:
         """Of labelled tracks. Args: whole: True for a track that is used as a whole."""
         pieces: dict[str, list[Piece] | None] = {}
-        ratios, samples, flying = list[Array](), 0, 0
+        ratios, jumps, samples, flying, lost = list[Array](), list[float](), 0, 0, 0
         for track, labels in labelled:
             own = pieces[track.name] = None if whole(track, labels) else pieces_of(labels)
             samples += len(track)
+            lost += int((labels.values == Label.LOST).sum())
             flying += len(track) if own is None else int((labels.values == Label.FLIGHT).sum())
             if len(pieces) <= LOOKED_AT:
                 ratios.append(error_ratios(track, labels))
+                jumps += [float(scatter(track.seconds, track.positions).max())] if len(track) >= FEWEST else []
         held = np.concatenate(ratios)
         smoothing = float(np.quantile(held, UNDISTURBED)) if len(held) else np.nan
-        return cls(pieces, flying / samples, smoothing)
+        return cls(pieces, flying / samples, smoothing, others(lost / samples, float(np.median(jumps or [0.0]))))
 
 
 def error_ratios(track: Track, labels: Labels) -> Array:

@@ -99,7 +99,7 @@ def _assembled(
         for name, values in one.innovations.items():
             innovations.setdefault(name, []).append(values)
     share = float(np.mean(labels.values == Label.FLIGHT))
-    notes = (f"{100 * share:.0f} % of the samples are flight, in {len(parts)} parts; the rest is as measured",)
+    notes = (f"{int(100 * share)} % of the samples are flight, in {len(parts)} parts; the rest is as measured",)
     whole = Estimate(track.name, track.times, states, covariances, _status(found), notes=notes, labels=labels.values)
     if not found:
         return replace(whole, innovations={"position": np.full((n, 3), np.nan)}, quality=quality)

@@ -12,6 +12,7 @@ import pytest
 from ballfg.diagnosis.fit.holdout import hold_out
 from ballfg.diagnosis.fit.stamps import Evidence, Stamps
 from ballfg.diagnosis.hypotheses.hypothesis import with_effects
+from ballfg.diagnosis.report.plain_effects import in_plain_words
 from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_findings, stamp_hypotheses
 from ballfg.dynamics.effects.measurement import CountedFrames, TimeScale
 from ballfg.simulation import SimulationConfig, write_simulation
@@ -48,7 +49,9 @@ def test_the_first_fit_finds_how_far_the_clock_is_off(make_ball, make_launches, 
     fit = first_fit(make_ball(), replace(holdout, search=written, stamps=stamps))
     (free,) = (name for name in fit.problem.free if name.endswith("time_scale.s"))
     assert fit.unknowns.values[free] == pytest.approx(0.3, abs=0.01)
-    (finding,) = stamp_findings(fit, stamps)
+    (finding,) = stamp_findings(fit, stamps, fit)
+    assert finding.parameters["s"].value == fit.unknowns.values[free]
+    assert in_plain_words(finding) == "The clock is wrong: durations are written 30 % too long."
     assert (finding.name, finding.kind, finding.p_value) == ("time_scale", "measurement", 1e-9)
     assert (finding.held_out_gain, finding.held_out_p) == (0.6, 1e-5)
     assert finding.delta_bic == pytest.approx(math.log(16) - 2.0 * 16 * 0.8)

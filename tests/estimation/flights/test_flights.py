@@ -171,9 +171,10 @@ def test_estimates_and_predictions_of_recordings(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert status("estimate", folder, "--out", tmp_path / "s.csv") == 0
-    doubt, share = capsys.readouterr().out.splitlines()[:2]
+    doubt, noise, share = capsys.readouterr().out.splitlines()[:3]
     assert doubt == "doubt: the frame may be mirrored"
-    assert share.endswith("of the samples are flight; the rest is as measured")
+    assert "usual one" in noise
+    assert share.endswith("of the samples are flight; the rest is held, rolls, rests or is lost")
     assert {line.rpartition(",")[2] for line in (tmp_path / "s.csv").read_text().splitlines()[1:]} >= {"flight", "held"}
     assert status("predict", folder, "--observe", "0.2", "--out", tmp_path / "p.csv", "--anyway") == 0
     names = {line.partition(",")[0] for line in (tmp_path / "p.csv").read_text().splitlines()[1:]}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy import stats
 
 from ballfg.dynamics import nominal_model
 from ballfg.learning.calibration.calibrate import Problem, Step, pose
-from ballfg.learning.calibration.gain import gain_of
+from ballfg.learning.calibration.gain import denser, gain_of
 from ballfg.learning.calibration.report import Comparison, outcome, report, table, verdict
 from ballfg.learning.calibration.run import status_of
 from ballfg.learning.config.calibration import CalibrationConfig
@@ -73,6 +74,23 @@ def test_interval_is_students() -> None:
     assert gain is not None
     expected = stats.ttest_1samp(change, 0.0).confidence_interval(0.95)
     np.testing.assert_allclose(np.log1p([gain.low, gain.high]), expected, rtol=1e-9)
+
+
+def test_the_density_decides_where_errors_do_not() -> None:
+    rng = np.random.default_rng(2)
+    before = np.exp(rng.standard_normal(12))
+    gain = gain_of(before, before * np.exp(rng.normal(0.0, 0.2, 12)))
+    assert gain is not None
+    assert gain.word == "no different"
+    scores, rise = rng.normal(2.0, 1.0, 12), rng.normal(0.3, 0.1, 12)
+    mean, low = denser(scores, scores + rise)
+    assert low == pytest.approx(stats.ttest_1samp(rise, 0.0).confidence_interval(0.95).low)
+    for density, word in (((mean, low), "better"), ((0.3, 0.05), "no different"), ((0.05, 0.04), "no different")):
+        assert replace(gain, density=density).word == word
+    assert f"{np.exp(mean):.2f} times as probable" in str(replace(gain, density=(mean, low)))
+    worse = gain_of(before, 1.5 * before * np.exp(rng.normal(0.0, 0.01, 12)))
+    assert worse is not None
+    assert replace(worse, density=(mean, low)).word == "worse"
 
 
 def test_what_is_not_known_is_said(problem: Problem) -> None:

@@ -1,0 +1,54 @@
+"""The range of speeds, spins and places that a model was fitted on: of tracks, in files, and outside of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ballfg.dynamics import load_model, nominal_model, save_model
+from ballfg.dynamics.domain import Domain
+from ballfg.tracks import Track
+
+
+def _moving(speed: float, spin: float | None = None) -> Track:
+    """A track along x, with turning direction, so that its chords are shorter than its path by less than 1 %."""
+    times = np.arange(0.0, 1.0, 0.01)
+    labels = {} if spin is None else {"spin_x": spin, "spin_y": 0.0, "spin_z": 0.0}
+    return Track(times, np.stack((speed * times, 0.1 * times, np.ones_like(times)), axis=1), None, labels, name="a")
+
+
+def test_ranges_are_those_of_the_tracks() -> None:
+    found = Domain.of([_moving(2.0, 100.0), _moving(6.0, 300.0)])
+    assert found is not None
+    assert found.ranges["speed"] == pytest.approx((2.0025, 6.0008), abs=1e-3)
+    assert found.ranges["spin"] == (100.0, 300.0)
+    assert found.ranges["x"] == pytest.approx((0.0, 5.94), abs=0.08)
+    assert Domain.of([]) is None
+
+
+def test_what_lies_outside_is_said_with_its_share_and_quantity() -> None:
+    fitted = Domain({"speed": (2.0, 4.0), "x": (0.0, 10.0)})
+    assert fitted.doubts([_moving(3.0), _moving(4.1)], "m.yaml") == []  # within a tenth of the width
+    (said,) = fitted.doubts([_moving(3.0), _moving(5.0)], "m.yaml")
+    assert said.startswith("50 % of the samples lie outside of what m.yaml was fitted on")
+    assert "speed 2 to 4 m/s" in said
+    assert "x " not in said.partition("(")[2]
+
+
+def test_a_model_file_keeps_it(tmp_path: Path) -> None:
+    model = nominal_model()
+    model.domain = Domain({"speed": (1.5, 9.0), "z": (0.0, 2.0)})
+    save_model(model, tmp_path / "model.yaml")
+    assert load_model(tmp_path / "model.yaml").domain == model.domain
+    text = (tmp_path / "model.yaml").read_text()
+    (tmp_path / "model.yaml").write_text(text.replace("- 1.5", "- 15"))
+    with pytest.raises(ValueError, match="pairs of growing numbers"):
+        load_model(tmp_path / "model.yaml")
+
+
+@pytest.mark.parametrize("ranges", [{"colour": (0.0, 1.0)}, {"speed": (1.0,)}, {"speed": 3.0}, {"speed": (2.0, 1.0)}])
+def test_damaged_sections_are_refused(ranges: dict[str, tuple[float, float]]) -> None:
+    with pytest.raises(ValueError, match=r"domain: \{speed"):
+        Domain(ranges)
