@@ -12,14 +12,13 @@ from scipy.special import ndtr
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.rally.hits import HIT_SIGMA
 from ballfg.estimation.rally.reconstruct import ShotRally
 from ballfg.estimation.result import Estimate
 from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, STATE_DIM, VELOCITY, VZ, Z
 
 STEPS: Final = 81
 """Moments between two strokes at which their paths are compared."""
-RACKET: Final = 0.05
-"""m, standard deviation between the paths before and after a hit."""
 BEHIND: Final = (0.2, 0.25)
 """m behind the end of the court where a first stroke is hit, and its standard deviation."""
 LANDS: Final = 2.0
@@ -114,7 +113,7 @@ def hit_between(model: BallModel, before: Estimate, after: Estimate, step: float
         one, other = carried(model, before, -1, float(t)), carried(model, after, 0, float(t))
         first, second = (state.covariance[POSITION, POSITION] for state in (one, other))
         off = other.state[POSITION] - one.state[POSITION]
-        both = first + second + RACKET**2 * np.eye(3)
+        both = first + second + HIT_SIGMA**2 * np.eye(3)
         cost.append(float(off @ np.linalg.solve(both, off) + np.linalg.slogdet(both)[1]))
         gain = first @ np.linalg.inv(both)
         places.append(one.state[POSITION] + gain @ off)

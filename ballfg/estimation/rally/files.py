@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Final
 
 from ballfg.tracks.detections_file import DETECTIONS_FILE
+from ballfg.tracks.events_file import EVENTS_FILE
 from ballfg.tracks.info import INFO_FILE
 from ballfg.vision.camera_file import CAMERAS_FILE
 
-STATES, MOTION, EVENTS, STROKES = "states.csv", "camera_motion.csv", "events.csv", "strokes.csv"
+STATES, MOTION, EVENTS, STROKES = "states.csv", "camera_motion.csv", EVENTS_FILE, "strokes.csv"
 FILES: Final = (INFO_FILE, STATES, DETECTIONS_FILE, CAMERAS_FILE, MOTION, EVENTS, STROKES)
 """All written files."""
 VIDEOS: Final = (".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation import read_sighted
+from ballfg.estimation import Smoother, dataset_settings, dataset_surfaces, read_sighted
 from ballfg.estimation.rally.events import end_of, events_of, net_touches, stroke_row
 from ballfg.estimation.rally.files import is_rally
 from ballfg.estimation.rally.page import between, rally_page
@@ -106,6 +107,24 @@ def test_what_is_written_is_a_dataset_that_other_commands_read(made: tuple[Truth
     assert {"rho_xy", "rho_xz", "rho_yz"} <= set(header)
     kinds = {line.split(",")[2] for line in (folder / "events.csv").read_text(encoding="utf-8").splitlines()[1:]}
     assert kinds <= {"hit", "bounce", "lost", "net", "floor", "cut"}
+
+
+def test_estimates_from_the_written_dataset_are_those_of_track(made: tuple[Truth, Rally], folder: Path) -> None:
+    data = read_sighted(folder)
+    smoother = Smoother(MODEL, dataset_surfaces(data), dataset_settings(data, MODEL))
+    for before in made[1].shots[0].estimates:
+        again = smoother.estimate(data[before.name])
+        off = np.linalg.norm(again.states[:, POSITION] - before.states[:, POSITION], axis=1)
+        assert off.max() < 0.1 * np.sqrt(before.covariances[:, 0, 0].max() + before.covariances[:, 1, 1].max())
+        assert len(again.contacts) == len(before.contacts)
+
+
+def test_bounces_without_a_column_are_refused_in_one_line(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder, tmp_path / "other")
+    events = tmp_path / "other" / "events.csv"
+    events.write_text(events.read_text(encoding="utf-8").replace("kind", "sort", 1), encoding="utf-8")
+    with pytest.raises(ValueError, match=r"events.csv must have the columns trajectory, t, kind; kind is missing"):
+        read_sighted(tmp_path / "other")
 
 
 def falling(state: list[float], times: list[float]) -> Estimate:
