@@ -28,7 +28,7 @@ from tests.commands import status
 from tests.estimation.rallies import MODEL
 from tests.estimation.rally.planted import SURFACES, planted
 from tests.estimation.rendered import Truth
-from tests.vision.broadcast.scene import COURT
+from tests.vision.broadcast.scene import COURT, TENNIS
 
 NET = 0.1525
 
@@ -66,7 +66,8 @@ def test_each_planted_stroke_is_found_with_its_events(made: tuple[Truth, Rally])
             for t, state in zip(mine.times, mine.states, strict=True)
             if states[float(t)] is not None
         ]
-        assert np.median(off) < 0.06
+        sigma = float(np.sqrt(np.trace(mine.covariances[:, POSITION, POSITION], axis1=1, axis2=2).max()))
+        assert np.median(off) < min(3.0 * sigma, 0.2)
         hit = next(event for event in rally.events if event.kind == "hit" and event.trajectory == mine.name)
         assert hit.t == pytest.approx(one.begin, abs=max(0.06, 3.0 * hit.sigma_t))
         row = next(row for row in rally.strokes if row["stroke"] == mine.name)
@@ -215,6 +216,15 @@ def test_the_page_holds_the_rally_and_says_that_the_video_is_missing(
         for t, state in zip(estimate.times, estimate.states, strict=True):
             place = [np.interp(t, path[:, 0], path[:, 1 + axis]) for axis in range(3)]
             assert np.linalg.norm(place - state[POSITION]) < 0.02
+
+
+def test_the_page_draws_the_court_that_a_user_gave(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder, tmp_path / "other")
+    assert data_of(rally_page(folder, None, tmp_path / "page.html")[0])["table"]["net"] == [NET, 0.7625 + NET]  # type: ignore[index]
+    (tmp_path / "other" / "court.yaml").write_text(TENNIS, encoding="utf-8")
+    table: dict[str, list[object]] = data_of(rally_page(tmp_path / "other", None, tmp_path / "page.html")[0])["table"]  # type: ignore[assignment]
+    assert (table["net"], table["extent"], table["floor"]) == ([0.914, 6.4], [-11.885, 11.885, -5.485, 5.485], None)
+    assert len(table["lines"]) == 10
 
 
 def test_a_video_that_is_not_there_is_named(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
