@@ -15,6 +15,8 @@ from ballfg.estimation.observations.sightings import sighted_track
 from ballfg.estimation.rally.arcs import arcs
 from ballfg.estimation.rally.choose import Chosen, rally
 from ballfg.estimation.rally.field import SEEN_RANGE, Field
+from ballfg.estimation.rally.joined import joined_estimates
+from ballfg.estimation.rally.moments import Event
 from ballfg.estimation.rally.strokes import Grower, Stroke
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.physics import physics_of
@@ -47,13 +49,15 @@ class ShotRally:
     Attributes:
         camera: fixed, at the shot's place, with the covariance of its turn, place and focal length.
         seen: the candidates as that camera sees them.  chosen: strokes with their probabilities.
-        estimates: of each stroke, in the same order.  exposure: of the time between pictures.
+        estimates: of each stroke, in the same order, joined at hits.
+        hits: at the begin of each, None where it follows none.  exposure: of the time between pictures.
     """
 
     camera: Camera
     seen: Detections
     chosen: Chosen
     estimates: tuple[Estimate, ...]
+    hits: tuple[Event | None, ...]
     exposure: float
 
 
@@ -108,13 +112,14 @@ def reconstruct(
         plain = replace(plain, seen=share)
     seen = _kinked(seen, chosen, field)
     smoother = Smoother(model, surfaces, Settings.for_measured(model, find_events=False))
-    estimates = list[Estimate]()
-    for stroke in watch(chosen.strokes, len(chosen.strokes), "strokes estimated"):
-        estimates.append(smoother.estimate(_track(stroke, seen, camera, model, surfaces)))
-    begun, end = _in_play(estimates)
-    named = [replace(one, name=f"{first + number:03d}") for number, one in enumerate(estimates[begun:end])]
-    parts = (chosen.strokes[begun:end], chosen.probabilities[begun:end], (False, *chosen.joined[begun + 1 : end]))
-    return ShotRally(camera, seen, Chosen(*parts) if named else chosen, tuple(named), field.exposure)
+    tracks = [_track(stroke, seen, camera, model, surfaces) for stroke in chosen.strokes]
+    alone = [smoother.estimate(track) for track in watch(tracks, len(tracks), "strokes estimated")]
+    begun, end = _in_play(alone)
+    joined = (False, *chosen.joined[begun + 1 : end])
+    estimates, hits = joined_estimates(smoother, tracks[begun:end], alone[begun:end], joined, field.step)
+    named = [replace(one, name=f"{first + number:03d}") for number, one in enumerate(estimates)]
+    parts = (chosen.strokes[begun:end], chosen.probabilities[begun:end], joined)
+    return ShotRally(camera, seen, Chosen(*parts) if named else chosen, tuple(named), tuple(hits), field.exposure)
 
 
 def _kinked(seen: Detections, chosen: Chosen, field: Field) -> Detections:

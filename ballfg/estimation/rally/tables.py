@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.estimation.rally.events import Event
 from ballfg.estimation.rally.files import COURT, EVENTS, FILES, MOTION, STATES, STROKES
+from ballfg.estimation.rally.moments import Event
 from ballfg.estimation.rally.reconstruct import ShotRally
 from ballfg.files.whole_folder import whole_folder
 from ballfg.tracks import TableWriter

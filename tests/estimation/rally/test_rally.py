@@ -15,6 +15,8 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import Smoother, dataset_settings, dataset_surfaces, read_sighted
 from ballfg.estimation.rally.events import end_of, events_of, net_touches, stroke_row
 from ballfg.estimation.rally.files import is_rally
+from ballfg.estimation.rally.hits import HIT_SIGMA
+from ballfg.estimation.rally.moments import carried
 from ballfg.estimation.rally.page import between, rally_page
 from ballfg.estimation.rally.reconstruct import reconstruct
 from ballfg.estimation.rally.tables import write_rally
@@ -110,14 +112,37 @@ def test_what_is_written_is_a_dataset_that_other_commands_read(made: tuple[Truth
     assert kinds <= {"hit", "bounce", "lost", "net", "floor", "cut"}
 
 
-def test_estimates_from_the_written_dataset_are_those_of_track(made: tuple[Truth, Rally], folder: Path) -> None:
+def alone(folder: Path) -> list[Estimate]:
+    """The estimates of the strokes one by one, from the written files."""
     data = read_sighted(folder)
     smoother = Smoother(MODEL, dataset_surfaces(data), dataset_settings(data, MODEL))
-    for before in made[1].shots[0].estimates:
-        again = smoother.estimate(data[before.name])
-        off = np.linalg.norm(again.states[:, POSITION] - before.states[:, POSITION], axis=1)
-        assert off.max() < 0.1 * np.sqrt(before.covariances[:, 0, 0].max() + before.covariances[:, 1, 1].max())
-        assert len(again.contacts) == len(before.contacts)
+    return [smoother.estimate(track) for track in data]
+
+
+def test_estimates_from_the_written_dataset_agree_with_those_of_track(made: tuple[Truth, Rally], folder: Path) -> None:
+    for one, joined in zip(alone(folder), made[1].shots[0].estimates, strict=True):
+        assert one.name == joined.name
+        assert len(one.contacts) == len(joined.contacts)
+        off = np.abs(one.states[:, POSITION] - joined.states[:, POSITION])
+        assert (off < 2.0 * one.sigmas[:, POSITION]).all()
+
+
+def test_strokes_that_are_joined_meet_at_the_hit_and_are_nearer_to_the_truth_there(
+    made: tuple[Truth, Rally], folder: Path
+) -> None:
+    of, (shot,) = made[0], made[1].shots
+    gaps, errors = [], []
+    for estimates in (alone(folder), shot.estimates):
+        pairs = [(a, b, hit.t) for a, b, hit in zip(estimates, estimates[1:], shot.hits[1:], strict=False) if hit]
+        ends = [
+            (carried(MODEL, a, -1, t).state[POSITION], carried(MODEL, b, 0, t).state[POSITION]) for a, b, t in pairs
+        ]
+        gaps.append(np.median([np.linalg.norm(a - b) for a, b in ends]))
+        near = [(one.states[k, POSITION], of.at(float(one.times[k]))) for one in estimates for k in (0, -1)]
+        errors.append(np.median([np.linalg.norm(place - true[POSITION]) for place, true in near if true is not None]))
+    assert len(pairs) >= 2
+    assert gaps[1] < min(0.7 * gaps[0], 2.0 * HIT_SIGMA)
+    assert errors[1] < errors[0]
 
 
 def test_bounces_without_a_column_are_refused_in_one_line(folder: Path, tmp_path: Path) -> None:
