@@ -79,11 +79,10 @@ function ellipse(pen, where) {
 
 const along = (a, b) => Array.from({length: 13}, (_, i) => a.map((v, k) => v + (b[k] - v) * i / 12));
 function outlines() {
-  const at = [[x0, y0, h], [x1, y0, h], [x1, y1, h], [x0, y1, h]], found = at.map((p, i) => along(p, at[(i + 1) % 4]));
-  const middle = (x0 + x1) / 2;
+  const found = table.lines.map(([a, b]) => along(a, b));
   if (table.net !== null) {
-    const reach = table.net, low = [[middle, y0 - reach, h], [middle, y1 + reach, h]], high = low.map(p => [p[0], p[1], h + table.net]);
-    found.push(along([x0, (y0 + y1) / 2, h], [x1, (y0 + y1) / 2, h]), along(high[0], high[1]), along(low[0], low[1]), along(low[0], high[0]), along(low[1], high[1]));
+    const [net, reach] = table.net, low = [[0, -reach, h], [0, reach, h]], high = low.map(p => [p[0], p[1], h + net]);
+    found.push(along(low[0], low[1]), along(low[0], high[0]), along(low[1], high[1]));
   }
   return found;
 }
@@ -209,6 +208,10 @@ function drawAbove() {
   const scale = 800 / (x1 - x0 + 2 * edge), at = (x, y) => [scale * (x - x0 + edge), scale * (y1 + edge - y)];
   const [left, top] = at(x0, y1), [middle, low] = at((x0 + x1) / 2, y0);
   add(above, "rect", {x: left, y: top, width: scale * (x1 - x0), height: scale * (y1 - y0), fill: "#2f7d6b33", stroke: "#2f7d6b", "stroke-width": 2});
+  for (const [a, b] of table.lines) {
+    const [from, to] = [at(a[0], a[1]), at(b[0], b[1])];
+    if (a[2] === 0) add(above, "line", {x1: from[0], y1: from[1], x2: to[0], y2: to[1], stroke: "#2f7d6b"});
+  }
   if (table.net !== null) add(above, "line", {x1: middle, x2: middle, y1: top - 20, y2: low + 20, stroke: "#888", "stroke-width": 2});
   for (const v of [-1, -0.5, 0, 0.5, 1]) add(above, "text", {x: at(v, 0)[0], y: low + 34, "text-anchor": "middle"}, `x ${v} m`.replace("-", "−"));
   for (const v of [-0.5, 0, 0.5]) add(above, "text", {x: left - 10, y: at(0, v)[1] + 4, "text-anchor": "end"}, `y ${v} m`.replace("-", "−"));

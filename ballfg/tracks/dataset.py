@@ -149,6 +149,11 @@ def _open_source(folder: Path) -> RowSource:
     if len(present) > 1:
         raise ValueError(f"{folder} must hold one table of tracks; got {' and '.join(present)}. Delete one of them.")
     if not present:
+        if (folder / DETECTIONS_FILE).is_file():
+            raise FileNotFoundError(
+                f"{folder} must hold positions for this command, in {' or '.join(TRACK_FILES)}; it holds sightings of "
+                "cameras alone. They serve 'ballfg estimate --from detections', and ballfg-train with kind: calibrate."
+            )
         problem = f"{folder} must hold {' or '.join(TRACK_FILES)}; got {_listing(folder)}"
         raise FileNotFoundError(f"{problem}. Add it: trajectory,t,x,y,z (docs/tracks.md).")
     source = CsvRows if present[0].endswith(".csv") else ParquetRows

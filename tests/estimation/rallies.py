@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from ballfg.arrays import Array
+from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.motion.rollout import rollout
 from ballfg.estimation.one_camera import track_one_camera
 from ballfg.estimation.result import Estimate
@@ -43,27 +44,33 @@ class Stroke:
     state: Array
 
 
-def flown(state: Array, times: Array) -> Array:
+def flown(state: Array, times: Array, ball: AnalyticModel = MODEL) -> Array:
     """(n, 9) states at times (n,) s after a first one (9,)."""
     with torch.no_grad():
         given = torch.from_numpy(state[None]), torch.from_numpy(np.append(0.0, times))
-        return np.asarray(rollout(MODEL, *given, SURFACES)[0, 1:])
+        return np.asarray(rollout(ball, *given, SURFACES)[0, 1:])
 
 
-def stroke(place: Array, to: float, rng: np.random.Generator) -> tuple[Array, float] | None:
-    """First state and duration of a stroke from a place to a half of the table, to: 1 or -1; None if none was drawn."""
+def stroke(
+    place: Array, to: float, rng: np.random.Generator, ball: AnalyticModel = MODEL, given: Array | None = None
+) -> tuple[Array, float] | None:
+    """First state and duration of a stroke from a place to a half of the table, to: 1 or -1; None if none was drawn.
+
+    Args: given: its spin (3,) rad/s; None: drawn.
+    """
     for _ in range(60):
         aim = np.array([to * rng.uniform(0.35, 1.15), rng.uniform(-0.5, 0.5), TABLE + 0.02])
         time = rng.uniform(0.28, 0.45)
         spin = np.array([rng.normal(0, 15), to * rng.normal(60, 60), rng.normal(0, 15)])
+        spin = spin if given is None else given
         velocity = (aim - place) / time
         velocity[2] += 0.5 * STANDARD_GRAVITY * time
         for _ in range(4):
-            end = flown(np.concatenate((place, velocity, spin)), np.array([0.999 * time]))[0]
+            end = flown(np.concatenate((place, velocity, spin)), np.array([0.999 * time]), ball)[0]
             velocity = velocity + (np.array([0.0, 0.0, 0.3]) if end[VZ] > 0.0 else (aim - end[POSITION]) / time)
         state, lasts = np.concatenate((place, velocity, spin)), time + rng.uniform(0.15, 0.32)
         moments = np.arange(0.004, lasts, 0.004)
-        path = flown(state, moments)
+        path = flown(state, moments, ball)
         (turns,) = np.nonzero(np.diff(path[:, VZ]) > 1.0)
         above = path[-1, Z] - TABLE
         fine = len(turns) == 1 and abs(moments[turns[0]] - time) < 0.08 and 0.03 < above < 0.6

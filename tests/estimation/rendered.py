@@ -2,7 +2,8 @@
 
     python -m tests.estimation.rendered --count 6 --seed 0 [--rate 60] [--view behind]
 
-renders rallies (strokes of `tests.estimation.rallies`) with bars of motion blur, players as moving shapes with white
+renders rallies (strokes of `tests.estimation.population`, whose ball, spins and scatter are those that the intervals
+are for) with bars of motion blur, players as moving shapes with white
 shoes, noise and video compression, and prints a line for each and the sums. Each seed draws its view (from the side,
 behind a player, a corner, or near behind a player who hides part of the table), the light, the focal length (and so the
 ball's size), the compression and how much the camera shakes.
@@ -25,10 +26,12 @@ from ballfg.estimation.rally.video import Rally, track_moving_camera
 from ballfg.state import POSITION, SPIN
 from ballfg.vision.arrays import Image
 from ballfg.vision.broadcast.lines import moved
+from ballfg.vision.broadcast.motion import Shot
 from ballfg.vision.broadcast.pinhole import Pinhole
 from ballfg.vision.detection.video import open_video
 from tests.estimation.observations.sighted_rig import TABLE
-from tests.estimation.rallies import MODEL, Stroke, flown, stroke
+from tests.estimation.population import Scattered, drawn_ball, scattered
+from tests.estimation.rallies import MODEL
 from tests.vision.broadcast.scene import COURT, looking, panned, picture
 
 EXPOSURE, LENGTH = 0.45, 6.0  # of the time between pictures; s
@@ -48,7 +51,7 @@ class Truth:
     """Strokes with times in the video, s, the cameras of its pictures, the share of light and JPEG's quality."""
 
     view: str
-    strokes: tuple[Stroke, ...]
+    strokes: tuple[Scattered, ...]
     cameras: tuple[Pinhole, ...]
     light: float
     quality: int
@@ -57,7 +60,7 @@ class Truth:
         """(9,) state with the table's surface at z = 0; None where no ball is in play."""
         for one in self.strokes:
             if one.begin < t <= one.end:
-                state = flown(one.state, np.array([t - one.begin]))[0]
+                state = one.at(t)
                 state[2] -= TABLE
                 return state
         return None
@@ -65,12 +68,13 @@ class Truth:
 
 def truth(view: str, rate: float, seed: int) -> Truth:
     """Strokes of a rally, each from where the one before ends, and a camera that follows a little."""
-    rng, now, found = np.random.default_rng(seed), 0.6, list[Stroke]()
+    rng, now, found = np.random.default_rng(seed), 0.6, list[Scattered]()
+    ball = drawn_ball(rng)
     side = float(rng.choice([-1, 1]))
     place = np.array([side * 1.5, rng.uniform(-0.4, 0.4), TABLE + 0.25])
-    while now < LENGTH - 1.0 and (drawn := stroke(place, -side, rng)) is not None:
-        found.append(Stroke(now, now + drawn[1], drawn[0]))
-        place, now, side = flown(drawn[0], np.array([drawn[1]]))[0, POSITION], now + drawn[1], -side
+    while now < LENGTH - 1.0 and (drawn := scattered(now, place, -side, ball, rng)) is not None:
+        found.append(drawn)
+        place, now, side = drawn.at(drawn.end)[POSITION], drawn.end, -side
     centre, focal = VIEWS[view]
     first = looking(np.add(centre, rng.normal(0.0, 0.3, 3)), (0.0, 0.0, 0.1), focal * rng.uniform(*ZOOM))
     cameras = panned(first, int(LENGTH * rate), rng.normal(0.0, 0.06), rng.normal(0.0, 0.05))
@@ -119,6 +123,28 @@ class Score:
     spins: tuple[int, int]
 
 
+@dataclass
+class CameraScore:
+    """Errors of place and focal length, of the true ones, and whether 90 % intervals hold."""
+
+    place: float
+    focal: float
+    held: Sequence[bool]
+
+
+def camera_judged(shot: Shot, of: Truth) -> CameraScore:
+    """The cameras of a shot against the truth: the place, and three pictures' focal lengths."""
+    pictures = [0, len(shot) // 2, len(shot) - 1]
+    pairs = [(shot.cameras[k], of.cameras[shot.first + k]) for k in pictures]
+    sigmas = [np.sqrt(np.diag(shot.covariances[k])) for k in pictures]
+    true = pairs[0][1]
+    off = pairs[0][0].place - true.place
+    held = (np.abs(off) < 1.645 * sigmas[0][3:6]).tolist()
+    focal = [np.log(found.focal / real.focal) for found, real in pairs]
+    held += [abs(error) < 1.645 * sigma[6] for error, sigma in zip(focal, sigmas, strict=True)]
+    return CameraScore(float(np.linalg.norm(off) / np.linalg.norm(true.place)), float(np.abs(focal).max()), held)
+
+
 def judged(rally: Rally, of: Truth) -> Score:
     """A rally against the truth."""
     found, false, errors, held, spins = set[int](), 0, list[float](), list[bool](), [0, 0]
@@ -150,7 +176,7 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=25.0, help="Hz")
     parser.add_argument("--view", choices=VIEWS, help="the same for all")
     given = parser.parse_args()
-    scores = list[Score]()
+    scores, cameras = list[Score](), list[CameraScore]()
     for seed in range(given.seed, given.seed + given.count):
         view = given.view or list(VIEWS)[seed % len(VIEWS)]
         of = truth(view, given.rate, seed)
@@ -165,16 +191,20 @@ def main() -> None:
                 print(f"{seed} {view}: {error}", flush=True)
                 scores.append(Score(len(of.strokes), 0, 0, [], [], (0, 0)))
                 continue
-        camera, true = rally.motion.shots[0].cameras[0], of.cameras[rally.motion.shots[0].first]
-        place = 100 * np.linalg.norm(camera.place - true.place) / np.linalg.norm(true.place)
-        focal = 100 * abs(camera.focal / true.focal - 1.0)
+        cameras.append(seen := camera_judged(rally.motion.shots[0], of))
         scores.append(one := judged(rally, of))
         print(
-            f"{seed} {view}, light {of.light:.1f}, {true.focal:.0f} px, quality {of.quality}: place {place:.2f} %, "
-            f"focal length {focal:.2f} %, {one.found} of {one.strokes} strokes, {one.false} false, median "
+            f"{seed} {view}, light {of.light:.1f}, {of.cameras[0].focal:.0f} px, quality {of.quality}: "
+            f"place {100 * seen.place:.2f} %, focal length {100 * seen.focal:.2f} %, "
+            f"{one.found} of {one.strokes} strokes, {one.false} false, median "
             f"{1e3 * np.median(one.errors or [np.nan]):.0f} mm, spins {one.spins}, {time.process_time() - begun:.0f} s",
             flush=True,
         )
+    worst = [100 * max(getattr(one, name) for one in cameras) for name in ("place", "focal")]
+    middle = [100 * np.median([getattr(one, name) for one in cameras]) for name in ("place", "focal")]
+    inside = 100 * np.mean([hold for one in cameras for hold in one.held])
+    print(f"place {middle[0]:.2f} %, focal length {middle[1]:.2f} % (largest {worst[0]:.2f}, {worst[1]:.2f})", end="")
+    print(f", 90 % intervals hold {inside:.0f} %")
     strokes, found, false = (sum(getattr(one, name) for one in scores) for name in ("strokes", "found", "false"))
     errors, held = (np.concatenate([getattr(one, name) for one in scores]) for name in ("errors", "held"))
     right, asked = np.sum([one.spins for one in scores], axis=0)

@@ -291,6 +291,10 @@ def test_a_changed_file_is_refused(make_folder):
         ((), "must hold dataset.yaml; got an empty folder. Add it: name, frame and ball (docs/tracks.md)."),
         (("tracks.csv",), "must hold dataset.yaml; got tracks.csv."),
         (("dataset.yaml",), "must hold tracks.csv or tracks.parquet; got dataset.yaml. Add it: trajectory,t,x,y,z"),
+        (
+            ("dataset.yaml", "detections.csv"),
+            "it holds sightings of cameras alone. They serve 'ballfg estimate --from det",
+        ),
     ],
 )
 def test_missing_files_are_named(tmp_path, present, message):

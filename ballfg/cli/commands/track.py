@@ -173,7 +173,7 @@ def _moving_camera(
     from ballfg.machine import usable_cores
     from ballfg.parallel.parts import with_jobs
     from ballfg.tracks.info import DatasetInfo
-    from ballfg.vision.broadcast.court import read_court
+    from ballfg.vision.broadcast.court import TABLE_TENNIS, read_court
     from ballfg.vision.broadcast.given import read_candidates, read_corners
     from ballfg.vision.detection.video import open_video
     from ballfg.vision.tracking.dataset import check_result_folder
@@ -211,7 +211,8 @@ def _moving_camera(
             source=f"ballfg track {path.name}",
             table_extent=surfaces_of(ground).extent,
         )
-        written = write_rally(out, info, found.motion, found.shots, found.events, found.strokes)
+        text = "" if court == TABLE_TENNIS else Path(court).read_text(encoding="utf-8")
+        written = write_rally(out, info, found.motion, found.shots, found.events, found.strokes, text)
         bounces = sum(event.kind == "bounce" for event in found.events)
         print(f"{out}: {len(found.strokes)} strokes, {bounces} bounces; wrote {', '.join(written)}")
 

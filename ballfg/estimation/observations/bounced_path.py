@@ -34,6 +34,9 @@ PLANE_SIGMA: Final = 1e-3
 """m, of the height at which a ball bounces."""
 LAWS: Final = 5e-3
 """m, standard deviation of the ball's place about a path of these laws, which leave out spin."""
+LIFT: Final = (2.0, 6.0, 6.0)
+"""m/s^2, prior standard deviation of the acceleration by spin: 12 m/s and 170 rad/s; it stands across the flight, which
+goes along x."""
 ASIDE: Final = 0.1
 """m beside the table where a bounce may seem to be."""
 STRETCH_LIMIT: Final = -0.8

@@ -14,7 +14,7 @@ import numpy as np
 
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.observations.bounced_path import Paths, Scene, possible, shares_of, solved, velocities_of
+from ballfg.estimation.observations.bounced_path import LIFT, Paths, Scene, possible, shares_of, solved, velocities_of
 from ballfg.estimation.observations.ray_path import Path, Rays
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.estimation.segmentation.result import Contact
@@ -81,6 +81,13 @@ def one_view(rays: Rays, moments: Array, physics: SegmentationPhysics, surfaces:
     return [_path(table, flight, 0, moments)]
 
 
+def bounced_at(rays: Rays, moments: Array, physics: SegmentationPhysics, surfaces: Surfaces, bounces: Array) -> OneView:
+    """The path with bounces on the table at known times (b,) s, with spin; other arguments as for `one_view`."""
+    scene = Scene(rays, physics, surfaces, surfaces.table_height, LIFT)
+    times = bounces if len(bounces) else np.array([float(np.median(rays.times))])
+    return _path(scene, solved(scene, times[None], len(bounces)), 0, moments)
+
+
 def _bounced(scene: Scene, moments: Array) -> list[tuple[Paths, Array]]:
     """Paths with one bounce at all guessed times and misfits (k,); then those with more, while they fit better."""
     step = max(STEPS * float(np.median(np.diff(moments))), LEAST_STEP) if len(moments) > 1 else 0.0
@@ -132,7 +139,7 @@ def _rivals(misfit: Array, times: Array, intervals: Index) -> list[int]:
 def _path(scene: Scene, tried: Paths, row: int, moments: Array) -> OneView:
     """One solution at moments (n,) s; misfits widen its sigmas."""
     times, drag, g = tried.times[[row]], tried.drag[[row]], scene.physics.gravity
-    (share,), (drop,) = shares_of(moments[None], times, tried.bounces, drag, g)
+    (share,), (drop,) = shares_of(moments[None], times, tried.bounces, drag, g, lift=scene.lift is not None)
     positions = share @ tried.vectors[row]
     positions[:, Z] -= drop
     joint = tried.covariance[row].reshape(share.shape[1], 3, share.shape[1], 3)

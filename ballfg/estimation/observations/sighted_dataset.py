@@ -1,17 +1,20 @@
 """Makes tracks from the sightings in a dataset's folder: `detections.csv` and `cameras.yaml`."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final
 
+from ballfg.arrays import Array
 from ballfg.checks import shown
 from ballfg.dynamics.nominal import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.sightings import TooFewSightingsError, sighted_track
 from ballfg.files.whole_folder import of_one_state
 from ballfg.tracks.detections_file import DETECTIONS_FILE, read_sightings
+from ballfg.tracks.events_file import EVENTS_FILE, read_bounces
 from ballfg.tracks.info import INFO_FILE, DatasetInfo, TrackFolder, read_info
 from ballfg.tracks.labels import LABELS_FILE, LabelTable, read_labels
 from ballfg.tracks.sightings import Sightings
@@ -44,6 +47,7 @@ class SightedDataset(TrackFolder):
         balls: dict[str, Sightings],
         labels: LabelTable,
         notes: list[str],
+        bounces: Mapping[str, Array] = MappingProxyType({}),
     ) -> None:
         self.path, self.info, self.cameras, self.notes = path, info, cameras, notes
         self.label_names = labels.names
@@ -51,8 +55,9 @@ class SightedDataset(TrackFolder):
         model = nominal_model(info.ball)
         surfaces = replace(Surfaces.table_tennis(info.table_height), extent=info.table_extent)
         for name, sightings in balls.items():
+            known, own = bounces.get(name), labels.of(name)
             try:
-                track = sighted_track(name, sightings, cameras, labels.of(name), model=model, surfaces=surfaces)
+                track = sighted_track(name, sightings, cameras, own, model=model, surfaces=surfaces, bounces=known)
                 self._tracks[name] = replace(track, dataset=self)
             except TooFewSightingsError as error:
                 notes.append(str(error))
@@ -92,7 +97,7 @@ def read_sighted(folder: str | PathLike[str]) -> SightedDataset:
 
     Args:
         folder: holds `dataset.yaml`, `cameras.yaml`, `detections.csv` with the trajectory of each row, and optionally
-            `labels.csv`.
+            `labels.csv` and `events.csv`, whose bounces of a ball that one camera saw are not searched for again.
     Returns: the balls that were seen often enough; `notes` list the others.
     Raises:
         FileNotFoundError: one of the files is missing.
@@ -110,7 +115,8 @@ def read_sighted(folder: str | PathLike[str]) -> SightedDataset:
     balls, more = read_sightings(path / DETECTIONS_FILE, {camera.name: camera.time_offset for camera in cameras})
     labels_file = path / LABELS_FILE
     labels = read_labels(labels_file, list(balls)) if labels_file.is_file() else LabelTable({}, {})
-    dataset = SightedDataset(path, info, cameras, balls, labels, [*notes, *more, *labels.notes])
+    bounces = read_bounces(path / EVENTS_FILE) if (path / EVENTS_FILE).is_file() else {}
+    dataset = SightedDataset(path, info, cameras, balls, labels, [*notes, *more, *labels.notes], bounces)
     if not len(dataset):
         raise ValueError(
             f"{path / DETECTIONS_FILE}: must hold a ball, seen often enough, its name in the column 'trajectory'; got "

@@ -18,12 +18,12 @@ from ballfg.dynamics.nominal import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.bounced_path import LAWS, place_prior
 from ballfg.estimation.observations.observation import Context, Observation, Unknowns
-from ballfg.estimation.observations.one_view import OneView, one_view
+from ballfg.estimation.observations.one_view import OneView, bounced_at, one_view
 from ballfg.estimation.observations.ray_path import Rays, determined, filled, rough_path
 from ballfg.estimation.observations.rig import cameras_of, check_apart, in_order, true_times_of
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.physics import physics_of
-from ballfg.estimation.segmentation.result import Contact, Quality, Segmentation
+from ballfg.estimation.segmentation.result import Contact, Segmentation
 from ballfg.estimation.settings import Settings
 from ballfg.factors.batch import FactorBatch
 from ballfg.factors.camera import FIXED, CameraFactors
@@ -73,6 +73,7 @@ class CameraSightings(Observation):
         one_view: True if no two cameras saw the ball within a few frames: motion gives the depth.
         bounces: of such a track, as its start has them.
         place: of such a track, prior mean (3,) m and standard deviation m of the first position; None: without.
+        known: events of such a track, if they were found before; None: its bounces are looked for.
     """
 
     name: ClassVar[str] = "sighting"
@@ -88,6 +89,7 @@ class CameraSightings(Observation):
         one_view: bool = False,
         bounces: tuple[Contact, ...] = (),
         place: tuple[Array, float] | None = None,
+        known: Segmentation | None = None,
     ) -> None:
         self.sightings = sightings
         self.cameras = cameras
@@ -97,6 +99,7 @@ class CameraSightings(Observation):
         self.one_view = one_view
         self.bounces = bounces
         self.place = place
+        self.known = known
 
     @property
     def time_offsets(self) -> Array:
@@ -165,14 +168,17 @@ class CameraSightings(Observation):
         """The sightings of some samples."""
         rows, number = samples[self.state], np.cumsum(samples) - 1
         sightings, state = self.sightings.select(rows), number[self.state[rows]]
-        return CameraSightings(sightings, self.cameras, state, self.delay[rows], self.moved, self.one_view)
+        own = CameraSightings(sightings, self.cameras, state, self.delay[rows], self.moved, self.one_view)
+        if self.known is not None and samples[: len(own.sightings)].all():  # the first samples, as predictions observe
+            own.place, own.known = self.place, self.known.opening(int(samples.sum()))
+        return own
 
     def starts(self, track: Track, model: BallModel, surfaces: Surfaces) -> tuple[Track, ...]:
         """The track with the paths that its own sightings, the ball and the surfaces give, if one camera saw it.
 
         Args: track: of the observation, with stamps since its first.  model: the ball.  surfaces: table and floor.
         """
-        if not self.one_view:
+        if not self.one_view or self.known is not None:
             return (track,)
         times = track.times[self.state] + self.delay
         found = one_view(Rays.of(self.sightings, times, self.cameras), track.times, physics_of(model), surfaces)
@@ -190,7 +196,7 @@ class CameraSightings(Observation):
 
     def loosened(self, track: Track) -> Track | None:
         """The track with the error of a start's laws added to the noise of one camera's pixels, if that is smaller."""
-        if not self.one_view:
+        if not self.one_view or self.known is not None:
             return None
         seen, (camera,) = self.sightings, (self.cameras[number] for number in np.unique(self.sightings.camera))
         spread = (LAWS / camera.depth(track.positions[self.state])[:, None] * np.diag(camera.matrix)[:2]) ** 2
@@ -241,9 +247,7 @@ class CameraSightings(Observation):
         """The bounces of a track that one camera saw; None if the positions show the events."""
         if not self.one_view:
             return None
-        none = np.zeros(0, dtype=np.int64)
-        good = np.full(int(self.state.max()) + 1, Quality.GOOD, dtype=np.int8)
-        return Segmentation(self.bounces, none, none, (), good)
+        return self.known or Segmentation.of_contacts(self.bounces, int(self.state.max()) + 1)
 
 
 def sightings_of(track: Track) -> CameraSightings:
@@ -267,6 +271,7 @@ def sighted_track(
     *,
     model: BallModel | None = None,
     surfaces: Surfaces | None = None,
+    bounces: Array | None = None,
 ) -> Track:
     """The track of one ball from the sightings of one or more cameras.
 
@@ -281,6 +286,7 @@ def sighted_track(
         labels: of the shot.
         model, surfaces: of the ball, and of what it bounces on, for the positions of a ball that one camera saw;
             estimators use their own. None: table tennis, with the table at z = 0.
+        bounces: (b,) s, stamps of all bounces of a ball that one camera saw, if they were found before; None: unknown.
     Raises: ValueError: if a camera is missing, two cameras stand at one point, rows are not in order of true time, or
         one camera saw the ball less than `LEAST_SEEN` times.
     """
@@ -304,17 +310,23 @@ def sighted_track(
     rays = Rays.of(sightings, times, rig)
     path = rough_path(rays, moments)
     alone = not determined(path).any()
+    known: OneView | None = None
     if alone:
-        if len(moments) < LEAST_SEEN:
+        ball, ground = physics_of(nominal_model() if model is None else model), surfaces or Surfaces.table_tennis(0.0)
+        if bounces is not None:
+            known = bounced_at(rays, moments, ball, ground, elapsed(bounces, origin))
+        elif len(moments) < LEAST_SEEN:
             raise TooFewSightingsError(
                 f"track {shown(name)}: a ball that one camera saw must be seen {LEAST_SEEN} times or more; got "
                 f"{len(moments)}. Leave the track out, or look at the time offsets of the cameras."
             )
-        ball = physics_of(nominal_model() if model is None else model)
-        path = one_view(rays, moments, ball, Surfaces.table_tennis(0.0) if surfaces is None else surfaces)[0].path
+        path = (known or one_view(rays, moments, ball, ground)[0]).path
     else:
         path = filled(moments, path)
     seen = CameraSightings(sightings, rig, state, times - moments[state], np.zeros(len(rig)), alone)
+    if known is not None:
+        seen.place = place_prior(ground)
+        seen.known = Segmentation.of_contacts(known.contacts(moments), len(moments))
     stamps = written(moments, origin)
     return Track(stamps, path.positions, path.sigmas, dict(labels or {}), observations=(seen,), rough=True, name=name)
 

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
-import torch
 from scipy.special import ndtr
 
-from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.rally.moments import Event, Moment, carried
 from ballfg.estimation.rally.reconstruct import ShotRally
 from ballfg.estimation.result import Estimate
 from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, STATE_DIM, VELOCITY, VZ, Z
 
-STEPS: Final = 81
-"""Moments between two strokes at which their paths are compared."""
-RACKET: Final = 0.05
-"""m, standard deviation between the paths before and after a hit."""
 BEHIND: Final = (0.2, 0.25)
 """m behind the end of the court where a first stroke is hit, and its standard deviation."""
 LANDS: Final = 2.0
@@ -28,54 +23,15 @@ TOUCHES: Final = 0.5
 """Least probability of a touch of the net that is an event."""
 
 
-@dataclass(frozen=True, eq=False)
-class Event:
-    """What happened to the ball: `kind` is hit, bounce, net, floor, lost or cut.
-
-    Attributes: trajectory: name of the stroke, that after a hit.  t: s.  place: (3,) m.  sigma_t: s.
-        sigmas: (3,) m.  probability: of the strokes that the event belongs to.
-    """
-
-    trajectory: str
-    t: float
-    kind: str
-    place: Array
-    sigma_t: float
-    sigmas: Array
-    probability: float
-
-
-@dataclass(frozen=True, eq=False)
-class Moment:
-    """A state (9,) and its covariance (9, 9) at a time, s."""
-
-    t: float
-    state: Array
-    covariance: Array
-
-
-def carried(model: BallModel, estimate: Estimate, sample: int, t: float) -> Moment:
-    """A sample's state carried to a time, s, nearby, before or after it, by an even acceleration, without contacts."""
-    state, dt = estimate.states[sample], t - float(estimate.times[sample])
-    with torch.no_grad():
-        rates = model.rates(torch.from_numpy(state[None].copy()))[0]
-    accelerated = np.asarray(rates)[0]
-    later, carry = state.copy(), np.eye(STATE_DIM)
-    later[POSITION] += state[VELOCITY] * dt + 0.5 * accelerated * dt**2
-    later[VELOCITY] += accelerated * dt
-    carry[POSITION, VELOCITY] = dt * np.eye(3)
-    return Moment(t, later, carry @ estimate.covariances[sample] @ carry.T)
-
-
 def events_of(one: ShotRally, model: BallModel, surfaces: Surfaces, step: float, net: float) -> list[Event]:
     """The events of a shot in order of time. Args: step: s between pictures.  net: m, its height at x = 0; 0: none."""
     found, last = list[Event](), len(one.estimates) - 1
     for number, estimate in enumerate(one.estimates):
         chance = float(one.chosen.probabilities[number])
-        if one.chosen.joined[number]:
-            before = one.estimates[number - 1]
+        hit = one.hits[number]
+        if hit is not None:
             both = chance * float(one.chosen.probabilities[number - 1])
-            found.append(replace(hit_between(model, before, estimate, step), probability=both))
+            found.append(replace(hit, trajectory=estimate.name, probability=both))
         else:
             found.append(replace(first_hit(model, estimate, surfaces, step), probability=chance))
         found += [replace(event, probability=chance) for event in bounces_of(model, estimate)]
@@ -104,30 +60,6 @@ def bounces_of(model: BallModel, estimate: Estimate) -> list[Event]:
             Event(estimate.name, at.t, "bounce", at.state[POSITION], sigma_t, np.append(sigmas[:2], 1e-3), 1.0)
         )
     return found
-
-
-def hit_between(model: BallModel, before: Estimate, after: Estimate, step: float) -> Event:
-    """The hit at which the path of a stroke meets that of the next one, most likely."""
-    times = np.linspace(before.times[-1] - 0.5 * step, after.times[0] + 0.5 * step, STEPS)
-    cost, places, spreads = [], [], []
-    for t in times:
-        one, other = carried(model, before, -1, float(t)), carried(model, after, 0, float(t))
-        first, second = (state.covariance[POSITION, POSITION] for state in (one, other))
-        off = other.state[POSITION] - one.state[POSITION]
-        both = first + second + RACKET**2 * np.eye(3)
-        cost.append(float(off @ np.linalg.solve(both, off) + np.linalg.slogdet(both)[1]))
-        gain = first @ np.linalg.inv(both)
-        places.append(one.state[POSITION] + gain @ off)
-        spreads.append(first - gain @ first)
-    weight = np.exp(-0.5 * (np.array(cost) - min(cost)))
-    weight /= weight.sum()
-    mean = float(weight @ times)
-    sigma_t = float(np.sqrt(weight @ (times - mean) ** 2 + (times[1] - times[0]) ** 2 / 12.0))
-    place = weight @ np.array(places)
-    spread = np.einsum("n,nij->ij", weight, np.array(spreads))
-    apart = np.array(places) - place
-    spread += (apart * weight[:, None]).T @ apart
-    return Event(after.name, mean, "hit", place, sigma_t, np.sqrt(np.diag(spread)), 1.0)
 
 
 def first_hit(model: BallModel, estimate: Estimate, surfaces: Surfaces, step: float) -> Event:

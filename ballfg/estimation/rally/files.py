@@ -6,11 +6,14 @@ from pathlib import Path
 from typing import Final
 
 from ballfg.tracks.detections_file import DETECTIONS_FILE
+from ballfg.tracks.events_file import EVENTS_FILE
 from ballfg.tracks.info import INFO_FILE
 from ballfg.vision.camera_file import CAMERAS_FILE
 
-STATES, MOTION, EVENTS, STROKES = "states.csv", "camera_motion.csv", "events.csv", "strokes.csv"
-FILES: Final = (INFO_FILE, STATES, DETECTIONS_FILE, CAMERAS_FILE, MOTION, EVENTS, STROKES)
+STATES, MOTION, EVENTS, STROKES = "states.csv", "camera_motion.csv", EVENTS_FILE, "strokes.csv"
+COURT: Final = "court.yaml"
+"""The court, as a user gave it; without this file it is that of table tennis."""
+FILES: Final = (INFO_FILE, STATES, DETECTIONS_FILE, CAMERAS_FILE, MOTION, EVENTS, STROKES, COURT)
 """All written files."""
 VIDEOS: Final = (".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi")
 

@@ -13,15 +13,15 @@ import cv2
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.estimation.rally.files import EVENTS, MOTION, STATES, STROKES, VIDEOS
+from ballfg.estimation.rally.files import COURT, EVENTS, MOTION, STATES, STROKES, VIDEOS
 from ballfg.estimation.rally.tables import POSE
 from ballfg.pages.html import Html, items, section, tag
-from ballfg.pages.outline import NET_HEIGHT, outline
 from ballfg.pages.page import own, whole_page
 from ballfg.state import STANDARD_GRAVITY
 from ballfg.tracks import csv_files
 from ballfg.tracks.detections_file import DETECTIONS_FILE
 from ballfg.tracks.info import INFO_FILE, read_info
+from ballfg.vision.broadcast.court import TABLE_TENNIS, read_court
 from ballfg.vision.broadcast.pinhole import Pinhole
 from ballfg.vision.camera_file import CAMERAS_FILE, read_cameras
 
@@ -47,16 +47,18 @@ def rally_page(folder: Path, video: Path | None, out: Path) -> tuple[str, list[s
     motion, events, strokes, states = (_read(folder / name) for name in (MOTION, EVENTS, STROKES, STATES))
     cameras = {one.name: one for one in read_cameras(folder / CAMERAS_FILE)}
     size = next(iter(cameras.values())).size
-    ground = outline(info, np.zeros((1, 3)))
+    ground = read_court(str(folder / COURT) if (folder / COURT).is_file() else TABLE_TENNIS)
+    x, y = ground.size.tolist()
     source, notes = _video(folder, info.source or "", video, out)
     data = {
         "size": size,
         "frames": [_camera_row(row) for row in motion],
         "candidates": _candidates(folder / DETECTIONS_FILE, motion, cameras),
         "table": {
-            "extent": ground.extent,
-            "height": ground.height,
-            "net": NET_HEIGHT if ground.net else None,
+            "extent": [-x, x, -y, y],
+            "height": 0.0,
+            "net": [ground.net, ground.net_reach] if ground.net else None,
+            "lines": ground.lines.tolist(),
             "floor": ground.floor,
         },
         "strokes": [_stroke(row, states, events) for row in strokes],

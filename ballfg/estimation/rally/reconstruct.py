@@ -11,16 +11,20 @@ import numpy as np
 from ballfg.arrays import Mask
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.observations.sightings import sighted_track
 from ballfg.estimation.rally.arcs import arcs
 from ballfg.estimation.rally.choose import Chosen, rally
 from ballfg.estimation.rally.field import SEEN_RANGE, Field
-from ballfg.estimation.rally.smoothed import rally_track
-from ballfg.estimation.rally.strokes import Grower
+from ballfg.estimation.rally.joined import joined_estimates
+from ballfg.estimation.rally.moments import Event
+from ballfg.estimation.rally.strokes import Grower, Stroke
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.progress import Watch, unwatched
+from ballfg.tracks.sightings import Sightings
+from ballfg.tracks.track import Track
 from ballfg.vision.broadcast.motion import Shot
 from ballfg.vision.broadcast.pinhole import Pinhole
 from ballfg.vision.camera import Camera
@@ -28,6 +32,9 @@ from ballfg.vision.detection.detections import Detections
 
 FRAME_SIGMA: Final = 0.3
 """px, of a picture's camera beside the error that all of a shot share."""
+
+KINK: Final = 2.0
+"""px, standard deviation of the middle of a bar in which the ball bounced."""
 
 ROUNDS, SETTLED = 3, 0.1
 """In which the probability to see the ball is found, and its change that ends them."""
@@ -42,13 +49,15 @@ class ShotRally:
     Attributes:
         camera: fixed, at the shot's place, with the covariance of its turn, place and focal length.
         seen: the candidates as that camera sees them.  chosen: strokes with their probabilities.
-        estimates: of each stroke, in the same order.  exposure: of the time between pictures.
+        estimates: of each stroke, in the same order, joined at hits.
+        hits: at the begin of each, None where it follows none.  exposure: of the time between pictures.
     """
 
     camera: Camera
     seen: Detections
     chosen: Chosen
     estimates: tuple[Estimate, ...]
+    hits: tuple[Event | None, ...]
     exposure: float
 
 
@@ -101,14 +110,34 @@ def reconstruct(
         if abs(share - field.seen) < SETTLED and before < THINNER * density:
             break
         plain = replace(plain, seen=share)
+    seen = _kinked(seen, chosen, field)
     smoother = Smoother(model, surfaces, Settings.for_measured(model, find_events=False))
-    estimates = list[Estimate]()
-    for stroke in watch(chosen.strokes, len(chosen.strokes), "strokes estimated"):
-        estimates.append(smoother.estimate(rally_track("stroke", [stroke], grower, camera, seen.times)))
-    begun, end = _in_play(estimates)
-    named = [replace(one, name=f"{first + number:03d}") for number, one in enumerate(estimates[begun:end])]
-    parts = (chosen.strokes[begun:end], chosen.probabilities[begun:end], (False, *chosen.joined[begun + 1 : end]))
-    return ShotRally(camera, seen, Chosen(*parts) if named else chosen, tuple(named), field.exposure)
+    tracks = [_track(stroke, seen, camera, model, surfaces) for stroke in chosen.strokes]
+    alone = [smoother.estimate(track) for track in watch(tracks, len(tracks), "strokes estimated")]
+    begun, end = _in_play(alone)
+    joined = (False, *chosen.joined[begun + 1 : end])
+    estimates, hits = joined_estimates(smoother, tracks[begun:end], alone[begun:end], joined, field.step)
+    named = [replace(one, name=f"{first + number:03d}") for number, one in enumerate(estimates)]
+    parts = (chosen.strokes[begun:end], chosen.probabilities[begun:end], joined)
+    return ShotRally(camera, seen, Chosen(*parts) if named else chosen, tuple(named), tuple(hits), field.exposure)
+
+
+def _kinked(seen: Detections, chosen: Chosen, field: Field) -> Detections:
+    """The candidates, with less certain centres of those bars in which the ball bounced."""
+    covariances, half = seen.covariances.copy(), 0.5 * field.exposure * field.step
+    for stroke in chosen.strokes:
+        apart = np.abs(seen.times[stroke.rows][:, None] - np.array(stroke.bounces))
+        covariances[stroke.rows[(apart < half).any(axis=1)]] += KINK**2 * np.eye(2)
+    return replace(seen, covariances=covariances)
+
+
+def _track(stroke: Stroke, seen: Detections, camera: Camera, model: BallModel, surfaces: Surfaces) -> Track:
+    """A stroke as a track of sightings with known bounces."""
+    rows = stroke.rows
+    parts = np.zeros(len(rows), dtype=np.int64), seen.times[rows], seen.pixels[rows], seen.covariances[rows]
+    bounces = np.array(stroke.bounces)
+    sightings = Sightings((camera.name,), *parts)
+    return sighted_track("stroke", sightings, [camera], model=model, surfaces=surfaces, bounces=bounces)
 
 
 def _in_play(estimates: Sequence[Estimate]) -> tuple[int, int]:

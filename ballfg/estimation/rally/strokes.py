@@ -16,16 +16,13 @@ from scipy.special import ndtr
 
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.observations.bounced_path import Paths, Scene, narrowed, possible, shares_of, solved
+from ballfg.estimation.observations.bounced_path import LIFT, Paths, Scene, narrowed, possible, shares_of, solved
 from ballfg.estimation.observations.ray_path import Rays
 from ballfg.estimation.rally.field import Field
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.state import Z
 from ballfg.vision.camera import Camera
 
-LIFT: Final = (2.0, 6.0, 6.0)
-"""m/s^2, prior standard deviation of the acceleration by spin: 12 m/s and 170 rad/s; it stands across the flight, which
-goes along x."""
 SHORT: Final = 0.4
 """Of a picture's time, over which a path shows its motion."""
 MISSED, RARE = 3, 0.02

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.estimation.rally.events import Event
-from ballfg.estimation.rally.files import EVENTS, FILES, MOTION, STATES, STROKES
+from ballfg.estimation.rally.files import COURT, EVENTS, FILES, MOTION, STATES, STROKES
+from ballfg.estimation.rally.moments import Event
 from ballfg.estimation.rally.reconstruct import ShotRally
 from ballfg.files.whole_folder import whole_folder
 from ballfg.tracks import TableWriter
@@ -35,12 +35,14 @@ def write_rally(
     rallies: Sequence[ShotRally],
     events: Sequence[Event],
     strokes: Sequence[dict[str, Any]],
+    court: str = "",
 ) -> list[str]:
     """Writes dataset.yaml, states.csv, detections.csv, cameras.yaml, camera_motion.csv, events.csv and strokes.csv.
 
     detections.csv holds the candidates where the fixed camera of their shot, in cameras.yaml, sees them.
 
     Args: rallies: of the motion's shots, in their order.  events, strokes: of all of them.
+        court: text of the file that describes it; empty: table tennis.
     Returns: the names of the files.
     Raises: OSError: something cannot be written.
     """
@@ -48,6 +50,8 @@ def write_rally(
         write_info(stage / INFO_FILE, info)
         write_cameras(stage / CAMERAS_FILE, [one.camera for one in rallies])
         _write_motion(stage / MOTION, motion)
+        if court:
+            (stage / COURT).write_text(court, encoding="utf-8")
         _write_events(stage / EVENTS, events, motion)
         with TableWriter(stage / DETECTIONS_FILE) as table:
             for one in rallies:

@@ -11,7 +11,8 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.rally.events import Event, events_of, stroke_row
+from ballfg.estimation.rally.events import events_of, stroke_row
+from ballfg.estimation.rally.moments import Event
 from ballfg.estimation.rally.reconstruct import ShotRally, reconstruct
 from ballfg.estimation.result import Status
 from ballfg.progress import Watch, unwatched

@@ -28,12 +28,13 @@ class Court:
     Attributes:
         corners: (4, 3) m, around the court; of its longest rectangle, to the outer edges of its lines.
         lines: (l, 2, 3) m, ends of the middles of its lines.  net: m, height of the net at x = 0; 0 for none.
-        floor: m, z of a floor below a table; None: there is none.
+        net_reach: m, half its width.  floor: m, z of a floor below a table; None: there is none.
     """
 
     corners: Array
     lines: Array
     net: float
+    net_reach: float
     floor: float | None
 
     @property
@@ -102,7 +103,7 @@ def _court(
         ends[border, :, axis] -= 0.5 * width * np.sign(ends[border, :, axis])
     if net is not None:
         ends = np.concatenate((ends, [[[0.0, -net[1], net[0]], [0.0, net[1], net[0]]]]))
-    return Court(corners, ends, 0.0 if net is None else net[0], floor)
+    return Court(corners, ends, *((0.0, 0.0) if net is None else net), floor)
 
 
 def _named(where: str, names: Any, count: int, known: dict[str, Array]) -> list[Array]:

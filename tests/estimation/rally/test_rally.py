@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,9 +12,11 @@ import numpy as np
 import pytest
 
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation import read_sighted
+from ballfg.estimation import Smoother, dataset_settings, dataset_surfaces, read_sighted
 from ballfg.estimation.rally.events import end_of, events_of, net_touches, stroke_row
 from ballfg.estimation.rally.files import is_rally
+from ballfg.estimation.rally.hits import HIT_SIGMA
+from ballfg.estimation.rally.moments import carried
 from ballfg.estimation.rally.page import between, rally_page
 from ballfg.estimation.rally.reconstruct import reconstruct
 from ballfg.estimation.rally.tables import write_rally
@@ -27,7 +30,7 @@ from tests.commands import status
 from tests.estimation.rallies import MODEL
 from tests.estimation.rally.planted import SURFACES, planted
 from tests.estimation.rendered import Truth
-from tests.vision.broadcast.scene import COURT
+from tests.vision.broadcast.scene import COURT, TENNIS
 
 NET = 0.1525
 
@@ -65,7 +68,8 @@ def test_each_planted_stroke_is_found_with_its_events(made: tuple[Truth, Rally])
             for t, state in zip(mine.times, mine.states, strict=True)
             if states[float(t)] is not None
         ]
-        assert np.median(off) < 0.06
+        sigma = float(np.sqrt(np.trace(mine.covariances[:, POSITION, POSITION], axis1=1, axis2=2).max()))
+        assert np.median(off) < min(3.0 * sigma, 0.2)
         hit = next(event for event in rally.events if event.kind == "hit" and event.trajectory == mine.name)
         assert hit.t == pytest.approx(one.begin, abs=max(0.06, 3.0 * hit.sigma_t))
         row = next(row for row in rally.strokes if row["stroke"] == mine.name)
@@ -106,6 +110,47 @@ def test_what_is_written_is_a_dataset_that_other_commands_read(made: tuple[Truth
     assert {"rho_xy", "rho_xz", "rho_yz"} <= set(header)
     kinds = {line.split(",")[2] for line in (folder / "events.csv").read_text(encoding="utf-8").splitlines()[1:]}
     assert kinds <= {"hit", "bounce", "lost", "net", "floor", "cut"}
+
+
+def alone(folder: Path) -> list[Estimate]:
+    """The estimates of the strokes one by one, from the written files."""
+    data = read_sighted(folder)
+    smoother = Smoother(MODEL, dataset_surfaces(data), dataset_settings(data, MODEL))
+    return [smoother.estimate(track) for track in data]
+
+
+def test_estimates_from_the_written_dataset_agree_with_those_of_track(made: tuple[Truth, Rally], folder: Path) -> None:
+    for one, joined in zip(alone(folder), made[1].shots[0].estimates, strict=True):
+        assert one.name == joined.name
+        assert len(one.contacts) == len(joined.contacts)
+        off = np.abs(one.states[:, POSITION] - joined.states[:, POSITION])
+        assert (off < 2.0 * one.sigmas[:, POSITION]).all()
+
+
+def test_strokes_that_are_joined_meet_at_the_hit_and_are_nearer_to_the_truth_there(
+    made: tuple[Truth, Rally], folder: Path
+) -> None:
+    of, (shot,) = made[0], made[1].shots
+    gaps, errors = [], []
+    for estimates in (alone(folder), shot.estimates):
+        pairs = [(a, b, hit.t) for a, b, hit in zip(estimates, estimates[1:], shot.hits[1:], strict=False) if hit]
+        ends = [
+            (carried(MODEL, a, -1, t).state[POSITION], carried(MODEL, b, 0, t).state[POSITION]) for a, b, t in pairs
+        ]
+        gaps.append(np.median([np.linalg.norm(a - b) for a, b in ends]))
+        near = [(one.states[k, POSITION], of.at(float(one.times[k]))) for one in estimates for k in (0, -1)]
+        errors.append(np.median([np.linalg.norm(place - true[POSITION]) for place, true in near if true is not None]))
+    assert len(pairs) >= 2
+    assert gaps[1] < min(0.7 * gaps[0], 2.0 * HIT_SIGMA)
+    assert errors[1] < errors[0]
+
+
+def test_bounces_without_a_column_are_refused_in_one_line(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder, tmp_path / "other")
+    events = tmp_path / "other" / "events.csv"
+    events.write_text(events.read_text(encoding="utf-8").replace("kind", "sort", 1), encoding="utf-8")
+    with pytest.raises(ValueError, match=r"events.csv must have the columns trajectory, t, kind; kind is missing"):
+        read_sighted(tmp_path / "other")
 
 
 def falling(state: list[float], times: list[float]) -> Estimate:
@@ -196,6 +241,15 @@ def test_the_page_holds_the_rally_and_says_that_the_video_is_missing(
         for t, state in zip(estimate.times, estimate.states, strict=True):
             place = [np.interp(t, path[:, 0], path[:, 1 + axis]) for axis in range(3)]
             assert np.linalg.norm(place - state[POSITION]) < 0.02
+
+
+def test_the_page_draws_the_court_that_a_user_gave(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder, tmp_path / "other")
+    assert data_of(rally_page(folder, None, tmp_path / "page.html")[0])["table"]["net"] == [NET, 0.7625 + NET]  # type: ignore[index]
+    (tmp_path / "other" / "court.yaml").write_text(TENNIS, encoding="utf-8")
+    table: dict[str, list[object]] = data_of(rally_page(tmp_path / "other", None, tmp_path / "page.html")[0])["table"]  # type: ignore[assignment]
+    assert (table["net"], table["extent"], table["floor"]) == ([0.914, 6.4], [-11.885, 11.885, -5.485, 5.485], None)
+    assert len(table["lines"]) == 10
 
 
 def test_a_video_that_is_not_there_is_named(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

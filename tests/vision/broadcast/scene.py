@@ -10,12 +10,21 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.vision.arrays import Image
-from ballfg.vision.broadcast.court import table_tennis
+from ballfg.vision.broadcast.court import Court, table_tennis
 from ballfg.vision.broadcast.lines import moved
 from ballfg.vision.broadcast.pinhole import Pinhole
 
 SIZE = (960, 540)
 COURT = table_tennis()
+TENNIS = """
+points: {a: [-11.885, -5.485], b: [11.885, -5.485], c: [11.885, 5.485], d: [-11.885, 5.485],
+  e: [-11.885, -4.115], f: [11.885, -4.115], g: [11.885, 4.115], h: [-11.885, 4.115],
+  i: [-6.4, -4.115], j: [-6.4, 4.115], k: [6.4, -4.115], l: [6.4, 4.115], m: [-6.4, 0], n: [6.4, 0]}
+corners: [a, b, c, d]
+lines: [[a, b], [b, c], [c, d], [d, a], [e, f], [h, g], [i, j], [k, l], [m, n]]
+line_width: 0.05
+net: [0.914, 6.4]
+"""
 FINE = 4  # bits of a drawn coordinate below a pixel
 
 
@@ -39,6 +48,7 @@ def picture(
     rng: np.random.Generator,
     balls: Sequence[Array] = (),
     others: Sequence[tuple[Array, float]] = (),
+    court: Court = COURT,
 ) -> Image:
     """A blue table with white lines and a net, on a dark floor with marks; balls (2, 3) m, ends of their bars.
 
@@ -55,8 +65,8 @@ def picture(
     for shown, level in others:
         if np.linalg.norm(shown.mean(axis=0) - camera.place) > far:
             _filled(image, camera, shown, (level, level, level))
-    _filled(image, camera, COURT.corners, (150, 80, 30))
-    for first, second in COURT.lines:
+    _filled(image, camera, court.corners, (150, 80, 30))
+    for first, second in court.lines:
         along = (second - first) / np.linalg.norm(second - first)
         across = np.array([-along[1], along[0], 0.0]) * 0.01
         if first[2] > 0.0:

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from ballfg.vision.broadcast.court import read_court
 from ballfg.vision.broadcast.lines import moved, slopes
 from ballfg.vision.broadcast.motion import find_motion
-from tests.vision.broadcast.scene import COURT, looking, panned, picture
+from tests.vision.broadcast.scene import COURT, TENNIS, looking, panned, picture
 
 
 @pytest.mark.parametrize(
@@ -38,3 +39,15 @@ def test_derivatives_of_pixels_are_those_of_differences():
         change = step * np.eye(7)[number]
         ahead, back = (moved(camera, way * change).project(points) for way in (1.0, -1.0))
         np.testing.assert_allclose(slope[..., number], (ahead - back) / (2.0 * step), atol=1e-5)
+
+
+def test_a_tennis_court_of_a_user_gives_the_camera(tmp_path):
+    (tmp_path / "tennis.yaml").write_text(TENNIS, encoding="utf-8")
+    court, rng = read_court(str(tmp_path / "tennis.yaml")), np.random.default_rng(3)
+    assert (court.net, court.net_reach) == (0.914, 6.4)
+    cameras = panned(looking((0.5, -24.0, 9.0), (0.0, 0.0, 0.3), 800.0), 12, 0.05, 0.02)
+    images = [picture(camera, rng, court=court) for camera in cameras]
+    motion = find_motion(lambda: ((k / 25.0, image) for k, image in enumerate(images)), court, len(images))
+    (shot,) = motion.shots
+    assert np.linalg.norm(shot.cameras[-1].place - cameras[-1].place) < 0.1
+    assert shot.cameras[-1].focal == pytest.approx(cameras[-1].focal, rel=0.005)
