@@ -36,7 +36,7 @@ from ballfg.factors.loss import Loss
 from ballfg.learning.calibration.coefficients import ONE_VIEW, USUAL, Chosen, choose, with_values
 from ballfg.learning.calibration.correction import Correction, doubt_sigmas, set_doubts, with_correction, with_weights
 from ballfg.learning.calibration.groups import Groups, GroupSpin
-from ballfg.learning.calibration.population import Evidence, evidence, fit_population
+from ballfg.learning.calibration.population import Evidence, agreeing, evidence, fit_population
 from ballfg.learning.calibration.volume import estimate_with_slopes
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.config_file import AUTO
@@ -316,7 +316,10 @@ def advanced(problem: Problem, last: Step, linear: Linear) -> Step:
     doubts: tuple[tuple[float, ...], ...] = ()
     if groups is None:
         alike = np.arange(size) if problem.dataset.one_view else None  # one view does not show a spread
-        population = fit_population(evidences, chosen.start, chosen.sigma, chosen.low, chosen.high, alike=alike)
+        fit = partial(fit_population, start=chosen.start, sigma=chosen.sigma, low=chosen.low, high=chosen.high)
+        population = fit(evidences, alike=alike)
+        if alike is not None:
+            population = fit(agreeing(evidences, population.mean), alike=alike)
     else:
         population, by_group, found, next_track = groups.fit(evidences, [fit.name for fit in fits], chosen)
         if problem.correction is not None:

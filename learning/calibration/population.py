@@ -16,7 +16,7 @@ no step size.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -148,6 +148,21 @@ def fit_population(
         log_likelihood=fit.log_likelihood,
         log_evidence=fit.log_likelihood - 0.5 * float(np.linalg.slogdet(fit.precision)[1]),
     )
+
+
+def agreeing(tracks: Sequence[Evidence], mean: Array) -> list[Evidence]:
+    """The tracks with their information divided by chi^2 / degrees of freedom about a common mean, if that is above 1.
+
+    Tracks that share their coefficients and contradict each other know less than they state (R. Birge, "The
+    calculation of errors by the method of least squares", Phys. Rev. 40, 1932).
+
+    Args: mean: (p,) of all tracks, fitted to them.
+    """
+    left = [track.vector - track.information @ (mean - track.about) for track in tracks]
+    chi2 = sum(float(r @ np.linalg.pinv(t.information, hermitian=True) @ r) for r, t in zip(left, tracks, strict=True))
+    freedom = sum(int(np.linalg.matrix_rank(t.information, hermitian=True)) for t in tracks) - len(mean)
+    factor = max(1.0, chi2 / freedom) if freedom > 0 else 1.0
+    return [replace(t, information=t.information / factor, vector=t.vector / factor) for t in tracks]
 
 
 class _Fit:

@@ -6,7 +6,7 @@ from scipy.optimize import minimize_scalar
 from scipy.stats import multivariate_normal, norm
 
 from ballfg.arrays import Array
-from ballfg.learning.calibration.population import Evidence, evidence, fit_population
+from ballfg.learning.calibration.population import Evidence, agreeing, evidence, fit_population
 
 WIDE = 1e6
 """Prior sigma that says nothing: the posterior is the likelihood to 1e-12."""
@@ -49,6 +49,21 @@ def test_balanced_tracks_have_the_spread_of_a_scalar_search(spread: float, count
         np.testing.assert_allclose(found.spread[k], np.exp(best.x), rtol=1e-6)
     expected = 1.0 / np.sqrt(count / (found.spread**2 + noise**2) + sigma**-2.0)
     np.testing.assert_allclose(found.sigma, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("apart", [0.3, 3.0])
+def test_tracks_that_contradict_each_other_know_less(apart: float) -> None:
+    """Scalars by hand: the error of a weighted mean, times the root of chi^2 over n - 1 where that is above 1."""
+    y, sigma = np.array([1.0, 1.0 + apart, 1.0 - apart, 1.2]), np.array([0.5, 1.0, 0.8, 2.0])
+    tracks = [gaussian(np.array([a]), np.array([[s**2]]), np.array([0.7])) for a, s in zip(y, sigma, strict=True)]
+    given = (np.zeros(1), np.array([WIDE]), *unbounded(1))
+    first = fit_population(tracks, *given, alike=np.array([0]))
+    found = fit_population(agreeing(tracks, first.mean), *given, alike=np.array([0]))
+    mean = np.average(y, weights=sigma**-2.0)
+    chi2 = (((y - mean) / sigma) ** 2).sum()
+    expected = np.sqrt(max(1.0, chi2 / 3.0) / (sigma**-2.0).sum())
+    np.testing.assert_allclose([found.mean[0], found.sigma[0]], [mean, expected], rtol=1e-9)
+    assert (chi2 > 3.0) == (apart > 1.0)
 
 
 def test_many_tracks_leave_the_usual_estimate_of_the_spread() -> None:
