@@ -11,10 +11,10 @@ from ballfg.arrays import Array
 from ballfg.checks import shown
 from ballfg.dynamics.nominal import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.observations.events_file import EVENTS_FILE, read_bounces
 from ballfg.estimation.observations.sightings import TooFewSightingsError, sighted_track
 from ballfg.files.whole_folder import of_one_state
 from ballfg.tracks.detections_file import DETECTIONS_FILE, read_sightings
-from ballfg.tracks.events_file import EVENTS_FILE, read_bounces
 from ballfg.tracks.info import INFO_FILE, DatasetInfo, TrackFolder, read_info
 from ballfg.tracks.labels import LABELS_FILE, LabelTable, read_labels
 from ballfg.tracks.sightings import Sightings
