@@ -151,7 +151,7 @@ def _open_source(folder: Path) -> RowSource:
     if not present:
         if (folder / DETECTIONS_FILE).is_file():
             raise FileNotFoundError(
-                f"{folder} must hold positions for this command, in {' or '.join(TRACK_FILES)}; it holds sightings of "
+                f"{folder} must hold {' or '.join(TRACK_FILES)}, positions, for this command; it holds sightings of "
                 "cameras alone. They serve 'ballfg estimate --from detections', and ballfg-train with kind: calibrate."
             )
         problem = f"{folder} must hold {' or '.join(TRACK_FILES)}; got {_listing(folder)}"
