@@ -30,8 +30,8 @@ AT_END: Final = 0.05
 """s, likewise where a track begins or ends."""
 STILL_AIR: Final = 0.7
 """m/s^2. Spread of the acceleration of a slow flying ball beside gravity and drag."""
-AIR: Final = 0.15
-"""1/m, its growth with the square of the speed: lift of a spinning ball, and drag of another ball than assumed."""
+AIR: Final = 1.25
+"""Its growth, over the ball's own drag: lift of a spinning ball, and drag of another ball than assumed."""
 BLOCK: Final = 20_000
 """Samples that are looked at together; memory grows with it."""
 
@@ -91,6 +91,6 @@ def _falling(
         speed = np.linalg.norm(velocity, axis=1, keepdims=True)
         noise = 2.0 * np.sqrt(unscaled[:, 2, 2, None]) / reach**2 * sigma
         off = pull + physics.drag * speed * velocity + np.array([0.0, 0.0, physics.gravity])
-        spread = noise**2 + (STILL_AIR + AIR * speed**2) ** 2
+        spread = noise**2 + (STILL_AIR + AIR * physics.drag * speed**2) ** 2
         telling = (noise[:, 2] ** 2 + STILL_AIR**2) * CLEARLY * MOST_OFF < physics.gravity**2
         yield telling & ((off**2 / spread).sum(axis=1) < MOST_OFF)

@@ -86,7 +86,7 @@ def move(h: Record, dt: float, scene: Record) -> None:
     """A hypothesis dt s later, in its mode."""
     if h.surface == FLYING:
         carry(h, dt, scene)
-        _relax(h, dt)
+        _relax(h, dt, scene)
     elif h.surface == HANDLED:
         _wander(h, dt, QUICK, QUICK_MEMORY)
     elif h.surface == CARRIED:
@@ -104,16 +104,16 @@ def move(h: Record, dt: float, scene: Record) -> None:
             h.cov[axis, 0, 0] += STIR**2 * dt
 
 
-@machine_code(REAL(ONE_HYPOTHESIS))
-def air(h: Record) -> float:
+@machine_code(REAL(ONE_HYPOTHESIS, SCENE))
+def air(h: Record, scene: Record) -> float:
     """m/s^2, spread of the acceleration of a flying ball beside gravity and drag: spin and wind act with the air."""
-    return STILL_AIR + AIR * (h.mean[0, 1] ** 2 + h.mean[1, 1] ** 2 + h.mean[2, 1] ** 2)
+    return STILL_AIR + AIR * scene.drag * (h.mean[0, 1] ** 2 + h.mean[1, 1] ** 2 + h.mean[2, 1] ** 2)
 
 
-@machine_code(NOTHING(ONE_HYPOTHESIS, REAL))
-def _relax(h: Record, t: float) -> None:
+@machine_code(NOTHING(ONE_HYPOTHESIS, REAL, SCENE))
+def _relax(h: Record, t: float, scene: Record) -> None:
     """That acceleration forgets itself within t s."""
-    memory, spread = math.exp(-t / AIR_MEMORY), min(air(h), MOST_AIR)
+    memory, spread = math.exp(-t / AIR_MEMORY), min(air(h, scene), MOST_AIR)
     for axis in range(3):
         h.mean[axis, 2] *= memory
         for k in range(3):
@@ -211,7 +211,7 @@ def enter(h: Record, mode: int, scene: Record) -> None:
         h.age = 0
     for axis in range(3):
         if mode == FLYING:
-            _accelerated(h, axis, 0.0, air(h))
+            _accelerated(h, axis, 0.0, air(h, scene))
         elif mode == HANDLED:
             _accelerated(h, axis, 0.0, STOPPING if before == FLYING else QUICK)
         elif mode == CARRIED:
@@ -271,5 +271,5 @@ def bounce(h: Record, dt: float, scene: Record) -> bool:
         h.mean[axis, 1] *= KEPT
         h.cov[axis, 1, 1] += (SLIDE * fall + BOUNCE_JITTER) ** 2
     for axis in range(3):
-        h.cov[axis, 2, 2] += air(h) ** 2
+        h.cov[axis, 2, 2] += air(h, scene) ** 2
     return True
