@@ -99,15 +99,15 @@ def scores_of(models: Sequence[Weighed]) -> dict[frozenset[str], float]:
 
 
 def tempered(names: frozenset[str], weight: Weight, believed: Mapping[frozenset[str], tuple[Weight, float]]) -> float:
-    """The evidence of a model, at most what is believed of each smaller one and what it gains on the other half.
+    """The evidence of a model as far as the other half bears out what it gains over each smaller one.
 
-    Args: believed: other models, with their tempered evidence. One that is not borne out takes nothing from a larger
-        one that is: what that gains beyond its evidence makes up for it.
+    Args: believed: other models, with their tempered evidence.
     """
     smaller = [one for known, one in believed.items() if known < names and one[0].evidence < weight.evidence]
     if not smaller:
         return weight.evidence
+    promised = weight.evidence - np.array([other.evidence for other, _ in smaller])
     gains = weight.held_out - np.stack([other.held_out for other, _ in smaller])
     most = gains.sum(axis=1) + SURELY * gains.std(axis=1, ddof=1) * np.sqrt(gains.shape[1])
-    whole = np.array([value for _, value in smaller]) + np.maximum(most, 0.0)
+    whole = np.array([value for _, value in smaller]) + np.clip(most, 0.0, promised)
     return float(min(weight.evidence, whole.min()))

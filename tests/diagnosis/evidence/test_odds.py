@@ -144,15 +144,6 @@ def test_an_addition_is_believed_as_far_as_it_gains_over_the_smaller_model():
     assert odds.of("scale") < 0.1
 
 
-def test_a_smaller_model_that_is_not_borne_out_takes_nothing_from_a_larger_one_that_is():
-    """Alone, an effect covers for others that lack, and halves of unlike shots disagree on it."""
-    nothing, alone = model([], 0.0), model(["wind"], 20.0, np.tile([0.5, 1.5], 5))
-    both = model(["wind", "scale"], 50.0, np.tile([4.5, 5.5], 5))
-    believed = {nothing.names: (nothing.weight, 0.0), alone.names: (alone.weight, borne_out(alone, nothing))}
-    assert believed[alone.names][1] < 15.0
-    assert tempered(both.names, both.weight, believed) == pytest.approx(50.0)
-
-
 def test_what_is_foretold_loses_what_its_origin_loses():
     """A smaller model that only the linearisation of a wrong one knows is no better than that one."""
     nothing, wrong = model([], 0.0), model(["gust_region", "scale"], 60.0, np.full(10, -5.0))
