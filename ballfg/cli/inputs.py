@@ -216,8 +216,8 @@ def open_inputs(
 
     know_effects(effects_files)
     data = with_readings(read_dataset(dataset))
-    opened = open_model(data, model, ball)
-    return Inputs(data, opened, dataset_surfaces(data), observed, doubts_of(data, opened, model))
+    found, doubts = _opened(data, model, ball)
+    return Inputs(data, found, dataset_surfaces(data), observed, doubts)
 
 
 def open_sighted(
@@ -253,6 +253,11 @@ def open_model(data: Dataset | SightedDataset, model: Path | None, ball: str | N
     Args: ball: name of the data's known ball; None: any ball.
     Raises: ValueError: if that name is unknown, or the data's radius and mass differ from that ball's.
     """
+    return _opened(data, model, ball)[0]
+
+
+def _opened(data: Dataset | SightedDataset, model: Path | None, ball: str | None) -> tuple[BallModel, tuple[str, ...]]:
+    """The same, with the doubts that were printed."""
     import torch
 
     from ballfg.dynamics import load_model, nominal_model
@@ -272,15 +277,16 @@ def open_model(data: Dataset | SightedDataset, model: Path | None, ball: str | N
     if model is not None:
         inertia = inertia_factor(data.ball)
         found = load_model(model, radius=data.ball.radius, inertia_factor=inertia, room=data.info.name)
-    print_doubts(doubts_of(data, found, model))
+    doubts = _doubts_of(data, found, model)
+    print_doubts(doubts)
     notes = [*data.notes, *filter(None, [table_note(data)])]
     if model is None:
         notes += [note for note in (nominal_note(data.ball), *unused_model(data.path, data.ball)) if note]
     print_notes(notes)
-    return found
+    return found, doubts
 
 
-def doubts_of(data: Dataset | SightedDataset, model: BallModel, file: Path | None) -> tuple[str, ...]:
+def _doubts_of(data: Dataset | SightedDataset, model: BallModel, file: Path | None) -> tuple[str, ...]:
     """What is not sure about a dataset, and how far it lies outside of what a model was fitted on."""
     from ballfg.estimation.flights.dataset import LOOKED_AT
 

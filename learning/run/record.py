@@ -23,8 +23,7 @@ from ballfg.learning.run.metrics import Epoch, epoch_line, read_metrics, write_m
 from ballfg.learning.run.training_page import beside_untrained, improved, page, verdict
 from ballfg.learning.trainee import PredictedShot
 from ballfg.machine import date, versions
-from ballfg.tracks import read_dataset
-from ballfg.tracks.info import INFO_FILE
+from ballfg.tracks.info import INFO_FILE, read_info
 
 SCALARS = {
     "loss/train": ("loss", 1.0),
@@ -131,8 +130,8 @@ class Record:
         following = shlex.join(words) if model.is_file() else ""
         origin = {"made on": date()} | ({"command": self.command} if self.command else {}) | {"data": ", ".join(data)}
         origin["with"] = ", ".join(f"{name} {version}" for name, version in versions(files.PACKAGES).items())
-        there = [folder for folder in data if (Path(folder) / INFO_FILE).is_file()]  # it may have moved since
-        doubts = [doubt for folder in there for doubt in read_dataset(folder).info.doubts]
+        infos = [Path(folder) / INFO_FILE for folder in data]
+        doubts = [doubt for info in infos if info.is_file() for doubt in read_info(info)[0].doubts]  # it may have moved
         drawn, learned = curves(self.epochs, self.title), self.training.task.trainee.learned()
         text = page(self.title, self.epochs, best, drawn, learned, shot, following, origin, untrained, doubts)
         write_text(self.folder / files.PAGE, text)
