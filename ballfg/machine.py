@@ -36,16 +36,25 @@ def date() -> str:
     return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(float(os.environ.get(DATE, time.time()))))
 
 
-MADE: Final = 50_000  # Growth in the number of objects before Python collects the new ones; its default is 700
+IMPORTED: Final = 1_000_000  # Number of objects before Python collects for the first time; its default is 700
+MADE: Final = 50_000  # Growth in the number of objects before each later collection
 
 
 def collect_rarely() -> None:
-    """Lets a program's process collect garbage less often.
+    """Lets a program's process collect garbage less often, and not before its imports are done.
 
-    torch and similar packages create a million permanent objects. Scanning them again and again during their import
-    takes a tenth of a command's start.
+    torch and similar packages create most of a million permanent objects. Scanning them again and again during their
+    import takes a tenth of a command's start.
     """
-    gc.set_threshold(MADE, *gc.get_threshold()[1:])
+    gc.set_threshold(IMPORTED, *gc.get_threshold()[1:])
+    gc.callbacks.append(_after_imports)
+
+
+def _after_imports(phase: str, _info: dict[str, int]) -> None:
+    """Python calls it at the first collection."""
+    if phase == "stop":
+        gc.callbacks.remove(_after_imports)
+        gc.set_threshold(MADE, *gc.get_threshold()[1:])
 
 
 def collecting_later(function: Callable[P, R]) -> Callable[P, R]:

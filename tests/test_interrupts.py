@@ -52,6 +52,22 @@ def run():
     except KeyboardInterrupt:
         raise ImportError("initialization failed")
 """
+ENDS_BY_ITSELF = """
+import atexit
+
+class Kept:
+    def __del__(self):
+        print("shut down by Python")
+
+kept = Kept()
+
+def run():
+    atexit.register(print, "ended")
+    print("ready", flush=True)
+    print("answer")
+    print("note", end="", file=sys.stderr)
+    sys.exit(3)
+"""
 GUARDED = """
 from ballfg.cli.start import guarded
 
@@ -142,3 +158,14 @@ def test_code_that_raises_an_interrupt_by_itself_is_not_interrupted(monkeypatch:
     monkeypatch.setattr(interrupts, "_number", signal.SIGINT)
     assert interrupts.is_interrupt(KeyboardInterrupt())
     assert not interrupts.is_interrupt(SystemExit())
+
+
+def test_a_program_that_ends_by_itself_says_all_and_leaves_python_nothing_to_shut_down(
+    program: Callable[..., subprocess.Popen[str]],
+) -> None:
+    with program(ENDS_BY_ITSELF) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert process.stdout.read() == "answer\nended\n"
+        assert process.stderr.read() == "note"
+    assert process.returncode == 3

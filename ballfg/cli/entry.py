@@ -41,7 +41,7 @@ def _run(module: str) -> None:
     except KeyboardInterrupt:
         _leave(say_so())
     except SystemExit as end:
-        if interrupted() and isinstance(end.code, int):
+        if isinstance(end.code, int):
             _leave(end.code)
         raise
     except Exception:
@@ -53,11 +53,12 @@ def _run(module: str) -> None:
 
 
 def _leave(status: int) -> NoReturn:
-    """Ends the process without Python's shutdown, which takes half a second for torch and similar packages."""
+    """Ends the process without Python's shutdown, which takes 0.7 s of a processor for torch and similar packages."""
     let_go()
     atexit._run_exitfuncs()
-    with suppress(OSError):  # the reader may be gone
-        sys.stdout.flush()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError):  # the reader may be gone
+            stream.flush()
     os._exit(status)
 
 

@@ -23,6 +23,7 @@ from typing import IO, Any, Final
 import llvmlite
 import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
+from numba.core.runtime import rtsys
 
 from ballfg.files.own_folder import is_own, own_bytes, temporary_folder
 
@@ -218,6 +219,16 @@ class _Cache(FunctionCache):
         cell = not os.path.exists(file)  # of a notebook
         stamp = str(self._impl.locator.get_source_stamp()) if cell else source_stamp(file)
         self._cache_file = _Checked(self.cache_path, self._impl.filename_base, stamp)
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """The kept code; None if there is none.
+
+        numba's own method first loads all that a compilation needs, which takes a fifth of a second. Code that is
+        compiled already needs the memory of its arrays alone; a compilation loads the rest itself.
+        """
+        rtsys.initialize(target_context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)
 
 
 class _KeptBeside(_Cache):

@@ -346,3 +346,40 @@ def test_the_folder_of_one_process_goes_with_it(tmp_path: Path) -> None:
     assert Path(path).parents[1] == tmp_path
     assert was_there == "True"
     assert list(tmp_path.iterdir()) == [taken]
+
+
+ALLOCATES = """
+import sys
+import numpy as np
+from numba import types
+from ballfg.dynamics.compiled.build import machine_code
+TWO = types.Array(types.float64, 2, "C")
+
+@machine_code(types.void(TWO, TWO))
+def square(x, y):
+    y[:] = np.dot(x, x.T) + np.ones((2, 2))
+
+@machine_code(types.void(TWO, TWO))
+def cube(x, y):
+    y[:] = np.dot(np.dot(x, x.T), x)
+
+x, y, z = np.array([[1.0, 2.0], [3.0, 5.0]]), np.empty((2, 2)), np.empty((2, 2))
+square(x, y)
+loaded = "numba.misc.cffiimpl" in sys.modules  # a part that numba imports for compilations alone
+if len(sys.argv) > 1:
+    cube(x, z)
+print(loaded, np.array_equal(y, x @ x.T + 1.0), np.array_equal(z, x @ x.T @ x))
+"""
+
+
+def test_kept_code_runs_without_what_a_compilation_loads_and_a_compilation_after_it_works(tmp_path: Path) -> None:
+    (tmp_path / "allocates.py").write_text(ALLOCATES)
+
+    def answer(*words: str) -> list[str]:
+        command = [sys.executable, str(tmp_path / "allocates.py"), *words]
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.split()
+
+    assert answer() == ["True", "True", "False"]  # compiled
+    assert answer() == ["False", "True", "False"]  # kept
+    assert answer("cube") == ["False", "True", "True"]  # kept, and then another one is compiled
