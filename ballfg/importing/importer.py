@@ -46,7 +46,7 @@ def import_tracks(
         time: unit of stamps: s, ms, us or ns.
         up: axis of the source that points up: x, y, z, -x, -y or -z.
         flip: axis of the source whose sign is changed first, for a left-handed frame.
-        table_height: z of the table's surface in the new frame, m.
+        table_height: z of the table's surface in the new frame, m; None: where bounces show it, else there is none.
         split_gap: s without samples after which a new shot begins.
         ball: table-tennis, tennis or a ball file; None: table-tennis.
         rate: Hz, for sources with numbers of frames in place of times.

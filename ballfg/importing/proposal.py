@@ -82,7 +82,7 @@ def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
     tracks, notes = _tracks(shots, frame)
     ball, ball_guess = ball_of(choices, frame)
     recorded = recordings(tracks)
-    height, height_guess = table_of(tracks, recorded.cut, ball, choices)
+    height, height_guess, table_doubt = table_of(tracks, recorded.cut, ball, choices)
     flights_guess = recorded.guess(choices.flights)
     tracks = _flights(recorded) if choices.flights else tracks
     rate = float(f"{1.0 / np.median(np.concatenate([np.diff(track.seconds) for track in tracks])):.4g}")
@@ -96,7 +96,7 @@ def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
         rate=rate,
         source=source[:200],
         imported={guess.what: f"{guess.value} ({guess.sure}: {guess.why})" for guess in guesses},
-        doubts=(*_unseen(roles), *frame.doubts, *recorded.doubts(frame, choices.flights)),
+        doubts=(*_unseen(roles), *frame.doubts, *recorded.doubts(frame, choices.flights), *table_doubt),
     )
     used = (*roles.time, *roles.places, roles.frame)
     doubts = [[*table.notes, *(said for name, said in table.doubts.items() if name in used)] for table in chosen]

@@ -169,11 +169,6 @@ def names_that_say_nothing(f: Path, s: list[Track]) -> Path:
     return written(f / "a.csv", renamed(columns, shot="A", t="B", x="C", y="D", z="E"))
 
 
-def no_bounce(f: Path, s: list[Track]) -> Path:
-    parts = [shot.between(0.0, float(shot.times[np.argmax(shot.positions[:, 0] > 0.8)])) for shot in s]
-    return written(f / "a.csv", columns_of(parts))
-
-
 def no_such_file(f: Path, s: list[Track]) -> Path:
     return f / "shots.csv"
 
@@ -207,7 +202,6 @@ REFUSED: dict[Mistake, str] = {
     two_balls_at_once: "--columns trajectory=NAME",
     frames_without_a_rate: "--rate 120",
     two_balls_in_columns: "--columns x=left_x,y=left_y,z=left_z (or x=right_x,y=right_y,z=right_z)",
-    no_bounce: "--table-height",
     no_such_file: "source must exist",
     a_pipe: "is a pipe or a device. Write what comes to a file",
     a_folder_of_pictures: "must hold files of measurements",

@@ -182,15 +182,14 @@ SOURCES: tuple[Callable[[Path], Path], ...] = (
     heights_without_a_bounce, two_coordinates, balls_in_columns, balls_in_columns_of_frames, qualisys,
     qualisys_without_times_or_bounces, motive_markers, motive_bodies_in_millimetres, vicon, dates_of_balls,
 )  # fmt: skip
-TRUTH = {"rate": 100.0, "length": "m", "time": "s", "up": "z", "table-height": 0.78}
+TRUTH = {"rate": 100.0, "length": "m", "time": "s", "up": "z"}
 """Answers to questions; the answer to one about columns is its first proposal."""
 DECIDED: dict[Callable[[Path], Path], tuple[str, ...]] = {
     frames_of_balls: ("rate",),
-    frames_of_falls_without_a_bounce: ("rate", "table-height"),
-    heights_without_a_bounce: ("rate", "table-height"),
+    frames_of_falls_without_a_bounce: ("rate",),
+    heights_without_a_bounce: ("rate",),
     balls_in_columns: ("columns",),
-    balls_in_columns_of_frames: ("columns", "rate", "table-height"),
-    qualisys_without_times_or_bounces: ("table-height",),
+    balls_in_columns_of_frames: ("columns", "rate"),
 }
 """What the source does not say, all of which the one refusal asks."""
 

@@ -53,7 +53,7 @@ class SightedDataset(TrackFolder):
         self.label_names = labels.names
         self._tracks = {}
         model = nominal_model(info.ball)
-        surfaces = replace(Surfaces.table_tennis(info.table_height), extent=info.table_extent)
+        surfaces = replace(Surfaces.table_tennis(self.table), extent=info.table_extent)
         for name, sightings in balls.items():
             known, own = bounces.get(name), labels.of(name)
             try:
