@@ -39,7 +39,8 @@ class Surfaces:
             table then lies under every ball whose centre is above its surface.
         edge_sigmas: (x_low, x_high, y_low, y_high) m, standard deviations of those ends, for predictions near them.
 
-    Raises: ValueError: a height that is neither finite nor -inf, a floor above the table, an extent out of order, a negative sigma.
+    Raises: ValueError: a height that is neither finite nor -inf, a floor above the table, an extent out of order, a
+        negative sigma.
     """
 
     table_height: float = 0.0

@@ -172,7 +172,7 @@ def test_calibration_tracks_that_fail_are_reported(
     [
         ("few", "conformal must hold at least 9 tracks with samples after their first 0.3 s: "),
         ("same", "conformal must hold other tracks than those that are predicted; got "),
-        ("table", "conformal must hold tracks above the same table, at 0.76 m; got 0.5 m in "),
+        ("table", "conformal must hold tracks with the same surface, table at 0.76 m; got table at 0.5 m in "),
         ("ball", "conformal must hold tracks of the same ball, Ball(radius=0.02, mass=0.0027); got "),
         ("none", "folder must exist; "),
         ("yaml", "section 'conformal' must be a mapping"),

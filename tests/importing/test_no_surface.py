@@ -43,7 +43,7 @@ def test_a_stated_height_stays() -> None:
 def test_turns_that_may_be_bounces_are_a_doubt() -> None:
     """Three balls that turn upwards at heights which no single surface has."""
     t, p = thrown(0.001)
-    data = bf.import_tracks([np.column_stack((t, p + [0.0, 0.0, rise])) for rise in (0.0, 0.35, 0.7)])
+    data = bf.import_tracks([np.column_stack((t, p + np.array([0.0, 0.0, rise]))) for rise in (0.0, 0.35, 0.7)])
     assert data.info.table_height is None
     (doubt,) = (doubt for doubt in data.info.doubts if "surface" in doubt)
     assert "3 turns at 0.78 to 1.48 m may be bounces or hits" in doubt
