@@ -61,7 +61,7 @@ def look_out(state: OnlineState, horizon: float, plane: Plane | None) -> Outlook
             "apex": lambda: EventAhead(apex(*carried, horizon), math.nan),
         }
         if plane is not None and path is not None:
-            asked = {"bounce": CONTACT, "apex": APEX, "crossing": plane}
+            asked: dict[str, Plane | str] = {"bounce": CONTACT, "apex": APEX, "crossing": plane}
             finders = {what: partial(event_on, path, event) for what, event in asked.items()}
         found = {what: _tried(find, what, notes) for what, find in finders.items()}
     chances = None if plane is None else {what: event.probability for what, event in found.items()}
