@@ -17,7 +17,7 @@ from ballfg.state import SIGMA_NAMES, STATE_NAMES
 from ballfg.tracks.detections_file import write_sightings
 from ballfg.tracks.info import TABLE_TENNIS, DatasetInfo, write_info
 from ballfg.vision.camera_file import write_cameras
-from tests.estimation.observations.sighted_rig import RIG, TABLE, Scene, scene, track_of, world
+from tests.estimation.observations.sighted_rig import RIG, TABLE, Scene, launch, scene, seen, track_of, truth, world
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +79,26 @@ def test_predict_command_reads_detections(folder: Path, capsys: pytest.CaptureFi
     assert len(rows) == sum(int((t.seconds > 0.2 + 1e-6).sum()) for t in read_sighted(folder))
     assert command("predict", folder, "--observe", 0.2, "--conformal", folder, "--out", out) == 2
     assert "conformal must not be given with detections" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("gust", [0.0, 20.0])
+def test_intervals_that_the_sightings_contradict(
+    gust: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A gust (m/s^2) that begins after the observed part: what cameras saw lies outside of the intervals."""
+    write_info(tmp_path / "dataset.yaml", DatasetInfo("seen", TABLE, TABLE_TENNIS))
+    write_cameras(tmp_path / "cameras.yaml", RIG)
+    times = np.repeat(np.arange(40) / 120.0, len(RIG)) + np.tile(np.arange(len(RIG)) / 360.0, 40)
+    camera, balls = np.tile(np.arange(len(RIG)), 40), {}
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        states = truth(launch(rng), times, world())
+        states[:, 1] += 0.5 * gust * np.maximum(times - 0.15, 0.0) ** 2
+        balls[f"{seed}"] = seen(states, camera, times, rng).sightings
+    write_sightings(tmp_path / "detections.csv", balls.items())
+    assert command("predict", tmp_path, "--observe", 0.15, "--out", tmp_path / "p.csv", "--jobs", 1) == 0
+    said = capsys.readouterr().out
+    assert ("of what was measured there; check the cameras, or write positions" in said) == (gust > 0.0)
 
 
 def test_source_can_be_chosen(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
