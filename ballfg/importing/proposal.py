@@ -7,6 +7,7 @@ from typing import Any, Final
 import numpy as np
 
 from ballfg.checks import short_text
+from ballfg.importing.beside import balls_of
 from ballfg.importing.bounces import ball_of, table_of
 from ballfg.importing.choices import AllUndecidedError, Choices, Guess, UndecidedError, decided
 from ballfg.importing.columns import UNMEASURED, Roles
@@ -41,7 +42,8 @@ def propose(data: Any, choices: Choices) -> Proposal:
 
     Raises: UndecidedError, AllUndecidedError: unsafe guesses, all at once. FileNotFoundError. ValueError: unreadable.
     """
-    tables = tables_of(data, choices.topic, choices.key)
+    read = tables_of(data, choices.topic, choices.key)
+    tables = [ball for table in read for ball in balls_of(table, choices)]
     try:
         return _proposed(tables, choices)
     except UndecidedError as question:
