@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import torch
 from numba.extending import register_jitable
 from torch import Tensor
 
-from ballfg.checks import check_array, check_number
+from ballfg.checks import check_array, check_number, is_number
 from ballfg.dynamics.motion.limits import DEEPEST
 from ballfg.state import Z
 
@@ -49,7 +49,7 @@ class Surfaces:
     edge_sigmas: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if self.table_height != -math.inf:
+        if not (is_number(self.table_height) and self.table_height == -math.inf):
             check_number("table_height", self.table_height, "m")
         floor = None if self.floor_height is None else check_number("floor_height", self.floor_height, "m")
         if floor is not None and not floor < self.table_height:
@@ -64,7 +64,8 @@ class Surfaces:
     @classmethod
     def table_tennis(cls, table_height: float) -> Surfaces:
         """A table at a height in the room, with the floor 0.76 m below its surface; of -inf none."""
-        return cls.none() if table_height == -math.inf else cls(table_height, table_height - TABLE_ABOVE_FLOOR)
+        table = cls(table_height)
+        return replace(table, floor_height=table_height - TABLE_ABOVE_FLOOR) if table.heights() else table
 
     @classmethod
     def none(cls) -> Surfaces:
