@@ -48,6 +48,8 @@ def collect(given: Given, names: Sequence[str] = (), limited: bool = True) -> Sh
         limited: True to take at most 40 shots and 36,000 rows, for a page.
     Raises: ValueError: an unknown name, results of other tracks, or a shot too long for a page.
     """
+    if given.dataset is not None and given.predictions is not None:  # predictions are of flights
+        given = replace(given, predictions=given.predictions.joined(given.dataset.names))
     known = _names(given)
     for name in names:
         if name not in known:
