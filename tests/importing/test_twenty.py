@@ -203,6 +203,9 @@ def test_right_or_asked_at_once(make: Callable[[Path], Path], tmp_path: Path) ->
         questions = error.questions if isinstance(error, AllUndecidedError) else (error,)
         assert tuple(question.option for question in questions) == DECIDED[make]
         assert all(f"--{question.option}" in str(error) for question in questions)
+        arguments = str(error).rpartition("In Python: ")[2].rstrip(".")
+        answers = eval(f"dict({arguments})")  # as a user pastes them
+        assert list(answers) == [question.option.replace("-", "_") for question in questions]
         for question in questions:
             known[question.option.replace("-", "_")] = TRUTH[question.option]
     data = bf.import_tracks(source, **known)
