@@ -18,12 +18,12 @@ from ballfg.machine import usable_cores
 from ballfg.progress import progress
 
 if TYPE_CHECKING:
-    from ballfg.dynamics import BallModel
+    from ballfg.dynamics import AnalyticModel, BallModel
     from ballfg.dynamics.surfaces import Surfaces
     from ballfg.estimation import Estimator, Settings
     from ballfg.estimation.observations.sighted_dataset import SightedDataset
     from ballfg.estimation.settings import Solver
-    from ballfg.tracks import Dataset
+    from ballfg.tracks import Ball, Dataset
 
 
 def check_dataset(folder: Path) -> Path:
@@ -79,7 +79,7 @@ ModelFile = Annotated[
 ]
 BallName = Annotated[
     str | None,
-    typer.Option("--ball", help="Known ball, by its name in ballfg balls; by default the one that the dataset states."),
+    typer.Option("--ball", help="Known ball, or a ball file (YAML); by default the one that the dataset states."),
 ]
 """The option of commands that read a dataset. It must agree with the dataset's own ball."""
 CORES = usable_cores()
@@ -250,7 +250,7 @@ def open_source(
 def open_model(data: Dataset | SightedDataset, model: Path | None, ball: str | None = None) -> BallModel:
     """The model of a file, or the nominal one; prints notes on data and model on stderr.
 
-    Args: ball: name of the data's known ball; None: any ball.
+    Args: ball: name of the data's known ball, or a ball file, whose model is then the nominal one; None: any ball.
     Raises: ValueError: if that name is unknown, or the data's radius and mass differ from that ball's.
     """
     return _opened(data, model, ball)[0]
@@ -261,29 +261,49 @@ def _opened(data: Dataset | SightedDataset, model: Path | None, ball: str | None
     import torch
 
     from ballfg.dynamics import load_model, nominal_model
-    from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball
-    from ballfg.dynamics.nominal import inertia_factor, known_name, nominal_note
+    from ballfg.dynamics.nominal import inertia_factor, nominal_note
     from ballfg.estimation.configure import table_note
     from ballfg.estimation.reading import unused_model
 
-    if ball is not None and known_name(data.ball) != (wanted := known_ball(ball)):
-        named, own = KNOWN_BALLS[wanted].ball, data.ball
+    file = ball is not None and Path(ball).is_file()
+    if ball is not None and not _agree(named := _named(ball)[0], own := data.ball):
         raise ValueError(
             f"--ball {ball} has a radius of {named.radius:g} m and {named.mass:g} kg; {data.path} states "
             f"{own.radius:g} m and {own.mass:g} kg. Leave --ball out, or correct ball in dataset.yaml."
         )
     torch.set_num_threads(1)  # the batches are small: threads cost more time than they save
-    found: BallModel = nominal_model(data.ball)
+    found: BallModel = _named(ball)[1] if file and ball is not None else nominal_model(data.ball)
     if model is not None:
         inertia = inertia_factor(data.ball)
         found = load_model(model, radius=data.ball.radius, inertia_factor=inertia, room=data.info.name)
     doubts = _doubts_of(data, found, model)
     print_doubts(doubts)
     notes = [*data.notes, *filter(None, [table_note(data)])]
-    if model is None:
+    if model is None and not file:
         notes += [note for note in (nominal_note(data.ball), *unused_model(data.path, data.ball)) if note]
     print_notes(notes)
     return found, doubts
+
+
+def _named(ball: str) -> tuple[Ball, AnalyticModel]:
+    """A ball and its model: a known one by its name, or that of a ball file."""
+    from ballfg.dynamics import nominal_model
+    from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball
+
+    if Path(ball).is_file():
+        from ballfg.simulation.balls import ball_kind
+
+        kind = ball_kind(ball)
+        return kind.ball, kind.model
+    name = known_ball(ball)
+    return KNOWN_BALLS[name].ball, nominal_model(name)
+
+
+def _agree(one: Ball, other: Ball) -> bool:
+    """True if radius and mass are those of the same ball."""
+    from ballfg.dynamics.nominal import TOLERANCE
+
+    return all(abs(a / b - 1.0) <= TOLERANCE for a, b in ((other.radius, one.radius), (other.mass, one.mass)))
 
 
 def _doubts_of(data: Dataset | SightedDataset, model: BallModel, file: Path | None) -> tuple[str, ...]:
@@ -298,18 +318,16 @@ def _doubts_of(data: Dataset | SightedDataset, model: BallModel, file: Path | No
 def model_alone(model: Path | None, ball: str | None) -> tuple[BallModel, Settings]:
     """A model without a dataset, and its settings: of a file, else the nominal one.
 
-    Args: ball: name of the known ball that gives radius and inertia; None: table tennis.
+    Args: ball: name of the known ball that gives radius and inertia, or a ball file; None: table tennis.
     """
-    from ballfg.dynamics import load_model, nominal_model
-    from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball
+    from ballfg.dynamics import load_model
     from ballfg.estimation import Settings
     from ballfg.estimation.configure import learned_process
     from ballfg.estimation.noise.parameters import with_noise
 
-    name = known_ball(ball or "table_tennis")
-    known = KNOWN_BALLS[name]
-    inertia = known.inertia_factor
-    loaded = load_model(model, radius=known.ball.radius, inertia_factor=inertia) if model else nominal_model(name)
+    loaded: BallModel = (known := _named(ball or "table_tennis")[1])
+    if model is not None:
+        loaded = load_model(model, radius=known.radius, inertia_factor=known.inertia_factor)
     settings = Settings.for_measured(loaded)
     if loaded.trained is not None:
         settings = Settings(position_scale=loaded.trained.position_scale, process=learned_process(loaded.trained))

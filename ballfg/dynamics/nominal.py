@@ -115,3 +115,15 @@ def _set_spread(model: AnalyticModel, shares: Mapping[str, float]) -> None:
         effect = cast(Effect, effects[name])
         (coefficient,) = effect.coefficients
         effect.set_sigmas(**{coefficient.name: share * abs(float(getattr(effect, coefficient.name).detach()))})
+
+
+def spread_like(model: AnalyticModel, usual: AnalyticModel) -> None:
+    """Gives coefficients the prior standard deviations of another model, in proportion to their values."""
+    for own, others in ((model.flight, usual.flight), (model.bounce, usual.bounce)):
+        effects, known = dict(own.items()), dict(others.items())
+        for name in effects.keys() & known.keys():
+            effect, other = cast(Effect, effects[name]), cast(Effect, known[name])
+            for one in other.coefficients:
+                value, size = (abs(float(getattr(each, one.name).detach())) for each in (effect, other))
+                if one.sigma is not None and size > 0.0:
+                    effect.set_sigmas(**{one.name: one.sigma * value / size})

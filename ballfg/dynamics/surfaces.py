@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import torch
 from numba.extending import register_jitable
 from torch import Tensor
 
-from ballfg.checks import check_array, check_number
+from ballfg.checks import check_array, check_number, is_number
 from ballfg.dynamics.motion.limits import DEEPEST
 from ballfg.state import Z
 
@@ -33,13 +33,14 @@ class Surfaces:
     """Table and floor, as heights in the world frame.
 
     Attributes:
-        table_height: m, z of the table's surface.
+        table_height: m, z of the table's surface; -inf where there is no surface at all (`none`).
         floor_height: m, z of the floor; None where there is no floor below (a court is its own floor).
         extent: (x_low, x_high, y_low, y_high) m of the table; infinite for an unknown end. None if no end is known: the
             table then lies under every ball whose centre is above its surface.
         edge_sigmas: (x_low, x_high, y_low, y_high) m, standard deviations of those ends, for predictions near them.
 
-    Raises: ValueError: a height that is not finite, a floor above the table, an extent out of order, a negative sigma.
+    Raises: ValueError: a height that is neither finite nor -inf, a floor above the table, an extent out of order, a
+        negative sigma.
     """
 
     table_height: float = 0.0
@@ -48,7 +49,8 @@ class Surfaces:
     edge_sigmas: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        check_number("table_height", self.table_height, "m")
+        if not (is_number(self.table_height) and self.table_height == -math.inf):
+            check_number("table_height", self.table_height, "m")
         floor = None if self.floor_height is None else check_number("floor_height", self.floor_height, "m")
         if floor is not None and not floor < self.table_height:
             raise ValueError(f"floor_height must lie below table_height {self.table_height:g} m; got {floor:g} m")
@@ -61,17 +63,26 @@ class Surfaces:
 
     @classmethod
     def table_tennis(cls, table_height: float) -> Surfaces:
-        """A table at a height in the room, with the floor 0.76 m below its surface."""
-        return cls(table_height, table_height - TABLE_ABOVE_FLOOR)
+        """A table at a height in the room, with the floor 0.76 m below its surface; of -inf none."""
+        table = cls(table_height)
+        return replace(table, floor_height=table_height - TABLE_ABOVE_FLOOR) if table.heights() else table
+
+    @classmethod
+    def none(cls) -> Surfaces:
+        """No surface: a ball flies, is struck, thrown or caught, and never bounces."""
+        return cls(-math.inf)
 
     def __str__(self) -> str:
+        if not self.heights():
+            return "no surface"
         names = ("x >= {:.2f} m", "x <= {:.2f} m", "y >= {:.2f} m", "y <= {:.2f} m")
         ends = [name.format(end) for name, end in zip(names, self.extent or (), strict=False) if math.isfinite(end)]
         return f"table at {self.table_height:g} m" + (f" within {', '.join(ends)}" if ends else "")
 
     def heights(self) -> tuple[float, ...]:
-        """All surface heights, the table's first."""
-        return (self.table_height,) if self.floor_height is None else (self.table_height, self.floor_height)
+        """All surface heights, the table's first; empty where there is no surface."""
+        known = (self.table_height, -math.inf if self.floor_height is None else self.floor_height)
+        return tuple(height for height in known if height > -math.inf)
 
     def over_table(self, state: Tensor) -> Tensor:
         """(...) bool of states (..., 9): the ball's x, y lie within the table's extent."""

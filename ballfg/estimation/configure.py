@@ -220,12 +220,12 @@ def launcher_of(info: DatasetInfo, model: BallModel) -> Launcher | None:
 
 
 def dataset_surfaces(dataset: Dataset | SightedDataset) -> Surfaces:
-    """The dataset's table and the floor below it.
+    """The dataset's table and the floor below it, or no surface.
 
     The table's ends come from `dataset.yaml`, else from the sides past which balls fell.
     """
     info = dataset.info
-    surfaces = Surfaces.table_tennis(info.table_height)
+    surfaces = Surfaces.table_tennis(dataset.table)
     if info.table_extent is not None:
         return replace(surfaces, extent=info.table_extent, edge_sigmas=(STATED_EDGE_SIGMA,) * 4)
     found = found_table(dataset)
@@ -235,6 +235,8 @@ def dataset_surfaces(dataset: Dataset | SightedDataset) -> Surfaces:
 @lru_cache(maxsize=8)
 def found_table(dataset: Dataset | SightedDataset) -> TableExtent | None:
     """The table's ends from the first tracks, whatever `dataset.yaml` says; None if the tracks do not show them."""
+    if dataset.info.table_height is None:
+        return None
     tracks = islice(iter(dataset), TRACKS_FOR_TABLE)
     return find_table_extent(tracks, dataset.info.table_height, dataset.ball.radius)
 

@@ -19,6 +19,7 @@ import yaml
 
 from ballfg.arrays import Array, Index
 from ballfg.checks import check_keys, check_path, one_line, short_text, shown
+from ballfg.dynamics.surfaces import Surfaces
 from ballfg.files.strict_yaml import mapping, read_mapping
 from ballfg.files.whole_file import write_text
 from ballfg.tracks.stamps import elapsed
@@ -212,7 +213,8 @@ def check_calibration_tracks(calibration: Dataset | SightedDataset, dataset: Dat
     if calibration.ball != dataset.ball:
         rule = f"of the same ball, {dataset.ball}; got {calibration.ball}"
     elif not isclose(calibration.table, dataset.table, rel_tol=0.0, abs_tol=TABLE_TOLERANCE):
-        rule = f"above the same table, at {dataset.table:g} m; got {calibration.table:g} m"
+        own, other = (Surfaces.table_tennis(one.table) for one in (dataset, calibration))
+        rule = f"with the same surface, {own}; got {other}"
     if rule:
         remedy = "Give calibration tracks of the same kind."
         raise ValueError(f"conformal must hold tracks {rule} in {calibration.path}. {remedy}")

@@ -7,10 +7,10 @@ from typing import Final
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.importing.choices import Choices, Guess, UndecidedError
+from ballfg.importing.choices import Choices, Guess
 from ballfg.importing.frame import Frame
 from ballfg.tracks import TABLE_TENNIS, Ball, Track
-from ballfg.tracks.info import TENNIS
+from ballfg.tracks.info import NO_SURFACE, TENNIS
 
 _ARM: Final = 0.06  # s of flight for the fit on each side of a bounce
 _LEAST_SAMPLES: Final = 3
@@ -193,29 +193,36 @@ def ball_of(choices: Choices, frame: Frame) -> tuple[Ball, Guess]:
     return TABLE_TENNIS, Guess("ball", "table-tennis", why, sure, "--ball tennis")
 
 
-def table_of(tracks: Sequence[Track], flights: Sequence[Track], ball: Ball, choices: Choices) -> tuple[float, Guess]:
-    """The height of the table's surface in m, and the confidence in it. Raises: UndecidedError: no bounce shows it.
+def table_of(
+    tracks: Sequence[Track], flights: Sequence[Track], ball: Ball, choices: Choices
+) -> tuple[float | None, Guess, list[str]]:
+    """The height of the table's surface in m, None without one, the confidence in it, and a doubt for `dataset.yaml`.
 
     Args: tracks: all.  flights: those in them; bounces of a ball in a hand are none.
     """
     if choices.table_height is not None:
         height = choices.table_height
-        return height, Guess("table height", f"{height:g} m", "as given", "stated", f"--table-height {height:g}")
+        return height, Guess("table height", f"{height:g} m", "as given", "stated", f"--table-height {height:g}"), []
     handled = len(flights) != len(tracks) or any(a is not b for a, b in zip(flights, tracks, strict=True))
     found = surface(((track.seconds, track.positions) for track in flights), handled)
     if found is None:
-        heights = [turn.height for flight in flights for turn in turns_of(flight.seconds, flight.positions)]
-        lowest = min(float(track.positions[:, 2].min()) for track in tracks)
-        what, likely = f"the lowest sample is at {lowest:.2f} m", lowest
-        if heights:
-            likely = float(np.median(heights))
-            many = "one turn" if len(heights) == 1 else f"{len(heights)} turns"
-            what = f"{many} at {min(heights):.2f} to {max(heights):.2f} m may be bounces or hits"
-        what = f"no bounces show the height of the table (m, along the up axis; of none, one below all samples); {what}"
-        raise UndecidedError(what, "table-height", (), f"{likely - ball.radius:.2f}")
+        return None, *_without(flights, ball)
     height = round(found.centre - ball.radius, 4)
     others = "".join(f"; also at {other - ball.radius:.2f} m" for other in found.others)
     one = "1 bounce" if found.bounces == 1 else f"{found.bounces} bounces"
     why = f"{one}, scatter {1e3 * found.spread:.1f} mm{others}"
     sure = "sure" if found.bounces >= 3 and not found.others else "likely"
-    return height, Guess("table height", f"{height:g} m", why, sure, f"--table-height {height:g}")
+    return height, Guess("table height", f"{height:g} m", why, sure, f"--table-height {height:g}"), []
+
+
+def _without(flights: Sequence[Track], ball: Ball) -> tuple[Guess, list[str]]:
+    """The guess that there is no surface, and a doubt if some turns of the balls may be bounces."""
+    turns = [turn for flight in flights for turn in turns_of(flight.seconds, flight.positions)]
+    heights = [turn.height - ball.radius for turn in turns if turn.bounce]
+    if not heights:
+        return Guess("table height", NO_SURFACE, "no ball bounces", "likely", "--table-height 0.76"), []
+    typed = f"--table-height {np.median(heights):.2f}"
+    where = f"at {min(heights):.2f} to {max(heights):.2f} m" if len(heights) > 1 else f"at {heights[0]:.2f} m"
+    many = "one turn" if len(heights) == 1 else f"{len(heights)} turns"
+    why = f"{many} {where} may be bounces or hits"
+    return Guess("table height", NO_SURFACE, why, "unsure", typed), [f"no surface is known: {why}"]

@@ -2,13 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Final
+from typing import Any, Final, Self
 
 from ballfg.checks import check_choice, check_instance, check_number, check_text, short_text, shown
 from ballfg.importing.fall import AXES, LENGTHS, TIMES
 
 ROLES: Final = ("t", "frame", "trajectory", "x", "y", "z", "sigma_x", "sigma_y", "sigma_z")  # of a column
 _EXAMPLE: Final = "--columns t=stamp,x=X."
+_NUMBERS: Final = ("table-height", "rate", "split-gap")
 MAX_WHAT: Final = 900  # largest number of characters of an open question in a message
 MAX_CHOICE: Final = 240  # largest number of characters of a choice in it, for three column names of usual length
 
@@ -24,6 +25,21 @@ class UndecidedError(ValueError):
         many = f" (or {', '.join(others)})" if others else ""
         super().__init__(f"{short_text(what, MAX_WHAT)}. Decide it with --{option} {remedy}{many}.")
 
+    @property
+    def arguments(self) -> str:
+        """The first answer as arguments of `import_tracks`."""
+        value: Any = self.first
+        if self.option == "columns":
+            value = dict(pair.split("=", 1) for pair in self.first.split(",") if "=" in pair)
+        elif self.option in _NUMBERS:
+            value = float(self.first)
+        return f"{self.option.replace('-', '_')}={value!r}"
+
+    def in_python(self) -> Self:
+        """The same question, with the arguments of `import_tracks` beside the options of the command."""
+        self.args = (f"{self} In Python: {short_text(self.arguments, MAX_WHAT)}.",)
+        return self
+
 
 class AllUndecidedError(UndecidedError):
     """Several unsafe guesses; `questions` has each, the later ones under the first values of the earlier ones."""
@@ -33,6 +49,11 @@ class AllUndecidedError(UndecidedError):
         self.option, self.choices, self.first = questions[0].option, questions[0].choices, questions[0].first
         listed = " ".join(f"({i}) {question}" for i, question in enumerate(questions, 1))
         ValueError.__init__(self, f"{len(questions)} decisions are needed. {listed}")
+
+    @property
+    def arguments(self) -> str:
+        """The first answers as arguments of `import_tracks`."""
+        return ", ".join(question.arguments for question in self.questions)
 
 
 @dataclass(frozen=True)
@@ -83,7 +104,7 @@ def decided(choices: Choices, option: str, answer: str) -> Choices:
     name = option.replace("-", "_")
     if name == "columns":
         return replace(choices, columns={**choices.columns, **parse_columns(answer)})
-    value: str | float = float(answer) if name in ("table_height", "rate", "split_gap") else answer
+    value: str | float = float(answer) if option in _NUMBERS else answer
     known: dict[str, Any] = {name: value}
     return replace(choices, **known)
 

@@ -5,7 +5,7 @@ from os import PathLike
 from typing import Any, Literal
 
 from ballfg.checks import check_choice, check_flag, check_path
-from ballfg.importing.choices import Choices
+from ballfg.importing.choices import Choices, UndecidedError
 from ballfg.importing.proposal import propose
 from ballfg.importing.writing import write_import
 from ballfg.tracks import Dataset, read_dataset
@@ -46,7 +46,7 @@ def import_tracks(
         time: unit of stamps: s, ms, us or ns.
         up: axis of the source that points up: x, y, z, -x, -y or -z.
         flip: axis of the source whose sign is changed first, for a left-handed frame.
-        table_height: z of the table's surface in the new frame, m.
+        table_height: z of the table's surface in the new frame, m; None: where bounces show it, else there is none.
         split_gap: s without samples after which a new shot begins.
         ball: table-tennis, tennis or a ball file; None: table-tennis.
         rate: Hz, for sources with numbers of frames in place of times.
@@ -57,7 +57,7 @@ def import_tracks(
         file_format: "csv" or "parquet".
         force: replace a dataset in `out`.
     Returns: the dataset; it goes into `bf.estimate` as it is.
-    Raises: UndecidedError: an unsafe guess, a ValueError that names the argument (as a command's option). ValueError:
+    Raises: UndecidedError: an unsafe guess, a ValueError that names the command's option and the argument. ValueError:
         unreadable data, or an argument that breaks its rule. FileNotFoundError: a missing file.
     """
     check_choice("file_format", file_format, ("csv", "parquet"))
@@ -68,7 +68,10 @@ def import_tracks(
         {} if columns is None else columns, length, time, up, flip, table_height, split_gap, ball, rate, key, topic,
         folder.name if name is None and folder is not None else name, flights,
     )  # fmt: skip
-    proposal = propose(data, choices)
+    try:
+        proposal = propose(data, choices)
+    except UndecidedError as question:
+        raise question.in_python() from None
     if folder is None:
         return dataset_in_memory(proposal.info, proposal.tracks, proposal.notes)
     write_import(folder, proposal, file_format, force)

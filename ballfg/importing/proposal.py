@@ -7,6 +7,7 @@ from typing import Any, Final
 import numpy as np
 
 from ballfg.checks import short_text
+from ballfg.importing.beside import balls_of
 from ballfg.importing.bounces import ball_of, table_of
 from ballfg.importing.choices import AllUndecidedError, Choices, Guess, UndecidedError, decided
 from ballfg.importing.columns import UNMEASURED, Roles
@@ -41,7 +42,8 @@ def propose(data: Any, choices: Choices) -> Proposal:
 
     Raises: UndecidedError, AllUndecidedError: unsafe guesses, all at once. FileNotFoundError. ValueError: unreadable.
     """
-    tables = tables_of(data, choices.topic, choices.key)
+    read = tables_of(data, choices.topic, choices.key)
+    tables = [ball for table in read for ball in balls_of(table, choices)]
     try:
         return _proposed(tables, choices)
     except UndecidedError as question:
@@ -82,7 +84,7 @@ def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
     tracks, notes = _tracks(shots, frame)
     ball, ball_guess = ball_of(choices, frame)
     recorded = recordings(tracks)
-    height, height_guess = table_of(tracks, recorded.cut, ball, choices)
+    height, height_guess, table_doubt = table_of(tracks, recorded.cut, ball, choices)
     flights_guess = recorded.guess(choices.flights)
     tracks = _flights(recorded) if choices.flights else tracks
     rate = float(f"{1.0 / np.median(np.concatenate([np.diff(track.seconds) for track in tracks])):.4g}")
@@ -96,7 +98,7 @@ def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
         rate=rate,
         source=source[:200],
         imported={guess.what: f"{guess.value} ({guess.sure}: {guess.why})" for guess in guesses},
-        doubts=(*_unseen(roles), *frame.doubts, *recorded.doubts(frame, choices.flights)),
+        doubts=(*_unseen(roles), *frame.doubts, *recorded.doubts(frame, choices.flights), *table_doubt),
     )
     used = (*roles.time, *roles.places, roles.frame)
     doubts = [[*table.notes, *(said for name, said in table.doubts.items() if name in used)] for table in chosen]

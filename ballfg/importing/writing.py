@@ -33,9 +33,10 @@ def page(proposal: Proposal) -> str:
     """The page: the shots from the side and from above, the guesses, and omitted rows."""
     info = proposal.info
     samples = sum(len(track) for track in proposal.tracks)
+    bounce = "" if info.table_height is None else " and bounce on the grey line"
     words = (
         f"{len(proposal.tracks)} shots, {samples} samples, {info.rate:g} Hz, from {info.source}. "
-        "Balls fly in arcs that open downwards and bounce on the grey line if the import is right."
+        f"Balls fly in arcs that open downwards{bounce} if the import is right."
     )
     rows = (
         (guess.what, tag("b", guess.value), guess.why, tag("span", guess.sure, kind=guess.sure), typed(guess.option))
@@ -52,7 +53,7 @@ def page(proposal: Proposal) -> str:
     )
 
 
-def _drawing(tracks: Sequence[Track], height: float) -> Html:
+def _drawing(tracks: Sequence[Track], height: float | None) -> Html:
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
@@ -65,7 +66,8 @@ def _drawing(tracks: Sequence[Track], height: float) -> Html:
             p = track.positions[:: max(1, -(-len(track) // _MOST_POINTS))]
             for axes, other in ((side, 2), (above, 1 - across)):
                 axes.plot(p[:, across], p[:, other], ".-", markersize=2, linewidth=0.5, alpha=0.7)
-        side.axhline(height, color="0.5", linewidth=1.5)
+        if height is not None:
+            side.axhline(height, color="0.5", linewidth=1.5)
         names = "xyz"
         side.set(ylabel="z, m (up)", title="from the side")
         above.set(xlabel=f"{names[across]}, m", ylabel=f"{names[1 - across]}, m", title="from above")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -17,7 +17,7 @@ from ballfg.estimation.result import Status
 from ballfg.live.tracker import BallUpdate
 from ballfg.prediction import BallState, apex, next_contact
 from ballfg.prediction.crossing import Crossing
-from ballfg.prediction.event_ahead import crossing_of
+from ballfg.prediction.event_ahead import APEX, CONTACT, EventAhead, event_on
 from ballfg.prediction.forecast import carried_by
 from ballfg.prediction.plane import Plane
 from ballfg.state import POSITION, SPIN, VELOCITY
@@ -30,6 +30,7 @@ class Outlook:
     """Events ahead of a ball.
 
     bounce: the next contact, apex: the next highest point, crossing: of the plane; None without one within the horizon.
+        probability: of each by its name, where a plane was asked for.
         note: reason for a missing prediction; empty without one.
     """
 
@@ -37,6 +38,7 @@ class Outlook:
     apex: Crossing | None = None
     crossing: Crossing | None = None
     note: str = ""
+    probability: Mapping[str, float] | None = None
 
 
 def look_out(state: OnlineState, horizon: float, plane: Plane | None) -> Outlook:
@@ -51,13 +53,21 @@ def look_out(state: OnlineState, horizon: float, plane: Plane | None) -> Outlook
     with np.errstate(all="ignore"):
         try:
             carried = carried_by(state)
+            path = None if plane is None else state.predict(horizon).path()
         except Exception as error:  # a prediction must not end the stream
             return Outlook(note=f"no prediction: {_one_line(error)}")
-        bounce = _tried(partial(next_contact, *carried, horizon), "bounce", notes)
-        top = _tried(partial(apex, *carried, horizon), "apex", notes)
-        across = None if plane is None else partial(crossing_of, carried, plane, horizon)
-        crossing = None if across is None else _tried(across, "crossing", notes)
-    return Outlook(bounce, top, crossing, "; ".join(notes))
+        finders: dict[str, Callable[[], EventAhead]] = {
+            "bounce": lambda: EventAhead(next_contact(*carried, horizon), math.nan),
+            "apex": lambda: EventAhead(apex(*carried, horizon), math.nan),
+        }
+        if plane is not None and path is not None:
+            asked: dict[str, Plane | str] = {"bounce": CONTACT, "apex": APEX, "crossing": plane}
+            finders = {what: partial(event_on, path, event) for what, event in asked.items()}
+        found = {what: _tried(find, what, notes) for what, find in finders.items()}
+    chances = None if plane is None else {what: event.probability for what, event in found.items()}
+    return Outlook(
+        **{what: event.crossing for what, event in found.items()}, note="; ".join(notes), probability=chances
+    )
 
 
 def unusable(state: BallState) -> str:
@@ -72,15 +82,16 @@ def unusable(state: BallState) -> str:
     return ""
 
 
-def _tried(find: Callable[[], Crossing | None], what: str, notes: list[str]) -> Crossing | None:
+def _tried(find: Callable[[], EventAhead], what: str, notes: list[str]) -> EventAhead:
     try:
         found = find()
     except Exception as error:
         notes.append(f"no {what}: {_one_line(error)}")
-        return None
-    if found is not None and not (math.isfinite(found.time) and np.isfinite(found.state).all()):
+        return EventAhead(None, math.nan)
+    mean = found.crossing
+    if mean is not None and not (math.isfinite(mean.time) and np.isfinite(mean.state).all()):
         notes.append(f"no {what}: it is not finite")
-        return None
+        return EventAhead(None, math.nan)
     return found
 
 
@@ -125,6 +136,7 @@ def encoded(fields: Fields, latency: float) -> bytes:
 def _state(update: BallUpdate, outlook: Outlook) -> Fields:
     state = update.state
     assert state is not None
+    chances = outlook.probability
     return {
         "t": state.time,
         "t_input": update.time,
@@ -142,6 +154,7 @@ def _state(update: BallUpdate, outlook: Outlook) -> Fields:
         "bounce": _crossing(outlook.bounce),
         "apex": _crossing(outlook.apex),
         "crossing": _crossing(outlook.crossing),
+        "probability": None if chances is None else {what: _number(chance) for what, chance in chances.items()},
         "note": "; ".join(text for text in (update.reason, outlook.note) if text),
     }
 

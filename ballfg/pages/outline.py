@@ -37,8 +37,13 @@ class Outline:
         return (self.height,) if self.floor is None else (self.height, self.floor)
 
 
-def outline(info: DatasetInfo, positions: Array) -> Outline:
-    """The table of a dataset. Args: info: of the dataset. positions: (n, 3) m, samples above the table, n >= 1."""
+def outline(info: DatasetInfo, positions: Array) -> Outline | None:
+    """The table of a dataset; None if it has no surface.
+
+    Args: info: of the dataset.  positions: (n, 3) m, samples above the table, n >= 1.
+    """
+    if info.table_height is None:
+        return None
     low, high = positions[:, :2].min(axis=0), positions[:, :2].max(axis=0)
     seen = (low[0] - MARGIN, high[0] + MARGIN, low[1] - MARGIN, high[1] + MARGIN)
     small = info.ball.radius < SMALL_BALL

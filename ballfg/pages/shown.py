@@ -25,7 +25,7 @@ class Shown:
 
     Attributes:
         given: all given files.  shots: the chosen ones, in the dataset's order.  count: total number of shots.
-        table: its place; None without a dataset.
+        table: its place; None without a dataset or a surface.
         coverage: of all predicted shots, not only the chosen ones; None without measured tracks or predictions.
         noise: a sentence on the standard deviation of the measured coordinates; empty if unknown.
         notes: sentences for the reader.
@@ -48,6 +48,8 @@ def collect(given: Given, names: Sequence[str] = (), limited: bool = True) -> Sh
         limited: True to take at most 40 shots and 36,000 rows, for a page.
     Raises: ValueError: an unknown name, results of other tracks, or a shot too long for a page.
     """
+    if given.dataset is not None and given.predictions is not None:  # predictions are of flights
+        given = replace(given, predictions=given.predictions.joined(given.dataset.names))
     known = _names(given)
     for name in names:
         if name not in known:
@@ -74,11 +76,9 @@ def collect(given: Given, names: Sequence[str] = (), limited: bool = True) -> Sh
     table = None
     if given.dataset is not None and shots:
         table = outline(given.dataset.info, np.concatenate([shot.positions for shot in shots]))
-        radius = given.dataset.ball.radius
-        shots = [
-            replace(s, marks=tuple(marks(s.state_times, s.states, table.surfaces, radius, s.flying))) for s in shots
-        ]
-        notes.append(table.words)
+        radius, surfaces = given.dataset.ball.radius, () if table is None else table.surfaces
+        shots = [replace(s, marks=tuple(marks(s.state_times, s.states, surfaces, radius, s.flying))) for s in shots]
+        notes += [] if table is None else [table.words]
     return Shown(given, tuple(shots), len(known), table, held, noise, tuple(notes))
 
 

@@ -2,7 +2,8 @@
 
 import enum
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +50,19 @@ class ResultTable:
     def of(self, name: str) -> Array:
         """(k, 1 + c) rows of a track in the units of the columns; empty for an unknown track."""
         return self.values[self.rows.get(name, slice(0))]
+
+    def joined(self, names: Sequence[str]) -> "ResultTable":
+        """The table with the rows of flights, as `TRACK-000`, under the name in `names` of their recording."""
+        known, parts = set(names), dict[str, list[NDArray[np.int64]]]()
+        for name, rows in self.rows.items():
+            track, _, number = name.rpartition("-")
+            whole = track if name not in known and track in known and number.isdigit() else name
+            parts.setdefault(whole, []).append(np.arange(rows.start, rows.stop))
+        order = np.concatenate([np.empty(0, np.int64), *(one for found in parts.values() for one in found)])
+        ends = np.cumsum([0, *(sum(map(len, found)) for found in parts.values())]).tolist()
+        rows_of = {name: slice(*pair) for name, pair in zip(parts, pairwise(ends), strict=True)}
+        labels = self.labels[order] if len(self.labels) else self.labels
+        return replace(self, rows=rows_of, values=self.values[order], labels=labels)
 
 
 def kind_of(columns: Sequence[str]) -> Kind | None:

@@ -110,7 +110,11 @@ class Forecast:
         if not isinstance(asked, Plane):
             check_text("asked", asked)
             asked = asked_event(asked)
-        return event_on(Path(self.start, self._carried, self.times, self.states, self.covariances), asked)
+        return event_on(self.path(), asked)
+
+    def path(self) -> Path:
+        """The path for several events."""
+        return Path(self.start, self._carried, self.times, self.states, self.covariances)
 
     @property
     def _carried(self) -> tuple[Propagator, Belief]:

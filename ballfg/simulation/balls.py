@@ -9,6 +9,7 @@ from ballfg.checks import check_number, listed, shown
 from ballfg.dynamics import AnalyticModel, Surfaces, nominal_model
 from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball
 from ballfg.dynamics.model_file import model_from_dict, model_to_dict
+from ballfg.dynamics.nominal import spread_like
 from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR, TABLE_LENGTH, TABLE_WIDTH
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.simulation.launcher import LAUNCHERS, TABLE_LAUNCHER, SimulatedLauncher
@@ -103,6 +104,7 @@ def ball_from_mapping(content: Any, default_name: str = "ball") -> BallKind:
     stated = {part: content.get(part, usual[part]) for part in ("flight", "bounce")}
     factor = check_number("inertia_factor", content.get("inertia_factor", known.inertia_factor))
     model = model_from_dict(stated, radius=ball.radius, inertia_factor=factor, where="ball")
+    spread_like(model, known)
     surface = content.get("surface", "table")
     if surface not in ("table", "court"):
         raise ValueError(f"surface must be 'table' or 'court'; got {shown(surface)}. Choose one of them.")

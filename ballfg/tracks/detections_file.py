@@ -44,6 +44,8 @@ RULES: Final[Mapping[str, Rule]] = {
 }
 DETECTIONS_FILE: Final = "detections.csv"
 REQUIRED: Final = (KEY, "t", CAMERA, "u", "v")
+BEYOND: Final = 0.05
+"""Share of a picture's size by which a place may lie beyond it: the centre of a ball that is cut by the border."""
 
 
 def read_sightings(
@@ -185,6 +187,30 @@ def check_cameras(
             f"{_place(path, lines[strange], CAMERA)} must be a camera: {', '.join(cameras)}; got {shown(got)}. "
             f"Rename it, add it to the cameras' file, or delete its rows.{did_you_mean(got, cameras)}"
         )
+
+
+def check_inside(path: Path, camera: str, size: tuple[int, int], pixels: Array) -> None:
+    """Refuses places (n, 2) px beyond a camera's picture of `size` px by more than `BEYOND`. Raises: ValueError."""
+    reach = np.array(size, dtype=np.float64)
+
+    def outside(limits: Array) -> NDArray[np.bool_]:
+        return np.asarray(((pixels < -BEYOND * limits) | (pixels > (1.0 + BEYOND) * limits)).any(axis=1))
+
+    wrong = outside(reach)
+    if not wrong.any():
+        return
+    u, v = pixels[int(np.argmax(wrong))].tolist()
+    right, down = pixels.max(axis=0).tolist()
+    cause = f"They reach ({right:.0f}, {down:.0f}): calibrate in the size of the videos, or delete wrong rows."
+    if not outside(reach[::-1]).any():
+        cause = (
+            f"They fit a picture of {size[1]}x{size[0]}: it is probably turned by 90 degrees against that of the "
+            "calibration. Turn one of them."
+        )
+    raise ValueError(
+        f"{path}: camera {shown(camera)} has a picture of {size[0]}x{size[1]} px, in which detections must lie; "
+        f"{int(wrong.sum())} of {len(wrong)} do not, such as ({u:g}, {v:g}). {cause}"
+    )
 
 
 def covariances(values: Mapping[str, Array]) -> Array:

@@ -1,5 +1,6 @@
 """Reads, checks and writes `dataset.yaml`, the description of a dataset."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,6 +24,7 @@ from ballfg.files.strict_yaml import YamlError, read_yaml
 from ballfg.tracks.noise import TrackNoise
 
 INFO_FILE = "dataset.yaml"
+NO_SURFACE = "none"  # in place of a table's height
 _REQUIRED = ("name", "frame", "ball")
 _OPTIONAL = ("rate", "position_noise", "spin_noise", "source", "licence")
 _KNOWN = (*_REQUIRED, *_OPTIONAL, "noise", "labels", "import", "doubts")
@@ -71,8 +73,8 @@ class DatasetInfo:
 
     name: str
     """One line of text."""
-    table_height: float
-    """z of the table's surface, m."""
+    table_height: float | None
+    """z of the table's surface, m; None where balls meet no surface (`table_height: none` in the file)."""
     ball: Ball
     """Radius (m) and mass (kg)."""
     rate: float | None = None
@@ -110,8 +112,13 @@ class DatasetInfo:
             raise TypeError(f"import must be a mapping; got {type_name(self.imported)}. Delete the section.")
         if not isinstance(self.ball, Ball):
             raise TypeError(f"ball must be a Ball; got {type(self.ball).__name__}. Pass Ball(radius, mass).")
-        height = check_number("frame.table_height", self.table_height, "m", limit=MAX_HEIGHT, instead="mm")
-        object.__setattr__(self, "table_height", height)
+        if self.table_height is not None:
+            height = check_number("frame.table_height", self.table_height, "m", limit=MAX_HEIGHT, instead="mm")
+            object.__setattr__(self, "table_height", height)
+        elif self.table_extent is not None:
+            raise ValueError(
+                "frame.table must be absent where frame.table_height is none. Delete it, or give the height."
+            )
         for key, unit, least, limit, instead in (
             ("rate", "Hz", 1e-3, 1e7, "mHz"),
             ("position_noise", "m", _MIN_NOISE, _MAX_POSITION_NOISE, "mm"),
@@ -141,7 +148,7 @@ class DatasetInfo:
         _need(content, "name", "")
         return cls(
             name=content["name"],
-            table_height=frame["table_height"],
+            table_height=None if frame["table_height"] == NO_SURFACE else frame["table_height"],
             ball=Ball(radius=ball["radius"], mass=ball["mass"]),
             table_extent=_stated_extent(frame),
             noise=None if content.get("noise") is None else TrackNoise.from_mapping(content["noise"]),
@@ -152,7 +159,8 @@ class DatasetInfo:
 
     def to_mapping(self) -> dict[str, Any]:
         """The content of the corresponding `dataset.yaml`, without fields that are None."""
-        frame: dict[str, Any] = {"up": "z", "table_height": self.table_height}
+        height = NO_SURFACE if self.table_height is None else self.table_height
+        frame: dict[str, Any] = {"up": "z", "table_height": height}
         if self.table_extent is not None:
             frame["table"] = {"x": list(self.table_extent[:2]), "y": list(self.table_extent[2:])}
         content: dict[str, Any] = {"name": self.name, "frame": frame, "ball": asdict(self.ball)}
@@ -182,8 +190,8 @@ class TrackFolder:
 
     @property
     def table(self) -> float:
-        """m, height of the table's surface."""
-        return self.info.table_height
+        """m, height of the table's surface; -inf where there is none."""
+        return -math.inf if self.info.table_height is None else self.info.table_height
 
 
 def read_info(path: Path) -> tuple[DatasetInfo, list[str]]:

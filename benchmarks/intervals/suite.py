@@ -191,7 +191,7 @@ def run_intervals(
 def known_surfaces(dataset: Dataset) -> Surfaces:
     """The table, with its ends only where they are stated: others would come from the predicted parts."""
     stated = dataset.info.table_extent is not None
-    return dataset_surfaces(dataset) if stated else Surfaces.table_tennis(dataset.info.table_height)
+    return dataset_surfaces(dataset) if stated else Surfaces.table_tennis(dataset.table)
 
 
 def _simulated(results: Results, config: SimulationConfig, jobs: int) -> None:

@@ -7,9 +7,12 @@ from pathlib import Path
 import pytest
 
 from ballfg.cli.commands.live import _scene
+from ballfg.dynamics import nominal_model
+from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.known_balls import KNOWN_BALLS
 from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.simulation.balls import ball_kind
+from ballfg.tracks import Ball
 from tests.commands import status
 
 
@@ -54,6 +57,28 @@ def test_another_ball_is_refused(
     assert not out.exists()
 
 
+@pytest.mark.parametrize("command", ["estimate", "predict", "live"])
+def test_a_ball_file_is_the_ball_of_a_dataset(command: str, basketball: Path, tmp_path: Path) -> None:
+    """The drag of the file is used; radius and mass alone give the nominal model; another ball is refused."""
+    made: dict[str, bytes] = {}
+    drag = "flight: {gravity: {}, drag: {k: 0.2}}"
+    for name, text in {"same": "radius: 0.121\nmass: 0.6", "own": f"radius: 0.121\nmass: 0.6\n{drag}"}.items():
+        (tmp_path / f"{name}.yaml").write_text(text)
+    (tmp_path / "other.yaml").write_text("radius: 0.02\nmass: 0.0027")
+    for name in ("none", "same", "own", "other"):
+        out = tmp_path / f"{name}.{'jsonl' if command == 'live' else 'csv'}"
+        words = {
+            "estimate": ["estimate", basketball, "--jobs", 1],
+            "predict": ["predict", basketball, "--observe", 0.3],
+            "live": ["live", "--replay", basketball, "--speed", 0],
+        }[command]
+        named = [] if name == "none" else ["--ball", tmp_path / f"{name}.yaml"]
+        assert status(*words, *named, "--out", out) == (2 if name == "other" else 0)
+        lines = out.read_text().splitlines() if out.exists() else []
+        made[name] = "".join(line.rpartition(',"latency_ms')[0] or line for line in lines).encode()
+    assert made["same"] == made["none"] != made["own"]
+
+
 def test_a_shuttle(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert status("simulate", "--ball", "badminton", "--out", tmp_path / "shots") == 2
     assert "a badminton shuttle is no ball" in capsys.readouterr().err
@@ -63,3 +88,16 @@ def test_a_stream_without_a_dataset_is_of_the_ball_that_is_named() -> None:
     ball, _, _ = _scene(None, None, "golf", None, None, None)
     assert (ball.radius, ball.inertia_factor) == (0.021335, 0.4)
     assert _scene(None, None, None, None, None, None)[0].radius == 0.02
+
+
+def test_a_stream_of_a_ball_file(tmp_path: Path) -> None:
+    (tmp_path / "squash.yaml").write_text("radius: 0.0201\nmass: 0.024\nflight: {gravity: {}, drag: {k: 0.016}}")
+    ball, _, _ = _scene(None, None, str(tmp_path / "squash.yaml"), None, None, None)
+    nominal = nominal_model(Ball(0.0201, 0.024))
+    assert ball.radius == 0.0201
+    assert float(ball.flight["drag"].k.detach()) == 0.016
+    share = 0.5  # of the drag, the prior standard deviation where nothing is known of the ball
+    assert coefficient_sigmas(nominal)["flight.drag.k"] == pytest.approx(
+        share * float(nominal.flight["drag"].k.detach())
+    )
+    assert coefficient_sigmas(ball)["flight.drag.k"] == pytest.approx(share * 0.016)

@@ -124,10 +124,10 @@ def test_bad_input_is_one_line_and_nothing_is_written(
 ) -> None:
     out = ("--out", tmp_path / "c.yaml")
     table = ("--table", calib / "table.yaml")
-    few = ("--images", f"left={calib / 'left' / '0[0-5].png'}")
+    few = ("--images", f"left={calib / 'left' / '0[0-1].png'}")
     cases = [
         ((*BOARD, *images(calib, "left"), *table, *out), "table.yaml names camera 'right', which --images does not"),
-        ((*BOARD, *few, *out), "camera 'left': at least 8 images must show the board; got 6 of 6"),
+        ((*BOARD, *few, *out), "camera 'left': at least 3 images must show the board; got 2 of 2"),
         ((*BOARD, "--images", f"left={calib / 'none'}", *out), "none: must be a folder, a pattern or a file of images"),
         ((*BOARD, "--images", "left", *out), "--images must be NAME=PLACE, as left=calib/left; got 'left'"),
         ((*BOARD[:2], "--squares", "8", *images(calib), *out), "--squares must be squares in a row x rows, as 10x7"),

@@ -19,7 +19,8 @@ from ballfg.estimation.conformal import load_conformal
 from ballfg.front import estimator_for
 from ballfg.prediction.event_ahead import event_numbers
 from ballfg.simulation import SimulationConfig, write_simulation
-from ballfg.tracks import Dataset, read_dataset, write_dataset
+from ballfg.tracks import Ball, Dataset, Track, read_dataset, write_dataset
+from ballfg.tracks.info import DatasetInfo
 from tests.commands import status
 
 METHODS = ("smoother", "online", "ekf", "sliding-window")
@@ -32,6 +33,18 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     folder = tmp_path_factory.mktemp("cli") / "shots"
     write_simulation(folder, SimulationConfig(tracks=6, rate=60.0, seed=2))
     return read_dataset(folder)
+
+
+@pytest.mark.parametrize("gust", [0.0, 6.0])
+def test_intervals_that_the_tracks_contradict(gust: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A gust (m/s^2) that begins after the observed part; six tracks are too few to show their noise."""
+    t, tracks = np.arange(60) / 100.0, []
+    for seed in range(6):
+        p = np.stack((3.0 * t, 0.5 * gust * np.maximum(t - 0.3, 0.0) ** 2, 1.0 + 4.0 * t - 4.905 * t**2), axis=1)
+        tracks.append(Track(t, p + np.random.default_rng(seed).normal(0.0, 0.002, p.shape), name=f"{seed}"))
+    write_dataset(tmp_path / "throws", DatasetInfo("throws", None, Ball(0.0335, 0.0577), position_noise=0.002), tracks)
+    assert status("predict", tmp_path / "throws", "--observe", 0.3, "--out", tmp_path / "p.csv") == 0
+    assert ("of what was measured there; widen them with --conformal" in capsys.readouterr().out) == (gust > 0.0)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -172,7 +185,7 @@ def test_calibration_tracks_that_fail_are_reported(
     [
         ("few", "conformal must hold at least 9 tracks with samples after their first 0.3 s: "),
         ("same", "conformal must hold other tracks than those that are predicted; got "),
-        ("table", "conformal must hold tracks above the same table, at 0.76 m; got 0.5 m in "),
+        ("table", "conformal must hold tracks with the same surface, table at 0.76 m; got table at 0.5 m in "),
         ("ball", "conformal must hold tracks of the same ball, Ball(radius=0.02, mass=0.0027); got "),
         ("none", "folder must exist; "),
         ("yaml", "section 'conformal' must be a mapping"),

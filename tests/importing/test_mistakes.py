@@ -158,20 +158,15 @@ def frames_without_a_rate(f: Path, s: list[Track]) -> Path:
     return written(f / "a.csv", renamed(columns, t="frame"))
 
 
-def two_balls_in_columns(f: Path, s: list[Track]) -> Path:
+def one_ball_twice_in_columns(f: Path, s: list[Track]) -> Path:
     columns = columns_of(s)
-    more = {f"right_{axis}": columns[axis] + 1.0 for axis in "xyz"}
+    more = {f"right_{axis}": columns[axis] + 0.01 for axis in "xyz"}
     return written(f / "a.csv", renamed(columns, x="left_x", y="left_y", z="left_z") | more)
 
 
 def names_that_say_nothing(f: Path, s: list[Track]) -> Path:
     columns = columns_of(s, size=1e3)
     return written(f / "a.csv", renamed(columns, shot="A", t="B", x="C", y="D", z="E"))
-
-
-def no_bounce(f: Path, s: list[Track]) -> Path:
-    parts = [shot.between(0.0, float(shot.times[np.argmax(shot.positions[:, 0] > 0.8)])) for shot in s]
-    return written(f / "a.csv", columns_of(parts))
 
 
 def no_such_file(f: Path, s: list[Track]) -> Path:
@@ -206,8 +201,7 @@ REFUSED: dict[Mistake, str] = {
     one_stamp_for_all: "--columns t=NAME",
     two_balls_at_once: "--columns trajectory=NAME",
     frames_without_a_rate: "--rate 120",
-    two_balls_in_columns: "--columns x=left_x,y=left_y,z=left_z (or x=right_x,y=right_y,z=right_z)",
-    no_bounce: "--table-height",
+    one_ball_twice_in_columns: "--columns x=left_x,y=left_y,z=left_z (or x=right_x,y=right_y,z=right_z)",
     no_such_file: "source must exist",
     a_pipe: "is a pipe or a device. Write what comes to a file",
     a_folder_of_pictures: "must hold files of measurements",
@@ -255,7 +249,7 @@ OPTIONS: dict[Mistake, list[str]] = {
     seconds_in_the_header_of_milliseconds: ["--time", "ms"],
     two_clocks: ["--columns", "t=time_camera"],
     frames_without_a_rate: ["--rate", "120"],
-    two_balls_in_columns: ["--columns", "x=left_x,y=left_y,z=left_z"],
+    one_ball_twice_in_columns: ["--columns", "x=left_x,y=left_y,z=left_z"],
 }
 
 

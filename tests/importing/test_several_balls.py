@@ -9,7 +9,7 @@ import pytest
 
 import ballfg as bf
 from ballfg.importing.choices import UndecidedError
-from tests.importing.throws import thrown
+from tests.importing.throws import thrown, write_rows
 
 BALLS = {"red": 0.0, "green": 1.0, "blue": 2.0}
 """Names, and m by which they fly apart along y."""
@@ -38,6 +38,58 @@ def test_a_column_of_identities_makes_tracks(column: str, by_time: bool, tmp_pat
     file = tmp_path / "balls.csv"
     file.write_text(f"{column},t,x,y,z\n" + "\n".join(",".join(map(str, row)) for row in rows))
     _right(bf.import_tracks(file), list(BALLS))
+
+
+@pytest.mark.parametrize("title", ["{ball}_{axis}", "{ball}.{axis}", "{axis}_{ball}", "{ball} {axis} [mm]"])
+def test_balls_side_by_side(title: str, tmp_path: Path) -> None:
+    t, paths = _paths()
+    size = 1e3 if "mm" in title else 1.0
+    columns = {
+        title.format(ball=name, axis=axis): size * p[:, "xyz".index(axis)]
+        for name, p in paths.items()
+        for axis in "xyz"
+    }
+    rows = np.column_stack((t, *columns.values())).tolist()
+    _right(bf.import_tracks(write_rows(tmp_path / "balls.csv", ",".join(("time", *columns)), rows)), list(BALLS))
+
+
+def test_numbered_balls_side_by_side_some_of_them_hidden(tmp_path: Path) -> None:
+    t, paths = _paths()
+    columns = {
+        f"ball{k}_{axis}": p[:, "xyz".index(axis)].tolist() for k, p in enumerate(paths.values()) for axis in "xyz"
+    }
+    for axis in "xyz":
+        columns[f"ball1_{axis}"][:20] = [""] * 20
+    rows = list(zip(t.tolist(), *columns.values(), strict=True))
+    data = bf.import_tracks(write_rows(tmp_path / "balls.csv", ",".join(("t", *columns)), rows))
+    assert data.names == ["ball-0", "ball-1", "ball-2"]
+    assert [len(track) for track in data] == [len(t), len(t) - 20, len(t)]
+    np.testing.assert_allclose(data["ball-1"].positions, paths["green"][20:], atol=1e-9)
+
+
+def test_heights_side_by_side(tmp_path: Path) -> None:
+    t, paths = _paths()
+    heights = np.column_stack((t, *(p[:, 2] + 2.0 * i for i, p in enumerate(paths.values())))).tolist()
+    data = bf.import_tracks(write_rows(tmp_path / "drops.csv", "t,red_z,green_z,blue_z", heights))
+    assert data.names == list(BALLS)
+    assert not any(track.positions[:, :2].any() for track in data)
+
+
+def test_shots_of_balls_side_by_side(tmp_path: Path) -> None:
+    t, paths = _paths()
+    rows = [(shot, *row) for shot in "ab" for row in np.column_stack((t, *paths.values())).tolist()]
+    header = ",".join(("shot", "t", *(f"{name}_{axis}" for name in paths for axis in "xyz")))
+    data = bf.import_tracks(write_rows(tmp_path / "balls.csv", header, rows))
+    assert len(data) == 6
+    assert all(len(track) == len(t) for track in data)
+
+
+@pytest.mark.parametrize(("words", "shift"), [(("raw", "filtered"), 1.0), (("left", "right"), 0.02)])
+def test_one_ball_measured_twice_is_asked_about(words: tuple[str, str], shift: float, tmp_path: Path) -> None:
+    t, p = thrown(0.001)
+    header = ",".join(("t", *(f"{name}_{axis}" for name in words for axis in "xyz")))
+    with pytest.raises(UndecidedError, match="2 sets of columns may be the ball's x, y, z"):
+        bf.import_tracks(write_rows(tmp_path / "a.csv", header, np.column_stack((t, p, p + shift)).tolist()))
 
 
 def test_balls_within_shots(tmp_path: Path) -> None:
@@ -122,12 +174,3 @@ def test_one_or_two_coordinates(header: str, tmp_path: Path) -> None:
     assert (track.positions[:, 1] == 0.0).all()
     assert "not measured" in data.info.doubts[0]
     assert bf.estimate(data)["000"].status is bf.Status.OK
-
-
-def test_sets_of_columns_are_asked_about(tmp_path: Path) -> None:
-    t, p = thrown(0.001)
-    file = tmp_path / "two.csv"
-    rows = np.column_stack((t, p, p + 1.0)).tolist()
-    file.write_text("t,left_x,left_y,left_z,right_x,right_y,right_z\n" + "\n".join(",".join(map(str, r)) for r in rows))
-    with pytest.raises(UndecidedError, match="sets of columns"):
-        bf.import_tracks(file)

@@ -182,15 +182,13 @@ SOURCES: tuple[Callable[[Path], Path], ...] = (
     heights_without_a_bounce, two_coordinates, balls_in_columns, balls_in_columns_of_frames, qualisys,
     qualisys_without_times_or_bounces, motive_markers, motive_bodies_in_millimetres, vicon, dates_of_balls,
 )  # fmt: skip
-TRUTH = {"rate": 100.0, "length": "m", "time": "s", "up": "z", "table-height": 0.78}
-"""Answers to questions; the answer to one about columns is its first proposal."""
+TRUTH = {"rate": 100.0, "length": "m", "time": "s", "up": "z"}
+"""Answers to questions."""
 DECIDED: dict[Callable[[Path], Path], tuple[str, ...]] = {
     frames_of_balls: ("rate",),
-    frames_of_falls_without_a_bounce: ("rate", "table-height"),
-    heights_without_a_bounce: ("rate", "table-height"),
-    balls_in_columns: ("columns",),
-    balls_in_columns_of_frames: ("columns", "rate", "table-height"),
-    qualisys_without_times_or_bounces: ("table-height",),
+    frames_of_falls_without_a_bounce: ("rate",),
+    heights_without_a_bounce: ("rate",),
+    balls_in_columns_of_frames: ("rate",),
 }
 """What the source does not say, all of which the one refusal asks."""
 
@@ -205,13 +203,15 @@ def test_right_or_asked_at_once(make: Callable[[Path], Path], tmp_path: Path) ->
         questions = error.questions if isinstance(error, AllUndecidedError) else (error,)
         assert tuple(question.option for question in questions) == DECIDED[make]
         assert all(f"--{question.option}" in str(error) for question in questions)
+        arguments = str(error).rpartition("In Python: ")[2].rstrip(".")
+        answers = eval(f"dict({arguments})")  # as a user pastes them
+        assert list(answers) == [question.option.replace("-", "_") for question in questions]
         for question in questions:
-            pairs = dict(part.split("=") for part in question.first.split(",")) if question.option == "columns" else {}
-            known[question.option.replace("-", "_")] = pairs or TRUTH[question.option]
+            known[question.option.replace("-", "_")] = TRUTH[question.option]
     data = bf.import_tracks(source, **known)
     t, paths = balls(drop=len(next(iter(data))) < 40)
-    one = make in (heights, heights_without_a_bounce, balls_in_columns, balls_in_columns_of_frames)
-    assert len(data) == (1 if one else 3)
+    two = make in (balls_in_columns, balls_in_columns_of_frames)
+    assert len(data) == (1 if make in (heights, heights_without_a_bounce) else 2 if two else 3)
     by_name = make is a_file_for_each_ball  # in the order of the alphabet
     for track, path in zip(data, [paths[track.name] for track in data] if by_name else paths.values(), strict=False):
         np.testing.assert_allclose(track.seconds, t - t[0] + track.seconds[0], atol=2e-5)

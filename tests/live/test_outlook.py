@@ -32,6 +32,16 @@ def test_events_are_those_of_the_prediction(state: OnlineState) -> None:
     assert look_out(state, 0.01, Plane.parse("x=50")).crossing is None
 
 
+@pytest.mark.parametrize("plane", ["x=1.5", "z=0.9,down", "z=0.9,up,after=1", "x=50"])
+def test_probabilities_are_those_of_the_prediction(state: OnlineState, plane: str) -> None:
+    ahead, seen = state.predict(0.5), look_out(state, 0.5, Plane.parse(plane))
+    expected = {"bounce": "next-contact", "apex": "apex", "crossing": plane}
+    assert seen.probability == {what: ahead.event(event).probability for what, event in expected.items()}
+    finer = state.predict(0.5, 0.005)  # as the command predict has it
+    assert seen.probability["crossing"] == pytest.approx(finer.event(plane).probability, abs=0.02)
+    assert look_out(state, 0.5, None).probability is None
+
+
 def test_what_cannot_be_predicted_says_why(state: OnlineState) -> None:
     assert "too few samples" in look_out(replace(state, status=Status.NO_VELOCITY), 0.5, None).note
     vague = replace(state, joint=state.joint * 1e6)

@@ -29,6 +29,22 @@ def test_residuals_are_measured_less_estimated(made: Made) -> None:
         assert contact.time == pytest.approx(fall.contact, abs=5e-4)
 
 
+def test_predictions_of_flights_are_shown_with_their_recording(made: Made, tmp_path: Path) -> None:
+    plain = pa_csv.read_csv(
+        made.predictions, convert_options=pa_csv.ConvertOptions(column_types={"trajectory": pa.string()})
+    )
+    times = plain["t"].to_numpy()
+    second = (times > np.median(times)).astype(int).tolist()
+    flights = [f"{name}-{k:03d}" for name, k in zip(plain["trajectory"].to_pylist(), second, strict=True)]
+    file = tmp_path / "of_flights.csv"
+    pa_csv.write_csv(plain.set_column(0, "trajectory", pa.array(flights)), file)
+    one, other = (collect(recognise([made.dataset, made.states, path])).shots for path in (made.predictions, file))
+    for shot, same in zip(one, other, strict=True):
+        assert shot.name == same.name
+        np.testing.assert_array_equal(shot.predicted, same.predicted)
+        np.testing.assert_array_equal(shot.predicted_times, same.predicted_times)
+
+
 def test_noise_of_the_residuals_where_none_is_stated(tmp_path: Path) -> None:
     made = make(tmp_path, {str(i): Fall() for i in range(30)}, noise=False)
     shown = collect(recognise([made.dataset, made.states]))

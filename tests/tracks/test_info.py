@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 
 from ballfg.checks import MAX_LISTED
@@ -44,6 +45,28 @@ def test_the_ends_of_the_table_are_read_and_written(make_folder, tmp_path):
     assert dataset.notes == []
     write_info(tmp_path / "dataset.yaml", dataset.info)
     assert read_info(tmp_path / "dataset.yaml") == (dataset.info, [])
+
+
+def test_a_dataset_without_a_surface(make_folder, tmp_path):
+    dataset = read_dataset(make_folder(yaml=_yaml(frame="frame: {up: z, table_height: none}")))
+    assert dataset.info.table_height is None
+    assert dataset.table == -np.inf
+    write_info(tmp_path / "dataset.yaml", dataset.info)
+    assert "table_height: none" in (tmp_path / "dataset.yaml").read_text()
+    assert read_info(tmp_path / "dataset.yaml") == (dataset.info, [])
+
+
+@pytest.mark.parametrize(
+    ("frame", "rule"),
+    [
+        ("{up: z, table_height: null}", "frame.table_height is required"),
+        ("{up: z, table_height: nothing}", "frame.table_height must be a number"),
+        ("{up: z, table_height: none, table: {x: [0, 2], y: [0, 1]}}", "frame.table must be absent"),
+    ],
+)
+def test_a_height_that_is_neither_a_number_nor_none(make_folder, frame, rule):
+    with pytest.raises(ValueError, match=rule):
+        read_dataset(make_folder(yaml=_yaml(frame=f"frame: {frame}")))
 
 
 def test_unknown_fields_are_noted_with_the_nearest_name(make_folder):

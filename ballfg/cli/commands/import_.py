@@ -29,7 +29,9 @@ def import_(
     time: Annotated[str | None, _guess(help="Unit of times: s, ms, us or ns.")] = None,
     up: Annotated[str | None, _guess(help="Axis that points up: x, y, z, -x, -y or -z.")] = None,
     flip: Annotated[str | None, _guess(help="Axis to mirror, for a left-handed frame: x, y or z.")] = None,
-    table_height: Annotated[float | None, _guess(help="z of the table's surface in the new frame, m.")] = None,
+    table_height: Annotated[
+        float | None, _guess(help="z of the table's surface in the new frame, m; without bounces none.")
+    ] = None,
     split_gap: Annotated[float | None, _guess(help="Gap after which a new shot begins, s.")] = None,
     ball: Annotated[str | None, _guess(help="One of `ballfg balls`, or a ball file (YAML).")] = None,
     rate: Annotated[float | None, _guess(help="Frames per second, where there are frames and no times.")] = None,

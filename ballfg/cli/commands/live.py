@@ -29,7 +29,10 @@ MCAP, SQLITE = ".mcap", ".db3"
 def live(
     model: inputs.ModelFile = None,
     ball: Annotated[
-        str | None, typer.Option(help="Known ball, by its name in ballfg balls.", show_default="table_tennis")
+        str | None,
+        typer.Option(
+            help="Known ball, by its name in ballfg balls, or a ball file (YAML).", show_default="table_tennis"
+        ),
     ] = None,
     replay: Annotated[
         Path | None, typer.Option(help="Dataset, or rosbag2 / MCAP, to replay in place of standard input.")

@@ -138,7 +138,7 @@ def predict(
             table.write(columns if result.outside is None else columns | {"outside": result.outside})
             outcome.add(result, plain.sigmas)
     if scales is None:
-        inputs.print_doubts(outcome.contradicted())
+        inputs.print_doubts(outcome.contradicted(opened.dataset.rough))
     print(f"{out}: {outcome.rows} positions of {count} tracks, from the first {observe:g} s of each by {method}")
     outcome.print(observe)
     outcome.tracks.print_outside()
@@ -270,12 +270,16 @@ class _Outcome:
         outside = None if result.outside is None or not len(result.outside) else float(result.outside.mean())
         self.tracks.add(result.name, result.status, result.estimate.notes, outside)
 
-    def contradicted(self) -> tuple[str, ...]:
-        """A sentence on intervals that hold clearly less of what was measured than they state, by their mean share."""
+    def contradicted(self, rough: bool) -> tuple[str, ...]:
+        """A sentence on intervals that hold clearly less of what was measured than they state, by their mean share.
+
+        Args: rough: True for detections, which are judged by the positions that cameras together show.
+        """
         if self.judged < LEAST_JUDGED or (mean := self.shares / self.judged) >= LEAST_HELD:
             return ()
-        said = f"90 % intervals hold {100 * mean:.0f} % of what was measured there; widen them with --conformal"
-        return (f"{said} and calibration tracks of the same kind",)
+        said = f"90 % intervals hold {100 * mean:.0f} % of what was measured there"
+        remedy = "widen them with --conformal and calibration tracks of the same kind"
+        return (f"{said}; {'check the cameras, or write positions (ballfg track) and ' if rough else ''}{remedy}",)
 
     def print(self, observe: float) -> None:
         """Prints the counts of tracks by status and the errors of their predictions."""

@@ -78,36 +78,37 @@ def scores_of(models: Sequence[Weighed]) -> dict[frozenset[str], float]:
     absent, the linearisation with them holds the model without (J. M. Dickey, 1971), and the better of both counts.
     Models that no refit weighed count as foretold, and lose what those lose whose linearisations foretell them.
     """
-    weighed: dict[frozenset[str], list[Weight]] = {model.names: [model.weight] for model in models}
+    weighed = {model.names: model.weight for model in models}
     for model in models:
         for names, weight in model.nested.items():
             if names in weighed and weight.evidence > model.evidence - ABSENT:
-                weighed[names].append(weight)
-    believed: dict[frozenset[str], tuple[Weight, float]] = {}
-    for names in sorted(weighed, key=lambda names: (len(names), sorted(names))):
-        tried = [(weight, tempered(names, weight, believed)) for weight in weighed[names]]
-        believed[names] = max(tried, key=lambda one: one[1] + one[0].odds)
-    scores = {names: value + weight.odds for names, (weight, value) in believed.items()}
+                weighed[names] = max(weighed[names], weight, key=_score)
+    scores = {names: tempered(names, weight, weighed) + weight.odds for names, weight in weighed.items()}
     foretold: dict[frozenset[str], float] = {}
     for model in models:
         for names, weight in (*model.nested.items(), *model.neighbours.items()):
             if names not in scores:
                 lost = scores[model.names] + weight.score - model.score
-                score = min(lost, tempered(names, weight, believed) + weight.odds)
+                score = min(lost, tempered(names, weight, weighed) + weight.odds)
                 foretold[names] = max(score, foretold.get(names, -np.inf))
     return scores | foretold
 
 
-def tempered(names: frozenset[str], weight: Weight, believed: Mapping[frozenset[str], tuple[Weight, float]]) -> float:
+def tempered(names: frozenset[str], weight: Weight, others: Mapping[frozenset[str], Weight]) -> float:
     """The evidence of a model as far as the other half bears out what it gains over each smaller one.
 
-    Args: believed: other models, with their tempered evidence.
+    A smaller one that is itself doubtful takes nothing from it: an effect may act only beside another.
+
+    Args: others: the models that were weighed.
     """
-    smaller = [one for known, one in believed.items() if known < names and one[0].evidence < weight.evidence]
+    smaller = [other for known, other in others.items() if known < names and other.evidence < weight.evidence]
     if not smaller:
         return weight.evidence
-    promised = weight.evidence - np.array([other.evidence for other, _ in smaller])
-    gains = weight.held_out - np.stack([other.held_out for other, _ in smaller])
+    evidence = np.array([other.evidence for other in smaller])
+    gains = weight.held_out - np.stack([other.held_out for other in smaller])
     most = gains.sum(axis=1) + SURELY * gains.std(axis=1, ddof=1) * np.sqrt(gains.shape[1])
-    whole = np.array([value for _, value in smaller]) + np.clip(most, 0.0, promised)
-    return float(min(weight.evidence, whole.min()))
+    return float((evidence + np.clip(most, 0.0, weight.evidence - evidence)).min())
+
+
+def _score(weight: Weight) -> float:
+    return weight.score

@@ -77,8 +77,8 @@ class Screen:
         return [self._with(one, self.model.weight) for one in range(len(self.candidates))]
 
     @property
-    def _alone(self) -> dict[frozenset[str], tuple[Weight, float]]:
-        return {self.model.names: (self.model.weight, self.model.evidence)}
+    def _alone(self) -> dict[frozenset[str], Weight]:
+        return {self.model.names: self.model.weight}
 
     def odds(self, chosen: Sequence[int]) -> float:
         """Logarithm of the posterior odds of the model with some candidates, added in turn, to the model itself."""
@@ -101,8 +101,8 @@ class Screen:
         far as the other half bears it out.
         """
         found: dict[tuple[int, ...], float] = {(one,): self.odds((one,)) for one in offered}
-        best, believed = self._leading(found), self._alone
-        scores = self._borne_out(best, believed)
+        best, others = self._leading(found), self._alone
+        scores = self._borne_out(best, others)
         for _ in range(most - 1):
             larger: dict[tuple[int, ...], float] = {}
             for chosen in best:
@@ -115,23 +115,23 @@ class Screen:
             best = self._leading(gained)
             found |= {chosen: gained[chosen] for chosen in best}
             known_scores = {frozenset(c): score for c, score in scores.items()}
-            more = self._borne_out(best, believed)
+            more = self._borne_out(best, others)
             best = [c for c in best if more[c] > max(known_scores.get(part, -np.inf) for part in _parts(c))]
             scores |= {chosen: more[chosen] for chosen in best}
         return sorted(scores, key=lambda chosen: -scores[chosen])
 
     def _borne_out(
-        self, leading: Sequence[tuple[int, ...]], believed: dict[frozenset[str], tuple[Weight, float]]
+        self, leading: Sequence[tuple[int, ...]], others: dict[frozenset[str], Weight]
     ) -> dict[tuple[int, ...], float]:
-        """Odds of sets to the model, as far as the other half bears them out; adds them to the sets believed."""
+        """Odds of sets to the model, as far as the other half bears them out; adds them to the others."""
         found = {}
         for chosen in leading:
             gain, beside = self._together(chosen)
             listed, names = [self.candidates[one] for one in chosen], self._names(chosen)
             density = held_out(*self._part(self.tracks, beside, None), self.model.halves)
             weight = Weight(self.model.evidence + gain + choice_odds(listed), log_odds(listed), density)
-            believed[names] = weight, tempered(names, weight, believed)
-            found[chosen] = believed[names][1] - self.model.evidence + weight.odds
+            found[chosen] = tempered(names, weight, others) - self.model.evidence + weight.odds
+            others[names] = weight
         return found
 
     @cached_property

@@ -276,7 +276,7 @@ class _Run:
         if not self.settings.find_events:
             return first, first + 1
         z = self.track.positions[:, Z, None] - self.owner.model.radius
-        near = np.abs(z - np.array(self.owner.surfaces.heights())).min(axis=-1) < NEAR_SURFACE
+        near = np.abs(z - np.array(self.owner.surfaces.heights())).min(axis=-1, initial=np.inf) < NEAR_SURFACE
         sigma = total_sigmas(self.settings, self.sigma, self.velocities)
         return first_pair(self.track.times, self.track.positions, sigma, near, first)
 

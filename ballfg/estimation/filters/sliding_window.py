@@ -96,7 +96,7 @@ class SlidingWindow(Estimator):
 def may_touch(times: Array, positions: Array, surfaces: Surfaces, radius: float) -> NDArray[np.bool_]:
     """(n,) True if one of the last two samples is nearer to a surface than the ball moves in one interval."""
     n = len(times)
-    gap = np.abs(positions[:, Z, None] - radius - np.array(surfaces.heights())).min(axis=-1)
+    gap = np.abs(positions[:, Z, None] - radius - np.array(surfaces.heights())).min(axis=-1, initial=np.inf)
     travel = np.abs(np.diff(positions[:, Z]))
     reach = np.zeros(n)  # the vertical travel of the neighbouring intervals: the one with the bounce hides it
     reach[1:] = travel

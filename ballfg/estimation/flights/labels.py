@@ -64,7 +64,7 @@ class Labels:
         Args: heights: (n,) m, of the samples.  levels: m, heights of the ball's centre on the surfaces.
         """
         down = np.isin(self.values, (Label.ROLLING, Label.RESTING))
-        near = np.abs(heights[:, None] - np.array(levels)).min(axis=1) < ALIKE
+        near = np.abs(heights[:, None] - np.array(levels)).min(axis=1, initial=np.inf) < ALIKE
         return np.asarray((self.values != Label.HELD) & (~down | near))
 
     def stretches(self, label: Label) -> list[tuple[int, int]]:

@@ -7,6 +7,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
+import numpy as np
+
 from ballfg.arrays import Array
 from ballfg.checks import shown
 from ballfg.dynamics.nominal import nominal_model
@@ -14,7 +16,7 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.events_file import EVENTS_FILE, read_bounces
 from ballfg.estimation.observations.sightings import TooFewSightingsError, sighted_track
 from ballfg.files.whole_folder import of_one_state
-from ballfg.tracks.detections_file import DETECTIONS_FILE, read_sightings
+from ballfg.tracks.detections_file import DETECTIONS_FILE, check_inside, read_sightings
 from ballfg.tracks.info import INFO_FILE, DatasetInfo, TrackFolder, read_info
 from ballfg.tracks.labels import LABELS_FILE, LabelTable, read_labels
 from ballfg.tracks.sightings import Sightings
@@ -53,7 +55,7 @@ class SightedDataset(TrackFolder):
         self.label_names = labels.names
         self._tracks = {}
         model = nominal_model(info.ball)
-        surfaces = replace(Surfaces.table_tennis(info.table_height), extent=info.table_extent)
+        surfaces = replace(Surfaces.table_tennis(self.table), extent=info.table_extent)
         for name, sightings in balls.items():
             known, own = bounces.get(name), labels.of(name)
             try:
@@ -113,6 +115,9 @@ def read_sighted(folder: str | PathLike[str]) -> SightedDataset:
     info, notes = read_info(path / INFO_FILE)
     cameras = tuple(read_cameras(path / CAMERAS_FILE))
     balls, more = read_sightings(path / DETECTIONS_FILE, {camera.name: camera.time_offset for camera in cameras})
+    for number, camera in enumerate(cameras):
+        seen = [ball.pixels[ball.camera == number] for ball in balls.values()]
+        check_inside(path / DETECTIONS_FILE, camera.name, camera.size, np.concatenate([np.empty((0, 2)), *seen]))
     labels_file = path / LABELS_FILE
     labels = read_labels(labels_file, list(balls)) if labels_file.is_file() else LabelTable({}, {})
     bounces = read_bounces(path / EVENTS_FILE) if (path / EVENTS_FILE).is_file() else {}

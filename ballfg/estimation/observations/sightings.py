@@ -313,6 +313,11 @@ def sighted_track(
     known: OneView | None = None
     if alone:
         ball, ground = physics_of(nominal_model() if model is None else model), surfaces or Surfaces.table_tennis(0.0)
+        if not ground.heights():
+            raise ValueError(
+                f"track {shown(name)}: a ball that one camera saw must bounce on a surface, which shows how far away "
+                "it is; got none. State frame.table_height, or use a second camera."
+            )
         if bounces is not None:
             known = bounced_at(rays, moments, ball, ground, elapsed(bounces, origin))
         elif len(moments) < LEAST_SEEN:

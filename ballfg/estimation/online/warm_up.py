@@ -46,7 +46,8 @@ def warmed_up(online: Online) -> list[OnlineState]:
 
 def falling_ball(online: Online) -> tuple[Array, Array]:
     """Stamps (40,) s and positions (40, 3) m of a ball that falls onto the table of an estimator, and bounces."""
-    gravity, rise = online.physics.gravity, online.surfaces.table_height + online.physics.radius
+    table = (*online.surfaces.heights(), 0.0)[0]
+    gravity, rise = online.physics.gravity, table + online.physics.radius
     t: Array = PERIOD * np.arange(SAMPLES, dtype=np.float64)
     after = np.maximum(t - np.sqrt(2.0 * DROP / gravity), 0.0)
     falling = DROP - 0.5 * gravity * t**2

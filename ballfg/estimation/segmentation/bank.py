@@ -153,7 +153,7 @@ class Scene:
         self.rows: Records = np.zeros(len(heights), dtype=SURFACE)
         self.rows["centre"] = heights + physics.surface_offset + physics.radius
         self.rows["restitution_sigma"] = s.floor_restitution_sigma
-        self.rows["restitution_sigma"][0] = s.restitution_sigma
+        self.rows["restitution_sigma"][:1] = s.restitution_sigma
 
     def height(self, surface: int) -> float | None:
         """m, declared height of a surface; None for -1."""

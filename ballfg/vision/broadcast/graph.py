@@ -1,10 +1,10 @@
 """The graph of a camera that stands at one place, turns and zooms, solved with GTSAM.
 
-Unknowns are the place (Point3) of a shot, and of each picture the rotation (Rot3) and the logarithm of the focal
-length. Measurements are the ridges of the court's lines in each picture, across the lines, and background points that
-were matched between neighbouring pictures: a turn and a zoom about one place is a homography. Each residual r has
-Cauchy's loss, s^2 log(1 + (r / s)^2), as the square of a residual of that size, so that the graph's least squares is
-the robust problem itself.
+Unknowns are the place (Point3) of a shot, its lens, how far each line is off in all pictures, and of each picture the
+rotation (Rot3) and the logarithm of the focal length. Measurements are the ridges of the court's lines in each picture,
+across the lines, and background points that were matched between neighbouring pictures: a turn and a zoom about one
+place is a homography. Each residual r has Cauchy's loss, s^2 log(1 + (r / s)^2), as the square of a residual of that
+size, so that the graph's least squares is the robust problem itself.
 """
 
 from __future__ import annotations
@@ -21,15 +21,17 @@ from ballfg.vision.broadcast.background import Match
 from ballfg.vision.broadcast.lines import Ridges, bending, slopes
 from ballfg.vision.broadcast.pinhole import Pinhole
 
-RIDGE_SIGMA: Final = 0.7
+RIDGE_SIGMA: Final = 0.2
 """px, of a ridge's place."""
+LINE_SIGMA: Final = 0.08
+"""px, by which a line is off in all pictures: it was painted so, or its net sags, or the ground beside it moves it."""
 SHARED: Final = 4.0
-"""Ridges of a line, and matches of neighbouring points, err together: the number that counts as one."""
+"""Ridges of a line in a picture, and matches of neighbouring points, err together: the number that counts as one."""
 MATCH_SIGMA: Final = 0.5
 """px, of a background point's motion."""
 ROBUST: Final = 2.0
 """Scale of Cauchy's loss, in standard deviations."""
-PLACE, LENS = gtsam.symbol("p", 0), gtsam.symbol("l", 0)
+PLACE, LENS, LINES = gtsam.symbol("p", 0), gtsam.symbol("l", 0), gtsam.symbol("c", 0)
 STEPS: Final = 30
 PLACE_SIGMA, FOCAL_SIGMA, BEND_SIGMA = 30.0, 1.0, 0.1
 """m, and of the logarithm: priors about the first values, far wider than what the court tells. Of k1, about none:
@@ -57,6 +59,9 @@ def solve(cameras: Sequence[Pinhole], seen: Sequence[Ridges | None], matched: Se
     graph.add(gtsam.PriorFactorPoint3(PLACE, place, gtsam.noiseModel.Isotropic.Sigma(3, PLACE_SIGMA)))
     values.insert(LENS, np.zeros(1))
     graph.add(gtsam.PriorFactorVector(LENS, np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, BEND_SIGMA)))
+    count = max((len(lines.asked) for lines in seen if lines is not None), default=1)
+    values.insert(LINES, np.zeros(count))
+    graph.add(gtsam.PriorFactorVector(LINES, np.zeros(count), gtsam.noiseModel.Isotropic.Sigma(count, LINE_SIGMA)))
     wide = gtsam.noiseModel.Isotropic.Sigma(1, FOCAL_SIGMA)
     for k, one in enumerate(cameras):
         values.insert(_turn(k), gtsam.Rot3(one.turn.T))
@@ -99,19 +104,21 @@ def _court_factor(k: int, like: Pinhole, lines: Ridges) -> gtsam.CustomFactor:
     """The ridges of picture k, whose cameras differ from `like` little."""
     sigma = RIDGE_SIGMA * np.sqrt(SHARED)
     target = (lines.normal * like.project(lines.points)).sum(axis=1) + lines.offset
+    own_line = np.eye(len(lines.asked))[lines.line]
 
     def error(_: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
         pixels, slope = slopes(_camera(like, values, k), lines.points)
-        left = ((lines.normal * pixels).sum(axis=1) - target) / sigma
+        left = ((lines.normal * pixels).sum(axis=1) + values.atVector(LINES)[lines.line] - target) / sigma
         left, scale = _robust(left)
         if H is not None:
             rows = scale[:, None] * np.einsum("na,nab->nb", lines.normal, slope) / sigma
             for place, part in enumerate((slice(0, 3), slice(3, 6), slice(6, 7), slice(7, 8))):
                 H[place] = np.asfortranarray(rows[:, part])
+            H[4] = np.asfortranarray(scale[:, None] * own_line / sigma)
         return left
 
     unit = gtsam.noiseModel.Unit.Create(len(target))
-    return gtsam.CustomFactor(unit, gtsam.KeyVector([_turn(k), PLACE, _zoom(k), LENS]), error)
+    return gtsam.CustomFactor(unit, gtsam.KeyVector([_turn(k), PLACE, _zoom(k), LENS, LINES]), error)
 
 
 def _match_factor(k: int, like: Pinhole, match: Match) -> gtsam.CustomFactor:

@@ -24,6 +24,8 @@ STEP: Final = 0.5
 """px between values along a normal."""
 FLANK: Final = 3.0
 """px from the middle of a line to the ground beside it."""
+CROSSING: Final = 2.0 * FLANK
+"""px from another line within which it is in the way."""
 RIDGE: Final = 12.0
 """Grey levels by which a line is brighter than the ground, at least."""
 SIGMA: Final = 0.7
@@ -59,8 +61,13 @@ class Ridges:
         return float((close[seen] / self.asked[seen]).mean()) if seen.sum() >= 3 else 0.0
 
 
+def brightness(image: Image) -> Array32:
+    """(h, w) of a picture (h, w, 3). Its colours have half the resolution, and bleed from the ground into a line."""
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.float32)
+
+
 def ridges(image: Array32, camera: Pinhole, court: Court, reach: float) -> Ridges:
-    """The ridges of a picture (h, w, 3) within `reach` px of the lines of a court as a camera should see them."""
+    """The ridges of a picture's `brightness` within `reach` px of the lines of a court as a camera should see them."""
     share = (np.arange(SAMPLES) + 0.5) / SAMPLES
     points = court.lines[:, None, 0] + share[:, None] * (court.lines[:, None, 1] - court.lines[:, None, 0])
     pixels = camera.project(points)
@@ -70,30 +77,51 @@ def ridges(image: Array32, camera: Pinhole, court: Court, reach: float) -> Ridge
     normals = np.broadcast_to(normal[:, None], pixels.shape)
     limit = np.array(camera.size) - 1.0
     inside = ((pixels > FLANK) & (pixels < limit - FLANK)).all(axis=2) & (length > 2 * SAMPLES)[:, None]
+    inside &= ~_crossed(pixels, camera.project(court.lines))
     line = np.broadcast_to(np.arange(len(court.lines))[:, None], inside.shape)[inside]
     offset, good = _brightest(image, pixels[inside], normals[inside], reach)
     asked = inside.sum(axis=1)
     return Ridges(points[inside][good], offset[good], normals[inside][good], line[good], asked)
 
 
+def _crossed(pixels: Array, ends: Array) -> Mask:
+    """(l, k) whether another line (l, 2, 2) px is so close to places (l, k, 2) px on lines that it hides them."""
+    along = ends[:, 1] - ends[:, 0]
+    away = pixels[:, :, None] - ends[:, 0]
+    share = np.clip((away * along).sum(axis=-1) / (along**2).sum(axis=-1), 0.0, 1.0)
+    close = np.linalg.norm(away - share[..., None] * along, axis=-1) < CROSSING
+    close[np.arange(len(ends)), :, np.arange(len(ends))] = False
+    return np.asarray(close.any(axis=-1))
+
+
 def _brightest(image: Array32, pixels: Array, normal: Array, reach: float) -> tuple[Array, Mask]:
-    """(n,) px, the middle of the strongest ridge along each normal, and whether there is one (n,)."""
+    """(n,) px, the middle of the strongest ridge along each normal, and whether there is one (n,).
+
+    The middle lies between the places on both sides where the brightness is halfway down to the ground there: the
+    brightest place itself lies towards the brighter ground.
+    """
     steps = np.arange(-reach - FLANK, reach + FLANK + STEP / 2, STEP)
     if not len(pixels):
         return np.zeros(0), np.zeros(0, dtype=bool)
     at = (pixels[:, None] + steps[:, None] * normal[:, None]).astype(np.float32)
-    values = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR).reshape(len(pixels), len(steps), 3)
-    flank = round(FLANK / STEP)
+    values = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR).reshape(len(pixels), len(steps))
+    flank, rows = round(FLANK / STEP), np.arange(len(pixels))
     rise = values[:, flank:-flank] - np.maximum(values[:, : -2 * flank], values[:, 2 * flank :])
-    rise = rise.max(axis=2)
     top = np.argmax(rise, axis=1)
-    rows = np.arange(len(top))
     good = (rise[rows, top] > RIDGE) & (top > 0) & (top < rise.shape[1] - 1)
-    top = np.clip(top, 1, rise.shape[1] - 2)
-    before, here, after = rise[rows, top - 1], rise[rows, top], rise[rows, top + 1]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        shift = np.where(good, 0.5 * (before - after) / (before - 2.0 * here + after), 0.0)
-    return -reach + STEP * (top + np.clip(np.nan_to_num(shift), -0.5, 0.5)), good
+    near = values[rows[:, None], top[:, None] + np.arange(2 * flank + 1)]
+    shift = STEP * 0.5 * (_halfway(near[:, flank:]) - _halfway(near[:, flank::-1]))
+    return -reach + STEP * top + np.where(good, shift, 0.0), good
+
+
+def _halfway(falling: Array) -> Array:
+    """(n,) number of the step, with its fraction, where values (n, k) are last halfway from the first to the last."""
+    level = 0.5 * (falling[:, 0] + falling[:, -1])
+    above = falling[:, :-1] >= level[:, None]
+    last = above.shape[1] - 1 - np.argmax(above[:, ::-1], axis=1)
+    rows = np.arange(len(falling))
+    here, after = falling[rows, last], falling[rows, last + 1]
+    return np.asarray(last + np.clip((here - level) / np.maximum(here - after, 1e-6), 0.0, 1.0))
 
 
 def slopes(camera: Pinhole, points: Array) -> tuple[Array, Array]:
@@ -132,7 +160,7 @@ def corrected(image: Image, camera: Pinhole, court: Court, free: slice = slice(0
 
     Args: free: numbers of the seven that are corrected; the others stay.
     """
-    picture = image.astype(np.float32)
+    picture = brightness(image)
     unknown = np.r_[free] if isinstance(free, slice) else free
     first = camera.focal
     for reach in REACHES:

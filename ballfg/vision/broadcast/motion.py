@@ -16,7 +16,7 @@ from ballfg.vision.broadcast.background import ALIKE, Match, matches
 from ballfg.vision.broadcast.court import Court
 from ballfg.vision.broadcast.find import cameras_of, find_court
 from ballfg.vision.broadcast.graph import Solved, solve
-from ballfg.vision.broadcast.lines import Ridges, corrected, moved, ridges, slopes
+from ballfg.vision.broadcast.lines import Ridges, brightness, corrected, moved, ridges, slopes
 from ballfg.vision.broadcast.pinhole import Pinhole
 
 Frames = Callable[[], Iterator[tuple[float, Image]]]
@@ -177,7 +177,7 @@ def _followed(
             camera = carried(camera, links[k - first - 1].before, links[k - first - 1].now)
         better, fit = corrected(image, camera, court, TURNED)
         camera = better if fit > FOLLOWED else camera
-        lines = ridges(image.astype(np.float32), camera, court, REACH)
+        lines = ridges(brightness(image), camera, court, REACH)
         cameras.append(camera)
         seen.append(lines if fit > FOLLOWED else None)
         fits.append(lines.fit)

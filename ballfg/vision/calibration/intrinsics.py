@@ -13,7 +13,8 @@ from ballfg.vision.calibration.boards import View
 from ballfg.vision.calibration.lens_covariance import covariance_of_lens, pixel_grid, sigma_of_rays
 from ballfg.vision.camera import DISTORTIONS, Camera
 
-MIN_VIEWS: Final = 8  # a view tells two numbers about the lens (Zhang 2000, section 2.3)
+MIN_VIEWS: Final = 3  # a view tells two numbers about the lens (Zhang 2000, section 2.3)
+USUAL_VIEWS: Final = 8  # with fewer, a bent board or a wrong corner looks like the lens
 MIN_TURN: Final = np.radians(10.0)  # rad between two boards: parallel ones confuse a long lens with a near board
 MAX_FOCAL_SIGMA: Final = 0.02  # relative standard deviation of the focal length: 2 % are 6 cm at a distance of 3 m
 MIN_COVERAGE: Final = 0.4  # of the image's cells with corners: outside of them, the distortion is extrapolated

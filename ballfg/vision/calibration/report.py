@@ -11,7 +11,7 @@ from matplotlib.patheffects import withStroke
 
 from ballfg.vision.arrays import Image
 from ballfg.vision.calibration.extrinsics import Extrinsics
-from ballfg.vision.calibration.intrinsics import CELLS, RAYS, FittedView, Intrinsics
+from ballfg.vision.calibration.intrinsics import CELLS, RAYS, USUAL_VIEWS, FittedView, Intrinsics
 from ballfg.vision.calibration.table_points import TABLE_HEIGHT, table_outline
 from ballfg.vision.camera import Camera
 
@@ -58,6 +58,11 @@ def summary(found: Calibration) -> Iterator[str]:
 def _lens_lines(lens: Intrinsics) -> Iterator[str]:
     count = len(lens.views) + len(lens.left_out) + len(lens.missed)
     yield f"  lens: {len(lens.views)} of {count} images, RMS {lens.rms:.2f} px, corners in {lens.coverage:.0%} of cells"
+    if len(lens.views) < USUAL_VIEWS:
+        yield (
+            "    few images: the uncertainties hold if the board is flat and all corners are right, which "
+            f"{USUAL_VIEWS} or more images show"
+        )
     usual, worst = lens.ray_sigma
     yield f"    rays known to {usual:.2f} px in {RAYS:.0%} of the image, {worst:.2f} px where worst"
     values, sigmas = _lens_numbers(lens)

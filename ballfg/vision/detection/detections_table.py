@@ -57,6 +57,7 @@ def read_detections(
     for camera in cameras:
         mine = {column: numbers[names == camera.name] for column, numbers in values.items()}
         frames, frame = np.unique(mine["t"], return_inverse=True)
+        detections_file.check_inside(path, camera.name, camera.size, np.column_stack((mine["u"], mine["v"])))
         order = np.argsort(frame, kind="stable")
         pixels, streaks = np.column_stack((mine["u"], mine["v"])), np.full((len(order), 2, 2), np.nan)
         spread, scores = detections_file.covariances(mine)[order], mine[detections_file.SCORE][order]

@@ -79,11 +79,13 @@ class View:
 class ContactSheet:
     """Collects pictures while the videos pass by, then writes the sheet.
 
-    Args: table_height: m, z of the table's surface.  table: (x_low, x_high, y_low, y_high) m; None if it is not known.
+    Args: table_height: m, z of the table's surface; None without one.  table: (x_low, x_high, y_low, y_high) m; None
+        if it is not known.
     """
 
-    def __init__(self, tracking: Tracking, table_height: float, table: Extent | None) -> None:
-        self._tracking, self._height, self._table = tracking, table_height, table
+    def __init__(self, tracking: Tracking, table_height: float | None, table: Extent | None) -> None:
+        self._height = np.nan if table_height is None else table_height  # NaN draws nothing
+        self._tracking, self._table = tracking, table
         self._shown = _spread(len(tracking.balls), MOST_TRACKS).tolist()
         self._views: list[list[View]] = []
         cameras = list(enumerate(tracking.cameras[:MOST_VIEWS]))
@@ -146,7 +148,7 @@ class ContactSheet:
         """The points with their standard deviations from the side and from above; one scale in all rows."""
         ball, every = self._tracking.balls[track], np.concatenate([ball.points for ball in self._tracking.balls])
         low, high = every.min(axis=0) - BESIDE, every.max(axis=0) + BESIDE
-        low[2] = min(low[2], self._height - BESIDE)
+        low[2] = np.fmin(low[2], self._height - BESIDE)
         table = self._table or (low[0], high[0], np.nan, np.nan)
         if self._table is not None:
             low[:2] = np.minimum(low[:2], np.array(table[::2]) - BESIDE)

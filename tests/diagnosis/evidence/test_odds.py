@@ -60,8 +60,8 @@ def model(names, evidence, held_out=None):
 
 
 def borne_out(effect, *smaller):
-    """The tempered evidence of a model, with smaller ones whose own is believed."""
-    return tempered(effect.names, effect.weight, {one.names: (one.weight, one.evidence) for one in smaller})
+    """The tempered evidence of a model, beside smaller ones."""
+    return tempered(effect.names, effect.weight, {one.names: one.weight for one in smaller})
 
 
 def test_a_strength_of_five_times_the_usual_one_costs_two_nats():
@@ -142,6 +142,15 @@ def test_an_addition_is_believed_as_far_as_it_gains_over_the_smaller_model():
     odds = odds_of([nothing, true, both])
     assert odds.of("wind") > 0.99
     assert odds.of("scale") < 0.1
+
+
+def test_the_doubt_of_a_smaller_model_decides_between_none_that_look_alike():
+    """A clock or a scale beside a wind: without the wind the clock gains nothing on the other half."""
+    nothing, wind = model([], 0.0), model(["wind"], 100.0)
+    clock, scale = model(["time_scale"], 30.0, np.full(10, -1.0)), model(["scale"], 30.0)
+    alike = [model(["wind", name], 150.0) for name in ("time_scale", "scale")]
+    odds = odds_of([nothing, wind, clock, scale, *alike])
+    assert [odds.of(name) for name in ("time_scale", "scale")] == pytest.approx([0.5, 0.5], abs=1e-6)
 
 
 def test_what_is_foretold_loses_what_its_origin_loses():

@@ -92,6 +92,13 @@ def test_parabolas_are_recovered(bounces: bool) -> None:
         assert found.bounces[0] == pytest.approx(at, abs=1e-9)
 
 
+def test_a_ball_that_meets_no_surface_is_refused() -> None:
+    times = PERIOD * np.arange(14)
+    seen = pixels_of(np.stack((4.0 * times, 0.0 * times, 1.0 + times - 4.9 * times**2), axis=1), times, SIDE, 0.1)
+    with pytest.raises(ValueError, match="must bounce on a surface"):
+        sighted_track("one", seen, [SIDE], surfaces=Surfaces.none())
+
+
 def test_states_and_bounces_against_the_truth(ball: World) -> None:
     """Strokes with 2 px of noise: depth to a decimetre, the rest to a centimetre, bounces to milliseconds."""
     surfaces = replace(ball.surfaces, extent=(-1.37, 1.37, -0.76, 0.76))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +17,9 @@ from ballfg.estimation.registry import make_estimator
 from ballfg.state import SIGMA_NAMES, STATE_NAMES
 from ballfg.tracks.detections_file import write_sightings
 from ballfg.tracks.info import TABLE_TENNIS, DatasetInfo, write_info
-from ballfg.vision.camera_file import write_cameras
-from tests.estimation.observations.sighted_rig import RIG, TABLE, Scene, scene, track_of, world
+from ballfg.vision.camera_file import read_cameras, write_cameras
+from ballfg.vision.detection.detections_table import read_detections
+from tests.estimation.observations.sighted_rig import RIG, TABLE, Scene, launch, scene, seen, track_of, truth, world
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +81,39 @@ def test_predict_command_reads_detections(folder: Path, capsys: pytest.CaptureFi
     assert len(rows) == sum(int((t.seconds > 0.2 + 1e-6).sum()) for t in read_sighted(folder))
     assert command("predict", folder, "--observe", 0.2, "--conformal", folder, "--out", out) == 2
     assert "conformal must not be given with detections" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("gust", [0.0, 20.0])
+def test_intervals_that_the_sightings_contradict(
+    gust: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A gust (m/s^2) that begins after the observed part: what cameras saw lies outside of the intervals."""
+    write_info(tmp_path / "dataset.yaml", DatasetInfo("seen", TABLE, TABLE_TENNIS))
+    write_cameras(tmp_path / "cameras.yaml", RIG)
+    times = np.repeat(np.arange(40) / 120.0, len(RIG)) + np.tile(np.arange(len(RIG)) / 360.0, 40)
+    camera, balls = np.tile(np.arange(len(RIG)), 40), {}
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        states = truth(launch(rng), times, world())
+        states[:, 1] += 0.5 * gust * np.maximum(times - 0.15, 0.0) ** 2
+        balls[f"{seed}"] = seen(states, camera, times, rng).sightings
+    write_sightings(tmp_path / "detections.csv", balls.items())
+    assert command("predict", tmp_path, "--observe", 0.15, "--out", tmp_path / "p.csv", "--jobs", 1) == 0
+    said = capsys.readouterr().out
+    assert ("of what was measured there; check the cameras, or write positions" in said) == (gust > 0.0)
+
+
+@pytest.mark.parametrize(
+    ("size", "cause"),
+    [((720, 1280), "They fit a picture of 1280x720: it is probably turned by 90 degrees"), ((640, 360), "They reach ")],
+)
+def test_sightings_outside_of_the_picture(folder: Path, size: tuple[int, int], cause: str) -> None:
+    write_cameras(folder / "cameras.yaml", [replace(camera, size=size) for camera in RIG])
+    rule = rf"camera '(left|back)' has a picture of {size[0]}x{size[1]} px, in which .* {cause}"
+    with pytest.raises(ValueError, match=rule):
+        read_sighted(folder)
+    with pytest.raises(ValueError, match=cause):
+        read_detections(folder / "detections.csv", read_cameras(folder / "cameras.yaml"))
 
 
 def test_source_can_be_chosen(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

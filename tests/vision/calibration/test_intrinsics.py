@@ -21,6 +21,7 @@ from ballfg.vision.calibration.intrinsics import (
     turn,
 )
 from ballfg.vision.calibration.lens_covariance import covariance_of_lens, pixel_grid, sigma_of_rays
+from ballfg.vision.calibration.report import Calibration, summary
 from tests.vision.calibration.board_scenes import CHARUCO, CHESSBOARD, TRUE, exact_views, image_of, poses
 
 
@@ -182,8 +183,30 @@ def refused(views: list[View], message: str, distortion: int = 5) -> None:
 def test_too_few_views_and_which_show_no_board() -> None:
     views = exact_views(9, np.random.default_rng(0))
     blank = replace(views[0], name="blank.png", pixels=np.zeros((0, 2)), points=np.zeros((0, 3)))
-    refused([*views[:7], blank], r"at least 8 images must show the board; got 7 of 8. No board .* in blank.png\.")
+    refused([*views[:2], blank], r"at least 3 images must show the board; got 2 of 3. No board .* in blank.png\.")
     assert calibrate_intrinsics("left", [*views, blank]).missed == ("blank.png",)
+
+
+@pytest.mark.parametrize("count", [3, 4, 6])
+def test_few_views_are_known_as_well_as_they_say(count: int) -> None:
+    """The squared error in the metric of the stated covariance has the mean of its nine degrees of freedom."""
+    true = np.array([*TRUE.matrix[[0, 1], [0, 1]], *TRUE.matrix[:2, 2], *TRUE.distortion])
+    squares = []
+    for seed in range(40):
+        fitted = _fit("left", exact_views(count, np.random.default_rng(8000 + seed), 0.05), 5)
+        found = np.array(
+            [*fitted.camera.matrix[[0, 1], [0, 1]], *fitted.camera.matrix[:2, 2], *fitted.camera.distortion]
+        )
+        squares.append((found - true) @ np.linalg.solve(fitted.covariance, found - true))
+    assert np.mean(squares) == pytest.approx(9.0, abs=3.0 * np.sqrt(2.0 * 9.0 / 40.0))
+
+
+def test_few_views_are_used_with_a_warning() -> None:
+    views = exact_views(8, np.random.default_rng(0), 0.02)
+    for count in (4, 8):
+        lens = calibrate_intrinsics("left", views[:count])
+        said = " ".join(summary(Calibration(lens.camera, lens, None)))
+        assert ("few images: the uncertainties hold if the board is flat" in said) == (count < 8)
 
 
 def test_images_of_different_sizes() -> None:
