@@ -261,18 +261,19 @@ def _opened(data: Dataset | SightedDataset, model: Path | None, ball: str | None
     import torch
 
     from ballfg.dynamics import load_model, nominal_model
-    from ballfg.dynamics.nominal import inertia_factor, nominal_note
+    from ballfg.dynamics.nominal import TOLERANCE, inertia_factor, mismatch, nominal_note
     from ballfg.estimation.configure import table_note
     from ballfg.estimation.reading import unused_model
 
-    file = ball is not None and Path(ball).is_file()
-    if ball is not None and not _agree(named := _named(ball)[0], own := data.ball):
+    file, own = ball is not None and Path(ball).is_file(), data.ball
+    named, usual = (own, None) if ball is None else _named(ball)
+    if mismatch(own, named) > TOLERANCE:
         raise ValueError(
             f"--ball {ball} has a radius of {named.radius:g} m and {named.mass:g} kg; {data.path} states "
             f"{own.radius:g} m and {own.mass:g} kg. Leave --ball out, or correct ball in dataset.yaml."
         )
     torch.set_num_threads(1)  # the batches are small: threads cost more time than they save
-    found: BallModel = _named(ball)[1] if file and ball is not None else nominal_model(data.ball)
+    found: BallModel = usual if file and usual is not None else nominal_model(own)
     if model is not None:
         inertia = inertia_factor(data.ball)
         found = load_model(model, radius=data.ball.radius, inertia_factor=inertia, room=data.info.name)
@@ -297,13 +298,6 @@ def _named(ball: str) -> tuple[Ball, AnalyticModel]:
         return kind.ball, kind.model
     name = known_ball(ball)
     return KNOWN_BALLS[name].ball, nominal_model(name)
-
-
-def _agree(one: Ball, other: Ball) -> bool:
-    """True if radius and mass are those of the same ball."""
-    from ballfg.dynamics.nominal import TOLERANCE
-
-    return all(abs(a / b - 1.0) <= TOLERANCE for a, b in ((other.radius, one.radius), (other.mass, one.mass)))
 
 
 def _doubts_of(data: Dataset | SightedDataset, model: BallModel, file: Path | None) -> tuple[str, ...]:

@@ -82,13 +82,13 @@ def air_coefficients(ball: Ball, drag_coefficient: float = DRAG_COEFFICIENT) -> 
 
 def known_name(ball: Ball) -> str | None:
     """Name of the known ball that matches; None if there is none."""
+    nearest = min(KNOWN_BALLS, key=lambda name: mismatch(ball, KNOWN_BALLS[name].ball))
+    return nearest if mismatch(ball, KNOWN_BALLS[nearest].ball) <= TOLERANCE else None
 
-    def distance(name: str) -> float:
-        known = KNOWN_BALLS[name].ball
-        return max(abs(ball.radius / known.radius - 1), abs(ball.mass / known.mass - 1))
 
-    nearest = min(KNOWN_BALLS, key=distance)
-    return nearest if distance(nearest) <= TOLERANCE else None
+def mismatch(ball: Ball, known: Ball) -> float:
+    """Largest relative difference of radius and mass from those of a known ball; they match up to `TOLERANCE`."""
+    return max(abs(ball.radius / known.radius - 1.0), abs(ball.mass / known.mass - 1.0))
 
 
 def _known_model(name: str, radius: float) -> AnalyticModel:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import torch
@@ -64,8 +64,7 @@ class Surfaces:
     @classmethod
     def table_tennis(cls, table_height: float) -> Surfaces:
         """A table at a height in the room, with the floor 0.76 m below its surface; of -inf none."""
-        table = cls(table_height)
-        return replace(table, floor_height=table_height - TABLE_ABOVE_FLOOR) if table.heights() else table
+        return cls.none() if table_height == -math.inf else cls(table_height, table_height - TABLE_ABOVE_FLOOR)
 
     @classmethod
     def none(cls) -> Surfaces:

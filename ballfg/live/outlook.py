@@ -52,22 +52,27 @@ def look_out(state: OnlineState, horizon: float, plane: Plane | None) -> Outlook
     notes: list[str] = []
     with np.errstate(all="ignore"):
         try:
-            carried = carried_by(state)
-            path = None if plane is None else state.predict(horizon).path()
+            finders = _finders(state, horizon, plane)
         except Exception as error:  # a prediction must not end the stream
             return Outlook(note=f"no prediction: {_one_line(error)}")
-        finders: dict[str, Callable[[], EventAhead]] = {
-            "bounce": lambda: EventAhead(next_contact(*carried, horizon), math.nan),
-            "apex": lambda: EventAhead(apex(*carried, horizon), math.nan),
-        }
-        if plane is not None and path is not None:
-            asked: dict[str, Plane | str] = {"bounce": CONTACT, "apex": APEX, "crossing": plane}
-            finders = {what: partial(event_on, path, event) for what, event in asked.items()}
         found = {what: _tried(find, what, notes) for what, find in finders.items()}
     chances = None if plane is None else {what: event.probability for what, event in found.items()}
     return Outlook(
         **{what: event.crossing for what, event in found.items()}, note="; ".join(notes), probability=chances
     )
+
+
+def _finders(state: OnlineState, horizon: float, plane: Plane | None) -> dict[str, Callable[[], EventAhead]]:
+    """What finds each event. Probabilities need the whole path, which is predicted only where a plane is asked for."""
+    if plane is None:
+        carried = carried_by(state)
+        return {
+            "bounce": lambda: EventAhead(next_contact(*carried, horizon), math.nan),
+            "apex": lambda: EventAhead(apex(*carried, horizon), math.nan),
+        }
+    path = state.predict(horizon).path()
+    asked: dict[str, Plane | str] = {"bounce": CONTACT, "apex": APEX, "crossing": plane}
+    return {what: partial(event_on, path, event) for what, event in asked.items()}
 
 
 def unusable(state: BallState) -> str:

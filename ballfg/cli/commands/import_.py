@@ -30,7 +30,7 @@ def import_(
     up: Annotated[str | None, _guess(help="Axis that points up: x, y, z, -x, -y or -z.")] = None,
     flip: Annotated[str | None, _guess(help="Axis to mirror, for a left-handed frame: x, y or z.")] = None,
     table_height: Annotated[
-        float | None, _guess(help="z of the table's surface in the new frame, m; without bounces none.")
+        float | None, _guess(help="z of the table's surface in the new frame, m; no surface if no ball bounces.")
     ] = None,
     split_gap: Annotated[float | None, _guess(help="Gap after which a new shot begins, s.")] = None,
     ball: Annotated[str | None, _guess(help="One of `ballfg balls`, or a ball file (YAML).")] = None,

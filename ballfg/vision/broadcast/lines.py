@@ -29,7 +29,7 @@ CROSSING: Final = 2.0 * FLANK
 RIDGE: Final = 12.0
 """Grey levels by which a line is brighter than the ground, at least."""
 SIGMA: Final = 0.7
-"""px, standard deviation of a ridge's place: compression, and the width of lines."""
+"""px, standard deviation of a ridge about the camera of one picture alone: more than that of its place."""
 ROBUST: Final = 2.0
 """Scale of Cauchy's loss on a ridge, in standard deviations."""
 FOCAL_SIGMA: Final = 0.5
@@ -155,16 +155,15 @@ def moved(camera: Pinhole, step: Array) -> Pinhole:
     return replace(camera, turn=turn, place=camera.place + step[3:6], focal=float(camera.focal * np.exp(step[6])))
 
 
-def corrected(image: Image, camera: Pinhole, court: Court, free: slice = slice(0, 7)) -> tuple[Pinhole, float]:
-    """The camera that fits the ridges of a picture, and the share of the court's lines that then fit.
+def corrected(image: Array32, camera: Pinhole, court: Court, free: slice = slice(0, 7)) -> tuple[Pinhole, float]:
+    """The camera that fits the ridges of a picture's `brightness`, and the share of the court's lines that then fit.
 
     Args: free: numbers of the seven that are corrected; the others stay.
     """
-    picture = brightness(image)
     unknown = np.r_[free] if isinstance(free, slice) else free
     first = camera.focal
     for reach in REACHES:
-        seen = ridges(picture, camera, court, reach)
+        seen = ridges(image, camera, court, reach)
         if len(seen.offset) < 2 * len(unknown):
             return camera, 0.0
         row = np.einsum("na,nab->nb", seen.normal, slopes(camera, seen.points)[1][..., :7]) / SIGMA
@@ -179,4 +178,4 @@ def corrected(image: Image, camera: Pinhole, court: Court, free: slice = slice(0
         camera = moved(camera, step)
     if not np.isfinite(camera.project(court.corners)).all():
         return camera, 0.0
-    return camera, ridges(picture, camera, court, REACHES[-1]).fit
+    return camera, ridges(image, camera, court, REACHES[-1]).fit

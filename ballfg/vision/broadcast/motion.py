@@ -147,9 +147,9 @@ def _of_corners(image: Image, court: Court, corners: Array) -> list[tuple[Pinhol
 
 def likely(image: Image, tried: Sequence[tuple[Pinhole, float]], court: Court) -> list[tuple[Pinhole, float]]:
     """The cameras whose lines fit a picture, best first, and how well; those at about one place once only."""
-    fine = list[tuple[Pinhole, float]]()
+    fine, picture = list[tuple[Pinhole, float]](), brightness(image)
     for camera, _ in tried:
-        better, fit = corrected(image, camera, court)
+        better, fit = corrected(picture, camera, court)
         if fit > FITS and better.place[2] > 0.0:
             fine.append((better, fit))
     fine.sort(key=lambda pair: -pair[1])
@@ -175,9 +175,10 @@ def _followed(
             continue
         if k > first:
             camera = carried(camera, links[k - first - 1].before, links[k - first - 1].now)
-        better, fit = corrected(image, camera, court, TURNED)
+        picture = brightness(image)
+        better, fit = corrected(picture, camera, court, TURNED)
         camera = better if fit > FOLLOWED else camera
-        lines = ridges(brightness(image), camera, court, REACH)
+        lines = ridges(picture, camera, court, REACH)
         cameras.append(camera)
         seen.append(lines if fit > FOLLOWED else None)
         fits.append(lines.fit)

@@ -1,9 +1,11 @@
-"""Ridges of a court's lines: in the middle between unlike grounds, and none where another line is in the way."""
+"""Ridges of lines: in the middle between unlike grounds, none where another line is in the way; their factor."""
 
 import cv2
+import gtsam
 import numpy as np
 import pytest
 
+from ballfg.vision.broadcast import graph
 from ballfg.vision.broadcast.lines import CROSSING, brightness, ridges
 from tests.vision.broadcast.scene import COURT, looking, picture
 
@@ -36,3 +38,28 @@ def test_no_ridge_is_sought_where_another_line_is_in_the_way(seen):
         assert np.linalg.norm(pixels - first - share[:, None] * along, axis=1).min() > CROSSING - 1e-9
     middle = np.concatenate([one.points[one.line == 4, 0] for one in seen])
     assert 0 < len(middle) < 8 * 24
+
+
+def test_derivatives_of_the_factor_are_those_of_differences(seen):
+    """Of a picture's ridges by turn, place, focal length, lens and the shift of each line."""
+    like, lines = looking((0.5, -7.02, 3.0), (0.02, 0.0, 0.0), 1003.0), seen[0]
+    factor = graph._court_factor(0, like, lines)
+    turn, place, zoom, lens, shift = keys = factor.keys()
+    values = gtsam.Values()
+    values.insert(turn, gtsam.Rot3(like.turn.T))
+    values.insert(place, gtsam.Point3(like.place))
+    values.insert(zoom, np.array([np.log(like.focal)]))
+    values.insert(lens, np.array([-0.02]))
+    values.insert(shift, np.linspace(-0.3, 0.3, len(COURT.lines)))
+    found = factor.linearize(values).jacobian()[0]
+    widths, column = (3, 3, 1, 1, len(COURT.lines)), 0
+    for key, width in zip(keys, widths, strict=True):
+        for number in range(width):
+            ends = []
+            for way in (1e-6, -1e-6):
+                step = gtsam.VectorValues()
+                for other, count in zip(keys, widths, strict=True):
+                    step.insert(other, way * np.eye(count)[number] if other == key else np.zeros(count))
+                ends.append(factor.unwhitenedError(values.retract(step)))
+            np.testing.assert_allclose(found[:, column], (ends[0] - ends[1]) / 2e-6, atol=1e-4, rtol=1e-5)
+            column += 1
