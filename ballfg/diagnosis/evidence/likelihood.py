@@ -10,9 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Final
 
 import numpy as np
-from scipy import linalg, optimize
+from scipy import linalg
 
 from ballfg.arrays import Array, Index, Mask
 from ballfg.diagnosis.evidence.rows import Rows
@@ -22,9 +23,10 @@ from ballfg.state import STATE_DIM
 
 LEAST, MOST = -5.0, 5.0
 """Bounds of the logarithm of a size over its unit."""
-MOST_STEPS, TOLERANCE = 30, 1e-6
-MOST_ROUNDS, SETTLED = 12, 0.1
-"""Largest number of turns of robust weights and sizes, and the step of every size, in its errors, that ends them."""
+MOST_STEPS, SETTLED = 30, 0.02
+"""Largest number of steps of the sizes, and the gain of evidence that ends them."""
+LONGEST: Final = 1.5
+"""Largest step of the logarithm of a size."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,7 @@ class Noise:
 
     white: float = 0.0
     spin: float = 0.0
-    random: tuple[float, ...] = (-1.0, -1.0, -1.0, -1.5)
+    random: tuple[float, ...] = (-4.0,) * 4
 
     @property
     def vector(self) -> Array:
@@ -95,6 +97,19 @@ class Posterior:
 
 
 @dataclass(frozen=True)
+class Slopes:
+    """Derivatives of the evidence by the logarithms of the sizes: slope (6,) and average information (6, 6).
+
+    `along` (n, d) are factors of the columns start, random, common, residual whose sum is the residual at the mean,
+    one for the residual.
+    """
+
+    slope: Array
+    information: Array
+    along: Array
+
+
+@dataclass(frozen=True)
 class Likelihood:
     """Inner products of the rows under some robust weights.
 
@@ -148,11 +163,13 @@ class Likelihood:
         constant = logs + self.rows.volume - narrow - self.penalty
         return Reduced(constant, gram - solved @ solved.swapaxes(1, 2)), Local(lower, solved)
 
-    def slope(self, noise: Noise, local: Local, found: Posterior, precision: Array, away: Array) -> Array:
-        """(6,) derivative of the evidence by the logarithms of the sizes: expected squares less their number.
+    def slopes(self, noise: Noise, local: Local, found: Posterior, precision: Array, away: Array) -> Slopes:
+        """The derivatives of the evidence by the logarithms of the sizes.
 
-        The expected squares over their variances of all rows and priors add up to the square at the mean plus one for
-        each unknown, so that those of the samples follow from the others.
+        The slope is expected squares less their number. The expected squares over their variances of all rows and
+        priors add up to the square at the mean plus one for each unknown, so that those of the samples follow from the
+        others. The average of the observed and the expected information needs no traces: A. R. Gilmour, R. Thompson,
+        B. R. Cullis, "Average information REML", Biometrics 51, 1995.
         """
         kinds = self.rows.motion.kinds
         end = STATE_DIM + kinds.shape[1]
@@ -173,7 +190,31 @@ class Likelihood:
         unseen = int((of_samples + of_spins == 0.0).sum()) + int((kinds < 0).sum())  # `inner` gives them a prior
         unknowns = mean.shape[0] * end - unseen + len(found.mean)
         white = found.square + float(unknowns) - sum(shown) - spin - prior
-        return np.array([white, spin, *shown]) - self.rows.counts
+        slope = np.array([white, spin, *shown]) - self.rows.counts
+        along = np.concatenate((-mean, np.broadcast_to(step, (len(mean), len(step)))), axis=1)
+        return Slopes(slope, self._information(noise, upper, local.solved, along, found.covariance), along)
+
+    def _information(self, noise: Noise, upper: Array, solved: Array, along: Array, covariance: Array) -> Array:
+        """(6, 6) twice the inner products of what each size's rows or columns show, less what all unknowns absorb.
+
+        Args: along: (n, d) factors of the columns whose sum is the residual at the mean.
+        """
+        kinds, (of_samples, of_spins) = self.rows.motion.kinds, self.grams
+        end = STATE_DIM + kinds.shape[1]
+        ahead = np.zeros((*along.shape, len(noise.random)))  # of the random columns alone, kind by kind
+        for kind in range(len(noise.random)):
+            ahead[:, STATE_DIM:end, kind] = -along[:, STATE_DIM:end] * (kinds == kind)
+        white, spin = np.exp(-2.0 * noise.white), np.exp(-2.0 * noise.spin)
+        factors = np.concatenate((along[..., None], ahead), axis=-1)
+        samples, spins = white * (of_samples @ factors), spin * (of_spins @ factors)
+        rows = np.concatenate((samples[..., :1], spins[..., :1], samples[..., 1:] + spins[..., 1:]), axis=-1)
+        products = np.zeros((rows.shape[-1],) * 2)
+        products[2:] = np.einsum("nda,ndb->ab", ahead, rows)
+        products[:2, 2:] = products[2:, :2].T
+        products[0, 0], products[1, 1] = (float((along * r[..., 0]).sum()) for r in (samples, spins))
+        local = upper.swapaxes(1, 2) @ rows[:, :end]
+        common = (rows[:, end:-1] - solved[:, :-1] @ local).sum(axis=0)
+        return 2.0 * (products - np.einsum("nla,nlb->ab", local, local) - common.T @ covariance @ common)
 
     def local_step(self, noise: Noise, common: Array) -> Array:
         """(n, l) first states and random motion that follow a step (c,) of the common unknowns."""
@@ -184,9 +225,16 @@ class Likelihood:
 
     def reweighted(self, noise: Noise, common: Array) -> Likelihood:
         """With the robust weights of the residual that remains beside the motion; common: (c,) step of the unknowns."""
-        r, motion = self.rows, self.local_step(noise, common)
-        columns = np.concatenate((r.by_start, r.motion.columns), axis=-1)
-        left = r.residual - r.by_common @ common - (columns @ motion[..., None])[..., 0]
+        step = np.append(-common, 1.0)
+        motion = self.local_step(noise, common)
+        return self.beside(np.concatenate((-motion, np.broadcast_to(step, (len(motion), len(step)))), axis=1), noise)
+
+    def beside(self, along: Array, noise: Noise) -> Likelihood:
+        """With the robust weights of a residual, the sum of columns by factors (n, d)."""
+        r, end = self.rows, STATE_DIM + self.rows.motion.kinds.shape[1]
+        start, random, common = along[:, :STATE_DIM], along[:, STATE_DIM:end], along[:, end:-1]
+        left = r.residual + (r.by_start @ start[..., None] + r.motion.columns @ random[..., None])[..., 0]
+        left += (r.by_common @ common[..., None])[..., 0]
         return weighted(r, left / np.exp(noise.white), left[:, -3:] / np.exp(noise.spin))
 
 
@@ -240,58 +288,68 @@ def held_out(tracks: Reduced, precision: Array, away: Array, halves: Mask) -> Ar
 
 
 def settled(
-    rows: Rows, precision: Array, away: Array, starts: Sequence[Noise | None] = (None,)
+    rows: Rows, precision: Array, away: Array, starts: Sequence[Noise | None] = (None,), own: int | None = None
 ) -> tuple[Likelihood, Noise]:
     """The likelihood with the robust weights and sizes of noise that maximise the evidence.
 
-    It has several maxima: noise that a wrong model needed can keep a right one from showing that it needs none.
+    It has several maxima: noise that a wrong model needed can keep a right one from showing that it needs none. Of
+    their ends the one counts at which the present unknowns are the most probable ones, since a long step to others
+    leaves the linear range.
 
     Args:
         precision, away: as in `posterior`.
-        starts: noise of similar models, or None for the usual noise; the best after one turn goes on.
+        starts: noise of similar models, or None for almost none beside that of the samples.
+        own: number of the common unknowns, the first ones, in which the rows are not linear; None: all.
     """
-
-    def evidence(end: tuple[Likelihood, Noise]) -> float:
-        return posterior(end[0].reduced(end[1])[0], precision, away).evidence
-
-    plain, none = (
-        weighted(rows, np.zeros_like(rows.residual), np.zeros((len(rows.residual), 3))),
-        np.zeros(len(precision)),
-    )
+    plain = weighted(rows, np.zeros_like(rows.residual), np.zeros((len(rows.residual), 3)))
+    none = np.zeros(len(precision))
     begun = [(plain.reweighted(start, none) if start else plain, start or Noise()) for start in starts]
-    turns = [_turned(*one, precision, away) for one in begun]
-    likelihood, now = max(turns, key=evidence) if len(turns) > 1 else turns[0]
-    for _ in range(1, MOST_ROUNDS):
-        before = now
-        likelihood, now = _turned(likelihood, before, precision, away)
-        if (np.abs(now.vector - before.vector) * _units(rows)).max() < SETTLED:
-            break
-    return likelihood, now
+    ends = [_climbed(*one, precision, away) for one in begun]
+
+    def here(end: tuple[Posterior, Likelihood, Noise]) -> float:
+        found = end[0]
+        return found.evidence - foretold_gain(found.mean[:own], found.covariance[:own, :own])
+
+    _, likelihood, noise = max(ends, key=here)
+    return likelihood, noise
 
 
-def _turned(likelihood: Likelihood, noise: Noise, precision: Array, away: Array) -> tuple[Likelihood, Noise]:
-    """The sizes of noise that maximise the evidence at the present weights, then the weights beside these sizes."""
-    unit = _units(likelihood.rows)
+def _climbed(likelihood: Likelihood, noise: Noise, precision: Array, away: Array) -> tuple[Posterior, Likelihood, Noise]:
+    """The largest evidence near a start, by steps with the average information, the weights following the sizes."""
 
-    def missing(scaled: Array) -> tuple[float, Array]:
-        noise = Noise.of(scaled / unit)
+    def at(likelihood: Likelihood, noise: Noise) -> tuple[Posterior, Slopes]:
         reduced, local = likelihood.reduced(noise)
         found = posterior(reduced, precision, away)
-        return -found.evidence, -likelihood.slope(noise, local, found, precision, away) / unit
+        return found, likelihood.slopes(noise, local, found, precision, away)
 
-    options = {"maxiter": MOST_STEPS, "ftol": TOLERANCE}
-    bounds = optimize.Bounds(LEAST * unit, MOST * unit)
-    best = optimize.minimize(missing, noise.vector * unit, method="L-BFGS-B", jac=True, bounds=bounds, options=options)
-    found = Noise.of(best.x / unit)
-    return likelihood.reweighted(found, posterior(likelihood.reduced(found)[0], precision, away).mean), found
+    found, slopes = at(likelihood, noise)
+    for _ in range(MOST_STEPS):
+        step = _bounded_step(noise.vector, slopes)
+        gain, share, promised = -np.inf, 1.0, 0.5 * float(step @ slopes.slope)
+        while gain <= 0.0 and (share == 1.0 or share * promised > SETTLED):
+            moved = Noise.of(noise.vector + share * step)
+            weights = likelihood.beside(slopes.along, moved)
+            after, derivatives = at(weights, moved)
+            gain, share = after.evidence - found.evidence, 0.5 * share
+        if gain > 0.0:
+            likelihood, noise, found, slopes = weights, moved, after, derivatives
+        if gain < SETTLED:
+            break
+    return found, likelihood, noise
 
 
-def _units(rows: Rows) -> Array:
-    """(6,) inverse errors of the logarithms of the sizes, as if all that they scale were known.
+def _bounded_step(sizes: Array, slopes: Slopes) -> Array:
+    """(6,) step of the logarithms of the sizes (6,), within their bounds; each is damped by its slope."""
+    slope, curved = slopes.slope, slopes.information + np.diag(np.abs(slopes.slope)) / LONGEST
+    free = np.flatnonzero(~((sizes <= LEAST) & (slope <= 0.0) | (sizes >= MOST) & (slope >= 0.0)))
+    step = np.zeros(len(sizes))
+    step[free] = np.linalg.lstsq(curved[np.ix_(free, free)], slope[free])[0]
+    return np.clip(sizes + step, LEAST, MOST) - sizes
 
-    In these units their maximum is found in a third of the steps.
-    """
-    return np.sqrt(2.0 * np.maximum(rows.counts, 1.0))
+
+def foretold_gain(step: Array, covariance: Array) -> float:
+    """Gain in the logarithm of a normal density by a step (c,) to its mean; covariance: (c, c)."""
+    return 0.5 * float(step @ np.linalg.solve(covariance, step))
 
 
 def inverses(lower: Array) -> Array:

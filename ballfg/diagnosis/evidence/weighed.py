@@ -10,7 +10,15 @@ import numpy as np
 
 from ballfg.arrays import Array, Mask
 from ballfg.diagnosis.evidence.halves import unlike_halves
-from ballfg.diagnosis.evidence.likelihood import Noise, Reduced, held_out, posterior, settled, weighted
+from ballfg.diagnosis.evidence.likelihood import (
+    Noise,
+    Reduced,
+    foretold_gain,
+    held_out,
+    posterior,
+    settled,
+    weighted,
+)
 from ballfg.diagnosis.evidence.nameless import NAMELESS, Patterns
 from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, log_odds, within
 from ballfg.diagnosis.evidence.priors_of_fit import Priors
@@ -185,11 +193,6 @@ class Step:
         return Unknowns(unknowns.starts + share * self.starts, values, launcher)
 
 
-def foretold_gain(step: Array, covariance: Array) -> float:
-    """Gain in the logarithm of a normal density by a step (c,) to its mean; covariance: (c, c)."""
-    return 0.5 * float(step @ np.linalg.solve(covariance, step))
-
-
 @dataclass(frozen=True)
 class _Point:
     """A fit with its rows, beside patterns without a name if the question has them, and the priors there."""
@@ -230,7 +233,7 @@ class _Question:
         own, effects = point.own, [h for h in self.named if h.strengths]
         of_patterns = list(widths[len(effects) :]) or [0] * (len(priors.places) - len(effects))
         first = priors.precision([len(WIDTHS) - 1] * len(effects) + of_patterns)
-        likelihood, noise = settled(rows, first, priors.away, starts)
+        likelihood, noise = settled(rows, first, priors.away, starts, own)
         total = likelihood.reduced(noise)[0].by_track(rows.track)
         whole = total.of(np.full(len(self.halves), True))
         best, mixed = priors.widths(whole)
@@ -271,8 +274,11 @@ class _Question:
             unknowns = step.taken(point.fit, share)
             if np.isfinite(unknowns.starts).all():
                 fit = Fit.at(point.fit.problem, unknowns, point.fit.noise, point.fit.steps)
-                if np.isfinite(fit.cost) and (density := self._density(after := self.point(fit), model)) > most:
+                density = self._density(after := self.point(fit), model) if np.isfinite(fit.cost) else -np.inf
+                if density > most:
                     best, most = after, density
+                elif best is not None:
+                    break
             if most > before + step.gain - WORTH_A_STEP:  # as foretold
                 break
         return best
