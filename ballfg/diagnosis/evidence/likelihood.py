@@ -95,6 +95,16 @@ class Posterior:
     mean: Array
     covariance: Array
 
+    def gain(self, own: int | None = None) -> float:
+        """Gain in the logarithm of the density by the step of the first `own` unknowns to their mean; None: of all."""
+        return 0.5 * float(self.mean[:own] @ np.linalg.solve(self.covariance[:own, :own], self.mean[:own]))
+
+    def held(self, own: int | None = None) -> Posterior:
+        """The same with the density of the tracks where the first `own` unknowns are, and the others follow them."""
+        gain, follow = self.gain(own), self.covariance[:, :own] @ np.linalg.inv(self.covariance[:own, :own])
+        mean = self.mean - follow @ self.mean[:own]
+        return Posterior(self.evidence - gain, self.square + 2.0 * gain, mean, self.covariance)
+
 
 @dataclass(frozen=True)
 class Slopes:
@@ -290,36 +300,32 @@ def held_out(tracks: Reduced, precision: Array, away: Array, halves: Mask) -> Ar
 def settled(
     rows: Rows, precision: Array, away: Array, starts: Sequence[Noise | None] = (None,), own: int | None = None
 ) -> tuple[Likelihood, Noise]:
-    """The likelihood with the robust weights and sizes of noise that maximise the evidence.
+    """The likelihood with the robust weights and sizes of noise that maximise the evidence at the present unknowns.
 
-    It has several maxima: noise that a wrong model needed can keep a right one from showing that it needs none. Of
-    their ends the one counts at which the present unknowns are the most probable ones, since a long step to others
-    leaves the linear range.
+    Not at those to which it leads: a long step leaves the linear range. There are several maxima: noise that a wrong
+    model needed can keep a right one from showing that it needs none.
 
     Args:
         precision, away: as in `posterior`.
-        starts: noise of similar models, or None for almost none beside that of the samples.
+        starts: noise of similar models, or None for almost none beside that of the samples; the best end counts.
         own: number of the common unknowns, the first ones, in which the rows are not linear; None: all.
     """
     plain = weighted(rows, np.zeros_like(rows.residual), np.zeros((len(rows.residual), 3)))
     none = np.zeros(len(precision))
     begun = [(plain.reweighted(start, none) if start else plain, start or Noise()) for start in starts]
-    ends = [_climbed(*one, precision, away) for one in begun]
-
-    def here(end: tuple[Posterior, Likelihood, Noise]) -> float:
-        found = end[0]
-        return found.evidence - foretold_gain(found.mean[:own], found.covariance[:own, :own])
-
-    _, likelihood, noise = max(ends, key=here)
+    ends = [_climbed(*one, precision, away, own) for one in begun]
+    _, likelihood, noise = max(ends, key=lambda end: end[0])
     return likelihood, noise
 
 
-def _climbed(likelihood: Likelihood, noise: Noise, precision: Array, away: Array) -> tuple[Posterior, Likelihood, Noise]:
+def _climbed(
+    likelihood: Likelihood, noise: Noise, precision: Array, away: Array, own: int | None
+) -> tuple[float, Likelihood, Noise]:
     """The largest evidence near a start, by steps with the average information, the weights following the sizes."""
 
     def at(likelihood: Likelihood, noise: Noise) -> tuple[Posterior, Slopes]:
         reduced, local = likelihood.reduced(noise)
-        found = posterior(reduced, precision, away)
+        found = posterior(reduced, precision, away).held(own)
         return found, likelihood.slopes(noise, local, found, precision, away)
 
     found, slopes = at(likelihood, noise)
@@ -335,7 +341,7 @@ def _climbed(likelihood: Likelihood, noise: Noise, precision: Array, away: Array
             likelihood, noise, found, slopes = weights, moved, after, derivatives
         if gain < SETTLED:
             break
-    return found, likelihood, noise
+    return found.evidence, likelihood, noise
 
 
 def _bounded_step(sizes: Array, slopes: Slopes) -> Array:
@@ -345,11 +351,6 @@ def _bounded_step(sizes: Array, slopes: Slopes) -> Array:
     step = np.zeros(len(sizes))
     step[free] = np.linalg.lstsq(curved[np.ix_(free, free)], slope[free])[0]
     return np.clip(sizes + step, LEAST, MOST) - sizes
-
-
-def foretold_gain(step: Array, covariance: Array) -> float:
-    """Gain in the logarithm of a normal density by a step (c,) to its mean; covariance: (c, c)."""
-    return 0.5 * float(step @ np.linalg.solve(covariance, step))
 
 
 def inverses(lower: Array) -> Array:

@@ -13,7 +13,6 @@ from ballfg.diagnosis.evidence.halves import unlike_halves
 from ballfg.diagnosis.evidence.likelihood import (
     Noise,
     Reduced,
-    foretold_gain,
     held_out,
     posterior,
     settled,
@@ -245,8 +244,7 @@ class _Question:
             centre = values[place] + priors.away[place]
             mixed[number] += within(hypothesis, centre, found.mean, sigmas, WIDTHS[best[number]])
             strengths[hypothesis.name] = found
-        away, spread = result.mean[:own], result.covariance[:own, :own]
-        gain = foretold_gain(away, spread)
+        gain = result.gain(own)
         weighed = Weighed(
             tuple(self.named),
             replace(fit),  # without what can be computed again: a search keeps dozens of models
@@ -261,7 +259,7 @@ class _Question:
             self.nameless,
             self._nested(priors, total, best, mixed),
         )
-        return weighed, Step(likelihood.local_step(noise, result.mean)[:, :STATE_DIM], away, gain)
+        return weighed, Step(likelihood.local_step(noise, result.mean)[:, :STATE_DIM], result.mean[:own], gain)
 
     def moved(self, point: _Point, model: Weighed, step: Step) -> _Point | None:
         """The point after the share of a step that leads to the most probable unknowns; None if all are less probable.
@@ -292,7 +290,7 @@ class _Question:
         plain = weighted(rows, np.zeros_like(rows.residual), np.zeros((len(rows.residual), 3)))
         reduced, _ = plain.reweighted(model.noise, none).reduced(model.noise)
         found, own = point.priors.posterior(reduced, model.widths), point.own
-        return found.evidence - foretold_gain(found.mean[:own], found.covariance[:own, :own])
+        return found.evidence - found.gain(own)
 
     def _nested(
         self, priors: Priors, tracks: Reduced, widths: Sequence[int], mixed: Sequence[float]

@@ -36,28 +36,36 @@ def prior(rows):
     return np.linspace(0.5, 2.0, count) * 10.0, np.linspace(-0.2, 0.3, count)
 
 
-def dense(likelihood, noise, precision, away):
-    """The density of all rows at once, its noise a full matrix, common unknowns random, first spins free.
+def dense_rows(likelihood, noise, precision, away):
+    """The residual of all rows at once, first states' columns, and what each size and the priors add to the variance.
 
-    Places and velocities have the density that makes them uniform in what the samples show.
+    Also a logarithm: places and velocities have the density that makes them uniform in what the samples show.
     """
     rows, parts, logs = likelihood.rows, [], 0.0
-    sizes = np.exp(2.0 * np.append(noise.random, -np.inf))
     for i, used in enumerate(rows.used):
         kept = np.concatenate((np.repeat(used, 3), np.full(3, True)))
         weights = np.concatenate((np.repeat(likelihood.samples[i], 3), np.repeat(likelihood.spins[i], 3)))[kept]
-        white = np.concatenate((np.full(3 * used.sum(), np.exp(2 * noise.white)), np.full(3, np.exp(2 * noise.spin))))
-        motion = rows.motion.columns[i][kept] * np.sqrt(sizes[rows.motion.kinds[i]])
         # a robust weight divides the variance in the square of the residual, and leaves the normalisation alone
-        parts.append((rows.residual[i][kept], rows.by_start[i][kept], rows.by_common[i][kept], motion, white / weights))
+        white, spin = (np.exp(2.0 * size) * np.diag(1.0 / weights) for size in (noise.white, noise.spin))
+        is_spin = np.arange(len(weights)) >= 3 * used.sum()
+        white[is_spin], spin[~is_spin] = 0.0, 0.0
+        added = [white, spin]
+        for kind, size in enumerate(noise.random):
+            columns = rows.motion.columns[i][kept][:, rows.motion.kinds[i] == kind]
+            added.append(np.exp(2.0 * size) * columns @ columns.T)
+        parts.append((rows.residual[i][kept], rows.by_start[i][kept], rows.by_common[i][kept], added))
         shown = np.linalg.svd(rows.by_start[i][kept][:-3, :6], compute_uv=False)
         logs += 0.5 * np.log(weights).sum() + likelihood.penalty[i] - np.log(shown).sum()
-    residual = np.concatenate([p[0] for p in parts])
     common = np.concatenate([p[2] for p in parts])
-    starts = linalg.block_diag(*(p[1] for p in parts))
-    variance = linalg.block_diag(*(p[3] @ p[3].T + np.diag(p[4]) for p in parts))
-    variance += common / precision @ common.T
-    left = residual - common @ away
+    added = [linalg.block_diag(*(p[3][size] for p in parts)) for size in range(6)] + [common / precision @ common.T]
+    left = np.concatenate([p[0] for p in parts]) - common @ away
+    return left, linalg.block_diag(*(p[1] for p in parts)), added, logs
+
+
+def dense(likelihood, noise, precision, away):
+    """The density of all rows at once, its noise a full matrix, common unknowns random, first spins free."""
+    left, starts, added, logs = dense_rows(likelihood, noise, precision, away)
+    variance = sum(added)
     inverse = np.linalg.inv(variance)
     information = starts.T @ inverse @ starts
     solved = starts.T @ inverse @ left
@@ -86,11 +94,34 @@ def test_derivative_is_that_of_differences(likelihood, prior):
         return posterior(likelihood.reduced(Noise.of(vector))[0], *prior).evidence
 
     reduced, local = likelihood.reduced(NOISE)
-    slope = likelihood.slope(NOISE, local, posterior(reduced, *prior), *prior)
+    slope = likelihood.slopes(NOISE, local, posterior(reduced, *prior), *prior).slope
     step = 1e-5
     moved = [NOISE.vector + step * sign * axis for axis in np.eye(6) for sign in (1, -1)]
     differences = np.array([value(v) for v in moved]).reshape(6, 2) @ [1, -1] / (2 * step)
     np.testing.assert_allclose(slope, differences, rtol=1e-6, atol=1e-6 * np.abs(slope).max())
+
+
+def test_information_is_the_average_of_the_observed_and_the_expected(likelihood, prior):
+    """By dense matrices: P y is the residual over the variance, with first states out, and dV / dz = 2 V of a size."""
+    reduced, local = likelihood.reduced(NOISE)
+    found = likelihood.slopes(NOISE, local, posterior(reduced, *prior), *prior).information
+    left, starts, added, _ = dense_rows(likelihood, NOISE, *prior)
+    inverse = np.linalg.inv(sum(added))
+    without = inverse - inverse @ starts @ np.linalg.solve(starts.T @ inverse @ starts, starts.T @ inverse)
+    shown = np.stack([2.0 * one @ without @ left for one in added[:6]])
+    np.testing.assert_allclose(found, 0.5 * shown @ without @ shown.T, rtol=1e-6, atol=1e-8 * np.abs(found).max())
+
+
+def test_unknowns_held_have_the_density_that_they_have_where_they_are(likelihood, prior):
+    """Against the posterior of the others alone, the first three unknowns at their present values."""
+    reduced, _ = likelihood.reduced(NOISE)
+    precision, away = prior
+    found, total = posterior(reduced, *prior), reduced.gram.sum(axis=0)
+    held, kept = found.held(3), np.arange(3, len(total))
+    rest = posterior(type(reduced)(reduced.constant, total[None][:, kept][..., kept]), precision[3:], away[3:])
+    np.testing.assert_allclose(held.mean, np.append(np.zeros(3), rest.mean), atol=1e-9)
+    assert held.square == pytest.approx(rest.square + precision[:3] @ away[:3] ** 2, rel=1e-9)
+    assert found.evidence - held.evidence == pytest.approx(0.5 * (held.square - found.square), rel=1e-6)
 
 
 def test_common_unknowns_are_those_of_generalised_least_squares(likelihood, prior):
