@@ -39,7 +39,7 @@ def prior(rows):
 def dense_rows(likelihood, noise, precision, away):
     """The residual of all rows at once, first states' columns, and what each size and the priors add to the variance.
 
-    Also a logarithm: places and velocities have the density that makes them uniform in what the samples show.
+    Also a logarithm: places, velocities and labelled spins have the density of what samples and labels show of them.
     """
     rows, parts, logs = likelihood.rows, [], 0.0
     for i, used in enumerate(rows.used):
@@ -54,7 +54,8 @@ def dense_rows(likelihood, noise, precision, away):
             columns = rows.motion.columns[i][kept][:, rows.motion.kinds[i] == kind]
             added.append(np.exp(2.0 * size) * columns @ columns.T)
         parts.append((rows.residual[i][kept], rows.by_start[i][kept], rows.by_common[i][kept], added))
-        shown = np.linalg.svd(rows.by_start[i][kept][:-3, :6], compute_uv=False)
+        whole = rows.by_start[i][kept]
+        shown = np.linalg.svd(whole if rows.labelled[i] else whole[:-3, :6], compute_uv=False)
         logs += 0.5 * np.log(weights).sum() + likelihood.penalty[i] - np.log(shown).sum()
     common = np.concatenate([p[2] for p in parts])
     added = [linalg.block_diag(*(p[3][size] for p in parts)) for size in range(6)] + [common / precision @ common.T]
@@ -79,11 +80,13 @@ def test_value_is_that_of_a_dense_gaussian(likelihood, prior):
     assert found == pytest.approx(dense(likelihood, NOISE, *prior), rel=1e-8)
 
 
-def test_value_is_the_same_in_other_units_of_place_and_velocity(likelihood, prior):
-    """A slower clock or a longer metre alone makes no first state more probable."""
-    units = np.eye(9)
-    units[:6, :6] = np.random.default_rng(3).normal(size=(6, 6))
-    rows = likelihood.rows
+@pytest.mark.parametrize("labelled", [True, False])
+def test_value_is_the_same_in_other_units_of_what_has_no_prior(likelihood, prior, labelled):
+    """A slower clock, a longer metre or, with labels, a larger unit of spin alone makes no first state more probable."""
+    rows = replace(likelihood.rows, labelled=np.full(len(likelihood.rows.labelled), labelled))
+    likelihood = replace(likelihood, rows=rows)
+    units, free = np.eye(9), 9 if labelled else 6
+    units[:free, :free] = np.random.default_rng(3).normal(size=(free, free))
     other = replace(likelihood, rows=replace(rows, by_start=rows.by_start @ units))
     values = [posterior(one.reduced(NOISE)[0], *prior).evidence for one in (likelihood, other)]
     assert values[1] == pytest.approx(values[0], abs=1e-6)
