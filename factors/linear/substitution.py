@@ -85,7 +85,7 @@ def _part(rows: Array, first: int, scale: float, part: Array) -> None:
 
 @machine_code(NOTHING(TWO, TWO, TWO))
 def _multiply(left: Array, right: Array, product: Array) -> None:
-    """The product (a, b) of (a, m) and (m, b); small, so that loops are as quick as BLAS, which takes scipy's import."""
+    """The product (a, b) of small (a, m) and (m, b): BLAS is no quicker, and takes the import of scipy.linalg."""
     for i in range(left.shape[0]):
         for j in range(right.shape[1]):
             product[i, j] = 0.0

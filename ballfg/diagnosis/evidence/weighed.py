@@ -10,18 +10,12 @@ import numpy as np
 
 from ballfg.arrays import Array, Mask
 from ballfg.diagnosis.evidence.halves import unlike_halves
-from ballfg.diagnosis.evidence.likelihood import (
-    Noise,
-    Reduced,
-    held_out,
-    posterior,
-    settled,
-    weighted,
-)
+from ballfg.diagnosis.evidence.likelihood import Noise, Reduced, held_out, posterior, weighted
 from ballfg.diagnosis.evidence.nameless import NAMELESS, Patterns
 from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, log_odds, within
 from ballfg.diagnosis.evidence.priors_of_fit import Priors
 from ballfg.diagnosis.evidence.rows import Motion, Rows, random_motion, rows_of
+from ballfg.diagnosis.evidence.sizes import settled
 from ballfg.diagnosis.fit.problem import Fit, Unknowns
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.state import STATE_DIM

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from ballfg.diagnosis.evidence.likelihood import Likelihood, Noise, posterior, settled
+from ballfg.diagnosis.evidence.likelihood import Likelihood, Noise, posterior
 from ballfg.diagnosis.evidence.rows import random_motion, rows_of
+from ballfg.diagnosis.evidence.sizes import settled, slopes_at
 from ballfg.state import STATE_DIM
 
 NOISE = Noise(0.1, 0.2, (-0.7, -1.1, -0.4, -1.2))
@@ -82,7 +83,7 @@ def test_value_is_that_of_a_dense_gaussian(likelihood, prior):
 
 @pytest.mark.parametrize("labelled", [True, False])
 def test_value_is_the_same_in_other_units_of_what_has_no_prior(likelihood, prior, labelled):
-    """A slower clock, a longer metre or, with labels, a larger unit of spin alone makes no first state more probable."""
+    """A slower clock, a longer metre or labels in a larger unit alone make no first state more probable."""
     rows = replace(likelihood.rows, labelled=np.full(len(likelihood.rows.labelled), labelled))
     likelihood = replace(likelihood, rows=rows)
     units, free = np.eye(9), 9 if labelled else 6
@@ -97,7 +98,7 @@ def test_derivative_is_that_of_differences(likelihood, prior):
         return posterior(likelihood.reduced(Noise.of(vector))[0], *prior).evidence
 
     reduced, local = likelihood.reduced(NOISE)
-    slope = likelihood.slopes(NOISE, local, posterior(reduced, *prior), *prior).slope
+    slope = slopes_at(likelihood, NOISE, local, posterior(reduced, *prior), *prior).slope
     step = 1e-5
     moved = [NOISE.vector + step * sign * axis for axis in np.eye(6) for sign in (1, -1)]
     differences = np.array([value(v) for v in moved]).reshape(6, 2) @ [1, -1] / (2 * step)
@@ -107,7 +108,7 @@ def test_derivative_is_that_of_differences(likelihood, prior):
 def test_information_is_the_average_of_the_observed_and_the_expected(likelihood, prior):
     """By dense matrices: P y is the residual over the variance, with first states out, and dV / dz = 2 V of a size."""
     reduced, local = likelihood.reduced(NOISE)
-    found = likelihood.slopes(NOISE, local, posterior(reduced, *prior), *prior).information
+    found = slopes_at(likelihood, NOISE, local, posterior(reduced, *prior), *prior).information
     left, starts, added, _ = dense_rows(likelihood, NOISE, *prior)
     inverse = np.linalg.inv(sum(added))
     without = inverse - inverse @ starts @ np.linalg.solve(starts.T @ inverse @ starts, starts.T @ inverse)
