@@ -16,6 +16,7 @@ from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, log_odds, withi
 from ballfg.diagnosis.evidence.priors_of_fit import Priors
 from ballfg.diagnosis.evidence.rows import Motion, Rows, random_motion, rows_of
 from ballfg.diagnosis.evidence.sizes import settled
+from ballfg.diagnosis.fit.fit import with_guesses
 from ballfg.diagnosis.fit.problem import Fit, Unknowns
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.state import STATE_DIM
@@ -211,6 +212,7 @@ class _Question:
 
     def point(self, fit: Fit) -> _Point:
         """The rows of a fit and the priors at its unknowns."""
+        fit = with_guesses(fit)
         rows, patterns = rows_of(fit, self.motion), Patterns.of(fit) if self.nameless else None
         beside = rows if patterns is None else patterns.beside(rows)
         return _Point(fit, beside, Priors.of(fit, self.named, patterns))
