@@ -138,16 +138,20 @@ class Likelihood:
         return total, -count * noise.white - 3.0 * noise.spin - sizes.sum(axis=1)
 
     def reduced(self, noise: Noise) -> tuple[Reduced, Local]:
-        """First states and random motion integrated out."""
+        """First states and random motion integrated out; stretches that leave all numbers have no density."""
         total, logs = self.inner(noise)
         end = STATE_DIM + self.rows.motion.kinds.shape[1]
+        lost = ~(
+            np.abs(total).max(axis=(1, 2)) * np.finfo(np.float64).eps < 1.0
+        )  # rounding alone is a unit of evidence
+        total[lost] = np.eye(total.shape[-1])
         gram, kept = total[:, end:, end:].copy(), np.arange(end, total.shape[-1])
         # its triangle below the eliminated rows is the same whatever these hold; large, they stay definite
         total[:, kept, kept] += 1.0 + total[:, kept, kept]
         triangle = np.asarray(np.linalg.cholesky(total), dtype=np.float64)
         lower, solved = triangle[:, :end, :end], triangle[:, end:, :end]
         narrow = np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)
-        constant = logs + self.rows.volume - narrow - self.penalty
+        constant = np.where(lost, -np.inf, logs + self.rows.volume - narrow - self.penalty)
         return Reduced(constant, gram - solved @ solved.swapaxes(1, 2)), Local(lower, solved)
 
     def local_step(self, noise: Noise, common: Array) -> Array:

@@ -64,13 +64,17 @@ def _climbed(
 ) -> tuple[float, Likelihood, Noise]:
     """The largest evidence near a start, by steps with the average information, the weights following the sizes."""
 
-    def at(likelihood: Likelihood, noise: Noise) -> tuple[Posterior, Slopes]:
+    def at(likelihood: Likelihood, noise: Noise) -> tuple[Posterior, Slopes | None]:
         reduced, local = likelihood.reduced(noise)
         found = posterior(reduced, precision, away).held(own)
+        if not np.isfinite(found.evidence):
+            return found, None
         return found, slopes_at(likelihood, noise, local, found, precision, away)
 
     found, slopes = at(likelihood, noise)
     for _ in range(MOST_STEPS):
+        if slopes is None:
+            break
         step = _bounded_step(noise.vector, slopes)
         gain, share, promised = -np.inf, 1.0, 0.5 * float(step @ slopes.slope)
         while gain <= 0.0 and (share == 1.0 or share * promised > SETTLED):

@@ -151,11 +151,18 @@ def weighed(
         start: noise of a similar model.
         nameless: with patterns without a name beside the effects.
     """
-    question = _Question(named, motion, halves, nameless)
+    with np.errstate(invalid="ignore"):  # differences of models without a density: they lose to all others
+        return _followed(_Question(named, motion, halves, nameless), fit, start)
+
+
+def _followed(question: _Question, fit: Fit, start: Noise | None) -> Weighed:
+    """The model at the most probable unknowns near a fit."""
     point = question.point(fit)
     found, step = question.at(point, (start, None) if start else (None,))
     for number in range(MOST_STEPS):
-        if step.gain < WORTH_A_STEP and (number or not nameless):  # noise and widths of patterns need a second turn
+        if step.gain < WORTH_A_STEP and (
+            number or not question.nameless
+        ):  # noise and widths of patterns need a second turn
             break
         moved = question.moved(point, found, step)
         if moved is None:

@@ -169,3 +169,12 @@ def test_the_best_of_several_starts_counts(rows, prior):
         for one, noise in (settled(rows, *prior, s) for s in ((starts[0],), (None,), starts))
     ]
     assert values[2] > max(values) - 0.05
+
+
+@pytest.mark.parametrize("part", ["residual", "by_start", "by_common"])
+def test_a_path_far_off_all_samples_has_hardly_any_density(rows, prior, part):
+    """A fit may end with a flight that left the room: it must lose, and not by chance of rounding win."""
+    far = getattr(rows, part).copy()
+    far[0] *= 1e100
+    likelihood, noise = settled(replace(rows, **{part: far}), *prior)
+    assert posterior(likelihood.reduced(noise)[0], *prior).evidence < -1e6
