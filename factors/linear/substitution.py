@@ -94,6 +94,17 @@ def _multiply(left: Array, right: Array, product: Array) -> None:
                 product[i, j] += left[i, k] * right[k, j]
 
 
+@machine_code(NOTHING(TWO, TWO, TWO))
+def _multiply_turned(left: Array, right: Array, product: Array) -> None:
+    """`_multiply` of (a, m) and the transpose of (b, m)."""
+    for i in range(left.shape[0]):
+        for j in range(right.shape[0]):
+            total = 0.0
+            for k in range(left.shape[1]):
+                total += left[i, k] * right[j, k]
+            product[i, j] = total
+
+
 @machine_code(NOTHING(ROOT, THREE, THREE, TWO))
 def covariances_of(triangle: Root, states: Array, cross: Array, coefficients: Array) -> None:
     """Blocks of (R^T R)^-1, from the last state back to the first.
@@ -112,7 +123,7 @@ def covariances_of(triangle: Root, states: Array, cross: Array, coefficients: Ar
         own, shared = np.empty((p, p)), np.empty((p, p))
         _part(last, 2 * w, 1.0, shared)
         invert(shared, own)
-        _multiply(own, own.T.copy(), coefficients)
+        _multiply_turned(own, own, coefficients)
     later, inverse = np.zeros((w + p, w + p)), np.empty((w, w))
     upper, coupling, gain = np.empty((w, w)), np.empty((w, w + p)), np.empty((w, w + p))
     own_part, later_part = np.empty((w, w)), np.empty((w, w))
@@ -125,8 +136,8 @@ def covariances_of(triangle: Root, states: Array, cross: Array, coefficients: Ar
         invert(upper, inverse)
         _multiply(inverse, coupling, gain)
         _multiply(gain, later, cross[i])
-        _multiply(inverse, inverse.T.copy(), own_part)
-        _multiply(cross[i], gain.T.copy(), later_part)
+        _multiply_turned(inverse, inverse, own_part)
+        _multiply_turned(cross[i], gain, later_part)
         for a in range(w):
             for b in range(w):
                 states[i, a, b] = later[a, b] = own_part[a, b] + later_part[a, b]

@@ -141,9 +141,8 @@ class Likelihood:
         """First states and random motion integrated out; stretches that leave all numbers have no density."""
         total, logs = self.inner(noise)
         end = STATE_DIM + self.rows.motion.kinds.shape[1]
-        lost = ~(
-            np.abs(total).max(axis=(1, 2)) * np.finfo(np.float64).eps < 1.0
-        )  # rounding alone is a unit of evidence
+        largest = np.diagonal(total, axis1=1, axis2=2).max(axis=1)
+        lost = ~(largest * np.finfo(np.float64).eps < 1.0)  # rounding alone is a unit of evidence
         total[lost] = np.eye(total.shape[-1])
         gram, kept = total[:, end:, end:].copy(), np.arange(end, total.shape[-1])
         # its triangle below the eliminated rows is the same whatever these hold; large, they stay definite
@@ -161,11 +160,12 @@ class Likelihood:
         right = total[:, :end, -1] - total[:, :end, end:-1] @ common
         return np.asarray(np.linalg.solve(total[:, :end, :end], right[..., None])[..., 0])
 
-    def reweighted(self, noise: Noise, common: Array) -> Likelihood:
-        """With the robust weights of the residual that remains beside the motion; common: (c,) step of the unknowns."""
-        step = np.append(-common, 1.0)
+    def reweighted(self, noise: Noise) -> Likelihood:
+        """With the robust weights of the residual that remains beside the motion, all common unknowns as they are."""
+        common = np.zeros(self.rows.by_common.shape[-1])
         motion = self.local_step(noise, common)
-        return self.beside(np.concatenate((-motion, np.broadcast_to(step, (len(motion), len(step)))), axis=1), noise)
+        kept = np.broadcast_to(np.append(common, 1.0), (len(motion), len(common) + 1))
+        return self.beside(np.concatenate((-motion, kept), axis=1), noise)
 
     def beside(self, along: Array, noise: Noise) -> Likelihood:
         """With the robust weights of a residual, the sum of columns by factors (n, d)."""
@@ -174,6 +174,11 @@ class Likelihood:
         left = r.residual + (r.by_start @ start[..., None] + r.motion.columns @ random[..., None])[..., 0]
         left += (r.by_common @ common[..., None])[..., 0]
         return weighted(r, left / np.exp(noise.white), left[:, -3:] / np.exp(noise.spin))
+
+
+def unweighted(rows: Rows) -> Likelihood:
+    """The likelihood with robust weights of one."""
+    return weighted(rows, np.zeros_like(rows.residual), np.zeros((len(rows.residual), 3)))
 
 
 def weighted(rows: Rows, left: Array, spins: Array) -> Likelihood:

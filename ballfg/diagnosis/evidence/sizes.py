@@ -13,7 +13,7 @@ import numpy as np
 from scipy import linalg
 
 from ballfg.arrays import Array
-from ballfg.diagnosis.evidence.likelihood import Likelihood, Local, Noise, Posterior, posterior, weighted
+from ballfg.diagnosis.evidence.likelihood import Likelihood, Local, Noise, Posterior, posterior, unweighted
 from ballfg.diagnosis.evidence.rows import Rows
 from ballfg.state import STATE_DIM
 
@@ -51,9 +51,8 @@ def settled(
         starts: noise of similar models, or None for almost none beside that of the samples; the best end counts.
         own: number of the common unknowns, the first ones, in which the rows are not linear; None: all.
     """
-    plain = weighted(rows, np.zeros_like(rows.residual), np.zeros((len(rows.residual), 3)))
-    none = np.zeros(len(precision))
-    begun = [(plain.reweighted(start, none) if start else plain, start or Noise()) for start in starts]
+    plain = unweighted(rows)
+    begun = [(plain.reweighted(start) if start else plain, start or Noise()) for start in starts]
     ends = [_climbed(*one, precision, away, own) for one in begun]
     _, likelihood, noise = max(ends, key=lambda end: end[0])
     return likelihood, noise
@@ -142,8 +141,7 @@ def _information(
     kinds, (of_samples, of_spins) = likelihood.rows.motion.kinds, likelihood.grams
     end = STATE_DIM + kinds.shape[1]
     ahead = np.zeros((*along.shape, len(noise.random)))  # of the random columns alone, kind by kind
-    for kind in range(len(noise.random)):
-        ahead[:, STATE_DIM:end, kind] = -along[:, STATE_DIM:end] * (kinds == kind)
+    ahead[:, STATE_DIM:end] = -along[:, STATE_DIM:end, None] * (kinds[..., None] == np.arange(len(noise.random)))
     white, spin = np.exp(-2.0 * noise.white), np.exp(-2.0 * noise.spin)
     factors = np.concatenate((along[..., None], ahead), axis=-1)
     samples, spins = white * (of_samples @ factors), spin * (of_spins @ factors)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ballfg.arrays import Array, Mask
 from ballfg.diagnosis.evidence.halves import unlike_halves
-from ballfg.diagnosis.evidence.likelihood import Noise, Reduced, held_out, posterior, weighted
+from ballfg.diagnosis.evidence.likelihood import Noise, Reduced, held_out, posterior, unweighted
 from ballfg.diagnosis.evidence.nameless import NAMELESS, Patterns
 from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, log_odds, within
 from ballfg.diagnosis.evidence.priors_of_fit import Priors
@@ -160,9 +160,8 @@ def _followed(question: _Question, fit: Fit, start: Noise | None) -> Weighed:
     point = question.point(fit)
     found, step = question.at(point, (start, None) if start else (None,))
     for number in range(MOST_STEPS):
-        if step.gain < WORTH_A_STEP and (
-            number or not question.nameless
-        ):  # noise and widths of patterns need a second turn
+        second = number == 0 and question.nameless  # noise and widths of patterns need a second turn
+        if step.gain < WORTH_A_STEP and not second:
             break
         moved = question.moved(point, found, step)
         if moved is None:
@@ -289,9 +288,7 @@ class _Question:
 
         The evidence is what it would be at the end of the step from there, if that were linear.
         """
-        rows, none = point.rows, np.zeros(point.rows.by_common.shape[-1])
-        plain = weighted(rows, np.zeros_like(rows.residual), np.zeros((len(rows.residual), 3)))
-        reduced, _ = plain.reweighted(model.noise, none).reduced(model.noise)
+        reduced, _ = unweighted(point.rows).reweighted(model.noise).reduced(model.noise)
         found, own = point.priors.posterior(reduced, model.widths), point.own
         return found.evidence - found.gain(own)
 
