@@ -20,15 +20,21 @@ from ballfg.diagnosis.residual_tests.label_check import check_labels, label_test
 from ballfg.diagnosis.residual_tests.residuals import residuals_of
 from ballfg.diagnosis.residual_tests.tracker_errors import look_at_tracker
 from ballfg.diagnosis.result import Diagnosis, Errors, Fallback, Unexplained, Value, Verdict
-from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.diagnosis.search.loop import NAMED, Search, SearchLoop
 from ballfg.diagnosis.search.plausible import at_bound, implausible
-from ballfg.diagnosis.search.process_noise import calibrated_model, noise_about, predictive_model
+from ballfg.diagnosis.search.process_noise import (
+    calibrated_model,
+    errors_of,
+    for_next_shot,
+    noise_about,
+    predictive_model,
+    unpopulated_model,
+    without_population,
+)
 from ballfg.diagnosis.search.stamp_effects import as_declared
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel
 from ballfg.dynamics.domain import Domain
 from ballfg.dynamics.effect import Effect
-from ballfg.estimation import dataset_settings
 from ballfg.tracks import Dataset
 from ballfg.tracks.noise import TrackNoise
 
@@ -65,13 +71,15 @@ def diagnose(
     model = analytic(model)
     tell = watch or (lambda line: None)
     holdout = hold_out(dataset, model, jobs, tell)
-    evaluate = partial(_errors, holdout, jobs)
+    evaluate = partial(errors_of, holdout=holdout, tracks=holdout.held_out_tracks, jobs=jobs)
     effects = tuple(catalogue or EFFECTS.values())
     loop = SearchLoop(
         holdout, effects, partial(predictive_model, holdout, jobs), evaluate, tell, jobs=jobs, name_at=name_at
     )
     search = loop.run(model)
     corrected, tracker, search = _with_own_noise(search, holdout, evaluate, tell, jobs)
+    bare = unpopulated_model(search.declared, holdout, jobs)
+    bare = search.before if bare is search.declared else evaluate(as_declared(bare, holdout.stamps))
     tell("looking at what is left")
     labels, of_labels = _labels(search, model, holdout, tracker, jobs)
     tests = in_order(*generic_tests(search.fit, search.first, tracker), *of_labels)
@@ -85,7 +93,9 @@ def diagnose(
     residuals = residuals_of(search.first)
     declared = {name: float(value.detach()) for name, value in model.named_parameters()}
     calibrated = values_of(search.whole, [name for name in search.whole.problem.free if name in declared], declared)
-    whole = calibrated_model(search.whole, holdout.launcher.embedding)
+    whole = calibrated_model(for_next_shot(search.whole), holdout.launcher.embedding)
+    if without_population(corrected) is corrected:
+        whole = without_population(whole)
     whole.noise = corrected.noise
     whole.domain = Domain.of(dataset) if search.findings else model.domain
     after = search.judged if helped is None else helped.after
@@ -98,6 +108,7 @@ def diagnose(
         rounds=search.rounds,
         before=search.before,
         after=after,
+        unpopulated=bare,
         tracks_found_on=len(np.unique(holdout.search.track)),
         tracks_judged_on=len(search.before.by_track),
         calibrated=calibrated,
@@ -172,11 +183,6 @@ def strange(fit: Fit, calibrated: Mapping[str, Value], radius: float) -> list[st
         known = implausible(name, value, radius) if full in calibrated else ""
         texts += [text for text in (known, at_bound(name, value, coefficient)) if text]
     return [f"The fitted {text}. {words}." for text in texts]
-
-
-def _errors(holdout: Holdout, jobs: int, model: BallModel) -> Errors:
-    settings = dataset_settings(holdout.dataset, model)
-    return prediction_errors(model, holdout.held_out_tracks, holdout.surfaces, settings, jobs)
 
 
 def in_order(*tests: GenericTest) -> tuple[GenericTest, ...]:

@@ -12,8 +12,8 @@ from torch import Tensor
 from ballfg.diagnosis.budget import ErrorBudget
 from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout, analytic, hold_out
 from ballfg.diagnosis.residual_tests.tracker_errors import look_at_tracker
-from ballfg.diagnosis.search.evaluation import LEAST_PREDICTED, OBSERVED, prediction_errors
-from ballfg.diagnosis.search.process_noise import calibrated_model, noise_about
+from ballfg.diagnosis.search.evaluation import LEAST_PREDICTED, OBSERVED
+from ballfg.diagnosis.search.process_noise import errors_of, noise_about, predictive_model
 from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit
 from ballfg.dynamics import BallModel, Surfaces
 from ballfg.estimation import Settings, dataset_settings
@@ -42,15 +42,13 @@ def error_budget(
     model, tell = analytic(model), watch or (lambda line: None)
     holdout = hold_out(dataset, model, jobs, tell)
     tell("fitting the model and its noise")
-    fitted = calibrated_model(first_fit(model, holdout), holdout.launcher.embedding)
-    fitted.noise = noise_about(fitted, holdout.search_tracks, dataset, jobs=jobs)
+    fitted = predictive_model(holdout, jobs, first_fit(model, holdout))
     tracker = look_at_tracker(fitted, holdout, jobs)
     if tracker.findings:
         fitted.noise = noise_about(fitted, holdout.search_tracks, dataset, tracker.noise, jobs=jobs)
     tell("predicting the other half")
     before, after = (
-        prediction_errors(m, holdout.held_out_tracks, holdout.surfaces, dataset_settings(dataset, m), jobs)
-        for m in (as_declared(fitted, holdout.stamps), fitted)
+        errors_of(m, holdout, holdout.held_out_tracks, jobs) for m in (as_declared(fitted, holdout.stamps), fitted)
     )
     budget = budget_of(fitted, holdout, before.prediction_rmse_mm, after.prediction_rmse_mm, jobs)
     if budget is None:

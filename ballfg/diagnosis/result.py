@@ -252,8 +252,9 @@ class Diagnosis:
         verdict, sentence: the answer, and the answer in one sentence with numbers.
         findings: effects in the order added.
         rounds: the ranking of all candidates in each round, best first.
-        before: errors on the held-out half with the declared model as calibrated.
+        before: errors on the held-out half with the declared model as calibrated, beside the population of its spins.
         after: the same with the corrected model: named effects, and the fallback where there is one.
+        unpopulated: as `before`, with the prior of any spin; None for several datasets.
         tracks_found_on, tracks_judged_on: numbers of tracks of the search half and of the held-out half.
         calibrated: declared coefficients fitted with the corrected model to the tracks of both halves.
         noise: position noise along x, y, z as estimated (m), and as stated.
@@ -293,6 +294,7 @@ class Diagnosis:
     nothing_lacking: float = float("nan")
     nameless: float = float("nan")
     budget: ErrorBudget | None = None
+    unpopulated: Errors | None = None
 
     def __repr__(self) -> str:
         effects = ", ".join(finding.name for finding in self.findings) or "none"

@@ -17,8 +17,7 @@ from ballfg.diagnosis.fit.problem import Problem
 from ballfg.diagnosis.fit.stretches import Stretches, stretches_of
 from ballfg.diagnosis.hypotheses.hypothesis import has_effect, with_effects, without_effect
 from ballfg.diagnosis.result import Errors
-from ballfg.diagnosis.search.evaluation import prediction_errors
-from ballfg.diagnosis.search.process_noise import calibrated_model, noise_about
+from ballfg.diagnosis.search.process_noise import errors_of, predictive_model
 from ballfg.dynamics import AnalyticModel, nominal_model
 from ballfg.dynamics.effect import Coefficient
 from ballfg.estimation import Smoother, dataset_settings
@@ -100,9 +99,7 @@ def true_errors(case: Case, dataset: Dataset) -> Errors:
     search = reachable(truth, _with_labelled_spins(truth, search))
     problem = Problem(truth, search, {**declared_free(declared), **planted_free(case)})
     start = first_guess(problem, holdout.settings.spin_label_noise, holdout.settings.spin_prior)
-    model = calibrated_model(fit_problem(problem, *start), holdout.launcher.embedding)
-    model.noise = noise_about(model, holdout.search_tracks, dataset)
-    return prediction_errors(model, holdout.held_out_tracks, holdout.surfaces, dataset_settings(dataset, model))
+    return errors_of(predictive_model(holdout, 1, fit_problem(problem, *start)), holdout, holdout.held_out_tracks, 1)
 
 
 def planted_free(case: Case) -> dict[str, Coefficient]:

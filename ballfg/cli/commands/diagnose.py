@@ -107,7 +107,7 @@ def _typed(
 
 def _summary(diagnosis: Diagnosis) -> Iterator[str]:
     """The diagnosis in lines: the sentence, effects, errors on the held-out half, the rest."""
-    from ballfg.diagnosis.report.headline import headline
+    from ballfg.diagnosis.report.headline import headline, of_population
     from ballfg.diagnosis.report.wording import fixed, listed, odds, probability
 
     yield headline(diagnosis)
@@ -130,6 +130,8 @@ def _summary(diagnosis: Diagnosis) -> Iterator[str]:
         ("log likelihood", fixed(before.log_likelihood, 2), fixed(after.log_likelihood, 2)),
     ]
     yield from ("", *_aligned(errors))
+    if told := of_population(diagnosis):
+        yield told
     left = diagnosis.unexplained
     if left.where:
         yield from ("", f"left unexplained: {left.where}")

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from ballfg.arrays import Array, Index, Mask
-from ballfg.diagnosis.evidence.rows import Rows
+from ballfg.diagnosis.evidence.rows import SPIN_KINDS, Rows
 from ballfg.diagnosis.fit.problem import LABEL_LOSS, POSITION_LOSS
 from ballfg.diagnosis.fit.system import by_track
 from ballfg.state import STATE_DIM
@@ -21,21 +21,25 @@ from ballfg.state import STATE_DIM
 
 @dataclass(frozen=True)
 class Noise:
-    """Logarithms of the sizes: of white noise and spin rows over the stated ones, and of random motion (4,)."""
+    """Logarithms of the sizes: of white noise and spins (4,) over the stated ones, and of random motion (4,).
+
+    Spins are those with a label, and the others forward, across and up.
+    """
 
     white: float = 0.0
-    spin: float = 0.0
+    spin: tuple[float, ...] = (0.0,) * SPIN_KINDS
     random: tuple[float, ...] = (-4.0,) * 4
 
     @property
     def vector(self) -> Array:
-        """(6,) all of them."""
-        return np.array([self.white, self.spin, *self.random])
+        """(9,) all of them."""
+        return np.array([self.white, *self.spin, *self.random])
 
     @classmethod
     def of(cls, vector: Array) -> Noise:
-        """The noise of (6,) logarithms."""
-        return cls(float(vector[0]), float(vector[1]), tuple(vector[2:].tolist()))
+        """The noise of (9,) logarithms."""
+        spin, random = vector[1 : 1 + SPIN_KINDS], vector[1 + SPIN_KINDS :]
+        return cls(float(vector[0]), tuple(spin.tolist()), tuple(random.tolist()))
 
 
 @dataclass(frozen=True)
@@ -119,23 +123,22 @@ class Likelihood:
         return np.concatenate(rows, axis=-1) * np.sqrt(self.spins)[:, None, None]
 
     @cached_property
-    def grams(self) -> tuple[Array, Array]:
-        """Two (n, d, d): of the samples, and of the spin rows; columns start, random, common, residual."""
-        spins = self.spin_columns
-        return self.rows.gram - self.rows.inner_products(1.0 - self.samples), spins.swapaxes(1, 2) @ spins
+    def gram(self) -> Array:
+        """(n, d, d) inner products of the samples; columns start, random, common, residual."""
+        return self.rows.gram - self.rows.inner_products(1.0 - self.samples)
 
     def inner(self, noise: Noise) -> tuple[Array, Array]:
         """(n, d, d) information with priors of the random columns, and (n,) logarithms of the sizes."""
-        of_samples, of_spins = self.grams
-        total = of_samples * np.exp(-2.0 * noise.white)
-        total += of_spins * np.exp(-2.0 * noise.spin)
+        logs = np.array(noise.spin)[self.rows.spin_kinds]
+        spins = self.spin_columns * np.exp(-logs)[..., None]
+        total = self.gram * np.exp(-2.0 * noise.white) + spins.swapaxes(1, 2) @ spins
         kinds, first = self.rows.motion.kinds, np.arange(STATE_DIM)
         sizes = np.append(noise.random, 0.0)[kinds]
         place = STATE_DIM + np.arange(kinds.shape[1])
         total[:, place, place] += np.exp(-2.0 * sizes)
         total[:, first, first] += total[:, first, first] == 0.0
         count = 3.0 * self.rows.used.sum(axis=1)
-        return total, -count * noise.white - 3.0 * noise.spin - sizes.sum(axis=1)
+        return total, -count * noise.white - logs.sum(axis=1) - sizes.sum(axis=1)
 
     def reduced(self, noise: Noise) -> tuple[Reduced, Local]:
         """First states and random motion integrated out; stretches that leave all numbers have no density."""
@@ -173,7 +176,7 @@ class Likelihood:
         start, random, common = along[:, :STATE_DIM], along[:, STATE_DIM:end], along[:, end:-1]
         left = r.residual + (r.by_start @ start[..., None] + r.motion.columns @ random[..., None])[..., 0]
         left += (r.by_common @ common[..., None])[..., 0]
-        return weighted(r, left / np.exp(noise.white), left[:, -3:] / np.exp(noise.spin))
+        return weighted(r, left / np.exp(noise.white), left[:, -3:] / np.exp(noise.spin)[r.spin_kinds])
 
 
 def unweighted(rows: Rows) -> Likelihood:

@@ -24,6 +24,8 @@ from ballfg.state import SPIN, STATE_DIM
 ACCELERATIONS, VELOCITIES, SPINS, COEFFICIENTS = range(4)
 """Kinds of random columns; each kind has one size for all tracks."""
 KINDS: Final = 4
+SPIN_KINDS: Final = 4
+"""Kinds of spin rows: of labels, and of other spins about forward, across and up. Each has one size too."""
 SIZES: Final = (ACCELERATION, CONTACT_VELOCITY, CONTACT_SPIN, 1.0)
 """Unit of each size: m/s^2/sqrt(Hz), m/s, rad/s, and prior standard deviations of the coefficients."""
 
@@ -65,10 +67,16 @@ class Rows:
 
     @property
     def counts(self) -> Array:
-        """(2 + KINDS,) numbers that each size scales: coordinates of samples and spins, random columns of each kind."""
+        """(1 + SPIN_KINDS + KINDS,) numbers that each size scales: coordinates of samples and spins, random columns."""
         kinds = self.motion.kinds
         random = [(kinds == kind).sum() for kind in range(KINDS)]
-        return np.array([3 * self.used.sum(), 3 * len(kinds), *random], dtype=np.float64)
+        spins = np.bincount(self.spin_kinds.ravel(), minlength=SPIN_KINDS)
+        return np.array([3 * self.used.sum(), *spins, *random], dtype=np.float64)
+
+    @property
+    def spin_kinds(self) -> Index:
+        """(n, 3) kind of each spin row: 0 of a label, which has no axes of its own, else 1, 2, 3 by the launch's."""
+        return np.where(self.labelled[:, None], 0, np.arange(1, SPIN_KINDS))
 
     @cached_property
     def volume(self) -> Array:

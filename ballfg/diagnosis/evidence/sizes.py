@@ -27,7 +27,7 @@ LONGEST: Final = 1.5
 
 @dataclass(frozen=True)
 class Slopes:
-    """Derivatives of the evidence by the logarithms of the sizes: slope (6,) and average information (6, 6).
+    """Derivatives of the evidence by the logarithms of the sizes: slope (9,) and average information (9, 9).
 
     `along` (n, d) are factors of the columns start, random, common, residual whose sum is the residual at the mean,
     one for the residual.
@@ -89,7 +89,7 @@ def _climbed(
 
 
 def _bounded_step(sizes: Array, slopes: Slopes) -> Array:
-    """(6,) step of the logarithms of the sizes (6,), within their bounds; each is damped by its slope."""
+    """(9,) step of the logarithms of the sizes (9,), within their bounds; each is damped by its slope."""
     slope, curved = slopes.slope, slopes.information + np.diag(np.abs(slopes.slope)) / LONGEST
     free = np.flatnonzero(~((sizes <= LEAST) & (slope <= 0.0) | (sizes >= MOST) & (slope >= 0.0)))
     step = np.zeros(len(sizes))
@@ -119,14 +119,15 @@ def slopes_at(
     spins = likelihood.spin_columns
     left = spins[..., end:] @ step - (spins[..., :end] @ mean[..., None])[..., 0]
     scattered = (spins[..., end:-1] - spins[..., :end] @ solved[..., :-1]) @ root
-    square = (left**2).sum() + (scattered**2).sum() + ((spins[..., :end] @ upper) ** 2).sum()
-    spin = float(square) * np.exp(-2.0 * noise.spin)
+    square = left**2 + (scattered**2).sum(axis=-1) + ((spins[..., :end] @ upper) ** 2).sum(axis=-1)
+    spin = np.bincount(likelihood.rows.spin_kinds.ravel(), square.ravel(), len(noise.spin))
+    spin *= np.exp(-2.0 * np.array(noise.spin))
     prior = float(precision @ ((away - found.mean) ** 2 + np.diagonal(found.covariance)))
-    of_samples, of_spins = (np.diagonal(gram, axis1=1, axis2=2)[:, :STATE_DIM] for gram in likelihood.grams)
-    unseen = int((of_samples + of_spins == 0.0).sum()) + int((kinds < 0).sum())  # `inner` gives them a prior
+    shown_of = np.diagonal(likelihood.gram, axis1=1, axis2=2) + (spins**2).sum(axis=1)
+    unseen = int((shown_of[:, :STATE_DIM] == 0.0).sum()) + int((kinds < 0).sum())  # `inner` gives them a prior
     unknowns = mean.shape[0] * end - unseen + len(found.mean)
-    white = found.square + float(unknowns) - sum(shown) - spin - prior
-    slope = np.array([white, spin, *shown]) - likelihood.rows.counts
+    white = found.square + float(unknowns) - sum(shown) - spin.sum() - prior
+    slope = np.array([white, *spin, *shown]) - likelihood.rows.counts
     along = np.concatenate((-mean, np.broadcast_to(step, (len(mean), len(step)))), axis=1)
     return Slopes(slope, _information(likelihood, noise, upper, local.solved, along, found.covariance), along)
 
@@ -134,22 +135,26 @@ def slopes_at(
 def _information(
     likelihood: Likelihood, noise: Noise, upper: Array, solved: Array, along: Array, covariance: Array
 ) -> Array:
-    """(6, 6) twice the inner products of what each size's rows or columns show, less what all unknowns absorb.
+    """(9, 9) twice the inner products of what each size's rows or columns show, less what all unknowns absorb.
 
     Args: along: (n, d) factors of the columns whose sum is the residual at the mean.
     """
-    kinds, (of_samples, of_spins) = likelihood.rows.motion.kinds, likelihood.grams
+    kinds = likelihood.rows.motion.kinds
     end = STATE_DIM + kinds.shape[1]
     ahead = np.zeros((*along.shape, len(noise.random)))  # of the random columns alone, kind by kind
     ahead[:, STATE_DIM:end] = -along[:, STATE_DIM:end, None] * (kinds[..., None] == np.arange(len(noise.random)))
-    white, spin = np.exp(-2.0 * noise.white), np.exp(-2.0 * noise.spin)
     factors = np.concatenate((along[..., None], ahead), axis=-1)
-    samples, spins = white * (of_samples @ factors), spin * (of_spins @ factors)
-    rows = np.concatenate((samples[..., :1], spins[..., :1], samples[..., 1:] + spins[..., 1:]), axis=-1)
+    of_spins = likelihood.rows.spin_kinds
+    columns = likelihood.spin_columns * np.exp(-np.array(noise.spin))[of_spins][..., None]
+    samples, spins = np.exp(-2.0 * noise.white) * (likelihood.gram @ factors), columns @ factors
+    own_rows = spins[..., :1] * (of_spins[..., None] == np.arange(len(noise.spin)))
+    shown = columns.swapaxes(1, 2) @ np.concatenate((own_rows, spins[..., 1:]), axis=-1)
+    own = 1 + len(noise.spin)
+    rows = np.concatenate((samples[..., :1], shown[..., : own - 1], samples[..., 1:] + shown[..., own - 1 :]), axis=-1)
     products = np.zeros((rows.shape[-1],) * 2)
-    products[2:] = np.einsum("nda,ndb->ab", ahead, rows)
-    products[:2, 2:] = products[2:, :2].T
-    products[0, 0], products[1, 1] = (float((along * r[..., 0]).sum()) for r in (samples, spins))
+    products[own:] = np.einsum("nda,ndb->ab", ahead, rows)
+    products[:own, own:] = products[own:, :own].T
+    products[range(own), range(own)] = np.einsum("nd,nda->a", along, rows[..., :own])
     local = upper.swapaxes(1, 2) @ rows[:, :end]
     common = (rows[:, end:-1] - solved[:, :-1] @ local).sum(axis=0)
     return 2.0 * (products - np.einsum("nla,nlb->ab", local, local) - common.T @ covariance @ common)

@@ -103,6 +103,17 @@ def gain(diagnosis: Diagnosis, what: str) -> str:
     return f"{what}, predictions are off by {after:.1f} instead of {before:.1f} mm."
 
 
+def of_population(diagnosis: Diagnosis) -> str:
+    """What the population of spins is worth, in one sentence; empty without one."""
+    bare = diagnosis.unpopulated
+    if bare is None or bare is diagnosis.before:
+        return ""
+    return (
+        f"How the spins of these launches scatter is known from the other tracks: with the prior of any spin, the "
+        f"declared model would be off by {bare.prediction_rmse_mm:.1f} mm."
+    )
+
+
 def skewed_medians(before: Errors, after: Errors) -> tuple[float, float] | None:
     """mm, errors of the median track before and after, if a few tracks dominate the root mean square."""
     was, now = (float(np.nanmedian(e.by_track)) if np.isfinite(e.by_track).any() else math.nan for e in (before, after))

@@ -6,7 +6,7 @@ from typing import Final
 from ballfg.diagnosis.budget import EXPECTED, PARTS
 from ballfg.diagnosis.report import pictures, shots
 from ballfg.diagnosis.report.glossary import term
-from ballfg.diagnosis.report.headline import skewed_medians
+from ballfg.diagnosis.report.headline import of_population, skewed_medians
 from ballfg.diagnosis.report.wording import NONE, change, fixed
 from ballfg.diagnosis.result import Diagnosis, Errors
 from ballfg.pages.html import Html, bar, items, picture, section, table, tag, text
@@ -64,6 +64,8 @@ def meaning(diagnosis: Diagnosis) -> list[Html]:
             f"of the release cost even an exact model. The error is {error:.1f} mm, {how}."
         )
         said.append(tag("span", "The ", term("floor"), least))
+    if told := of_population(diagnosis):
+        said.append(text(told))
     if medians := skewed_medians(diagnosis.before, after):
         was = f"{medians[0]:.1f} mm before and " if after is not diagnosis.before else ""
         off = f"{was}{medians[1]:.1f} mm{' after' if was else ''}"

@@ -124,6 +124,7 @@ def content(diagnosis: Diagnosis) -> dict[str, Any]:
             "error": {
                 "before": _errors(diagnosis.before),
                 "after": _errors(diagnosis.after),
+                "unpopulated": None if diagnosis.unpopulated is None else _errors(diagnosis.unpopulated),
                 "floor_mm": diagnosis.floor_mm,
                 "tracks_found_on": diagnosis.tracks_found_on,
                 "tracks_judged_on": diagnosis.tracks_judged_on,

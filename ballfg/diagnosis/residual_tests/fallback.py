@@ -6,7 +6,7 @@ from ballfg.diagnosis.fit.holdout import EvaluationTrack
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.residual_tests.sparse import SparseTerms, fit_with_terms, sparse_terms
 from ballfg.diagnosis.result import Errors, Fallback
-from ballfg.diagnosis.search.process_noise import calibrated_model, noise_about
+from ballfg.diagnosis.search.process_noise import calibrated_model, for_next_shot, noise_about
 from ballfg.dynamics import BallModel
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.tracks import Dataset
@@ -34,7 +34,7 @@ def fallback(
     if terms is None:
         return None
     after = fit_with_terms(before, terms)
-    model = calibrated_model(after, embedding)
+    model = calibrated_model(for_next_shot(after), embedding)
     model.noise = noise_about(model, parts, dataset, noise)
     errors = evaluate(model)
     if errors.prediction_rmse_mm >= HELPS * now.prediction_rmse_mm:

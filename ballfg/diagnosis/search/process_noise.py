@@ -11,9 +11,14 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from ballfg.diagnosis.evidence.likelihood import posterior
+from ballfg.diagnosis.evidence.rows import random_motion, rows_of
+from ballfg.diagnosis.evidence.sizes import settled
 from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import with_effects
+from ballfg.diagnosis.result import Errors
+from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.dynamics import AnalyticModel, BallModel
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
@@ -103,12 +108,58 @@ def noise_about(
     return replace(noise, memory=settings.memory, memory_time=settings.memory_time) if settings.has_memory else noise
 
 
+def for_next_shot(fit: Fit) -> Fit:
+    """The fit with the scatter of a further shot's spin about its launcher's mean, from the evidence of the tracks.
+
+    The fit's own scatter holds what its model lacks too: beside random motion, that counts as motion. The doubt about
+    the mean comes on top: shots that happen to agree show no scatter.
+    """
+    problem, unknowns = fit.problem, fit.unknowns
+    if problem.stretches.labelled.all():
+        return fit
+    values = np.array([unknowns.values[name] for name in problem.free])
+    away = np.concatenate((problem.centres - values, -unknowns.launcher.ravel()))
+    likelihood, noise = settled(rows_of(fit, random_motion(fit)), problem.common_precision, away)
+    found = posterior(likelihood.reduced(noise)[0], problem.common_precision, away)
+    of_launcher = np.diagonal(found.covariance)[len(values) :].reshape(-1, 3)
+    doubt = (problem.stretches.settings**2 @ of_launcher).mean(axis=0)
+    scatter = np.sqrt((fit.noise.spin * np.exp(noise.spin[1:])) ** 2 + doubt)
+    return replace(fit, noise=replace(fit.noise, spin=scatter))
+
+
+def without_population(model: AnalyticModel) -> AnalyticModel:
+    """A calibrated model without what it knows of the launchers' spins, and without noise; itself if it knows none."""
+    if model.spins is None and (model.trained is None or model.trained.launcher is None):
+        return model
+    bare = with_effects(model)
+    bare.variations, bare.trained = model.variations, Trained(position_scale=model.trained.position_scale)
+    return bare
+
+
 def predictive_model(holdout: Holdout, jobs: int, fit: Fit) -> AnalyticModel:
-    """The fitted model with its own noise on the search half.
+    """The fitted model with its own noise on the search half, and with its population of spins if that predicts better.
 
     A model that lacks an effect has too much noise for the corrected one; with that noise predictions hardly follow the
-    observed part, and an effect's gain would depend on the errors of the others.
+    observed part, and an effect's gain would depend on the errors of the others. Spins that such a model needs differ
+    from flight to flight more than those of a launcher: a population may then be worse than the prior of any spin.
     """
-    model = calibrated_model(fit, holdout.launcher.embedding)
+    model = calibrated_model(for_next_shot(fit), holdout.launcher.embedding)
     model.noise = noise_about(model, holdout.search_tracks, holdout.dataset, jobs=jobs)
-    return model
+    bare = unpopulated_model(model, holdout, jobs)
+    if bare is model:
+        return model
+    return max(model, bare, key=lambda one: errors_of(one, holdout, holdout.search_tracks, jobs).log_likelihood)
+
+
+def unpopulated_model(model: AnalyticModel, holdout: Holdout, jobs: int) -> AnalyticModel:
+    """A predictive model without its population, with its own noise; itself without one."""
+    bare = without_population(model)
+    if bare is not model:
+        bare.noise = noise_about(bare, holdout.search_tracks, holdout.dataset, jobs=jobs)
+    return bare
+
+
+def errors_of(model: BallModel, holdout: Holdout, tracks: Sequence[EvaluationTrack], jobs: int) -> Errors:
+    """Errors of a model's predictions on tracks of one half."""
+    settings = dataset_settings(holdout.dataset, model)
+    return prediction_errors(model, tracks, holdout.surfaces, settings, jobs)

@@ -13,14 +13,15 @@ from ballfg.diagnosis.evidence.rows import random_motion, rows_of
 from ballfg.diagnosis.evidence.sizes import settled, slopes_at
 from ballfg.state import STATE_DIM
 
-NOISE = Noise(0.1, 0.2, (-0.7, -1.1, -0.4, -1.2))
+NOISE = Noise(0.1, (0.2, -0.3, 0.4, 0.1), (-0.7, -1.1, -0.4, -1.2))
 
 
 @pytest.fixture(scope="module")
 def rows(make_ball, make_launches, make_shots, make_fit):
-    """Rows of five shots with a bounce; the first states have all nine numbers shown."""
+    """Rows of five shots with a bounce, three with a label; the first states have all nine numbers shown."""
     fit = make_fit(make_ball(), make_shots(make_ball(), make_launches(5, 11), 11, rate=40.0, duration=0.6).stretches)
-    return rows_of(fit, random_motion(fit, ["flight.drag.k", "bounce.restitution.e"]))
+    found = rows_of(fit, random_motion(fit, ["flight.drag.k", "bounce.restitution.e"]))
+    return replace(found, labelled=np.array([True, False, True, True, False]))
 
 
 @pytest.fixture(scope="module")
@@ -47,10 +48,11 @@ def dense_rows(likelihood, noise, precision, away):
         kept = np.concatenate((np.repeat(used, 3), np.full(3, True)))
         weights = np.concatenate((np.repeat(likelihood.samples[i], 3), np.repeat(likelihood.spins[i], 3)))[kept]
         # a robust weight divides the variance in the square of the residual, and leaves the normalisation alone
-        white, spin = (np.exp(2.0 * size) * np.diag(1.0 / weights) for size in (noise.white, noise.spin))
-        is_spin = np.arange(len(weights)) >= 3 * used.sum()
-        white[is_spin], spin[~is_spin] = 0.0, 0.0
-        added = [white, spin]
+        first = 3 * used.sum()
+        number = np.arange(len(weights)) - first  # of a spin row: labels have one size, the others one an axis
+        axes = [(number >= 0) & rows.labelled[i], *((number == axis) & ~rows.labelled[i] for axis in range(3))]
+        sized = [(number < 0, noise.white), *zip(axes, noise.spin, strict=True)]
+        added = [np.diag(np.exp(2.0 * size) / weights * own) for own, size in sized]
         for kind, size in enumerate(noise.random):
             columns = rows.motion.columns[i][kept][:, rows.motion.kinds[i] == kind]
             added.append(np.exp(2.0 * size) * columns @ columns.T)
@@ -59,7 +61,7 @@ def dense_rows(likelihood, noise, precision, away):
         shown = np.linalg.svd(whole if rows.labelled[i] else whole[:-3, :6], compute_uv=False)
         logs += 0.5 * np.log(weights).sum() + likelihood.penalty[i] - np.log(shown).sum()
     common = np.concatenate([p[2] for p in parts])
-    added = [linalg.block_diag(*(p[3][size] for p in parts)) for size in range(6)] + [common / precision @ common.T]
+    added = [linalg.block_diag(*(p[3][size] for p in parts)) for size in range(9)] + [common / precision @ common.T]
     left = np.concatenate([p[0] for p in parts]) - common @ away
     return left, linalg.block_diag(*(p[1] for p in parts)), added, logs
 
@@ -100,8 +102,8 @@ def test_derivative_is_that_of_differences(likelihood, prior):
     reduced, local = likelihood.reduced(NOISE)
     slope = slopes_at(likelihood, NOISE, local, posterior(reduced, *prior), *prior).slope
     step = 1e-5
-    moved = [NOISE.vector + step * sign * axis for axis in np.eye(6) for sign in (1, -1)]
-    differences = np.array([value(v) for v in moved]).reshape(6, 2) @ [1, -1] / (2 * step)
+    moved = [NOISE.vector + step * sign * axis for axis in np.eye(9) for sign in (1, -1)]
+    differences = np.array([value(v) for v in moved]).reshape(9, 2) @ [1, -1] / (2 * step)
     np.testing.assert_allclose(slope, differences, rtol=1e-6, atol=1e-6 * np.abs(slope).max())
 
 
@@ -112,7 +114,7 @@ def test_information_is_the_average_of_the_observed_and_the_expected(likelihood,
     left, starts, added, _ = dense_rows(likelihood, NOISE, *prior)
     inverse = np.linalg.inv(sum(added))
     without = inverse - inverse @ starts @ np.linalg.solve(starts.T @ inverse @ starts, starts.T @ inverse)
-    shown = np.stack([2.0 * one @ without @ left for one in added[:6]])
+    shown = np.stack([2.0 * one @ without @ left for one in added[:9]])
     np.testing.assert_allclose(found, 0.5 * shown @ without @ shown.T, rtol=1e-6, atol=1e-8 * np.abs(found).max())
 
 
@@ -163,7 +165,7 @@ def test_sizes_of_noise_come_back(make_ball, make_launches, make_shots, make_fit
 
 def test_the_best_of_several_starts_counts(rows, prior):
     """A start with noise that the samples do not have may end elsewhere; beside the usual one it does no harm."""
-    starts = (Noise(-1.0, 1.0, (2.0, 2.0, 2.0, 1.0)), None)
+    starts = (Noise(-1.0, (1.0,) * 4, (2.0, 2.0, 2.0, 1.0)), None)
     values = [
         posterior(one.reduced(noise)[0], *prior).evidence
         for one, noise in (settled(rows, *prior, s) for s in ((starts[0],), (None,), starts))
