@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ import torch
 from ballfg.diagnosis.fit.fit import values_of
 from ballfg.diagnosis.fit.holdout import EvaluationTrack
 from ballfg.diagnosis.fit.problem import launch_axes
-from ballfg.diagnosis.search.process_noise import calibrated_model, noise_about
+from ballfg.diagnosis.search.process_noise import calibrated_model, for_next_shot, noise_about, without_population
 from ballfg.dynamics import load_model, nominal_model, save_model
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate
@@ -122,3 +124,42 @@ def test_tracks_that_are_too_short_tell_no_noise(recording):
     dataset, parts = recording
     short = [EvaluationTrack(part.track.until(float(part.track.times[3])), part.bounces) for part in parts]
     assert noise_about(nominal_model(), short, dataset) is None
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_a_further_shot_scatters_as_the_planted_spins(make_ball, make_launches, make_shots, make_fit, wrong):
+    """By 60 rad/s about across and 5 about the others; also beside a gust, which is motion and no scatter of spins."""
+    starts = make_launches(24, 14, spin=0.0)
+    local = np.random.default_rng(14).standard_normal((24, 3)) * (5.0, 60.0, 5.0)
+    starts[:, 6:] = torch.from_numpy((launch_axes(starts.numpy()) @ local[..., None])[..., 0])
+    shots = make_shots(make_ball(), starts, 14, labelled=False, noise=0.001).stretches
+    if wrong:
+        kick = 0.01 * np.random.default_rng(5).standard_normal((24, 1, 3)) * (np.arange(42)[:, None] / 42) ** 2
+        shots = replace(shots, positions=shots.positions + torch.from_numpy(kick))
+    fit = make_fit(make_ball(), shots)
+    forward, across, up = for_next_shot(fit).noise.spin
+    assert across == pytest.approx(60.0 * np.sqrt(25.0 / 24.0), rel=0.35)  # 24 draws tell a scatter to 15 %
+    assert max(forward, up) < 0.4 * across
+
+
+def test_shots_that_agree_leave_the_doubt_about_their_mean(make_ball, make_launches, make_shots, make_fit):
+    starts = make_launches(6, 21, spin=0.0)
+    fit = make_fit(make_ball(), make_shots(make_ball(), starts, 21, labelled=False).stretches)
+    total = fit.gram.sum(axis=0)[:-1, :-1] + np.diag(fit.problem.common_precision)
+    doubt = np.sqrt(np.diagonal(np.linalg.inv(total))[-3:])
+    assert (for_next_shot(fit).noise.spin > 0.5 * doubt).all()
+
+
+def test_labelled_spins_have_no_population(calm_fit):
+    assert for_next_shot(calm_fit) is calm_fit
+    model = calibrated_model(calm_fit, EMBEDDING)
+    assert without_population(model) is model
+
+
+def test_without_its_population_a_model_is_the_same_ball(unlabelled):
+    model = calibrated_model(unlabelled, EMBEDDING)
+    bare = without_population(model)
+    assert bare.spins is None
+    assert bare.trained.launcher is None
+    assert bare.trained.position_scale == model.trained.position_scale
+    assert {n: float(p) for n, p in bare.named_parameters()} == {n: float(p) for n, p in model.named_parameters()}
