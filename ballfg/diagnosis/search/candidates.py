@@ -12,8 +12,8 @@ from ballfg.arrays import Array
 from ballfg.diagnosis.evidence.rows import Motion, random_motion
 from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.weighed import Step, Weighed
-from ballfg.diagnosis.fit.fit import MOST_STEPS, fit_problem
-from ballfg.diagnosis.fit.problem import Fit, Problem
+from ballfg.diagnosis.fit.fit import fit_problem
+from ballfg.diagnosis.fit.problem import Fit, Problem, Unknowns
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, with_effects
 from ballfg.diagnosis.hypotheses.signatures import columns_of, hypothesis_signatures
 from ballfg.diagnosis.search.label_frames import FRAMES
@@ -27,8 +27,13 @@ LEAST_GAIN = 0.0
 """Natural units. Least foretold gain of a candidate that is refitted: with new noise it may gain more."""
 MOST_REFITS = 4
 """Largest number of hypotheses that are refitted alone in a round."""
-MOST_SHAPES, FIRST_STEPS = 9, 4
-"""Largest number of shapes of a hypothesis that are refitted, and of the steps after which the lowest goes on alone."""
+MOST_SHAPES, FIRST_STEPS, USUAL_STEPS = 9, 2, 6
+"""Largest number of shapes of a hypothesis that are refitted, and of the steps of a refit from absence, and from the
+usual strength, which all spins must follow.
+
+They lead near the minimum of the deterministic fit, and the likelihood leads on from there. At that minimum itself a
+model that lacks something else has strengths that random motion does not need, often in the range of another maximum.
+"""
 PAIR = 2
 """Number of hypotheses in the smallest set of several."""
 FRAME_CHOICE = 2.0 * float(np.log(FRAMES - 1))
@@ -152,55 +157,52 @@ def refit_set(before: Fit, chosen: Sequence[Scored], step: Step, strengths: Arra
         name: float(np.clip(absent[name] + strength, problem.free[name].low, problem.free[name].high))
         for name, strength in zip(names, strengths.tolist(), strict=True)
     }
-    after = fit_problem(
-        problem, replace(moved, values={**moved.values, **absent, **foretold}), before.noise, settle_noise=False
-    )
+    after = _from(before, problem, replace(moved, values={**moved.values, **absent, **foretold}))
     if not np.isfinite(after.cost):  # too long a step: a flight missed its contact
-        values = {**before.unknowns.values, **absent}
-        after = fit_problem(problem, replace(before.unknowns, values=values), before.noise, settle_noise=False)
+        after = _from(before, problem, replace(before.unknowns, values={**before.unknowns.values, **absent}))
     return Refit(chosen[-1], after, delta_bic(before, after), tuple(listed[:-1]))
 
 
 def refit(before: Fit, scored: Scored) -> Refit:
-    """The joint fit with a hypothesis in the model, started from its absence.
+    """The joint fit with a hypothesis in the model, a few steps from its absence, in its lowest shape.
 
-    If it has several shapes, all take a few steps, and the lowest goes on: a fit finds only a place nearby. A usual
-    effect (friction, say) is also started at its usual strength, for its absence may be a minimum of its own: without
-    friction, the fitted spins contradict friction.
+    A usual effect (friction, say) is also started at its usual strength, for its absence may be a minimum of its own:
+    without friction, the fitted spins contradict friction.
 
     Args:
         before: the fit without the hypothesis.
         scored: the hypothesis and its score test.
     """
-    if not scored.shapes:
-        return _refit(before, scored)
     shaped = [replace(scored, hypothesis=shape) for shape in (scored.hypothesis, *scored.shapes)]
-    first = min((_refit(before, shape, FIRST_STEPS) for shape in shaped), key=lambda r: r.fit.cost)
-    after = fit_problem(first.fit.problem, first.fit.unknowns, before.noise, settle_noise=False)
-    return Refit(first.scored, after, delta_bic(before, after))
+    return min((_refit(before, shape) for shape in shaped), key=lambda r: r.fit.cost)
 
 
-def _refit(before: Fit, scored: Scored, steps: int = MOST_STEPS) -> Refit:
+def _refit(before: Fit, scored: Scored) -> Refit:
     hypothesis, problem = scored.hypothesis, with_hypothesis(before.problem, scored.hypothesis)
     parameters = dict(problem.model.named_parameters())
     absent = {name: float(parameters[name]) if name in parameters else 0.0 for name in hypothesis.free()}
     usual = absent | {hypothesis.parameter(n): hypothesis.coefficients[n].default for n in hypothesis.strengths}
-    tried = [_started_at(before, hypothesis, problem, absent, steps)]
+    tried = [_started_at(before, hypothesis, problem, absent)]
     if usual != absent:
-        tried.append(_started_at(before, hypothesis, problem, usual, steps))
+        tried.append(_started_at(before, hypothesis, problem, usual, USUAL_STEPS))
     after = min(tried, key=lambda fitted: fitted.cost)
     chosen = 0.0 if hypothesis.strengths else FRAME_CHOICE
     return Refit(scored, after, delta_bic(before, after) + chosen)
 
 
+def _from(before: Fit, problem: Problem, unknowns: Unknowns, steps: int = FIRST_STEPS) -> Fit:
+    """A few steps of a fit at the noise of the previous one."""
+    return fit_problem(problem, unknowns, before.noise, settle_noise=False, steps=steps)
+
+
 def _started_at(
-    before: Fit, hypothesis: Hypothesis, problem: Problem, values: Mapping[str, float], steps: int = MOST_STEPS
+    before: Fit, hypothesis: Hypothesis, problem: Problem, values: Mapping[str, float], steps: int = FIRST_STEPS
 ) -> Fit:
     """The fit of a problem with a hypothesis, started from the previous fit and some values of the hypothesis."""
     unknowns = replace(before.unknowns, values={**before.unknowns.values, **values})
     if hypothesis.shape and not hypothesis.strengths:
         unknowns = replace(unknowns, starts=_starts_with_labels(problem, unknowns.starts))
-    return fit_problem(problem, unknowns, before.noise, settle_noise=False, steps=steps)
+    return _from(before, problem, unknowns, steps)
 
 
 def with_hypothesis(problem: Problem, hypothesis: Hypothesis) -> Problem:

@@ -19,7 +19,7 @@ from ballfg.diagnosis.fit.problem import Fit, Problem
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, without_effect
 from ballfg.diagnosis.hypotheses.varying import Grouping, groupings
 from ballfg.diagnosis.result import Candidate, Errors, Finding
-from ballfg.diagnosis.search.candidates import Refit, Scored, refit
+from ballfg.diagnosis.search.candidates import FIRST_STEPS, Refit, Scored, refit
 from ballfg.diagnosis.search.evaluation import on_all, on_others
 from ballfg.diagnosis.search.ranking import finding_of, ranking
 from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_findings, stamp_hypotheses
@@ -353,12 +353,12 @@ def _score(model: Weighed) -> float:
 
 
 def without_named(fit: Fit, gone: Sequence[Hypothesis], first: Fit) -> Fit:
-    """The fit without some of the effects added to the first one's model, at the same noise."""
+    """A few steps of the fit without some of the effects added to the first one's model, at the same noise."""
     problem = fit.problem
     for hypothesis in gone:
         problem = _problem_without(problem, hypothesis, first)
     unknowns = replace(fit.unknowns, values={n: fit.unknowns.values[n] for n in problem.free})
-    return fit_problem(problem, unknowns, fit.noise, settle_noise=False)
+    return fit_problem(problem, unknowns, fit.noise, settle_noise=False, steps=FIRST_STEPS)
 
 
 def _problem_without(problem: Problem, hypothesis: Hypothesis, first: Fit) -> Problem:
