@@ -22,7 +22,6 @@ from ballfg.diagnosis.evidence.priors_of_fit import Priors
 from ballfg.diagnosis.evidence.rows import Motion, roots, rows_of
 from ballfg.diagnosis.evidence.weighed import Step, Weighed, Weight
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
-from ballfg.state import STATE_DIM
 
 TRIED: Final = tuple(range(0, len(WIDTHS), 2))
 """Numbers of the widths that are tried: a screen needs no finer ones."""
@@ -171,10 +170,7 @@ class Screen:
         for one in chosen:
             beside = (*beside, (one, self._beside(beside, one).width))
         mean = self._posterior(beside).mean
-        common = np.zeros(self.likelihood.rows.by_common.shape[-1])
-        common[self._columns(chosen)] = mean
-        starts = self.likelihood.local_step(self.model.noise, common)[:, :STATE_DIM]
-        return Step(starts, mean[: self._own], 0.0), mean[self._own :]
+        return Step(mean[: self._own], 0.0), mean[self._own :]
 
     def _names(self, chosen: Sequence[int]) -> frozenset[str]:
         return self.model.names | {self.candidates[one].name for one in chosen}

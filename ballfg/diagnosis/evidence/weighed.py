@@ -16,10 +16,9 @@ from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, log_odds, withi
 from ballfg.diagnosis.evidence.priors_of_fit import Priors
 from ballfg.diagnosis.evidence.rows import Motion, Rows, random_motion, rows_of
 from ballfg.diagnosis.evidence.sizes import settled
-from ballfg.diagnosis.fit.fit import with_guesses
+from ballfg.diagnosis.fit.fit import followed, with_guesses
 from ballfg.diagnosis.fit.problem import Fit, Unknowns
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
-from ballfg.state import STATE_DIM
 
 MOST_STEPS = 8
 """Largest number of steps from a deterministic fit to the most probable unknowns."""
@@ -141,7 +140,9 @@ def weighed(
     """Weighs a model at the most probable values of its unknowns.
 
     A deterministic fit ends where the model alone comes closest to the samples; beside random motion other values are
-    more probable. From the fit on, the unknowns follow the likelihood.
+    more probable. From the fit on, the common unknowns follow the likelihood. First states and random motion are
+    integrated out about the path that comes closest to the samples: about another one, whose distance the motion would
+    bridge, flights and bounces are far from linear.
 
     Args:
         fit: to the tracks of both halves.
@@ -157,7 +158,7 @@ def weighed(
 
 def _followed(question: _Question, fit: Fit, start: Noise | None) -> Weighed:
     """The model at the most probable unknowns near a fit."""
-    point = question.point(fit)
+    point = question.point(followed(fit, fit.unknowns))
     found, step = question.at(point, (start, None) if start else (None,))
     for number in range(MOST_STEPS):
         second = number == 0 and question.nameless  # noise and widths of patterns need a second turn
@@ -173,24 +174,23 @@ def _followed(question: _Question, fit: Fit, start: Noise | None) -> Weighed:
 
 @dataclass(frozen=True)
 class Step:
-    """A step of first states (n, 9) and common unknowns (c,) with the logarithm of the density that it should gain.
+    """A step of the common unknowns (c,) with the logarithm of the density that it should gain.
 
     Patterns are no unknowns of the fit: at its new values they are as free as before.
     """
 
-    starts: Array
     common: Array
     gain: float
 
     def taken(self, fit: Fit, share: float = 1.0) -> Unknowns:
-        """The unknowns of a fit after a share of the step; coefficients stay within their bounds."""
+        """The unknowns of a fit after a share of the step; coefficients stay within their bounds, first states stay."""
         unknowns, free, common = fit.unknowns, fit.problem.free, share * self.common
         values = {
             name: float(np.clip(unknowns.values[name] + step, c.low, c.high))
             for (name, c), step in zip(free.items(), common[: len(free)].tolist(), strict=True)
         }
         launcher = unknowns.launcher + common[len(free) :].reshape(-1, 3)
-        return Unknowns(unknowns.starts + share * self.starts, values, launcher)
+        return Unknowns(unknowns.starts, values, launcher)
 
 
 @dataclass(frozen=True)
@@ -261,7 +261,7 @@ class _Question:
             self.nameless,
             self._nested(priors, total, best, mixed),
         )
-        return weighed, Step(likelihood.local_step(noise, result.mean)[:, :STATE_DIM], result.mean[:own], gain)
+        return weighed, Step(result.mean[:own], gain)
 
     def moved(self, point: _Point, model: Weighed, step: Step) -> _Point | None:
         """The point after the share of a step that leads to the most probable unknowns; None if all are less probable.
@@ -271,14 +271,12 @@ class _Question:
         before = most = self._density(point, model)
         best = None
         for share in SHARES:
-            unknowns = step.taken(point.fit, share)
-            if np.isfinite(unknowns.starts).all():
-                fit = Fit.at(point.fit.problem, unknowns, point.fit.noise, point.fit.steps)
-                density = self._density(after := self.point(fit), model) if np.isfinite(fit.cost) else -np.inf
-                if density > most:
-                    best, most = after, density
-                elif best is not None:
-                    break
+            fit = followed(point.fit, step.taken(point.fit, share))
+            density = self._density(after := self.point(fit), model) if np.isfinite(fit.cost) else -np.inf
+            if density > most:
+                best, most = after, density
+            elif best is not None:
+                break
             if most > before + step.gain - WORTH_A_STEP:  # as foretold
                 break
         return best

@@ -26,6 +26,8 @@ from ballfg.tracks import Track
 
 MOST_STEPS = 15
 """Largest number of Gauss-Newton steps in one minimisation."""
+CORRECTIONS = 2
+"""Number of corrections of first states that follow a step of all other unknowns."""
 SCALE_ROUNDS = 3
 """Number of minimisations, each with new noise and weights."""
 SETTLED = 0.01
@@ -110,6 +112,21 @@ def fit_problem(
     return result
 
 
+def followed(fit: Fit, unknowns: Unknowns) -> Fit:
+    """The fit at other common unknowns, its first states those whose paths come closest to the samples.
+
+    Args: unknowns: their first states are not used.
+    """
+    names, system = fit.problem.free, fit.linearised
+    values = np.array([unknowns.values[name] - fit.unknowns.values[name] for name in names])
+    step = np.concatenate((values, (unknowns.launcher - fit.unknowns.launcher).ravel()))
+    starts = fit.unknowns.starts + system.eliminated().start_step(step)
+    moved = Fit.at(fit.problem, replace(unknowns, starts=starts), fit.noise, fit.steps)
+    for _ in range(CORRECTIONS):
+        moved = _followed_up(moved, system, fit.robust)
+    return moved
+
+
 def _near(before: Noise, after: Noise) -> bool:
     """True if the noise has converged."""
     ratios = np.append(after.position / before.position, after.spin / before.spin)
@@ -189,7 +206,7 @@ def _followed_up(moved: Fit, system: System, weights: Robust) -> Fit:
 
     The linearised problem leaves out the product of a step of coefficients and a step of states. With many samples that
     product is large, and first states can absorb most of it. The derivatives stay; a stretch without a gain keeps its
-    state. Further corrections would gain no more than the next step does.
+    state.
     """
     correction = system.start_correction(moved.weighted_residual(weights))
     unknowns = replace(moved.unknowns, starts=moved.unknowns.starts + correction)

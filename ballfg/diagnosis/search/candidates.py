@@ -12,7 +12,7 @@ from ballfg.arrays import Array
 from ballfg.diagnosis.evidence.rows import Motion, random_motion
 from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.weighed import Step, Weighed
-from ballfg.diagnosis.fit.fit import fit_problem
+from ballfg.diagnosis.fit.fit import fit_problem, followed
 from ballfg.diagnosis.fit.problem import Fit, Problem, Unknowns
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, with_effects
 from ballfg.diagnosis.hypotheses.signatures import columns_of, hypothesis_signatures
@@ -140,7 +140,7 @@ def leading_sets(screen: Screen, scored: Sequence[Scored], most: int) -> list[tu
 
 
 def refit_set(before: Fit, chosen: Sequence[Scored], step: Step, strengths: Array) -> Refit:
-    """The joint fit with several hypotheses, started from the most probable strengths of the linearised model.
+    """The fit with several hypotheses at the most probable unknowns of the linearised model.
 
     Args:
         before: the fit without them.
@@ -150,16 +150,18 @@ def refit_set(before: Fit, chosen: Sequence[Scored], step: Step, strengths: Arra
     problem, listed = before.problem, [one.hypothesis for one in chosen]
     for hypothesis in listed:
         problem = with_hypothesis(problem, hypothesis)
-    moved, parameters = step.taken(before), dict(problem.model.named_parameters())
+    parameters = dict(problem.model.named_parameters())
     absent = {name: float(parameters[name]) if name in parameters else 0.0 for h in listed for name in h.free()}
     names = [name for hypothesis in listed for name in hypothesis.columns]
     foretold = {
         name: float(np.clip(absent[name] + strength, problem.free[name].low, problem.free[name].high))
         for name, strength in zip(names, strengths.tolist(), strict=True)
     }
-    after = _from(before, problem, replace(moved, values={**moved.values, **absent, **foretold}))
+    moved, values = step.taken(before), before.unknowns.values
+    wider = Fit.at(problem, replace(before.unknowns, values={**values, **absent}), before.noise)
+    after = followed(wider, replace(moved, values={**moved.values, **absent, **foretold}))
     if not np.isfinite(after.cost):  # too long a step: a flight missed its contact
-        after = _from(before, problem, replace(before.unknowns, values={**before.unknowns.values, **absent}))
+        after = wider
     return Refit(chosen[-1], after, delta_bic(before, after), tuple(listed[:-1]))
 
 

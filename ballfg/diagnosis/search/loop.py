@@ -129,7 +129,7 @@ class SearchLoop:
         findings = []
         for h, rest in zip(final.named, rests, strict=True):
             own = rounds.get(h.name, found.rounds[-1])
-            findings.append(finding_of(h, final, rest, odds, own.scored, own.refits))
+            findings.append(finding_of(h, final, rest, odds, own.scored))
         return Search(
             first,
             declared,

@@ -21,14 +21,13 @@ def finding_of(
     without: Weighed,
     odds: Odds,
     scored: Sequence[Scored],
-    refits: Sequence[Refit],
 ) -> Finding:
     """A named effect with its evidence.
 
     Args:
         model, without: the most probable model, and the same without the effect.
         odds: of all models.
-        scored, refits: of the round that added it.
+        scored: of the round that added it.
     """
     values = fitted_values(model.fit, hypothesis)
     if hypothesis.name in model.strengths and not hypothesis.deviations():
@@ -36,8 +35,6 @@ def finding_of(
         values |= {n: replace(values[n], sigma=s) for n, s in zip(hypothesis.strengths, sigmas, strict=True)}
     gains = model.held_out - without.held_out
     error = gains.std(ddof=1) / np.sqrt(len(gains))
-    named = [r for r in refits if hypothesis.name in [h.name for h in r.added]]
-    own = min(named, key=lambda r: len(r.added), default=None)
     alike = odds.alike(hypothesis.name, model.names)
     return Finding(
         name=hypothesis.name,
@@ -46,7 +43,7 @@ def finding_of(
         decide=hypothesis.decide,
         parameters=values,
         p_value=_by_chance(hypothesis, model.evidence - without.evidence, scored),
-        delta_bic=0.0 if own is None else own.delta_bic,
+        delta_bic=-2.0 * (model.evidence - without.evidence),
         indistinguishable_from=(*TWINS.get(hypothesis.name, ()), *alike),
         held_out_gain=float(gains.mean()),
         held_out_p=float(stats.norm.sf(gains.mean() / error)),
