@@ -22,7 +22,7 @@ from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 
 MOST_STEPS = 8
 """Largest number of steps from a deterministic fit to the most probable unknowns."""
-SHARES = (1.0, 0.5, 0.25, 0.125)
+SHARES = (1.0, 0.5, 0.25)
 """Of a step, tried in turn."""
 WORTH_A_STEP = 0.5
 """Least expected gain of a step, natural units."""
