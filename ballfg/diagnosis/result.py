@@ -52,7 +52,7 @@ class Finding:
     Attributes:
         parameters: its coefficients fitted to the tracks of both halves, at the end of the search.
         p_value: of its score test, corrected for the number of candidates tested.
-        delta_bic: BIC of the model with it minus BIC without; negative is better.
+        delta_bic: minus twice `evidence`, which BIC approximates; negative is better.
         indistinguishable_from: candidates that would have explained as much.
         held_out_gain: increase of the log likelihood per track on the held-out half, natural units.
         held_out_p: probability of such a gain there by chance.
@@ -87,7 +87,7 @@ class Candidate:
         estimate: the effect's coefficients after one step from absent.
         explained: squared whitened residual that it would explain.
         p_value: of its score test, corrected for the number of candidates.
-        delta_bic: after a full refit; None if the score was too low for one.
+        delta_bic: after a few steps of a refit; None if the score was too low for one.
         outcome: of the round.
         seen_from: coefficient -> size, in its unit, that the score test would have detected in 9 of 10 such recordings,
             whatever the other coefficients are; empty if nothing shows it.

@@ -100,7 +100,7 @@ def _finding(finding: Finding) -> Html:
     if finding.usual:
         evidence.append(f"Stronger than usual: {finding.usual}.")
     by_chance = f" by chance, all candidates counted: {probability(finding.p_value)}."
-    bic = f" {verb} by {abs(finding.delta_bic):.0f} with it, refitted."
+    bic = f" {verb} by {abs(finding.delta_bic):.0f} with it."
     gained = f" it {gain} {number(abs(finding.held_out_gain))} of "
     per_track = f" per track; probability of that by chance: {probability(finding.held_out_p)}."
     evidence += [
