@@ -138,11 +138,11 @@ def choose_candidate(problem: Problem, watch: Watch = unwatched) -> tuple[Choice
         scores[name] = score(_judging(posed, fitted), problem.model, watch, settings)
     shown = None if noise is None else noise.noise
     for name, posed in ((CALIBRATED, plain), (GROUPED, grouped), (CORRECTED, grouped)):
-        if name == CORRECTED:
-            posed = pose_correction(grouped, found[GROUPED].steps[-1], watch, noise)
-        else:
-            posed = replace(posed, shown=shown)
         try:
+            if name == CORRECTED:
+                posed = pose_correction(grouped, found[GROUPED].steps[-1], watch, noise)
+            else:
+                posed = replace(posed, shown=shown)
             found[name], linear = _fitted(posed, watch)
         except TooManyFailures:  # it, and the richer ones that begin from it, are left out
             break
