@@ -100,7 +100,7 @@ class Choice(BaseModel):
         """The candidates as plain text."""
         rows = [("model", "tracks", "median RMSE, mm", "90 % hold, %", "log score", "gain over the best simpler")]
         for one in self.candidates:
-            gain = "" if one.name == NOMINAL else f"{one.gain:+.3f} ± {one.gain_error:.3f}"
+            gain = "" if one is self.candidates[0] else f"{one.gain:+.3f} ± {one.gain_error:.3f}"
             numbers = (f"{1e3 * one.rmse_median:.1f}", f"{100 * one.coverage_90:.0f}", f"{one.log_score:.3f}")
             rows.append((one.name, str(one.tracks), *numbers, gain))
         widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
@@ -202,7 +202,7 @@ def compared(scores: dict[str, Sequence[TrackScore | None]]) -> Choice:
     rows = [row for row in zip(*scores.values(), strict=True) if all(row)]
     kept = {name: [row[k] for row in rows if row[k] is not None] for k, name in enumerate(scores)}
     logs = {name: np.array([one.log_score for one in kept[name] if one is not None]) for name in scores}
-    chosen, candidates = NOMINAL, []
+    chosen, candidates = next(iter(scores)), list[Candidate]()
     for name in scores:
         found = summary([one for one in kept[name] if one is not None])
         if found is None:
