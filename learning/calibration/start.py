@@ -28,7 +28,6 @@ from ballfg.learning.calibration.calibrate import (
     pose,
 )
 from ballfg.learning.config.calibration import CalibrationConfig
-from ballfg.learning.config.config_file import AUTO
 from ballfg.learning.config.training import ObserveConfig, TrainConfig
 from ballfg.learning.evaluation import TrackScore, judge_track
 from ballfg.learning.split import tracks_of, training_split
@@ -100,7 +99,7 @@ def calibrated_start(config: TrainConfig, folder: Path, *, resume: bool, watch: 
     start = Start(folder / CALIBRATED, folder / BASE, dataset, judge, config.observe)
     if not (resume and start.base.is_file()):
         model = analytic_model(config.model, dataset.info.ball)
-        problem = pose(dataset, model, CalibrationConfig(kind=AUTO, data=path))
+        problem = pose(dataset, model, CalibrationConfig(kind="auto", data=path))
         problem = replace(problem, split=replace(problem.split, fit=fit, judge=judge))
         choice, found = choose_candidate(problem, watch)
         print(f"the training tracks choose what the network starts from:\n{choice.table()}\n{choice.verdict()}")

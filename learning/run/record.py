@@ -105,8 +105,8 @@ class Record:
             return 0
         if self.start is None:
             judged = task.trainee.without_training(task.validation) if task.validation else None
-            known = judged is not None and judged.points > 0
-            untrained = math.sqrt(judged.squared_error / judged.points) if known else None
+            points = 0 if judged is None else judged.points
+            untrained = math.sqrt(judged.squared_error / points) if judged is not None and points else None
             beside = beside_untrained(epochs, progress.best_epoch, untrained)
         self._write_page(model, self.median_shot(), beside)
         better = gains and improved(epochs, progress.best_epoch)
