@@ -57,9 +57,11 @@ class Start:
     judge: tuple[str, ...]
     observe: ObserveConfig
 
-    def compare(self, network: Path) -> Choice:
-        """The calibrated model and a network's file by their predictions. Raises: ValueError: no track can judge."""
-        return compared({WITHOUT: self._scores(self.calibrated), NETWORK: self._scores(network)})
+    def compare(self, network: Path) -> Choice | None:
+        """The calibrated model and a network's file by their predictions; None: no track could be judged by both."""
+        before, after = (self._scores(path) for path in (self.calibrated, network))
+        judged = any(b and a for b, a in zip(before, after, strict=True))
+        return compared({WITHOUT: before, NETWORK: after}) if judged else None
 
     def _scores(self, path: Path) -> list[TrackScore | None]:
         ball = self.dataset.info.ball

@@ -108,7 +108,7 @@ class Record:
             points = 0 if judged is None else judged.points
             untrained = math.sqrt(judged.squared_error / points) if judged is not None and points else None
             beside = beside_untrained(epochs, progress.best_epoch, untrained)
-        self._write_page(model, self.median_shot(), beside)
+        self._write_page(model, self.median_shot() if gains else None, beside)
         better = gains and improved(epochs, progress.best_epoch)
         print(verdict(epochs, progress.best_epoch))
         print(beside, end="\n" if beside else "")
@@ -143,10 +143,12 @@ class Record:
         if self.start is None:
             return path, "", True
         choice = self.start.compare(path)
-        print(choice.table())
-        gains = choice.chosen == NETWORK
+        gains = choice is not None and choice.chosen == NETWORK
         if not gains:
             save_model(load_model(self.start.calibrated), path)
+        if choice is None:
+            return path, "No validation track could be judged: the model file holds the calibrated model.", False
+        print(choice.table())
         before, after = choice.candidates
         said = "surely predicts better than" if gains else "does not surely predict better than"
         left = "" if gains else ", which the model file holds"

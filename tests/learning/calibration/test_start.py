@@ -44,6 +44,9 @@ def test_a_network_that_gains_nothing_leaves_the_calibrated_model(refused: tuple
     assert isinstance(calibrated, AnalyticModel)
     assert model_to_dict(written) == model_to_dict(calibrated)
     assert "does not surely predict better than the calibrated model, which the model file holds" in page
+    assert (
+        "the log score changes by +0.000 ± 0.000" in page
+    )  # epoch 0, the best one, is the calibration with its doubts
     drag = float(dict(written.named_parameters())["flight.drag.k"].detach())
     assert abs(drag - PLANTED["flight.drag.k"]) < 0.01
 
@@ -57,6 +60,7 @@ def test_the_comparison_is_of_predictions_by_the_written_files(
     names = tuple(track.name for track in data)[:6]
     start = Start(folder / CALIBRATED, folder / BASE, data, names, config(many_tracks, 0.1).observe)
     choice = start.compare(folder / CALIBRATED)
+    assert choice is not None
     assert choice.chosen == WITHOUT
     assert choice.candidates[1].gain == 0.0
     model = load_model(folder / CALIBRATED)
@@ -74,6 +78,7 @@ def test_one_that_gains_carries_the_population(
 
     def gains(start: Start, network: Path) -> object:
         choice = real(start, network)
+        assert choice is not None
         return choice.model_copy(update={"chosen": NETWORK})
 
     real = Start.compare
@@ -97,3 +102,9 @@ def test_what_has_no_start(many_tracks: Path, tmp_path: Path) -> None:
     assert calibrated_start(alone, tmp_path, resume=False, watch=unwatched) is None
     plain = TrainConfig.model_validate({"data": [str(many_tracks)], "observe": {"samples": 25}})
     assert calibrated_start(plain, tmp_path, resume=False, watch=unwatched) is None
+
+
+def test_without_a_judged_track_the_calibrated_model_stays(refused: tuple[Path, int, str], many_tracks: Path) -> None:
+    folder, _, _ = refused
+    given = (read_dataset(many_tracks), (), config(many_tracks, 0.1).observe)
+    assert Start(folder / CALIBRATED, folder / BASE, *given).compare(folder / CALIBRATED) is None
