@@ -2,6 +2,7 @@
 
 import difflib
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -223,7 +224,8 @@ def save_model(model: BallModel, path: str | Path) -> None:
     path = check_path("path", path)
     content = model_to_dict(_analytic_part(model)) | _listed(model.variations)
     if model.noise is not None:
-        content["measurement"][NOISE] = model.noise.to_mapping()
+        listed = {name.removeprefix("base."): sigma for name, sigma in model.noise.coefficients.items()}
+        content["measurement"][NOISE] = replace(model.noise, coefficients=listed).to_mapping()
     if has_learned_part(model):
         content["learned"] = write_learned(model, path.parent, path.stem)
     write_text(path, yaml.safe_dump(content, sort_keys=False))

@@ -28,6 +28,7 @@ from ballfg.factors.noise import PROCESS_NOISE, ProcessNoise
 from ballfg.progress import Watch, doing, unwatched
 from ballfg.tracks import Dataset, Track
 from ballfg.tracks.info import DatasetInfo
+from ballfg.tracks.noise import TrackNoise
 
 TRACKS_FOR_NOISE = 50
 """Number of tracks for the estimate of the measurement noise when a dataset does not state it."""
@@ -77,11 +78,16 @@ def dataset_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Set
             settings = replace(settings, spin_label_noise=trained.spin_noise)
     if info.spin_noise is not None:
         settings = replace(settings, spin_label_noise=info.spin_noise)
-    for stated in (info.noise, model.noise):
+    for stated in (info.noise, _own_noise(dataset, model)):
         settings = settings if stated is None else with_noise(settings, stated)
     if dataset.one_view:  # predictions have one process noise for all tracks
         settings = replace(settings, process=settings.for_track(next(iter(dataset))).process)
     return settings if model.spins is None else replace(settings, spins=model.spins)
+
+
+def _own_noise(dataset: Dataset | SightedDataset, model: BallModel) -> TrackNoise | None:
+    """The noise that a model file states; None for a network in another room, where its `Trained.elsewhere` counts."""
+    return None if model.trained is not None and model.trained.is_foreign(dataset.info.name) else model.noise
 
 
 def fitted_settings(
@@ -111,7 +117,7 @@ def fitted_settings(
 
 def _noise_is_stated(dataset: Dataset | SightedDataset, model: BallModel) -> bool:
     at_home = model.trained is not None and not model.trained.is_foreign(dataset.info.name)
-    return dataset.info.noise is not None or model.noise is not None or at_home
+    return dataset.info.noise is not None or _own_noise(dataset, model) is not None or at_home
 
 
 def usual_noise(dataset: Dataset | SightedDataset, model: BallModel) -> tuple[str, ...]:

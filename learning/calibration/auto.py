@@ -100,7 +100,7 @@ class Choice(BaseModel):
         """The candidates as plain text."""
         rows = [("model", "tracks", "median RMSE, mm", "90 % hold, %", "log score", "gain over the best simpler")]
         for one in self.candidates:
-            gain = "" if one.name == NOMINAL else f"{one.gain:+.3f} ± {one.gain_error:.3f}"
+            gain = "" if one is self.candidates[0] else f"{one.gain:+.3f} ± {one.gain_error:.3f}"
             numbers = (f"{1e3 * one.rmse_median:.1f}", f"{100 * one.coverage_90:.0f}", f"{one.log_score:.3f}")
             rows.append((one.name, str(one.tracks), *numbers, gain))
         widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
@@ -138,11 +138,11 @@ def choose_candidate(problem: Problem, watch: Watch = unwatched) -> tuple[Choice
         scores[name] = score(_judging(posed, fitted), problem.model, watch, settings)
     shown = None if noise is None else noise.noise
     for name, posed in ((CALIBRATED, plain), (GROUPED, grouped), (CORRECTED, grouped)):
-        if name == CORRECTED:
-            posed = pose_correction(grouped, found[GROUPED].steps[-1], watch, noise)
-        else:
-            posed = replace(posed, shown=shown)
         try:
+            if name == CORRECTED:
+                posed = pose_correction(grouped, found[GROUPED].steps[-1], watch, noise)
+            else:
+                posed = replace(posed, shown=shown)
             found[name], linear = _fitted(posed, watch)
         except TooManyFailures:  # it, and the richer ones that begin from it, are left out
             break
@@ -202,7 +202,7 @@ def compared(scores: dict[str, Sequence[TrackScore | None]]) -> Choice:
     rows = [row for row in zip(*scores.values(), strict=True) if all(row)]
     kept = {name: [row[k] for row in rows if row[k] is not None] for k, name in enumerate(scores)}
     logs = {name: np.array([one.log_score for one in kept[name] if one is not None]) for name in scores}
-    chosen, candidates = NOMINAL, []
+    chosen, candidates = next(iter(scores)), list[Candidate]()
     for name in scores:
         found = summary([one for one in kept[name] if one is not None])
         if found is None:

@@ -170,10 +170,10 @@ def pose_correction(
 ) -> Problem:
     """The problem of a correction of drag and lift on top of a calibration with groups.
 
-    The tracks are linearised with the noise that they show about the calibrated model.
+    It begins from a first step with the noise that the tracks show about the calibrated model.
 
     Args: noise: that one, if it is known already.
-    Raises: ValueError: as `with_correction`.
+    Raises: ValueError: as `with_correction`. TooManyFailures: as `calibrate`.
     """
     model, settings, names = population_model(problem, last), population_settings(problem, last), problem.split.fit
     noise = noise or fitted_noise(problem, model, settings, watch, errors=False)
@@ -189,8 +189,15 @@ def pose_correction(
     mean = np.concatenate((last.mean, np.zeros(len(chosen.shared))))
     config = problem.config.model_copy(update={"tolerance": max(problem.config.tolerance, ROUGHLY)})
     begun = Correction(mean, last.spins, terms)
-    shown = None if noise is None else noise.noise
-    return replace(problem, model=corrected, chosen=chosen, config=config, correction=begun, shown=shown)
+    posed = replace(problem, model=corrected, chosen=chosen, config=config, correction=begun)
+    if noise is None:
+        return posed
+    # what the calibrated model lacks looks like noise: the correction has the noise about its first step
+    posed, step = replace(posed, shown=noise.noise), Step(number=0, mean=_plain(mean))
+    step = advanced(posed, step, linearised(posed, step, watch))
+    posed = replace(posed, correction=replace(begun, mean=np.array(step.mean), spins=step.spins))
+    shown = fitted_noise(posed, population_model(posed, step), population_settings(posed, step), watch, errors=False)
+    return posed if shown is None else replace(posed, shown=shown.noise)
 
 
 def calibrate(problem: Problem, done: Iterable[Step] = (), *, watch: Watch = unwatched) -> Iterator[Step]:
@@ -323,7 +330,7 @@ def advanced(problem: Problem, last: Step, linear: Linear) -> Step:
     else:
         population, by_group, found, next_track = groups.fit(evidences, [fit.name for fit in fits], chosen)
         if problem.correction is not None:
-            doubts = problem.correction.doubts(population.covariance[np.ix_(chosen.alike, chosen.alike)])
+            doubts = problem.correction.directions(chosen, population.mean[:size], population.covariance[:size, :size])
     return Step(
         number=last.number + 1,
         mean=_plain(population.mean[:size]),

@@ -43,14 +43,18 @@ LINEAR: Final = 0.1
 """Standard deviation of each weight in one track, about the mean at which it is linearised; it is removed again."""
 REACH: Final = (5.0, 95.0)
 """Percentiles of the speeds and spin ratios of the samples that the functions span."""
-BEYOND: Final = 1.15
+BEYOND: Final = 2.0
 """Scale of the functions as a multiple of half the span: the kernel's length."""
+CONSTANT: Final = np.array([0.5**0.5 if name in ("vv", "ss") else float(name == "one") for name in FUNCTIONS])
+"""Weights of a correction that is 1, but for terms of the fourth degree."""
 LEAST_SPEED: Final = 1.0
 """m/s. Least scale: over less, the drag law hardly changes."""
 LEAST_RATIO: Final = 0.1
-"""Least scale of the spin ratio."""
+"""Least scale of S / (1 + S) of the spin ratio S."""
+MOST_RATIO: Final = 0.99
+"""Largest S / (1 + S) that is shown."""
 ELSEWHERE: Final = 0.05
-"""Weight of places without data in the choice of the directions whose uncertainty is kept."""
+"""Weight of places without data in the order of the directions of uncertainty."""
 
 
 @dataclass(frozen=True)
@@ -60,28 +64,32 @@ class Correction:
     Attributes:
         mean: (p,) of all coefficients, those of the calibration first.
         spins: of each group, as calibrated.
-        terms: (7, 7) mean product of the functions over the samples.
+        terms: (11, 11) mean product of the functions over the samples.
     """
 
     mean: Array
     spins: tuple[GroupSpin, ...]
     terms: Array
 
-    def doubts(self, covariance: Array) -> tuple[tuple[float, ...], ...]:
-        """`DOUBTS` directions of the weights of each force, first of drag, those that move it most at the samples.
+    def directions(self, chosen: Chosen, mean: Array, covariance: Array) -> tuple[tuple[float, ...], ...]:
+        """Of the uncertainty of each force's weights, first of drag; those that move it most at the samples lead.
 
-        Each force has its own, for one of them would take most of those that both shared.
+        Each force has its own, for one of them would take most of the leading ones that both shared. Those of drag are
+        of the weights together with the mean drag, for a larger drag and a larger correction are the same.
 
-        Args: covariance: (7, 7) of the weights of drag, or (14, 14) with those of lift.
+        Args: mean, covariance: (p,), (p, p) of the chosen coefficients.
         """
         count, found = len(FUNCTIONS), list[tuple[float, ...]]()
         metric = self.terms + ELSEWHERE * np.eye(count)
-        for first in range(0, len(covariance), count):
-            own = slice(first, first + count)
-            values, vectors = np.linalg.eigh(covariance[own, own])
+        for first in range(0, len(chosen.alike), count):
+            turn = np.eye(len(mean))[chosen.alike[first : first + count]]
+            k = chosen.names.index(SCALE) if SCALE in chosen.names and first == 0 else None
+            if k is not None and mean[k] > 0.0:
+                turn[:, k] = CONSTANT / mean[k]
+            values, vectors = np.linalg.eigh(turn @ covariance @ turn.T)
             root = vectors * np.sqrt(np.maximum(values, 0.0))
             _, turns = np.linalg.eigh(root.T @ metric @ root)
-            found += [tuple(row) for row in (root @ turns[:, ::-1][:, :DOUBTS]).T.tolist()]
+            found += [tuple(row) for row in (root @ turns[:, ::-1]).T.tolist()]
         return tuple(found)
 
 
@@ -101,7 +109,8 @@ def with_correction(
         raise ValueError("tracks must have estimates; every one failed. Calibrate without a correction.")
     states = np.concatenate([estimate.states for estimate in found])
     speed = np.maximum(np.linalg.norm(states[:, VELOCITY], axis=1), LEAST_SPEED)
-    ratio = model.radius * np.linalg.norm(states[:, SPIN], axis=1) / speed
+    rim = model.radius * np.linalg.norm(states[:, SPIN], axis=1)
+    ratio = rim / (speed + rim)
     shape: dict[str, float] = {}
     places = []
     for name, values, least in (("speed", speed, LEAST_SPEED), ("ratio", ratio, LEAST_RATIO)):
@@ -122,11 +131,11 @@ def with_correction(
 
 
 def set_doubts(model: AnalyticModel, doubts: Sequence[Sequence[float]]) -> None:
-    """Put the directions of the weights' uncertainty into a model with a correction; as of `Correction.doubts`."""
+    """Put the directions of the weights' uncertainty into a model with a correction; as of `Correction.directions`."""
     parameters = dict(model.named_parameters())
     with torch.no_grad():
         for number, direction in enumerate(doubts):
-            force, k = FORCES[number // DOUBTS], number % DOUBTS + 1
+            force, k = FORCES[number // len(FUNCTIONS)], number % len(FUNCTIONS) + 1
             for term, value in zip(FUNCTIONS, direction, strict=True):
                 parameters[f"{SECTION}.{force}_{term}_{k}"].fill_(value)
 
@@ -143,21 +152,21 @@ def learned(model: AnalyticModel, force: str, speed: Array, ratio: Array) -> tup
     values = cast(Effect, model.flight[AirCorrection.name]).values()
     x, y = (
         torch.from_numpy((given - values[name]) / values[f"{name}_scale"])[:, None]
-        for name, given in (("speed", speed), ("ratio", ratio))
+        for name, given in (("speed", speed), ("ratio", ratio / (1.0 + ratio)))
     )
     terms = correction_terms(x, y).numpy()
-    rows = [
-        [values[f"{force}_{term}{end}"] for term in FUNCTIONS] for end in ("", *(f"_{k}" for k in range(1, DOUBTS + 1)))
-    ]
-    mean, *doubts = np.array(rows) @ terms.T
-    return mean, np.linalg.norm(doubts, axis=0)
+    ends = ("", *(f"_{k}" for k in range(1, len(FUNCTIONS) + 1)))
+    mean, *away = np.array([[values[f"{force}_{term}{end}"] for term in FUNCTIONS] for end in ends]) @ terms.T
+    return mean, np.linalg.norm(away, axis=0)
 
 
 def spans(model: AnalyticModel) -> dict[str, tuple[float, float]]:
     """Ends of the range of the samples, 5 to 95 %: of `speed`, m/s, and `ratio`; model: with a correction."""
     values = cast(Effect, model.flight[AirCorrection.name]).values()
     half = {name: values[f"{name}_scale"] / BEYOND for name in ("speed", "ratio")}
-    return {name: (max(values[name] - reach, 0.0), values[name] + reach) for name, reach in half.items()}
+    found = {name: (max(values[name] - reach, 0.0), values[name] + reach) for name, reach in half.items()}
+    low, high = (end / (1.0 - end) for end in np.minimum(found["ratio"], MOST_RATIO).tolist())
+    return found | {"ratio": (low, high)}
 
 
 def places(model: AnalyticModel) -> tuple[Array, Array]:
@@ -167,7 +176,7 @@ def places(model: AnalyticModel) -> tuple[Array, Array]:
     Returns: (5,) each.
     """
     values, ends = cast(Effect, model.flight[AirCorrection.name]).values(), spans(model)
-    speed, ratio = values["speed"], values["ratio"]
+    speed, ratio = values["speed"], values["ratio"] / (1.0 - values["ratio"])
     return np.array([speed, *ends["speed"], speed, speed]), np.array([ratio, ratio, ratio, *ends["ratio"]])
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Final
 
 import numpy as np
@@ -16,6 +17,7 @@ from pydantic import BaseModel, ConfigDict
 
 from ballfg.arrays import Array, Index
 from ballfg.checks import listed, shown
+from ballfg.dynamics.effects.generic import FUNCTIONS
 from ballfg.dynamics.population import SpinGroup, SpinPopulation, launch_axes
 from ballfg.dynamics.variation import Variation
 from ballfg.estimation import Estimate, Settings
@@ -205,16 +207,28 @@ class Groups:
 def _widest(
     evidences: Sequence[Evidence], columns: Columns, numbers: Index, alike: Index
 ) -> tuple[Columns, Population]:
-    """The population, and its columns with the prior of the shared coefficients that has the largest evidence."""
+    """The population, and its columns with the priors of the shared coefficients that have the largest evidence.
+
+    The weights of each force have a width of their own: lift may saturate where drag is nearly as declared. Mean and
+    covariance are those over all widths, each as probable as its evidence says.
+    """
     if not len(alike):
         return columns, fit_population(evidences, *columns, numbers)
     start, sigma, low, high = columns
-    tried = []
-    for width in WIDTHS:
+    forces, tried = alike.reshape(-1, len(FUNCTIONS)), []
+    for widths in product(WIDTHS, repeat=len(forces)):
         own = sigma.copy()
-        own[alike] = width
+        own[forces] = np.array(widths)[:, None]
         tried.append(((start, own, low, high), fit_population(evidences, start, own, low, high, numbers, alike)))
-    return max(tried, key=lambda one: one[1].log_evidence)
+    evidence_of = np.array([found.log_evidence for _, found in tried])
+    share = np.exp(evidence_of - evidence_of.max())
+    share /= share.sum()
+    means = np.array([found.mean for _, found in tried])
+    mean = share @ means
+    away = (means - mean) * np.sqrt(share)[:, None]
+    covariance = np.tensordot(share, np.array([found.covariance for _, found in tried]), 1) + away.T @ away
+    wide, best = tried[int(share.argmax())]
+    return wide, replace(best, mean=mean, covariance=covariance)
 
 
 def _columns_of(population: Population) -> Columns:

@@ -13,7 +13,6 @@ import torch
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from ballfg.dynamics import save_model
-from ballfg.dynamics.domain import Domain
 from ballfg.dynamics.model_file import model_to_dict
 from ballfg.files.damaged import whole_content
 from ballfg.learning.calibration.auto import (
@@ -42,6 +41,7 @@ from ballfg.learning.calibration.calibrate import (
 from ballfg.learning.calibration.gain import denser
 from ballfg.learning.calibration.picture import draw
 from ballfg.learning.calibration.report import compare, outcome, report, table
+from ballfg.learning.calibration.start import written_model
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.config_file import AUTO
 from ballfg.learning.evaluation import TrackScore, summary
@@ -49,7 +49,6 @@ from ballfg.learning.run import run_folder as files
 from ballfg.learning.run.record import NOT_BETTER
 from ballfg.learning.training_data import analytic_model, open_source
 from ballfg.progress import Watch
-from ballfg.tracks import Dataset
 from ballfg.tracks.noise import TrackNoise
 
 
@@ -209,12 +208,9 @@ def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch,
     if comparison.gain is not None and comparison.gain.word == "no different" and noise is not None:
         comparison = replace(comparison, density=_density(problem, shown, watch))
     found = report(problem, last, comparison, noise)
-    model.noise = None if noise is None else noise.noise
+    model = written_model(problem, last, noise)
     if problem.dataset.one_view:  # its tracks cannot correct a drag: the model file states how sure it is
         model.noise = TrackNoise(coefficients={name: last.next_track[k] for k, name in problem.chosen.listed})
-    model.spins = population.spins
-    if isinstance(problem.dataset, Dataset):
-        model.domain = Domain.of(track for track in problem.dataset if track.name in problem.split.fit)
     save_model(model, folder / files.MODEL)
     files.write_json(folder / files.REPORT, found)
     draw(problem, last, comparison, folder / files.PICTURE)

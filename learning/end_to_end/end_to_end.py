@@ -299,6 +299,8 @@ class EndToEnd(Trainee):
             rooms=tuple(dict.fromkeys(self.shots[number].room for number in self.fades)) if elsewhere else (),
             elsewhere=elsewhere,
         )
+        if noise.learned and isinstance(self.learnables.model, LearnedModel) and self.learnables.model.base is not None:
+            self.learnables.model.base.noise = None  # it would take precedence over the learned one
         return self.learnables.model
 
     def _faded(self) -> TrackNoise | None:

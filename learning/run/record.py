@@ -14,8 +14,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from torch.utils.tensorboard import SummaryWriter
 
+from ballfg.dynamics import load_model, save_model
 from ballfg.estimation.noise.estimate import spread_over
 from ballfg.files.whole_file import whole_file, write_text
+from ballfg.learning.calibration.start import NETWORK, Start
 from ballfg.learning.run import run_folder as files
 from ballfg.learning.run.checkpoint import Checkpoint, write_checkpoint
 from ballfg.learning.run.loop import Training
@@ -52,8 +54,15 @@ class Record:
     Rows of epochs after the checkpoint from which the run continues are dropped, and those epochs run again.
     """
 
-    def __init__(self, training: Training, folder: Path, checkpoint: Checkpoint | None, command: str) -> None:
-        task = training.task
+    def __init__(
+        self,
+        training: Training,
+        folder: Path,
+        checkpoint: Checkpoint | None,
+        command: str,
+        start: Start | None = None,
+    ) -> None:
+        task, self.start = training.task, start
         self.training, self.folder, self.command, self.last = training, folder, command, task.config.optimizer.epochs
         self.saved = -1 if checkpoint is None else checkpoint.progress.epoch
         rows = read_metrics(folder / files.METRICS) if checkpoint is not None else []
@@ -91,21 +100,24 @@ class Record:
     def finish(self) -> int:
         """Write the model with the best weights and the page, and print whether it helped. Returns: the exit status."""
         folder, progress, epochs, task = self.folder, self.training.progress, self.epochs, self.training.task
-        model = task.trainee.export(folder)
+        model, beside, gains = self._export()
         if progress is None:
             return 0
-        judged = task.trainee.without_training(task.validation) if task.validation else None
-        untrained = math.sqrt(judged.squared_error / judged.points) if judged is not None and judged.points else None
-        self._write_page(model, self.median_shot(), untrained)
-        better = improved(epochs, progress.best_epoch)
+        if self.start is None:
+            judged = task.trainee.without_training(task.validation) if task.validation else None
+            points = 0 if judged is None else judged.points
+            untrained = math.sqrt(judged.squared_error / points) if judged is not None and points else None
+            beside = beside_untrained(epochs, progress.best_epoch, untrained)
+        self._write_page(model, self.median_shot() if gains else None, beside)
+        better = gains and improved(epochs, progress.best_epoch)
         print(verdict(epochs, progress.best_epoch))
-        beside = beside_untrained(epochs, progress.best_epoch, untrained)
         print(beside, end="\n" if beside else "")
         if progress.best_rmse is not None:
             print(f"best: epoch {progress.best_epoch}, validation RMSE {1e3 * progress.best_rmse:.2f} mm")
         else:
             print("no validation track could be judged: the weights are those of the last epoch")
-        what = "the model before the first step, which no epoch improved" if better is False else "the trained model"
+        kept = "the calibrated model" if self.start else "the model before the first step, which no epoch improved"
+        what = kept if better is False else "the trained model"
         print(f"{folder / files.PAGE}: the training, to read")
         print(f"{model}: {what}\n{folder / files.METRICS}: all numbers\n{folder / files.CURVES}")
         return NOT_BETTER if better is False else 0
@@ -118,11 +130,36 @@ class Record:
             print("no model is written: not even the first one had been judged", file=sys.stderr)
             return
         self.training.take_best()
-        model = self.training.task.trainee.export(self.folder)
-        self._write_page(model, None, None)
+        model, beside, _ = self._export()
+        self._write_page(model, None, beside)
         print(f"{model}: the best model so far, of epoch {self.training.progress.best_epoch}", file=sys.stderr)
 
-    def _write_page(self, model: Path, shot: PredictedShot | None, untrained: float | None) -> None:
+    def _export(self) -> tuple[Path, str, bool]:
+        """Write the model: the network, or the calibrated one that it started from if it does not surely beat it.
+
+        Returns: its path, a sentence on the comparison, which is empty without one, and False for the calibrated model.
+        """
+        path = self.training.task.trainee.export(self.folder)
+        if self.start is None:
+            return path, "", True
+        choice = self.start.compare(path)
+        gains = choice is not None and choice.chosen == NETWORK
+        if not gains:
+            save_model(load_model(self.start.calibrated), path)
+        if choice is None:
+            return path, "No validation track could be judged: the model file holds the calibrated model.", False
+        print(choice.table())
+        before, after = choice.candidates
+        said = "surely predicts better than" if gains else "does not surely predict better than"
+        left = "" if gains else ", which the model file holds"
+        sentence = (
+            f"The network {said} the calibrated model{left}: median errors are {1e3 * after.rmse_median:.1f} and "
+            f"{1e3 * before.rmse_median:.1f} mm, the log score changes by {after.gain:+.3f} ± "
+            f"{after.gain_error:.3f}."
+        )
+        return path, sentence, gains
+
+    def _write_page(self, model: Path, shot: PredictedShot | None, beside: str) -> None:
         best = 0 if self.training.progress is None else self.training.progress.best_epoch
         data = self.training.task.config.data or ()
         words = ["ballfg", "predict", *(data[:1] or ["DATASET"]), "--model", str(model)]
@@ -133,7 +170,7 @@ class Record:
         infos = [Path(folder) / INFO_FILE for folder in data]
         doubts = [doubt for info in infos if info.is_file() for doubt in read_info(info)[0].doubts]  # it may have moved
         drawn, learned = curves(self.epochs, self.title), self.training.task.trainee.learned()
-        text = page(self.title, self.epochs, best, drawn, learned, shot, following, origin, untrained, doubts)
+        text = page(self.title, self.epochs, best, drawn, learned, shot, following, origin, beside, doubts)
         write_text(self.folder / files.PAGE, text)
 
     def median_shot(self) -> PredictedShot | None:

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ballfg.learning.calibration.start import Start, calibrated_start
 from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.registry import TRAINEES
 from ballfg.learning.run import run_folder as files
@@ -48,13 +49,15 @@ def run_training(
     """
     with join_ranks() as ranks, ExitStack() as stack:
         ranks.from_first(lambda: stack.enter_context(files.running(folder, config, resume=resume)))
-        trainee, train, validation = ranks.together(lambda: _built(ranks, config))
+        start = ranks.from_first(lambda: calibrated_start(config, folder, resume=resume, watch=watch))
+        begun = config if start is None else config.model_copy(update={"model": str(start.base)})
+        trainee, train, validation = ranks.together(lambda: _built(ranks, begun))
         # processes on machines of other kinds too begin with the same weights, bit for bit
         trainee.module.load_state_dict(ranks.from_first(trainee.module.state_dict))
         checkpoint = ranks.from_first(lambda: read_checkpoint(folder) if resume else None)
         task = Task(trainee, tuple(train), tuple(validation), config, ranks, watch)
         training = ranks.together(lambda: Training(task, checkpoint))
-        record = ranks.together(lambda: _record(training, folder, checkpoint, command) if ranks.first else None)
+        record = ranks.together(lambda: _record(training, folder, checkpoint, command, start) if ranks.first else None)
         try:
             for epoch in training.epochs():
                 due = epoch.epoch % config.checkpoint_every == 0 or epoch.epoch == config.optimizer.epochs
@@ -84,8 +87,10 @@ def _built(ranks: Ranks, config: TrainConfig) -> Prepared:
         return build(config)
 
 
-def _record(training: Training, folder: Path, checkpoint: Checkpoint | None, command: str) -> Record:
+def _record(
+    training: Training, folder: Path, checkpoint: Checkpoint | None, command: str, start: Start | None
+) -> Record:
     """Pictures and TensorBoard take half a second to import; processes other than the first do without."""
     from ballfg.learning.run.record import Record
 
-    return Record(training, folder, checkpoint, command)
+    return Record(training, folder, checkpoint, command, start)

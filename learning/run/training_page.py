@@ -73,7 +73,7 @@ def page(
     shot: PredictedShot | None,
     next_command: str,
     origin: Mapping[str, str],
-    untrained: float | None = None,
+    beside: str = "",
     doubts: Sequence[str] = (),
 ) -> str:
     """The whole page.
@@ -84,10 +84,10 @@ def page(
         shot: a validation track predicted by the written model; None where there is none.
         next_command: the command to type next, or empty.
         origin: date, versions, command: what the page comes from, by its name.
-        untrained: RMSE of the analytic model on the validation tracks, m; None where it is not known.
+        beside: a sentence on another model's errors, or empty.
         doubts: what is not sure about the tracks.
     """
-    first = f"{verdict(epochs, best_epoch)} {beside_untrained(epochs, best_epoch, untrained)}".strip()
+    first = f"{verdict(epochs, best_epoch)} {beside}".strip()
     caption = "Loss (a pure number) and root mean square errors (mm) after each epoch. An axis of powers of ten is "
     made = [(name, typed(said) if name == "command" else said) for name, said in origin.items()]
     made.append(("config", "config.yaml beside this page, with every default"))

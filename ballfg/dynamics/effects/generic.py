@@ -1,6 +1,7 @@
 """Generic effects describe patterns without a known cause as sums of terms in place, velocity and spin."""
 
 from collections.abc import Iterable, Mapping
+from math import factorial
 from typing import Final
 
 import torch
@@ -51,15 +52,15 @@ BOUND: Final = 1e3
 MEASUREMENT_BOUND: Final = 100.0
 """The same for an error of a measurement: it is small."""
 
-FUNCTIONS: Final = ("one", "v", "s", "vv", "vs", "ss", "far")
-"""Functions of one correction: v and s are speed and spin ratio from their centres."""
+FUNCTIONS: Final = ("one", "v", "s", "vv", "vs", "ss", "vvv", "vvs", "vss", "sss", "far")
+"""Functions of one correction: v is the speed and s the spin ratio S as S / (1 + S), from their centres."""
+POWERS: Final = tuple((name.count("v"), name.count("s")) for name in FUNCTIONS[:-1])
+"""Of v and s in all functions but the last."""
 FORCES: Final = ("drag", "lift")
 DOUBTS: Final = 4
 """Number of directions of the weights of a force whose uncertainty an estimate carries."""
 DOUBT: Final = {"drag": "doubt", "lift": "lift_doubt"}
 """Prefix of the names of a force's doubts."""
-SLOWEST: Final = 1e-9
-"""m/s. Keeps the spin ratio finite at rest, where the correction is that of `far` and the forces are zero."""
 LEAST_REST: Final = 1e-12
 """Least share of the variance in the last function: its square root stays differentiable."""
 LIMIT: Final = 10.0
@@ -181,24 +182,23 @@ def motion_terms(flight: Flight, axes: Tensor, place: Tensor, reference: Tensor)
 
 
 def correction_terms(speed: Tensor, ratio: Tensor) -> Tensor:
-    """(..., 7) the functions `FUNCTIONS` of one correction; their squares add up to one.
+    """(..., 11) the functions `FUNCTIONS` of one correction; their squares add up to one.
 
     Args: speed, ratio: (..., 1) from their centres, in their scales, dimensionless.
     """
     away = speed.square() + ratio.square()
     near = torch.exp(-0.5 * away)
-    kept = near.square() * (1.0 + away + 0.5 * away.square())
-    half = 0.5**0.5
-    inner = (near, near * speed, near * ratio, near * speed * speed * half, near * speed * ratio)
-    return torch.cat((*inner, near * ratio * ratio * half, (1.0 - kept).clamp_min(LEAST_REST).sqrt()), dim=-1)
+    kept = near.square() * (1.0 + away * (1.0 + away * (1.0 / 2.0 + away / 6.0)))
+    inner = (near * speed**i * ratio**j / (factorial(i) * factorial(j)) ** 0.5 for i, j in POWERS)
+    return torch.cat((*inner, (1.0 - kept).clamp_min(LEAST_REST).sqrt()), dim=-1)
 
 
 def _shape() -> tuple[Coefficient, ...]:
     return (
         Coefficient("speed", 5.0, 0.0, "m/s", 0.0, 1e3, absent=None),
         Coefficient("speed_scale", 4.0, 0.0, "m/s", 1e-3, 1e3, absent=None),
-        Coefficient("ratio", 0.25, 0.0, "1", 0.0, 1e3, absent=None),
-        Coefficient("ratio_scale", 0.3, 0.0, "1", 1e-3, 1e3, absent=None),
+        Coefficient("ratio", 0.2, 0.0, "1", 0.0, 1.0, absent=None),
+        Coefficient("ratio_scale", 0.2, 0.0, "1", 1e-3, 1.0, absent=None),
     )
 
 
@@ -211,7 +211,7 @@ def _numbers() -> tuple[Coefficient, ...]:
     )
     directions = tuple(
         Coefficient(f"{name}_{k}", 0.0, 0.0, "1", -LIMIT, LIMIT, absent=None)
-        for k in range(1, DOUBTS + 1)
+        for k in range(1, len(FUNCTIONS) + 1)
         for name in WEIGHTS
     )
     return (*weights, *doubts, *directions)
@@ -220,14 +220,15 @@ def _numbers() -> tuple[Coefficient, ...]:
 class AirCorrection(FlightEffect):
     """Drag and lift times 1 + a correction each, a Gaussian process over speed and spin ratio S = R |w| / |v|.
 
-    The kernel is s^2 exp(-|x - x'|^2 / 2) in x = ((speed - centre) / scale, (ratio - centre) / scale). Its Taylor
-    series writes the process as a sum of weights N(0, s^2) times exp(-|x|^2 / 2) x_1^i x_2^j / sqrt(i! j!). Those of
-    degree two and less are kept, and one further function carries the variance of all others. So the prior's standard
-    deviation is s at every speed and spin. Far from the data only that last function is left: the correction is zero
-    with the prior's width (C. Rasmussen, C. Williams, "Gaussian Processes for Machine Learning", 2006, 2.1 and 4.3).
+    The kernel is s^2 exp(-|x - x'|^2 / 2) in the speed and S / (1 + S), less their centres, over their scales. Its
+    Taylor series writes the process as a sum of weights N(0, s^2) times exp(-|x|^2 / 2) x_1^i x_2^j / sqrt(i! j!).
+    Those of degree three and less are kept, and one further function carries the variance of all others. So the
+    prior's standard deviation is s at every speed and spin. Far from the data only that last function is left
+    (C. Rasmussen, C. Williams, "Gaussian Processes for Machine Learning", 2006, 2.1 and 4.3).
 
-    Each weight is its mean plus the doubts of its force, of standard deviation 1, times their directions: the leading
-    part of the posterior that `ballfg-train` found. Estimates carry the doubts as coefficients of each track.
+    Each weight is its mean plus the doubts of its force, of standard deviation 1, times the first of its directions,
+    the columns of a root of the posterior's covariance that `ballfg-train` found. Estimates carry the doubts as
+    coefficients of each track. The directions without a doubt move the correction least; its band shows them.
     """
 
     name = "air_correction"
@@ -242,7 +243,8 @@ class AirCorrection(FlightEffect):
     def adjust(self, flight: Flight) -> Flight:
         """The flight with the gains that other effects gave it times one plus the correction."""
         spin = (flight.spin.square().sum(-1, keepdim=True) + SOFT_SPIN**2).sqrt()
-        ratio = flight.radius * spin / flight.speed.clamp_min(SLOWEST)
+        rim = flight.radius * spin
+        ratio = rim / (flight.speed + rim)
         terms = correction_terms(
             (flight.speed - self.speed) / self.speed_scale, (ratio - self.ratio) / self.ratio_scale
         )
@@ -251,7 +253,7 @@ class AirCorrection(FlightEffect):
         return flight.more_lift(lift if flight.lift_gain is None else lift * flight.lift_gain)
 
     def _weights(self, force: str) -> Tensor:
-        """(7,) or (..., 7) the weights of one force."""
+        """(11,) or (..., 11) the weights of one force."""
         names = [f"{force}_{term}" for term in FUNCTIONS]
         total = vector(*(getattr(self, name) for name in names))
         for k in range(1, DOUBTS + 1):

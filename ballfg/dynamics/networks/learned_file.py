@@ -6,6 +6,7 @@ folder, and saving again never changes that folder.
 
 import hashlib
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -185,8 +186,11 @@ def _empty_model(config: _Config, analytic: AnalyticModel, folder: Path) -> Ball
             if base is None:
                 raise ValueError(f"{folder / CONFIG}: fading must have a model to fade to; make architecture residual.")
             model.fading = Fading.empty(config.fading.flight_centres, config.fading.contact_centres, analytic.radius)
-    model.noise = analytic.noise
+    model.noise, model.spins = analytic.noise, analytic.spins
     if model is not analytic:
+        if model.noise is not None and model.base is analytic:
+            spreads = {f"{BASE}{name}": sigma for name, sigma in model.noise.coefficients.items()}
+            model.noise = replace(model.noise, coefficients=spreads)
         model.variations = {f"{BASE}{name}": variation for name, variation in analytic.variations.items()}
     if config.trained is not None:
         model.trained = _trained(config.trained, folder)

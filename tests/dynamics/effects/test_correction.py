@@ -11,7 +11,7 @@ import torch
 from ballfg.dynamics import AnalyticModel, load_model, nominal_model, save_model
 from ballfg.dynamics.effects import generic, registry
 from ballfg.dynamics.effects.flight import Drag, Gravity, Magnus
-from ballfg.dynamics.effects.generic import DOUBT, DOUBTS, WEIGHTS, AirCorrection, correction_terms
+from ballfg.dynamics.effects.generic import DOUBT, DOUBTS, FUNCTIONS, WEIGHTS, AirCorrection, correction_terms
 from ballfg.state import STANDARD_GRAVITY
 
 LOW, HIGH = -4.0, 4.0
@@ -23,7 +23,7 @@ def column(values: np.ndarray) -> torch.Tensor:
 
 def random_correction(seed: int = 3) -> AirCorrection:
     rng = np.random.default_rng(seed)
-    numbers = {f"{name}_{k}": 0.1 * rng.normal() for name in WEIGHTS for k in range(1, DOUBTS + 1)}
+    numbers = {f"{name}_{k}": 0.1 * rng.normal() for name in WEIGHTS for k in range(1, len(FUNCTIONS) + 1)}
     doubts = {f"{prefix}_{k}": rng.normal() for prefix in DOUBT.values() for k in range(1, DOUBTS + 1)}
     return AirCorrection(**{name: 0.3 * rng.normal() for name in WEIGHTS}, **numbers, **doubts)
 
@@ -44,7 +44,7 @@ def test_the_prior_is_as_wide_everywhere() -> None:
 
 
 def test_near_the_data_the_covariance_is_the_kernel() -> None:
-    """Within one length of the centre, where the terms of third and higher degree are small."""
+    """Within one length of the centre, where the terms of fourth and higher degree are small."""
     rng = np.random.default_rng(2)
     places = rng.uniform(-0.5, 0.5, (40, 2))
     terms = correction_terms(column(places[:, 0]), column(places[:, 1])).numpy()
@@ -72,10 +72,12 @@ def test_the_gains_are_those_of_the_formula() -> None:
     found = model_with(effect).rates(state)[0].detach().numpy()[0]
     velocity, spin = state[0, 3:6].numpy(), state[0, 6:].numpy()
     speed, ratio = np.linalg.norm(velocity), 0.02 * np.hypot(np.linalg.norm(spin), generic.SOFT_SPIN)
-    x, y = (speed - values["speed"]) / values["speed_scale"], (ratio / speed - values["ratio"]) / values["ratio_scale"]
-    near = np.exp(-(x * x + y * y) / 2)
-    rest = 1 - near**2 * (1 + x * x + y * y + (x * x + y * y) ** 2 / 2)
-    terms = np.array([near, near * x, near * y, near * x * x / 2**0.5, near * x * y, near * y * y / 2**0.5, rest**0.5])
+    share = ratio / (speed + ratio)  # S / (1 + S)
+    x, y = (speed - values["speed"]) / values["speed_scale"], (share - values["ratio"]) / values["ratio_scale"]
+    squares = x * x / 2**0.5, x * y, y * y / 2**0.5
+    cubes = x**3 / 6**0.5, x * x * y / 2**0.5, x * y * y / 2**0.5, y**3 / 6**0.5
+    inner = np.exp(-(x * x + y * y) / 2) * np.array([1.0, x, y, *squares, *cubes])
+    terms = np.append(inner, (1 - inner @ inner) ** 0.5)
     gains = []
     for force in ("drag", "lift"):
         weights = [

@@ -16,9 +16,11 @@ from ballfg.dynamics import AnalyticModel, Architecture, BallModel, build, load_
 from ballfg.dynamics.model_file import model_to_dict
 from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.dynamics.population import SpinGroup, SpinPopulation
 from ballfg.dynamics.trained import Trained
 from ballfg.dynamics.variation import Variation
 from ballfg.tracks import Track
+from ballfg.tracks.noise import TrackNoise
 
 KINDS = ("mlp", "mlp+gs", "skip+gs", "mnn+gs")
 
@@ -67,6 +69,19 @@ def test_round_trip(kind, residual, every_effect, tmp_path):
     content = yaml.safe_load((tmp_path / "m.yaml").read_text())
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(["m.yaml", content["learned"]])
     assert content["flight"] == (model_to_dict(every_effect)["flight"] if residual else {})
+
+
+def test_noise_and_spins_of_the_corrected_model_are_read_and_written_again(tmp_path):
+    base = nominal_model()
+    base.noise = TrackNoise(acceleration=0.1, coefficients={"flight.drag.k": 0.01})
+    base.spins = SpinPopulation("group", {"top": SpinGroup((0.0, 60.0, 0.0), (3.0, 10.0, 3.0), 7)})
+    save_model(small(KINDS[1], base), tmp_path / "m.yaml")
+    first = load_model(tmp_path / "m.yaml", radius=0.02)
+    assert first.noise == TrackNoise(acceleration=0.1, coefficients={"base.flight.drag.k": 0.01})
+    assert first.spins == base.spins
+    save_model(first, tmp_path / "n.yaml")
+    again = load_model(tmp_path / "n.yaml", radius=0.02)
+    assert (again.noise, again.spins) == (first.noise, first.spins)
 
 
 def test_values_of_groups_stay_those_of_the_model_it_corrects(every_effect, tmp_path):

@@ -9,11 +9,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
-from scipy import linalg
+from scipy import stats
 
 from ballfg.dynamics import AnalyticModel, Surfaces, load_model, nominal_model
 from ballfg.dynamics.effects.flight import Drag, DragSpeed, Gravity, Magnus
-from ballfg.dynamics.effects.generic import DOUBTS, FUNCTIONS, WEIGHTS, AirCorrection
+from ballfg.dynamics.effects.generic import DOUBTS, FUNCTIONS, WEIGHTS, AirCorrection, correction_terms
 from ballfg.dynamics.model_file import model_to_dict
 from ballfg.dynamics.motion.paths import paths
 from ballfg.estimation import dataset_settings
@@ -38,8 +38,20 @@ from ballfg.learning.calibration.calibrate import (
     pose_correction,
     score,
 )
-from ballfg.learning.calibration.correction import Correction, learned, places, set_doubts, spans, with_correction
+from ballfg.learning.calibration.coefficients import Chosen
+from ballfg.learning.calibration.correction import (
+    ALL,
+    SCALE,
+    Correction,
+    learned,
+    places,
+    set_doubts,
+    spans,
+    with_correction,
+)
+from ballfg.learning.calibration.groups import WIDTHS, _widest
 from ballfg.learning.calibration.picture import draw
+from ballfg.learning.calibration.population import Evidence
 from ballfg.learning.calibration.report import compare
 from ballfg.learning.calibration.run import run_calibration
 from ballfg.learning.config.calibration import CalibrationConfig
@@ -169,13 +181,42 @@ def test_all_tracks_share_the_weights(curved: tuple[Problem, Step, Problem, Step
     assert sum("doubt" in name for name in settings.coefficients) == DOUBTS
 
 
-def test_directions_keep_the_variance_that_matters_at_the_samples() -> None:
-    rng = np.random.default_rng(1)
-    drag, lift, samples = rng.normal(size=(7, 3)), rng.normal(size=(7, 3)), rng.normal(size=(7, 30))
-    covariance = linalg.block_diag(drag @ drag.T, lift @ lift.T)  # of rank three each: four directions keep all of it
-    kept = np.array(Correction(np.zeros(1), (), samples @ samples.T / 30.0).doubts(covariance))
-    of_drag, of_lift = kept[:DOUBTS], kept[DOUBTS:]
-    np.testing.assert_allclose(linalg.block_diag(of_drag.T @ of_drag, of_lift.T @ of_lift), covariance, atol=1e-9)
+def test_directions_are_a_root_of_the_posterior_and_lead_where_samples_are() -> None:
+    """That of drag holds the mean drag's uncertainty: at the samples, of the whole drag force, by differences."""
+    rng, count = np.random.default_rng(1), len(FUNCTIONS)
+    names, mean = (SCALE, *ALL), np.append(0.12, 0.02 * rng.normal(size=2 * count))
+    chosen = Chosen(names, ("1",) * len(names), mean, np.ones(len(names)), mean - 9.0, mean + 9.0, shared=ALL)
+    root = 0.003 * rng.normal(size=(len(mean), len(mean)))
+    x, y = (torch.from_numpy(0.2 * rng.normal(size=(30, 1))) for _ in range(2))
+    samples = correction_terms(x, y).numpy()
+    found = Correction(np.zeros(1), (), samples.T @ samples / 30.0).directions(chosen, mean, root @ root.T)
+    of_drag, of_lift = np.array(found).reshape(2, count, count)
+    lift = chosen.alike[count:]
+    np.testing.assert_allclose(of_lift.T @ of_lift, (root @ root.T)[np.ix_(lift, lift)], atol=1e-12)
+    weights = chosen.alike[:count]
+    moved = (mean[0] + root[0]) * (1.0 + samples @ (mean[weights, None] + root[weights])) / mean[0]
+    away = moved - 1.0 - samples @ mean[weights, None]
+    np.testing.assert_allclose(np.linalg.norm(of_drag @ samples.T, axis=0), np.linalg.norm(away, axis=1), rtol=0.05)
+    shares = np.square(of_drag @ samples.T).sum(axis=1)
+    assert shares[:DOUBTS].sum() > 0.9 * shares.sum()
+
+
+def test_the_width_of_the_prior_is_averaged_by_its_evidence() -> None:
+    """Against the densities of the measured weights with every width, and their mixture's moments by draws."""
+    rng, count = np.random.default_rng(2), len(FUNCTIONS)
+    noise, measured = 0.1, 0.1 * rng.normal(size=count)
+    one = Evidence(np.eye(count) / noise**2, measured / noise**2, np.zeros(count))
+    columns = (np.zeros(count), np.ones(count), np.full(count, -9.0), np.full(count, 9.0))
+    _, found = _widest([one], columns, np.arange(count)[None], np.arange(count))
+    widths = np.array(WIDTHS)
+    spreads = np.hypot(noise, widths)[:, None]
+    share = np.exp(stats.norm.logpdf(measured, 0.0, spreads).sum(axis=1))
+    shrunk = (widths / spreads[:, 0]) ** 2
+    picked = rng.choice(len(widths), 200_000, p=share / share.sum())
+    draws = measured * shrunk[picked, None] + noise * np.sqrt(shrunk[picked, None]) * rng.normal(size=(200_000, count))
+    np.testing.assert_allclose(found.mean, draws.mean(axis=0), atol=2e-3)
+    np.testing.assert_allclose(found.covariance, np.cov(draws.T), atol=2e-4)
+    assert 0.1 < np.max(share / share.sum()) < 0.9  # more than one width counts
 
 
 def test_a_run_writes_the_correction_and_continues(tmp_path: Path) -> None:
@@ -197,7 +238,7 @@ def test_a_run_writes_the_correction_and_continues(tmp_path: Path) -> None:
 
 def test_a_second_correction_is_refused() -> None:
     model = AnalyticModel([Gravity(), Drag(), Magnus(), AirCorrection()])
-    set_doubts(model, [[0.1] * len(FUNCTIONS)] * 2 * DOUBTS)
+    set_doubts(model, [[0.1] * len(FUNCTIONS)] * 2 * len(FUNCTIONS))
     with pytest.raises(ValueError, match=r"must not have flight\.air_correction yet"):
         with_correction(model, [], labelled=True)
     with pytest.raises(ValueError, match="every one failed"):
