@@ -38,6 +38,9 @@ EXCHANGED: Final = 4
 """Candidates at an end of a chosen stroke that are exchanged for others."""
 TOGETHER: Final = 16
 """Flights that a process follows in turn."""
+BESIDE: Final = 30
+"""Flights of which strokes are grown where no hit joins a stroke to the next one: a hit's place tells of many flights
+those that may go on from it."""
 ROUNDS: Final = 6
 """Of exchanges in a sequence, until nothing improves."""
 
@@ -51,9 +54,8 @@ class Chosen:
     joined: tuple[bool, ...]
 
 
-def hypotheses(grower: Grower, seeds: Sequence[Index], watch: Watch = unwatched) -> list[Stroke]:
-    """The strokes that grow from arcs, highest scores first; of those with the same candidates only the best."""
-    flights = [grower.flown(rows, ()) for rows in seeds]
+def hypotheses(grower: Grower, flights: Sequence[Stroke], watch: Watch = unwatched) -> list[Stroke]:
+    """The strokes that grow from flights, highest scores first; of those with the same candidates only the best."""
     found = dict[tuple[int, ...], Stroke]()
     # a swaying shoe is no flight, however smooth; an arc through a bounce becomes one with its bounce
     alone = _best_in_each(grower, flights, KEPT, 1, grower.plausible)
@@ -68,21 +70,46 @@ def hypotheses(grower: Grower, seeds: Sequence[Index], watch: Watch = unwatched)
     return _best_in_each(grower, sorted(found.values(), key=lambda one: -one.score), COMPARED)
 
 
-def rally(grower: Grower, seeds: Sequence[Index], watch: Watch = unwatched) -> Chosen:
-    """The likeliest strokes of a rally, after exchanges of candidates and bounces in which nothing improves it."""
-    known = {_key(stroke): stroke for stroke in hypotheses(grower, seeds, watch)}
-    done, hits = set[tuple[int, ...]](), Hits(grower)
+def rally(grower: Grower, seeds: Sequence[Index], earlier: Sequence[Stroke] = (), watch: Watch = unwatched) -> Chosen:
+    """The likeliest strokes of a rally, after exchanges of candidates and bounces in which nothing improves it.
+
+    Args: seeds: arcs.  earlier: strokes that may be among them, from a search with other probabilities.
+    """
+    flights = grower.flights(seeds)
+    rated = [grower.flown(stroke.rows, stroke.bounces) for stroke in earlier]
+    known = {_key(stroke): stroke for stroke in (*rated, *hypotheses(grower, flights, watch))}
+    done, followed, hits = set[tuple[int, ...]](), set[tuple[tuple[int, ...], int]](), Hits(grower)
     for _ in range(ROUNDS):
         chosen = best_sequence(grower, hits, list(known.values()))
         fresh = [stroke for stroke in chosen.strokes if _key(stroke) not in done]
         done.update(map(_key, fresh))
-        for some in in_parts(partial(_exchanged, grower), fresh, 1):
-            for better in some:
-                old = known.get(_key(better))
-                known[_key(better)] = better if old is None or better.score > old.score else old
-        if not fresh:
+        ends = [(stroke, way) for stroke, way in _open_ends(chosen) if (_key(stroke), way) not in followed]
+        followed.update((_key(stroke), way) for stroke, way in ends)
+        beside = {id(one): one for end in ends for one in _beside(hits, flights, *end)}
+        found = [*in_parts(partial(_exchanged, grower), fresh, 1)]
+        found += in_parts(partial(_variants, grower), list(beside.values()), TOGETHER)
+        for better in (one for some in found for one in some):
+            old = known.get(_key(better))
+            if (old is None or better.score > old.score) and grower.plausible(better):
+                known[_key(better)] = better
+        if not fresh and not ends:
             break
     return best_sequence(grower, hits, list(known.values()))
+
+
+def _open_ends(chosen: Chosen) -> list[tuple[Stroke, int]]:
+    """The strokes that no hit joins to a later one (way 1) or to an earlier one (-1): there one may be missing."""
+    joined = (*chosen.joined, False)
+    last = [(stroke, 1) for stroke, on in zip(chosen.strokes, joined[1:], strict=True) if not on]
+    return last + [(stroke, -1) for stroke, on in zip(chosen.strokes, joined[:-1], strict=True) if not on]
+
+
+def _beside(hits: Hits, flights: Sequence[Stroke], stroke: Stroke, way: int) -> list[Stroke]:
+    """The flights that most likely follow a stroke (way 1), or that it follows (-1), best first."""
+    links = hits.between([stroke], flights)[0] if way > 0 else hits.between(flights, [stroke])[:, 0]
+    rated = np.array([flight.score for flight in flights]) + links
+    order = np.argsort(-rated, kind="stable")[:BESIDE]
+    return [flights[number] for number in order if np.isfinite(rated[number])]
 
 
 def _key(stroke: Stroke) -> tuple[int, ...]:
@@ -94,13 +121,13 @@ def _exchanged(grower: Grower, stroke: Stroke) -> list[Stroke]:
     """Better strokes than one, that have a bounce more or other candidates at an end."""
     parts = [stroke, *grower.shortened(stroke, EXCHANGED)]
     tried = [bounced for part in parts for way in (1, -1) for bounced in _bounced(grower, part, way)]
-    tried += [grower.timed(grower.grown(grower.grown(part, 1), -1)) for part in parts]
+    tried += [grower.timed(one) for part in parts for one in grower.whole(part)]
     return [one for one in tried if one.score > stroke.score + GAINED and grower.plausible(one)]
 
 
 def _variants(grower: Grower, flight: Stroke) -> list[Stroke]:
     """A flight without bounce, with one after or before it, and with one after and one before it."""
-    found = [grower.grown(grower.grown(flight, 1), -1)]
+    found = grower.whole(flight)
     for way in (1, -1):
         for stroke in _bounced(grower, flight, way):
             found.append(stroke)
@@ -109,11 +136,11 @@ def _variants(grower: Grower, flight: Stroke) -> list[Stroke]:
 
 
 def _bounced(grower: Grower, flight: Stroke, way: int) -> list[Stroke]:
-    """The best stroke with one more bounce, if there is any."""
+    """The best strokes with one more bounce, if there are any."""
     if len(flight.bounces) == MOST_BOUNCES:
         return []
     best = max(grower.bounced(flight, way), key=lambda one: one.score, default=None)
-    return [] if best is None else [grower.grown(grower.grown(grower.timed(best), way), -way)]
+    return [] if best is None else grower.whole(grower.timed(best))
 
 
 def _best_in_each(
@@ -153,9 +180,10 @@ def best_sequence(grower: Grower, hits: Hits, strokes: Sequence[Stroke]) -> Chos
     score = np.array([one.score for one in ordered])
     begins = np.where([one.path.bounces > 0 for one in ordered], -BEGINS, -np.inf)  # else it may be anything
     later = first > last[:, None]
-    link = np.where(later, np.maximum(begins, hits.between(ordered)), -np.inf)
+    link = np.where(later, np.maximum(begins, hits.between(ordered, ordered)), -np.inf)
     soon = grower.field.stamps[first] - grower.field.stamps[last][:, None] < PAUSE
-    link -= SERVED * (soon & np.array([one.path.bounces == MOST_BOUNCES for one in ordered]))
+    bounces = np.array([one.path.bounces for one in ordered])
+    link -= SERVED * (soon & (bounces == MOST_BOUNCES) & (bounces > 0)[:, None])  # a toss before it is no stroke
     best, before = score + begins, np.full(count, -1)
     forward, backward = score + begins, np.zeros(count)
     for j in range(count):
