@@ -85,6 +85,12 @@ def black() -> list[Image]:
     return [np.zeros((SIZE[1], SIZE[0], 3), dtype=np.uint8)] * 12
 
 
+def near() -> list[Image]:
+    """A close-up of a player's end: the other half of the table is beyond the picture."""
+    rng, camera = np.random.default_rng(11), looking((1.5, -5.0, 1.5), (1.8, 0.0, 0.1), 1800.0)
+    return [picture(one, rng) for one in panned(camera, 12, 0.01, 0.0)]
+
+
 def hall() -> list[Image]:
     """Bright shapes that move a little, without a table."""
     rng = np.random.default_rng(9)
@@ -98,10 +104,11 @@ def hall() -> list[Image]:
         (black, "must show the whole court"),
         (turned, "must show the whole court"),
         (hall, "must show the whole court"),
+        (near, "must show the whole court"),
         (lambda: scenes(5), "10 pictures in a row"),
         (lambda: scenes(14), "must show strokes of a ball"),
     ],
-    ids=["black", "turned", "no table", "five pictures", "no ball"],
+    ids=["black", "turned", "no table", "close-up", "five pictures", "no ball"],
 )
 def test_a_video_without_a_rally_is_refused_in_one_line_and_nothing_is_written(
     images: Callable[[], Sequence[Image]], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
