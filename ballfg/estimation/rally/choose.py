@@ -54,13 +54,17 @@ class Chosen:
     joined: tuple[bool, ...]
 
 
+def promising(grower: Grower, flights: Sequence[Stroke]) -> list[Stroke]:
+    """The flights with the highest scores, and among those that a ball in play could have."""
+    # a swaying shoe is no flight, however smooth; an arc through a bounce becomes one with its bounce
+    alone = _best_in_each(grower, flights, KEPT, 1, grower.plausible)
+    return list({id(one): one for one in (*_best_in_each(grower, flights, KEPT, 1), *alone)}.values())
+
+
 def hypotheses(grower: Grower, flights: Sequence[Stroke], watch: Watch = unwatched) -> list[Stroke]:
     """The strokes that grow from flights, highest scores first; of those with the same candidates only the best."""
     found = dict[tuple[int, ...], Stroke]()
-    # a swaying shoe is no flight, however smooth; an arc through a bounce becomes one with its bounce
-    alone = _best_in_each(grower, flights, KEPT, 1, grower.plausible)
-    chosen = list({id(one): one for one in (*_best_in_each(grower, flights, KEPT, 1), *alone)}.values())
-    grown = watch(in_parts(partial(_variants, grower), chosen, TOGETHER), len(chosen), "possible flights followed")
+    grown = watch(in_parts(partial(_variants, grower), flights, TOGETHER), len(flights), "possible flights followed")
     whole = [one for some in grown for one in some]
     likely = _best_in_each(grower, list({_key(one): one for one in whole}.values()), COMPARED)
     for stroke in (*whole, *(part for one in likely for part in grower.shortened(one))):
@@ -77,22 +81,23 @@ def rally(grower: Grower, seeds: Sequence[Index], earlier: Sequence[Stroke] = ()
     """
     flights = grower.flights(seeds)
     rated = [grower.flown(stroke.rows, stroke.bounces) for stroke in earlier]
-    known = {_key(stroke): stroke for stroke in (*rated, *hypotheses(grower, flights, watch))}
-    done, followed, hits = set[tuple[int, ...]](), set[tuple[tuple[int, ...], int]](), Hits(grower)
+    begun = promising(grower, flights)
+    known = {_key(stroke): stroke for stroke in (*rated, *hypotheses(grower, begun, watch))}
+    done, followed, hits = set[tuple[int, ...]](), {id(flight) for flight in begun}, Hits(grower)
     for _ in range(ROUNDS):
         chosen = best_sequence(grower, hits, list(known.values()))
         fresh = [stroke for stroke in chosen.strokes if _key(stroke) not in done]
         done.update(map(_key, fresh))
-        ends = [(stroke, way) for stroke, way in _open_ends(chosen) if (_key(stroke), way) not in followed]
-        followed.update((_key(stroke), way) for stroke, way in ends)
-        beside = {id(one): one for end in ends for one in _beside(hits, flights, *end)}
+        beside = {id(one): one for end in _open_ends(chosen) for one in _beside(hits, flights, *end)}
+        new = [one for name, one in beside.items() if name not in followed]
+        followed.update(beside)
         found = [*in_parts(partial(_exchanged, grower), fresh, 1)]
-        found += in_parts(partial(_variants, grower), list(beside.values()), TOGETHER)
+        found += in_parts(partial(_variants, grower), new, TOGETHER)
         for better in (one for some in found for one in some):
             old = known.get(_key(better))
             if (old is None or better.score > old.score) and grower.plausible(better):
                 known[_key(better)] = better
-        if not fresh and not ends:
+        if not fresh and not new:
             break
     return best_sequence(grower, hits, list(known.values()))
 
@@ -139,7 +144,7 @@ def _bounced(grower: Grower, flight: Stroke, way: int) -> list[Stroke]:
     """The best strokes with one more bounce, if there are any."""
     if len(flight.bounces) == MOST_BOUNCES:
         return []
-    best = max(grower.bounced(flight, way), key=lambda one: one.score, default=None)
+    best = max(grower.bounced(flight, way), key=lambda one: (grower.plausible(one), one.score), default=None)
     return [] if best is None else grower.whole(grower.timed(best))
 
 

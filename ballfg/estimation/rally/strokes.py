@@ -203,15 +203,15 @@ class Grower:
     def grown(self, stroke: Stroke, way: int) -> list[Stroke]:
         """The stroke with further candidates after it (way 1) or before it (-1): as long as they make it likelier.
 
-        A second one goes on with candidates that are likelier than a picture without the ball, to where it is best: few
-        candidates leave a path so wide that one more hardly counts, but the next ones do.
+        A second one goes on with doubtful candidates, to where it is best: few candidates leave a path so wide that one
+        more hardly counts, but the next ones do. The less often the ball is seen, the more doubt is allowed.
         """
         missed, frame = 0, int(self.field.frame[stroke.rows[-1 if way > 0 else 0]])
         careful, best, doubtful = stroke, stroke, False
         most = max(MISSED, int(np.log(RARE) / np.log(1.0 - self.field.seen)))
         while missed <= most and 0 <= (frame := frame + way) < len(self.field.first) - 1:
             missed, more = missed + 1, self._with(stroke, self.field.rows(frame))
-            if more is None or more.score <= stroke.score + missed * np.log(1.0 - self.field.seen):
+            if more is None or more.score <= stroke.score + missed * np.log(self.field.seen):
                 continue
             doubtful |= more.score <= stroke.score
             missed, stroke = 0, more
