@@ -4,7 +4,6 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.flight import put_all
 from ballfg.dynamics.compiled.signatures import COUNT, NOTHING, ONE, REAL, THREE, TWO
 from ballfg.factors.linear.elimination import ROOT, Root
 
@@ -84,6 +83,28 @@ def _part(rows: Array, first: int, scale: float, part: Array) -> None:
             part[a, b] = scale * rows[a, first + b]
 
 
+@machine_code(NOTHING(TWO, TWO, TWO))
+def _multiply(left: Array, right: Array, product: Array) -> None:
+    """The product (a, b) of small (a, m) and (m, b): BLAS is no quicker, and takes the import of scipy.linalg."""
+    for i in range(left.shape[0]):
+        for j in range(right.shape[1]):
+            product[i, j] = 0.0
+        for k in range(left.shape[1]):
+            for j in range(right.shape[1]):
+                product[i, j] += left[i, k] * right[k, j]
+
+
+@machine_code(NOTHING(TWO, TWO, TWO))
+def _multiply_turned(left: Array, right: Array, product: Array) -> None:
+    """`_multiply` of (a, m) and the transpose of (b, m)."""
+    for i in range(left.shape[0]):
+        for j in range(right.shape[0]):
+            total = 0.0
+            for k in range(left.shape[1]):
+                total += left[i, k] * right[j, k]
+            product[i, j] = total
+
+
 @machine_code(NOTHING(ROOT, THREE, THREE, TWO))
 def covariances_of(triangle: Root, states: Array, cross: Array, coefficients: Array) -> None:
     """Blocks of (R^T R)^-1, from the last state back to the first.
@@ -102,9 +123,10 @@ def covariances_of(triangle: Root, states: Array, cross: Array, coefficients: Ar
         own, shared = np.empty((p, p)), np.empty((p, p))
         _part(last, 2 * w, 1.0, shared)
         invert(shared, own)
-        coefficients[:] = np.dot(own, own.T)
+        _multiply_turned(own, own, coefficients)
     later, inverse = np.zeros((w + p, w + p)), np.empty((w, w))
-    upper, coupling = np.empty((w, w)), np.empty((w, w + p))
+    upper, coupling, gain = np.empty((w, w)), np.empty((w, w + p)), np.empty((w, w + p))
+    own_part, later_part = np.empty((w, w)), np.empty((w, w))
     for a in range(p):
         for b in range(p):
             later[w + a, w + b] = coefficients[a, b]
@@ -112,9 +134,10 @@ def covariances_of(triangle: Root, states: Array, cross: Array, coefficients: Ar
         _part(root[i], 0, 1.0, upper)
         _part(root[i], w, -1.0, coupling)
         invert(upper, inverse)
-        gain = np.dot(inverse, coupling)
-        put_all(cross[i], np.dot(gain, later))
-        own_part, later_part = np.dot(inverse, inverse.T), np.dot(cross[i], gain.T)
+        _multiply(inverse, coupling, gain)
+        _multiply(gain, later, cross[i])
+        _multiply_turned(inverse, inverse, own_part)
+        _multiply_turned(cross[i], gain, later_part)
         for a in range(w):
             for b in range(w):
                 states[i, a, b] = later[a, b] = own_part[a, b] + later_part[a, b]

@@ -7,24 +7,16 @@ approximation.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy import linalg, optimize
 
 from ballfg.arrays import Array, Index, Mask
 from ballfg.diagnosis.evidence.rows import Rows
 from ballfg.diagnosis.fit.problem import LABEL_LOSS, POSITION_LOSS
 from ballfg.diagnosis.fit.system import by_track
 from ballfg.state import STATE_DIM
-
-LEAST, MOST = -5.0, 5.0
-"""Bounds of the logarithm of a size over its unit."""
-MOST_STEPS, TOLERANCE = 30, 1e-6
-MOST_ROUNDS, SETTLED = 12, 0.1
-"""Largest number of turns of robust weights and sizes, and the step of every size, in its errors, that ends them."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +25,7 @@ class Noise:
 
     white: float = 0.0
     spin: float = 0.0
-    random: tuple[float, ...] = (-1.0, -1.0, -1.0, -1.5)
+    random: tuple[float, ...] = (-4.0,) * 4
 
     @property
     def vector(self) -> Array:
@@ -93,6 +85,16 @@ class Posterior:
     mean: Array
     covariance: Array
 
+    def gain(self, own: int | None = None) -> float:
+        """Gain in the logarithm of the density by the step of the first `own` unknowns to their mean; None: of all."""
+        return 0.5 * float(self.mean[:own] @ np.linalg.solve(self.covariance[:own, :own], self.mean[:own]))
+
+    def held(self, own: int | None = None) -> Posterior:
+        """The same with the density of the tracks where the first `own` unknowns are, and the others follow them."""
+        gain, follow = self.gain(own), self.covariance[:, :own] @ np.linalg.inv(self.covariance[:own, :own])
+        mean = self.mean - follow @ self.mean[:own]
+        return Posterior(self.evidence - gain, self.square + 2.0 * gain, mean, self.covariance)
+
 
 @dataclass(frozen=True)
 class Likelihood:
@@ -136,44 +138,20 @@ class Likelihood:
         return total, -count * noise.white - 3.0 * noise.spin - sizes.sum(axis=1)
 
     def reduced(self, noise: Noise) -> tuple[Reduced, Local]:
-        """First states and random motion integrated out."""
+        """First states and random motion integrated out; stretches that leave all numbers have no density."""
         total, logs = self.inner(noise)
         end = STATE_DIM + self.rows.motion.kinds.shape[1]
+        largest = np.diagonal(total, axis1=1, axis2=2).max(axis=1)
+        lost = ~(largest * np.finfo(np.float64).eps < 1.0)  # rounding alone is a unit of evidence
+        total[lost] = np.eye(total.shape[-1])
         gram, kept = total[:, end:, end:].copy(), np.arange(end, total.shape[-1])
         # its triangle below the eliminated rows is the same whatever these hold; large, they stay definite
         total[:, kept, kept] += 1.0 + total[:, kept, kept]
         triangle = np.asarray(np.linalg.cholesky(total), dtype=np.float64)
         lower, solved = triangle[:, :end, :end], triangle[:, end:, :end]
         narrow = np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)
-        constant = logs + self.rows.volume - narrow - self.penalty
+        constant = np.where(lost, -np.inf, logs + self.rows.volume - narrow - self.penalty)
         return Reduced(constant, gram - solved @ solved.swapaxes(1, 2)), Local(lower, solved)
-
-    def slope(self, noise: Noise, local: Local, found: Posterior, precision: Array, away: Array) -> Array:
-        """(6,) derivative of the evidence by the logarithms of the sizes: expected squares less their number.
-
-        The expected squares over their variances of all rows and priors add up to the square at the mean plus one for
-        each unknown, so that those of the samples follow from the others.
-        """
-        kinds = self.rows.motion.kinds
-        end = STATE_DIM + kinds.shape[1]
-        upper = inverses(local.lower)
-        solved = upper @ local.solved.swapaxes(1, 2)  # (n, l, c + 1), what local unknowns absorb of each column
-        step, root = np.append(-found.mean, 1.0), np.linalg.cholesky(found.covariance)
-        mean, moved = solved @ step, solved[..., :-1] @ root
-        squares = mean**2 + (upper**2).sum(axis=-1) + (moved**2).sum(axis=-1)
-        own = [squares[:, STATE_DIM:][kinds == kind] for kind in range(len(noise.random))]
-        shown = [float(o.sum()) * np.exp(-2.0 * log) for o, log in zip(own, noise.random, strict=True)]
-        spins = self.spin_columns
-        left = spins[..., end:] @ step - (spins[..., :end] @ mean[..., None])[..., 0]
-        scattered = (spins[..., end:-1] - spins[..., :end] @ solved[..., :-1]) @ root
-        square = (left**2).sum() + (scattered**2).sum() + ((spins[..., :end] @ upper) ** 2).sum()
-        spin = float(square) * np.exp(-2.0 * noise.spin)
-        prior = float(precision @ ((away - found.mean) ** 2 + np.diagonal(found.covariance)))
-        of_samples, of_spins = (np.diagonal(gram, axis1=1, axis2=2)[:, :STATE_DIM] for gram in self.grams)
-        unseen = int((of_samples + of_spins == 0.0).sum()) + int((kinds < 0).sum())  # `inner` gives them a prior
-        unknowns = mean.shape[0] * end - unseen + len(found.mean)
-        white = found.square + float(unknowns) - sum(shown) - spin - prior
-        return np.array([white, spin, *shown]) - self.rows.counts
 
     def local_step(self, noise: Noise, common: Array) -> Array:
         """(n, l) first states and random motion that follow a step (c,) of the common unknowns."""
@@ -182,12 +160,25 @@ class Likelihood:
         right = total[:, :end, -1] - total[:, :end, end:-1] @ common
         return np.asarray(np.linalg.solve(total[:, :end, :end], right[..., None])[..., 0])
 
-    def reweighted(self, noise: Noise, common: Array) -> Likelihood:
-        """With the robust weights of the residual that remains beside the motion; common: (c,) step of the unknowns."""
-        r, motion = self.rows, self.local_step(noise, common)
-        columns = np.concatenate((r.by_start, r.motion.columns), axis=-1)
-        left = r.residual - r.by_common @ common - (columns @ motion[..., None])[..., 0]
+    def reweighted(self, noise: Noise) -> Likelihood:
+        """With the robust weights of the residual that remains beside the motion, all common unknowns as they are."""
+        common = np.zeros(self.rows.by_common.shape[-1])
+        motion = self.local_step(noise, common)
+        kept = np.broadcast_to(np.append(common, 1.0), (len(motion), len(common) + 1))
+        return self.beside(np.concatenate((-motion, kept), axis=1), noise)
+
+    def beside(self, along: Array, noise: Noise) -> Likelihood:
+        """With the robust weights of a residual, the sum of columns by factors (n, d)."""
+        r, end = self.rows, STATE_DIM + self.rows.motion.kinds.shape[1]
+        start, random, common = along[:, :STATE_DIM], along[:, STATE_DIM:end], along[:, end:-1]
+        left = r.residual + (r.by_start @ start[..., None] + r.motion.columns @ random[..., None])[..., 0]
+        left += (r.by_common @ common[..., None])[..., 0]
         return weighted(r, left / np.exp(noise.white), left[:, -3:] / np.exp(noise.spin))
+
+
+def unweighted(rows: Rows) -> Likelihood:
+    """The likelihood with robust weights of one."""
+    return weighted(rows, np.zeros_like(rows.residual), np.zeros((len(rows.residual), 3)))
 
 
 def weighted(rows: Rows, left: Array, spins: Array) -> Likelihood:
@@ -237,63 +228,3 @@ def held_out(tracks: Reduced, precision: Array, away: Array, halves: Mask) -> Ar
         more = Reduced(others.constant + tracks.constant[own], others.gram + tracks.gram[own])
         found[own] = evidences(more, precision, away) - evidences(others, precision, away)
     return found
-
-
-def settled(
-    rows: Rows, precision: Array, away: Array, starts: Sequence[Noise | None] = (None,)
-) -> tuple[Likelihood, Noise]:
-    """The likelihood with the robust weights and sizes of noise that maximise the evidence.
-
-    It has several maxima: noise that a wrong model needed can keep a right one from showing that it needs none.
-
-    Args:
-        precision, away: as in `posterior`.
-        starts: noise of similar models, or None for the usual noise; the best after one turn goes on.
-    """
-
-    def evidence(end: tuple[Likelihood, Noise]) -> float:
-        return posterior(end[0].reduced(end[1])[0], precision, away).evidence
-
-    plain, none = (
-        weighted(rows, np.zeros_like(rows.residual), np.zeros((len(rows.residual), 3))),
-        np.zeros(len(precision)),
-    )
-    begun = [(plain.reweighted(start, none) if start else plain, start or Noise()) for start in starts]
-    turns = [_turned(*one, precision, away) for one in begun]
-    likelihood, now = max(turns, key=evidence) if len(turns) > 1 else turns[0]
-    for _ in range(1, MOST_ROUNDS):
-        before = now
-        likelihood, now = _turned(likelihood, before, precision, away)
-        if (np.abs(now.vector - before.vector) * _units(rows)).max() < SETTLED:
-            break
-    return likelihood, now
-
-
-def _turned(likelihood: Likelihood, noise: Noise, precision: Array, away: Array) -> tuple[Likelihood, Noise]:
-    """The sizes of noise that maximise the evidence at the present weights, then the weights beside these sizes."""
-    unit = _units(likelihood.rows)
-
-    def missing(scaled: Array) -> tuple[float, Array]:
-        noise = Noise.of(scaled / unit)
-        reduced, local = likelihood.reduced(noise)
-        found = posterior(reduced, precision, away)
-        return -found.evidence, -likelihood.slope(noise, local, found, precision, away) / unit
-
-    options = {"maxiter": MOST_STEPS, "ftol": TOLERANCE}
-    bounds = optimize.Bounds(LEAST * unit, MOST * unit)
-    best = optimize.minimize(missing, noise.vector * unit, method="L-BFGS-B", jac=True, bounds=bounds, options=options)
-    found = Noise.of(best.x / unit)
-    return likelihood.reweighted(found, posterior(likelihood.reduced(found)[0], precision, away).mean), found
-
-
-def _units(rows: Rows) -> Array:
-    """(6,) inverse errors of the logarithms of the sizes, as if all that they scale were known.
-
-    In these units their maximum is found in a third of the steps.
-    """
-    return np.sqrt(2.0 * np.maximum(rows.counts, 1.0))
-
-
-def inverses(lower: Array) -> Array:
-    """(n, l, l) transposed inverses of triangles (n, l, l)."""
-    return np.stack([linalg.lapack.dtrtri(one.T)[0] for one in lower])

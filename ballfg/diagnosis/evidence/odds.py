@@ -78,6 +78,8 @@ def scores_of(models: Sequence[Weighed]) -> dict[frozenset[str], float]:
     absent, the linearisation with them holds the model without (J. M. Dickey, 1971), and the better of both counts.
     Models that no refit weighed count as foretold, and lose what those lose whose linearisations foretell them.
     """
+    lost = {model.names: -np.inf for model in models if not np.isfinite(model.evidence)}
+    models = [model for model in models if np.isfinite(model.evidence)]
     weighed = {model.names: model.weight for model in models}
     for model in models:
         for names, weight in model.nested.items():
@@ -88,10 +90,10 @@ def scores_of(models: Sequence[Weighed]) -> dict[frozenset[str], float]:
     for model in models:
         for names, weight in (*model.nested.items(), *model.neighbours.items()):
             if names not in scores:
-                lost = scores[model.names] + weight.score - model.score
-                score = min(lost, tempered(names, weight, weighed) + weight.odds)
+                less = scores[model.names] + weight.score - model.score
+                score = min(less, tempered(names, weight, weighed) + weight.odds)
                 foretold[names] = max(score, foretold.get(names, -np.inf))
-    return scores | foretold
+    return lost | scores | foretold
 
 
 def tempered(names: frozenset[str], weight: Weight, others: Mapping[frozenset[str], Weight]) -> float:

@@ -19,7 +19,7 @@ from ballfg.arrays import Array, Index, Mask
 from ballfg.diagnosis.fit.free_motion import ACCELERATION, CONTACT_SPIN, CONTACT_VELOCITY, free_motion
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.stretches import of_similar_length
-from ballfg.state import SPIN
+from ballfg.state import SPIN, STATE_DIM
 
 ACCELERATIONS, VELOCITIES, SPINS, COEFFICIENTS = range(4)
 """Kinds of random columns; each kind has one size for all tracks."""
@@ -72,15 +72,17 @@ class Rows:
 
     @cached_property
     def volume(self) -> Array:
-        """(n,) half the log determinant of the information on first places and velocities, at the stated noise.
+        """(n,) half the log determinant of the information on what has no prior of its own, at the stated noise.
 
-        It is the density of their prior: they are uniform in what the samples show of them (H. Jeffreys, "An invariant
-        form for the prior probability in estimation problems", Proc. R. Soc. A 186, 1946). Uniform in metres per
-        second, a slower clock would be more probable than less gravity, which samples alone cannot tell from it, by
-        the cube of its rate for each track. Spins have a prior of their own.
+        It is the density of their prior: first places and velocities are uniform in what the samples show of them, and
+        labelled spins in what labels and samples show (H. Jeffreys, "An invariant form for the prior probability in
+        estimation problems", Proc. R. Soc. A 186, 1946). Uniform in metres per second, a slower clock would be more
+        probable than less gravity, which samples alone cannot tell from it, by the cube of its rate for each track; and
+        uniform in radians per second, labels would be the more probable the smaller their scale. Spins without labels
+        have a prior.
         """
-        shown = self.by_start[:, :-3, : SPIN.start]
-        information, diagonal = shown.swapaxes(1, 2) @ shown, np.arange(SPIN.start)
+        information, diagonal = self.by_start.swapaxes(1, 2) @ self.by_start, np.arange(STATE_DIM)
+        information[~self.labelled, SPIN], information[~self.labelled, :, SPIN] = 0.0, 0.0
         information[:, diagonal, diagonal] += information[:, diagonal, diagonal] == 0.0
         return np.asarray(0.5 * np.linalg.slogdet(information)[1])
 

@@ -10,11 +10,13 @@ import numpy as np
 
 from ballfg.arrays import Array, Mask
 from ballfg.diagnosis.evidence.halves import unlike_halves
-from ballfg.diagnosis.evidence.likelihood import Noise, Reduced, held_out, posterior, settled, weighted
+from ballfg.diagnosis.evidence.likelihood import Noise, Reduced, held_out, posterior, unweighted
 from ballfg.diagnosis.evidence.nameless import NAMELESS, Patterns
 from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, log_odds, within
 from ballfg.diagnosis.evidence.priors_of_fit import Priors
 from ballfg.diagnosis.evidence.rows import Motion, Rows, random_motion, rows_of
+from ballfg.diagnosis.evidence.sizes import settled
+from ballfg.diagnosis.fit.fit import with_guesses
 from ballfg.diagnosis.fit.problem import Fit, Unknowns
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.state import STATE_DIM
@@ -149,11 +151,17 @@ def weighed(
         start: noise of a similar model.
         nameless: with patterns without a name beside the effects.
     """
-    question = _Question(named, motion, halves, nameless)
+    with np.errstate(invalid="ignore"):  # differences of models without a density: they lose to all others
+        return _followed(_Question(named, motion, halves, nameless), fit, start)
+
+
+def _followed(question: _Question, fit: Fit, start: Noise | None) -> Weighed:
+    """The model at the most probable unknowns near a fit."""
     point = question.point(fit)
     found, step = question.at(point, (start, None) if start else (None,))
     for number in range(MOST_STEPS):
-        if step.gain < WORTH_A_STEP and (number or not nameless):  # noise and widths of patterns need a second turn
+        second = number == 0 and question.nameless  # noise and widths of patterns need a second turn
+        if step.gain < WORTH_A_STEP and not second:
             break
         moved = question.moved(point, found, step)
         if moved is None:
@@ -185,11 +193,6 @@ class Step:
         return Unknowns(unknowns.starts + share * self.starts, values, launcher)
 
 
-def foretold_gain(step: Array, covariance: Array) -> float:
-    """Gain in the logarithm of a normal density by a step (c,) to its mean; covariance: (c, c)."""
-    return 0.5 * float(step @ np.linalg.solve(covariance, step))
-
-
 @dataclass(frozen=True)
 class _Point:
     """A fit with its rows, beside patterns without a name if the question has them, and the priors there."""
@@ -215,6 +218,7 @@ class _Question:
 
     def point(self, fit: Fit) -> _Point:
         """The rows of a fit and the priors at its unknowns."""
+        fit = with_guesses(fit)
         rows, patterns = rows_of(fit, self.motion), Patterns.of(fit) if self.nameless else None
         beside = rows if patterns is None else patterns.beside(rows)
         return _Point(fit, beside, Priors.of(fit, self.named, patterns))
@@ -230,7 +234,7 @@ class _Question:
         own, effects = point.own, [h for h in self.named if h.strengths]
         of_patterns = list(widths[len(effects) :]) or [0] * (len(priors.places) - len(effects))
         first = priors.precision([len(WIDTHS) - 1] * len(effects) + of_patterns)
-        likelihood, noise = settled(rows, first, priors.away, starts)
+        likelihood, noise = settled(rows, first, priors.away, starts, own)
         total = likelihood.reduced(noise)[0].by_track(rows.track)
         whole = total.of(np.full(len(self.halves), True))
         best, mixed = priors.widths(whole)
@@ -242,8 +246,7 @@ class _Question:
             centre = values[place] + priors.away[place]
             mixed[number] += within(hypothesis, centre, found.mean, sigmas, WIDTHS[best[number]])
             strengths[hypothesis.name] = found
-        away, spread = result.mean[:own], result.covariance[:own, :own]
-        gain = foretold_gain(away, spread)
+        gain = result.gain(own)
         weighed = Weighed(
             tuple(self.named),
             replace(fit),  # without what can be computed again: a search keeps dozens of models
@@ -258,7 +261,7 @@ class _Question:
             self.nameless,
             self._nested(priors, total, best, mixed),
         )
-        return weighed, Step(likelihood.local_step(noise, result.mean)[:, :STATE_DIM], away, gain)
+        return weighed, Step(likelihood.local_step(noise, result.mean)[:, :STATE_DIM], result.mean[:own], gain)
 
     def moved(self, point: _Point, model: Weighed, step: Step) -> _Point | None:
         """The point after the share of a step that leads to the most probable unknowns; None if all are less probable.
@@ -271,8 +274,11 @@ class _Question:
             unknowns = step.taken(point.fit, share)
             if np.isfinite(unknowns.starts).all():
                 fit = Fit.at(point.fit.problem, unknowns, point.fit.noise, point.fit.steps)
-                if np.isfinite(fit.cost) and (density := self._density(after := self.point(fit), model)) > most:
+                density = self._density(after := self.point(fit), model) if np.isfinite(fit.cost) else -np.inf
+                if density > most:
                     best, most = after, density
+                elif best is not None:
+                    break
             if most > before + step.gain - WORTH_A_STEP:  # as foretold
                 break
         return best
@@ -282,11 +288,9 @@ class _Question:
 
         The evidence is what it would be at the end of the step from there, if that were linear.
         """
-        rows, none = point.rows, np.zeros(point.rows.by_common.shape[-1])
-        plain = weighted(rows, np.zeros_like(rows.residual), np.zeros((len(rows.residual), 3)))
-        reduced, _ = plain.reweighted(model.noise, none).reduced(model.noise)
+        reduced, _ = unweighted(point.rows).reweighted(model.noise).reduced(model.noise)
         found, own = point.priors.posterior(reduced, model.widths), point.own
-        return found.evidence - foretold_gain(found.mean[:own], found.covariance[:own, :own])
+        return found.evidence - found.gain(own)
 
     def _nested(
         self, priors: Priors, tracks: Reduced, widths: Sequence[int], mixed: Sequence[float]

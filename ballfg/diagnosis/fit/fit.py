@@ -138,10 +138,7 @@ def covariance_of(fit: Fit, names: Sequence[str]) -> Array:
 def _minimise(now: Fit, steps: int = MOST_STEPS) -> Fit:
     damping = FIRST_DAMPING
     for _ in range(steps if np.isfinite(now.cost) else 0):
-        stretches, found = now.problem.stretches, torch.from_numpy(now.predicted.contacts)
-        guesses = torch.where(found.isnan(), stretches.contacts, found)
-        problem = replace(now.problem, stretches=replace(stretches, contacts=guesses))
-        now = replace(now, problem=problem, steps=now.steps + 1)
+        now = with_guesses(replace(now, steps=now.steps + 1))
         moved, damping = _step(now, damping)
         if moved is None:
             break
@@ -149,6 +146,13 @@ def _minimise(now: Fit, steps: int = MOST_STEPS) -> Fit:
         if gain < TOLERANCE * max(1.0, now.cost):
             break
     return now
+
+
+def with_guesses(now: Fit) -> Fit:
+    """The fit with its own contacts as first guesses of those that follow."""
+    stretches, found = now.problem.stretches, torch.from_numpy(now.predicted.contacts)
+    guesses = torch.where(found.isnan(), stretches.contacts, found)
+    return replace(now, problem=replace(now.problem, stretches=replace(stretches, contacts=guesses)))
 
 
 def _step(now: Fit, damping: float) -> tuple[Fit | None, float]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.signatures import COUNT, NOTHING, ONE
+from ballfg.dynamics.compiled.signatures import COUNT, NOTHING, ONE, TWO
 
 LEAST_FOR_BLAS: Final = 256
 """Multiplications from which on a call of BLAS is quicker than loops; ten times so for layers of 80."""
@@ -21,6 +21,22 @@ BITS, BIAS = np.int64(52), np.int64(1023 << 52)
 """Place of the exponent in a float64."""
 STEEP: Final = 0.625
 """Below, 1 - 2 / (exp(2x) + 1) would lose digits."""
+
+
+@machine_code(NOTHING(ONE, ONE, TWO))
+def _add_row(whole: Array, row: Array, matrix: Array) -> None:
+    """Add the product of a row (k,) and a matrix (k, n) to `whole` (n,); BLAS takes twice as long for one row."""
+    k, n = matrix.shape
+    fours = k - k % 4  # four rows at a time, since each pass reads and writes `whole`
+    for r in range(0, fours, 4):
+        a, b, c, d = row[r], row[r + 1], row[r + 2], row[r + 3]
+        one, two, three, four = matrix[r], matrix[r + 1], matrix[r + 2], matrix[r + 3]
+        for j in range(n):
+            whole[j] += a * one[j] + b * two[j] + c * three[j] + d * four[j]
+    for r in range(fours, k):
+        factor, last = row[r], matrix[r]
+        for j in range(n):
+            whole[j] += factor * last[j]
 
 
 @machine_code(NOTHING(ONE, COUNT, COUNT, *(ONE, *[COUNT] * 4) * 2, *[COUNT] * 4))
@@ -54,6 +70,10 @@ def add_product(
     """
     in_rows = left_column == 1 and (m == 1 or left_row == k)
     upright, turned = right_column == 1 and right_row == n, right_row == 1 and right_column == k
+    if in_rows and upright and m * count == 1:
+        matrix = right[right_at : right_at + k * n].reshape(k, n)
+        _add_row(whole[whole_at : whole_at + n], left[left_at : left_at + k], matrix)
+        return
     if not (in_rows and (upright or turned) and m * k * n * count >= LEAST_FOR_BLAS):
         for q in range(count):
             for i in range(m):

@@ -37,7 +37,7 @@ def _through(laws, x, level, h, world, after):
         remaining -= tau[0]
         put(after, at[0])
         glide(laws.rates, after, remaining, 1)
-        if at_rest(at[0], gap_of(laws.surface, at[0], level, world[2]), level, world):
+        if at_rest(laws.surface, at[0], level, world):
             return True
         if not (gap_of(laws.surface, after, level, world[2]) < 0.0 and after[5] < 0.0):
             return False
@@ -70,7 +70,7 @@ def roll_out(rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws, start, dura
                 if reached[r] <= j:
                     continue
                 level, laws = level_below(x[r, 2], world), laws_of_one(all_laws, r)
-                hard = at_rest(x[r], gap_of(laws.surface, x[r], level, world[2]), level, world)
+                hard = at_rest(laws.surface, x[r], level, world)
                 if not hard and after[r, 5] < 0.0 and gap_of(laws.surface, after[r], level, world[2]) < 0.0:
                     hard = _through(laws, x[r], level, step[r], world, after[r])
                 if hard:

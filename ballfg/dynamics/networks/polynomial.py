@@ -1,7 +1,7 @@
 """Expands an MNN of N steps to a polynomial of degree N + 1, with coefficients computed from the weights.
 
 For many states with few features that costs a small part of running the network, derivatives included: the coefficients
-need one pass through the wide hidden states, instead of one for each state. Derivation in docs/derivations/mnn.md.
+need one pass through the wide hidden states, instead of one for each state (docs/derivations/gram_schmidt.md).
 """
 
 import functools

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from ballfg.diagnosis.evidence.likelihood import Likelihood, Noise, posterior, settled
+from ballfg.diagnosis.evidence.likelihood import Likelihood, Noise, posterior
 from ballfg.diagnosis.evidence.rows import random_motion, rows_of
+from ballfg.diagnosis.evidence.sizes import settled, slopes_at
 from ballfg.state import STATE_DIM
 
 NOISE = Noise(0.1, 0.2, (-0.7, -1.1, -0.4, -1.2))
@@ -36,28 +37,37 @@ def prior(rows):
     return np.linspace(0.5, 2.0, count) * 10.0, np.linspace(-0.2, 0.3, count)
 
 
-def dense(likelihood, noise, precision, away):
-    """The density of all rows at once, its noise a full matrix, common unknowns random, first spins free.
+def dense_rows(likelihood, noise, precision, away):
+    """The residual of all rows at once, first states' columns, and what each size and the priors add to the variance.
 
-    Places and velocities have the density that makes them uniform in what the samples show.
+    Also a logarithm: places, velocities and labelled spins have the density of what samples and labels show of them.
     """
     rows, parts, logs = likelihood.rows, [], 0.0
-    sizes = np.exp(2.0 * np.append(noise.random, -np.inf))
     for i, used in enumerate(rows.used):
         kept = np.concatenate((np.repeat(used, 3), np.full(3, True)))
         weights = np.concatenate((np.repeat(likelihood.samples[i], 3), np.repeat(likelihood.spins[i], 3)))[kept]
-        white = np.concatenate((np.full(3 * used.sum(), np.exp(2 * noise.white)), np.full(3, np.exp(2 * noise.spin))))
-        motion = rows.motion.columns[i][kept] * np.sqrt(sizes[rows.motion.kinds[i]])
         # a robust weight divides the variance in the square of the residual, and leaves the normalisation alone
-        parts.append((rows.residual[i][kept], rows.by_start[i][kept], rows.by_common[i][kept], motion, white / weights))
-        shown = np.linalg.svd(rows.by_start[i][kept][:-3, :6], compute_uv=False)
+        white, spin = (np.exp(2.0 * size) * np.diag(1.0 / weights) for size in (noise.white, noise.spin))
+        is_spin = np.arange(len(weights)) >= 3 * used.sum()
+        white[is_spin], spin[~is_spin] = 0.0, 0.0
+        added = [white, spin]
+        for kind, size in enumerate(noise.random):
+            columns = rows.motion.columns[i][kept][:, rows.motion.kinds[i] == kind]
+            added.append(np.exp(2.0 * size) * columns @ columns.T)
+        parts.append((rows.residual[i][kept], rows.by_start[i][kept], rows.by_common[i][kept], added))
+        whole = rows.by_start[i][kept]
+        shown = np.linalg.svd(whole if rows.labelled[i] else whole[:-3, :6], compute_uv=False)
         logs += 0.5 * np.log(weights).sum() + likelihood.penalty[i] - np.log(shown).sum()
-    residual = np.concatenate([p[0] for p in parts])
     common = np.concatenate([p[2] for p in parts])
-    starts = linalg.block_diag(*(p[1] for p in parts))
-    variance = linalg.block_diag(*(p[3] @ p[3].T + np.diag(p[4]) for p in parts))
-    variance += common / precision @ common.T
-    left = residual - common @ away
+    added = [linalg.block_diag(*(p[3][size] for p in parts)) for size in range(6)] + [common / precision @ common.T]
+    left = np.concatenate([p[0] for p in parts]) - common @ away
+    return left, linalg.block_diag(*(p[1] for p in parts)), added, logs
+
+
+def dense(likelihood, noise, precision, away):
+    """The density of all rows at once, its noise a full matrix, common unknowns random, first spins free."""
+    left, starts, added, logs = dense_rows(likelihood, noise, precision, away)
+    variance = sum(added)
     inverse = np.linalg.inv(variance)
     information = starts.T @ inverse @ starts
     solved = starts.T @ inverse @ left
@@ -71,11 +81,13 @@ def test_value_is_that_of_a_dense_gaussian(likelihood, prior):
     assert found == pytest.approx(dense(likelihood, NOISE, *prior), rel=1e-8)
 
 
-def test_value_is_the_same_in_other_units_of_place_and_velocity(likelihood, prior):
-    """A slower clock or a longer metre alone makes no first state more probable."""
-    units = np.eye(9)
-    units[:6, :6] = np.random.default_rng(3).normal(size=(6, 6))
-    rows = likelihood.rows
+@pytest.mark.parametrize("labelled", [True, False])
+def test_value_is_the_same_in_other_units_of_what_has_no_prior(likelihood, prior, labelled):
+    """A slower clock, a longer metre or labels in a larger unit alone make no first state more probable."""
+    rows = replace(likelihood.rows, labelled=np.full(len(likelihood.rows.labelled), labelled))
+    likelihood = replace(likelihood, rows=rows)
+    units, free = np.eye(9), 9 if labelled else 6
+    units[:free, :free] = np.random.default_rng(3).normal(size=(free, free))
     other = replace(likelihood, rows=replace(rows, by_start=rows.by_start @ units))
     values = [posterior(one.reduced(NOISE)[0], *prior).evidence for one in (likelihood, other)]
     assert values[1] == pytest.approx(values[0], abs=1e-6)
@@ -86,11 +98,34 @@ def test_derivative_is_that_of_differences(likelihood, prior):
         return posterior(likelihood.reduced(Noise.of(vector))[0], *prior).evidence
 
     reduced, local = likelihood.reduced(NOISE)
-    slope = likelihood.slope(NOISE, local, posterior(reduced, *prior), *prior)
+    slope = slopes_at(likelihood, NOISE, local, posterior(reduced, *prior), *prior).slope
     step = 1e-5
     moved = [NOISE.vector + step * sign * axis for axis in np.eye(6) for sign in (1, -1)]
     differences = np.array([value(v) for v in moved]).reshape(6, 2) @ [1, -1] / (2 * step)
     np.testing.assert_allclose(slope, differences, rtol=1e-6, atol=1e-6 * np.abs(slope).max())
+
+
+def test_information_is_the_average_of_the_observed_and_the_expected(likelihood, prior):
+    """By dense matrices: P y is the residual over the variance, with first states out, and dV / dz = 2 V of a size."""
+    reduced, local = likelihood.reduced(NOISE)
+    found = slopes_at(likelihood, NOISE, local, posterior(reduced, *prior), *prior).information
+    left, starts, added, _ = dense_rows(likelihood, NOISE, *prior)
+    inverse = np.linalg.inv(sum(added))
+    without = inverse - inverse @ starts @ np.linalg.solve(starts.T @ inverse @ starts, starts.T @ inverse)
+    shown = np.stack([2.0 * one @ without @ left for one in added[:6]])
+    np.testing.assert_allclose(found, 0.5 * shown @ without @ shown.T, rtol=1e-6, atol=1e-8 * np.abs(found).max())
+
+
+def test_unknowns_held_have_the_density_that_they_have_where_they_are(likelihood, prior):
+    """Against the posterior of the others alone, the first three unknowns at their present values."""
+    reduced, _ = likelihood.reduced(NOISE)
+    precision, away = prior
+    found, total = posterior(reduced, *prior), reduced.gram.sum(axis=0)
+    held, kept = found.held(3), np.arange(3, len(total))
+    rest = posterior(type(reduced)(reduced.constant, total[None][:, kept][..., kept]), precision[3:], away[3:])
+    np.testing.assert_allclose(held.mean, np.append(np.zeros(3), rest.mean), atol=1e-9)
+    assert held.square == pytest.approx(rest.square + precision[:3] @ away[:3] ** 2, rel=1e-9)
+    assert found.evidence - held.evidence == pytest.approx(0.5 * (held.square - found.square), rel=1e-6)
 
 
 def test_common_unknowns_are_those_of_generalised_least_squares(likelihood, prior):
@@ -134,3 +169,12 @@ def test_the_best_of_several_starts_counts(rows, prior):
         for one, noise in (settled(rows, *prior, s) for s in ((starts[0],), (None,), starts))
     ]
     assert values[2] > max(values) - 0.05
+
+
+@pytest.mark.parametrize("part", ["residual", "by_start", "by_common"])
+def test_a_path_far_off_all_samples_has_hardly_any_density(rows, prior, part):
+    """A fit may end with a flight that left the room: it must lose, and not by chance of rounding win."""
+    far = getattr(rows, part).copy()
+    far[0] *= 1e100
+    likelihood, noise = settled(replace(rows, **{part: far}), *prior)
+    assert posterior(likelihood.reduced(noise)[0], *prior).evidence < -1e6

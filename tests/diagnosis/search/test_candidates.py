@@ -106,8 +106,9 @@ def test_bic_counts_tracks(windy_fit, wind_refit):
     gain = 2.0 * (windy_fit.cost - wind_refit.fit.cost)
     assert wind_refit.delta_bic == pytest.approx(-gain + 3 * np.log(16), rel=1e-12)
     assert gain > 100.0
-    # one step of the score foresaw the gain, up to the bend of the flights and the weights of far samples: 13 % here
-    assert gain == pytest.approx(wind_refit.scored.score.explained, rel=0.2)
+    # one step of the score foresaw the gain, from where the evidence has its maximum, and up to the bend of the flights
+    # and the weights of far samples: a fifth here
+    assert gain == pytest.approx(wind_refit.scored.score.explained, rel=0.3)
 
 
 def test_nothing_is_found_where_nothing_is(calm_fit):

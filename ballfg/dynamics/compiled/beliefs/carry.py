@@ -163,7 +163,7 @@ def carry(
             else:
                 age[k + 1, r] = np.nan
             low, after = level_below(x[2], world), mean[k + 1, r]
-            if at_rest(x[:9], gap_of(laws.surface, x[:9], low, world[2]), low, world):
+            if at_rest(laws.surface, x[:9], low, world):
                 hard[r], stop = 2.0, True
                 continue
             if after[5] >= 0.0 or gap_of(laws.surface, after[:9], low, world[2]) >= 0.0:

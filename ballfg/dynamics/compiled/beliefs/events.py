@@ -82,7 +82,7 @@ def _contact_within(laws, x, h, world, touch):
     time at which it falls past the table, else NaN; writes its state there to touch (9,).
     """
     low, after = level_below(x[2], world), x.copy()
-    if at_rest(x, gap_of(laws.surface, x, low, world[2]), low, world):
+    if at_rest(laws.surface, x, low, world):
         return low, np.nan, np.nan
     glide(laws.rates, after, h, 1)
     if after[5] >= 0.0 or gap_of(laws.surface, after, low, world[2]) >= 0.0:
