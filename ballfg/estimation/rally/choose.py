@@ -185,10 +185,14 @@ def best_sequence(grower: Grower, hits: Hits, strokes: Sequence[Stroke]) -> Chos
     score = np.array([one.score for one in ordered])
     begins = np.where([one.path.bounces > 0 for one in ordered], -BEGINS, -np.inf)  # else it may be anything
     later = first > last[:, None]
-    link = np.where(later, np.maximum(begins, hits.between(ordered, ordered)), -np.inf)
     soon = grower.field.stamps[first] - grower.field.stamps[last][:, None] < PAUSE
+    # without a hit between them a ball in play was there unseen, or a new rally began at once
+    unseen = np.minimum(-np.log(1.0 - grower.field.seen) * (first - last[:, None] - 1), SERVED)
+    alone = np.where(later, begins - np.where(soon, unseen, 0.0), -np.inf)
+    met = np.where(later, hits.between(ordered, ordered), -np.inf)
     bounces = np.array([one.path.bounces for one in ordered])
-    link -= SERVED * (soon & (bounces == MOST_BOUNCES) & (bounces > 0)[:, None])  # a toss before it is no stroke
+    served = SERVED * (soon & (bounces == MOST_BOUNCES) & (bounces > 0)[:, None])  # a toss before it is no stroke
+    link = np.maximum(alone, met) - served
     best, before = score + begins, np.full(count, -1)
     forward, backward = score + begins, np.zeros(count)
     for j in range(count):
@@ -206,5 +210,5 @@ def best_sequence(grower: Grower, hits: Hits, strokes: Sequence[Stroke]) -> Chos
         at = int(before[at])
     chain.reverse()
     probabilities = np.exp(np.minimum(forward[chain] + backward[chain] - total, 0.0))
-    joined = (False, *(bool(link[i, j] > begins[j]) for i, j in pairwise(chain)))[: len(chain)]
+    joined = (False, *(bool(met[i, j] > alone[i, j]) for i, j in pairwise(chain)))[: len(chain)]
     return Chosen(tuple(ordered[i] for i in chain), probabilities, joined)
