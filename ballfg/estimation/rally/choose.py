@@ -47,7 +47,10 @@ ROUNDS: Final = 6
 
 @dataclass(frozen=True, eq=False)
 class Chosen:
-    """The strokes of the best sequence, the probability of each, and whether a hit joins each to the one before."""
+    """The strokes of the best sequence, and whether a hit joins each to the one before.
+
+    Attributes: probabilities: of each stroke and those like it, with as many bounces and most of its candidates.
+    """
 
     strokes: tuple[Stroke, ...]
     probabilities: Array
@@ -209,6 +212,13 @@ def best_sequence(grower: Grower, hits: Hits, strokes: Sequence[Stroke]) -> Chos
         chain.append(at)
         at = int(before[at])
     chain.reverse()
-    probabilities = np.exp(np.minimum(forward[chain] + backward[chain] - total, 0.0))
+    likely, sets = np.exp(forward + backward - total), [frozenset(one.rows.tolist()) for one in ordered]
+
+    def alike(i: int, j: int) -> bool:
+        shared = 2 * len(sets[i] & sets[j])
+        return shared > len(sets[i]) and shared > len(sets[j]) and bounces[i] == bounces[j]
+
+    # no sequence holds two strokes that are like a third one: their probabilities add up
+    probabilities = np.array([likely[[j for j in range(count) if alike(i, j)]].sum() for i in chain])
     joined = (False, *(bool(met[i, j] > alone[i, j]) for i, j in pairwise(chain)))[: len(chain)]
-    return Chosen(tuple(ordered[i] for i in chain), probabilities, joined)
+    return Chosen(tuple(ordered[i] for i in chain), np.minimum(probabilities, 1.0), joined)
