@@ -109,7 +109,11 @@ def test_a_hit_is_as_likely_as_the_normal_density_of_what_parts_the_paths(
         ]
         onward = one.path.vectors[0, 2, 0] * other.path.vectors[0, 1, 0] > 0.0
         assert not onward
-        assert found[i, i + 1] == pytest.approx(max(density) + np.log(hits_of.ROOM) - hits_of.HIT)
+        field = grower.field
+        missed = field.frame[other.rows[0]] - field.frame[one.rows[-1]] - 1
+        going_on = np.exp(-field.step / hits_of.HIDDEN)  # of the hiding; else the ball is seen, or missed by chance
+        hidden = missed * np.log(going_on + (1.0 - going_on) * (1.0 - field.seen))
+        assert found[i, i + 1] == pytest.approx(max(density) + np.log(hits_of.ROOM) - hits_of.HIT + hidden)
     assert found[0, 1] > 0.0
     again = replace(strokes[1], path=replace(strokes[1].path, vectors=-strokes[1].path.vectors))
     assert Hits(grower).between(strokes[:1], [again])[0, 0] < found[0, 1]
