@@ -141,7 +141,8 @@ def film(of: Truth, path: Path, rate: float, seed: int) -> None:
 class Score:
     """Sums over rallies: strokes and those found, false ones, errors (m) of samples, whether 90 % intervals hold.
 
-    And signs of spins that are right, bounces within `BOUNCE` of the true ones, each with the number of all.
+    And signs of spins that are right, of all beyond 60 rad/s and of those known to 2 sigma, and bounces within `BOUNCE`
+    of the true ones, each with the number of all.
     """
 
     strokes: int
@@ -149,7 +150,7 @@ class Score:
     false: int
     errors: Sequence[float]
     held: Sequence[bool]
-    spins: tuple[int, int]
+    spins: tuple[int, ...]
     bounces: tuple[int, int] = (0, 0)
 
 
@@ -177,7 +178,7 @@ def camera_judged(shot: Shot, of: Truth) -> CameraScore:
 
 def judged(rally: Rally, of: Truth) -> Score:
     """A rally against the truth."""
-    found, false, errors, held, spins = set[int](), 0, list[float](), list[bool](), [0, 0]
+    found, false, errors, held, spins = set[int](), 0, list[float](), list[bool](), np.zeros(4, dtype=int)
     for estimate in (one for shot in rally.shots for one in shot.estimates):
         middle = float(np.median(estimate.times))
         numbers = [i for i, one in enumerate(of.strokes) if one.begin < middle <= one.end]
@@ -193,11 +194,12 @@ def judged(rally: Rally, of: Truth) -> Score:
         held += (np.abs(off) < 1.645 * sigmas).ravel().tolist()
         true = states[good[0]][SPIN]
         if abs(true[1]) > 60.0:
-            spins[0] += bool(np.sign(true[1]) == np.sign(estimate.states[good[0], SPIN][1]))
-            spins[1] += 1
+            spin, sigma = estimate.states[good[0], SPIN][1], np.sqrt(estimate.covariances[good[0]][SPIN, SPIN][1, 1])
+            right, known = bool(np.sign(true[1]) == np.sign(spin)), bool(abs(spin) > 2.0 * sigma)
+            spins += (right, 1, right and known, known)
     bounces = [event.t for event in rally.events if event.kind == "bounce"]
     near = sum(any(abs(t - true) < BOUNCE for t in bounces) for true in of.bounces)
-    return Score(len(of.strokes), len(found), false, errors, held, (spins[0], spins[1]), (near, len(of.bounces)))
+    return Score(len(of.strokes), len(found), false, errors, held, tuple(spins.tolist()), (near, len(of.bounces)))
 
 
 def main() -> None:
@@ -226,7 +228,7 @@ def main() -> None:
                 rally = track_moving_camera(video.frames, COURT, MODEL, count=video.count, candidates=own)
             except ValueError as error:
                 print(f"{seed} {view}: {error}", flush=True)
-                scores.append(Score(len(of.strokes), 0, 0, [], [], (0, 0)))
+                scores.append(Score(len(of.strokes), 0, 0, [], [], (0, 0, 0, 0)))
                 continue
         cameras.append(seen := camera_judged(rally.motion.shots[0], of))
         scores.append(one := judged(rally, of))
@@ -245,9 +247,10 @@ def main() -> None:
     print(f", 90 % intervals hold {inside:.0f} %")
     strokes, found, false = (sum(getattr(one, name) for one in scores) for name in ("strokes", "found", "false"))
     errors, held = (np.concatenate([getattr(one, name) for one in scores]) for name in ("errors", "held"))
-    right, asked = np.sum([one.spins for one in scores], axis=0)
+    right, asked, sure, known = np.sum([one.spins for one in scores], axis=0)
     print(f"found {found} of {strokes}, false {false}, median {1e3 * np.median(errors):.0f} mm")
     print(f"90 % intervals hold {100 * held.mean():.0f} %, spin's sign {right} of {asked}", end="")
+    print(f", where known to 2 sigma {sure} of {known}", end="")
     near, count = np.sum([one.bounces for one in scores], axis=0)
     print(f", bounces {near} of {count}, {100 * near / count:.0f} %")
 
