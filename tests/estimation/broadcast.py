@@ -1,9 +1,9 @@
 """What `ballfg track` makes of the real broadcast rally, against labels made by eye: required and measured.
 
-    python -m tests.estimation.broadcast [--half]
+    python -m tests.estimation.broadcast [--half --seed 1]
 
-reads broadcast/ of the measured data (`BALLFG_DATA`). With `--half`, half of the candidates that are the ball are taken
-away and twenty false ones put into each picture.
+reads broadcast/ of the measured data (`BALLFG_DATA`). With `--half` the candidates are those of another detector: half
+of the labelled balls, and twenty false ones in each picture.
 """
 
 from __future__ import annotations
@@ -11,9 +11,11 @@ from __future__ import annotations
 import argparse
 import json
 import resource
+import tempfile
 import time
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -21,18 +23,19 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.estimation.rally.video import Rally, track_moving_camera
 from ballfg.simulation.balls import ball_kind
-from ballfg.vision.broadcast.candidates import find_candidates
 from ballfg.vision.broadcast.court import TABLE_TENNIS, Court, read_court
+from ballfg.vision.broadcast.given import read_candidates
 from ballfg.vision.broadcast.lines import moved, slopes
 from ballfg.vision.broadcast.motion import Shot
 from ballfg.vision.broadcast.pinhole import Pinhole
-from ballfg.vision.detection.detections import Candidates, Detections
 from ballfg.vision.detection.video import open_video
 from tests.places import DATA
+from tests.vision.broadcast.own import write_candidates
 
 FOLDER: Final = DATA / "broadcast"
 PLACE: Final = ((0.0, -8.9, 4.85), 0.1)
 """m, where the labelled corners alone put the camera, and how well (README of the data)."""
+LABELLED: Final = 1.5  # px, standard deviation of labelled balls
 NEAR, HIT, BOUNCE = 5.0, 1.5, 0.5  # px, and frames, within which a ball, a hit, a bounce is found
 
 
@@ -116,45 +119,21 @@ def matched(rally: Rally, kind: str, labels: list[dict[str, Any]], fps: float, w
     return pairs
 
 
-def spoiled(labels: dict[str, Any], rng: np.random.Generator) -> Callable[[Detections, Shot], Detections]:
-    """Takes away half of the candidates that are the ball, and puts in twenty false ones a picture."""
-    true = {ball["frame"]: np.array([ball["u"], ball["v"]]) for ball in labels["ball"]}
-
-    def changed(found: Detections, shot: Shot) -> Detections:
-        frames = []
-        for number, stamp in enumerate(found.frames):
-            here = found.in_frame(number)
-            ball = true.get(number + shot.first)
-            if ball is not None and rng.random() < 0.5:
-                away = np.linalg.norm(here.pixels - ball, axis=1) > NEAR
-                fields = (here.pixels, here.covariances, here.scores, here.streaks)
-                here = Candidates(*(one[away] for one in fields))
-            wrong = rng.uniform((0, 0), shot.cameras[0].size, (20, 2))
-            false = Candidates.at(wrong, 0.6, rng.uniform(0.0, 1.0, 20))
-            both = (np.concatenate((getattr(here, n), getattr(false, n))) for n in ("pixels", "covariances", "scores"))
-            streaks = np.concatenate((here.streaks, false.streaks))
-            frames.append((float(stamp), Candidates(*both, streaks)))
-        return Detections.of_frames(found.camera, frames)
-
-    return changed
-
-
 def main() -> None:
     """Prints required and measured."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--half", action="store_true", help="candidates spoiled")
+    parser.add_argument("--half", action="store_true", help="candidates of another detector")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     labels = json.loads((FOLDER / "labels.json").read_text(encoding="utf-8"))
     video, court, kind = open_video(FOLDER / "rally.mp4"), read_court(TABLE_TENNIS), ball_kind(TABLE_TENNIS)
-    begun, own = time.process_time(), None
-    if given.half:
-        spoil = spoiled(labels, np.random.default_rng(given.seed))
-
-        def own(shot: Shot, stamps: Array) -> Detections:
-            return spoil(find_candidates(video.frames, shot, court, kind.ball.radius, stamps), shot)
-
-    rally = track_moving_camera(video.frames, court, kind.model, count=video.count, candidates=own)
+    begun = time.process_time()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "candidates.csv"
+        balls = {ball["frame"]: np.array([ball["u"], ball["v"]]) for ball in labels["ball"]}
+        write_candidates(path, balls, np.arange(video.count) / labels["fps"], (1280, 720), LABELLED, given.seed)
+        own = partial(read_candidates, path) if given.half else None
+        rally = track_moving_camera(video.frames, court, kind.model, count=video.count, candidates=own)
     spent = time.process_time() - begun
     errors = camera_errors(rally.motion.shots[0], court, labels)
     print(f"corners, px, median; 95 %     | 1.5; 4   | {np.median(errors):.2f}; {np.percentile(errors, 95):.2f}")

@@ -79,14 +79,19 @@ class Paths:
 
 
 def solved(scene: Scene, times: Array, bounces: int) -> Paths:
-    """The paths with bounces at guessed times (k, b) s, or of one flight about an anchor (k, 1) s."""
+    """The paths with bounces at guessed times (k, b) s, or of one flight about an anchor (k, 1) s.
+
+    Args: scene: with rays (m,) of all guesses, or (k, m) of each.
+    """
     rays, physics = scene.rays, scene.physics
-    k, m, size = len(times), len(rays.times), 3 * columns_of(scene, bounces)
+    k, m, size = len(times), rays.times.shape[-1], 3 * columns_of(scene, bounces)
     drag, depth, weight = np.zeros((k, bounces + 1)), np.ones((k, m)), np.ones((k, m))
-    precision = LAWS**2 * np.linalg.det(rays.root)  # (m,) of a sighting, at 1 m, beside that of the laws
+    precision = LAWS**2 * np.linalg.det(rays.root)  # of a sighting, at 1 m, beside that of the laws
     for _ in range(ROUNDS):
         prior, target = _priors(scene, times, bounces, drag)
-        share, drop = shares_of(rays.times[None], times, bounces, drag, physics.gravity, lift=scene.lift is not None)
+        share, drop = shares_of(
+            np.atleast_2d(rays.times), times, bounces, drag, physics.gravity, lift=scene.lift is not None
+        )
         root = rays.root / np.sqrt(depth**2 + precision)[..., None, None]
         seen = (root @ rays.matrix)[:, :, :, None, :] * share[:, :, None, :, None]
         seen = seen.reshape(k, 2 * m, size)
@@ -102,7 +107,7 @@ def solved(scene: Scene, times: Array, bounces: int) -> Paths:
         drag = physics.drag * np.minimum(np.linalg.norm(vectors[:, 1 : bounces + 2], axis=-1), 2.0 * SPEED)
         point = share @ vectors
         point[..., Z] -= drop
-        depth = np.maximum((rays.depth_row[:, :3] * point).sum(axis=-1) + rays.depth_row[:, 3], NEAREST)
+        depth = np.maximum((rays.depth_row[..., :3] * point).sum(axis=-1) + rays.depth_row[..., 3], NEAREST)
     loss = ROBUST**2 * np.log1p(square / ROBUST**2).sum(axis=1)
     misfit = loss + (((prior @ unknown)[..., 0] - target) ** 2).sum(axis=1)
     return Paths(times, bounces, misfit, vectors, drag, np.asarray(np.linalg.inv(information), dtype=np.float64))
@@ -185,11 +190,11 @@ def possible(scene: Scene, tried: Paths) -> NDArray[np.bool_]:
     return np.asarray(fine)
 
 
-def narrowed(scene: Scene, tried: Paths, row: int) -> float:
-    """Logarithm of the share of its prior volume that a path has left: the factor of Occam in its evidence."""
-    rows, _ = _priors(scene, tried.times[[row]], tried.bounces, tried.drag[[row]])
-    before = float(np.linalg.slogdet(rows[0].T @ rows[0])[1])
-    return 0.5 * (before + float(np.linalg.slogdet(tried.covariance[row])[1]))
+def narrowed(scene: Scene, tried: Paths) -> Array:
+    """(k,) logarithm of the share of its prior volume that a path has left: the factor of Occam in its evidence."""
+    rows, _ = _priors(scene, tried.times, tried.bounces, tried.drag)
+    before = np.linalg.slogdet(rows.swapaxes(1, 2) @ rows)[1]
+    return np.asarray(0.5 * (before + np.linalg.slogdet(tried.covariance)[1]))
 
 
 def velocities_of(tried: Paths, row: int, moments: Array, gravity: float) -> Array:

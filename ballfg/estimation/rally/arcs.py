@@ -114,6 +114,8 @@ def _begun(
                 rows.reverse()
                 used.update(pairwise(rows))
                 found.append(np.array(rows))
+                if len(rows) > len(triple):  # beyond pictures without the ball an arc may go on through a bounce
+                    found.append(np.array(triple))
     return found
 
 

@@ -38,27 +38,36 @@ EXCHANGED: Final = 4
 """Candidates at an end of a chosen stroke that are exchanged for others."""
 TOGETHER: Final = 16
 """Flights that a process follows in turn."""
+BESIDE: Final = 30
+"""Flights of which strokes are grown where no hit joins a stroke to the next one: a hit's place tells of many flights
+those that may go on from it."""
 ROUNDS: Final = 6
 """Of exchanges in a sequence, until nothing improves."""
 
 
 @dataclass(frozen=True, eq=False)
 class Chosen:
-    """The strokes of the best sequence, the probability of each, and whether a hit joins each to the one before."""
+    """The strokes of the best sequence, and whether a hit joins each to the one before.
+
+    Attributes: probabilities: of each stroke and those like it, with as many bounces and most of its candidates.
+    """
 
     strokes: tuple[Stroke, ...]
     probabilities: Array
     joined: tuple[bool, ...]
 
 
-def hypotheses(grower: Grower, seeds: Sequence[Index], watch: Watch = unwatched) -> list[Stroke]:
-    """The strokes that grow from arcs, highest scores first; of those with the same candidates only the best."""
-    flights = [grower.flown(rows, ()) for rows in seeds]
-    found = dict[tuple[int, ...], Stroke]()
+def promising(grower: Grower, flights: Sequence[Stroke]) -> list[Stroke]:
+    """The flights with the highest scores, and among those that a ball in play could have."""
     # a swaying shoe is no flight, however smooth; an arc through a bounce becomes one with its bounce
     alone = _best_in_each(grower, flights, KEPT, 1, grower.plausible)
-    chosen = list({id(one): one for one in (*_best_in_each(grower, flights, KEPT, 1), *alone)}.values())
-    grown = watch(in_parts(partial(_variants, grower), chosen, TOGETHER), len(chosen), "possible flights followed")
+    return list({id(one): one for one in (*_best_in_each(grower, flights, KEPT, 1), *alone)}.values())
+
+
+def hypotheses(grower: Grower, flights: Sequence[Stroke], watch: Watch = unwatched) -> list[Stroke]:
+    """The strokes that grow from flights, highest scores first; of those with the same candidates only the best."""
+    found = dict[tuple[int, ...], Stroke]()
+    grown = watch(in_parts(partial(_variants, grower), flights, TOGETHER), len(flights), "possible flights followed")
     whole = [one for some in grown for one in some]
     likely = _best_in_each(grower, list({_key(one): one for one in whole}.values()), COMPARED)
     for stroke in (*whole, *(part for one in likely for part in grower.shortened(one))):
@@ -68,21 +77,47 @@ def hypotheses(grower: Grower, seeds: Sequence[Index], watch: Watch = unwatched)
     return _best_in_each(grower, sorted(found.values(), key=lambda one: -one.score), COMPARED)
 
 
-def rally(grower: Grower, seeds: Sequence[Index], watch: Watch = unwatched) -> Chosen:
-    """The likeliest strokes of a rally, after exchanges of candidates and bounces in which nothing improves it."""
-    known = {_key(stroke): stroke for stroke in hypotheses(grower, seeds, watch)}
-    done, hits = set[tuple[int, ...]](), Hits(grower)
+def rally(grower: Grower, seeds: Sequence[Index], earlier: Sequence[Stroke] = (), watch: Watch = unwatched) -> Chosen:
+    """The likeliest strokes of a rally, after exchanges of candidates and bounces in which nothing improves it.
+
+    Args: seeds: arcs.  earlier: strokes that may be among them, from a search with other probabilities.
+    """
+    flights = grower.flights(seeds)
+    rated = [grower.flown(stroke.rows, stroke.bounces) for stroke in earlier]
+    begun = promising(grower, flights)
+    known = {_key(stroke): stroke for stroke in (*rated, *hypotheses(grower, begun, watch))}
+    done, followed, hits = set[tuple[int, ...]](), {id(flight) for flight in begun}, Hits(grower)
     for _ in range(ROUNDS):
         chosen = best_sequence(grower, hits, list(known.values()))
         fresh = [stroke for stroke in chosen.strokes if _key(stroke) not in done]
         done.update(map(_key, fresh))
-        for some in in_parts(partial(_exchanged, grower), fresh, 1):
-            for better in some:
-                old = known.get(_key(better))
-                known[_key(better)] = better if old is None or better.score > old.score else old
-        if not fresh:
+        beside = {id(one): one for end in _open_ends(chosen) for one in _beside(hits, flights, *end)}
+        new = [one for name, one in beside.items() if name not in followed]
+        followed.update(beside)
+        found = [*in_parts(partial(_exchanged, grower), fresh, 1)]
+        found += in_parts(partial(_variants, grower), new, TOGETHER)
+        for better in (one for some in found for one in some):
+            old = known.get(_key(better))
+            if (old is None or better.score > old.score) and grower.plausible(better):
+                known[_key(better)] = better
+        if not fresh and not new:
             break
     return best_sequence(grower, hits, list(known.values()))
+
+
+def _open_ends(chosen: Chosen) -> list[tuple[Stroke, int]]:
+    """The strokes that no hit joins to a later one (way 1) or to an earlier one (-1): there one may be missing."""
+    joined = (*chosen.joined, False)
+    last = [(stroke, 1) for stroke, on in zip(chosen.strokes, joined[1:], strict=True) if not on]
+    return last + [(stroke, -1) for stroke, on in zip(chosen.strokes, joined[:-1], strict=True) if not on]
+
+
+def _beside(hits: Hits, flights: Sequence[Stroke], stroke: Stroke, way: int) -> list[Stroke]:
+    """The flights that most likely follow a stroke (way 1), or that it follows (-1), best first."""
+    links = hits.between([stroke], flights)[0] if way > 0 else hits.between(flights, [stroke])[:, 0]
+    rated = np.array([flight.score for flight in flights]) + links
+    order = np.argsort(-rated, kind="stable")[:BESIDE]
+    return [flights[number] for number in order if np.isfinite(rated[number])]
 
 
 def _key(stroke: Stroke) -> tuple[int, ...]:
@@ -94,13 +129,13 @@ def _exchanged(grower: Grower, stroke: Stroke) -> list[Stroke]:
     """Better strokes than one, that have a bounce more or other candidates at an end."""
     parts = [stroke, *grower.shortened(stroke, EXCHANGED)]
     tried = [bounced for part in parts for way in (1, -1) for bounced in _bounced(grower, part, way)]
-    tried += [grower.timed(grower.grown(grower.grown(part, 1), -1)) for part in parts]
+    tried += [grower.timed(one) for part in parts for one in grower.whole(part)]
     return [one for one in tried if one.score > stroke.score + GAINED and grower.plausible(one)]
 
 
 def _variants(grower: Grower, flight: Stroke) -> list[Stroke]:
     """A flight without bounce, with one after or before it, and with one after and one before it."""
-    found = [grower.grown(grower.grown(flight, 1), -1)]
+    found = grower.whole(flight)
     for way in (1, -1):
         for stroke in _bounced(grower, flight, way):
             found.append(stroke)
@@ -109,11 +144,11 @@ def _variants(grower: Grower, flight: Stroke) -> list[Stroke]:
 
 
 def _bounced(grower: Grower, flight: Stroke, way: int) -> list[Stroke]:
-    """The best stroke with one more bounce, if there is any."""
+    """The best strokes with one more bounce, if there are any."""
     if len(flight.bounces) == MOST_BOUNCES:
         return []
-    best = max(grower.bounced(flight, way), key=lambda one: one.score, default=None)
-    return [] if best is None else [grower.grown(grower.grown(grower.timed(best), way), -way)]
+    best = max(grower.bounced(flight, way), key=lambda one: (grower.plausible(one), one.score), default=None)
+    return [] if best is None else grower.whole(grower.timed(best))
 
 
 def _best_in_each(
@@ -153,9 +188,14 @@ def best_sequence(grower: Grower, hits: Hits, strokes: Sequence[Stroke]) -> Chos
     score = np.array([one.score for one in ordered])
     begins = np.where([one.path.bounces > 0 for one in ordered], -BEGINS, -np.inf)  # else it may be anything
     later = first > last[:, None]
-    link = np.where(later, np.maximum(begins, hits.between(ordered)), -np.inf)
     soon = grower.field.stamps[first] - grower.field.stamps[last][:, None] < PAUSE
-    link -= SERVED * (soon & np.array([one.path.bounces == MOST_BOUNCES for one in ordered]))
+    # without a hit between them a ball in play was there unseen, or a new rally began at once
+    unseen = np.minimum(-np.log(1.0 - grower.field.seen) * (first - last[:, None] - 1), SERVED)
+    alone = np.where(later, begins - np.where(soon, unseen, 0.0), -np.inf)
+    met = np.where(later, hits.between(ordered, ordered), -np.inf)
+    bounces = np.array([one.path.bounces for one in ordered])
+    served = SERVED * (soon & (bounces == MOST_BOUNCES) & (bounces > 0)[:, None])  # a toss before it is no stroke
+    link = np.maximum(alone, met) - served
     best, before = score + begins, np.full(count, -1)
     forward, backward = score + begins, np.zeros(count)
     for j in range(count):
@@ -172,6 +212,13 @@ def best_sequence(grower: Grower, hits: Hits, strokes: Sequence[Stroke]) -> Chos
         chain.append(at)
         at = int(before[at])
     chain.reverse()
-    probabilities = np.exp(np.minimum(forward[chain] + backward[chain] - total, 0.0))
-    joined = (False, *(bool(link[i, j] > begins[j]) for i, j in pairwise(chain)))[: len(chain)]
-    return Chosen(tuple(ordered[i] for i in chain), probabilities, joined)
+    likely, sets = np.exp(forward + backward - total), [frozenset(one.rows.tolist()) for one in ordered]
+
+    def alike(i: int, j: int) -> bool:
+        shared = 2 * len(sets[i] & sets[j])
+        return shared > len(sets[i]) and shared > len(sets[j]) and bounces[i] == bounces[j]
+
+    # no sequence holds two strokes that are like a third one: their probabilities add up
+    probabilities = np.array([likely[[j for j in range(count) if alike(i, j)]].sum() for i in chain])
+    joined = (False, *(bool(met[i, j] > alone[i, j]) for i, j in pairwise(chain)))[: len(chain)]
+    return Chosen(tuple(ordered[i] for i in chain), np.minimum(probabilities, 1.0), joined)

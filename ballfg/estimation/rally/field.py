@@ -10,9 +10,10 @@ import numpy as np
 from ballfg.arrays import Array, Index, Mask
 from ballfg.vision.detection.detections import Detections
 
-SEEN: Final = 0.9
-"""Probability that the ball is among the candidates of a picture, at first."""
-SEEN_RANGE: Final = (0.4, 0.95)
+SEEN, UNKNOWN = 0.9, 0.5
+"""Probability that the ball is among the candidates of a picture, at first: among those of `ballfg.vision.broadcast`,
+and among those of a detector of which nothing is known."""
+SEEN_RANGE: Final = (0.2, 0.95)
 """Of that probability, as a found rally shows it."""
 BAR_SIGMA, BAR_SHARE = 1.5, 0.12
 """px, and share of its length, by which a ball's bar differs from its motion while the shutter is open."""
@@ -54,8 +55,8 @@ class Field:
     seen: float = SEEN
 
     @classmethod
-    def of(cls, seen: Detections, scale: float) -> Field:
-        """The field of detections of a fixed camera, with the exposure that its arcs show."""
+    def of(cls, seen: Detections, scale: float, ball: float = SEEN) -> Field:
+        """The field of detections of a fixed camera that hold the ball with a probability `ball`."""
         count, size = len(seen.frames), np.ptp(seen.pixels, axis=0)
         better = len(seen) - np.searchsorted(np.sort(seen.scores), seen.scores)
         first = np.searchsorted(seen.frame, np.arange(count + 1))
@@ -64,7 +65,8 @@ class Field:
         number = (np.linalg.norm(bars, axis=1) // RING).astype(np.int64)
         share = (np.bincount(number) + 1.0) / (len(bars) + number.max(initial=0) + 1.0)
         usual = share[number] / (np.pi * RING**2 * (2.0 * number + 1.0))  # of rings about a bar of no length
-        return cls(seen.frame, seen.pixels, seen.covariances, bars, density, usual, first, seen.frames, step, scale)
+        rows = seen.frame, seen.pixels, seen.covariances, bars, density, usual
+        return cls(*rows, first, seen.frames, step, scale, seen=ball)
 
     def smooth(self, density: float) -> Field:
         """The field whose clutter moves smoothly: where its motion foretells a candidate, it has a density, 1/px^2."""
@@ -82,16 +84,18 @@ class Field:
         long, far = np.linalg.norm(bars, axis=1), np.linalg.norm(motion, axis=1)
         return np.asarray(~((long > LONG) & (far > LONG) & (cross > np.sin(ASKEW) * long * far)))
 
-    def gain(self, rows: Index, motion: Array) -> float:
-        """Logarithm of how much likelier candidates (n,) are a ball than clutter, by their number and their bars.
+    def gain(self, rows: Index, motion: Array) -> Array:
+        """(k,) logarithm of how much likelier candidates (k, n) are a ball than clutter, by their number and bars.
 
-        Their distances from a path count elsewhere. Args: motion: (n, 2) px a picture, of the ball.
+        Their distances from a path count elsewhere. Args: motion: (k, n, 2) px a picture, of the ball.
         """
         spot = self.density[rows] * 2.0 * np.pi * np.sqrt(np.linalg.det(self.covariances[rows]))
-        return float(np.log(self.seen / spot).sum() + self.bar_gain(rows, motion, self.exposure).sum())
+        return np.asarray((self.bar_gain(rows, motion, self.exposure) + np.log(self.seen / spot)).sum(axis=-1))
 
     def bar_gain(self, rows: Index, motion: Array, exposure: float) -> Array:
-        """(n,) of the bars alone: a ball's is as long as its motion while the shutter is open, either way around."""
+        """(..., n) of bars alone: a ball's is as long as its motion while the shutter is open, either way around."""
+        if not self.bars.any():  # a detector that gives centres only
+            return np.zeros(rows.shape)
         off, variance = self._bar_errors(rows, motion, exposure)
         ratio = np.exp(-0.5 * off / variance) / (2.0 * np.pi * variance) / self.usual[rows]
         return np.asarray(np.log(STRAY + (1.0 - STRAY) * ratio))
@@ -108,8 +112,8 @@ class Field:
     def _bar_errors(self, rows: Index, motion: Array, exposure: float) -> tuple[Array, Array]:
         """(n,) px^2, squared distances of bars from motions while the shutter is open, and their variances."""
         bars, true = self.bars[rows], exposure * motion
-        off = np.minimum(((bars - true) ** 2).sum(axis=1), ((bars + true) ** 2).sum(axis=1))
-        return off, BAR_SIGMA**2 + BAR_SHARE**2 * (true**2).sum(axis=1)
+        off = np.minimum(((bars - true) ** 2).sum(axis=-1), ((bars + true) ** 2).sum(axis=-1))
+        return off, BAR_SIGMA**2 + BAR_SHARE**2 * (true**2).sum(axis=-1)
 
     def motion(self, rows: Index) -> Array:
         """(n, 2) px a picture, of an arc."""

@@ -19,6 +19,8 @@ ROOM: Final = 30.0
 """m^3, in which a stroke begins that no hit joins to another."""
 LONGEST_HIT: Final = 0.4
 """s without a candidate about a hit, behind a player."""
+HIDDEN: Final = 0.1
+"""s, mean of the time for which a player hides the ball about a hit: in broadcasts mostly 1 to 4 pictures at 25 Hz."""
 SAME_WAY: Final = 5.0
 """Logarithm of what it costs that the ball goes on along the court after a hit: players alternate."""
 MOMENTS: Final = 9
@@ -40,28 +42,33 @@ class Hits:
     grower: Grower
     ends: dict[tuple[Stroke, int], Ahead] = field(default_factory=dict)
 
-    def between(self, strokes: Sequence[Stroke]) -> Array:
-        """(n, n) logarithm of the likelihood that a hit joins a stroke (row) and a later one (column); -inf for none.
+    def between(self, strokes: Sequence[Stroke], later: Sequence[Stroke]) -> Array:
+        """(n, m) logarithm of the likelihood that a hit joins a stroke (row) and a later one (column); -inf for none.
 
-        Args: strokes: n of them; a stroke that begins before another one ends does not follow it.
+        Args: strokes, later: n and m; a stroke that begins before another one ends does not follow it.
         """
         frame = self.grower.field.frame
-        first, last = (frame[[one.rows[end] for one in strokes]] for end in (0, -1))
+        first, last = frame[[one.rows[0] for one in later]], frame[[one.rows[-1] for one in strokes]]
         gap = first - last[:, None]
         before, after = np.nonzero((gap > 0) & (gap <= self._widest()))
         found = np.full(gap.shape, -np.inf)
         if not len(before):
             return found
-        ways = np.array([(one.path.vectors[0, one.path.bounces + 1, 0], one.path.vectors[0, 1, 0]) for one in strokes])
-        onward = ways[before, 0] * ways[after, 1] > 0.0
+        ways = [np.array([one.path.vectors[0, one.path.bounces + 1, 0] for one in strokes])[before]]
+        ways += [np.array([one.path.vectors[0, 1, 0] for one in later])[after]]
+        onward = ways[0] * ways[1] > 0.0
         pair = gap[before, after] - 1
-        beyond, toward = ([self._ahead(one, way) for one in strokes] for way in (1, -1))
-        starts = np.stack([one.places for one in beyond])[before, pair]
-        ends = np.stack([one.places for one in toward])[after, pair]
-        spread = np.stack([one.covariances for one in beyond])[before, pair]
-        spread += np.stack([one.covariances for one in toward])[after, pair]
+        beyond = {number: self._ahead(strokes[number], 1) for number in np.unique(before).tolist()}
+        toward = {number: self._ahead(later[number], -1) for number in np.unique(after).tolist()}
+        here, there = [beyond[number] for number in before.tolist()], [toward[number] for number in after.tolist()]
+        ends = np.stack([one.places[k] for one, k in zip(there, pair, strict=True)])
+        starts = np.stack([one.places[k] for one, k in zip(here, pair, strict=True)])
+        spread = np.stack([one.covariances[k] for one, k in zip(here, pair, strict=True)])
+        spread += np.stack([one.covariances[k] for one, k in zip(there, pair, strict=True)])
         near = _log_normal(ends - starts, spread + HIT_SIGMA**2 * np.eye(3)).max(axis=1)
-        found[before, after] = near + np.log(ROOM) - HIT - SAME_WAY * onward
+        seen, step = self.grower.field.seen, self.grower.field.step
+        missed = -np.log(1.0 - seen * -np.expm1(-step / HIDDEN)) * pair  # hidden still, or not among the candidates
+        found[before, after] = near + np.log(ROOM) - HIT - SAME_WAY * onward - missed
         return found
 
     def _widest(self) -> int:

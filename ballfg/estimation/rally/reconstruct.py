@@ -14,7 +14,7 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.sightings import sighted_track
 from ballfg.estimation.rally.arcs import arcs
 from ballfg.estimation.rally.choose import Chosen, rally
-from ballfg.estimation.rally.field import SEEN_RANGE, Field
+from ballfg.estimation.rally.field import SEEN, SEEN_RANGE, Field
 from ballfg.estimation.rally.joined import joined_estimates
 from ballfg.estimation.rally.moments import Event
 from ballfg.estimation.rally.strokes import Grower, Stroke
@@ -85,31 +85,39 @@ def on_fixed_camera(found: Detections, shot: Shot, onto: Pinhole, name: str) -> 
 
 
 def reconstruct(
-    found: Detections, shot: Shot, model: BallModel, surfaces: Surfaces, *, first: int = 0, watch: Watch = unwatched
+    found: Detections,
+    shot: Shot,
+    model: BallModel,
+    surfaces: Surfaces,
+    *,
+    first: int = 0,
+    seen_share: float = SEEN,
+    watch: Watch = unwatched,
 ) -> ShotRally:
     """The strokes of a shot, with the estimate of each.
 
     Args:
         found: candidates in the pictures of the shot.  model: the ball.  surfaces: with the court's ends.
         first: number of the first stroke; strokes are named by three digits.
+        seen_share: probability that the ball is among the candidates of a picture, at first.
     """
     name = f"shot{shot.first}"
     pinhole, camera = fixed_camera(shot, name)
     seen = on_fixed_camera(found, shot, pinhole, name)
-    field = Field.of(seen, pinhole.focal / float(np.linalg.norm(pinhole.place)))
+    field = Field.of(seen, pinhole.focal / float(np.linalg.norm(pinhole.place)), seen_share)
     seeds, plain, foretold = arcs(field)
     density = foretold.density(np.zeros(0, dtype=np.int64))  # with the ball, which is not known yet
+    chosen = Chosen((), np.zeros(0), ())
     for _ in range(ROUNDS):
         field = plain.smooth(density)
         grower = Grower.of(field, seen.times, camera, physics_of(model), surfaces)
-        chosen = rally(grower, seeds, watch)
+        chosen = rally(grower, seeds, chosen.strokes, watch)
         if not chosen.strokes:
             break
-        share, before = _seen_share(field, chosen), density
+        plain, before = replace(plain, seen=_seen_share(field, chosen)), density
         density = foretold.density(np.concatenate([stroke.rows for stroke in chosen.strokes]))
-        if abs(share - field.seen) < SETTLED and before < THINNER * density:
+        if abs(plain.seen - field.seen) < SETTLED and before < THINNER * density:
             break
-        plain = replace(plain, seen=share)
     seen = _kinked(seen, chosen, field)
     smoother = Smoother(model, surfaces, Settings.for_measured(model, find_events=False))
     tracks = [_track(stroke, seen, camera, model, surfaces) for stroke in chosen.strokes]

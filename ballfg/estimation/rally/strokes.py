@@ -7,7 +7,7 @@ explains the candidates than clutter does.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -53,6 +53,8 @@ CUT: Final = 12
 goes on smoothly for some pictures after a hit."""
 SPEEDS: Final = (2.0, 40.0)
 """m/s, of a stroke, along the court at least and in all at most."""
+TOGETHER: Final = 2000
+"""Flights that are solved at once: more take more memory, and no less time."""
 ROOM: Final = (3.6, 3.6, 5.0)
 """Half lengths and half widths of the court, and half widths above it, in which a ball is in play."""
 
@@ -94,7 +96,7 @@ class Grower:
         return cls(field, rays, camera, physics, surfaces)
 
     def scene(self, rows: Index) -> Scene:
-        """The scene with the rays of some candidates."""
+        """The scene with the rays of some candidates (n,) or (k, n)."""
         some = {name: getattr(self.rays, name)[rows] for name in ("times", "camera", "matrix", "target", "root")}
         rays = replace(self.rays, **some, depth_row=self.rays.depth_row[rows])
         return Scene(rays, self.physics, self.surfaces, self.surfaces.table_height, LIFT)
@@ -105,19 +107,37 @@ class Grower:
         anchor = bounces or (float(np.median(scene.rays.times)),)
         return self._rated(rows, solved(scene, np.array([anchor]), len(bounces)), 0)
 
+    def flights(self, seeds: Sequence[Index]) -> list[Stroke]:
+        """The flights without a bounce through the candidates of each seed; those of equal length at once."""
+        found, length = dict[int, Stroke](), np.array([len(rows) for rows in seeds])
+        for count in np.unique(length):
+            numbers = np.flatnonzero(length == count)
+            for some in np.array_split(numbers, -(-len(numbers) // TOGETHER)):
+                rows = np.stack([seeds[number] for number in some])
+                tried = solved(self.scene(rows), np.median(self.rays.times[rows], axis=1)[:, None], 0)
+                scores = self._scores(rows, tried)
+                found |= {
+                    int(number): Stroke(mine, (), _one(tried, row), float(scores[row]))
+                    for row, (number, mine) in enumerate(zip(some, rows, strict=True))
+                }
+        return [found[number] for number in range(len(seeds))]
+
     def _rated(self, rows: Index, tried: Paths, row: int) -> Stroke:
         """One of several solutions as a stroke."""
-        names = ("times", "misfit", "vectors", "drag", "covariance")
-        path = replace(tried, **{name: getattr(tried, name)[[row]] for name in names})
+        path = _one(tried, row)
         bounces = tuple(path.times[0].tolist()) if path.bounces else ()
-        frames, moments = self.field.frame[rows], self.rays.times[rows]
+        score = float(self._scores(rows[None], path)[0]) - (self._halves(path) if bounces else 0.0)
+        return Stroke(rows, bounces, path, score)
+
+    def _scores(self, rows: Index, tried: Paths) -> Array:
+        """(k,) scores of paths through candidates (k, n), but for the halves of the court on which they bounce."""
+        frames, moments, count = self.field.frame[rows], self.rays.times[rows], rows.shape[1]
         half = 0.5 * SHORT * self.field.step
-        ends = self.foretold(path, np.concatenate((moments - half, moments + half)))[0][0]
-        gain = self.field.gain(rows, (ends[len(rows) :] - ends[: len(rows)]) / SHORT)
-        hidden = (frames[-1] - frames[0] + 1 - len(rows)) * np.log(1.0 - self.field.seen)
-        price = BOUNCE * len(bounces) + UNBOUNCED * (len(bounces) != 1) - narrowed(self.scene(rows), path, 0)
-        price += self._halves(path) if bounces else 0.0
-        return Stroke(rows, bounces, path, gain + hidden - 0.5 * float(path.misfit[0]) - price)
+        ends = self.foretold(tried, np.concatenate((moments - half, moments + half), axis=1))[0]
+        gain = self.field.gain(rows, (ends[:, count:] - ends[:, :count]) / SHORT)
+        gain += (frames[:, -1] - frames[:, 0] + 1 - count) * np.log(1.0 - self.field.seen)
+        price = BOUNCE * tried.bounces + UNBOUNCED * (tried.bounces != 1) - narrowed(self.scene(rows), tried)
+        return np.asarray(gain - 0.5 * tried.misfit - price)
 
     def _halves(self, path: Paths) -> float:
         """Logarithm of what the halves of the court cost on which a path bounces, as well as these are known."""
@@ -129,14 +149,16 @@ class Grower:
         return float(-np.log(right + np.exp(-OTHER_HALF) * (1.0 - right)).sum())
 
     def places(self, path: Paths, moments: Array) -> tuple[Array, Array]:
-        """Positions (k, n, 3) m of paths at moments (n,) s, and shares (k, n, c) of their vectors."""
-        share, drop = shares_of(moments[None], path.times, path.bounces, path.drag, self.physics.gravity, lift=True)
+        """Positions (k, n, 3) m of paths at moments (n,) or (k, n) s, and shares (k, n, c) of their vectors."""
+        share, drop = shares_of(
+            np.atleast_2d(moments), path.times, path.bounces, path.drag, self.physics.gravity, lift=True
+        )
         positions = share @ path.vectors
         positions[..., Z] -= drop
         return positions, share
 
     def foretold(self, path: Paths, moments: Array) -> tuple[Array, Array]:
-        """Pixels (k, n, 2) of paths at moments (n,) s, and their covariances (k, n, 2, 2)."""
+        """Pixels (k, n, 2) of paths at moments (n,) or (k, n) s, and their covariances (k, n, 2, 2)."""
         positions, share = self.places(path, moments)
         spread = self._spread(path, share)
         at = positions @ self.camera.rotation.T + self.camera.tvec
@@ -178,35 +200,51 @@ class Grower:
         slack = 2.0 * np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
         return bool(((positions > low - slack) & (positions < high + slack)).all())
 
-    def grown(self, stroke: Stroke, way: int) -> Stroke:
-        """The stroke with further candidates after it (way 1) or before it (-1), as long as they agree."""
+    def grown(self, stroke: Stroke, way: int) -> list[Stroke]:
+        """The stroke with further candidates after it (way 1) or before it (-1): as long as they make it likelier.
+
+        A second one goes on with doubtful candidates, to where it is best: few candidates leave a path so wide that one
+        more hardly counts, but the next ones do. The less often the ball is seen, the more doubt is allowed.
+        """
         missed, frame = 0, int(self.field.frame[stroke.rows[-1 if way > 0 else 0]])
+        careful, best, doubtful = stroke, stroke, False
         most = max(MISSED, int(np.log(RARE) / np.log(1.0 - self.field.seen)))
-        while missed <= most:
-            frame += way
-            here = self.field.rows(frame)
-            if not len(here):
-                missed += 1
-                if not 0 <= frame < len(self.field.first) - 1:
-                    break
+        while missed <= most and 0 <= (frame := frame + way) < len(self.field.first) - 1:
+            missed, more = missed + 1, self._with(stroke, self.field.rows(frame))
+            if more is None or more.score <= stroke.score + missed * np.log(self.field.seen):
                 continue
-            pixels, spread = (array[0, 0] for array in self.foretold(stroke.path, self.rays.times[here[:1]]))
-            off = self._distances(here, pixels, spread)
-            best = int(np.argmin(off))
-            more = self._with(stroke, here[best], way) if off[best] < GATE else None
-            missed, stroke = (missed + 1, stroke) if more is None else (0, more)
+            doubtful |= more.score <= stroke.score
+            missed, stroke = 0, more
+            best = more if more.score > best.score else best
+            careful = careful if doubtful else more
+        return [careful] if best is careful else [careful, best]
+
+    def _with(self, stroke: Stroke, here: Index) -> Stroke | None:
+        """The stroke with the nearest of a picture's candidates (n,), if one is near."""
+        if not len(here):
+            return None
+        pixels, spread = (array[0, 0] for array in self.foretold(stroke.path, self.rays.times[here[:1]]))
+        off = self._distances(here, pixels, spread)
+        rows = np.sort(np.append(stroke.rows, here[int(np.argmin(off))]))
+        return self.flown(rows, stroke.bounces) if off.min() < GATE else None
+
+    def whole(self, stroke: Stroke) -> list[Stroke]:
+        """The strokes that a stroke grows to on both sides, with the candidates between its own, likeliest first."""
+        grown = [self._filled(one) for after in self.grown(stroke, 1) for one in self.grown(after, -1)]
+        return sorted(grown, key=lambda one: -one.score)
+
+    def _filled(self, stroke: Stroke) -> Stroke:
+        """The stroke with the candidates between its own that make it likelier."""
+        frames = self.field.frame[stroke.rows]
+        for frame in np.setdiff1d(np.arange(frames[0], frames[-1]), frames):
+            more = self._with(stroke, self.field.rows(int(frame)))
+            stroke = more if more is not None and more.score > stroke.score else stroke
         return stroke
 
     def _distances(self, here: Index, pixels: Array, spread: Array) -> Array:
         """(n,) squared Mahalanobis distances of candidates from a foretold pixel (2,)."""
         off = self.field.pixels[here] - pixels
         return np.asarray(np.einsum("na,nab,nb->n", off, np.linalg.inv(self.field.covariances[here] + spread), off))
-
-    def _with(self, stroke: Stroke, row: int, way: int) -> Stroke | None:
-        """The stroke with one candidate more; None if clutter explains that one better."""
-        rows = np.append(stroke.rows, row) if way > 0 else np.append(row, stroke.rows)
-        more = self.flown(rows, stroke.bounces)
-        return more if more.score > stroke.score else None
 
     def bounced(self, stroke: Stroke, way: int) -> Iterator[Stroke]:
         """The stroke with a bounce after its last candidate (way 1) or before its first (-1), and what follows it."""
@@ -227,7 +265,7 @@ class Grower:
         for row in np.argsort(misfit, kind="stable")[:FOLLOWED]:
             if misfit[row] > misfit.min() + ALIKE or not np.isfinite(misfit[row]):
                 return
-            yield self.grown(self._rated(stroke.rows, tried, int(row)), way)
+            yield from self.grown(self._rated(stroke.rows, tried, int(row)), way)
 
     def shortened(self, stroke: Stroke, most: int = CUT) -> Iterator[Stroke]:
         """The stroke without its last or its first one to `most` candidates, as long as enough are left."""
@@ -249,3 +287,9 @@ class Grower:
             if misfit.min() < stroke.path.misfit[0]:
                 stroke = self._rated(stroke.rows, tried, int(np.argmin(misfit)))
         return stroke
+
+
+def _one(tried: Paths, row: int) -> Paths:
+    """One of several solutions."""
+    names = ("times", "misfit", "vectors", "drag", "covariance")
+    return replace(tried, **{name: getattr(tried, name)[[row]] for name in names})

@@ -12,6 +12,7 @@ from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.rally.events import events_of, stroke_row
+from ballfg.estimation.rally.field import SEEN, UNKNOWN
 from ballfg.estimation.rally.moments import Event
 from ballfg.estimation.rally.reconstruct import ShotRally, reconstruct
 from ballfg.estimation.result import Status
@@ -87,10 +88,10 @@ def track_moving_camera(
     shots, events, rows = list[ShotRally](), list[Event](), list[dict[str, Any]]()
     for shot in motion.shots:
         if candidates is None:
-            found = find_candidates(frames, shot, court, model.radius, motion.times, watch)
+            found, share = find_candidates(frames, shot, court, model.radius, motion.times, watch), SEEN
         else:
-            found = candidates(shot, motion.times)
-        one = reconstruct(found, shot, model, surfaces, first=len(rows), watch=watch)
+            found, share = candidates(shot, motion.times), UNKNOWN
+        one = reconstruct(found, shot, model, surfaces, first=len(rows), seen_share=share, watch=watch)
         mine = events_of(one, model, surfaces, step, court.net)
         shots.append(one)
         events += mine

@@ -67,6 +67,20 @@ def test_a_stroke_that_flies_past_the_wrong_half_costs_as_much_as_it_says(
     assert grower._halves(back) == pytest.approx(5.0, abs=0.2)
 
 
+def test_a_stroke_grows_from_three_of_its_candidates_and_has_those_between(
+    made: tuple[Truth, Shot, Grower, list[Any]],
+) -> None:
+    of, shot, grower, _ = made
+    whole, bounce = true_stroke(of, 0, grower, shot)
+    rows = whole.rows[grower.rays.times[whole.rows] < bounce]
+    known = {tuple(one.rows.tolist()) for one in grower.whole(grower.flown(rows[[0, 2, 4]], ()))}
+    assert any(set(rows.tolist()) <= set(one) for one in known)
+    (together, *_) = grower.flights([rows[[0, 2, 4]], rows[:4], rows[[1, 3, 4]]])
+    alone = grower.flown(rows[[0, 2, 4]], ())
+    assert together.score == pytest.approx(alone.score, abs=1e-6)
+    np.testing.assert_allclose(together.path.vectors, alone.path.vectors, rtol=1e-6, atol=1e-8)
+
+
 def test_shortened_strokes_lose_one_end_each(made: tuple[Truth, Shot, Grower, list[Any]]) -> None:
     of, shot, grower, _ = made
     stroke, _ = true_stroke(of, 0, grower, shot)
@@ -83,7 +97,7 @@ def test_a_hit_is_as_likely_as_the_normal_density_of_what_parts_the_paths(
 ) -> None:
     of, shot, grower, _ = made
     strokes = [true_stroke(of, number, grower, shot)[0] for number in range(3)]
-    found = Hits(grower).between(strokes)
+    found = Hits(grower).between(strokes, strokes)
     assert np.isneginf(found[np.tril_indices(3)]).all()
     for i in range(2):
         one, other = strokes[i], strokes[i + 1]
@@ -95,10 +109,14 @@ def test_a_hit_is_as_likely_as_the_normal_density_of_what_parts_the_paths(
         ]
         onward = one.path.vectors[0, 2, 0] * other.path.vectors[0, 1, 0] > 0.0
         assert not onward
-        assert found[i, i + 1] == pytest.approx(max(density) + np.log(hits_of.ROOM) - hits_of.HIT)
+        field = grower.field
+        missed = field.frame[other.rows[0]] - field.frame[one.rows[-1]] - 1
+        going_on = np.exp(-field.step / hits_of.HIDDEN)  # of the hiding; else the ball is seen, or missed by chance
+        hidden = missed * np.log(going_on + (1.0 - going_on) * (1.0 - field.seen))
+        assert found[i, i + 1] == pytest.approx(max(density) + np.log(hits_of.ROOM) - hits_of.HIT + hidden)
     assert found[0, 1] > 0.0
     again = replace(strokes[1], path=replace(strokes[1].path, vectors=-strokes[1].path.vectors))
-    assert Hits(grower).between([strokes[0], again])[0, 1] < found[0, 1]
+    assert Hits(grower).between(strokes[:1], [again])[0, 0] < found[0, 1]
 
 
 class Links:
@@ -107,24 +125,24 @@ class Links:
     def __init__(self, table: Any) -> None:
         self.table = table
 
-    def between(self, strokes: list[Any]) -> Any:
-        rows = [one.number for one in strokes]
-        return self.table[np.ix_(rows, rows)]
+    def between(self, strokes: list[Any], later: list[Any]) -> Any:
+        return self.table[np.ix_([one.number for one in strokes], [one.number for one in later])]
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_the_best_sequence_and_its_probabilities_are_those_of_all_sequences(seed: int) -> None:
     rng, count = np.random.default_rng(seed), 7
-    first = rng.integers(0, 30, count)
+    first = rng.integers(0, 20, count)
+    first[5:] = first[:2] + 1  # so that two are like earlier ones
     last = first + rng.integers(3, 9, count)
     frame, stamps = np.arange(50), 0.04 * np.arange(50)
-    grower: Any = SimpleNamespace(field=SimpleNamespace(frame=frame, stamps=stamps))
+    grower: Any = SimpleNamespace(field=SimpleNamespace(frame=frame, stamps=stamps, seen=0.6 + 0.05 * seed))
     table = rng.normal(0.0, 6.0, (count, count))
     strokes: list[Any] = [
         SimpleNamespace(
-            rows=np.array([a, b]),
+            rows=np.arange(a, b + 1),
             score=float(rng.uniform(0.0, 12.0)),
-            path=SimpleNamespace(bounces=int(rng.integers(0, 3))),
+            path=SimpleNamespace(bounces=int(rng.integers(0, 3)) if number < 5 else 1),
             number=number,
         )
         for number, (a, b) in enumerate(zip(first, last, strict=True))
@@ -139,8 +157,11 @@ def test_the_best_sequence_and_its_probabilities_are_those_of_all_sequences(seed
         total = begins(chain[0]) + chain[0].score
         for before, after in pairwise(chain):
             pause = stamps[after.rows[0]] - stamps[before.rows[-1]]
-            link = max(begins(after), table[before.number, after.number])
-            total += link - SERVED * (pause < PAUSE and after.path.bounces == MOST_BOUNCES) + after.score
+            unseen = -np.log(1.0 - grower.field.seen) * (after.rows[0] - before.rows[-1] - 1)
+            alone = begins(after) - min(unseen, SERVED) * (pause < PAUSE)
+            link = max(alone, table[before.number, after.number])
+            served = after.path.bounces == MOST_BOUNCES and before.path.bounces > 0
+            total += link - SERVED * (pause < PAUSE and served) + after.score
         return total
 
     def chains() -> Iterator[tuple[Any, ...]]:
@@ -157,8 +178,13 @@ def test_the_best_sequence_and_its_probabilities_are_those_of_all_sequences(seed
         assert not chosen.strokes
         return
     assert [one.number for one in chosen.strokes] == [one.number for one in best]
+
+    def like(one: Any, other: Any) -> bool:
+        shared = len(set(one.rows.tolist()) & set(other.rows.tolist()))
+        return one.path.bounces == other.path.bounces and shared > max(len(one.rows), len(other.rows)) / 2
+
     for one, chance in zip(chosen.strokes, chosen.probabilities, strict=True):
-        mine = [score for chain, score in values.items() if one.number in {other.number for other in chain}]
+        mine = [score for chain, score in values.items() if any(like(one, other) for other in chain)]
         assert chance == pytest.approx(np.exp(logsumexp(mine) - total), abs=1e-9)
 
 
