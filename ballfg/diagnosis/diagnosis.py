@@ -78,8 +78,6 @@ def diagnose(
     )
     search = loop.run(model)
     corrected, tracker, search = _with_own_noise(search, holdout, evaluate, tell, jobs)
-    bare = unpopulated_model(search.declared, holdout, jobs)
-    bare = search.before if bare is search.declared else evaluate(as_declared(bare, holdout.stamps))
     tell("looking at what is left")
     labels, of_labels = _labels(search, model, holdout, tracker, jobs)
     tests = in_order(*generic_tests(search.fit, search.first, tracker), *of_labels)
@@ -108,7 +106,7 @@ def diagnose(
         rounds=search.rounds,
         before=search.before,
         after=after,
-        unpopulated=bare,
+        unpopulated=_unpopulated(search, holdout, evaluate, jobs),
         tracks_found_on=len(np.unique(holdout.search.track)),
         tracks_judged_on=len(search.before.by_track),
         calibrated=calibrated,
@@ -126,6 +124,12 @@ def diagnose(
         nameless=search.odds.nameless,
         budget=budget,
     )
+
+
+def _unpopulated(search: Search, holdout: Holdout, evaluate: Callable[[BallModel], Errors], jobs: int) -> Errors:
+    """Errors of the declared model with the prior of any spin."""
+    bare = unpopulated_model(search.declared, holdout, jobs)
+    return search.before if bare is search.declared else evaluate(as_declared(bare, holdout.stamps))
 
 
 def _labels(

@@ -129,10 +129,11 @@ def for_next_shot(fit: Fit) -> Fit:
 
 def without_population(model: AnalyticModel) -> AnalyticModel:
     """A calibrated model without what it knows of the launchers' spins, and without noise; itself if it knows none."""
-    if model.spins is None and (model.trained is None or model.trained.launcher is None):
+    trained = model.trained or Trained()
+    if model.spins is None and trained.launcher is None:
         return model
     bare = with_effects(model)
-    bare.variations, bare.trained = model.variations, Trained(position_scale=model.trained.position_scale)
+    bare.variations, bare.trained = model.variations, Trained(position_scale=trained.position_scale)
     return bare
 
 
