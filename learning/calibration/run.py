@@ -41,12 +41,12 @@ from ballfg.learning.calibration.calibrate import (
 from ballfg.learning.calibration.gain import denser
 from ballfg.learning.calibration.picture import draw
 from ballfg.learning.calibration.report import compare, outcome, report, table
-from ballfg.learning.calibration.start import written_model
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.config_file import AUTO
 from ballfg.learning.evaluation import TrackScore, summary
 from ballfg.learning.run import run_folder as files
 from ballfg.learning.run.record import NOT_BETTER
+from ballfg.learning.start import written_model
 from ballfg.learning.training_data import analytic_model, open_source
 from ballfg.progress import Watch
 from ballfg.tracks.noise import TrackNoise

@@ -13,9 +13,9 @@ from ballfg.dynamics.model_file import model_to_dict
 from ballfg.dynamics.networks.learned import BASE as PREFIX
 from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.estimation import Smoother, dataset_settings, dataset_surfaces, predict_tracks
-from ballfg.learning.calibration.start import BASE, CALIBRATED, NETWORK, WITHOUT, Start, calibrated_start
 from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.run.training import run_training
+from ballfg.learning.start import BASE, CALIBRATED, NETWORK, WITHOUT, Start, calibrated_start
 from ballfg.progress import unwatched
 from ballfg.tracks import read_dataset
 from tests.learning.conftest import PLANTED
