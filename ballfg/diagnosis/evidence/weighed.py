@@ -253,7 +253,7 @@ class _Question:
             noise,
             (likelihood.samples, likelihood.spins, likelihood.penalty),
             tuple(best),
-            result.evidence + sum(mixed) + choice_odds(self.named),
+            (result.evidence if np.isfinite(result.evidence) else -np.inf) + sum(mixed) + choice_odds(self.named),
             log_odds(self.named, self.nameless),
             strengths,
             held_out(total, priors.precision(best), priors.away, self.halves),

@@ -149,8 +149,8 @@ class _Found:
     """Everything weighed so far, by the names of the effects, and the best of it."""
 
     def __init__(self, loop: SearchLoop, first: Fit) -> None:
-        self.loop, self.first = loop, first
-        whole = on_all(first, on_others(first, loop.holdout.held_out))
+        self.loop = loop
+        self.first = whole = on_all(first, on_others(first, loop.holdout.held_out))
         self.halves: Mask = unlike_halves(whole)
         self.motion = random_motion(whole)  # the same for all models: with another one they cannot be compared
         self.best = weighed(whole, (), self.motion, self.halves)
@@ -353,12 +353,21 @@ def _score(model: Weighed) -> float:
 
 
 def without_named(fit: Fit, gone: Sequence[Hypothesis], first: Fit) -> Fit:
-    """A few steps of the fit without some of the effects added to the first one's model, at the same noise."""
+    """A few steps of the fit without some of the effects added to the first one's model, at the same noise.
+
+    They begin at the first one's values where a ball leaves its path without an effect: a large lift that saturates
+    without its saturation, say.
+    """
     problem = fit.problem
     for hypothesis in gone:
         problem = _problem_without(problem, hypothesis, first)
-    unknowns = replace(fit.unknowns, values={n: fit.unknowns.values[n] for n in problem.free})
-    return fit_problem(problem, unknowns, fit.noise, settle_noise=False, steps=FIRST_STEPS)
+    known, plain = fit.unknowns, first.unknowns
+    kept = replace(known, values={n: known.values[n] for n in problem.free})
+    begun = fit_problem(problem, kept, fit.noise, settle_noise=False, steps=FIRST_STEPS)
+    if np.isfinite(begun.cost):
+        return begun
+    values = {n: plain.values.get(n, value) for n, value in kept.values.items()}
+    return fit_problem(problem, replace(plain, values=values), fit.noise, settle_noise=False, steps=FIRST_STEPS)
 
 
 def _problem_without(problem: Problem, hypothesis: Hypothesis, first: Fit) -> Problem:
