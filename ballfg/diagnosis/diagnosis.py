@@ -26,6 +26,7 @@ from ballfg.diagnosis.search.process_noise import (
     calibrated_model,
     errors_of,
     for_next_shot,
+    has_population,
     noise_about,
     predictive_model,
     unpopulated_model,
@@ -92,7 +93,7 @@ def diagnose(
     declared = {name: float(value.detach()) for name, value in model.named_parameters()}
     calibrated = values_of(search.whole, [name for name in search.whole.problem.free if name in declared], declared)
     whole = calibrated_model(for_next_shot(search.whole), holdout.launcher.embedding)
-    if without_population(corrected) is corrected:
+    if has_population(whole) and not has_population(corrected):
         whole = without_population(whole)
     whole.noise = corrected.noise
     whole.domain = Domain.of(dataset) if search.findings else model.domain
@@ -128,8 +129,9 @@ def diagnose(
 
 def _unpopulated(search: Search, holdout: Holdout, evaluate: Callable[[BallModel], Errors], jobs: int) -> Errors:
     """Errors of the declared model with the prior of any spin."""
-    bare = unpopulated_model(search.declared, holdout, jobs)
-    return search.before if bare is search.declared else evaluate(as_declared(bare, holdout.stamps))
+    if not has_population(search.declared):
+        return search.before
+    return evaluate(as_declared(unpopulated_model(search.declared, holdout, jobs), holdout.stamps))
 
 
 def _labels(

@@ -31,12 +31,10 @@ from ballfg.diagnosis.residual_tests.generic import generic_tests
 from ballfg.diagnosis.residual_tests.label_check import judged, label_evidence, label_test
 from ballfg.diagnosis.residual_tests.residuals import residuals_of
 from ballfg.diagnosis.result import Diagnosis, Errors, Finding
-from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.diagnosis.search.loop import NAMED, SearchLoop
-from ballfg.diagnosis.search.process_noise import calibrated_model, fitted_model, noise_about
+from ballfg.diagnosis.search.process_noise import calibrated_model, errors_of, fitted_model, noise_about
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel
 from ballfg.dynamics.effect import Effect
-from ballfg.estimation import dataset_settings
 from ballfg.tracks import Dataset
 from ballfg.tracks.noise import TrackNoise
 
@@ -266,8 +264,7 @@ class _Predicting:
         found = {}
         for room in self.rooms:
             model, holdout = models[room.name], room.holdout
-            settings = dataset_settings(holdout.dataset, model)
-            found[room.name] = prediction_errors(model, holdout.held_out_tracks, holdout.surfaces, settings, self.jobs)
+            found[room.name] = errors_of(model, holdout, holdout.held_out_tracks, self.jobs)
         return found
 
 

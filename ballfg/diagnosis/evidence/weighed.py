@@ -158,7 +158,8 @@ def weighed(
 
 def _followed(question: _Question, fit: Fit, start: Noise | None) -> Weighed:
     """The model at the most probable unknowns near a fit."""
-    point = question.point(followed(fit, fit.unknowns))
+    closest = followed(fit, fit.unknowns)
+    point = question.point(closest if np.isfinite(closest.cost) else fit)
     found, step = question.at(point, (start, None) if start else (None,))
     for number in range(MOST_STEPS):
         second = number == 0 and question.nameless  # noise and widths of patterns need a second turn
@@ -246,14 +247,14 @@ class _Question:
             centre = values[place] + priors.away[place]
             mixed[number] += within(hypothesis, centre, found.mean, sigmas, WIDTHS[best[number]])
             strengths[hypothesis.name] = found
-        gain = result.gain(own)
+        evidence, gain = result.evidence + sum(mixed) + choice_odds(self.named), result.gain(own)
         weighed = Weighed(
             tuple(self.named),
             replace(fit),  # without what can be computed again: a search keeps dozens of models
             noise,
             (likelihood.samples, likelihood.spins, likelihood.penalty),
             tuple(best),
-            (result.evidence if np.isfinite(result.evidence) else -np.inf) + sum(mixed) + choice_odds(self.named),
+            evidence if np.isfinite(evidence) else -np.inf,
             log_odds(self.named, self.nameless),
             strengths,
             held_out(total, priors.precision(best), priors.away, self.halves),

@@ -116,7 +116,7 @@ def followed(fit: Fit, unknowns: Unknowns) -> Fit:
     """The fit at other common unknowns, its first states those whose paths come closest to the samples.
 
     Args: unknowns: their first states are not used.
-    Returns: of infinite cost if a path misses a contact; the fit itself if it does so at its own unknowns.
+    Returns: of infinite cost if a path misses a contact.
     """
     names, system = fit.problem.free, fit.linearised
     values = np.array([unknowns.values[name] - fit.unknowns.values[name] for name in names])
@@ -125,7 +125,7 @@ def followed(fit: Fit, unknowns: Unknowns) -> Fit:
     moved = Fit.at(fit.problem, replace(unknowns, starts=starts), fit.noise, fit.steps)
     for _ in range(CORRECTIONS):
         moved = _followed_up(moved, system, fit.robust)
-    return moved if np.isfinite(moved.cost) or unknowns is not fit.unknowns else fit
+    return moved
 
 
 def _near(before: Noise, after: Noise) -> bool:

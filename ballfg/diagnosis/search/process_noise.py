@@ -127,12 +127,14 @@ def for_next_shot(fit: Fit) -> Fit:
     return replace(fit, noise=replace(fit.noise, spin=scatter))
 
 
+def has_population(model: BallModel) -> bool:
+    """True if a model knows more of the launchers' spins than the prior of any spin."""
+    return model.spins is not None or (model.trained is not None and model.trained.launcher is not None)
+
+
 def without_population(model: AnalyticModel) -> AnalyticModel:
-    """A calibrated model without what it knows of the launchers' spins, and without noise; itself if it knows none."""
-    trained = model.trained or Trained()
-    if model.spins is None and trained.launcher is None:
-        return model
-    bare = with_effects(model)
+    """A calibrated model without what it knows of the launchers' spins, and without noise."""
+    bare, trained = with_effects(model), model.trained or Trained()
     bare.variations, bare.trained = model.variations, Trained(position_scale=trained.position_scale)
     return bare
 
@@ -146,17 +148,16 @@ def predictive_model(holdout: Holdout, jobs: int, fit: Fit) -> AnalyticModel:
     """
     model = calibrated_model(for_next_shot(fit), holdout.launcher.embedding)
     model.noise = noise_about(model, holdout.search_tracks, holdout.dataset, jobs=jobs)
-    bare = unpopulated_model(model, holdout, jobs)
-    if bare is model:
+    if not has_population(model):
         return model
+    bare = unpopulated_model(model, holdout, jobs)
     return max(model, bare, key=lambda one: errors_of(one, holdout, holdout.search_tracks, jobs).log_likelihood)
 
 
 def unpopulated_model(model: AnalyticModel, holdout: Holdout, jobs: int) -> AnalyticModel:
-    """A predictive model without its population, with its own noise; itself without one."""
+    """A predictive model without its population, with its own noise."""
     bare = without_population(model)
-    if bare is not model:
-        bare.noise = noise_about(bare, holdout.search_tracks, holdout.dataset, jobs=jobs)
+    bare.noise = noise_about(bare, holdout.search_tracks, holdout.dataset, jobs=jobs)
     return bare
 
 

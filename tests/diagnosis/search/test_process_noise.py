@@ -11,7 +11,13 @@ import torch
 from ballfg.diagnosis.fit.fit import values_of
 from ballfg.diagnosis.fit.holdout import EvaluationTrack
 from ballfg.diagnosis.fit.problem import launch_axes
-from ballfg.diagnosis.search.process_noise import calibrated_model, for_next_shot, noise_about, without_population
+from ballfg.diagnosis.search.process_noise import (
+    calibrated_model,
+    for_next_shot,
+    has_population,
+    noise_about,
+    without_population,
+)
 from ballfg.dynamics import load_model, nominal_model, save_model
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate
@@ -152,13 +158,14 @@ def test_shots_that_agree_leave_the_doubt_about_their_mean(make_ball, make_launc
 
 def test_labelled_spins_have_no_population(calm_fit):
     assert for_next_shot(calm_fit) is calm_fit
-    model = calibrated_model(calm_fit, EMBEDDING)
-    assert without_population(model) is model
+    assert not has_population(calibrated_model(calm_fit, EMBEDDING))
 
 
 def test_without_its_population_a_model_is_the_same_ball(unlabelled):
     model = calibrated_model(unlabelled, EMBEDDING)
     bare = without_population(model)
+    assert has_population(model)
+    assert not has_population(bare)
     assert bare.spins is None
     assert bare.trained.launcher is None
     assert bare.trained.position_scale == model.trained.position_scale
