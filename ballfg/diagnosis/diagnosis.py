@@ -25,12 +25,11 @@ from ballfg.diagnosis.search.plausible import at_bound, implausible
 from ballfg.diagnosis.search.process_noise import (
     calibrated_model,
     errors_of,
-    for_next_shot,
     has_population,
+    next_shot_model,
     noise_about,
     predictive_model,
     unpopulated_model,
-    without_population,
 )
 from ballfg.diagnosis.search.stamp_effects import as_declared
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel
@@ -87,14 +86,12 @@ def diagnose(
     if verdict is Verdict.UNEXPLAINED and any(t.name in DESCRIBABLE for t in alarms(tests)):
         tell("describing what is left without a name")
         embedding, parts = holdout.launcher.embedding, holdout.search_tracks
-        helped = fallback(search.fit, embedding, corrected.noise, dataset, parts, search.judged, evaluate)
+        helped = fallback(search.fit, embedding, corrected, dataset, parts, search.judged, evaluate)
     unexplained = what_is_left(tests, helped)
     residuals = residuals_of(search.first)
     declared = {name: float(value.detach()) for name, value in model.named_parameters()}
     calibrated = values_of(search.whole, [name for name in search.whole.problem.free if name in declared], declared)
-    whole = calibrated_model(for_next_shot(search.whole), holdout.launcher.embedding)
-    if has_population(whole) and not has_population(corrected):
-        whole = without_population(whole)
+    whole = next_shot_model(search.whole, holdout.launcher.embedding, corrected)
     whole.noise = corrected.noise
     whole.domain = Domain.of(dataset) if search.findings else model.domain
     after = search.judged if helped is None else helped.after

@@ -6,11 +6,10 @@ from ballfg.diagnosis.fit.holdout import EvaluationTrack
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.residual_tests.sparse import SparseTerms, fit_with_terms, sparse_terms
 from ballfg.diagnosis.result import Errors, Fallback
-from ballfg.diagnosis.search.process_noise import calibrated_model, for_next_shot, noise_about
-from ballfg.dynamics import BallModel
+from ballfg.diagnosis.search.process_noise import next_shot_model, noise_about
+from ballfg.dynamics import AnalyticModel, BallModel
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.tracks import Dataset
-from ballfg.tracks.noise import TrackNoise
 
 HELPS = 0.9
 """Ratio of the prediction errors on the held-out half with and without an accepted fallback."""
@@ -19,7 +18,7 @@ HELPS = 0.9
 def fallback(
     before: Fit,
     embedding: SpinEmbedding,
-    noise: TrackNoise | None,
+    corrected: AnalyticModel,
     dataset: Dataset,
     parts: Sequence[EvaluationTrack],
     now: Errors,
@@ -27,15 +26,15 @@ def fallback(
 ) -> Fallback | None:
     """A description of the rest without a name; None if nothing predicts better.
 
-    The previous fit and the tracks are those of the search half, with their noise. The errors `now`, of the model so
-    far, and those from `evaluate` are those on the held-out half.
+    The previous fit and the tracks are those of the search half; `corrected` is the model of that fit, with its noise.
+    Its errors `now` and those from `evaluate` are those on the held-out half.
     """
     terms = sparse_terms(before)
     if terms is None:
         return None
     after = fit_with_terms(before, terms)
-    model = calibrated_model(for_next_shot(after), embedding)
-    model.noise = noise_about(model, parts, dataset, noise)
+    model = next_shot_model(after, embedding, corrected)
+    model.noise = noise_about(model, parts, dataset, corrected.noise)
     errors = evaluate(model)
     if errors.prediction_rmse_mm >= HELPS * now.prediction_rmse_mm:
         return None

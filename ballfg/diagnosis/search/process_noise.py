@@ -127,6 +127,15 @@ def for_next_shot(fit: Fit) -> Fit:
     return replace(fit, noise=replace(fit.noise, spin=scatter))
 
 
+def next_shot_model(fit: Fit, embedding: SpinEmbedding, like: AnalyticModel | None = None) -> AnalyticModel:
+    """The fitted model for a further shot, without its noise.
+
+    Args: embedding: as in `calibrated_model`.  like: a model; where it has no population of spins, this one has none.
+    """
+    model = calibrated_model(for_next_shot(fit), embedding)
+    return model if like is None or has_population(like) or not has_population(model) else without_population(model)
+
+
 def has_population(model: BallModel) -> bool:
     """True if a model knows more of the launchers' spins than the prior of any spin."""
     return model.spins is not None or (model.trained is not None and model.trained.launcher is not None)
@@ -146,7 +155,7 @@ def predictive_model(holdout: Holdout, jobs: int, fit: Fit) -> AnalyticModel:
     observed part, and an effect's gain would depend on the errors of the others. Spins that such a model needs differ
     from flight to flight more than those of a launcher: a population may then be worse than the prior of any spin.
     """
-    model = calibrated_model(for_next_shot(fit), holdout.launcher.embedding)
+    model = next_shot_model(fit, holdout.launcher.embedding)
     model.noise = noise_about(model, holdout.search_tracks, holdout.dataset, jobs=jobs)
     if not has_population(model):
         return model
@@ -155,9 +164,9 @@ def predictive_model(holdout: Holdout, jobs: int, fit: Fit) -> AnalyticModel:
 
 
 def unpopulated_model(model: AnalyticModel, holdout: Holdout, jobs: int) -> AnalyticModel:
-    """A predictive model without its population, with its own noise."""
+    """A predictive model without its population, with its own noise beside the same tracker."""
     bare = without_population(model)
-    bare.noise = noise_about(bare, holdout.search_tracks, holdout.dataset, jobs=jobs)
+    bare.noise = noise_about(bare, holdout.search_tracks, holdout.dataset, model.noise, jobs=jobs)
     return bare
 
 
