@@ -34,8 +34,8 @@ def unlike_halves(fit: Fit) -> Mask:
     away = _launches(fit)
     place = away @ np.linalg.svd(away, full_matrices=False)[2][0]
     if np.ptp(place) > ALIKE:
-        middle = np.median(place)
-        begun = np.stack([away[side].mean(axis=0) for side in (place >= middle, place < middle)])
+        lower, upper = np.split(np.argsort(place, kind="stable"), [len(place) // 2])  # equal places: neither is empty
+        begun = np.stack([away[upper].mean(axis=0), away[lower].mean(axis=0)])
         means, _ = kmeans2(away, begun, minit="matrix", missing="raise")
         place = (away - means.mean(axis=0)) @ (means[0] - means[1])
     count, halves = len(place), np.full(len(place), False)

@@ -7,7 +7,8 @@ approximation.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,6 +18,9 @@ from ballfg.diagnosis.evidence.rows import SPIN_KINDS, Rows
 from ballfg.diagnosis.fit.problem import LABEL_LOSS, POSITION_LOSS
 from ballfg.diagnosis.fit.system import by_track
 from ballfg.state import STATE_DIM
+
+Weights = tuple[Array, Array, Array]
+"""Robust weights of samples (n, k) and spins (n,), and their cost (n,)."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +106,7 @@ class Posterior:
 
 @dataclass(frozen=True)
 class Likelihood:
-    """Inner products of the rows under some robust weights.
+    """Inner products of the rows of one batch under some robust weights.
 
     Attributes:
         rows: of a fit.
@@ -177,6 +181,52 @@ class Likelihood:
         left = r.residual + (r.by_start @ start[..., None] + r.motion.columns @ random[..., None])[..., 0]
         left += (r.by_common @ common[..., None])[..., 0]
         return weighted(r, left / np.exp(noise.white), left[:, -3:] / np.exp(noise.spin)[r.spin_kinds])
+
+
+@dataclass(frozen=True)
+class Batches:
+    """The likelihood of all stretches, batch by batch.
+
+    Attributes:
+        parts: the likelihood of each batch.
+        numbers: of its stretches among all.
+    """
+
+    parts: tuple[Likelihood, ...]
+    numbers: tuple[Index, ...]
+
+    @classmethod
+    def of(cls, rows: Rows, weights: Sequence[Weights] | None = None) -> Batches:
+        """The likelihood of rows; weights: of each batch, one if None."""
+        numbers, batches = zip(*rows.batches, strict=True)
+        if weights is None:
+            return cls(tuple(unweighted(batch) for batch in batches), numbers)
+        return cls(tuple(Likelihood(b, *own) for b, own in zip(batches, weights, strict=True)), numbers)
+
+    @property
+    def weights(self) -> tuple[Weights, ...]:
+        """The robust weights of samples and spins, and their cost, of each batch."""
+        return tuple((part.samples, part.spins, part.penalty) for part in self.parts)
+
+    @property
+    def counts(self) -> Array:
+        """As of `Rows`."""
+        return np.sum([part.rows.counts for part in self.parts], axis=0)
+
+    def reduced(self, noise: Noise) -> tuple[Reduced, list[Local]]:
+        """First states and random motion integrated out, and what was eliminated in each batch."""
+        found = [part.reduced(noise) for part in self.parts]
+        order = np.argsort(np.concatenate(self.numbers))
+        constant, gram = (np.concatenate([getattr(r, name) for r, _ in found])[order] for name in ("constant", "gram"))
+        return Reduced(constant, gram), [local for _, local in found]
+
+    def reweighted(self, noise: Noise) -> Batches:
+        """As of `Likelihood`."""
+        return replace(self, parts=tuple(part.reweighted(noise) for part in self.parts))
+
+    def beside(self, along: Sequence[Array], noise: Noise) -> Batches:
+        """As of `Likelihood`, by the factors of each batch."""
+        return replace(self, parts=tuple(p.beside(own, noise) for p, own in zip(self.parts, along, strict=True)))
 
 
 def unweighted(rows: Rows) -> Likelihood:

@@ -114,6 +114,27 @@ class Rows:
             found[stretches] = rows.swapaxes(1, 2) @ rows
         return found
 
+    @property
+    def batches(self) -> list[tuple[Index, Rows]]:
+        """Stretches of similar length with their numbers, as wide as their widest: a long one would pad all others."""
+        return [(numbers, self._batch(numbers, count)) for numbers, count in of_similar_length(self.used)]
+
+    def _batch(self, numbers: Index, count: int) -> Rows:
+        """The rows of some stretches, of their first samples and their own random columns."""
+        places = np.append(np.arange(3 * count), np.arange(-3, 0))
+        kinds = self.motion.kinds[numbers]
+        width = int((kinds >= 0).sum(axis=1).max())
+        cut = np.ix_(numbers, places)
+        return Rows(
+            self.residual[cut],
+            self.by_start[cut],
+            self.by_common[cut],
+            Motion(self.motion.columns[..., :width][cut], kinds[:, :width]),
+            self.used[numbers, :count],
+            self.labelled[numbers],
+            self.track[numbers],
+        )
+
     def with_common(self, by_common: Array) -> Rows:
         """The rows with other common unknowns; by_common: (n, m, q)."""
         return replace(self, by_common=by_common)

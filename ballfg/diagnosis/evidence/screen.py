@@ -15,7 +15,7 @@ import numpy as np
 from scipy import special
 
 from ballfg.arrays import Array, Index
-from ballfg.diagnosis.evidence.likelihood import Likelihood, Posterior, Reduced, held_out, posterior
+from ballfg.diagnosis.evidence.likelihood import Batches, Posterior, Reduced, held_out, posterior
 from ballfg.diagnosis.evidence.odds import tempered
 from ballfg.diagnosis.evidence.prior import WIDTHS, centres, choice_odds, log_odds, scales, within
 from ballfg.diagnosis.evidence.priors_of_fit import Priors
@@ -36,15 +36,13 @@ class Screen:
     Attributes:
         model: without the candidates.
         candidates: the hypotheses.
-        likelihood: with the columns of their strengths last.
-        tracks: the same of each track, first states and random motion integrated out.
+        tracks: of each track, with the columns of their strengths last, first states and random motion integrated out.
         total: summed over the tracks.
         priors: of the model's own common unknowns.
     """
 
     model: Weighed
     candidates: Sequence[Hypothesis]
-    likelihood: Likelihood
     tracks: Reduced
     total: Reduced
     priors: Priors
@@ -58,10 +56,9 @@ class Screen:
         """
         rows = rows_of(model.fit, motion)
         wide = replace(rows, by_common=np.concatenate((rows.by_common, columns / roots(model.fit)), axis=-1))
-        likelihood = Likelihood(wide, *model.weights)
-        tracks = likelihood.reduced(model.noise)[0].by_track(rows.track)
+        tracks = Batches.of(wide, model.weights).reduced(model.noise)[0].by_track(rows.track)
         total = tracks.of(np.full(len(model.halves), True))
-        return cls(model, candidates, likelihood, tracks, total, Priors.of(model.fit, model.named))
+        return cls(model, candidates, tracks, total, Priors.of(model.fit, model.named))
 
     @cached_property
     def gains(self) -> list[float]:

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import linalg
 
 from ballfg.arrays import Array
-from ballfg.diagnosis.evidence.likelihood import Likelihood, Local, Noise, Posterior, posterior, unweighted
+from ballfg.diagnosis.evidence.likelihood import Batches, Likelihood, Local, Noise, Posterior, posterior
 from ballfg.diagnosis.evidence.rows import Rows
 from ballfg.state import STATE_DIM
 
@@ -29,18 +29,18 @@ LONGEST: Final = 1.5
 class Slopes:
     """Derivatives of the evidence by the logarithms of the sizes: slope (9,) and average information (9, 9).
 
-    `along` (n, d) are factors of the columns start, random, common, residual whose sum is the residual at the mean,
-    one for the residual.
+    `along` are, of each batch, the factors (n, d) of the columns start, random, common, residual whose sum is the
+    residual at the mean, one for the residual.
     """
 
     slope: Array
     information: Array
-    along: Array
+    along: list[Array]
 
 
 def settled(
     rows: Rows, precision: Array, away: Array, starts: Sequence[Noise | None] = (None,), own: int | None = None
-) -> tuple[Likelihood, Noise]:
+) -> tuple[Batches, Noise]:
     """The likelihood with the robust weights and sizes of noise that maximise the evidence at the present unknowns.
 
     Not at those to which it leads: a long step leaves the linear range. There are several maxima: noise that a wrong
@@ -51,7 +51,7 @@ def settled(
         starts: noise of similar models, or None for almost none beside that of the samples; the best end counts.
         own: number of the common unknowns, the first ones, in which the rows are not linear; None: all.
     """
-    plain = unweighted(rows)
+    plain = Batches.of(rows)
     begun = [(plain.reweighted(start) if start else plain, start or Noise()) for start in starts]
     ends = [_climbed(*one, precision, away, own) for one in begun]
     _, likelihood, noise = max(ends, key=lambda end: end[0])
@@ -59,11 +59,11 @@ def settled(
 
 
 def _climbed(
-    likelihood: Likelihood, noise: Noise, precision: Array, away: Array, own: int | None
-) -> tuple[float, Likelihood, Noise]:
+    likelihood: Batches, noise: Noise, precision: Array, away: Array, own: int | None
+) -> tuple[float, Batches, Noise]:
     """The largest evidence near a start, by steps with the average information, the weights following the sizes."""
 
-    def at(likelihood: Likelihood, noise: Noise) -> tuple[Posterior, Slopes | None]:
+    def at(likelihood: Batches, noise: Noise) -> tuple[Posterior, Slopes | None]:
         reduced, local = likelihood.reduced(noise)
         found = posterior(reduced, precision, away).held(own)
         if not np.isfinite(found.evidence):
@@ -98,7 +98,7 @@ def _bounded_step(sizes: Array, slopes: Slopes) -> Array:
 
 
 def slopes_at(
-    likelihood: Likelihood, noise: Noise, local: Local, found: Posterior, precision: Array, away: Array
+    likelihood: Batches, noise: Noise, eliminated: Sequence[Local], found: Posterior, precision: Array, away: Array
 ) -> Slopes:
     """The derivatives of the evidence by the logarithms of the sizes.
 
@@ -106,7 +106,39 @@ def slopes_at(
     priors add up to the square at the mean plus one for each unknown, so that those of the samples follow from the
     others. The average of the observed and the expected information needs no traces: A. R. Gilmour, R. Thompson,
     B. R. Cullis, "Average information REML", Biometrics 51, 1995.
+
+    Args: eliminated: of each batch, as `reduced` gives them with the posterior.
     """
+    shown = [_shown(part, noise, local, found) for part, local in zip(likelihood.parts, eliminated, strict=True)]
+    squares, products, common = (sum(getattr(s, name) for s in shown) for name in ("squares", "products", "common"))
+    prior = float(precision @ ((away - found.mean) ** 2 + np.diagonal(found.covariance)))
+    unknowns = sum(s.unknowns for s in shown) + len(found.mean)
+    white = found.square + float(unknowns) - squares.sum() - prior
+    slope = np.append(white, squares) - likelihood.counts
+    information = 2.0 * (products - common.T @ found.covariance @ common)
+    return Slopes(slope, information, [s.along for s in shown])
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """What one batch shows of the sizes.
+
+    Attributes:
+        squares: (8,) expected ones over the variance, of spins and random columns by their kinds.
+        unknowns: number of first states and random columns.
+        along: (n, d) as of `Slopes`.
+        products: (9, 9) inner products of what each size's rows or columns show, less what local unknowns absorb.
+        common: (c, 9) their inner products with the common columns, less the same.
+    """
+
+    squares: Array
+    unknowns: int
+    along: Array
+    products: Array
+    common: Array
+
+
+def _shown(likelihood: Likelihood, noise: Noise, local: Local, found: Posterior) -> _Shown:
     kinds = likelihood.rows.motion.kinds
     end = STATE_DIM + kinds.shape[1]
     upper = inverses(local.lower)
@@ -114,31 +146,21 @@ def slopes_at(
     step, root = np.append(-found.mean, 1.0), np.linalg.cholesky(found.covariance)
     mean, moved = solved @ step, solved[..., :-1] @ root
     squares = mean**2 + (upper**2).sum(axis=-1) + (moved**2).sum(axis=-1)
-    own = [squares[:, STATE_DIM:][kinds == kind] for kind in range(len(noise.random))]
-    shown = [float(o.sum()) * np.exp(-2.0 * log) for o, log in zip(own, noise.random, strict=True)]
+    own = np.array([squares[:, STATE_DIM:][kinds == kind].sum() for kind in range(len(noise.random))])
     spins = likelihood.spin_columns
     left = spins[..., end:] @ step - (spins[..., :end] @ mean[..., None])[..., 0]
     scattered = (spins[..., end:-1] - spins[..., :end] @ solved[..., :-1]) @ root
     square = left**2 + (scattered**2).sum(axis=-1) + ((spins[..., :end] @ upper) ** 2).sum(axis=-1)
     spin = np.bincount(likelihood.rows.spin_kinds.ravel(), square.ravel(), len(noise.spin))
-    spin *= np.exp(-2.0 * np.array(noise.spin))
-    prior = float(precision @ ((away - found.mean) ** 2 + np.diagonal(found.covariance)))
     shown_of = np.diagonal(likelihood.gram, axis1=1, axis2=2) + (spins**2).sum(axis=1)
     unseen = int((shown_of[:, :STATE_DIM] == 0.0).sum()) + int((kinds < 0).sum())  # `inner` gives them a prior
-    unknowns = mean.shape[0] * end - unseen + len(found.mean)
-    white = found.square + float(unknowns) - sum(shown) - spin.sum() - prior
-    slope = np.array([white, *spin, *shown]) - likelihood.rows.counts
     along = np.concatenate((-mean, np.broadcast_to(step, (len(mean), len(step)))), axis=1)
-    return Slopes(slope, _information(likelihood, noise, upper, local.solved, along, found.covariance), along)
+    weighted = np.concatenate((spin, own)) * np.exp(-2.0 * noise.vector[1:])
+    return _Shown(weighted, mean.size - unseen, along, *_products(likelihood, noise, upper, local.solved, along))
 
 
-def _information(
-    likelihood: Likelihood, noise: Noise, upper: Array, solved: Array, along: Array, covariance: Array
-) -> Array:
-    """(9, 9) twice the inner products of what each size's rows or columns show, less what all unknowns absorb.
-
-    Args: along: (n, d) factors of the columns whose sum is the residual at the mean.
-    """
+def _products(likelihood: Likelihood, noise: Noise, upper: Array, solved: Array, along: Array) -> tuple[Array, Array]:
+    """As of `_Shown`; along: (n, d) factors of the columns whose sum is the residual at the mean."""
     kinds = likelihood.rows.motion.kinds
     end = STATE_DIM + kinds.shape[1]
     ahead = np.zeros((*along.shape, len(noise.random)))  # of the random columns alone, kind by kind
@@ -157,7 +179,7 @@ def _information(
     products[range(own), range(own)] = np.einsum("nd,nda->a", along, rows[..., :own])
     local = upper.swapaxes(1, 2) @ rows[:, :end]
     common = (rows[:, end:-1] - solved[:, :-1] @ local).sum(axis=0)
-    return 2.0 * (products - np.einsum("nla,nlb->ab", local, local) - common.T @ covariance @ common)
+    return products - np.einsum("nla,nlb->ab", local, local), common
 
 
 def inverses(lower: Array) -> Array:

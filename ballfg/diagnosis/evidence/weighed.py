@@ -10,7 +10,7 @@ import numpy as np
 
 from ballfg.arrays import Array, Mask
 from ballfg.diagnosis.evidence.halves import unlike_halves
-from ballfg.diagnosis.evidence.likelihood import Noise, Reduced, held_out, posterior, unweighted
+from ballfg.diagnosis.evidence.likelihood import Batches, Noise, Reduced, Weights, held_out, posterior
 from ballfg.diagnosis.evidence.nameless import NAMELESS, Patterns
 from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, log_odds, within
 from ballfg.diagnosis.evidence.priors_of_fit import Priors
@@ -64,7 +64,7 @@ class Weighed:
         named: effects added to the declared model.
         fit: to the tracks of both halves.
         noise: sizes of its noise.
-        weights: robust weights of samples (n, k) and spins (n,), and their cost (n,).
+        weights: robust weights, batch by batch.
         widths: number of each effect's most probable prior width.
         evidence: logarithm, natural units, up to a constant that all models of the same tracks share.
         odds: logarithm of the prior odds.
@@ -79,7 +79,7 @@ class Weighed:
     named: tuple[Hypothesis, ...]
     fit: Fit
     noise: Noise
-    weights: tuple[Array, Array, Array]
+    weights: tuple[Weights, ...]
     widths: tuple[int, ...]
     evidence: float
     odds: float
@@ -252,7 +252,7 @@ class _Question:
             tuple(self.named),
             replace(fit),  # without what can be computed again: a search keeps dozens of models
             noise,
-            (likelihood.samples, likelihood.spins, likelihood.penalty),
+            likelihood.weights,
             tuple(best),
             evidence if np.isfinite(evidence) else -np.inf,
             log_odds(self.named, self.nameless),
@@ -287,7 +287,7 @@ class _Question:
 
         The evidence is what it would be at the end of the step from there, if that were linear.
         """
-        reduced, _ = unweighted(point.rows).reweighted(model.noise).reduced(model.noise)
+        reduced, _ = Batches.of(point.rows).reweighted(model.noise).reduced(model.noise)
         found, own = point.priors.posterior(reduced, model.widths), point.own
         return found.evidence - found.gain(own)
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from ballfg.diagnosis.evidence.likelihood import Likelihood, Noise, posterior
-from ballfg.diagnosis.evidence.rows import random_motion, rows_of
+from ballfg.diagnosis.evidence.likelihood import Batches, Likelihood, Noise, posterior, unweighted
+from ballfg.diagnosis.evidence.rows import Motion, random_motion, rows_of
 from ballfg.diagnosis.evidence.sizes import settled, slopes_at
 from ballfg.state import STATE_DIM
 
@@ -95,12 +95,42 @@ def test_value_is_the_same_in_other_units_of_what_has_no_prior(likelihood, prior
     assert values[1] == pytest.approx(values[0], abs=1e-6)
 
 
+def slopes_of(likelihood, prior):
+    batches = Batches((likelihood,), (np.arange(len(likelihood.rows.used)),))
+    reduced, eliminated = batches.reduced(NOISE)
+    return slopes_at(batches, NOISE, eliminated, posterior(reduced, *prior), *prior)
+
+
+def test_batches_of_unlike_lengths_are_the_same_as_one(rows, prior):
+    """Three stretches end early: they are narrower, and all numbers and their order are those of one wide batch."""
+    used, kinds, columns = rows.used.copy(), rows.motion.kinds.copy(), rows.motion.columns.copy()
+    for number, (samples, random) in {0: (8, 11), 2: (8, 9), 3: (14, 30)}.items():
+        used[number, samples:], kinds[number, random:], columns[number, ..., random:] = False, -1, 0.0
+    gone = np.concatenate((np.repeat(~used, 3, axis=1), np.full((len(used), 3), False)), axis=1)
+    short = replace(rows, used=used, motion=Motion(np.where(gone[..., None], 0.0, columns), kinds))
+    short = replace(short, **{n: np.where(gone[..., None], 0.0, getattr(rows, n)) for n in ("by_start", "by_common")})
+    short = replace(short, residual=np.where(gone, 0.0, rows.residual))
+    many, (one,) = Batches.of(short).reweighted(NOISE), [unweighted(short).reweighted(NOISE)]
+    assert [part.rows.used.shape[1] for part in many.parts] == [8, 14, rows.used.shape[1]]
+    assert max(part.rows.motion.kinds.shape[1] for part in many.parts[:2]) < kinds.shape[1]
+    whole = Batches((one,), (np.arange(len(used)),))
+    (found, eliminated), (wide, local) = many.reduced(NOISE), whole.reduced(NOISE)
+    np.testing.assert_allclose(found.constant, wide.constant, rtol=1e-9)
+    np.testing.assert_allclose(found.gram, wide.gram, rtol=1e-7, atol=1e-9 * np.abs(wide.gram).max())
+    at = posterior(found, *prior)
+    slopes = slopes_at(many, NOISE, eliminated, at, *prior), slopes_at(whole, NOISE, local, at, *prior)
+    np.testing.assert_allclose(slopes[0].slope, slopes[1].slope, rtol=1e-7)
+    np.testing.assert_allclose(slopes[0].information, slopes[1].information, rtol=1e-6, atol=1e-6)
+    again, beside = many.beside(slopes[0].along, NOISE), one.beside(slopes[1].along[0], NOISE)
+    for part, numbers in zip(again.parts, again.numbers, strict=True):
+        np.testing.assert_allclose(part.samples, beside.samples[numbers, : part.samples.shape[1]], rtol=1e-9)
+
+
 def test_derivative_is_that_of_differences(likelihood, prior):
     def value(vector):
         return posterior(likelihood.reduced(Noise.of(vector))[0], *prior).evidence
 
-    reduced, local = likelihood.reduced(NOISE)
-    slope = slopes_at(likelihood, NOISE, local, posterior(reduced, *prior), *prior).slope
+    slope = slopes_of(likelihood, prior).slope
     step = 1e-5
     moved = [NOISE.vector + step * sign * axis for axis in np.eye(9) for sign in (1, -1)]
     differences = np.array([value(v) for v in moved]).reshape(9, 2) @ [1, -1] / (2 * step)
@@ -109,8 +139,7 @@ def test_derivative_is_that_of_differences(likelihood, prior):
 
 def test_information_is_the_average_of_the_observed_and_the_expected(likelihood, prior):
     """By dense matrices: P y is the residual over the variance, with first states out, and dV / dz = 2 V of a size."""
-    reduced, local = likelihood.reduced(NOISE)
-    found = slopes_at(likelihood, NOISE, local, posterior(reduced, *prior), *prior).information
+    found = slopes_of(likelihood, prior).information
     left, starts, added, _ = dense_rows(likelihood, NOISE, *prior)
     inverse = np.linalg.inv(sum(added))
     without = inverse - inverse @ starts @ np.linalg.solve(starts.T @ inverse @ starts, starts.T @ inverse)
