@@ -126,7 +126,8 @@ def weigh(fit: Fit, named: Sequence[Hypothesis] = (), *, nameless: bool = False)
         nameless: with patterns without a name beside them.
     Returns: the model with its evidence; ratios of evidences compare models of the same stretches.
     """
-    return weighed(fit, named, random_motion(fit), unlike_halves(fit), nameless=nameless)
+    patterns = Patterns.of(fit) if nameless else None
+    return weighed(fit, named, random_motion(fit), unlike_halves(fit), patterns=patterns)
 
 
 def weighed(
@@ -135,7 +136,7 @@ def weighed(
     motion: Motion,
     halves: Mask,
     start: Noise | None = None,
-    nameless: bool = False,
+    patterns: Patterns | None = None,
 ) -> Weighed:
     """Weighs a model at the most probable values of its unknowns.
 
@@ -150,10 +151,10 @@ def weighed(
         motion: random columns of this or a similar model.
         halves: (t,) which half each track belongs to, in the order of the fit's tracks (`unlike_halves`).
         start: noise of a similar model.
-        nameless: with patterns without a name beside the effects.
+        patterns: without a name, beside the effects; of this or a similar model.
     """
     with np.errstate(invalid="ignore"):  # differences of models without a density: they lose to all others
-        return _followed(_Question(named, motion, halves, nameless), fit, start)
+        return _followed(_Question(named, motion, halves, patterns), fit, start)
 
 
 def _followed(question: _Question, fit: Fit, start: Noise | None) -> Weighed:
@@ -215,12 +216,17 @@ class _Question:
     named: Sequence[Hypothesis]
     motion: Motion
     halves: Mask
-    nameless: bool
+    patterns: Patterns | None
+
+    @property
+    def nameless(self) -> bool:
+        """Whether there are patterns without a name."""
+        return self.patterns is not None
 
     def point(self, fit: Fit) -> _Point:
         """The rows of a fit and the priors at its unknowns."""
         fit = with_guesses(fit)
-        rows, patterns = rows_of(fit, self.motion), Patterns.of(fit) if self.nameless else None
+        rows, patterns = rows_of(fit, self.motion), self.patterns
         beside = rows if patterns is None else patterns.beside(rows)
         return _Point(fit, beside, Priors.of(fit, self.named, patterns))
 

@@ -2,13 +2,13 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
 from ballfg.arrays import Mask
 from ballfg.diagnosis.evidence.halves import unlike_halves
-from ballfg.diagnosis.evidence.nameless import NAMELESS
+from ballfg.diagnosis.evidence.nameless import NAMELESS, Patterns
 from ballfg.diagnosis.evidence.odds import ALIKE, Odds, odds_of, scores_of
 from ballfg.diagnosis.evidence.rows import random_motion
 from ballfg.diagnosis.evidence.screen import Screen
@@ -158,6 +158,11 @@ class _Found:
         self.rounds: list[Round] = []
         self.tried: set[tuple[frozenset[str], frozenset[str]]] = set()
 
+    @cached_property
+    def patterns(self) -> Patterns:
+        """Patterns without a name about the declared model's fit, the same for all models."""
+        return Patterns.of(self.models[frozenset()].fit)
+
     @property
     def odds(self) -> Odds:
         """Probabilities over all models weighed so far."""
@@ -276,7 +281,9 @@ class _Found:
     def beside_nameless(self, models: Sequence[Weighed]) -> list[Weighed]:
         """The same models with something nameless beside their effects."""
         new = {m.names | {NAMELESS}: m for m in models if m.names | {NAMELESS} not in self.models}
-        tasks = [partial(weighed, m.fit, m.named, self.motion, self.halves, m.noise, True) for m in new.values()]
+        tasks = [
+            partial(weighed, m.fit, m.named, self.motion, self.halves, m.noise, self.patterns) for m in new.values()
+        ]
         self.models |= dict(zip(new, do_all(tasks, self.loop.jobs), strict=True))
         return [self.models[m.names | {NAMELESS}] for m in models]
 
