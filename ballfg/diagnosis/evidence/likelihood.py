@@ -8,7 +8,7 @@ approximation.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -123,7 +123,7 @@ class Likelihood:
     def spin_columns(self) -> Array:
         """(n, 3, d) weighted spin rows: columns start, random, common, residual."""
         r = self.rows
-        rows = (r.by_start[:, -3:], r.motion.columns[:, -3:], r.by_common[:, -3:], r.residual[:, -3:, None])
+        rows = (r.by_start[:, -3:], r.random[:, -3:], r.by_common[:, -3:], r.residual[:, -3:, None])
         return np.concatenate(rows, axis=-1) * np.sqrt(self.spins)[:, None, None]
 
     @cached_property
@@ -136,7 +136,7 @@ class Likelihood:
         logs = np.array(noise.spin)[self.rows.spin_kinds]
         spins = self.spin_columns * np.exp(-logs)[..., None]
         total = self.gram * np.exp(-2.0 * noise.white) + spins.swapaxes(1, 2) @ spins
-        kinds, first = self.rows.motion.kinds, np.arange(STATE_DIM)
+        kinds, first = self.rows.kinds, np.arange(STATE_DIM)
         sizes = np.append(noise.random, 0.0)[kinds]
         place = STATE_DIM + np.arange(kinds.shape[1])
         total[:, place, place] += np.exp(-2.0 * sizes)
@@ -147,7 +147,7 @@ class Likelihood:
     def reduced(self, noise: Noise) -> tuple[Reduced, Local]:
         """First states and random motion integrated out; stretches that leave all numbers have no density."""
         total, logs = self.inner(noise)
-        end = STATE_DIM + self.rows.motion.kinds.shape[1]
+        end = STATE_DIM + self.rows.kinds.shape[1]
         largest = np.diagonal(total, axis1=1, axis2=2).max(axis=1)
         lost = ~(largest * np.finfo(np.float64).eps < 1.0)  # rounding alone is a unit of evidence
         total[lost] = np.eye(total.shape[-1])
@@ -163,7 +163,7 @@ class Likelihood:
     def local_step(self, noise: Noise, common: Array) -> Array:
         """(n, l) first states and random motion that follow a step (c,) of the common unknowns."""
         total, _ = self.inner(noise)
-        end = STATE_DIM + self.rows.motion.kinds.shape[1]
+        end = STATE_DIM + self.rows.kinds.shape[1]
         right = total[:, :end, -1] - total[:, :end, end:-1] @ common
         return np.asarray(np.linalg.solve(total[:, :end, :end], right[..., None])[..., 0])
 
@@ -176,32 +176,25 @@ class Likelihood:
 
     def beside(self, along: Array, noise: Noise) -> Likelihood:
         """With the robust weights of a residual, the sum of columns by factors (n, d)."""
-        r, end = self.rows, STATE_DIM + self.rows.motion.kinds.shape[1]
+        r, end = self.rows, STATE_DIM + self.rows.kinds.shape[1]
         start, random, common = along[:, :STATE_DIM], along[:, STATE_DIM:end], along[:, end:-1]
-        left = r.residual + (r.by_start @ start[..., None] + r.motion.columns @ random[..., None])[..., 0]
+        left = r.residual + (r.by_start @ start[..., None] + r.random @ random[..., None])[..., 0]
         left += (r.by_common @ common[..., None])[..., 0]
         return weighted(r, left / np.exp(noise.white), left[:, -3:] / np.exp(noise.spin)[r.spin_kinds])
 
 
 @dataclass(frozen=True)
 class Batches:
-    """The likelihood of all stretches, batch by batch.
-
-    Attributes:
-        parts: the likelihood of each batch.
-        numbers: of its stretches among all.
-    """
+    """The likelihood of all stretches; parts: that of each batch."""
 
     parts: tuple[Likelihood, ...]
-    numbers: tuple[Index, ...]
 
     @classmethod
-    def of(cls, rows: Rows, weights: Sequence[Weights] | None = None) -> Batches:
+    def of(cls, rows: Sequence[Rows], weights: Sequence[Weights] | None = None) -> Batches:
         """The likelihood of rows; weights: of each batch, one if None."""
-        numbers, batches = zip(*rows.batches, strict=True)
         if weights is None:
-            return cls(tuple(unweighted(batch) for batch in batches), numbers)
-        return cls(tuple(Likelihood(b, *own) for b, own in zip(batches, weights, strict=True)), numbers)
+            return cls(tuple(unweighted(batch) for batch in rows))
+        return cls(tuple(Likelihood(batch, *own) for batch, own in zip(rows, weights, strict=True)))
 
     @property
     def weights(self) -> tuple[Weights, ...]:
@@ -216,17 +209,17 @@ class Batches:
     def reduced(self, noise: Noise) -> tuple[Reduced, list[Local]]:
         """First states and random motion integrated out, and what was eliminated in each batch."""
         found = [part.reduced(noise) for part in self.parts]
-        order = np.argsort(np.concatenate(self.numbers))
+        order = np.argsort(np.concatenate([part.rows.numbers for part in self.parts]))
         constant, gram = (np.concatenate([getattr(r, name) for r, _ in found])[order] for name in ("constant", "gram"))
         return Reduced(constant, gram), [local for _, local in found]
 
     def reweighted(self, noise: Noise) -> Batches:
         """As of `Likelihood`."""
-        return replace(self, parts=tuple(part.reweighted(noise) for part in self.parts))
+        return Batches(tuple(part.reweighted(noise) for part in self.parts))
 
     def beside(self, along: Sequence[Array], noise: Noise) -> Batches:
         """As of `Likelihood`, by the factors of each batch."""
-        return replace(self, parts=tuple(p.beside(own, noise) for p, own in zip(self.parts, along, strict=True)))
+        return Batches(tuple(part.beside(own, noise) for part, own in zip(self.parts, along, strict=True)))
 
 
 def unweighted(rows: Rows) -> Likelihood:

@@ -6,13 +6,14 @@ more than smooth patterns of place, velocity, spin and time would, whose sizes a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from ballfg.arrays import Array, Index
-from ballfg.diagnosis.evidence.rows import Rows, roots
+from ballfg.diagnosis.evidence.rows import Rows, batches_of, roots
 from ballfg.diagnosis.fit.patterns import blocks_of
 from ballfg.diagnosis.fit.problem import Fit
 
@@ -26,11 +27,11 @@ class Patterns:
     """Columns of all patterns at a fit.
 
     Attributes:
-        columns: (n, m, p) whitened responses of the samples to patterns that are large in practice.
+        columns: (b, m, p) whitened responses of the samples to patterns that are large in practice, batch by batch.
         blocks: where in p the columns of each block are; those of a block share the width of their prior.
     """
 
-    columns: Array
+    columns: tuple[Array, ...]
     blocks: tuple[Index, ...]
 
     @classmethod
@@ -39,8 +40,9 @@ class Patterns:
         blocks = blocks_of(fit)
         ends = np.cumsum([block.columns.shape[-1] for block in blocks])
         places = tuple(np.arange(end - b.columns.shape[-1], end) for b, end in zip(blocks, ends, strict=True))
-        return cls(np.concatenate([block.columns for block in blocks], axis=-1) / roots(fit), places)
+        columns = np.concatenate([block.columns for block in blocks], axis=-1) / roots(fit)
+        return cls(tuple(batch.of(columns) for batch in batches_of(fit.problem.stretches.used.numpy())), places)
 
-    def beside(self, rows: Rows) -> Rows:
+    def beside(self, rows: Sequence[Rows]) -> list[Rows]:
         """Rows with the patterns as further common unknowns, last."""
-        return rows.with_common(np.concatenate((rows.by_common, self.columns), axis=-1))
+        return [batch.beside(columns) for batch, columns in zip(rows, self.columns, strict=True)]

@@ -55,7 +55,7 @@ class Priors:
         sizes = tuple(scales(h) for h in with_strengths)
         if patterns is None:
             return cls(base, away, places, sizes)
-        none = np.zeros(patterns.columns.shape[-1])
+        none = np.zeros(sum(len(block) for block in patterns.blocks))
         more = tuple(len(base) + block for block in patterns.blocks)
         usual = tuple(np.full(len(block), USUAL) for block in patterns.blocks)
         return cls(np.append(base, none), np.append(away, none), (*places, *more), (*sizes, *usual))

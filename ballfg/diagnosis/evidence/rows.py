@@ -32,55 +32,79 @@ SIZES: Final = (ACCELERATION, CONTACT_VELOCITY, CONTACT_SPIN, 1.0)
 
 @dataclass(frozen=True)
 class Motion:
-    """Random columns of n stretches.
+    """Random columns of n stretches, batch by batch as in `batches_of`.
 
     Attributes:
-        columns: (n, m, r) derivatives at the unit of each kind, zero where a stretch has fewer.
-        kinds: (n, r) kind of each column, -1 for none.
+        columns: (b, m, r) derivatives at the unit of each kind, zero where a stretch has fewer.
+        kinds: (b, r) kind of each column, -1 for none.
     """
 
-    columns: Array
-    kinds: Index
+    columns: tuple[Array, ...]
+    kinds: tuple[Index, ...]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Stretches of similar length: one long stretch would pad all others to its own.
+
+    Attributes:
+        numbers: (b,) of its stretches among all.
+        rows: (m,) numbers of the rows of their samples, then of their spins, among all rows.
+    """
+
+    numbers: Index
+    rows: Index
+
+    def of(self, columns: Array) -> Array:
+        """(b, m, ...) the part of columns (n, 3 k + 3, ...)."""
+        return columns[np.ix_(self.numbers, self.rows)]
+
+
+def batches_of(used: Mask) -> list[Batch]:
+    """The batches of stretches; used: (n, k) samples that there are."""
+    spins = 3 * used.shape[1] + np.arange(3)
+    return [Batch(numbers, np.append(np.arange(3 * count), spins)) for numbers, count in of_similar_length(used)]
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Whitened rows of n stretches without robust weights: three for each of k samples, then three for the spin.
+    """Whitened rows of a batch of b stretches without robust weights: three for each of k samples, then three for spin.
 
     Attributes:
-        residual: (n, m) measured minus predicted.
-        by_start: (n, m, 9) derivatives by the first state.
-        by_common: (n, m, q) by the unknowns that all stretches share.
-        motion: the random columns.
-        used: (n, k) samples that there are.
-        labelled: (n,) True where the spin rows compare with a label.
-        track: (n,) number of the track.
+        numbers: (b,) of the stretches among all.
+        residual: (b, m) measured minus predicted.
+        by_start: (b, m, 9) derivatives by the first state.
+        by_common: (b, m, q) by the unknowns that all stretches share.
+        random: (b, m, r) the random columns.
+        kinds: (b, r) kind of each, -1 for none.
+        used: (b, k) samples that there are.
+        labelled: (b,) True where the spin rows compare with a label.
     """
 
+    numbers: Index
     residual: Array
     by_start: Array
     by_common: Array
-    motion: Motion
+    random: Array
+    kinds: Index
     used: Mask
     labelled: Mask
-    track: Index
 
     @property
     def counts(self) -> Array:
         """(1 + SPIN_KINDS + KINDS,) numbers that each size scales: coordinates of samples and spins, random columns."""
-        kinds = self.motion.kinds
-        random = [(kinds == kind).sum() for kind in range(KINDS)]
+        random = [(self.kinds == kind).sum() for kind in range(KINDS)]
         spins = np.bincount(self.spin_kinds.ravel(), minlength=SPIN_KINDS)
         return np.array([3 * self.used.sum(), *spins, *random], dtype=np.float64)
 
     @property
     def spin_kinds(self) -> Index:
-        """(n, 3) kind of each spin row: 0 of a label, which has no axes of its own, else 1, 2, 3 by the launch's."""
+        """(b, 3) kind of each spin row: 0 of a label, which has no axes of its own, else 1, 2, 3 by the launch's."""
         return np.where(self.labelled[:, None], 0, np.arange(1, SPIN_KINDS))
 
     @cached_property
     def volume(self) -> Array:
-        """(n,) half the log determinant of the information on what has no prior of its own, at the stated noise.
+        """(b,) half the log determinant of the information on what has no prior of its own, at the stated noise.
 
         It is the density of their prior: first places and velocities are uniform in what the samples show of them, and
         labelled spins in what labels and samples show (H. Jeffreys, "An invariant form for the prior probability in
@@ -96,12 +120,12 @@ class Rows:
 
     @cached_property
     def gram(self) -> Array:
-        """(n, d, d) inner products of the rows of samples; columns start, random, common, residual."""
+        """(b, d, d) inner products of the rows of samples; columns start, random, common, residual."""
         return self.inner_products(np.ones(self.used.shape))
 
     def inner_products(self, weights: Array) -> Array:
-        """(n, d, d) the same of weighted samples; weights: (n, k), not negative. It is fast where few are not zero."""
-        listed = (self.by_start, self.motion.columns, self.by_common, self.residual[..., None])
+        """(b, d, d) the same of weighted samples; weights: (b, k), not negative. It is fast where few are not zero."""
+        listed = (self.by_start, self.random, self.by_common, self.residual[..., None])
         size, used = sum(columns.shape[-1] for columns in listed), (weights != 0.0) & self.used
         first = np.argsort(~used, axis=1, kind="stable")
         found = np.zeros((len(used), size, size))
@@ -114,44 +138,33 @@ class Rows:
             found[stretches] = rows.swapaxes(1, 2) @ rows
         return found
 
-    @property
-    def batches(self) -> list[tuple[Index, Rows]]:
-        """Stretches of similar length with their numbers, as wide as their widest: a long one would pad all others."""
-        return [(numbers, self._batch(numbers, count)) for numbers, count in of_similar_length(self.used)]
-
-    def _batch(self, numbers: Index, count: int) -> Rows:
-        """The rows of some stretches, of their first samples and their own random columns."""
-        places = np.append(np.arange(3 * count), np.arange(-3, 0))
-        kinds = self.motion.kinds[numbers]
-        width = int((kinds >= 0).sum(axis=1).max())
-        cut = np.ix_(numbers, places)
-        return Rows(
-            self.residual[cut],
-            self.by_start[cut],
-            self.by_common[cut],
-            Motion(self.motion.columns[..., :width][cut], kinds[:, :width]),
-            self.used[numbers, :count],
-            self.labelled[numbers],
-            self.track[numbers],
-        )
-
-    def with_common(self, by_common: Array) -> Rows:
-        """The rows with other common unknowns; by_common: (n, m, q)."""
-        return replace(self, by_common=by_common)
+    def beside(self, columns: Array) -> Rows:
+        """The rows with further common unknowns, last; columns: (b, m, p)."""
+        return replace(self, by_common=np.concatenate((self.by_common, columns), axis=-1))
 
 
-def rows_of(fit: Fit, motion: Motion) -> Rows:
+def rows_of(fit: Fit, motion: Motion) -> list[Rows]:
     """The rows of a fit at its minimum; motion: `random_motion` of this or a similar fit to the same samples."""
-    system, stretches, root = fit.linearised, fit.problem.stretches, roots(fit)
-    return Rows(
-        system.residual / root[..., 0],
-        system.by_start / root,
-        system.by_common / root,
-        motion,
-        stretches.used.numpy(),
-        stretches.labelled,
-        stretches.track,
+    system, stretches, root, used = (
+        fit.linearised,
+        fit.problem.stretches,
+        roots(fit),
+        fit.problem.stretches.used.numpy(),
     )
+    residual, by_start, by_common = system.residual / root[..., 0], system.by_start / root, system.by_common / root
+    return [
+        Rows(
+            batch.numbers,
+            batch.of(residual),
+            batch.of(by_start),
+            batch.of(by_common),
+            random,
+            kinds,
+            used[batch.numbers, : len(batch.rows) // 3 - 1],
+            stretches.labelled[batch.numbers],
+        )
+        for batch, random, kinds in zip(batches_of(used), motion.columns, motion.kinds, strict=True)
+    ]
 
 
 def roots(fit: Fit) -> Array:
@@ -177,13 +190,17 @@ def random_motion(fit: Fit, scattering: Collection[str] | None = None) -> Motion
     listed = list(fit.problem.free)
     chosen = [listed.index(name) for name in scattering]
     spread, count = np.array([fit.problem.free[name].sigma for name in scattering]), len(chosen)
-    width = max(sum(len(k) for _, k in pieces) for pieces in own.values()) + count
-    by_common = fit.linearised.by_common
-    n, m = by_common.shape[:2]
-    random, kinds = np.zeros((n, m, width)), np.full((n, width), -1)
-    random[..., :count], kinds[:, :count] = by_common[..., chosen] * spread, COEFFICIENTS
-    for row, pieces in own.items():
-        columns = np.concatenate([c for c, _ in pieces], axis=1)
-        random[row, :, count : count + columns.shape[1]] = columns
-        kinds[row, count : count + columns.shape[1]] = np.concatenate([k for _, k in pieces])
-    return Motion(random / roots(fit), kinds)
+    root = roots(fit)
+    coefficients = fit.linearised.by_common[..., chosen] * spread / root
+    found = []
+    for batch in batches_of(fit.problem.stretches.used.numpy()):
+        width = count + max(sum(len(k) for _, k in own[row]) for row in batch.numbers.tolist())
+        random = np.zeros((len(batch.numbers), len(batch.rows), width))
+        kinds = np.full((len(batch.numbers), width), -1)
+        random[..., :count], kinds[:, :count] = batch.of(coefficients), COEFFICIENTS
+        for place, row in enumerate(batch.numbers.tolist()):
+            columns = np.concatenate([c for c, _ in own[row]], axis=1) / root[row]
+            random[place, :, count : count + columns.shape[1]] = columns[batch.rows]
+            kinds[place, count : count + columns.shape[1]] = np.concatenate([k for _, k in own[row]])
+        found.append((random, kinds))
+    return Motion(*zip(*found, strict=True))

@@ -7,7 +7,7 @@ solution, so that effects which only help together are found together.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final
 
@@ -19,7 +19,7 @@ from ballfg.diagnosis.evidence.likelihood import Batches, Posterior, Reduced, he
 from ballfg.diagnosis.evidence.odds import tempered
 from ballfg.diagnosis.evidence.prior import WIDTHS, centres, choice_odds, log_odds, scales, within
 from ballfg.diagnosis.evidence.priors_of_fit import Priors
-from ballfg.diagnosis.evidence.rows import Motion, roots, rows_of
+from ballfg.diagnosis.evidence.rows import Motion, batches_of, roots, rows_of
 from ballfg.diagnosis.evidence.weighed import Step, Weighed, Weight
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 
@@ -54,9 +54,10 @@ class Screen:
 
         Args: motion: random columns of its fit.  columns: (n, m, p) of all strengths, as in the fit's system.
         """
-        rows = rows_of(model.fit, motion)
-        wide = replace(rows, by_common=np.concatenate((rows.by_common, columns / roots(model.fit)), axis=-1))
-        tracks = Batches.of(wide, model.weights).reduced(model.noise)[0].by_track(rows.track)
+        stretches, strengths = model.fit.problem.stretches, columns / roots(model.fit)
+        batches = zip(rows_of(model.fit, motion), batches_of(stretches.used.numpy()), strict=True)
+        wide = [rows.beside(batch.of(strengths)) for rows, batch in batches]
+        tracks = Batches.of(wide, model.weights).reduced(model.noise)[0].by_track(stretches.track)
         total = tracks.of(np.full(len(model.halves), True))
         return cls(model, candidates, tracks, total, Priors.of(model.fit, model.named))
 

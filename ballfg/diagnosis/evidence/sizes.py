@@ -39,7 +39,11 @@ class Slopes:
 
 
 def settled(
-    rows: Rows, precision: Array, away: Array, starts: Sequence[Noise | None] = (None,), own: int | None = None
+    rows: Sequence[Rows],
+    precision: Array,
+    away: Array,
+    starts: Sequence[Noise | None] = (None,),
+    own: int | None = None,
 ) -> tuple[Batches, Noise]:
     """The likelihood with the robust weights and sizes of noise that maximise the evidence at the present unknowns.
 
@@ -139,7 +143,7 @@ class _Shown:
 
 
 def _shown(likelihood: Likelihood, noise: Noise, local: Local, found: Posterior) -> _Shown:
-    kinds = likelihood.rows.motion.kinds
+    kinds = likelihood.rows.kinds
     end = STATE_DIM + kinds.shape[1]
     upper = inverses(local.lower)
     solved = upper @ local.solved.swapaxes(1, 2)  # (n, l, c + 1), what local unknowns absorb of each column
@@ -161,7 +165,7 @@ def _shown(likelihood: Likelihood, noise: Noise, local: Local, found: Posterior)
 
 def _products(likelihood: Likelihood, noise: Noise, upper: Array, solved: Array, along: Array) -> tuple[Array, Array]:
     """As of `_Shown`; along: (n, d) factors of the columns whose sum is the residual at the mean."""
-    kinds = likelihood.rows.motion.kinds
+    kinds = likelihood.rows.kinds
     end = STATE_DIM + kinds.shape[1]
     ahead = np.zeros((*along.shape, len(noise.random)))  # of the random columns alone, kind by kind
     ahead[:, STATE_DIM:end] = -along[:, STATE_DIM:end, None] * (kinds[..., None] == np.arange(len(noise.random)))

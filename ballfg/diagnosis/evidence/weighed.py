@@ -200,7 +200,7 @@ class _Point:
     """A fit with its rows, beside patterns without a name if the question has them, and the priors there."""
 
     fit: Fit
-    rows: Rows
+    rows: Sequence[Rows]
     priors: Priors
 
     @property
@@ -242,7 +242,7 @@ class _Question:
         of_patterns = list(widths[len(effects) :]) or [0] * (len(priors.places) - len(effects))
         first = priors.precision([len(WIDTHS) - 1] * len(effects) + of_patterns)
         likelihood, noise = settled(rows, first, priors.away, starts, own)
-        total = likelihood.reduced(noise)[0].by_track(rows.track)
+        total = likelihood.reduced(noise)[0].by_track(fit.problem.stretches.track)
         whole = total.of(np.full(len(self.halves), True))
         best, mixed = priors.widths(whole)
         result = priors.posterior(whole, best)

@@ -190,8 +190,9 @@ class Fit:
     @cached_property
     def robust(self) -> Robust:
         """Weights and losses: Huber's of positions, Cauchy's of labels."""
-        length = np.linalg.norm(self.whitened, axis=-1)
-        spin, labelled = np.linalg.norm(self.whitened_spins, axis=-1), self.problem.stretches.labelled
+        with np.errstate(over="ignore"):  # the loss of a path far outside of the room is infinite
+            length = np.linalg.norm(self.whitened, axis=-1)
+            spin, labelled = np.linalg.norm(self.whitened_spins, axis=-1), self.problem.stretches.labelled
         spin_weight = np.where(labelled, LABEL_LOSS.weight(spin), 1.0)
         spin_loss = np.where(labelled, LABEL_LOSS.value(spin), 0.5 * spin**2)
         losses = POSITION_LOSS.value(length).sum(axis=-1) + spin_loss

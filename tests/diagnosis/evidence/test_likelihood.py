@@ -9,7 +9,7 @@ import pytest
 from scipy import linalg
 
 from ballfg.diagnosis.evidence.likelihood import Batches, Likelihood, Noise, posterior, unweighted
-from ballfg.diagnosis.evidence.rows import Motion, random_motion, rows_of
+from ballfg.diagnosis.evidence.rows import batches_of, random_motion, rows_of
 from ballfg.diagnosis.evidence.sizes import settled, slopes_at
 from ballfg.state import STATE_DIM
 
@@ -20,7 +20,7 @@ NOISE = Noise(0.1, (0.2, -0.3, 0.4, 0.1), (-0.7, -1.1, -0.4, -1.2))
 def rows(make_ball, make_launches, make_shots, make_fit):
     """Rows of five shots with a bounce, three with a label; the first states have all nine numbers shown."""
     fit = make_fit(make_ball(), make_shots(make_ball(), make_launches(5, 11), 11, rate=40.0, duration=0.6).stretches)
-    found = rows_of(fit, random_motion(fit, ["flight.drag.k", "bounce.restitution.e"]))
+    (found,) = rows_of(fit, random_motion(fit, ["flight.drag.k", "bounce.restitution.e"]))
     return replace(found, labelled=np.array([True, False, True, True, False]))
 
 
@@ -54,7 +54,7 @@ def dense_rows(likelihood, noise, precision, away):
         sized = [(number < 0, noise.white), *zip(axes, noise.spin, strict=True)]
         added = [np.diag(np.exp(2.0 * size) / weights * own) for own, size in sized]
         for kind, size in enumerate(noise.random):
-            columns = rows.motion.columns[i][kept][:, rows.motion.kinds[i] == kind]
+            columns = rows.random[i][kept][:, rows.kinds[i] == kind]
             added.append(np.exp(2.0 * size) * columns @ columns.T)
         parts.append((rows.residual[i][kept], rows.by_start[i][kept], rows.by_common[i][kept], added))
         whole = rows.by_start[i][kept]
@@ -96,24 +96,37 @@ def test_value_is_the_same_in_other_units_of_what_has_no_prior(likelihood, prior
 
 
 def slopes_of(likelihood, prior):
-    batches = Batches((likelihood,), (np.arange(len(likelihood.rows.used)),))
+    batches = Batches((likelihood,))
     reduced, eliminated = batches.reduced(NOISE)
     return slopes_at(batches, NOISE, eliminated, posterior(reduced, *prior), *prior)
 
 
 def test_batches_of_unlike_lengths_are_the_same_as_one(rows, prior):
     """Three stretches end early: they are narrower, and all numbers and their order are those of one wide batch."""
-    used, kinds, columns = rows.used.copy(), rows.motion.kinds.copy(), rows.motion.columns.copy()
-    for number, (samples, random) in {0: (8, 11), 2: (8, 9), 3: (14, 30)}.items():
-        used[number, samples:], kinds[number, random:], columns[number, ..., random:] = False, -1, 0.0
-    gone = np.concatenate((np.repeat(~used, 3, axis=1), np.full((len(used), 3), False)), axis=1)
-    short = replace(rows, used=used, motion=Motion(np.where(gone[..., None], 0.0, columns), kinds))
-    short = replace(short, **{n: np.where(gone[..., None], 0.0, getattr(rows, n)) for n in ("by_start", "by_common")})
-    short = replace(short, residual=np.where(gone, 0.0, rows.residual))
-    many, (one,) = Batches.of(short).reweighted(NOISE), [unweighted(short).reweighted(NOISE)]
+    used, kinds, random = rows.used.copy(), rows.kinds.copy(), rows.random.copy()
+    for number, (samples, own) in {0: (8, 11), 2: (8, 9), 3: (14, 30)}.items():
+        used[number, samples:], kinds[number, own:], random[number, ..., own:] = False, -1, 0.0
+    there = np.concatenate((np.repeat(used, 3, axis=1), np.full((len(used), 3), True)), axis=1)
+    parts = {"residual": rows.residual, "by_start": rows.by_start, "by_common": rows.by_common, "random": random}
+    parts = {name: part * there.reshape(*there.shape, *[1] * (part.ndim - 2)) for name, part in parts.items()}
+    short, batches = replace(rows, used=used, kinds=kinds, **parts), batches_of(used)
+    widths = [int((kinds[batch.numbers] >= 0).sum(axis=1).max()) for batch in batches]
+    narrow = [
+        replace(
+            short,
+            numbers=batch.numbers,
+            used=used[batch.numbers, : len(batch.rows) // 3 - 1],
+            labelled=rows.labelled[batch.numbers],
+            kinds=kinds[batch.numbers, :width],
+            **{name: batch.of(part) for name, part in parts.items() if name != "random"},
+            random=batch.of(parts["random"])[..., :width],
+        )
+        for batch, width in zip(batches, widths, strict=True)
+    ]
+    many, one = Batches.of(narrow).reweighted(NOISE), unweighted(short).reweighted(NOISE)
     assert [part.rows.used.shape[1] for part in many.parts] == [8, 14, rows.used.shape[1]]
-    assert max(part.rows.motion.kinds.shape[1] for part in many.parts[:2]) < kinds.shape[1]
-    whole = Batches((one,), (np.arange(len(used)),))
+    assert widths[:2] == [11, 30]
+    whole = Batches((one,))
     (found, eliminated), (wide, local) = many.reduced(NOISE), whole.reduced(NOISE)
     np.testing.assert_allclose(found.constant, wide.constant, rtol=1e-9)
     np.testing.assert_allclose(found.gram, wide.gram, rtol=1e-7, atol=1e-9 * np.abs(wide.gram).max())
@@ -122,8 +135,8 @@ def test_batches_of_unlike_lengths_are_the_same_as_one(rows, prior):
     np.testing.assert_allclose(slopes[0].slope, slopes[1].slope, rtol=1e-7)
     np.testing.assert_allclose(slopes[0].information, slopes[1].information, rtol=1e-6, atol=1e-6)
     again, beside = many.beside(slopes[0].along, NOISE), one.beside(slopes[1].along[0], NOISE)
-    for part, numbers in zip(again.parts, again.numbers, strict=True):
-        np.testing.assert_allclose(part.samples, beside.samples[numbers, : part.samples.shape[1]], rtol=1e-9)
+    for part in again.parts:
+        np.testing.assert_allclose(part.samples, beside.samples[part.rows.numbers, : part.samples.shape[1]], rtol=1e-9)
 
 
 def test_derivative_is_that_of_differences(likelihood, prior):
@@ -172,7 +185,7 @@ def test_common_unknowns_are_those_of_generalised_least_squares(likelihood, prio
 
 def test_local_step_leaves_no_gradient(likelihood, prior):
     total, _ = likelihood.inner(NOISE)
-    end = STATE_DIM + likelihood.rows.motion.kinds.shape[1]
+    end = STATE_DIM + likelihood.rows.kinds.shape[1]
     common = 0.1 * prior[1]
     local = likelihood.local_step(NOISE, common)
     left = total[:, :end, -1] - total[:, :end, end:-1] @ common - (total[:, :end, :end] @ local[..., None])[..., 0]
@@ -184,7 +197,7 @@ def test_sizes_of_noise_come_back(make_ball, make_launches, make_shots, make_fit
     shots = make_shots(make_ball(), make_launches(30, 17), 17, rate=60.0, duration=0.5).stretches
     fit = make_fit(make_ball(), shots, settle_noise=False)
     rows = rows_of(fit, random_motion(fit, ()))
-    halved = type(rows)(**{**vars(rows), "residual": 2.0 * rows.residual})
+    halved = [replace(batch, residual=2.0 * batch.residual) for batch in rows]
     precision = fit.problem.common_precision
     _, noise = settled(halved, precision, np.zeros(len(precision)))
     _, plain = settled(rows, precision, np.zeros(len(precision)))
@@ -197,7 +210,7 @@ def test_the_best_of_several_starts_counts(rows, prior):
     starts = (Noise(-1.0, (1.0,) * 4, (2.0, 2.0, 2.0, 1.0)), None)
     values = [
         posterior(one.reduced(noise)[0], *prior).evidence
-        for one, noise in (settled(rows, *prior, s) for s in ((starts[0],), (None,), starts))
+        for one, noise in (settled([rows], *prior, s) for s in ((starts[0],), (None,), starts))
     ]
     assert values[2] > max(values) - 0.05
 
@@ -207,5 +220,5 @@ def test_a_path_far_off_all_samples_has_hardly_any_density(rows, prior, part):
     """A fit may end with a flight that left the room: it must lose, and not by chance of rounding win."""
     far = getattr(rows, part).copy()
     far[0] *= 1e100
-    likelihood, noise = settled(replace(rows, **{part: far}), *prior)
+    likelihood, noise = settled([replace(rows, **{part: far})], *prior)
     assert posterior(likelihood.reduced(noise)[0], *prior).evidence < -1e6
