@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.flight import evaluate, fly_one, glide, laws_of, only, put, put_all, value_of
+from ballfg.dynamics.compiled.flight import evaluate, fly_one, glide, law_at, laws_of, only, put, put_all, value_of
 from ballfg.dynamics.compiled.signatures import COUNT, GIVEN, LAW, LAWS, NOTHING, ONE, REAL, THREE, TWO, Law, several
 from ballfg.dynamics.motion import limits
 from ballfg.dynamics.motion.limits import LEAST_FALL, MAX_STEP, MIN_SPEED, SEARCH_STEPS, TYPICAL_JERK, steps_over
@@ -116,7 +116,7 @@ def times_of(rates, surface, start, heights, longest, radius, tau):
 def contact_times(rates, surface, start, c, s, w, ws, heights, longest, radius, tau):
     """`times_of` for Python."""
     none, nones = np.empty((len(c), c.shape[1], 0)), np.empty((len(s), s.shape[1], 0))
-    times_of(Law(rates, c, none, w), Law(surface, s, nones, ws), start, heights, longest, radius, tau)
+    times_of(law_at(rates, c, none, w), law_at(surface, s, nones, ws), start, heights, longest, radius, tau)
 
 
 @machine_code(NOTHING(LAWS, TWO, THREE, ONE, ONE, REAL, ONE, TWO, TWO, THREE))

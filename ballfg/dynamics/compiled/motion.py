@@ -39,7 +39,8 @@ class Moving:
         inner = model.model if isinstance(model, AugmentedModel) else model
         self.weights = functions.weights(inner)
         self.functions, self.travelling = functions, states.numpy()[:, STATE_DIM:]
-        self.computes = (functions.rates.compute, functions.impact.compute, functions.surface.compute)
+        parts = (functions.rates, functions.impact, functions.surface)
+        self.addresses = tuple(part.compute.address for part in parts)
         self.states = np.array(states.numpy()[:, :STATE_DIM], order="C")  # moved in place
         self.moved = np.zeros((n, STATE_DIM, width))
         own = range(min(STATE_DIM, width))
@@ -55,14 +56,14 @@ class Moving:
         steps = step_count(left)
         rates = self.functions.rates
         given = (self.states, self.moved, *self.coefficients(rates), self.weights[0], left, earlier, steps)
-        fly_together(rates.compute, *given)
+        fly_together(rates.compute.address, *given)
 
     def bounce(self, height: Array, longest: Array) -> None:
         """Moves on through the next contact with surfaces at some heights (n,) m; NaN if there is none."""
         n, _, width = self.moved.shape
         tau, slower = np.empty(n), np.empty((n, width))
         after, moved = np.empty_like(self.states), np.empty_like(self.moved)
-        given = (*self.computes, self.states, self.moved, *self.all_coefficients(), *self.weights)
+        given = (*self.addresses, self.states, self.moved, *self.all_coefficients(), *self.weights)
         contacts(*given, height, longest, self.functions.radius, tau, slower, after, moved)
         self.states, self.moved = after, moved
         self.elapsed, self.slower = self.elapsed + tau, self.slower + slower
@@ -72,8 +73,8 @@ class Moving:
         rates, surface, tau = self.functions.rates, self.functions.surface, np.empty(len(self.states))
         c, s = (self.coefficients(function)[0] for function in (rates, surface))
         w, _, ws = self.weights
-        radius = self.functions.radius
-        contact_times(rates.compute, surface.compute, self.states, c, s, w, ws, height, longest, radius, tau)
+        places = (rates.compute.address, surface.compute.address)
+        contact_times(*places, self.states, c, s, w, ws, height, longest, self.functions.radius, tau)
         return tau
 
     def gaps(self, height: float) -> tuple[Array, Array]:
@@ -158,7 +159,7 @@ def roll_out(
     moving = Moving(model, functions, state.detach(), 0)
     states, reached = np.empty((n, steps.shape[1], STATE_DIM)), np.empty(n, dtype=np.int64)
     durations, world = np.ascontiguousarray(steps.detach().numpy()), world_of(surfaces, functions.radius)
-    given = (*moving.computes, *moving.all_coefficients(), *moving.weights)
+    given = (*moving.addresses, *moving.all_coefficients(), *moving.weights)
     roll_out_rows(*given, moving.states, durations, world, states, reached)
     travelling = np.broadcast_to(moving.travelling[:, None], (n, steps.shape[1], width - STATE_DIM))
     return torch.from_numpy(np.concatenate((states, travelling), axis=2)), torch.from_numpy(reached)
