@@ -217,15 +217,16 @@ def _variance(h: Record, axis: int, sigma: float, component: int, scene: Record)
 @machine_code(NOTHING(ONE_HYPOTHESIS, ONE, ONE, SCENE, ONE))
 def weigh(h: Record, position: Array, sigma: Array, scene: Record, said: Array) -> None:
     """Writes a sample's evidence: (4,) nats, less 3/2 log 2 pi, if good, wide, outlier; and the squared innovation."""
-    said[SURPRISE] = 0.0
     for component in range(3):
-        said[component] = scene.log_shares[component]
+        volume, distance = 1.0, 0.0
         for axis in range(3):
             off = position[axis] - h.mean[axis, 0]
             spread = _variance(h, axis, sigma[axis], component, scene)
-            said[component] -= 0.5 * (off * off / spread + math.log(spread))
-            if component == AS_GOOD:
-                said[SURPRISE] += off * off / spread
+            volume *= spread
+            distance += off * off / spread
+        said[component] = scene.log_shares[component] - 0.5 * (distance + math.log(volume))
+        if component == AS_GOOD:
+            said[SURPRISE] = distance
 
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, ONE, ONE, COUNT, SCENE))
