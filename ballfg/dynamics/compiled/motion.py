@@ -64,15 +64,29 @@ class Moving:
         contact_times(*places, states, c, s, w, ws, height, longest, self.functions.radius, tau)
         return tau
 
-    def gaps(self, height: float) -> tuple[Array, Array]:
-        """(n,) m from a surface up to the balls' lowest points, and the derivatives (n, d)."""
-        n, surface = len(self.start), self.functions.surface
-        states, moved = self.start[:, :STATE_DIM].copy(), np.tile(np.eye(STATE_DIM, self.width), (n, 1, 1))
-        offset, slopes = np.zeros((n, 3)), np.zeros((n, 3, self.width))
-        values, tangents = self.coefficients(surface)
-        surface.compute(states, values, self.weights[2], moved, tangents, offset, slopes)
-        gap = states[:, Z] - height - offset[:, 0] - self.functions.radius
-        return gap, moved[:, Z] - slopes[:, 0]
+    def gaps(self, height: Array | float) -> tuple[Array, Array]:
+        """(n,) m from surfaces up to the balls' lowest points, and the derivatives (n, d). Args: height: m or (n,)."""
+        offset, slopes = self._value(self.functions.surface, self.weights[2])
+        by_state = -slopes[:, 0]
+        by_state[:, Z : Z + 1] += 1.0 if self.width else 0.0
+        return self.start[:, Z] - height - offset[:, 0] - self.functions.radius, by_state
+
+    def after_bounce(self) -> Array:
+        """(n, 9 + p) states right after an impact."""
+        after = self.start.copy()
+        after[:, :STATE_DIM] = self._value(self.functions.impact, self.weights[1])[0]
+        return after
+
+    def _value(self, function: Function, weights: Array) -> tuple[Array, Array]:
+        """(n, m) of a function at the start, and its derivatives (n, m, d)."""
+        n, d = len(self.start), self.width
+        states, moved = np.ascontiguousarray(self.start[:, :STATE_DIM]), np.zeros((n, STATE_DIM, d))
+        own = range(min(STATE_DIM, d))
+        moved[:, own, own] = 1.0
+        value, slopes = np.zeros((n, function.size)), np.zeros((n, function.size, d))
+        c, ct = self.coefficients(function)
+        function.compute(states, c, weights, moved, ct, value, slopes)
+        return value, slopes
 
     def all_coefficients(self) -> list[Array]:
         """`coefficients` of rates, impact and surface, one behind another."""
