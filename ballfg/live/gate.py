@@ -120,6 +120,8 @@ def assign(costs: Array, limit: float) -> list[tuple[int, int]]:
 
     Args: costs: (n, m) dimensionless.  limit: of one pair.
     """
+    if costs.size == 0:
+        return []
     turned = costs.shape[0] > costs.shape[1]
     allowed = np.where(costs <= limit, costs, FAR)
     pairs = sorted((j, i) if turned else (i, j) for i, j in enumerate(_columns(allowed.T if turned else allowed)))
@@ -140,7 +142,8 @@ def _columns(costs: Array) -> list[int]:
     of_row, of_column = np.zeros(n), np.zeros(m)  # prices: no cost lies below the sum of both
     for new in range(n):
         length, before, done = np.full(m, np.inf), np.full(m, -1), np.zeros(m, dtype=bool)
-        row, so_far, end, passed = new, 0.0, -1, []
+        row, so_far, end = new, 0.0, -1
+        passed: list[int] = []
         while row >= 0:
             passed.append(row)
             through = so_far + costs[row] - of_row[row] - of_column

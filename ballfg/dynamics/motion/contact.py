@@ -203,8 +203,8 @@ def _flow_rate(model: BallModel, state: Tensor, dt: Tensor) -> Tensor:
 def gap_jacobian(model: BallModel, state: Tensor, height: Tensor | float) -> tuple[Tensor, Tensor]:
     """Gaps (n,) m between balls in states (n, 9) and surfaces at heights in m or (n,), and their derivatives (n, 9)."""
     if is_plain(state) and (functions := motion.functions_of(model)) is not None:
-        gap, by_state = motion.Moving(model, functions, state, state.shape[-1]).gaps(_numbers(height))
-        return torch.from_numpy(gap), torch.from_numpy(by_state)
+        found = motion.Moving(model, functions, state, state.shape[-1]).gaps(_numbers(height))
+        return torch.from_numpy(found[0]), torch.from_numpy(found[1])
     leaf = state.detach().requires_grad_(True)
     with torch.enable_grad():
         gap = model.gap(leaf, height)
