@@ -5,10 +5,11 @@ and Jacobians of every row together with the exact bytes of their inputs. A call
 result; any other call is a miss. docs/custom_factors.md is the contract.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Literal
+from __future__ import annotations
 
-import gtsam
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
 import numpy as np
 
 from ballfg.arrays import Array, Index
@@ -17,12 +18,15 @@ from ballfg.factors.graph import BallGraph
 from ballfg.factors.linear.step import weighted
 from ballfg.state import STATE_DIM
 
+if TYPE_CHECKING:
+    import gtsam
+
 OnMiss = Literal["changed", "row"]
 
-STATE_KEY = int(gtsam.symbol("x", 0))
-COEFFICIENT_KEY = int(gtsam.symbol("c", 0))
+STATE_KEY, COEFFICIENT_KEY = ord("x") << 56, ord("c") << 56
+"""The keys x0 and c0 as GTSAM numbers them: it takes a tenth of a second to import, and a chain needs none of it."""
 
-Callback = Callable[[gtsam.CustomFactor, gtsam.Values, "gtsam.JacobianVector | None"], Array]
+Callback: TypeAlias = "Callable[[gtsam.CustomFactor, gtsam.Values, gtsam.JacobianVector | None], Array]"
 
 
 def key_of(variable: int) -> int:
@@ -74,6 +78,8 @@ class Bridge:
         """
         numbers = self.batch.variables[row].tolist() if variables is None else variables
         keys = [key_of(v) for v in numbers]
+        import gtsam
+
         return gtsam.CustomFactor(self.batch.loss.noise_model(self.batch.dim), keys, _callback(self, row, keys))
 
     def factors(self) -> list[gtsam.CustomFactor]:
@@ -262,6 +268,8 @@ def _not_finite(what: str, row: int) -> str:
 
 def nonlinear_graph(graph: BallGraph) -> tuple[gtsam.NonlinearFactorGraph, list[Bridge]]:
     """A graph for GTSAM's own optimizers, with the bridges that evaluate it (they count the calls)."""
+    import gtsam
+
     bridges = [Bridge(batch) for batch in graph.batches if len(batch)]
     result = gtsam.NonlinearFactorGraph()
     for bridge in bridges:
@@ -275,6 +283,8 @@ def linear_graph(linearized: Sequence[Rows]) -> gtsam.GaussianFactorGraph:
 
     They include the curvature of robust losses, which GTSAM's own linearisation leaves out.
     """
+    import gtsam
+
     result = gtsam.GaussianFactorGraph()
     for rows in linearized:
         residual, jacobians = weighted(rows)
@@ -287,6 +297,8 @@ def linear_graph(linearized: Sequence[Rows]) -> gtsam.GaussianFactorGraph:
 
 def to_gtsam(values: Values) -> gtsam.Values:
     """States as vectors x0, x1, ..., biases behind them; coefficients, if any, as the vector c0."""
+    import gtsam
+
     result = gtsam.Values()
     for i, state in enumerate(values.gather(np.arange(len(values.states)), with_biases=True)):
         result.insert(STATE_KEY + i, state)
@@ -297,6 +309,8 @@ def to_gtsam(values: Values) -> gtsam.Values:
 
 def from_gtsam(values: gtsam.Values) -> Values:
     """The values from GTSAM's, as `to_gtsam` wrote them; other variables than x0, x1, ... and c0 are left out."""
+    import gtsam
+
     states = np.array(gtsam.utilities.extractVectors(values, "x"))
     coefficients = np.array(values.atVector(COEFFICIENT_KEY)) if values.exists(COEFFICIENT_KEY) else np.zeros(0)
     biases = states[:, STATE_DIM:] if states.shape[1] > STATE_DIM else None

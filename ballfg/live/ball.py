@@ -11,7 +11,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.estimation.online.online import Online
 from ballfg.estimation.online.state import OnlineState
-from ballfg.estimation.smoother.motion import Motion
+from ballfg.estimation.smoother.motion import FLIGHT, Motion
 from ballfg.live.gate import Gate, Known
 
 PARTS = 4
@@ -166,7 +166,9 @@ class Ball:
         samples = window.samples[-LOOK_BACK:]
         found: list[BallEvent] = []
         for before, sample in pairwise(samples):
-            found += _events(sample.motion, before.motion, *map(self._online.stamp_of, (before.time, sample.time)))
+            if sample.motion is not FLIGHT:
+                stamps = map(self._online.stamp_of, (before.time, sample.time))
+                found += _events(sample.motion, before.motion, *stamps)
         told = self._told
         fresh = [e for e in found if not any(k == e.kind and abs(t - e.time) < SAME_EVENT for k, t in told)]
         self._told.extend((event.kind, event.time) for event in fresh)

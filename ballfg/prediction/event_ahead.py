@@ -104,7 +104,8 @@ def falls(value: Array, sigma: Array) -> float:
     above = special.ndtr(value / np.maximum(sigma, np.finfo(float).tiny))
     lowest = np.minimum.accumulate(above[::-1])[::-1]  # from each time on
     covered, reached = 0.0, np.inf
-    for high, low in sorted(zip(above[:-1].tolist(), lowest[1:].tolist(), strict=True), reverse=True):
+    falling = above[:-1] > lowest[1:]
+    for high, low in sorted(zip(above[:-1][falling].tolist(), lowest[1:][falling].tolist(), strict=True), reverse=True):
         covered += max(min(high, reached) - low, 0.0)
         reached = min(reached, low)
     return covered

@@ -13,7 +13,7 @@ from ballfg.checks import check_number, check_text
 from ballfg.factors.linear.definite import definite
 from ballfg.prediction.belief import Belief
 from ballfg.prediction.crossing import Crossing, apex, next_contact
-from ballfg.prediction.event_ahead import EventAhead, Path, asked_event, crossing_of, event_on
+from ballfg.prediction.event_ahead import Carried, EventAhead, Path, asked_event, crossing_of, event_on
 from ballfg.prediction.plane import AXES, Plane
 from ballfg.prediction.propagate import Propagator
 from ballfg.prediction.state import BallState
@@ -49,6 +49,7 @@ class Forecast:
     times: Array
     states: Array
     covariances: Array
+    _carried: Carried
 
     def __repr__(self) -> str:
         end, spread = self.positions[-1], self.sigmas[-1]
@@ -116,10 +117,6 @@ class Forecast:
         """The path for several events."""
         return Path(self.start, self._carried, self.times, self.states, self.covariances)
 
-    @property
-    def _carried(self) -> tuple[Propagator, Belief]:
-        return carried_by(self.start)
-
     def to_frame(self) -> DataFrame:
         """A pandas table: t, x, y, z and sigma_x, sigma_y, sigma_z, s and m, one row a time.
 
@@ -156,7 +153,8 @@ def look_ahead(start: BallState, horizon: float, step: float = 0.01) -> Forecast
     count = max(int(np.ceil(horizon / step - 1e-9)), 1)
     since = np.minimum(step * np.arange(1, count + 1), horizon)
     path = propagator.rollout(belief.from_zero(), since)
-    return Forecast(start, horizon, start.time + since, path.states[0], definite(path.covariances[0]))
+    covariances = definite(path.covariances[0])
+    return Forecast(start, horizon, start.time + since, path.states[0], covariances, (propagator, belief))
 
 
 def carried_by(start: BallState) -> tuple[Propagator, Belief]:

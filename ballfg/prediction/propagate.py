@@ -35,7 +35,7 @@ from ballfg.state import POSITION, STATE_DIM, VZ
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-AT_ONCE = 64
+AT_ONCE = 128
 """Largest number of steps of free flight in one call of machine code: more would waste memory on covariances."""
 
 

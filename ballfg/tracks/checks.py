@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, median
 from ballfg.checks import shown
 from ballfg.state import STANDARD_GRAVITY, Z
 
@@ -118,7 +118,7 @@ def fuse(values: Array) -> Array:
 def check_scale(label: str, times: Array, positions: Array, sigmas: Array | None, rate: float | None) -> None:
     """Refuses times (n,) s and positions (n, 3) m that cannot be in these units. Raises: ValueError: the likely one."""
     steps = np.diff(times)
-    step = float(np.median(steps))
+    step = float(median(steps))
     misses_rate = rate is not None and not 1 / MAX_RATE_RATIO <= step * rate <= MAX_RATE_RATIO
     low, high = positions.min(axis=0), positions.max(axis=0)
     farthest = float(max(high.max(), -low.min()))
@@ -136,7 +136,7 @@ def check_scale(label: str, times: Array, positions: Array, sigmas: Array | None
         problem = f"{label}: t must be in s, its stamps {expected}; got a median step of {step:.4g}"
         raise ValueError(f"{problem}. {_time_remedy(step, rate)}")
     with np.errstate(over="ignore"):  # a single step may be almost zero
-        speed = float(np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1) / steps))
+        speed = float(median(np.linalg.norm(np.diff(positions, axis=0), axis=1) / steps))
     if speed > MAX_SPEED:
         raise ValueError(
             f"{label}: x, y, z must be in m and t in s; got a median speed of {speed:.4g} m/s, above that of sound. "
@@ -149,7 +149,7 @@ def check_scale(label: str, times: Array, positions: Array, sigmas: Array | None
 
 def doubts_about(times: Array, positions: Array, surfaces: Sequence[float], radius: float) -> tuple[str, ...]:
     """Doubts that a ball, of times (n,) s and positions (n, 3) m, falls along -z and bounces on the surfaces (m)."""
-    step = float(np.median(np.diff(times))) if len(times) > 1 else np.inf
+    step = float(median(np.diff(times))) if len(times) > 1 else np.inf
     reach = max(round(BASELINE / step), 1) if np.isfinite(step) else 1
     if len(times) < 4 * reach:
         return ()
@@ -199,7 +199,7 @@ def _other_axis(times: Array, positions: Array, reach: int) -> tuple[str, ...]:
     before, middle, after = positions[: -2 * reach], positions[reach:-reach], positions[2 * reach :]
     span = (times[2 * reach :] - times[: -2 * reach]) / 2
     accelerations = (after - 2 * middle + before) / span[:, None] ** 2
-    acceleration = np.median(accelerations, axis=0)
+    acceleration = median(accelerations)
     low, high = FALLS[0] * STANDARD_GRAVITY, FALLS[1] * STANDARD_GRAVITY
     falls = (-high <= accelerations[:, Z]) & (accelerations[:, Z] <= -low)
     rises = (low <= accelerations[:, Z]) & (accelerations[:, Z] <= high)
@@ -223,7 +223,7 @@ def _other_surface(
     lowest = z[inner] == sliding_window_view(z, 2 * reach + 1).min(axis=1)
     bounces = z[inner[lowest & (fall < -LEAST_REVERSAL) & (rise > LEAST_REVERSAL)]] - radius
     gaps = np.abs(bounces[:, None] - np.array(surfaces)).min(axis=1, initial=np.inf)
-    if not len(bounces) or not len(surfaces) or np.median(gaps) <= NEAR_SURFACE:
+    if not len(bounces) or not len(surfaces) or median(gaps) <= NEAR_SURFACE:
         return ()
     heights = " and ".join(f"{height:g}" for height in surfaces)
     return (

@@ -17,6 +17,7 @@ import torch
 from ballfg.arrays import Array
 from ballfg.dynamics import AnalyticModel, Surfaces, nominal_model
 from ballfg.dynamics.compiled.beliefs.course import density_of
+from ballfg.dynamics.compiled.contacts import contacts
 from ballfg.dynamics.compiled.functions import compiled
 from ballfg.dynamics.compiled.in_c.routines import Routine, Translator
 from ballfg.dynamics.compiled.in_c.values import UntranslatableError
@@ -138,11 +139,14 @@ def test_contacts(in_c: InC) -> None:
     assert functions is not None
     for i in range(n):  # one by one: those of a batch share their number of integration steps
         ball = Moving(in_c.model, functions, torch.from_numpy(x[i : i + 1]), 9)
-        ball.bounce(np.full(1, 0.1), np.full(1, 0.5))
-        close(times[i], ball.elapsed[0])
-        close(after[i], ball.states[0])
+        given = (*ball.addresses, x[i : i + 1], np.eye(9)[None], *ball.all_coefficients(), *ball.weights)
+        tau, bounced, by_state = np.empty(1), np.empty((1, 9)), np.empty((1, 9, 9))
+        level, longest = np.full(1, 0.1), np.full(1, 0.5)
+        contacts(*given, level, longest, functions.radius, tau, np.empty((1, 9)), bounced, by_state)
+        close(times[i], tau[0])
+        close(after[i], bounced[0])
         if np.isfinite(times[i]):
-            close(jacobians[i], ball.moved[0])
+            close(jacobians[i], by_state[0])
 
 
 def test_predictions(in_c: InC) -> None:

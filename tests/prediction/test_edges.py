@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from numba import njit
 from scipy.stats import norm
 
 from ballfg.dynamics import Surfaces, rollout
 from ballfg.dynamics.compiled.beliefs.course import Course
 from ballfg.dynamics.compiled.beliefs.edges import come_down, falls_past
-from ballfg.dynamics.compiled.signatures import Law, Laws
+from ballfg.dynamics.compiled.flight import laws_of
 from ballfg.dynamics.motion.integrate import fly
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction import Propagator, apex
@@ -99,24 +100,28 @@ def test_known_places_at_a_known_edge_have_no_doubt(model, beliefs):
         assert np.abs(predicted.covariances).max() < 1e-12
 
 
-@pytest.mark.filterwarnings("ignore:.*First-class function type feature is experimental")
+@njit
+def both_ways(rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws, x, world, touch, covariance, h, after, spread):
+    """Time at which a ball comes down on the table at z = 0, and whether it falls past; from Python's arguments."""
+    laws = laws_of(rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws)
+    tau = come_down(laws, x, 0.0, world, touch)
+    return tau, falls_past(laws, covariance, touch, tau, h, world, after, spread)
+
+
 def test_the_spread_of_both_ways_is_that_of_the_states(uncertain, beliefs):
     """Share times the outer product of the two ways' difference; coefficients are the same on both."""
     belief = beliefs(uncertain, STEPS["falls past, some bounce"])
     propagator, h = Propagator(with_end(0.925), NOISY), 0.02
     carrier = propagator._carrier(belief)
-    rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws = carrier._given
-    laws = Laws(Law(rates, c, ct, w), Law(impact, b, bt, wb), Law(surface, s, st, ws))
     covariance, spread, after, touch = np.zeros((18, 18)), np.zeros((18, 18)), np.ones(18), np.empty(9)
     covariance[:9, :9] = belief.covariance[0, :9, :9]
     start = belief.mean[0, :9].numpy().copy()
-    tau = come_down(laws, start, 0.0, carrier._world, touch)
     with torch.no_grad():
         end = torch.tensor([h], dtype=torch.float64)
         after[:9] = fly(uncertain, belief.mean, end)[0, :9]
         bounced = rollout(uncertain, belief.mean, end, Surfaces(0.0))[0, 0, :9].numpy()
-    args = (covariance, touch, tau, h, carrier._world, after, spread)
-    assert falls_past(laws, *args)
+    _, past = both_ways(*carrier._given, start, carrier._world, touch, covariance, h, after, spread)
+    assert past
     assert not spread[9:].any()
     assert not spread[:, 9:].any()
     share = norm.cdf((0.925 - touch[0]) / np.sqrt(along(touch) @ covariance[:9, :9] @ along(touch)))

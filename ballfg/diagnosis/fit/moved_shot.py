@@ -82,10 +82,10 @@ def shoot_compiled(
         functions = (model.rates, model.impact, model.surface)
         given = [array for function in functions for array in coefficients.of(function, rows, d)]
         level = np.ascontiguousarray(met[rows, number])
-        computes = (function.compute for function in functions)
+        addresses = (function.compute.address for function in functions)
         longest = np.full(m, LONGEST_FALL)
         contacts(
-            *computes, near, nearer, *given, NONE, NONE, NONE, level, longest, model.radius, tau, slower, start, moved
+            *addresses, near, nearer, *given, NONE, NONE, NONE, level, longest, model.radius, tau, slower, start, moved
         )
         found[rows, number] = begun + tau
         begun, began = begun + np.nan_to_num(tau), began + slower
@@ -107,7 +107,6 @@ def _flown(
     nodes, slopes = np.empty((m, count + 1, 9)), np.empty((m, count + 1, 9))
     nodes_moved, slopes_moved = np.empty((m, count + 1, 9, d)), np.empty((m, count + 1, 9, d))
     given = coefficients.of(model.rates, rows, d)
-    fly_arcs(
-        model.rates.compute, start, moved, *given, NONE, step.numpy(), count, nodes, nodes_moved, slopes, slopes_moved
-    )
+    rates = model.rates.compute.address
+    fly_arcs(rates, start, moved, *given, NONE, step.numpy(), count, nodes, nodes_moved, slopes, slopes_moved)
     return MovedArc(rows, begun, began, step.numpy(), nodes, slopes, nodes_moved, slopes_moved)

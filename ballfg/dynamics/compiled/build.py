@@ -13,9 +13,9 @@ from types import ModuleType
 from typing import Any, Final
 
 from numba import njit
+from numba.core import cgutils
 from numba.core.compiler_lock import global_compiler_lock
-from numba.core.types import WrapperAddressProtocol
-from numba.extending import typeof_impl
+from numba.extending import intrinsic
 
 from ballfg.dynamics.compiled.kept import Kept, keep, readable
 from ballfg.dynamics.compiled.signatures import FUNCTION
@@ -73,30 +73,33 @@ def machine_code(signature: Any) -> Callable[[Callable[..., Any]], Any]:
     return declared
 
 
-class Code(WrapperAddressProtocol):
-    """A compiled function as machine code takes it: by its address, which numba would look up anew in every call."""
+class Code:
+    """A compiled function of a model.
+
+    Attributes: address: by which machine code takes it; numba would look for the function's type in every call.
+    """
 
     def __init__(self, compiled: Any) -> None:
         self.__wrapped__ = compiled
-        (self._signature,) = compiled.nopython_signatures
-        result = compiled.get_compile_result(self._signature)
-        self._address = result.library.get_pointer_to_function(result.fndesc.llvm_cfunc_wrapper_name)
+        (signature,) = compiled.nopython_signatures
+        result = compiled.get_compile_result(signature)
+        self.address = int(result.library.get_pointer_to_function(result.fndesc.llvm_cfunc_wrapper_name))
 
     def __call__(self, *args: Any) -> None:
         """Call it from Python."""
         self.__wrapped__(*args)
 
-    def __wrapper_address__(self) -> int:
-        return int(self._address)
 
-    def signature(self) -> Any:
-        """Of its arguments and result, as numba asks for it."""
-        return self._signature
+@intrinsic
+def function_at(_context: Any, address: Any) -> Any:
+    """The function of a model at an address, for machine code."""
 
+    def generate(context: Any, builder: Any, _signature: Any, given: Any) -> Any:
+        function = cgutils.create_struct_proxy(FUNCTION)(context, builder)
+        function.c_addr = builder.inttoptr(given[0], cgutils.voidptr_t)
+        return function._getvalue()
 
-@typeof_impl.register(Code)
-def _type_of(code: Code, _context: Any) -> Any:
-    return FUNCTION
+    return FUNCTION(address), generate
 
 
 def built(source: str) -> Code:

@@ -3,12 +3,47 @@
 import math
 
 import numpy as np
+from numba import types
 
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.flight import evaluate, fly_one, glide, laws_of, only, put, put_all, value_of
-from ballfg.dynamics.compiled.signatures import COUNT, GIVEN, LAW, LAWS, NOTHING, ONE, REAL, THREE, TWO, Law, several
+from ballfg.dynamics.compiled.flight import (
+    evaluate,
+    fly_one,
+    fly_together,
+    glide,
+    law_at,
+    laws_of,
+    only,
+    put,
+    put_all,
+    value_of,
+)
+from ballfg.dynamics.compiled.signatures import (
+    ADDRESS,
+    COUNT,
+    COUNTS,
+    FLAG,
+    GIVEN,
+    LAW,
+    LAWS,
+    NOTHING,
+    ONE,
+    REAL,
+    THREE,
+    TWO,
+    Law,
+    several,
+)
 from ballfg.dynamics.motion import limits
-from ballfg.dynamics.motion.limits import LEAST_FALL, MAX_STEP, MIN_SPEED, SEARCH_STEPS, TYPICAL_JERK, steps_over
+from ballfg.dynamics.motion.limits import (
+    BEYOND,
+    LEAST_FALL,
+    MAX_STEP,
+    MIN_SPEED,
+    SEARCH_STEPS,
+    TYPICAL_JERK,
+    steps_over,
+)
 
 LEAST = 1e-300
 """Keeps a division by zero away."""
@@ -116,7 +151,7 @@ def times_of(rates, surface, start, heights, longest, radius, tau):
 def contact_times(rates, surface, start, c, s, w, ws, heights, longest, radius, tau):
     """`times_of` for Python."""
     none, nones = np.empty((len(c), c.shape[1], 0)), np.empty((len(s), s.shape[1], 0))
-    times_of(Law(rates, c, none, w), Law(surface, s, nones, ws), start, heights, longest, radius, tau)
+    times_of(law_at(rates, c, none, w), law_at(surface, s, nones, ws), start, heights, longest, radius, tau)
 
 
 @machine_code(NOTHING(LAWS, TWO, THREE, ONE, ONE, REAL, ONE, TWO, TWO, THREE))
@@ -159,6 +194,71 @@ def meet(laws, start, startt, heights, longest, radius, tau, taut, after, aftert
             for i in range(9):
                 xt[i, q] = later[i, q] + later[i, d] * taut[r, q]
         evaluate(only(impact, r), x, xt, after[r], aftert[r])
+
+
+@machine_code(types.Tuple((TWO, THREE))(ONE, COUNTS, TWO, COUNT))
+def coefficients_of(own, places, start, width):
+    """Coefficients (m, p) of a function for each ball, and their tangents (m, p, d).
+
+    Args:
+        own (p,), places (p,): values, and -1, or in place of the value the column of `start` in which it travels.
+        start (m, 9 + q): the balls.  width: d, 9 + q or 0.
+    """
+    m, p = len(start), len(own)
+    c, ct = np.empty((m, p)), np.zeros((m, p, width))
+    for r in range(m):
+        for k in range(p):
+            c[r, k] = own[k] if places[k] < 0 else start[r, places[k]]
+            if places[k] >= 0 and width > 0:
+                ct[r, k, places[k]] = 1.0
+    return c, ct
+
+
+@machine_code(FLAG(*[ADDRESS] * 3, *[ONE] * 3, *[COUNTS] * 3, *[ONE] * 3, TWO, ONE, TWO, REAL, TWO, THREE, TWO))
+def travel(
+    rates, impact, surface, own, owni, owns, places, placesi, placess, w, wb, ws,
+    start, dt, heights, radius, after, moved, times,
+):  # fmt: skip
+    """Moves m balls on by durations dt (m,) s, through a contact at each of their surfaces heights (m, k) on the way.
+
+    Args: start (m, 9 + q): states with the coefficients that travel; the others as `coefficients_of` takes them.
+    Writes: after (m, 9 + q); its derivatives by `start`, moved (m, 9 + q, d), d either 9 + q or 0; contact times (m, k)
+        s since the start. NaN after a contact that never comes.
+    Returns: False, without a motion, if a duration is infinite.
+    """
+    (m, wide), d = start.shape, moved.shape[2]
+    c, ct = coefficients_of(own, places, start, d)
+    b, bt = coefficients_of(owni, placesi, start, d)
+    s, st = coefficients_of(owns, placess, start, d)
+    laws = laws_of(rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws)
+    x, xt, y, yt = np.empty((m, 9)), np.zeros((m, 9, d)), np.empty((m, 9)), np.empty((m, 9, d))
+    left, earlier, tau, taut = dt.copy(), np.zeros((m, d)), np.empty(m), np.empty((m, d))
+    level, longest = np.empty(m), np.empty(m)
+    for r in range(m):
+        if math.isinf(dt[r]):
+            return False
+        longest[r] = abs(dt[r]) + BEYOND
+        for i in range(9):
+            x[r, i] = start[r, i]
+            if d > 0:
+                xt[r, i, i] = 1.0
+    for k in range(heights.shape[1]):
+        for r in range(m):
+            level[r] = heights[r, k]
+        meet(laws, x, xt, level, longest, radius, tau, taut, y, yt)
+        for r in range(m):
+            times[r, k] = tau[r] + (times[r, k - 1] if k > 0 else 0.0)
+            left[r] = dt[r] - times[r, k]
+            for q in range(d):
+                earlier[r, q] -= taut[r, q]
+        x, xt, y, yt = y, yt, x, xt
+    fly_together(rates, x, xt, c, ct, w, left, earlier, _common_steps(left))
+    for r in range(m):
+        for i in range(wide):
+            after[r, i] = x[r, i] if i < 9 else start[r, i]
+            for q in range(d):
+                moved[r, i, q] = xt[r, i, q] if i < 9 else (1.0 if q == i else 0.0)
+    return True
 
 
 @machine_code(NOTHING(*GIVEN[:3], TWO, THREE, *GIVEN[3:], ONE, ONE, REAL, ONE, TWO, TWO, THREE))

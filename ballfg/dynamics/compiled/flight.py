@@ -8,8 +8,8 @@ values: derivatives in d directions at once, of which there may be none. The rul
 import numpy as np
 from numba.extending import register_jitable
 
-from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.signatures import COUNT, FOUR, FUNCTION, LAW, NOTHING, ONE, REAL, THREE, TWO, Law, Laws
+from ballfg.dynamics.compiled.build import function_at, machine_code
+from ballfg.dynamics.compiled.signatures import ADDRESS, COUNT, FOUR, LAW, NOTHING, ONE, REAL, THREE, TWO, Law, Laws
 from ballfg.dynamics.motion.limits import STAGES
 
 TOGETHER = 96
@@ -44,9 +44,15 @@ def put_all(target, source):
 
 
 @register_jitable
+def law_at(address, c, ct, w):
+    """A law whose function lies at an address."""
+    return Law(function_at(address), c, ct, w)
+
+
+@register_jitable
 def laws_of(rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws):
     """The `Laws` from arguments as in `signatures.GIVEN`."""
-    return Laws(Law(rates, c, ct, w), Law(impact, b, bt, wb), Law(surface, s, st, ws))
+    return Laws(law_at(rates, c, ct, w), law_at(impact, b, bt, wb), law_at(surface, s, st, ws))
 
 
 @register_jitable
@@ -118,7 +124,7 @@ def step_on(rates, x, xt, h, ht, k, kt):
                 xt[r, i, q] += (h[r] * totalt[r, i, q] + ht[r, q] * total[r, i]) / 6.0
 
 
-@machine_code(NOTHING(FUNCTION, TWO, THREE, TWO, THREE, ONE, ONE, COUNT, THREE, FOUR, THREE, FOUR))
+@machine_code(NOTHING(ADDRESS, TWO, THREE, TWO, THREE, ONE, ONE, COUNT, THREE, FOUR, THREE, FOUR))
 def fly_arcs(rates, start, startt, c, ct, w, step, count, nodes, nodest, slopes, slopest):
     """Flight of m balls over `count` steps of their own length.
 
@@ -127,7 +133,7 @@ def fly_arcs(rates, start, startt, c, ct, w, step, count, nodes, nodest, slopes,
     """
     d = startt.shape[2]
     x, xt, k, kt = np.empty((1, 9)), np.empty((1, 9, d)), np.empty((1, 9)), np.empty((1, 9, d))
-    a, at, fixed, law = np.empty((1, 6)), np.empty((1, 6, d)), np.zeros((1, d)), Law(rates, c, ct, w)
+    a, at, fixed, law = np.empty((1, 6)), np.empty((1, 6, d)), np.zeros((1, d)), law_at(rates, c, ct, w)
     for r in range(len(start)):
         own = only(law, r)
         put(x[0], start[r])
@@ -142,7 +148,7 @@ def fly_arcs(rates, start, startt, c, ct, w, step, count, nodes, nodest, slopes,
             put_all(slopest[r, s], kt[0])
 
 
-@machine_code(NOTHING(FUNCTION, TWO, THREE, TWO, THREE, ONE, ONE, TWO, COUNT))
+@machine_code(NOTHING(ADDRESS, TWO, THREE, TWO, THREE, ONE, ONE, TWO, COUNT))
 def fly_together(rates, state, statet, c, ct, w, dt, dtt, steps):
     """Move m balls on by durations dt (m,) s with tangents dtt (m, d), in so many equal steps each, in place.
 
@@ -150,7 +156,7 @@ def fly_together(rates, state, statet, c, ct, w, dt, dtt, steps):
     """
     for first in range(0, len(state), TOGETHER):
         past = min(first + TOGETHER, len(state))
-        x, xt, own = state[first:past], statet[first:past], Law(rates, c[first:past], ct[first:past], w)
+        x, xt, own = state[first:past], statet[first:past], law_at(rates, c[first:past], ct[first:past], w)
         n, d = len(x), xt.shape[2]
         h, ht = dt[first:past] / steps, dtt[first:past] / steps
         k, kt, a, at = np.empty((n, 9)), np.empty((n, 9, d)), np.empty((n, 6)), np.empty((n, 6, d))

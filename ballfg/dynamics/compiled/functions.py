@@ -336,7 +336,7 @@ def _compare_steps(model: BallModel, made: CompiledModel) -> None:
     moved, names = np.tile(np.eye(STATE_DIM), (COMPARED, 1, 1)), made.rates.names
     c = np.tile([numbers_of(model).value(name) for name in names], (COMPARED, 1)).reshape(COMPARED, len(names))
     given = (c, np.zeros((*c.shape, STATE_DIM)), made.weights(model)[0], np.full(COMPARED, MAX_STEP))
-    fly_together(made.rates.compute, states, moved, *given, np.zeros((COMPARED, STATE_DIM)), 1)
+    fly_together(made.rates.compute.address, states, moved, *given, np.zeros((COMPARED, STATE_DIM)), 1)
     _agree(f"flight of {type(model).__name__}", (states, moved), right)
 
 

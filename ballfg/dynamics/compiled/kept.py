@@ -21,8 +21,10 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 import llvmlite
+import llvmlite.binding as llvm
 import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
+from numba.core.codegen import JITCodeLibrary
 from numba.core.runtime import rtsys
 
 from ballfg.files.own_folder import is_own, own_bytes, temporary_folder
@@ -132,11 +134,42 @@ WRITTEN: Final[list[Any]] = [_Trusted(locator) for locator in (*CompileResultCac
 READ: Final[list[Any]] = [_Beside]
 
 
-class _Written(CompileResultCacheImpl):
+class _Library(JITCodeLibrary):
+    """A loaded function, whose code for building it into others is read when one of them is compiled.
+
+    A program that only calls it would spend half of the time of loading on that.
+    """
+
+    _waiting: bytes | None
+
+    def _get_module_for_linking(self) -> Any:
+        if self._waiting is not None:
+            self._shared_module, self._waiting = llvm.parse_bitcode(self._waiting), None
+            self._codegen._engine._load_defined_symbols(self._shared_module)
+        return super()._get_module_for_linking()
+
+
+class _Kept(CompileResultCacheImpl):
+    def rebuild(self, target_context: Any, payload: Any) -> Any:
+        """The function of kept code, as numba asks for it."""
+        (name, kind, (code, shared)), about, *others = payload
+        codegen = target_context.codegen()
+        codegen._engine._defined_symbols |= {about.llvm_cpython_wrapper_name, about.llvm_cfunc_wrapper_name}
+        found = super().rebuild(target_context, ((name, kind, (code, _no_code())), about, *others))
+        found.library.__class__, found.library._waiting = _Library, shared
+        return found
+
+
+@cache
+def _no_code() -> bytes:
+    return bytes(llvm.parse_assembly("").as_bitcode())
+
+
+class _Written(_Kept):
     _locator_classes = WRITTEN
 
 
-class _Read(CompileResultCacheImpl):
+class _Read(_Kept):
     _locator_classes = READ
 
 

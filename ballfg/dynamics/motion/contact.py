@@ -11,6 +11,7 @@ import math
 import torch
 from torch import Tensor
 
+from ballfg.arrays import Array
 from ballfg.dynamics.compiled import motion
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.flight_step import rk4_step
@@ -176,7 +177,7 @@ def fly_through_jacobian(
             tau = contact_time(model, state, height, dt.abs() + BEYOND)
         before, flight = fly_jacobian(model, state, tau)
         jacobian = flight @ jacobian
-        rate, upward = _flow_rate(model, state, tau), _gap_gradient(model, before, height)
+        rate, upward = _flow_rate(model, state, tau), gap_jacobian(model, before, height)[1]
         speed = (upward * rate).sum(-1).clamp_max(-MIN_SPEED)
         # at the contact the gap is zero: d gap + speed d tau = 0
         tau_by_state = -(upward.unsqueeze(-2) @ jacobian) / speed[..., None, None]
@@ -199,10 +200,25 @@ def _flow_rate(model: BallModel, state: Tensor, dt: Tensor) -> Tensor:
     return flown[1][..., 0]
 
 
-def _gap_gradient(model: BallModel, state: Tensor, height: Tensor | float) -> Tensor:
-    """Derivative of the gap by the state, of the state's shape."""
+def gap_jacobian(model: BallModel, state: Tensor, height: Tensor | float) -> tuple[Tensor, Tensor]:
+    """Gaps (n,) m between balls in states (n, 9) and surfaces at heights in m or (n,), and their derivatives (n, 9)."""
+    if is_plain(state) and (functions := motion.functions_of(model)) is not None:
+        found = motion.Moving(model, functions, state, state.shape[-1]).gaps(_numbers(height))
+        return torch.from_numpy(found[0]), torch.from_numpy(found[1])
     leaf = state.detach().requires_grad_(True)
     with torch.enable_grad():
-        total = model.gap(leaf, height).sum()
-    (gradient,) = torch.autograd.grad(total, leaf)
-    return gradient
+        gap = model.gap(leaf, height)
+    (gradient,) = torch.autograd.grad(gap.sum(), leaf)
+    return gap.detach(), gradient
+
+
+def bounced(model: BallModel, state: Tensor) -> Tensor:
+    """`model.after_bounce` of states (n, 9), without derivatives."""
+    if is_plain(state) and (functions := motion.functions_of(model)) is not None:
+        return torch.from_numpy(motion.Moving(model, functions, state, 0).after_bounce())
+    with torch.no_grad():
+        return model.after_bounce(state)
+
+
+def _numbers(height: Tensor | float) -> Array | float:
+    return height.numpy() if isinstance(height, Tensor) else height

@@ -8,7 +8,7 @@ from numba import types
 
 from ballfg.arrays import Array
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, FLAG, INDEX, NOTHING, ONE, REAL, TWO
+from ballfg.dynamics.compiled.signatures import COUNT, FLAG, NOTHING, ONE, REAL, TWO
 from ballfg.estimation.flights.modes import (
     BOUNCE,
     CARRIED,
@@ -55,6 +55,7 @@ from ballfg.estimation.segmentation.bank import (
     prune,
     update,
 )
+from ballfg.estimation.segmentation.log import chain, compact
 
 RATE: Final = 1.0
 """1/s. Prior rate of every event."""
@@ -160,37 +161,13 @@ def _begin(work: Work, sample: Sample, hands: bool, scene: Record) -> None:
     update(work, 0, sample, scene)
 
 
-@machine_code(COUNT(BANK, LOG, COUNTS))
-def _compact(kept: Records, log: Records, fill: Any) -> int:
-    """Drops events that no hypothesis has; returns how many are left."""
-    written = fill[WRITTEN]
-    needed = np.zeros(written, np.int64)
-    for row in range(len(kept)):
-        tip = kept[row].tip
-        while tip >= 0 and needed[tip] == 0:
-            needed[tip] = 1
-            tip = log[tip].before
-    count = 0
-    for row in range(written):
-        if needed[row]:
-            log[count] = log[row]
-            if log[count].before >= 0:
-                log[count].before = needed[log[count].before] - 2
-            needed[row] = count + 2
-            count += 1
-    for row in range(len(kept)):
-        kept[row].tip = needed[kept[row].tip] - 2
-    fill[WRITTEN] = count
-    return count
-
-
-@machine_code(types.Tuple((INDEX, REAL))(ONE, TWO, TWO, FLAG, SCENE))
+@machine_code(types.Tuple((LOG, REAL))(ONE, TWO, TWO, FLAG, SCENE))
 def decode(times: Array, positions: Array, sigmas: Array, hands: bool, scene: Record) -> Any:
     """The events of the most likely explanation, oldest first.
 
     Args:
         times: (n,) s.  positions, sigmas: (n, 3) m.  hands: False if no hand may touch the ball.  scene: of a `Scene`.
-    Returns: (k, 3): kind, index of the interval or sample, and mode from there on; and the log evidence, nats.
+    Returns: the events, whose `surface` is the mode from there on; and the log evidence, nats.
     """
     n, most = len(times), int(scene.most)
     room = 2 * (most + BRANCHES)
@@ -218,30 +195,16 @@ def decode(times: Array, positions: Array, sigmas: Array, hands: bool, scene: Re
     for row in range(len(kept)):
         if kept[row].score - _brevity(kept[row], dt) > last:
             best, last = row, kept[row].score - _brevity(kept[row], dt)
-    return _chain(kept[best].tip, work.log), last
+    return chain(kept[best].tip, work.log), last
 
 
 @machine_code(WORK(BANK, WORK, COUNT))
 def _roomy(kept: Records, work: Work, spare: int) -> Any:
     """The same work with a compacted log, which is made longer where its events fill most of it."""
-    count = _compact(kept, work.log, work.fill)
+    count = compact(kept, work.log, work.fill[WRITTEN])
+    work.fill[WRITTEN] = count
     if 2 * count < len(work.log):
         return work
     longer = np.empty(2 * len(work.log) + spare, LOGGED)
     longer[:count] = work.log[:count]
     return Work(work.bank, longer, work.fill)
-
-
-@machine_code(INDEX(COUNT, LOG))
-def _chain(tip: int, log: Records) -> Any:
-    """(k, 3) kind, index and mode of the events up to one, oldest first."""
-    count, event = 0, tip
-    while event >= 0:
-        count, event = count + 1, log[event].before
-    found = np.empty((count, 3), np.int64)
-    event = tip
-    while event >= 0:
-        count -= 1
-        found[count, 0], found[count, 1], found[count, 2] = log[event].kind, log[event].index, log[event].surface
-        event = log[event].before
-    return found

@@ -114,11 +114,12 @@ def _explained(
     if most - least < HANDS:
         events = alone
     modes, lost = np.zeros(n, np.int64), np.zeros(n, dtype=bool)
-    for kind, index, mode in events.tolist():
+    plain = events[["kind", "index", "surface"]].tolist()
+    for kind, index, mode in plain:
         if kind in (CHANGE, STRIKE):
             modes[index + 1 :] = mode
         lost[index] |= kind == OUTLIER
-    bounces = np.array([index for kind, index, _ in events.tolist() if kind == BOUNCE], dtype=np.int64)
+    bounces = np.array([index for kind, index, _ in plain if kind == BOUNCE], dtype=np.int64)
     values = _placed(positions, modes, bounces, levels)
     values[lost] = Label.LOST
     return Labels(values, bounces)

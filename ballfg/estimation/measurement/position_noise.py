@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, median
 from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
 from ballfg.tracks import Track
 
@@ -77,7 +77,7 @@ def noise_doubts(track: Track, settings: Settings) -> tuple[str, ...]:
         return ()
     white = sample_sigmas(settings, len(times), None if track.sigmas is None else track.sigmas[first])
     stated = total_sigmas(settings, white, np.gradient(positions, times, axis=0))
-    seen, said = (float(np.sqrt(np.square(s).mean())) for s in (_robust_sigma(residuals), np.median(stated, axis=0)))
+    seen, said = (float(np.sqrt(np.square(s).mean())) for s in (_robust_sigma(residuals), median(stated)))
     if seen <= MOST_SCATTER * said:
         return ()
     return (
@@ -112,10 +112,10 @@ def _robust_sigma(residuals: Array) -> Array:
     """(3,) m from window residuals (w, 11, 3): MAD of the middle ones, over windows without large residuals."""
     middle = residuals[:, HALF_WINDOW]
     largest = np.abs(residuals).max(axis=1)
-    sigma = MAD_TO_SIGMA * np.median(np.abs(middle), axis=0)
+    sigma = MAD_TO_SIGMA * median(np.abs(middle))
     for _ in range(ROUNDS - 1):
         clean = (largest <= REJECT * np.maximum(sigma, FLOOR)).all(axis=1)
         if not clean.any():
             break
-        sigma = MAD_TO_SIGMA * np.median(np.abs(middle[clean]), axis=0)
+        sigma = MAD_TO_SIGMA * median(np.abs(middle[clean]))
     return np.asarray(sigma)

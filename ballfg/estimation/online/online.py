@@ -26,7 +26,6 @@ from ballfg.estimation.online.stream import SightingStream
 from ballfg.estimation.online.warm_up import warmed_up
 from ballfg.estimation.online.windows.chain import ChainWindow
 from ballfg.estimation.online.windows.stream_window import StreamWindow
-from ballfg.estimation.online.windows.window import IsamWindow
 from ballfg.estimation.plausible import plausible, possible
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.physics import physics_of
@@ -46,7 +45,6 @@ from ballfg.vision.camera import Camera
 
 LAG = 128
 """States that stay when the window is cut: 0.7 s at 180 Hz; new samples carry no information on older ones."""
-WINDOWS: Final[Mapping[Solver, type[StreamWindow]]] = {"gtsam": IsamWindow, "ballfg": ChainWindow}
 EARLIER: Final[Mapping[str, Solver]] = {"isam2": "gtsam", "chain": "ballfg"}
 """Earlier names of solvers as an argument of `Online`."""
 
@@ -234,7 +232,12 @@ class Online(Estimator):
     def _new_window(self, sample: Sample) -> StreamWindow:
         """A window that begins with a sample; only measured positions have a tracker's bias."""
         biased = self.settings.has_memory and sample.measured
-        window = WINDOWS[self.settings.solver or "gtsam"](self.ball, self.settings, float(sample.stated.min()), biased)
+        kind: type[StreamWindow] = ChainWindow
+        if self.settings.solver != "ballfg":
+            from ballfg.estimation.online.windows.window import IsamWindow  # GTSAM takes a tenth of a second to import
+
+            kind = IsamWindow
+        window = kind(self.ball, self.settings, float(sample.stated.min()), biased)
         self._monitor = ContactMonitor(
             HypothesisModel(self.ball, self.surfaces, self.settings, window.width - STATE_DIM)
         )

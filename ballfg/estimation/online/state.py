@@ -1,10 +1,12 @@
 """Measurements and samples of a stream, the record of an update, and the belief after it."""
 
+from __future__ import annotations
+
 from collections import defaultdict
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-import gtsam
 import numpy as np
 
 from ballfg.arrays import Array
@@ -21,6 +23,9 @@ from ballfg.factors.bridge import Bridge, checked
 from ballfg.prediction.state import BallState
 from ballfg.state import STATE_DIM
 from ballfg.tracks import Track
+
+if TYPE_CHECKING:
+    import gtsam
 
 
 class Measurement:

@@ -41,7 +41,7 @@ HYPOTHESIS: Final = np.dtype(
 - score: nats, log evidence less the prices of events, apart from a constant per sample.
 - surface: index of the surface on which the ball rests, or `FLYING`.
 - age: samples used since the last event.
-- tip: its last event: the row of a log, or -1 - k for the last event of hypothesis k before the sample.
+- tip: its last event: the row of a log, or `NO_EVENT`.
 """
 
 LOGGED: Final = np.dtype(
@@ -50,14 +50,16 @@ LOGGED: Final = np.dtype(
         ("index", np.int64),
         ("surface", np.int64),
         ("before", np.int64),
+        ("serial", np.int64),
         ("time", np.float64),
         ("offset", np.float64, (3,)),
     ]
 )
-"""An event of some hypotheses during one sample.
+"""An event of some hypotheses.
 
 - kind: value of an `EventKind`.  index: the interval, or the sample.  surface: its index, -1 without one.
 - before: the previous event, as the `tip` of a hypothesis.  time: s.  offset: m, of a shift.
+- serial: its number in the whole stream, which it keeps when the log is compacted.
 """
 
 SURFACE: Final = np.dtype([("centre", np.float64), ("restitution_sigma", np.float64)])
@@ -215,15 +217,16 @@ def _variance(h: Record, axis: int, sigma: float, component: int, scene: Record)
 @machine_code(NOTHING(ONE_HYPOTHESIS, ONE, ONE, SCENE, ONE))
 def weigh(h: Record, position: Array, sigma: Array, scene: Record, said: Array) -> None:
     """Writes a sample's evidence: (4,) nats, less 3/2 log 2 pi, if good, wide, outlier; and the squared innovation."""
-    said[SURPRISE] = 0.0
     for component in range(3):
-        said[component] = scene.log_shares[component]
+        volume, distance = 1.0, 0.0
         for axis in range(3):
             off = position[axis] - h.mean[axis, 0]
             spread = _variance(h, axis, sigma[axis], component, scene)
-            said[component] -= 0.5 * (off * off / spread + math.log(spread))
-            if component == AS_GOOD:
-                said[SURPRISE] += off * off / spread
+            volume *= spread
+            distance += off * off / spread
+        said[component] = scene.log_shares[component] - 0.5 * (distance + math.log(volume))
+        if component == AS_GOOD:
+            said[SURPRISE] = distance
 
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, ONE, ONE, COUNT, SCENE))

@@ -160,7 +160,8 @@ def segment(
     """
     t, x, s = _checked(times, positions, sigma)
     physics, settings = physics or SegmentationPhysics(), settings or SegmentationSettings()
-    return assembled(Segmenter(surfaces, physics, settings).push_all(t, x, s), t, x, physics, settings)
+    found = Segmenter(surfaces, physics, settings).push_all(t, x, s)
+    return assembled((*found.final, *found.pending), t, x, physics, settings)
 
 
 def assembled(

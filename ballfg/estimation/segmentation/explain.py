@@ -1,4 +1,4 @@
-"""Explains one sample in machine code: every hypothesis branches, is weighed, and the unlikely are dropped."""
+"""Explains samples in machine code: every hypothesis branches, is weighed, and the unlikely are dropped."""
 
 import math
 from typing import Any, Final
@@ -8,7 +8,7 @@ from numba import types
 
 from ballfg.arrays import Array
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.signatures import COUNT, NOTHING, ONE, REAL
+from ballfg.dynamics.compiled.signatures import COUNT, NOTHING, ONE, REAL, TWO
 from ballfg.estimation.segmentation.bank import (
     AS_OUTLIER,
     BANK,
@@ -34,6 +34,7 @@ from ballfg.estimation.segmentation.bank import (
     rank,
     update,
 )
+from ballfg.estimation.segmentation.log import chain, compact, decide
 from ballfg.estimation.segmentation.result import HIT, LEAVE, OUTLIER, REST, RESTART, SHIFT
 from ballfg.estimation.segmentation.surface_contact import Step, advance, lift, put_down
 
@@ -151,13 +152,16 @@ def _rarity(rate: float, dt: float) -> float:
     return -math.log(-math.expm1(-rate * max(dt, SHORTEST_STEP)))
 
 
+SERIES: Final = 32
+"""Bits of the `serial` of an event that count those of one sample; the others are the sample's number."""
 EXPLAINED: Final[Any] = types.Tuple((BANK, LOG))
-"""Hypotheses, best first, and the events of all hypotheses during a sample."""
+"""Hypotheses, best first, and the events of all hypotheses."""
 
 
-@machine_code(EXPLAINED(BANK, REAL, REAL, ONE, ONE, COUNT, SCENE, SURFACES))
+@machine_code(EXPLAINED(BANK, LOG, REAL, REAL, ONE, ONE, COUNT, SCENE, SURFACES))
 def explain(
     bank: Records,
+    log: Records,
     before: float,
     time: float,
     position: Array,
@@ -166,20 +170,21 @@ def explain(
     scene: Record,
     surfaces: Records,
 ) -> Any:
-    """The likely hypotheses after a sample, best first, and the log for their `tip`, from those before it.
+    """The likely hypotheses after a sample, best first, and the log of their events, from those before it.
 
     Args:
-        bank: (h,) best first; none before the first sample.  before: s, stamp of the last sample.
+        bank: (h,) best first; none before the first sample.  log: of their events.
+        before: s, stamp of the last sample.
         time, position, sigma, index: of this one, as in `Sample`, with its number.
     """
-    h, dt, now = len(bank), time - before, bank.copy()
-    for row in range(h):
-        now[row].tip = -1 - row
+    h, dt, now, old = len(bank), time - before, bank.copy(), len(log)
     gap = h > 0 and dt > scene.longest_gap
     steps = 1 if h == 0 or gap else max(1, math.ceil(dt / scene.longest_step))
     branched = max(h, int(scene.most)) * (1 + 2 * len(surfaces))
     room, fill = 2 * (branched + MOST_ADDED + len(surfaces)), np.zeros(2, np.int64)
-    work = Work(np.empty(room, HYPOTHESIS), np.empty(steps * branched + 2 * room, LOGGED), fill)
+    work = Work(np.empty(room, HYPOTHESIS), np.empty(old + steps * branched + 2 * room, LOGGED), fill)
+    work.log[:old] = log
+    fill[WRITTEN] = old
     sample = Sample(position, sigma, index, time)
     if h == 0:
         start(work, NO_EVENT, 0.0, sample, scene, surfaces)
@@ -193,7 +198,52 @@ def explain(
             advance(work, Step(dt / steps, index - 1, before + k * dt / steps, steps > 1), scene, surfaces)
             _keep_best(work, int(scene.most))
         _weigh(work, now, dt, sample, scene, surfaces)
-    return prune(work.bank, fill[USED], scene), work.log[: fill[WRITTEN]].copy()
+    for row in range(old, fill[WRITTEN]):
+        work.log[row].serial = (index << SERIES) + row
+    return prune(work.bank, fill[USED], scene), work.log[: fill[WRITTEN]]
+
+
+FOLLOWED: Final[Any] = types.Tuple((BANK, LOG, LOG))
+"""Hypotheses, best first; their events that are open; the events that became final, oldest first."""
+
+
+@machine_code(FOLLOWED(BANK, LOG, REAL, ONE, TWO, TWO, COUNT, SCENE, SURFACES))
+def follow(
+    bank: Records,
+    log: Records,
+    before: float,
+    times: Array,
+    positions: Array,
+    sigmas: Array,
+    first: int,
+    scene: Record,
+    surfaces: Records,
+) -> Any:
+    """The likely hypotheses after samples, from those before them: those that deny a final event are dropped.
+
+    Events `scene.lag` samples old are final.
+
+    Args:
+        bank, log, before: as for `explain`; the log has open events only.
+        times: (n,) s, positions, sigmas: (n, 3) m, of samples from number `first` on.
+    """
+    final, count = np.empty(8, LOGGED), 0
+    for k in range(len(times)):
+        bank, log = explain(bank, log, before, times[k], positions[k], sigmas[k], first + k, scene, surfaces)
+        before, row = times[k], bank[0].tip
+        while row >= 0 and log[row].index >= first + k + 1 - scene.lag:
+            row = log[row].before
+        if row >= 0:
+            decided = chain(row, log)
+            if count + len(decided) > len(final):
+                longer = np.empty(2 * (count + len(decided)), LOGGED)
+                longer[:count] = final[:count]
+                final = longer
+            final[count : count + len(decided)] = decided
+            count += len(decided)
+            bank = bank[: decide(bank, log, row)]
+        log = log[: compact(bank, log, len(log))].copy()
+    return bank, log, final[:count]
 
 
 @machine_code(NOTHING(WORK, COUNT))

@@ -1,8 +1,7 @@
-"""Events form chains that hypotheses share; a segmentation holds the contacts, hits, rests and qualities of a track."""
+"""Kinds of events; a segmentation holds the contacts, hits, rests and qualities of a track."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, IntEnum, auto
 
@@ -143,61 +142,3 @@ class Event:
     time: float
     height: float | None = None
     offset: NDArray[np.float64] | None = None
-
-
-class Node:
-    """An event, made on demand, and the previous one; `final` once every living hypothesis contains it."""
-
-    __slots__ = ("_event", "final", "parent")
-
-    def __init__(self, event: Event | Callable[[], Event], parent: Node | None) -> None:
-        self._event = event
-        self.parent = parent
-        self.final = False
-
-    @property
-    def event(self) -> Event:
-        """The event of the node."""
-        if not isinstance(self._event, Event):
-            self._event = self._event()
-        return self._event
-
-
-def copied(node: Node | None, known: dict[int, Node]) -> Node | None:
-    """An independent chain with the same events; `known` holds the copies so far by the identity of the original."""
-    if node is None:
-        return None
-    chain = [node]
-    while (parent := chain[-1].parent) is not None and id(chain[-1]) not in known:
-        chain.append(parent)
-    last: Node | None = None
-    for old in reversed(chain):
-        if id(old) not in known:
-            known[id(old)] = Node(old.event, last)
-            known[id(old)].final = old.final
-        last = known[id(old)]
-    return last
-
-
-def open_nodes(node: Node | None) -> list[Node]:
-    """The nodes of a chain that are not final, oldest first."""
-    chain: list[Node] = []
-    while node is not None and not node.final:
-        chain.append(node)
-        node = node.parent
-    return chain[::-1]
-
-
-def contains(tip: Node | None, node: Node) -> bool:
-    """True if the chain that ends in `tip` goes through `node`."""
-    while tip is not None and tip is not node:
-        tip = tip.parent
-    return tip is node
-
-
-def make_final(nodes: list[Node]) -> tuple[Event, ...]:
-    """Marks the oldest nodes of a chain as final and cuts the chain there, so that memory does not grow."""
-    for node in nodes:
-        node.final = True
-        node.parent = None
-    return tuple(node.event for node in nodes)

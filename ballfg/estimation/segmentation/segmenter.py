@@ -3,17 +3,17 @@
 import copy
 import math
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ballfg.arrays import Array
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.segmentation.bank import HYPOTHESIS, NO_EVENT, Records, Scene
-from ballfg.estimation.segmentation.explain import explain
+from ballfg.estimation.segmentation.bank import HYPOTHESIS, LOGGED, Records, Scene
+from ballfg.estimation.segmentation.explain import follow
+from ballfg.estimation.segmentation.log import chain
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
-from ballfg.estimation.segmentation.result import Event, EventKind, Node, contains, copied, make_final, open_nodes
+from ballfg.estimation.segmentation.result import Event, EventKind
 from ballfg.estimation.segmentation.settings import SegmentationSettings
 
 USUAL = SegmentationSettings()
@@ -42,17 +42,16 @@ class Segmenter:
     ) -> None:
         self._scene = Scene(physics, surfaces, settings)
         self._bank: Records = np.empty(0, HYPOTHESIS)
-        self._tips: list[Node | None] = []
+        self._log: Records = np.empty(0, LOGGED)
+        self._open: dict[int, Event] = {}
+        """The best explanation's events that are not final, oldest first, by their serial numbers."""
         self.count = 0
         """Number of samples so far."""
         self._time = -math.inf
 
     def copy(self) -> "Segmenter":
         """An independent segmenter with the same samples."""
-        other = copy.copy(self)
-        known: dict[int, Node] = {}
-        other._tips = [copied(tip, known) for tip in self._tips]
-        return other
+        return copy.copy(self)  # nothing is changed in place
 
     def push(self, time: float, position: ArrayLike, sigma: ArrayLike) -> Decision:
         """Takes in the next sample.
@@ -63,58 +62,32 @@ class Segmenter:
         if not math.isfinite(time) or time <= self._time:
             raise ValueError(f"time must be finite and increase; got {time} s after {self._time} s. Sort the samples.")
         point, noise = _triple("position", position), _triple("sigma", sigma)
-        final = self._taken(time, point, np.maximum(noise, self._scene.settings.sigma_floor))
-        return Decision(final, tuple(node.event for node in open_nodes(self._tips[0])))
+        return self._followed(np.array([time]), point[None], noise[None])
 
-    def push_all(self, times: Array, positions: Array, sigmas: Array) -> list[Event]:
-        """The events of all samples so far, oldest first, after finite samples in order."""
-        events: list[Event] = []
-        noise = np.array(np.maximum(sigmas, self._scene.settings.sigma_floor), order="C")
-        for sample in zip(times.tolist(), np.array(positions, order="C"), noise, strict=True):
-            events += self._taken(*sample)
-        return events + ([node.event for node in open_nodes(self._tips[0])] if self._tips else [])
+    def push_all(self, times: Array, positions: Array, sigmas: Array) -> Decision:
+        """Takes in all of the next samples, which are finite and in order: (n,) s, (n, 3) m, (n, 3) m."""
+        return self._followed(*(np.array(given, order="C") for given in (times, positions, sigmas)))
 
-    def _taken(self, time: float, position: Array, sigma: Array) -> tuple[Event, ...]:
-        """Takes in a sample; returns the events that become final."""
-        last, scene = (self._bank, self._time), self._scene
-        self._bank, log = explain(*last, time, position, sigma, self.count, scene.numbers, scene.rows)
-        self._tips = self._followed(self._bank["tip"].tolist(), log)
-        self._time = time
-        self.count += 1
-        return self._made_final()
+    def _followed(self, times: Array, positions: Array, sigmas: Array) -> Decision:
+        if not len(times):
+            return Decision((), ())
+        scene, noise = self._scene, np.maximum(sigmas, self._scene.settings.sigma_floor)
+        known = (self._bank, self._log, self._time, times, positions, noise, self.count, scene.numbers, scene.rows)
+        self._bank, self._log, final = follow(*known)
+        self._time = float(times[-1])
+        self.count += len(times)
+        decided = tuple(self._events(final).values())
+        self._open = self._events(chain(self._bank[0]["tip"], self._log)) if len(self._log) else {}
+        return Decision(decided, tuple(self._open.values()))
 
-    def _followed(self, tips: list[int], log: Records) -> list[Node | None]:
-        """The last node of each hypothesis, by its `tip` in the log of a sample; equal events share a node."""
-        old = self._tips
-        if not len(log):
-            return [old[-1 - tip] for tip in tips]
-        made: dict[int, Node | None] = {NO_EVENT: None}
-        before = log["before"].tolist()
-
-        def node(tip: int) -> Node | None:
-            if tip not in made:
-                event = partial(_event, log, tip, self._scene)
-                made[tip] = old[-1 - tip] if tip < 0 else Node(event, node(before[tip]))
-            return made[tip]
-
-        return [old[-1 - tip] if NO_EVENT < tip < 0 else node(tip) for tip in tips]
-
-    def _made_final(self) -> tuple[Event, ...]:
-        """Makes old events final, and drops the hypotheses that deny them."""
-        cutoff = self.count - self._scene.settings.lag
-        old = [node for node in open_nodes(self._tips[0]) if node.event.index < cutoff]
-        if not old:
-            return ()
-        agreeing = [row for row, tip in enumerate(self._tips) if contains(tip, old[-1])]
-        self._bank, self._tips = self._bank[agreeing], [self._tips[row] for row in agreeing]
-        return make_final(old)
-
-
-def _event(log: Records, row: int, scene: Scene) -> Event:
-    """The event in a row of a log."""
-    number, index, surface, _, time, offset = log[row].tolist()
-    kind = EventKind(number)
-    return Event(kind, index, time, scene.height(surface), np.array(offset) if kind is EventKind.SHIFT else None)
+    def _events(self, rows: Records) -> dict[int, Event]:
+        """The events in some rows of a log; those that were open in the last explanation are the same objects."""
+        found = {}
+        for number, index, surface, _, serial, time, offset in rows.tolist():
+            kind, height = EventKind(number), self._scene.height(surface)
+            event = Event(kind, index, time, height, np.array(offset) if kind is EventKind.SHIFT else None)
+            found[serial] = self._open.get(serial, event)
+        return found
 
 
 def _triple(name: str, value: ArrayLike) -> NDArray[np.float64]:

@@ -17,9 +17,8 @@ import numpy as np
 import torch
 
 from ballfg.arrays import Array
-from ballfg.dynamics.compiled.motion import Moving, functions_of
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.contact import fly_through_jacobian
+from ballfg.dynamics.motion.contact import fly_through_jacobian, gap_jacobian
 from ballfg.dynamics.motion.integrate import fly_jacobian
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.observation import Observation
@@ -95,15 +94,9 @@ class HypothesisModel:
         """(n,) m between balls (n, d) and a surface, and its gradients (n, d)."""
         gradients = np.zeros(means.shape)
         states = torch.from_numpy(np.ascontiguousarray(means[:, : self.width]))
-        if (functions := functions_of(self.ball)) is not None:
-            gaps, gradients[:, : self.width] = Moving(self.ball, functions, states, self.width).gaps(level)
-            return gaps, gradients
-        leaf = states.requires_grad_(True)
-        with torch.enable_grad():
-            heights = self.ball.gap(leaf, level)
-            (slopes,) = torch.autograd.grad(heights.sum(), leaf)
+        gaps, slopes = gap_jacobian(self.ball, states, level)
         gradients[:, : self.width] = slopes.numpy()
-        return heights.detach().numpy(), gradients
+        return gaps.numpy(), gradients
 
     def may_touch(self, mean: Array, covariance: Array, dt: float) -> bool:
         """True if a ball may come down to a surface within dt s; most are far: a coarse bound is first."""

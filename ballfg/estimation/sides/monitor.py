@@ -13,6 +13,7 @@ import torch
 
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.motion.contact import gap_jacobian
 from ballfg.dynamics.motion.integrate import fly
 from ballfg.estimation.plausible import possible
 from ballfg.estimation.result import Estimate
@@ -98,11 +99,12 @@ def widening_near_contacts(
     sigmas = _gap_sigmas(states[stamps], covariances[stamps], shared, stamps, [c.height for _, _, c in sides], model)
     speeds = np.maximum(np.abs(states[stamps, VZ]), LEAST_SPEED)
     margins = np.array([(c.time - times[k]) * np.sign(b - k) for k, b, c in sides]) * speeds / sigmas
-    for i in np.flatnonzero(margins < FAR):
-        k, other = stamps[i], beyond[i]
-        there = _carried(model, np.append(states[other], shared.mean), times[k] - times[other])
+    near = margins < FAR
+    stamps, beyond = stamps[near], beyond[near]
+    carried = _carried(model, states[beyond], shared.mean, times[stamps] - times[beyond])
+    for k, other, there, margin in zip(stamps, beyond, carried, margins[near].tolist(), strict=True):
         if possible(there):  # back over a long gap, drag accelerates
-            chance = 0.5 * math.erfc(max(float(margins[i]), 0.0) / math.sqrt(2.0))
+            chance = 0.5 * math.erfc(max(margin, 0.0) / math.sqrt(2.0))
             lacking[k] += widening(covariances[k], covariances[other], there - states[k], chance)
     return lacking
 
@@ -111,10 +113,8 @@ def _gap_sigmas(
     states: Array, covariances: Array, shared: Shared, stamps: Array, heights: Sequence[float], model: BallModel
 ) -> Array:
     """(m,) m, standard deviations of the gaps between balls and surfaces."""
-    leaf = torch.from_numpy(np.column_stack((states, np.tile(shared.mean, (len(states), 1))))).requires_grad_(True)
-    with torch.enable_grad():
-        gaps = model.gap(leaf, torch.tensor(heights, dtype=torch.float64))
-        (slopes,) = torch.autograd.grad(gaps.sum(), leaf)
+    whole = _with_coefficients(states, shared.mean)
+    _, slopes = gap_jacobian(model, whole, torch.tensor(heights, dtype=torch.float64))
     own, rest = slopes.numpy()[:, :STATE_DIM], slopes.numpy()[:, STATE_DIM:]
     variance = np.einsum("mi,mij,mj->m", own, covariances, own)
     variance += np.einsum("mi,ij,mj->m", rest, shared.covariance, rest)
@@ -122,11 +122,18 @@ def _gap_sigmas(
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
-def _carried(model: BallModel, state: Array, dt: float) -> Array:
-    """(9,) a state carried over dt s of free flight: the other side's motion, at this side's stamp."""
+def _carried(model: BallModel, states: Array, coefficients: Array, dt: Array) -> Array:
+    """(m, 9) states carried over dt (m,) s of free flight each: the other side's motion, at this side's stamp."""
+    after = np.empty_like(states)
     with torch.no_grad():
-        after = fly(model, torch.from_numpy(state[None]), torch.tensor([dt], dtype=torch.float64))
-    return np.asarray(after[0, :STATE_DIM])
+        for i in range(len(states)):  # one by one: balls that fly together share their number of integration steps
+            one = _with_coefficients(states[i : i + 1], coefficients)
+            after[i] = fly(model, one, torch.from_numpy(dt[i : i + 1]))[0, :STATE_DIM]
+    return after
+
+
+def _with_coefficients(states: Array, coefficients: Array) -> torch.Tensor:
+    return torch.from_numpy(np.column_stack((states, np.tile(coefficients, (len(states), 1)))))
 
 
 @dataclass(frozen=True)

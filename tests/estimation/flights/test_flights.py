@@ -12,13 +12,13 @@ import ballfg as bf
 from ballfg.dynamics import nominal_model
 from ballfg.estimation.flights.cut import flies_throughout, flights_of, pieces_of
 from ballfg.estimation.flights.dataset import error_ratios, in_flight
-from ballfg.estimation.flights.decode import _compact
 from ballfg.estimation.flights.estimates import estimated
 from ballfg.estimation.flights.falling import falls_throughout, scatter
 from ballfg.estimation.flights.labels import label_samples
 from ballfg.estimation.flights.modes import _wandered
 from ballfg.estimation.result import Label
-from ballfg.estimation.segmentation.bank import HYPOTHESIS, LOGGED, WRITTEN
+from ballfg.estimation.segmentation.bank import HYPOTHESIS, LOGGED
+from ballfg.estimation.segmentation.log import chain, compact
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.tracks import TABLE_TENNIS, Track, read_dataset, write_dataset
 from ballfg.tracks.info import DatasetInfo
@@ -194,12 +194,8 @@ def test_import_of_flights(tmp_path: Path) -> None:
 
 def test_events_that_no_hypothesis_has_are_dropped() -> None:
     """Of a log of two chains, the one that a hypothesis ends keeps its events and their order."""
-    log, kept, fill = np.zeros(6, LOGGED), np.zeros(1, HYPOTHESIS), np.zeros(2, np.int64)
-    log["before"], log["index"], fill[WRITTEN] = [-(2**62), -(2**62), 0, 1, 2, 3], range(6), 6
+    log, kept = np.zeros(6, LOGGED), np.zeros(1, HYPOTHESIS)
+    log["before"], log["index"] = [-(2**62), -(2**62), 0, 1, 2, 3], range(6)
     kept["tip"] = 5
-    assert _compact(kept, log, fill) == 3
-    chain, tip = [], int(kept["tip"][0])
-    while tip >= 0:
-        chain.append(int(log["index"][tip]))
-        tip = int(log["before"][tip])
-    assert chain == [5, 3, 1]
+    assert compact(kept, log, 6) == 3
+    assert chain(kept["tip"][0], log)["index"].tolist() == [1, 3, 5]

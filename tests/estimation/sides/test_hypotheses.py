@@ -11,9 +11,9 @@ from scipy.stats import multivariate_normal, norm
 
 from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces
 from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.compiled import motion
 from ballfg.dynamics.motion.rollout import advance
 from ballfg.estimation.settings import Settings
-from ballfg.estimation.sides import hypotheses
 from ballfg.estimation.sides.gaussians import GaussianMixture
 from ballfg.estimation.sides.hypotheses import ContactHypotheses, HypothesisModel, SampleMeasurement
 from ballfg.estimation.sides.monitor import ContactMonitor
@@ -40,7 +40,7 @@ def test_gaps_by_machine_code_and_by_torch(monkeypatch: pytest.MonkeyPatch) -> N
             parameter += 0.01
     means = np.random.default_rng(4).normal(size=(5, 10))
     found = hypothesis_model(ball).gaps(means, 0.3)
-    monkeypatch.setattr(hypotheses, "functions_of", lambda _: None)
+    monkeypatch.setattr(motion, "functions_of", lambda _: None)
     for own, right in zip(found, hypothesis_model(ball).gaps(means, 0.3), strict=True):
         np.testing.assert_allclose(own, right, rtol=1e-13, atol=1e-13)
     assert np.abs(found[1][:, [0, 1, 9]]).min() > 0.0

@@ -79,7 +79,8 @@ class Carrier:
         inner = model.model if isinstance(model, AugmentedModel) else model
         functions = compiled(inner) or in_torch(inner)
         moving = Moving(model, functions, torch.from_numpy(mean), mean.shape[1])
-        self._given: tuple[Any, ...] = (*moving.computes, *moving.all_coefficients(), *moving.weights)
+        self._given: tuple[Any, ...] = (*moving.addresses, *moving.all_coefficients(), *moving.weights)
+        self._functions = functions
         self._world, self._noise = world_of(surfaces, functions.radius), noise
         self._keeps = inner  # what torch computes is found by the model as long as it is there
 
@@ -121,7 +122,8 @@ class Carrier:
         """Gradient (9 + p,) of the event of `find` at a mean (9 + p,), and the mean's rate of change in flight."""
         width, x = len(mean), mean[None, :STATE_DIM].copy()
         gradient, rate, moved = np.zeros(width), np.zeros(width), np.zeros((1, 3, width))
-        rates, _, surface, c, _, _, _, s, st, w, _, ws = self._given
+        _, _, _, c, _, _, _, s, st, w, _, ws = self._given
+        rates, surface = self._functions.rates.compute, self._functions.surface.compute
         if line is None:
             surface(x, s[:1], ws, np.eye(STATE_DIM, width)[None], st[:1], np.empty((1, 3)), moved)
             gradient[Z] = 1.0

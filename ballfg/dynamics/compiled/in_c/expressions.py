@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from ballfg.dynamics.compiled.build import function_at
 from ballfg.dynamics.compiled.in_c.values import (
     ANY,
     ATOM,
@@ -264,6 +265,8 @@ def _called(body: Body, node: ast.Call) -> Value:
         return Scalar(f"{name}({text_of(given[0])})", kind)
     if function in OF_TWO:
         return _extreme(body, OF_TWO[function], given)
+    if function is function_at:  # C has the function itself
+        return given[0]
     if isinstance(function, type) and issubclass(function, tuple):
         return function(*given)
     return body.call(function, given)

@@ -1,9 +1,10 @@
 """Linear factors keep the information of removed states and of a tracker's bias."""
 
-from collections.abc import Sequence
-from typing import Any, Self
+from __future__ import annotations
 
-import gtsam
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Self
+
 import numpy as np
 
 from ballfg.arrays import Array, Index
@@ -13,6 +14,9 @@ from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY
 from ballfg.factors.correlated_noise import BIAS_DIM, BiasFactors, BiasStartFactors
 from ballfg.state import STATE_DIM
 
+if TYPE_CHECKING:
+    import gtsam
+
 
 def linear_factor(
     keys: Sequence[int], blocks: Sequence[Array], right: Array, point: gtsam.Values | None = None
@@ -21,6 +25,8 @@ def linear_factor(
 
     Args: blocks: (r, w) each, A_k whitened.  right: (r,) b, whitened.  point: p_k of all states; None: zero.
     """
+    import gtsam
+
     parts: list[Any] = [part for pair in zip(keys, blocks, strict=False) for part in pair]
     parts += [right, gtsam.noiseModel.Unit.Create(len(right))]
     factor = gtsam.JacobianFactor(*parts)
@@ -69,6 +75,8 @@ class LinearFactors(FactorBatch):
     @classmethod
     def of_gtsam(cls, factor: gtsam.NonlinearFactor, values: Values, first: int) -> Self:
         """A linear factor of iSAM2 at the values of the window, whose first state has the number `first`."""
+        import gtsam
+
         keys = list(factor.keys())
         numbers = [COEFFICIENTS if k == COEFFICIENT_KEY else k - STATE_KEY - first for k in keys]
         points = [np.array(values.gather(np.array([n]), with_biases=True)) for n in numbers]

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, median
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.limits import REST_SPEED
@@ -107,7 +107,7 @@ def low_hops(
     if len(track) < 2:
         return ()
     sigma, ball, found = _height_sigmas(track, settings), _Ball(model, settings), list[LowHops]()
-    most = max(LOWEST, LOW * float(np.median(sigma)))
+    most = max(LOWEST, LOW * float(median(sigma)))
     for number, height in enumerate(surfaces.heights()):
         gap = ball.gap(track.positions, height)
         low = np.abs(gap) < most
