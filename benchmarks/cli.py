@@ -315,8 +315,7 @@ def intervals(
 
     Example: ballfg-bench intervals --data data/aimy --data data/ballgun --out results/intervals
     """
-    from ballfg.benchmarks.intervals import suite
-    from ballfg.benchmarks.intervals import trained as networks
+    from ballfg.benchmarks.intervals import suite, trained as networks
 
     if diagnosed and data:
         raise typer.BadParameter("it is for simulated tracks. Leave out --data.", param_hint="--diagnosed")

@@ -46,8 +46,7 @@ def diagnose(
     model.NAME.yaml that of each room.
     """
     from ballfg.checks import check_range
-    from ballfg.diagnosis import diagnose as find
-    from ballfg.diagnosis import diagnose_jointly
+    from ballfg.diagnosis import diagnose as find, diagnose_jointly
     from ballfg.diagnosis.report.origin import Origin
     from ballfg.diagnosis.report.report import MODEL, PAGE, REPORT, check_report_folder, room_file, write_report
     from ballfg.dynamics import AnalyticModel
