@@ -12,10 +12,8 @@ from ballfg.estimation import Settings, Smoother
 from ballfg.estimation.segmentation.result import Segmentation
 from ballfg.tracks import Track
 
-LEAST_OBSERVED = 5
-"""Samples that an estimate needs."""
-LEAST_PREDICTED = 3
-"""Samples that a prediction is judged on."""
+LEAST_OBSERVED = 5  # Samples that an estimate needs
+LEAST_PREDICTED = 3  # Samples that a prediction is judged on
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,7 @@ from ballfg.learning.training_data import analytic_model, open_dataset
 from ballfg.progress import Watch
 from ballfg.tracks import Dataset, Track
 
-CALIBRATED: Final = "calibrated.yaml"
-"""File of the calibrated model."""
+CALIBRATED: Final = "calibrated.yaml"  # File of the calibrated model
 BASE: Final = "base.yaml"
 """File of the same with one value of each coefficient for all tracks, from which the network starts."""
 WITHOUT: Final = "calibrated, without network"

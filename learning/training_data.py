@@ -25,8 +25,7 @@ from ballfg.tracks import Ball, Dataset, Track, read_dataset
 D = TypeVar("D", Dataset, SightedDataset)
 FIRST_SPIN = {"topspin": (0.0, 50.0, 0.0), "sidespin": (0.0, 0.0, 50.0)}
 """rad/s about (forward, across, up) per level of the settings with a known axis; other settings start at no spin."""
-FIRST_SPIN_NOISE = 60.0
-"""rad/s, standard deviation of the spin given the settings, before anything is learned."""
+FIRST_SPIN_NOISE = 60.0  # rad/s, standard deviation of the spin given the settings, before anything is learned
 
 
 @dataclass(frozen=True)

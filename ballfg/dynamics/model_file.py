@@ -24,12 +24,10 @@ from ballfg.tracks.noise import TrackNoise
 KINDS: Final[tuple[Kind, ...]] = ("flight", "bounce", "measurement")
 VARIATIONS: Final = "variations"
 POPULATIONS: Final = "populations"
-SPIN: Final = "spin"
-"""Entry of the section `populations`."""
+SPIN: Final = "spin"  # Entry of the section `populations`
 DOMAIN: Final = "domain"
 SECTIONS = (*KINDS, VARIATIONS, POPULATIONS, DOMAIN, "learned")
-LONGEST_NAME: Final = 255
-"""Characters of a folder's name."""
+LONGEST_NAME: Final = 255  # Characters of a folder's name
 NOISE: Final = "noise"
 """Entry of the section `measurement` that is not an effect: the scatter of tracks about the model."""
 

@@ -16,8 +16,7 @@ from ballfg.arrays import Array
 from ballfg.checks import check_number, listed, shown
 from ballfg.dynamics.networks.spin_embedding import SOFT_SPEED
 
-FASTEST: Final = 5000.0
-"""rad/s. Largest mean and spread; a larger one is in another unit."""
+FASTEST: Final = 5000.0  # rad/s. Largest mean and spread; a larger one is in another unit
 _FIELDS: Final = ("by", "groups")
 
 

@@ -14,12 +14,9 @@ from ballfg.checks import check_array, check_number, is_number
 from ballfg.dynamics.motion.limits import DEEPEST
 from ballfg.state import Z
 
-TABLE_ABOVE_FLOOR: Final = 0.76
-"""m, height of a table-tennis table (ITTF Laws 2.1.1)."""
-TABLE_LENGTH: Final = 2.74
-"""m (ITTF Laws 2.1.1)."""
-TABLE_WIDTH: Final = 1.525
-"""m (ITTF Laws 2.1.1)."""
+TABLE_ABOVE_FLOOR: Final = 0.76  # m, height of a table-tennis table (ITTF Laws 2.1.1)
+TABLE_LENGTH: Final = 2.74  # m (ITTF Laws 2.1.1)
+TABLE_WIDTH: Final = 1.525  # m (ITTF Laws 2.1.1)
 
 
 @register_jitable

@@ -23,8 +23,7 @@ from ballfg.tracks.checks import Findings, tidy
 from ballfg.tracks.grouping import RowGroup
 from ballfg.tracks.info import DatasetInfo
 
-MOST_QUESTIONS: Final = 8
-"""Largest number of questions about one source; with more, something else is wrong."""
+MOST_QUESTIONS: Final = 8  # Largest number of questions about one source; with more, something else is wrong
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from ballfg.checks import check_array, check_choice, check_count, check_number, 
 
 AXES: Final = ("x", "y", "z")
 DIRECTIONS: Final = ("either", "up", "down")
-MOST_BOUNCES: Final = 20
-"""Largest number of bounces before a crossing: after so many a ball rolls."""
+MOST_BOUNCES: Final = 20  # Largest number of bounces before a crossing: after so many a ball rolls
 
 
 @dataclass(frozen=True)

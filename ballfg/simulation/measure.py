@@ -18,8 +18,7 @@ from ballfg.state import POSITION, SPIN
 from ballfg.tracks import Track
 from ballfg.tracks.track import SPIN_LABELS
 
-LEAST_SAMPLES = 2
-"""Least number of samples in a track: readers refuse shorter ones."""
+LEAST_SAMPLES = 2  # Least number of samples in a track: readers refuse shorter ones
 
 
 @dataclass(frozen=True, eq=False)

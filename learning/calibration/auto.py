@@ -43,10 +43,8 @@ PER_TRACK: Final = "per-track coefficients"
 CALIBRATED: Final = "calibrated"
 GROUPED: Final = "with groups"
 CORRECTED: Final = "with correction"
-CANDIDATES: Final = (NOMINAL, PER_TRACK, CALIBRATED, GROUPED, CORRECTED)
-"""Simple ones first."""
-UNLEARNED: Final = (NOMINAL, PER_TRACK)
-"""Without calibration: coefficients as they are, or estimated with each track."""
+CANDIDATES: Final = (NOMINAL, PER_TRACK, CALIBRATED, GROUPED, CORRECTED)  # Simple ones first
+UNLEARNED: Final = (NOMINAL, PER_TRACK)  # Without calibration: coefficients as they are, or estimated with each track
 SURELY: Final = 1.0
 """Standard errors by which a richer model must gain. Two leave out models that pay where tracks are few; one misleads
 in none of forty nominal worlds, where no candidate gains as much as `NOTICED`. Calibration needs `NOTICED` alone: its
@@ -55,10 +53,8 @@ NOTICED: Final = 0.005
 """Least gain in the mean log density of a coordinate: half a per cent, which no user of a prediction notices."""
 NEAR: Final = 0.3
 """s, longest judged forecast, as for the noise (`estimate_noise`): later on, contacts decide more than the air."""
-LEAST: Final = 4
-"""Fitted tracks that a choice needs."""
-FOLDS: Final = 5
-"""Parts of the fitted tracks; the others calibrate the candidates that judge a part."""
+LEAST: Final = 4  # Fitted tracks that a choice needs
+FOLDS: Final = 5  # Parts of the fitted tracks; the others calibrate the candidates that judge a part
 
 
 @dataclass(frozen=True)

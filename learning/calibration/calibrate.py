@@ -48,8 +48,7 @@ from ballfg.tracks.noise import TrackNoise
 
 ROUGHLY: Final = 0.3
 """Tolerance of a correction at least: its weights move slowly along directions that hardly change a prediction."""
-FIRST: Final = 0.75
-"""s, the part of each track that teaches a correction: later on contacts say more than the air does."""
+FIRST: Final = 0.75  # s, the part of each track that teaches a correction: later on contacts say more than the air does
 
 
 class TooManyFailures(ValueError):  # noqa: N818 - the name is the statement

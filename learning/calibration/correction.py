@@ -32,29 +32,21 @@ from ballfg.learning.calibration.groups import GroupSpin
 from ballfg.state import SPIN, VELOCITY
 
 SECTION: Final = f"flight.{AirCorrection.name}"
-DRAG: Final = tuple(f"{SECTION}.{name}" for name in WEIGHTS if name.startswith("drag"))
-"""Names of the weights of drag."""
+DRAG: Final = tuple(f"{SECTION}.{name}" for name in WEIGHTS if name.startswith("drag"))  # Names of the weights of drag
 ALL: Final = tuple(f"{SECTION}.{name}" for name in WEIGHTS)
 """With those of lift, which tracks without spin labels cannot tell from another spin."""
 SCALE: Final = "flight.drag.k"
-HELD: Final = 0.1
-"""Prior standard deviation of the mean drag beside a correction, as a share of the usual one."""
+HELD: Final = 0.1  # Prior standard deviation of the mean drag beside a correction, as a share of the usual one
 LINEAR: Final = 0.1
 """Standard deviation of each weight in one track, about the mean at which it is linearised; it is removed again."""
-REACH: Final = (5.0, 95.0)
-"""Percentiles of the speeds and spin ratios of the samples that the functions span."""
-BEYOND: Final = 2.0
-"""Scale of the functions as a multiple of half the span: the kernel's length."""
+REACH: Final = (5.0, 95.0)  # Percentiles of the speeds and spin ratios of the samples that the functions span
+BEYOND: Final = 2.0  # Scale of the functions as a multiple of half the span: the kernel's length
 CONSTANT: Final = np.array([0.5**0.5 if name in ("vv", "ss") else float(name == "one") for name in FUNCTIONS])
 """Weights of a correction that is 1, but for terms of the fourth degree."""
-LEAST_SPEED: Final = 1.0
-"""m/s. Least scale: over less, the drag law hardly changes."""
-LEAST_RATIO: Final = 0.1
-"""Least scale of S / (1 + S) of the spin ratio S."""
-MOST_RATIO: Final = 0.99
-"""Largest S / (1 + S) that is shown."""
-ELSEWHERE: Final = 0.05
-"""Weight of places without data in the order of the directions of uncertainty."""
+LEAST_SPEED: Final = 1.0  # m/s. Least scale: over less, the drag law hardly changes
+LEAST_RATIO: Final = 0.1  # Least scale of S / (1 + S) of the spin ratio S
+MOST_RATIO: Final = 0.99  # Largest S / (1 + S) that is shown
+ELSEWHERE: Final = 0.05  # Weight of places without data in the order of the directions of uncertainty
 
 
 @dataclass(frozen=True)

@@ -30,10 +30,8 @@ from ballfg.tracks import Dataset
 
 WIDEST: Final = 200.0
 """rad/s, standard deviation of the prior of a group's mean spin about zero; its spread begins there."""
-LABEL_PRIOR: Final = 2000.0
-"""rad/s, the smoother's prior beside a spin label (`UNINFORMATIVE_SPIN`)."""
-OWN: Final = "group"
-"""The label without which a dataset is one group of its own name."""
+LABEL_PRIOR: Final = 2000.0  # rad/s, the smoother's prior beside a spin label (`UNINFORMATIVE_SPIN`)
+OWN: Final = "group"  # The label without which a dataset is one group of its own name
 WIDTHS: Final = (0.003, 0.03, 0.1, 0.3, 0.6)
 """Standard deviations of the prior of a correction, relative to drag and lift, among which the evidence chooses: next
 to none, and some per cent up to what a law that is wrong by half needs. Beyond them the evidence overfits."""

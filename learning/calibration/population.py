@@ -24,12 +24,9 @@ from scipy.optimize import lsq_linear
 
 from ballfg.arrays import Array, Index
 
-MAX_STEPS = 500
-"""Largest number of iterations, a step of each sort; ten are usual."""
-STEP_TOLERANCE = 1e-11
-"""Relative change of every variance at which the iteration ends."""
-LARGEST_FALL = 10.0
-"""A step of Fisher scoring divides no variance by more."""
+MAX_STEPS = 500  # Largest number of iterations, a step of each sort; ten are usual
+STEP_TOLERANCE = 1e-11  # Relative change of every variance at which the iteration ends
+LARGEST_FALL = 10.0  # A step of Fisher scoring divides no variance by more
 NO_INFORMATION = 1e-2
 """Information of all tracks, as a share of the prior's, below which a coefficient has no spread but its prior."""
 

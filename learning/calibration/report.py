@@ -13,8 +13,7 @@ from ballfg.learning.calibration.gain import Gain, gain_of
 from ballfg.learning.evaluation import Summary, TrackScore, summary
 
 AXES = ("forward", "across", "up")
-NEW_INFORMATION = 0.05
-"""Least share by which informative data narrow the prior of a coefficient."""
+NEW_INFORMATION = 0.05  # Least share by which informative data narrow the prior of a coefficient
 
 
 @dataclass(frozen=True)

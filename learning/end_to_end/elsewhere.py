@@ -22,10 +22,8 @@ from ballfg.learning.shots import TrainingShot
 from ballfg.state import STATE_DIM
 from ballfg.tracks.noise import TrackNoise
 
-ROOM_TRACKS: Final = 12
-"""Tracks of each room that tell its noise, in a few seconds."""
-HORIZON: Final = 0.3
-"""s after the observed part at which a correction is judged."""
+ROOM_TRACKS: Final = 12  # Tracks of each room that tell its noise, in a few seconds
+HORIZON: Final = 0.3  # s after the observed part at which a correction is judged
 AVERAGED: Final = ("contact_velocity", "contact_tangential", "contact_spin")
 
 

@@ -19,10 +19,8 @@ from ballfg.estimation import Smoother, Status
 from ballfg.learning.shots import TrainingShot
 from ballfg.state import SPIN, VELOCITY
 
-SPIN_PRIOR: Final = 150.0
-"""rad/s, standard deviation of the prior: launchers reach this spin."""
-LEAST_SPEED: Final = 0.5
-"""m/s of horizontal motion below which a launch has no forward direction."""
+SPIN_PRIOR: Final = 150.0  # rad/s, standard deviation of the prior: launchers reach this spin
+LEAST_SPEED: Final = 0.5  # m/s of horizontal motion below which a launch has no forward direction
 
 
 def begin_with_tracks(embedding: SpinEmbedding, shots: Iterable[TrainingShot], model: AnalyticModel) -> None:

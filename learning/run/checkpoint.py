@@ -19,10 +19,8 @@ from ballfg.files.whole_folder import whole_folder
 
 NAME = "checkpoint"
 STATE = "state.yaml"
-DIGESTS = "digests"
-"""In `state.yaml`: the SHA-256 of every file of tensors."""
-TENSORS = ("weights", "optimizer", "memory", "best")
-"""One file `<name>.safetensors` each."""
+DIGESTS = "digests"  # In `state.yaml`: the SHA-256 of every file of tensors
+TENSORS = ("weights", "optimizer", "memory", "best")  # One file `<name>.safetensors` each
 
 
 class RunProgress(BaseModel):

@@ -17,10 +17,8 @@ from torch.multiprocessing.spawn import ProcessContext, ProcessExitedException, 
 HOST = "127.0.0.1"
 GRACE = 60.0
 """s that interrupted processes have to end by themselves: compiled code notices Ctrl-C only when it returns."""
-NO_STATUS = -1
-"""Exit status of a process that has not returned."""
-LAST_WORDS = 10.0
-"""s that the other processes have to print their errors once one of them has died."""
+NO_STATUS = -1  # Exit status of a process that has not returned
+LAST_WORDS = 10.0  # s that the other processes have to print their errors once one of them has died
 
 
 def launch(processes: int, work: Callable[..., int], *arguments: Any) -> int:

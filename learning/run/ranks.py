@@ -21,8 +21,7 @@ import torch.distributed.nn.functional
 from torch import Tensor
 
 T = TypeVar("T")
-TOLD_BY_FIRST = 1
-"""Exit status of a process that prints nothing because the first one prints the reason."""
+TOLD_BY_FIRST = 1  # Exit status of a process that prints nothing because the first one prints the reason
 
 
 def for_others(rank: int, error: BaseException) -> BaseException:

@@ -16,8 +16,7 @@ from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.learning.augment import apply
 from ballfg.tracks import Track
 
-LEAST_OBSERVED = 2
-"""Fewest observations that show a direction."""
+LEAST_OBSERVED = 2  # Fewest observations that show a direction
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,7 @@ from torch import Tensor, nn
 from ballfg.learning.sequence.data import Batch
 from ballfg.learning.sequence.model import Draw, SequenceModel
 
-STRIDE = 0.05
-"""Units of the frame per grid step for an output of one, so that outputs are of order one."""
+STRIDE = 0.05  # Units of the frame per grid step for an output of one, so that outputs are of order one
 SHORTEST_STEP = 0.1
 """Least interval between observations, in grid steps, that a displacement is divided by, since stamps jitter."""
 

@@ -13,12 +13,9 @@ from torch import Tensor, nn
 
 from ballfg.learning.sequence.data import Batch, Example, collate
 
-LARGEST_GAP = 2.5
-"""Steps between two samples beyond which nothing is interpolated, since a bounce may lie between them."""
-ROUND = 1e-6
-"""Share of a step by which stamps may miss the grid and still count as on it; files round them."""
-Draw = tuple[int, int, int]
-"""Seed, epoch and track, from which the random numbers of one track's loss derive."""
+LARGEST_GAP = 2.5  # Steps between two samples beyond which nothing is interpolated, since a bounce may lie between them
+ROUND = 1e-6  # Share of a step by which stamps may miss the grid and still count as on it; files round them
+Draw = tuple[int, int, int]  # Seed, epoch and track, from which the random numbers of one track's loss derive
 
 
 class Frame(nn.Module):

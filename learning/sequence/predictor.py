@@ -25,11 +25,9 @@ from ballfg.learning.sequence.model import Frame, SequenceModel
 from ballfg.tracks import Track
 
 SequenceKind = Literal["lstm", "diffusion"]
-DEFAULT_WIDTH: dict[SequenceKind, int] = {"lstm": 96, "diffusion": 64}
-"""Chosen by validation on simulated tracks."""
+DEFAULT_WIDTH: dict[SequenceKind, int] = {"lstm": 96, "diffusion": 64}  # Chosen by validation on simulated tracks
 _MODELS: dict[SequenceKind, type[LstmModel] | type[DiffusionModel]] = {"lstm": LstmModel, "diffusion": DiffusionModel}
-CHUNK = 64
-"""Tracks that are predicted at once, which bounds the memory."""
+CHUNK = 64  # Tracks that are predicted at once, which bounds the memory
 CONFIG, WEIGHTS = "config.yaml", "weights.safetensors"
 
 

@@ -18,8 +18,7 @@ from ballfg.learning.trainee import BatchLoss, PredictedShot, Prepared, Trainee
 from ballfg.learning.training_data import read_training_data
 from ballfg.tracks import Track
 
-FOLDER = "model"
-"""Folder of the predictor, in that of a training."""
+FOLDER = "model"  # Folder of the predictor, in that of a training
 
 
 class SequenceTrainee(Trainee):

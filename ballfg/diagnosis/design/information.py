@@ -13,8 +13,7 @@ from ballfg.diagnosis.fit.problem import Fit, Unknowns
 from ballfg.diagnosis.search.candidates import with_hypothesis
 from ballfg.dynamics import Surfaces
 
-AT_ONCE = 500
-"""Number of flights whose derivatives are held at once; a flight takes up to half a megabyte."""
+AT_ONCE = 500  # Number of flights whose derivatives are held at once; a flight takes up to half a megabyte
 MISSED = 1e-3
 """m. Difference between a planned flight's samples with given and with found contacts that means other contacts."""
 

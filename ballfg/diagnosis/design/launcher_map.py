@@ -13,8 +13,7 @@ from ballfg.arrays import Array
 from ballfg.diagnosis.fit.problem import launch_axes
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 
-SPARE = 2
-"""Number of shots beyond one for each parameter of the line; fewer do not show the scatter about it."""
+SPARE = 2  # Number of shots beyond one for each parameter of the line; fewer do not show the scatter about it
 LEAST_SHARE = 1e-8
 """Smallest over largest eigenvalue of the settings' correlations: below, settings changed together only."""
 

@@ -12,10 +12,8 @@ from ballfg.diagnosis.result import Candidate, Diagnosis, Outcome
 from ballfg.dynamics import EFFECTS
 from ballfg.pages.html import Html, bar, picture, section, table, tag
 
-COLOURS = {Outcome.ADDED: "added", Outcome.ALIKE: "alike"}
-"""CSS classes for the outcome of a candidate."""
-SHOWN = 8
-"""Number of visible rows of a ranking; the others unfold."""
+COLOURS = {Outcome.ADDED: "added", Outcome.ALIKE: "alike"}  # CSS classes for the outcome of a candidate
+SHOWN = 8  # Number of visible rows of a ranking; the others unfold
 RANKING = (
     "candidate",
     term("squared residual", "squared residual it would explain"),

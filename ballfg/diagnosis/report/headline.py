@@ -30,8 +30,7 @@ PLACES: Final = {
 """Beginning of a test's words, and the same within a sentence."""
 SURE: Final = ((1e-6, "practically certain"), (1e-3, "very likely"), (0.05, "likely"))
 """Words for the probability that a finding is false; the larger one of both halves of the tracks counts."""
-SKEWED: Final = 1.5
-"""Ratio of the root mean square to the median track's error beyond which the median is reported."""
+SKEWED: Final = 1.5  # Ratio of the root mean square to the median track's error beyond which the median is reported
 MAIN: Final = ("wind", "drag_speed", "time_scale", "scale", "frame_tilt")
 """Effects whose detectable size is in the first lines of a report without findings."""
 COUNTS: Final = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine")

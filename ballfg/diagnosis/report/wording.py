@@ -6,14 +6,10 @@ from collections.abc import Mapping, Sequence
 from ballfg.diagnosis.result import Finding, Unexplained, Value, Verdict
 from ballfg.estimation.noise.tracker_errors import NUMBERS
 
-NONE = "–"
-"""Text for a missing number."""
-MOST_DECIMALS = 6
-"""Largest number of decimals; others are written with a power of ten."""
-MOST_CERTAIN = 0.999
-"""Larger probabilities of an effect depend on what no catalogue holds."""
-LEAST_PROBABILITY = 1e-99
-"""Smaller probabilities depend on unknown tails of distributions."""
+NONE = "–"  # Text for a missing number
+MOST_DECIMALS = 6  # Largest number of decimals; others are written with a power of ten
+MOST_CERTAIN = 0.999  # Larger probabilities of an effect depend on what no catalogue holds
+LEAST_PROBABILITY = 1e-99  # Smaller probabilities depend on unknown tails of distributions
 
 
 def number(value: float, digits: int = 3) -> str:

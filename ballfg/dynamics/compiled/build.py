@@ -36,8 +36,7 @@ ONE, TWO, THREE = (types.Array(types.float64, dimensions, "C") for dimensions in
 @machine_code(types.void(TWO, TWO, ONE, THREE, THREE, TWO, THREE))
 '''
 """Beginning of each generated file, before `compute`."""
-HELPERS: Final = ("add_product", "tanh_all")
-"""Functions of `layers.py` that generated ones may call."""
+HELPERS: Final = ("add_product", "tanh_all")  # Functions of `layers.py` that generated ones may call
 
 
 def machine_code(signature: Any) -> Callable[[Callable[..., Any]], Any]:

@@ -10,8 +10,7 @@ from ballfg.dynamics.compiled.signatures import COUNT, GIVEN, LAW, LAWS, NOTHING
 from ballfg.dynamics.motion import limits
 from ballfg.dynamics.motion.limits import LEAST_FALL, MAX_STEP, MIN_SPEED, SEARCH_STEPS, TYPICAL_JERK, steps_over
 
-LEAST = 1e-300
-"""Keeps a division by zero away."""
+LEAST = 1e-300  # Keeps a division by zero away
 
 
 @machine_code(several(REAL, 3)(LAW, LAW, ONE, REAL, REAL))

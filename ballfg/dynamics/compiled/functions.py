@@ -30,12 +30,9 @@ from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.progress import doing
 from ballfg.state import STATE_DIM
 
-VALUES_AGREE: Final = 1e-12
-"""Largest relative difference between a compiled value and torch's."""
-SLOPES_AGREE: Final = 1e-10
-"""Largest relative difference between a compiled derivative and torch's."""
-COMPARED: Final = 4
-"""Number of random states at which both are computed."""
+VALUES_AGREE: Final = 1e-12  # Largest relative difference between a compiled value and torch's
+SLOPES_AGREE: Final = 1e-10  # Largest relative difference between a compiled derivative and torch's
+COMPARED: Final = 4  # Number of random states at which both are computed
 
 
 @dataclass(frozen=True)
@@ -87,8 +84,7 @@ class CompiledModel:
         return known[2]
 
 
-NONE: Final = np.zeros(0)
-"""The weights of a function without tables."""
+NONE: Final = np.zeros(0)  # The weights of a function without tables
 _Weighed = tuple[Hashable, Sequence[Tensor], tuple[Array, Array, Array]]
 """Stamp of a model's tables; the tables, kept so that no others get their place in memory and with it their stamp; the
 weights of rates, impact and surface that were computed from them."""
@@ -194,8 +190,7 @@ def _surface(model: BallModel, state: Tensor) -> Tensor:
     return torch.cat((offset.expand(state.shape[:-1]).unsqueeze(-1), slope), dim=-1)
 
 
-PARTS: Final = (_rates, _impact, _surface)
-"""The functions that are compiled: of a model and of a state (9,)."""
+PARTS: Final = (_rates, _impact, _surface)  # The functions that are compiled: of a model and of a state (9,)
 
 
 def _function(model: BallModel, function: Callable[[BallModel, Tensor], Tensor], key: Hashable | None) -> Function:

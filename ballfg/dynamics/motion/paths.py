@@ -23,8 +23,7 @@ from ballfg.dynamics.motion.rollout import next_surface, rollout, stays
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import POSITION, VELOCITY, VZ
 
-MOST_ARCS = 40
-"""Number of arcs after which a ball is about to come to rest."""
+MOST_ARCS = 40  # Number of arcs after which a ball is about to come to rest
 
 
 def paths(model: BallModel, state: Tensor, times: Tensor, surfaces: Surfaces) -> Tensor:

@@ -8,8 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 Kind = Literal["mlp", "mlp+gs", "skip+gs", "mnn+gs"]
 
-MOST_WIDTH: Final = 2048
-"""Hidden units; such a layer takes 34 MB."""
+MOST_WIDTH: Final = 2048  # Hidden units; such a layer takes 34 MB
 MOST_DEPTH: Final = 20
 
 DEFAULT_SIZES: Final[dict[Kind, tuple[int, int, int]]] = {

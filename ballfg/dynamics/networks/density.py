@@ -13,14 +13,10 @@ from ballfg.arrays import Array
 
 MOST_CENTRES: Final = 200
 """Largest number of kernels: more cost time in every step of a flight and hardly change the density."""
-LEAST_GROUPS: Final = 8
-"""Smallest number of tracks for a density; with fewer its weight is zero."""
-LEAST_SPREAD: Final = 0.03
-"""Smallest spread of a feature in [-1, 1], for a launcher that always does the same."""
-EDGE: Final = 0.05
-"""Share of held-out training features whose weight is below one half."""
-BANDWIDTHS: Final = np.geomspace(0.05, 2.0, 30)
-"""Kernel widths to choose from, in standard deviations of the features."""
+LEAST_GROUPS: Final = 8  # Smallest number of tracks for a density; with fewer its weight is zero
+LEAST_SPREAD: Final = 0.03  # Smallest spread of a feature in [-1, 1], for a launcher that always does the same
+EDGE: Final = 0.05  # Share of held-out training features whose weight is below one half
+BANDWIDTHS: Final = np.geomspace(0.05, 2.0, 30)  # Kernel widths to choose from, in standard deviations of the features
 
 
 class FeatureDensity(nn.Module):

@@ -13,8 +13,7 @@ from ballfg.dynamics.networks.density import FeatureDensity
 from ballfg.dynamics.networks.gram_schmidt import CONTACT_FEATURES, FLIGHT_FEATURES, contact_frame, flight_frame
 from ballfg.state import SPIN, VELOCITY, VZ
 
-DOUBT: Final = "fading."
-"""Prefix of the doubts' names in a `LearnedModel`."""
+DOUBT: Final = "fading."  # Prefix of the doubts' names in a `LearnedModel`
 ABROAD: Final = 0.5
 """Largest share of a correction that is used in a room outside of the training: a few rooms cannot separate the ball's
 part of a correction from theirs. Whichever it is, at least half of it is right."""

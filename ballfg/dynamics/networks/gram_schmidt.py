@@ -14,10 +14,8 @@ from torch import Tensor
 
 from ballfg.state import SPIN, VELOCITY
 
-SPEED_SCALE: Final = 6.0
-"""m/s, a usual speed of a table-tennis ball: the middle of a feature's range."""
-SPIN_SCALE: Final = 150.0
-"""rad/s, a usual spin of a table-tennis ball: the middle of a feature's range."""
+SPEED_SCALE: Final = 6.0  # m/s, a usual speed of a table-tennis ball: the middle of a feature's range
+SPIN_SCALE: Final = 150.0  # rad/s, a usual spin of a table-tennis ball: the middle of a feature's range
 CONTACT_SCALE: Final = 5.0
 """m/s, the same for a contact's velocities: of the ball, and of its surface (radius times spin)."""
 LIFT: Final = 0.3
@@ -25,8 +23,7 @@ LIFT: Final = 0.3
 balls do, large enough for derivatives up to the third to be moderate."""
 
 FLIGHT_FEATURES: Final = 3
-FLIGHT_TERMS: Final = 3
-"""Coefficients of the acceleration; there are as many of the angular acceleration."""
+FLIGHT_TERMS: Final = 3  # Coefficients of the acceleration; there are as many of the angular acceleration
 CONTACT_FEATURES: Final = 6
 CONTACT_TERMS: Final = 8
 """Coefficients of a contact: three each for the change of v_xy and of radius z x w, two for that of w_z."""

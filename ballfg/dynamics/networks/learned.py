@@ -24,8 +24,7 @@ from ballfg.state import SPIN, VZ
 START_OFFSET: Final = -0.003
 """m by which an untrained model puts surfaces above their declared heights, as in the nominal model."""
 
-BASE: Final = "base."
-"""Prefix of the names of the base's coefficients."""
+BASE: Final = "base."  # Prefix of the names of the base's coefficients
 
 
 class LearnedModel(BallModel):

@@ -36,8 +36,7 @@ _MODEL, _LAUNCHER, BASE = "model.", "launcher.", "base."
 """Prefixes of tensor names: of the networks and of the spin embedding; of the base, whose values stand in the model
 file itself."""
 
-LARGEST_DENSITY = 100_000
-"""Largest number of centres of a feature density; training chooses a few hundred."""
+LARGEST_DENSITY = 100_000  # Largest number of centres of a feature density; training chooses a few hundred
 
 
 class _Section(BaseModel):

@@ -14,11 +14,9 @@ from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, VELOCITY, VZ
 
 HIGHEST_RESTITUTION: Final = 1.2
 """Largest restitution of a network: above one, so that a fit can pass through unphysical values."""
-START_RESTITUTION: Final = 0.85
-"""Restitution of an untrained model."""
+START_RESTITUTION: Final = 0.85  # Restitution of an untrained model
 
-Maker = Callable[[int, int], MLP | Skip | MNN]
-"""From the numbers of inputs and outputs to a network."""
+Maker = Callable[[int, int], MLP | Skip | MNN]  # From the numbers of inputs and outputs to a network
 
 _UP = torch.tensor((0.0, 0.0, 1.0), dtype=torch.float64)
 _RAW_SCALES = torch.tensor([1 / SPEED_SCALE] * 3 + [1 / SPIN_SCALE] * 3, dtype=torch.float64)

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 CPU = torch.device("cpu")
-Weights = tuple[Tensor, Tensor]
-"""Of a linear layer: weight (outputs, inputs), bias (outputs,)."""
+Weights = tuple[Tensor, Tensor]  # Of a linear layer: weight (outputs, inputs), bias (outputs,)
 
 
 def expand(first: Weights, step: Weights, last: Weights, depth: int) -> Tensor:

@@ -19,28 +19,20 @@ from ballfg.estimation.result import Label
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.tracks import Dataset, Track
 
-ENOUGH: Final = 0.5
-"""Share of the samples in flight below which commands that presume flight refuse."""
+ENOUGH: Final = 0.5  # Share of the samples in flight below which commands that presume flight refuse
 SMOOTHED: Final = 1.35
 """Ratio of the errors over 0.25 s to those from sample to sample beyond which a filter smoothed the positions: on five
 measured sets it is at most 1.18, on simulated recordings (seeds 0 to 83) at most 1.08, after a low-pass of 6 Hz at
 least 1.58."""
-OTHERS: Final = 0.1
-"""Share of the samples that no motion of the ball explains from which they are worth a doubt."""
-FARTHEST: Final = 0.1
-"""m. Scatter from sample to sample beyond that of trackers."""
-UNDISTURBED: Final = 0.2
-"""Quantile of that ratio: stretches with a bounce or a hit have larger ones."""
+OTHERS: Final = 0.1  # Share of the samples that no motion of the ball explains from which they are worth a doubt
+FARTHEST: Final = 0.1  # m. Scatter from sample to sample beyond that of trackers
+UNDISTURBED: Final = 0.2  # Quantile of that ratio: stretches with a bounce or a hit have larger ones
 SMOOTHING: Final = "a filter smoothed the positions"
 OTHER: Final = "of another ball, or outliers"
-SPAN: Final = 0.25
-"""s, of the cubics whose residuals show the errors."""
-LEAST_SPAN: Final = 8
-"""Samples, likewise."""
-ROUNDING: Final = 5e-5
-"""m. Errors below are those of rounding."""
-LOOKED_AT: Final = 200
-"""Number of tracks that show whether a filter smoothed the positions."""
+SPAN: Final = 0.25  # s, of the cubics whose residuals show the errors
+LEAST_SPAN: Final = 8  # Samples, likewise
+ROUNDING: Final = 5e-5  # m. Errors below are those of rounding
+LOOKED_AT: Final = 200  # Number of tracks that show whether a filter smoothed the positions
 
 
 class FlightsOf(Dataset):

@@ -18,8 +18,7 @@ from ballfg.estimation.settings import sample_sigmas
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 from ballfg.tracks import Track
 
-UNKNOWN_SPEED: Final = 5.0
-"""m/s. Standard deviation of the velocity of a ball that does not fly, per axis."""
+UNKNOWN_SPEED: Final = 5.0  # m/s. Standard deviation of the velocity of a ball that does not fly, per axis
 
 
 @dataclass(frozen=True, eq=False)

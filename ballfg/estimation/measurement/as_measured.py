@@ -15,8 +15,7 @@ from ballfg.dynamics.motion.rollout import advance
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import POSITION, STATE_DIM
 
-_MEASUREMENT = "measurement"
-"""Attribute of an `AnalyticModel` that holds its measurement effects."""
+_MEASUREMENT = "measurement"  # Attribute of an `AnalyticModel` that holds its measurement effects
 LARGEST_CONDITION = 1e6
 """Largest condition of the map from spins to labels: beyond it a label leaves a component of the spin undetermined."""
 

@@ -25,10 +25,8 @@ from ballfg.tracks import Track
 from ballfg.tracks.stamps import elapsed
 from ballfg.tracks.track import FASTEST_BALL, FASTEST_SPIN
 
-FARTHEST: Final = 0.05
-"""s. A reading farther from every sample is refused: the ball may bounce in so long a time."""
-LEAST_SPEED: Final = 1e-6
-"""m/s. Below it the derivative of the velocity's length is set to zero."""
+FARTHEST: Final = 0.05  # s. A reading farther from every sample is refused: the ball may bounce in so long a time
+LEAST_SPEED: Final = 1e-6  # m/s. Below it the derivative of the velocity's length is set to zero
 
 
 class Reading(Observation):

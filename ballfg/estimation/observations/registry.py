@@ -20,8 +20,7 @@ from ballfg.registry import Registry
 from ballfg.tracks import TableWriter, Track, csv_files
 from ballfg.tracks.rows import KEY
 
-LONGEST_HEADER: Final = 4096
-"""Largest number of bytes read from a table's first line."""
+LONGEST_HEADER: Final = 4096  # Largest number of bytes read from a table's first line
 
 OBSERVATIONS: Final[Registry[Observation]] = Registry(
     "observation", group="ballfg.observations", base=Observation, remedy="docs/custom_factors.md has an example."

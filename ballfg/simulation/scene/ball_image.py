@@ -14,16 +14,11 @@ from ballfg.arrays import Array
 from ballfg.simulation.scene.view import Rect, clipped
 from ballfg.vision.camera import Camera
 
-STEP: Final = 0.25
-"""px, longest step of the path for averaging the outline."""
-MARGIN: Final = 2
-"""px of empty margin around the outline."""
-SHADING: Final = 0.12
-"""Depth of the ball's shading: a point facing away from the lamp has 1 - 2 `SHADING` of the light."""
-TINY: Final = 1e-12
-"""Replaces the zero distance of a pixel at the very centre; any small number makes it covered."""
-_LAMP: Final = np.array([0.3, 0.25, 0.92]) / np.linalg.norm([0.3, 0.25, 0.92])
-"""Direction to the lamp, world."""
+STEP: Final = 0.25  # px, longest step of the path for averaging the outline
+MARGIN: Final = 2  # px of empty margin around the outline
+SHADING: Final = 0.12  # Depth of the ball's shading: a point facing away from the lamp has 1 - 2 `SHADING` of the light
+TINY: Final = 1e-12  # Replaces the zero distance of a pixel at the very centre; any small number makes it covered
+_LAMP: Final = np.array([0.3, 0.25, 0.92]) / np.linalg.norm([0.3, 0.25, 0.92])  # Direction to the lamp, world
 
 
 @dataclass(frozen=True, eq=False)

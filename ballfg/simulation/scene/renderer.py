@@ -24,14 +24,10 @@ from ballfg.vision.camera import Camera
 Image = NDArray[np.float32]
 Pixels = NDArray[np.uint8]
 
-LENS_BLUR: Final = 0.7
-"""px, standard deviation of the point spread of the lens."""
-_REACH: Final = 3
-"""px, extent of the blur: four standard deviations."""
-MAINS: Final = 100.0
-"""Hz at which lamps flicker on a 50 Hz mains."""
-MIDDLE_GREY: Final = 128.0
-"""Grey level at which the noise has twice the variance of black."""
+LENS_BLUR: Final = 0.7  # px, standard deviation of the point spread of the lens
+_REACH: Final = 3  # px, extent of the blur: four standard deviations
+MAINS: Final = 100.0  # Hz at which lamps flicker on a 50 Hz mains
+MIDDLE_GREY: Final = 128.0  # Grey level at which the noise has twice the variance of black
 NOISE_MARGIN: Final = 256
 """px by which the field of noise exceeds the image: each frame cuts its noise from another place of it."""
 BALL_COLOURS: Final[dict[str, Colour]] = {"white": (226.0, 230.0, 230.0), "orange": (40.0, 128.0, 236.0)}

@@ -16,8 +16,7 @@ from ballfg.dynamics.compiled.in_c.helpers import BY_HAND
 from ballfg.dynamics.compiled.in_c.statements import block
 from ballfg.dynamics.compiled.in_c.values import Array, Scalar, UntranslatableError, Value, form
 
-Blocks = tuple[int, ...]
-"""The blocks around a place in a function."""
+Blocks = tuple[int, ...]  # The blocks around a place in a function
 
 
 @dataclass(frozen=True, eq=False)

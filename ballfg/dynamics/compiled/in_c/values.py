@@ -9,12 +9,10 @@ from math import prod
 from typing import Any, Final, TypeAlias
 
 DOUBLE: Final = "double"
-INT: Final = "int"
-"""C's types of numbers; truth values are int."""
+INT: Final = "int"  # C's types of numbers; truth values are int
 
 
-ATOM, TIMES, PLUS, ANY = range(4)
-"""Ranks of operators: none, products, sums, and all that bind less than these."""
+ATOM, TIMES, PLUS, ANY = range(4)  # Ranks of operators: none, products, sums, and all that bind less than these
 
 
 class UntranslatableError(Exception):

@@ -17,10 +17,8 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from ballfg.dynamics.compiled.translation.program import Number, Operation, Program
 
-INPUTS: Final = ("input",)
-"""Operations that give inputs, by which derivatives are taken."""
-SMALL: Final = 12
-"""Largest number of entries in an array that is split into numbers."""
+INPUTS: Final = ("input",)  # Operations that give inputs, by which derivatives are taken
+SMALL: Final = 12  # Largest number of entries in an array that is split into numbers
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-Number = int
-"""The place of a scalar in its program."""
+Number = int  # The place of a scalar in its program
 
 COMMUTATIVE: Final = frozenset({"add", "mul", "minimum", "maximum"})
 FOLDED: Final[dict[str, Callable[..., float]]] = {

@@ -11,8 +11,7 @@ from ballfg.dynamics.compiled.translation.loops import EACH_STATE, Entries, expr
 from ballfg.dynamics.compiled.translation.program import Number, Operation
 from ballfg.dynamics.compiled.translation.trace import Traced
 
-OF_ARRAYS = frozenset({"read", "slope", "back"})
-"""Operations that read arrays or their derivatives."""
+OF_ARRAYS = frozenset({"read", "slope", "back"})  # Operations that read arrays or their derivatives
 
 
 def function_source(traced: Traced, state: Sequence[Number], others: Sequence[Number]) -> str:

@@ -24,8 +24,7 @@ from ballfg.dynamics.compiled.translation.recipe import Recipe
 from ballfg.dynamics.compiled.translation.rules import EACH, RULES, Numbers, Rules, UnknownOperationError
 from ballfg.dynamics.compiled.translation.weights import Known, Weights
 
-MOST_READ = 500
-"""Largest array that is split into numbers for an operation without an array rule."""
+MOST_READ = 500  # Largest array that is split into numbers for an operation without an array rule
 
 
 @dataclass(frozen=True)
