@@ -242,8 +242,7 @@ def loop(
     Example: ballfg-bench loop --data data/aimy --out results/loop
     """
     from ballfg.benchmarks.diagnosis.cases import FULL, QUICK
-    from ballfg.benchmarks.diagnosis.reliability import run_reliability
-    from ballfg.benchmarks.diagnosis.suite import run_loop
+    from ballfg.benchmarks.diagnosis.suite import run_loop, run_reliability
 
     if reliability and data:
         raise typer.BadParameter("its sets are simulated. Leave out --data.", param_hint="--reliability")

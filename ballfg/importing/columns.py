@@ -11,8 +11,8 @@ from ballfg.checks import did_you_mean, listed, short_text, shown
 from ballfg.importing.choices import Choices, UndecidedError
 from ballfg.importing.fall import LENGTHS
 from ballfg.importing.formats.raw import RawTable, is_number, numbers
-from ballfg.importing.identities import identified
 from ballfg.importing.names import Meaning, meanings
+from ballfg.importing.several_balls import identified
 from ballfg.importing.stamps import as_stamps
 
 RATES: Final = ("rate", "fps", "frame_rate", "framerate", "hz", "sampling_rate", "frequency")  # frames per second

@@ -7,7 +7,6 @@ from typing import Any, Final
 import numpy as np
 
 from ballfg.checks import short_text
-from ballfg.importing.beside import balls_of
 from ballfg.importing.bounces import ball_of, table_of
 from ballfg.importing.choices import AllUndecidedError, Choices, Guess, UndecidedError, decided
 from ballfg.importing.columns import UNMEASURED, Roles
@@ -16,6 +15,7 @@ from ballfg.importing.formats.sources import tables_of
 from ballfg.importing.frame import Frame, find_frame
 from ballfg.importing.gathering import MOST_SHOTS, relative, shots_of, split, understood, with_labels
 from ballfg.importing.recordings import Recordings, recordings
+from ballfg.importing.several_balls import balls_of
 from ballfg.importing.shots import Counts, SourceShot
 from ballfg.importing.stamps import in_seconds, origin_of
 from ballfg.tracks import Track

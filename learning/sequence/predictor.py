@@ -20,8 +20,7 @@ from ballfg.files.weights import read_tensors
 from ballfg.files.whole_folder import of_one_state, whole_folder
 from ballfg.learning.sequence.data import Example, LauncherSettings, collate, example
 from ballfg.learning.sequence.diffusion import DiffusionModel
-from ballfg.learning.sequence.lstm import LstmModel
-from ballfg.learning.sequence.model import Frame, SequenceModel
+from ballfg.learning.sequence.model import Frame, LstmModel, SequenceModel
 from ballfg.tracks import Track
 
 SequenceKind = Literal["lstm", "diffusion"]

@@ -35,7 +35,7 @@ from ballfg.simulation.settings import settings_of_shots
 from ballfg.simulation.synthetic import dataset_info
 from ballfg.state import STATE_DIM
 from ballfg.tracks import Dataset, Track
-from ballfg.tracks.memory import dataset_in_memory
+from ballfg.tracks.dataset import dataset_in_memory
 from ballfg.tracks.track import SPIN_LABELS
 
 TRACKS, RATE, NOISE, LABEL_NOISE = 25, 100.0, 0.002, 4.0

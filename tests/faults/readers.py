@@ -10,7 +10,7 @@ from ballfg.benchmarks.diagnosis.ideal import Ideal
 from ballfg.benchmarks.diagnosis.record import Record as Case
 from ballfg.benchmarks.dynamics.contenders import Record as Contender
 from ballfg.benchmarks.speed.stopwatch import SlowerError, check_ratios
-from ballfg.diagnosis.design.reported import reported_pairs
+from ballfg.diagnosis.design.goal import reported_pairs
 from ballfg.dynamics import load_model
 from ballfg.estimation.conformal import load_conformal
 from ballfg.estimation.observations.sighted_dataset import read_sighted

@@ -96,7 +96,7 @@ def _pairs(
 ) -> Sequence[tuple[str, str]]:
     """The pairs of effects to separate: from the options, else those that a diagnosis left open; none with --shrink."""
     from ballfg.diagnosis import diagnose
-    from ballfg.diagnosis.design.reported import pairs_of, reported_pairs
+    from ballfg.diagnosis.design.goal import pairs_of, reported_pairs
 
     given = [name for name, value in (("--between", between), ("--shrink", shrink), ("--diagnosis", folder)) if value]
     if len(given) > 1:

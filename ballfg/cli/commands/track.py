@@ -95,9 +95,15 @@ def track(
     from ballfg.vision.camera_file import read_cameras
     from ballfg.vision.detection.detections_table import read_detections
     from ballfg.vision.tracking.dataset import check_result_folder, write_tracking
-    from ballfg.vision.tracking.pipeline import check_rig, track_detections
+    from ballfg.vision.tracking.pipeline import (
+        blind_cameras,
+        check_rig,
+        disagreement,
+        no_ball,
+        summary,
+        track_detections,
+    )
     from ballfg.vision.tracking.recordings import without as others
-    from ballfg.vision.tracking.report import blind_cameras, disagreement, no_ball, summary
 
     kind = ball_kind(ball)
     if cameras is None:
@@ -262,8 +268,7 @@ def _from_videos(
 def _on_one_clock(tracking: Tracking, model: AnalyticModel, surfaces: Surfaces) -> Tracking:
     """The same candidates with time offsets of the cameras estimated from the balls."""
     from ballfg.estimation import Settings, estimate_time_offsets, sighted_track
-    from ballfg.vision.tracking.pipeline import track_detections
-    from ballfg.vision.tracking.report import disagreement
+    from ballfg.vision.tracking.pipeline import disagreement, track_detections
 
     pairs = zip(tracking.names, tracking.balls, strict=True)
     tracks = [sighted_track(name, ball.sightings, tracking.cameras) for name, ball in pairs]

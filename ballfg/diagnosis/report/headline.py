@@ -12,8 +12,20 @@ import numpy as np
 from ballfg.diagnosis.fit.patterns import EVERYWHERE
 from ballfg.diagnosis.generic_test import ALARM
 from ballfg.diagnosis.report.origin import Origin
-from ballfg.diagnosis.report.plain_effects import BY_GROUP, DRIFT, in_plain_words, plain_name
-from ballfg.diagnosis.report.wording import MOST_CERTAIN, NONE, capital, fixed, joined, number, probability, sized
+from ballfg.diagnosis.report.wording import (
+    BY_GROUP,
+    DRIFT,
+    MOST_CERTAIN,
+    NONE,
+    capital,
+    fixed,
+    in_plain_words,
+    joined,
+    number,
+    plain_name,
+    probability,
+    sized,
+)
 from ballfg.diagnosis.residual_tests.label_check import LABEL
 from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Finding, Outcome, Verdict
 from ballfg.dynamics import EFFECTS

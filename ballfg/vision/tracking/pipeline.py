@@ -1,6 +1,6 @@
-"""Turns camera recordings into balls: detections, tracks, and the agreement of the cameras."""
+"""Turns camera recordings into balls: detections, tracks, the agreement of the cameras, and a summary."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -11,7 +11,7 @@ from ballfg.arrays import Array, Index
 from ballfg.checks import shown
 from ballfg.progress import Watch, unwatched
 from ballfg.tracks import Track
-from ballfg.vision.association.agreement import Agreement, check_agreement
+from ballfg.vision.association.agreement import LEAST_MISFIT, Agreement, check_agreement
 from ballfg.vision.association.associate import AssociationSettings, associate
 from ballfg.vision.association.gathering import SeenBall
 from ballfg.vision.camera import Camera
@@ -160,3 +160,33 @@ def check_overlap(detections: Sequence[Detections], cameras: Sequence[Camera]) -
             when = "; ".join(f"{shown(other)} {first:g} to {last:g} s" for other, (first, last) in spans.items())
             problem = f"videos must overlap in time; camera {shown(name)} overlaps with no other: {when} (true time)"
             raise ValueError(f"{problem}. Check stamps and time_offset, or that the files are of one recording.")
+
+
+def summary(tracking: Tracking) -> Iterator[str]:
+    """Lines: the detections of each camera, and their use."""
+    for number, (camera, seen) in enumerate(zip(tracking.cameras, tracking.detections, strict=True)):
+        used = sum(int((ball.sightings.camera == number).sum()) for ball in tracking.balls)
+        yield f"  {camera.name}: {len(seen.frames)} frames, {len(seen)} candidates, {used} of them a ball"
+
+
+def blind_cameras(tracking: Tracking) -> Iterator[str]:
+    """A sentence for each camera without a part in any ball, if there are balls."""
+    for number, camera in enumerate(tracking.cameras):
+        if tracking.balls and not any((ball.sightings.camera == number).any() for ball in tracking.balls):
+            yield f"camera {shown(camera.name)} saw none of the balls. Check its stamps, its pose and its candidates."
+
+
+def disagreement(tracking: Tracking) -> str | None:
+    """A sentence on the calibration; None if the cameras agree or too little was seen."""
+    found = tracking.agreement
+    return found.sentence if found and (found.culprit is not None or found.misfit > LEAST_MISFIT) else None
+
+
+def no_ball(tracking: Tracking) -> str:
+    """One sentence with the best scores of each camera, for a recording in which no ball was found."""
+    best = "; ".join(
+        f"{seen.camera}: {', '.join(f'{score:.2f}' for score in seen.best_scores()) or 'no candidate'}"
+        f" in {len(seen.frames)} frames"
+        for seen in tracking.detections
+    )
+    return f"no ball was found. Best candidates' scores (1 is a ball): {best}."

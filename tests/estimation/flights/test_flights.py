@@ -21,8 +21,8 @@ from ballfg.estimation.result import Label
 from ballfg.estimation.segmentation.bank import HYPOTHESIS, LOGGED, WRITTEN
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.tracks import TABLE_TENNIS, Track, read_dataset, write_dataset
+from ballfg.tracks.dataset import dataset_in_memory
 from ballfg.tracks.info import DatasetInfo
-from ballfg.tracks.memory import dataset_in_memory
 from tests.commands import status
 from tests.estimation.flights.found import Count, take
 from tests.estimation.flights.recordings import recording
