@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ballfg.cli.inputs import CORES, Address, Cluster, Jobs, print_notes, workers
+from ballfg.cli.inputs import CORES, Address, Cluster, Jobs, workers
 from ballfg.cli.start import start
+from ballfg.progress import print_notes
 
 if TYPE_CHECKING:
     from ballfg.benchmarks.results import Results

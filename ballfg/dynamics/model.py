@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from ballfg.tracks import Track
     from ballfg.tracks.noise import TrackNoise
 
+BASE: Final = "base."  # Prefix of the names of the coefficients of the model that a learned one corrects
 THIN_SHELL: Final = 2.0 / 3.0  # Moment of inertia of a thin spherical shell divided by m R^2
 
 ROLLING_FRICTION: Final = 0.25  # Coulomb coefficient that turns a resting ball's slip into rolling

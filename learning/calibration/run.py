@@ -46,7 +46,7 @@ from ballfg.learning.config.config_file import AUTO
 from ballfg.learning.evaluation import TrackScore, summary
 from ballfg.learning.run import run_folder as files
 from ballfg.learning.run.record import NOT_BETTER
-from ballfg.learning.start import written_model
+from ballfg.learning.start import describe
 from ballfg.learning.training_data import analytic_model, open_source
 from ballfg.progress import Watch
 from ballfg.tracks.noise import TrackNoise
@@ -208,7 +208,7 @@ def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch,
     if comparison.gain is not None and comparison.gain.word == "no different" and noise is not None:
         comparison = replace(comparison, density=_density(problem, shown, watch))
     found = report(problem, last, comparison, noise)
-    model = written_model(problem, last, noise)
+    describe(model, problem, population, noise)
     if problem.dataset.one_view:  # its tracks cannot correct a drag: the model file states how sure it is
         model.noise = TrackNoise(coefficients={name: last.next_track[k] for k, name in problem.chosen.listed})
     save_model(model, folder / files.MODEL)

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import typer
 
-from ballfg.cli.inputs import print_doubts
-from ballfg.progress import idle
+from ballfg.progress import idle, print_doubts
 
 if TYPE_CHECKING:
     from ballfg.importing import Choices

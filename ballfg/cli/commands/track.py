@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from ballfg.cli.inputs import print_notes
-from ballfg.progress import progress
+from ballfg.progress import print_notes, progress
 
 if TYPE_CHECKING:
     from ballfg.arrays import Array

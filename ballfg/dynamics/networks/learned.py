@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from ballfg.dynamics.effect import Coefficient, per_row
 from ballfg.dynamics.effects.bounce import TableHeight
-from ballfg.dynamics.model import THIN_SHELL, BallModel, Rates
+from ballfg.dynamics.model import BASE, THIN_SHELL, BallModel, Rates
 from ballfg.dynamics.networks import gram_schmidt
 from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.dynamics.networks.fading import DOUBT, DOUBTS, Fading
@@ -130,8 +130,6 @@ def _changed(guess: Tensor, velocity: Tensor, normal: Tensor, spin: Tensor, firs
 
 START_OFFSET: Final = -0.003
 """m by which an untrained model puts surfaces above their declared heights, as in the nominal model."""
-
-BASE: Final = "base."  # Prefix of the names of the base's coefficients
 
 
 class LearnedModel(BallModel):
