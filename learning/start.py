@@ -5,8 +5,6 @@ tracks then compare the two by the log score of predictions, intervals included:
 calibration and its population hold.
 """
 
-from __future__ import annotations
-
 import copy
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Finds the flights in imported recordings, and what is doubtful about them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain

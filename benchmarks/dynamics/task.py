@@ -1,7 +1,5 @@
 """Holds the tracks of the dynamics comparison, shots for training and for judging, and scores predicted paths."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -6,8 +6,6 @@ in the mean log score by more than its standard error over the tracks, calibrati
 docs/train.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final

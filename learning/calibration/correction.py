@@ -4,8 +4,6 @@ The weights of the effect `air_correction` are shared by all tracks; their prior
 The calibrated model and its spins are where the iteration begins.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace

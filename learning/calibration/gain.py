@@ -1,7 +1,5 @@
 """Decides if a calibrated model predicts better, by an interval of the change of the errors over tracks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Compiles generated source to machine code and keeps it on disk under the hash of that source."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import sys

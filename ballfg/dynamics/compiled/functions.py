@@ -1,7 +1,5 @@
 """Compiles the functions of a ball model, rates, impact and surface, each with its tangents."""
 
-from __future__ import annotations
-
 import sys
 import threading
 import warnings

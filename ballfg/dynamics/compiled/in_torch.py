@@ -3,8 +3,6 @@
 Prediction then runs the same code for every model, only more slowly.
 """
 
-from __future__ import annotations
-
 import threading
 import weakref
 from collections.abc import Callable

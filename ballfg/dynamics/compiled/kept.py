@@ -4,8 +4,6 @@ Machine code is run as it is found. So it is read only from folders that this us
 file states its function, its sources, their versions and the processor.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import pickle

@@ -1,7 +1,5 @@
 """Cuts the flights out of tracks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final

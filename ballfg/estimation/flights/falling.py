@@ -1,7 +1,5 @@
 """Tests positions quickly for white noise, for a fall of all of them, and for a filter that smoothed them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Final
 

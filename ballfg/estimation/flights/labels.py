@@ -1,7 +1,5 @@
 """Labels the samples of a track: flight, held, rolling, resting or lost."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

@@ -5,8 +5,6 @@ Drag stretches a flight's time s to ln(1 + k v s) / (k v), with the speed v of t
 g s^2 / 2 by 1 + k v s / 3. Spin, where a scene has it, accelerates each flight evenly.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final

@@ -5,8 +5,6 @@ At a guessed time the ball bounces where the ray then meets a surface, with flig
 much better. Without a bounce, gravity gives the scale.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Final
 

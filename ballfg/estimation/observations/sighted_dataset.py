@@ -1,7 +1,5 @@
 """Makes tracks from the sightings in a dataset's folder: `detections.csv`, `cameras.yaml`, `events.csv`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from os import PathLike

@@ -1,7 +1,5 @@
 """Values of a function that is translated to C: constants, C expressions, and arrays whose sizes are known."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Translates torch's operations on arrays of a program."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 

@@ -4,8 +4,6 @@ Array `k` of all states lies one behind another in `a<k>`: number i of state r a
 `count` numbers lie in an array of another name, the q-th of state r at (r * count + q) * size + i.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final

@@ -4,8 +4,6 @@ A program is a list of operations on numbers, each used as often as it is needed
 programs too: the chain rule adds their operations, and terms that are zero or one never become operations.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field

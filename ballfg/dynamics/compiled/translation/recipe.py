@@ -1,7 +1,5 @@
 """Records torch operations on tables in a file; they compute the weights of compiled functions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final

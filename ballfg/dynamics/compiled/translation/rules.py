@@ -1,7 +1,5 @@
 """Translates torch's operations on small tensors to operations on numbers of a program."""
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Callable, Sequence
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """Writes numba source for a program and for the tangents of its outputs."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 

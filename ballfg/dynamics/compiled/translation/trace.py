@@ -5,8 +5,6 @@ the layers of a network, stay arrays (`array_rules.py`). Torch computes values t
 weights, once for all states (`weights.py`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """Collects the values that a traced function computes from its tables alone, once for all states, as weights."""
 
-from __future__ import annotations
-
 from collections.abc import Hashable
 from dataclasses import dataclass, field
 from math import prod
