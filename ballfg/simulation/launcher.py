@@ -31,38 +31,25 @@ class SimulatedLauncher:
     Raises: ValueError, TypeError: a field that is not a number within its bounds; the message names it.
     """
 
-    x: float = bounded(0.0, -100.0, 100.0)
-    """m, muzzle; x = 0 is the launcher's end of the table."""
-    height: float = bounded(0.56, 0.05, 10.0)
-    """m, muzzle above the surface."""
-    speed_slow: float = bounded(3.4, 0.5, 100.0)
-    """m/s at velocity level 8; levels between are linear."""
-    speed_fast: float = bounded(4.1, 0.5, 100.0)
-    """m/s at velocity level 14."""
+    x: float = bounded(0.0, -100.0, 100.0)  # m, muzzle; x = 0 is the launcher's end of the table
+    height: float = bounded(0.56, 0.05, 10.0)  # m, muzzle above the surface
+    speed_slow: float = bounded(3.4, 0.5, 100.0)  # m/s at velocity level 8; levels between are linear
+    speed_fast: float = bounded(4.1, 0.5, 100.0)  # m/s at velocity level 14
     elevation_slow: float = bounded(1.24, -1.5, 1.5)
     """rad above the horizontal at velocity level 8; the head is lowered as the speed goes up."""
-    elevation_fast: float = bounded(-0.18, -1.5, 1.5)
-    """rad above the horizontal at velocity level 14."""
-    topspin_scale: float = bounded(58.0, 0.0, 1000.0)
-    """rad/s per level of topspin."""
-    sidespin_scale: float = bounded(48.0, 0.0, 1000.0)
-    """rad/s per level of sidespin."""
+    elevation_fast: float = bounded(-0.18, -1.5, 1.5)  # rad above the horizontal at velocity level 14
+    topspin_scale: float = bounded(58.0, 0.0, 1000.0)  # rad/s per level of topspin
+    sidespin_scale: float = bounded(48.0, 0.0, 1000.0)  # rad/s per level of sidespin
     position_spread: float = bounded(0.003, 0.0, 0.5)
     """m, standard deviation of each coordinate of the muzzle from shot to shot."""
-    speed_spread: float = bounded(0.005, 0.0, 0.2)
-    """Standard deviation of the speed from shot to shot, relative."""
-    aim_spread: float = bounded(0.005, 0.0, 0.5)
-    """rad, standard deviation of azimuth and elevation from shot to shot."""
+    speed_spread: float = bounded(0.005, 0.0, 0.2)  # Standard deviation of the speed from shot to shot, relative
+    aim_spread: float = bounded(0.005, 0.0, 0.5)  # rad, standard deviation of azimuth and elevation from shot to shot
     spin_spread: float = bounded(3.0, 0.0, 500.0)
     """rad/s, standard deviation of each component of the spin from shot to shot."""
-    x_low: float = bounded(-0.4, -200.0, 200.0)
-    """m, a track ends where the ball comes back behind this."""
-    x_high: float = bounded(3.2, -200.0, 200.0)
-    """m, a track ends where the ball goes beyond this."""
-    y_far: float = bounded(1.2, 0.01, 200.0)
-    """m, a track ends where the ball is farther than this from the x axis."""
-    duration: float = bounded(1.32, 0.05, 20.0)
-    """s, longest track."""
+    x_low: float = bounded(-0.4, -200.0, 200.0)  # m, a track ends where the ball comes back behind this
+    x_high: float = bounded(3.2, -200.0, 200.0)  # m, a track ends where the ball goes beyond this
+    y_far: float = bounded(1.2, 0.01, 200.0)  # m, a track ends where the ball is farther than this from the x axis
+    duration: float = bounded(1.32, 0.05, 20.0)  # s, longest track
 
     def __post_init__(self) -> None:
         check_bounds(self)

@@ -25,12 +25,9 @@ LEAST_SAMPLES = 2  # Least number of samples in a track: readers refuse shorter 
 class SimulatedTrack:
     """A measured track with its true states."""
 
-    track: Track
-    """Stamps, positions and labels with all their noise."""
-    true_times: Array
-    """(n,) s, true times of the frames."""
-    true_states: Array
-    """(n, 9) the ball's state at those times."""
+    track: Track  # Stamps, positions and labels with all their noise
+    true_times: Array  # (n,) s, true times of the frames
+    true_states: Array  # (n, 9) the ball's state at those times
 
 
 @torch.no_grad()

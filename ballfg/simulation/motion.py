@@ -92,10 +92,8 @@ class KickedModel(BallModel):
 class TrueMotion:
     """The true states of a block of shots at their frames, frame k at k / rate seconds."""
 
-    states: NDArray[np.float64]
-    """(n, k, 9); undefined after the end of a track."""
-    lengths: NDArray[np.int64]
-    """(n,) frames of each track."""
+    states: NDArray[np.float64]  # (n, k, 9); undefined after the end of a track
+    lengths: NDArray[np.int64]  # (n,) frames of each track
 
 
 @torch.no_grad()

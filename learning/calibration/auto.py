@@ -70,16 +70,11 @@ class Candidate(BaseModel):
 
     name: str
     tracks: int
-    rmse_median: float
-    """m."""
-    coverage_90: float
-    """Share of measured coordinates inside their 90 % intervals."""
-    log_score: float
-    """Mean over tracks, per coordinate and metre."""
-    gain: float
-    """Mean difference from the best simpler candidate; 0 for the first."""
-    gain_error: float
-    """Standard error of the gain over tracks."""
+    rmse_median: float  # m
+    coverage_90: float  # Share of measured coordinates inside their 90 % intervals
+    log_score: float  # Mean over tracks, per coordinate and metre
+    gain: float  # Mean difference from the best simpler candidate; 0 for the first
+    gain_error: float  # Standard error of the gain over tracks
 
 
 class Choice(BaseModel):

@@ -69,8 +69,7 @@ class Problem:
     jobs: int
     groups: Groups | None = None
     correction: Correction | None = None
-    shown: TrackNoise | None = None
-    """The noise that the fitted tracks are linearised with; None: the settings'."""
+    shown: TrackNoise | None = None  # The noise that the fitted tracks are linearised with; None: the settings'
 
     @property
     def linearising(self) -> Settings:
@@ -103,26 +102,18 @@ class Step(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     number: int
-    mean: tuple[float, ...]
-    """(p,) the population's mean: the coefficients of the next model."""
-    sigma: tuple[float, ...] = ()
-    """(p,) standard errors of the mean."""
-    spread: tuple[float, ...] = ()
-    """(p,) standard deviations between tracks."""
-    next_track: tuple[float, ...] = ()
-    """(p,) standard deviations of a new track's coefficients about the mean."""
-    spins: tuple[GroupSpin, ...] = ()
-    """The spins of each group, in the order of `Groups.names`; none without groups."""
+    mean: tuple[float, ...]  # (p,) the population's mean: the coefficients of the next model
+    sigma: tuple[float, ...] = ()  # (p,) standard errors of the mean
+    spread: tuple[float, ...] = ()  # (p,) standard deviations between tracks
+    next_track: tuple[float, ...] = ()  # (p,) standard deviations of a new track's coefficients about the mean
+    spins: tuple[GroupSpin, ...] = ()  # The spins of each group, in the order of `Groups.names`; none without groups
     by_group: dict[str, tuple[float, ...]] = {}
     """Means by group, in the same order, of the coefficients that differ between groups."""
     doubts: tuple[tuple[float, ...], ...] = ()
     """Directions of the uncertainty of a correction's weights; none without a correction."""
-    moved: float | None = None
-    """Largest move of a mean in this step, in standard errors."""
-    fits: tuple[TrackFit, ...] = ()
-    """Posteriors of the tracks that were used."""
-    skipped: tuple[tuple[str, str], ...] = ()
-    """Name and reason of each track that was not used."""
+    moved: float | None = None  # Largest move of a mean in this step, in standard errors
+    fits: tuple[TrackFit, ...] = ()  # Posteriors of the tracks that were used
+    skipped: tuple[tuple[str, str], ...] = ()  # Name and reason of each track that was not used
     scores: tuple[TrackScore | None, ...] = ()
     """Scores of the judging tracks with the mean of this step; None where a track could not be judged."""
 

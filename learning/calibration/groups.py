@@ -45,12 +45,9 @@ class GroupSpin(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     mean: Three = (0.0, 0.0, 0.0)
-    sigma: Three = (0.0, 0.0, 0.0)
-    """Standard errors of the mean."""
-    spread: Three = (0.0, 0.0, 0.0)
-    """Standard deviations between tracks."""
-    next_track: Three = (0.0, 0.0, 0.0)
-    """Standard deviations of a new track's spin about the mean."""
+    sigma: Three = (0.0, 0.0, 0.0)  # Standard errors of the mean
+    spread: Three = (0.0, 0.0, 0.0)  # Standard deviations between tracks
+    next_track: Three = (0.0, 0.0, 0.0)  # Standard deviations of a new track's spin about the mean
 
     @classmethod
     def rows(cls, mean: Array, sigma: Array, spread: Array, next_track: Array, first: int) -> tuple[GroupSpin, ...]:

@@ -57,14 +57,10 @@ class Checkpoint(BaseModel):
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
-    data: str
-    """Digest of the dataset's content."""
-    model: dict[str, Any]
-    """Content of the model file that the run started from."""
-    steps: tuple[Step, ...]
-    """Finished steps."""
-    corrected: tuple[Step, ...] = ()
-    """Finished steps of the correction."""
+    data: str  # Digest of the dataset's content
+    model: dict[str, Any]  # Content of the model file that the run started from
+    steps: tuple[Step, ...]  # Finished steps
+    corrected: tuple[Step, ...] = ()  # Finished steps of the correction
 
 
 def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jobs: int, watch: Watch) -> int:

@@ -30,8 +30,7 @@ class RunProgress(BaseModel):
 
     epoch: int
     best_epoch: int
-    best_rmse: float | None
-    """m, RMSE of the best weights on the validation tracks; null: none was judged."""
+    best_rmse: float | None  # m, RMSE of the best weights on the validation tracks; null: none was judged
     skipped_in_row: int
     train: int
     validation: int

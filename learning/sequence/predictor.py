@@ -78,8 +78,7 @@ class FolderConfig(BaseModel):
     points: Annotated[int, Field(ge=1, le=100_000)]
     labels: Annotated[tuple[str, ...], Field(strict=False)]
     categories: dict[str, Annotated[tuple[str, ...], Field(strict=False)]]
-    digest: str | None = None
-    """SHA-256 of the weights; null in folders of earlier versions."""
+    digest: str | None = None  # SHA-256 of the weights; null in folders of earlier versions
 
 
 @dataclass(eq=False)

@@ -42,10 +42,8 @@ _SIDE_LIGHT: Final = (0.72, 0.85, 1.0)  # Light on faces across x, y and z, rela
 class Backdrop:
     """The still picture of a camera, before the lens blurs it."""
 
-    image: Image
-    """(h, w, 3) blue, green, red, grey levels."""
-    distance: Image
-    """(h, w) m, from the camera to the visible surface."""
+    image: Image  # (h, w, 3) blue, green, red, grey levels
+    distance: Image  # (h, w) m, from the camera to the visible surface
 
 
 def backdrop(camera: Camera, kind: BallKind, rng: np.random.Generator) -> Backdrop:

@@ -25,12 +25,9 @@ _LAMP: Final = np.array([0.3, 0.25, 0.92]) / np.linalg.norm([0.3, 0.25, 0.92])  
 class BallImage:
     """A ball within a part of the image."""
 
-    rect: Rect
-    """Its part of the image."""
-    cover: Array
-    """(h, w) share of the exposure and of the pixel that the ball covers, 0 to 1."""
-    light: Array
-    """(h, w) light from the ball: `cover` times the shading, at most `cover`."""
+    rect: Rect  # Its part of the image
+    cover: Array  # (h, w) share of the exposure and of the pixel that the ball covers, 0 to 1
+    light: Array  # (h, w) light from the ball: `cover` times the shading, at most `cover`
 
 
 def ball_image(camera: Camera, path: Array, radius: float) -> BallImage | None:

@@ -34,14 +34,10 @@ ROUND_SHADE: Final = 0.3  # Difference in brightness between a capsule's edge an
 class Capsule:
     """A ball swept along a segment."""
 
-    ends: Array
-    """(2, 3) m."""
-    radius: float
-    """m."""
-    colour: Colour
-    """Grey levels, blue green red."""
-    velocity: Array
-    """(2, 3) m/s of the ends, for the blur of the outline."""
+    ends: Array  # (2, 3) m
+    radius: float  # m
+    colour: Colour  # Grey levels, blue green red
+    velocity: Array  # (2, 3) m/s of the ends, for the blur of the outline
 
 
 def movers(time: float) -> list[Capsule]:

@@ -32,14 +32,10 @@ WALLS: Final = (np.array([-3.5, -4.2, 0.0]), np.array([6.0, 4.2, 3.4]))
 class Box:
     """An upright box with one colour, and another on top if it is the table."""
 
-    low: Array
-    """(3,) m."""
-    high: Array
-    """(3,) m."""
-    colour: Colour
-    """Of its sides, and of its top unless `lined`."""
-    lined: bool = False
-    """True if its top is the playing surface."""
+    low: Array  # (3,) m
+    high: Array  # (3,) m
+    colour: Colour  # Of its sides, and of its top unless `lined`
+    lined: bool = False  # True if its top is the playing surface
 
     def corners(self) -> Array:
         """(8, 3) m."""
