@@ -166,7 +166,8 @@ class Groups:
                 best, columns, numbers, apart[name] = found, wider, split, first
         next_track = np.sqrt((best.next_track[numbers[:, :size]] ** 2).mean(axis=0))
         values = {name: tuple(best.mean[k : k + len(self.names)].tolist()) for name, k in apart.items()}
-        mean, sigma, spread, next_spin = (values_of[: size + 3 * len(self.names)] for values_of in _columns_of(best))
+        every = (best.mean, best.sigma, best.spread, best.next_track)
+        mean, sigma, spread, next_spin = (numbers_of[: size + 3 * len(self.names)] for numbers_of in every)
         return shared, values, GroupSpin.rows(mean, sigma, spread, next_spin, size), next_track
 
     def variations(self, by_group: Mapping[str, Sequence[float]]) -> dict[str, Variation]:
@@ -224,8 +225,3 @@ def _widest(
     covariance = np.tensordot(share, np.array([found.covariance for _, found in tried]), 1) + away.T @ away
     wide, best = tried[int(share.argmax())]
     return wide, replace(best, mean=mean, covariance=covariance)
-
-
-def _columns_of(population: Population) -> Columns:
-    """Mean, its standard error, spread and standard deviation of a new track, of every number."""
-    return population.mean, population.sigma, population.spread, population.next_track

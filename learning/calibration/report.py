@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from ballfg.checks import aligned
 from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.learning.calibration.calibrate import Problem, Step, has_converged, population_model
 from ballfg.learning.calibration.correction import SCALE, learned, places
@@ -228,10 +229,4 @@ def table(problem: Problem, last: Step, comparison: Comparison) -> str:
     ):
         cells = ("-" if s is None else f"{scale * getattr(s, name):.4g}" for s in summaries)
         errors.append((label, unit, *cells))
-    return "\n\n".join(_aligned(part) for part in (rows, errors))
-
-
-def _aligned(rows: Sequence[Sequence[str]]) -> str:
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = ("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
-    return "\n".join(line.rstrip() for line in lines)
+    return "\n\n".join("\n".join(aligned(part)) for part in (rows, errors))

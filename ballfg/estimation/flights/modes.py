@@ -66,7 +66,7 @@ def move(h: Record, dt: float, scene: Record) -> None:
         _wander(h, dt, SWAY, SWAY_MEMORY)
     elif h.surface == ROLLING:
         for axis in range(3):
-            _constant(h, axis, dt)
+            _transform(h, axis, dt, 0.5 * dt * dt, dt, 1.0)  # constant acceleration
         for axis in range(2):
             h.cov[axis, 1, 1] += ROLLING_DRIFT**2 * dt
         h.cov[2, 0, 0] += STIR**2 * dt
@@ -91,12 +91,6 @@ def _relax(h: Record, t: float, scene: Record) -> None:
             h.cov[axis, 2, k] *= memory
             h.cov[axis, k, 2] *= memory
         h.cov[axis, 2, 2] += spread * spread * (1.0 - memory * memory)
-
-
-@machine_code(NOTHING(ONE_HYPOTHESIS, COUNT, REAL))
-def _constant(h: Record, axis: int, t: float) -> None:
-    """One axis t s later, with constant acceleration."""
-    _transform(h, axis, t, 0.5 * t * t, t, 1.0)
 
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, COUNT, REAL, REAL, REAL, REAL))

@@ -14,7 +14,7 @@ from typing import Any
 from ballfg.dynamics.compiled.in_c.body import TANGENTS, WIDTH, Body
 from ballfg.dynamics.compiled.in_c.helpers import BY_HAND
 from ballfg.dynamics.compiled.in_c.statements import block
-from ballfg.dynamics.compiled.in_c.values import Array, Scalar, UntranslatableError, Value, form
+from ballfg.dynamics.compiled.in_c.values import Array, UntranslatableError, Value, form
 
 Blocks = tuple[int, ...]  # The blocks around a place in a function
 
@@ -164,11 +164,7 @@ class Translator:
         head = f"static inline {kind or 'void'} {name}({', '.join(passed) or 'void'}) {{"
         lines = body.finished()
         words = set(re.findall(r"\w+", "\n".join(lines)))
-        unused = [leaf for leaf in map(_name, arguments) if leaf not in words]
+        unused = [leaf for a in arguments if (leaf := a.pointer if isinstance(a, Array) else a.text) not in words]
         above = [f"/* {told} */"] if number == 1 else []
         self.texts.append("\n".join([*above, head, *(f" (void){leaf};" for leaf in unused), *lines, "}"]))
         return Made(name, kind, outputs, [isinstance(a, Array) and a.root in body.written for a in arguments])
-
-
-def _name(argument: Scalar | Array) -> str:
-    return argument.pointer if isinstance(argument, Array) else argument.text
