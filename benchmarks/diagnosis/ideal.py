@@ -23,7 +23,7 @@ from ballfg.benchmarks.diagnosis.cases import Case, Recording, planted_case
 from ballfg.benchmarks.diagnosis.data import declared_model, make_dataset
 from ballfg.benchmarks.diagnosis.effects import PLANTS
 from ballfg.benchmarks.diagnosis.record import case_digest
-from ballfg.benchmarks.resumable import Kept
+from ballfg.benchmarks.results import Kept
 from ballfg.diagnosis.fit.fit import fit_model
 from ballfg.diagnosis.fit.holdout import launcher_labels
 from ballfg.diagnosis.fit.problem import Fit

@@ -20,8 +20,7 @@ from ballfg.benchmarks.diagnosis.record import Found, Record, is_one_of
 from ballfg.benchmarks.diagnosis.suite import collect_records, run_case
 from ballfg.benchmarks.metrics import Figure, share
 from ballfg.benchmarks.pictures import BLUE, GREY, ORANGE, save
-from ballfg.benchmarks.results import Results
-from ballfg.benchmarks.resumable import RUNS_FOLDER
+from ballfg.benchmarks.results import RUNS_FOLDER, Results
 from ballfg.diagnosis.residual_tests.tracker_errors import UNITS
 from ballfg.dynamics import EFFECTS, Coefficient
 from ballfg.estimation.noise.tracker_errors import JITTER, MEMORY

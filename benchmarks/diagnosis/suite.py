@@ -19,8 +19,7 @@ from ballfg.benchmarks.diagnosis.ideal import Ideal, ideal_case, ideal_of
 from ballfg.benchmarks.diagnosis.record import Record, case_digest, record_of
 from ballfg.benchmarks.diagnosis.rows import add_all, detectable
 from ballfg.benchmarks.metrics import CONFIDENCE, Figure
-from ballfg.benchmarks.results import Results
-from ballfg.benchmarks.resumable import RUNS_FOLDER, Kept, collect
+from ballfg.benchmarks.results import RUNS_FOLDER, Kept, Results, collect
 from ballfg.diagnosis import diagnose
 from ballfg.diagnosis.hypotheses.hypothesis import TWINS
 from ballfg.diagnosis.result import Diagnosis

@@ -12,7 +12,7 @@ import torch
 
 from ballfg.arrays import Array
 from ballfg.benchmarks.dynamics.task import PathScore, Task
-from ballfg.benchmarks.resumable import Kept
+from ballfg.benchmarks.results import Kept
 from ballfg.dynamics import BallModel, Surfaces, nominal_model
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.motion.paths import paths

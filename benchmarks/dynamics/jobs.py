@@ -14,7 +14,7 @@ from ballfg.benchmarks.dynamics import contenders
 from ballfg.benchmarks.dynamics.contenders import Contender, GraphContender, Job, Record, fan_of, job_digest
 from ballfg.benchmarks.dynamics.task import Task, score_path
 from ballfg.benchmarks.dynamics.trained import RESIDUAL, recipe, trained_contender
-from ballfg.benchmarks.resumable import collect
+from ballfg.benchmarks.results import collect
 from ballfg.benchmarks.speed.stopwatch import milliseconds
 from ballfg.learning.run.loop import TrainingStoppedError
 

@@ -16,8 +16,7 @@ from ballfg.benchmarks.dynamics.measured import Measured, measured_tasks
 from ballfg.benchmarks.dynamics.task import APEXES, Task, pooled_rmse
 from ballfg.benchmarks.dynamics.truth import TRACKS, synthetic_task
 from ballfg.benchmarks.metrics import Figure
-from ballfg.benchmarks.results import CURVE_MARK, Results
-from ballfg.benchmarks.resumable import RUNS_FOLDER
+from ballfg.benchmarks.results import CURVE_MARK, RUNS_FOLDER, Results
 
 
 def add_rows(results: Results, task: Task, records: Sequence[Record]) -> None:

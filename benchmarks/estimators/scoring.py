@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array
 from ballfg.benchmarks.estimators.protocols import Candidate, Case
 from ballfg.benchmarks.metrics import inside, nees, square_norms
-from ballfg.benchmarks.resumable import in_processes
+from ballfg.benchmarks.results import in_processes
 from ballfg.estimation import Status
 from ballfg.estimation.filters.sliding_window import WINDOW
 from ballfg.state import POSITION, SPIN, VELOCITY

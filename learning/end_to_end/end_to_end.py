@@ -32,8 +32,7 @@ from ballfg.learning.end_to_end.pretrain import Anchor
 from ballfg.learning.end_to_end.solving import TRAINING, BatchSolver, Pose, Solved
 from ballfg.learning.gradient.conjugate_gradients import ConjugateGradients, GaussNewtonFactors, NotAMinimum
 from ballfg.learning.gradient.implicit import GradientMethod, ImplicitGradient, LinearSolver
-from ballfg.learning.gradient.likelihood import negative_log_likelihood
-from ballfg.learning.gradient.objective import BatchObjective
+from ballfg.learning.gradient.objective import BatchObjective, negative_log_likelihood
 from ballfg.learning.run.run_folder import MODEL
 from ballfg.learning.shots import TrainingShot
 from ballfg.learning.trainee import BatchLoss, Learned, PredictedShot, Trainee

@@ -92,7 +92,7 @@ def track(
     from ballfg.simulation.balls import ball_kind
     from ballfg.tracks.info import DatasetInfo
     from ballfg.vision.camera_file import read_cameras
-    from ballfg.vision.detection.detections_table import read_detections
+    from ballfg.vision.detection.detections import read_detections
     from ballfg.vision.tracking.dataset import check_result_folder, write_tracking
     from ballfg.vision.tracking.pipeline import (
         blind_cameras,
@@ -101,8 +101,8 @@ def track(
         no_ball,
         summary,
         track_detections,
+        without as others,
     )
-    from ballfg.vision.tracking.recordings import without as others
 
     kind = ball_kind(ball)
     if cameras is None:
@@ -252,8 +252,7 @@ def _from_videos(
     from ballfg.vision.detection.detect import learn_detector, load_detector
     from ballfg.vision.detection.detector import DetectorSettings
     from ballfg.vision.detection.video import open_video
-    from ballfg.vision.tracking.pipeline import detect_videos
-    from ballfg.vision.tracking.recordings import match_videos, stamp_files
+    from ballfg.vision.tracking.pipeline import detect_videos, match_videos, stamp_files
 
     videos, files = match_videos(recordings, rig, without), stamp_files(stamps, rig)
     if detector is not None and colour is not None:

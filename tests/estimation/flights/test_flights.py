@@ -10,8 +10,7 @@ import pytest
 
 import ballfg as bf
 from ballfg.dynamics import nominal_model
-from ballfg.estimation.flights.cut import flies_throughout, flights_of, pieces_of
-from ballfg.estimation.flights.dataset import error_ratios, in_flight
+from ballfg.estimation.flights.dataset import error_ratios, flies_throughout, flights_of, in_flight, pieces_of
 from ballfg.estimation.flights.decode import _compact
 from ballfg.estimation.flights.estimates import estimated
 from ballfg.estimation.flights.falling import falls_throughout, scatter

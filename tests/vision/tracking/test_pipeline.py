@@ -19,8 +19,7 @@ from ballfg.tracks.info import DatasetInfo
 from ballfg.vision import Camera
 from ballfg.vision.camera_file import read_cameras
 from ballfg.vision.detection.detect import load_detector
-from ballfg.vision.detection.detections import Candidates, Detections
-from ballfg.vision.detection.detections_table import read_detections
+from ballfg.vision.detection.detections import Candidates, Detections, read_detections
 from ballfg.vision.detection.video import Video, open_video
 from ballfg.vision.tracking.dataset import FILES, check_result_folder, write_tracking
 from ballfg.vision.tracking.overlay import Image
