@@ -16,8 +16,7 @@ from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.tracks import Track
 from ballfg.tracks.track import SPIN_LABELS
 
-FIRST_SAMPLES = 10
-"""Number of samples whose mean direction of flight is the launch direction."""
+FIRST_SAMPLES = 10  # Number of samples whose mean direction of flight is the launch direction
 
 
 @dataclass(frozen=True)
