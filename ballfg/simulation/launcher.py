@@ -5,11 +5,9 @@ spin of `topspin` about the horizontal axis across the launch (y) and of `sidesp
 not give the rad/s and m/s of a level; docs/simulate.md derives the chosen scales.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 import torch
@@ -58,7 +56,7 @@ class SimulatedLauncher:
                 f"x must lie between x_low and x_high; got {self.x_low:g}, {self.x:g}, {self.x_high:g} m. Correct them."
             )
 
-    def with_fields(self, changes: Mapping[str, Any]) -> SimulatedLauncher:
+    def with_fields(self, changes: Mapping[str, Any]) -> Self:
         """This launcher with some fields changed.
 
         Raises: ValueError, TypeError: changes that are not a mapping, an unknown field or a bad value.

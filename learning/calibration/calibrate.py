@@ -5,12 +5,10 @@ finds the population's mean and spread, and puts the mean into the model. It end
 docs/train.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
@@ -126,7 +124,7 @@ class Linear:
     evidences: tuple[Evidence, ...]
     skipped: tuple[tuple[str, str], ...]
 
-    def without(self, names: Sequence[str]) -> Linear:
+    def without(self, names: Sequence[str]) -> Self:
         """Without some tracks."""
         kept = [k for k, fit in enumerate(self.fits) if fit.name not in names]
         return replace(self, fits=tuple(self.fits[k] for k in kept), evidences=tuple(self.evidences[k] for k in kept))

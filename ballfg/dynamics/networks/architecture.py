@@ -1,8 +1,6 @@
 """Describes the networks of a learned model by numbers for a file."""
 
-from __future__ import annotations
-
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -49,7 +47,7 @@ class Architecture(BaseModel):
         depth: int | None = None,
         residual: bool = False,
         spin_rate: bool = False,
-    ) -> Architecture:
+    ) -> Self:
         """An architecture with the kind's default for each size that is not given."""
         given = (width_flight, width_contact, depth)
         sizes = (size if own is None else own for own, size in zip(given, DEFAULT_SIZES[kind], strict=True))

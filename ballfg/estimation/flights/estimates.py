@@ -1,11 +1,9 @@
 """Estimates the flights of a track, and leaves what is no flight as it was measured."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
@@ -30,7 +28,7 @@ class Seen:
     parts: list[tuple[int, int]]
 
     @classmethod
-    def of(cls, estimator: Estimator, track: Track) -> Seen:
+    def of(cls, estimator: Estimator, track: Track) -> Self:
         """A track as an estimator may explain it: flights, and rolling and rest on its surfaces."""
         estimator.prepared(track)  # refuses what is no track before anything looks at it
         levels = [height + estimator.model.radius for height in estimator.surfaces.heights()]

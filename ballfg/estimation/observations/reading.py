@@ -1,7 +1,5 @@
 """A reading compares an instrument's numbers with one torch function of the ball's state."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Hashable, Mapping
 from functools import partial
@@ -170,7 +168,7 @@ class RadarSpeed(Reading):
         """(..., 1) m/s, length of the velocity."""
         return state[..., VELOCITY].square().sum(-1, keepdim=True).clamp_min(LEAST_SPEED**2).sqrt()
 
-    def turned(self, rotation: Tensor, shift: Tensor) -> RadarSpeed:
+    def turned(self, rotation: Tensor, shift: Tensor) -> Self:
         """A speed is the same in every frame."""
         return self
 

@@ -1,11 +1,9 @@
 """Holds the candidates of a frame and of a recording, reads them from tables, and defines a detector."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -46,12 +44,12 @@ class Candidates:
         return len(self.pixels)
 
     @classmethod
-    def none(cls) -> Candidates:
+    def none(cls) -> Self:
         """The candidates of a frame without any."""
         return cls(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros((0, 2, 2)))
 
     @classmethod
-    def at(cls, pixels: ArrayLike, sigma: float, scores: ArrayLike | None = None) -> Candidates:
+    def at(cls, pixels: ArrayLike, sigma: float, scores: ArrayLike | None = None) -> Self:
         """The candidates of a detector that gives centres only.
 
         Args: pixels: (k, 2).  sigma: px, of each coordinate.  scores: (k,) dimensionless, in [0, 1]; 1 by default.
@@ -126,7 +124,7 @@ class Detections:
         rows = slice(*np.searchsorted(self.frame, (number, number + 1)))
         return Candidates(*(getattr(self, field)[rows] for field in _SHAPES))
 
-    def select(self, keep: Mask) -> Detections:
+    def select(self, keep: Mask) -> Self:
         """The detections with the candidates of `keep` (n,) bool, and all frames."""
         return replace(self, **{field: getattr(self, field)[keep] for field in ("frame", *_SHAPES)})
 
@@ -135,7 +133,7 @@ class Detections:
         return np.sort(self.scores)[::-1][:count].copy()
 
     @classmethod
-    def of_frames(cls, camera: str, seen: Iterable[tuple[float, Candidates]]) -> Detections:
+    def of_frames(cls, camera: str, seen: Iterable[tuple[float, Candidates]]) -> Self:
         """Joins the candidates of frames.
 
         Args: camera: name of the camera.  seen: stamp (s) and candidates of each frame, in order.

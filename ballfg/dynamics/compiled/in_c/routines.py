@@ -1,7 +1,5 @@
 """Translates Python functions to C functions, one for each form of the arguments with which they are called."""
 
-from __future__ import annotations
-
 import ast
 import inspect
 import re
@@ -9,7 +7,7 @@ import textwrap
 from collections import Counter
 from collections.abc import Callable, Hashable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
 from ballfg.dynamics.compiled.in_c.body import TANGENTS, WIDTH, Body
 from ballfg.dynamics.compiled.in_c.helpers import BY_HAND
@@ -36,14 +34,14 @@ class Routine:
     generated: bool = False
 
     @classmethod
-    def of(cls, function: Callable[..., Any]) -> Routine:
+    def of(cls, function: Callable[..., Any]) -> Self:
         """Of a function with a file."""
         (tree,) = ast.parse(textwrap.dedent(inspect.getsource(function))).body
         assert isinstance(tree, ast.FunctionDef)
         return cls(function.__name__.strip("_"), tree, function.__globals__, _changing(tree))
 
     @classmethod
-    def of_source(cls, name: str, source: str, known: Mapping[str, Any]) -> Routine:
+    def of_source(cls, name: str, source: str, known: Mapping[str, Any]) -> Self:
         """Of the one function in a generated text, which computes a number anew in each loop that needs it."""
         (tree,) = ast.parse(source).body
         assert isinstance(tree, ast.FunctionDef)
