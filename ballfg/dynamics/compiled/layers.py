@@ -37,24 +37,11 @@ def _add_row(whole: Array, row: Array, matrix: Array) -> None:
 
 @machine_code(NOTHING(ONE, COUNT, COUNT, *(ONE, *[COUNT] * 4) * 2, *[COUNT] * 4))
 def add_product(
-    whole: Array,
-    whole_at: int,
-    whole_step: int,
-    left: Array,
-    left_at: int,
-    left_step: int,
-    left_row: int,
-    left_column: int,
-    right: Array,
-    right_at: int,
-    right_step: int,
-    right_row: int,
-    right_column: int,
-    count: int,
-    m: int,
-    k: int,
-    n: int,
-) -> None:
+    whole: Array, whole_at: int, whole_step: int,
+    left: Array, left_at: int, left_step: int, left_row: int, left_column: int,
+    right: Array, right_at: int, right_step: int, right_row: int, right_column: int,
+    count: int, m: int, k: int, n: int,
+) -> None:  # fmt: skip
     """Add matrix products (m, k) (k, n) to `whole`, whose rows lie one behind another.
 
     Args:
