@@ -52,13 +52,10 @@ class Row:
 
 @dataclass
 class Results:
-    """All numbers of one run of a benchmark.
+    """All numbers of one run of a benchmark."""
 
-    Attributes: command: as typed, with a dataset's folder name in place of its path.  seed: random seed.
-    """
-
-    command: str
-    seed: int
+    command: str  # as typed, with a dataset's folder name in place of its path
+    seed: int  # random seed
     rows: list[Row] = field(default_factory=list)
 
     def add(self, case: str, method: str, metric: str, unit: str, value: float | Figure, n: int) -> None:

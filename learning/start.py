@@ -42,17 +42,13 @@ NETWORK: Final = "with network"
 
 @dataclass(frozen=True)
 class Start:
-    """Files of a calibrated model, and the tracks of a dataset that compare a network with it.
-
-    Attributes:
-        judge: names of these tracks.  observe: their observed part.
-    """
+    """Files of a calibrated model, and the tracks of a dataset that compare a network with it."""
 
     calibrated: Path
     base: Path
     dataset: Dataset
-    judge: tuple[str, ...]
-    observe: ObserveConfig
+    judge: tuple[str, ...]  # names of these tracks
+    observe: ObserveConfig  # their observed part
 
     def compare(self, network: Path) -> Choice | None:
         """The calibrated model and a network's file by their predictions; None: no track could be judged by both."""

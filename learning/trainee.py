@@ -48,14 +48,10 @@ class BatchLoss:
 
 @dataclass(frozen=True)
 class PredictedShot:
-    """The predicted and measured positions (k, 3) m of a track.
-
-    Attributes:
-        times: (k,) s since the last observed sample; those of observed samples are not positive.
-    """
+    """The predicted and measured positions (k, 3) m of a track."""
 
     name: str
-    times: Array
+    times: Array  # (k,) s since the last observed sample; those of observed samples are not positive
     measured: Array
     predicted: Array
 

@@ -38,17 +38,11 @@ class Kept:
 
 @dataclass(frozen=True)
 class BallEvent:
-    """An event of a ball.
+    """An event of a ball."""
 
-    Attributes:
-        kind: `bounce`, `hit`, `rest` (the ball came to lie) or `gap` (too long for a link).
-        time: s; of a bounce its own, of a hit the middle of its interval, of the others the first sample after it.
-        height: m, of the surface; None without one.
-    """
-
-    kind: str
-    time: float
-    height: float | None = None
+    kind: str  # `bounce`, `hit`, `rest` (the ball came to lie) or `gap` (too long for a link)
+    time: float  # s; of a bounce its own, of a hit the middle of its interval, of the others the first sample after it
+    height: float | None = None  # m, of the surface; None without one
 
 
 class Ball:

@@ -152,18 +152,12 @@ BIN = 0.05  # s, width of the bins of the horizon
 
 @dataclass(frozen=True)
 class Coverage:
-    """Shares by horizon, the time since the last sample before the first predicted one.
+    """Shares by horizon, the time since the last sample before the first predicted one."""
 
-    Attributes:
-        horizons: (b,) s, the middle of each bin that holds samples.
-        shares: (b, 3) of the coordinates x, y, z inside their intervals, 0 to 1.
-        samples: (b,) counts.  shots: (b,) counts.
-    """
-
-    horizons: Array
-    shares: Array
-    samples: Index
-    shots: Index
+    horizons: Array  # (b,) s, the middle of each bin that holds samples
+    shares: Array  # (b, 3) of the coordinates x, y, z inside their intervals, 0 to 1
+    samples: Index  # (b,) counts
+    shots: Index  # (b,) counts
 
 
 def coverage(shots: Iterable[ShownShot]) -> Coverage:

@@ -41,16 +41,11 @@ AT_ONCE = 64
 
 @dataclass(frozen=True)
 class Prediction:
-    """Future states. Near a contact they include the balls that have bounced and those that have not.
+    """Future states. Near a contact they include the balls that have bounced and those that have not."""
 
-    Attributes:
-        times: (n, k) s, on each track's clock.  states: (n, k, 9) position m, velocity m/s, spin rad/s.
-        covariances: (n, k, 9, 9) of the states, in the products of those units; without measurement noise.
-    """
-
-    times: Array
-    states: Array
-    covariances: Array
+    times: Array  # (n, k) s, on each track's clock
+    states: Array  # (n, k, 9) position m, velocity m/s, spin rad/s
+    covariances: Array  # (n, k, 9, 9) of the states, in the products of those units; without measurement noise
 
     def plot(self, ball: int = 0) -> Figure:
         """A picture of x, y and z of one ball over time, each with the band that holds 90 %.

@@ -38,15 +38,11 @@ POWER = 0.9  # Probability at which an effect counts as detectable
 
 @dataclass(frozen=True)
 class Ideal(Kept):
-    """The ideal test of an effect.
-
-    Attributes:
-        rank: degrees of freedom; 0 where the data do not show the effect.  information: non-centrality at size 1.
-    """
+    """The ideal test of an effect."""
 
     what = "an ideal test"
-    rank: int
-    information: float
+    rank: int  # degrees of freedom; 0 where the data do not show the effect
+    information: float  # non-centrality at size 1
 
     @property
     def size(self) -> float:

@@ -69,17 +69,12 @@ def figures(record: Record, measured: bool) -> Iterator[tuple[str, str, float, i
 
 @dataclass(frozen=True)
 class Plan:
-    """The amount of computation.
+    """The amount of computation."""
 
-    Attributes:
-        tracks: synthetic ones.  measured: measured tracks at most; None for all.
-        seeds: how often each trained method is trained.  quick: train just enough to see that everything works.
-    """
-
-    tracks: int
-    measured: int | None
-    seeds: int
-    quick: bool
+    tracks: int  # synthetic ones
+    measured: int | None  # measured tracks at most; None for all
+    seeds: int  # how often each trained method is trained
+    quick: bool  # train just enough to see that everything works
 
 
 FULL: Final = Plan(tracks=TRACKS, measured=None, seeds=3, quick=False)

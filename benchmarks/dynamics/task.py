@@ -54,28 +54,18 @@ class TaskShot:
 
 @dataclass(frozen=True)
 class Task:
-    """A comparison.
+    """A comparison."""
 
-    Attributes:
-        case: its name in `results.json`.  info: the declared table, ball, rate and position noise.
-        surfaces: table and floor, for every model.
-        settings: of the estimator, the same for every model but for noise that a model has learned.
-        launcher: spin per level for models that do not learn it; None where the tracks have no levels.
-        launcher_labels: labels from which trained models learn the spin.
-        observe: the observed part of a shot, as in a training config.
-        truth: the true dynamics; None for measured tracks.  train: shots to learn from.  validation: shots to judge by.
-    """
-
-    case: str
-    info: DatasetInfo
-    surfaces: Surfaces
-    settings: Settings
-    launcher: Launcher | None
-    launcher_labels: tuple[str, ...]
-    observe: Mapping[str, float]
-    truth: BallModel | None
-    train: tuple[TaskShot, ...]
-    validation: tuple[TaskShot, ...]
+    case: str  # its name in `results.json`
+    info: DatasetInfo  # the declared table, ball, rate and position noise
+    surfaces: Surfaces  # table and floor, for every model
+    settings: Settings  # of the estimator, the same for every model but for noise that a model has learned
+    launcher: Launcher | None  # spin per level for models that do not learn it; None where the tracks have no levels
+    launcher_labels: tuple[str, ...]  # labels from which trained models learn the spin
+    observe: Mapping[str, float]  # the observed part of a shot, as in a training config
+    truth: BallModel | None  # the true dynamics; None for measured tracks
+    train: tuple[TaskShot, ...]  # shots to learn from
+    validation: tuple[TaskShot, ...]  # shots to judge by
 
     def write(self, folder: Path, *, validate: bool = True) -> None:
         """Write the tracks of both parts into a new folder, as a dataset with a label `split`.

@@ -49,17 +49,11 @@ ELSEWHERE: Final = 0.05  # Weight of places without data in the order of the dir
 
 @dataclass(frozen=True)
 class Correction:
-    """Where a correction begins.
+    """Where a correction begins."""
 
-    Attributes:
-        mean: (p,) of all coefficients, those of the calibration first.
-        spins: of each group, as calibrated.
-        terms: (11, 11) mean product of the functions over the samples.
-    """
-
-    mean: Array
-    spins: tuple[GroupSpin, ...]
-    terms: Array
+    mean: Array  # (p,) of all coefficients, those of the calibration first
+    spins: tuple[GroupSpin, ...]  # of each group, as calibrated
+    terms: Array  # (11, 11) mean product of the functions over the samples
 
     def directions(self, chosen: Chosen, mean: Array, covariance: Array) -> tuple[tuple[float, ...], ...]:
         """Of the uncertainty of each force's weights, first of drag; those that move it most at the samples lead.

@@ -61,21 +61,13 @@ class GroupSpin(BaseModel):
 
 @dataclass(frozen=True)
 class Groups:
-    """The groups of a calibration.
+    """The groups of a calibration."""
 
-    Attributes:
-        by: the label that names them.
-        names: of the fitted tracks' groups, sorted.
-        tracks: the group of each fitted track, by the track's name.
-        labelled: names of the fitted tracks with a spin label, which takes the place of the group's prior.
-        own: the group of tracks without the label.
-    """
-
-    by: str
-    names: tuple[str, ...]
-    tracks: Mapping[str, str]
-    labelled: frozenset[str]
-    own: str
+    by: str  # the label that names them
+    names: tuple[str, ...]  # of the fitted tracks' groups, sorted
+    tracks: Mapping[str, str]  # the group of each fitted track, by the track's name
+    labelled: frozenset[str]  # names of the fitted tracks with a spin label, which takes the place of the group's prior
+    own: str  # the group of tracks without the label
 
     @classmethod
     def of(cls, dataset: Dataset | SightedDataset, by: str, fit: Sequence[str]) -> Groups:

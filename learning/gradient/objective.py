@@ -30,17 +30,11 @@ from ballfg.state import STATE_DIM
 
 @dataclass(frozen=True)
 class Layout:
-    """The order of the values of several tracks in one vector: all states of all tracks, then all coefficients.
+    """The order of the values of several tracks in one vector: all states of all tracks, then all coefficients."""
 
-    Attributes:
-        lengths: number of states of each of t tracks.
-        coefficients: number p of coefficients of each track.
-        width: numbers w of a state: 9, or 12 where the tracker's bias stands behind it.
-    """
-
-    lengths: tuple[int, ...]
-    coefficients: int
-    width: int = STATE_DIM
+    lengths: tuple[int, ...]  # number of states of each of t tracks
+    coefficients: int  # number p of coefficients of each track
+    width: int = STATE_DIM  # numbers w of a state: 9, or 12 where the tracker's bias stands behind it
 
     @property
     def states(self) -> int:

@@ -115,21 +115,13 @@ MISSED = 1e-3
 
 @dataclass(frozen=True)
 class Information:
-    """Information matrices about q common unknowns, first states eliminated, in units of the priors.
+    """Information matrices about q common unknowns, first states eliminated, in units of the priors."""
 
-    Attributes:
-        names: of the coefficients, which are the first unknowns; launcher settings follow.
-        units: (q,) prior standard deviations, the units of the matrices.
-        known: (q, q) of priors and dataset.
-        shots: (m, q, q) of each candidate.
-        kept: (m,) numbers of the candidates with usable flights.
-    """
-
-    names: tuple[str, ...]
-    units: Array
-    known: Array
-    shots: Array
-    kept: Index
+    names: tuple[str, ...]  # of the coefficients, which are the first unknowns; launcher settings follow
+    units: Array  # (q,) prior standard deviations, the units of the matrices
+    known: Array  # (q, q) of priors and dataset
+    shots: Array  # (m, q, q) of each candidate
+    kept: Index  # (m,) numbers of the candidates with usable flights
 
     def columns(self, names: Sequence[str]) -> list[int]:
         """Places of coefficients among the unknowns."""

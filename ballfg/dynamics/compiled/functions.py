@@ -54,18 +54,12 @@ class Function:
 
 @dataclass(frozen=True)
 class CompiledModel:
-    """The functions of a ball model.
+    """The functions of a ball model."""
 
-    Attributes:
-        rates: of the velocity, then of the spin, (6,).  impact: state after an impact, (9,).
-        surface: offset of surfaces above their declared heights in m, and their slopes along x and y, (3,).
-        radius: m, of the ball.
-    """
-
-    rates: Function
-    impact: Function
-    surface: Function
-    radius: float
+    rates: Function  # of the velocity, then of the spin, (6,)
+    impact: Function  # state after an impact, (9,)
+    surface: Function  # offset of surfaces above their declared heights in m, and their slopes along x and y, (3,)
+    radius: float  # m, of the ball
 
     def weights(self, model: BallModel) -> tuple[Array, Array, Array]:
         """Weights of rates, impact and surface from a model's present tables."""

@@ -54,21 +54,15 @@ class Path:
 
 @dataclass(frozen=True)
 class Rays:
-    """Sightings as linear equations A X = b of the ball's position, in units of x/z and y/z times depth.
+    """Sightings as linear equations A X = b of the ball's position, in units of x/z and y/z times depth."""
 
-    Attributes:
-        times: (m,) s, true, ascending.  camera: (m,) number of the camera.  matrix: (m, 2, 3).  target: (m, 2).
-        root: (m, 2, 2) whitens a residual divided by the depth.  depth_row: (m, 4): depth = row[:3] X + row[3].
-        period: s, of the slowest camera.
-    """
-
-    times: Array
-    camera: Index
-    matrix: Array
-    target: Array
-    root: Array
-    depth_row: Array
-    period: float
+    times: Array  # (m,) s, true, ascending
+    camera: Index  # (m,) number of the camera
+    matrix: Array  # (m, 2, 3)
+    target: Array  # (m, 2)
+    root: Array  # (m, 2, 2) whitens a residual divided by the depth
+    depth_row: Array  # (m, 4): depth = row[:3] X + row[3]
+    period: float  # s, of the slowest camera
 
     @classmethod
     def of(cls, sightings: Sightings, times: Array, cameras: Sequence[Camera]) -> Rays:

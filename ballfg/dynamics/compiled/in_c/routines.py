@@ -19,19 +19,13 @@ Blocks = tuple[int, ...]  # The blocks around a place in a function
 
 @dataclass(frozen=True, eq=False)
 class Routine:
-    """A Python function as syntax.
+    """A Python function as syntax."""
 
-    Attributes:
-        name: in C.  tree: of the function.  known: the names of its module.
-        changing: names of numbers that are variables.
-        generated: true for a function of a model: one in C serves any number of tangents.
-    """
-
-    name: str
-    tree: ast.FunctionDef
-    known: Mapping[str, Any]
-    changing: Set[str]
-    generated: bool = False
+    name: str  # in C
+    tree: ast.FunctionDef  # of the function
+    known: Mapping[str, Any]  # the names of its module
+    changing: Set[str]  # names of numbers that are variables
+    generated: bool = False  # true for a function of a model: one in C serves any number of tangents
 
     @classmethod
     def of(cls, function: Callable[..., Any]) -> Self:
@@ -102,13 +96,10 @@ class Made:
 
 @dataclass
 class Translator:
-    """The C functions that were asked for and all those that they call.
+    """The C functions that were asked for and all those that they call."""
 
-    Attributes: prefix: of their names.  texts: in an order in which each comes after what it calls.
-    """
-
-    prefix: str
-    texts: list[str] = field(default_factory=list)
+    prefix: str  # of their names
+    texts: list[str] = field(default_factory=list)  # in an order in which each comes after what it calls
     _made: dict[tuple[Hashable, ...], Made] = field(default_factory=dict)
     _routines: dict[Any, Routine] = field(default_factory=dict)
     _names: Counter[str] = field(default_factory=Counter)

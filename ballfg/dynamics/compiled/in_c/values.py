@@ -26,14 +26,11 @@ class Constant:
 
 @dataclass(frozen=True)
 class Scalar:
-    """A C expression without effects.
+    """A C expression without effects."""
 
-    Attributes: text: without brackets around it.  kind: its type.  rank: of its operator; more binds less.
-    """
-
-    text: str
-    kind: str
-    rank: int = ATOM
+    text: str  # without brackets around it
+    kind: str  # its type
+    rank: int = ATOM  # of its operator; more binds less
 
 
 @dataclass(frozen=True)

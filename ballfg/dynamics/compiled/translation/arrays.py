@@ -23,17 +23,12 @@ SMALL: Final = 12  # Largest number of entries in an array that is split into nu
 
 @dataclass(frozen=True)
 class View:
-    """An array: where its numbers lie, in a block or among the weights.
+    """An array: where its numbers lie, in a block or among the weights."""
 
-    Attributes:
-        block: its number; None for an array among the weights.  shape: of the array.
-        strides: how many numbers further the next entry along each dimension lies.  offset: of the first number.
-    """
-
-    block: int | None
-    shape: tuple[int, ...]
-    strides: tuple[int, ...]
-    offset: int = 0
+    block: int | None  # its number; None for an array among the weights
+    shape: tuple[int, ...]  # of the array
+    strides: tuple[int, ...]  # how many numbers further the next entry along each dimension lies
+    offset: int = 0  # of the first number
 
     @classmethod
     def whole(cls, block: int | None, shape: Sequence[int], offset: int = 0) -> View:

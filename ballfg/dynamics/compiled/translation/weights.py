@@ -18,16 +18,11 @@ IDLE: Final = frozenset({"memory_format", "pin_memory", "device", "layout"})
 
 @dataclass(frozen=True)
 class Known:
-    """A tensor that does not depend on the vectors of a function.
+    """A tensor that does not depend on the vectors of a function."""
 
-    Attributes:
-        node: where it stands in the graph.  example: its value for the tables that were traced.
-        varies: whether other tables give other values.
-    """
-
-    node: Node
-    example: Any
-    varies: bool
+    node: Node  # where it stands in the graph
+    example: Any  # its value for the tables that were traced
+    varies: bool  # whether other tables give other values
 
 
 @dataclass
