@@ -23,17 +23,13 @@ SAME_EVENT = 0.03  # s. Two events of a kind that lie closer are the same.
 
 @dataclass(frozen=True, order=True)
 class Kept:
-    """A sample of a ball.
+    """A sample of a ball."""
 
-    Attributes:
-        time: s.  position: (3,) m.  sigma: (3,) m, or None.
-        by_hit: True if the sample was taken as one after a hit: it was off the ball's path.
-    """
-
-    time: float
-    position: Array = field(compare=False)
-    sigma: Array | None = field(compare=False, default=None)
+    time: float  # s
+    position: Array = field(compare=False)  # (3,) m
+    sigma: Array | None = field(compare=False, default=None)  # (3,) m, or None
     by_hit: bool = field(compare=False, default=False)
+    """True if the sample was taken as one after a hit: it was off the ball's path."""
 
 
 @dataclass(frozen=True)

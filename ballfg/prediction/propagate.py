@@ -64,17 +64,13 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Found:
-    """The result of a search for an event.
-
-    Attributes:
-        end: `events.NONE`, `FOUND`, or `HARD` before a step of rest, several bounces, or a bounce at a table's edge.
-        belief: at the end.  gradient: (9 + p,) of the event there.  rate: (9 + p,) 1/s, the state's rate of change.
-    """
+    """The result of a search for an event."""
 
     end: float
-    belief: Belief
-    gradient: Array
-    rate: Array
+    """`events.NONE`, `FOUND`, or `HARD` before a step of rest, several bounces, or a bounce at a table's edge."""
+    belief: Belief  # at the end
+    gradient: Array  # (9 + p,) of the event there
+    rate: Array  # (9 + p,) 1/s, the state's rate of change
 
 
 @dataclass(frozen=True)

@@ -25,26 +25,17 @@ SPLIT_LABEL: Final = "split"  # The label in a written task that says which part
 
 @dataclass(frozen=True)
 class TaskShot:
-    """One track with its reference.
+    """One track with its reference."""
 
-    Attributes:
-        track: stamps, measured positions and labels: all that a model may see.
-        reference: (n, 3) m, the positions that count: the true ones where there is truth, else the measured ones.
-        observed: number of first samples that a model is given.
-        judged: number of first samples for the errors; the rest of the track serves for apexes only.
-        bounces: (b,) s, on the track's clock, in order.
-        apexes: (3, 3) m, the highest points of the flights in `APEXES`; NaN where a flight has none inside the track.
-        apex_times: (3,) s; NaN likewise.  states: (n, 9) the true states; None for measured tracks.
-    """
-
-    track: Track
-    reference: Array
-    observed: int
-    judged: int
-    bounces: Array
+    track: Track  # stamps, measured positions and labels: all that a model may see
+    reference: Array  # (n, 3) m, the positions that count: the true ones where there is truth, else the measured ones
+    observed: int  # number of first samples that a model is given
+    judged: int  # number of first samples for the errors; the rest of the track serves for apexes only
+    bounces: Array  # (b,) s, on the track's clock, in order
     apexes: Array
-    apex_times: Array
-    states: Array | None = None
+    """(3, 3) m, the highest points of the flights in `APEXES`; NaN where a flight has none inside the track."""
+    apex_times: Array  # (3,) s; NaN likewise
+    states: Array | None = None  # (n, 9) the true states; None for measured tracks
 
     @property
     def seen(self) -> Track:
@@ -84,19 +75,14 @@ class Task:
 
 @dataclass(frozen=True)
 class PathScore:
-    """The errors of one predicted path.
-
-    Attributes:
-        track: m^2, of the squared distances over all judged samples (None if some were not predicted); their number.
-        rest: the same over the judged samples after the observed ones.
-        apex: m, distance between predicted and reference apex by flight (`APEXES`); None where either is missing.
-        apex_ahead: True if the reference apex lies after the observed part.
-    """
+    """The errors of one predicted path."""
 
     track: tuple[float | None, int]
-    rest: tuple[float | None, int]
+    """m^2, of the squared distances over all judged samples (None if some were not predicted); their number."""
+    rest: tuple[float | None, int]  # the same over the judged samples after the observed ones
     apex: tuple[float | None, float | None, float | None]
-    apex_ahead: tuple[bool, bool, bool]
+    """m, distance between predicted and reference apex by flight (`APEXES`); None where either is missing."""
+    apex_ahead: tuple[bool, bool, bool]  # True if the reference apex lies after the observed part
 
     @property
     def track_rmse(self) -> float:

@@ -19,27 +19,18 @@ NEW_INFORMATION = 0.05  # Least share by which informative data narrow the prior
 
 @dataclass(frozen=True)
 class Comparison:
-    """Scores of those judging tracks that could be judged both before and after.
-
-    Attributes:
-        with_spread: with the calibrated model, each track's prior as wide as the population.
-        with_noise: with the noise besides that the fitted tracks show.
-        better: number of tracks whose RMSE fell.
-        pairs: (n, 2) m, RMSE before and after of each track.
-        failed: number of tracks that could not be judged each time.
-        written: (n,) m, RMSE of each track with the model that is written, with its population and noise.
-        density: as of `Gain`; None where the errors alone decide.
-    """
+    """Scores of those judging tracks that could be judged both before and after."""
 
     before: Summary | None
     after: Summary | None
-    with_spread: Summary | None
-    with_noise: Summary | None
-    better: int
-    pairs: np.ndarray
-    failed: int
+    with_spread: Summary | None  # with the calibrated model, each track's prior as wide as the population
+    with_noise: Summary | None  # with the noise besides that the fitted tracks show
+    better: int  # number of tracks whose RMSE fell
+    pairs: np.ndarray  # (n, 2) m, RMSE before and after of each track
+    failed: int  # number of tracks that could not be judged each time
     written: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    density: tuple[float, float] | None = None
+    """(n,) m, RMSE of each track with the model that is written, with its population and noise."""
+    density: tuple[float, float] | None = None  # as of `Gain`; None where the errors alone decide
 
     @property
     def gain(self) -> Gain | None:

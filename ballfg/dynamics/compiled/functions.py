@@ -35,21 +35,15 @@ COMPARED: Final = 4  # Number of random states at which both are computed
 
 @dataclass(frozen=True)
 class Function:
-    """A compiled function of a state and some coefficients.
-
-    Attributes:
-        compute: `compute(x, c, w, xt, ct, y, yt)`: n states x (n, 9), their coefficients c (n, p), weights w (k,),
-            tangents xt (n, 9, d) and ct (n, p, d); writes the results y (n, m) and their tangents yt (n, m, d).
-        names: of the p coefficients that the function uses, as in `model.named_parameters()`.  size: m.
-        weigh: computes the weights from a model's tables; None if there are none.
-        source: of `compute`; empty where torch computes.
-    """
+    """A compiled function of a state and some coefficients."""
 
     compute: Code
-    names: tuple[str, ...]
-    size: int
-    weigh: Recipe | None = None
-    source: str = ""
+    """`compute(x, c, w, xt, ct, y, yt)`: n states x (n, 9), their coefficients c (n, p), weights w (k,), tangents xt
+    (n, 9, d) and ct (n, p, d); writes the results y (n, m) and their tangents yt (n, m, d)."""
+    names: tuple[str, ...]  # of the p coefficients that the function uses, as in `model.named_parameters()`
+    size: int  # m
+    weigh: Recipe | None = None  # computes the weights from a model's tables; None if there are none
+    source: str = ""  # of `compute`; empty where torch computes
 
 
 @dataclass(frozen=True)

@@ -81,22 +81,16 @@ def angular_acceleration(frame: FlightFrame, coefficients: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class ContactFrame:
-    """Velocity and spin of a ball at a horizontal surface, taken apart, in units of `CONTACT_SCALE`.
-
-    Attributes:
-        features: (..., 6) invariants in (-1, 1): lengths of slip, of v_xy across the slip, and of radius w_z, then
-            v_xy along the slip, v_z, and `twist` times `turn`, each squashed by x / sqrt(1 + x^2).
-        direction: (..., 2) of the slip, shorter than one where there is little.  velocity: (..., 2) v_xy.
-        side: (..., 2) `twist` z x direction.  turn: (..., 1) z . (direction x v_xy): a pseudoscalar.
-        twist: (..., 1) radius times w_z: a pseudoscalar.
-    """
+    """Velocity and spin of a ball at a horizontal surface, taken apart, in units of `CONTACT_SCALE`."""
 
     features: Tensor
-    direction: Tensor
-    velocity: Tensor
-    side: Tensor
-    turn: Tensor
-    twist: Tensor
+    """(..., 6) invariants in (-1, 1): lengths of slip, of v_xy across the slip, and of radius w_z, then v_xy along the
+    slip, v_z, and `twist` times `turn`, each squashed by x / sqrt(1 + x^2)."""
+    direction: Tensor  # (..., 2) of the slip, shorter than one where there is little
+    velocity: Tensor  # (..., 2) v_xy
+    side: Tensor  # (..., 2) `twist` z x direction
+    turn: Tensor  # (..., 1) z . (direction x v_xy): a pseudoscalar
+    twist: Tensor  # (..., 1) radius times w_z: a pseudoscalar
 
 
 def contact_frame(state: Tensor, radius: float) -> ContactFrame:

@@ -35,19 +35,13 @@ class Scalar:
 
 @dataclass(frozen=True)
 class Array:
-    """Numbers that lie one behind another.
+    """Numbers that lie one behind another."""
 
-    Attributes:
-        pointer: C expression.  shape: a length is a number, the name of an int of the function, or None, which nobody
-            knows; only the first may be.
-        root: name of the storage, to tell which arguments a function writes to.
-        fixed: true for a table of the whole text, which functions read without an argument.
-    """
-
-    pointer: str
+    pointer: str  # C expression
     shape: tuple[int | str | None, ...]
-    root: str
-    fixed: bool = False
+    """A length is a number, the name of an int of the function, or None, which nobody knows; only the first may be."""
+    root: str  # name of the storage, to tell which arguments a function writes to
+    fixed: bool = False  # true for a table of the whole text, which functions read without an argument
 
     @property
     def size(self) -> int:

@@ -143,17 +143,13 @@ def operands_of(making: Making) -> list[View]:
 
 @dataclass
 class Arrays:
-    """The blocks of a program.
+    """The blocks of a program."""
 
-    Attributes:
-        program: that reads them.  makings: how each is made.  sizes: of each.
-        asked: places of a block that are read, where their derivatives run backward.
-    """
-
-    program: Program
-    makings: list[Making] = field(default_factory=list)
-    sizes: list[int] = field(default_factory=list)
+    program: Program  # that reads them
+    makings: list[Making] = field(default_factory=list)  # how each is made
+    sizes: list[int] = field(default_factory=list)  # of each
     asked: dict[int, list[int]] = field(default_factory=dict)
+    """Places of a block that are read, where their derivatives run backward."""
 
     def make(self, making: Making, shape: Sequence[int]) -> View:
         """A new block of a shape."""
