@@ -36,11 +36,9 @@ class SightedDataset(TrackFolder):
     Raises: ValueError: cameras with numbers that no lens has.
     """
 
-    rough: Final = True
-    """The positions of the tracks are made from the sightings."""
+    rough: Final = True  # The positions of the tracks are made from the sightings
 
-    has_sigmas: Final = False
-    """The errors of these positions are not stated."""
+    has_sigmas: Final = False  # The errors of these positions are not stated
 
     def __init__(
         self,
