@@ -33,18 +33,13 @@ _UPWARD_GRAVITY: Final = np.array([0.0, 0.0, STANDARD_GRAVITY])
 
 @dataclass(frozen=True)
 class TableExtent:
-    """A table's ends, as far as the tracks show them.
-
-    Attributes:
-        sides: (x_low, x_high, y_low, y_high) m; infinite if no ball fell beyond the side.
-        sigmas: m, of each side; 0 where it is infinite.  bounces: number of bounces on the table.
-        falls: number of balls that fell past it.
-    """
+    """A table's ends, as far as the tracks show them."""
 
     sides: tuple[float, float, float, float]
-    sigmas: tuple[float, float, float, float]
-    bounces: int
-    falls: int
+    """(x_low, x_high, y_low, y_high) m; infinite if no ball fell beyond the side."""
+    sigmas: tuple[float, float, float, float]  # m, of each side; 0 where it is infinite
+    bounces: int  # number of bounces on the table
+    falls: int  # number of balls that fell past it
 
     def __str__(self) -> str:
         ends = [
