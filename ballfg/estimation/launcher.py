@@ -20,13 +20,18 @@ FIRST_SAMPLES = 10  # Number of samples whose mean direction of flight is the la
 
 @dataclass(frozen=True)
 class SpinLabel:
-    """A spin known before the flight, from a label or from the population of shots."""
+    """A spin known before the flight, from a label or from the population of shots.
 
-    spin: NDArray[np.float64]  # (3,) rad/s
-    sigma: float | NDArray[np.float64]  # rad/s, standard deviation per axis, one number or (3,)
+    Attributes:
+        spin: (3,) rad/s.  sigma: rad/s, standard deviation per axis, one number or (3,).
+        axes: (3, 3), one unit vector a row, along which sigma counts.
+        measured: True if a label gives it; False if the population does.
+    """
+
+    spin: NDArray[np.float64]
+    sigma: float | NDArray[np.float64]
     axes: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
-    """(3, 3), one unit vector a row, along which sigma counts."""
-    measured: bool = True  # True if a label gives it; False if the population does
+    measured: bool = True
 
     @property
     def sigmas(self) -> NDArray[np.float64]:
@@ -43,13 +48,16 @@ class SpinLabel:
 class Launcher:
     """Spin from the labels of a track.
 
+    Attributes:
+        embedding: from the settings to a spin.  sigma: rad/s, standard deviation per axis of that spin.
+        defaults: labels for tracks that lack them, for instance `group` for a dataset that is one group.
+
     Raises: ValueError: a sigma that is not positive and finite.
     """
 
-    embedding: SpinEmbedding  # from the settings to a spin
-    sigma: float  # rad/s, standard deviation per axis of that spin
+    embedding: SpinEmbedding
+    sigma: float
     defaults: Mapping[str, str] = field(default_factory=dict)
-    """Labels for tracks that lack them, for instance `group` for a dataset that is one group."""
 
     def __post_init__(self) -> None:
         check_number("sigma", self.sigma, "rad/s", above=0.0)

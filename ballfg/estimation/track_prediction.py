@@ -37,20 +37,30 @@ Observed: TypeAlias = float | Callable[[Track], float]
 
 @dataclass(frozen=True, eq=False)
 class TrackPrediction:
-    """Predicted positions of one track, with the model's measurement effects, at recorded stamps."""
+    """Predicted positions of one track, with the model's measurement effects, at recorded stamps.
 
-    name: str  # of the track
-    times: Array  # (k,) s, the stamps after the observed part; none if the track ends before
-    positions: Array  # (k, 3) m
+    Attributes:
+        name: of the track.
+        times: (k,) s, the stamps after the observed part; none if the track ends before.
+        positions: (k, 3) m.
+        sigmas: (k, 3) m, of a measured position: state and measurement noise. Measurement effects are
+            left out of them, such as a stretch of lengths, or a lag that multiplies the velocity's sigma.
+        measured: (k, 3) m, the track's positions at those stamps.
+        estimate: from the observed part.
+        conformal: the scales of the sigmas; None for the model's own sigmas.
+        covariances: (k, 3, 3) m^2, of the positions, without measurement noise.
+        outside: (k,) share from 0, where a network was trained, to 1 far from there; None for other models.
+    """
+
+    name: str
+    times: Array
+    positions: Array
     sigmas: Array
-    """(k, 3) m, of a measured position: state and measurement noise. Measurement effects are left out of them, such as
-    a stretch of lengths, or a lag that multiplies the velocity's sigma."""
-    measured: Array  # (k, 3) m, the track's positions at those stamps
-    estimate: Estimate  # from the observed part
-    conformal: ConformalScales | None = None  # the scales of the sigmas; None for the model's own sigmas
+    measured: Array
+    estimate: Estimate
+    conformal: ConformalScales | None = None
     outside: Array | None = None
-    """(k,) share from 0, where a network was trained, to 1 far from there; None for other models."""
-    covariances: Array | None = None  # (k, 3, 3) m^2, of the positions, without measurement noise
+    covariances: Array | None = None
 
     def __repr__(self) -> str:
         return f"TrackPrediction({self.name!r}, {len(self.times)} positions, {self.status.name.lower()})"
