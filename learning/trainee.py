@@ -48,10 +48,14 @@ class BatchLoss:
 
 @dataclass(frozen=True)
 class PredictedShot:
-    """The predicted and measured positions (k, 3) m of a track."""
+    """The predicted and measured positions (k, 3) m of a track.
+
+    Attributes:
+        times: (k,) s since the last observed sample; those of observed samples are not positive.
+    """
 
     name: str
-    times: Array  # (k,) s since the last observed sample; those of observed samples are not positive
+    times: Array
     measured: Array
     predicted: Array
 

@@ -22,15 +22,21 @@ ALIASES: Final[Mapping[str, str]] = {"soccer": "football", "golf_ball": "golf", 
 
 @dataclass(frozen=True)
 class KnownBall:
-    """A ball whose nominal model is the file of its name in `ballfg/dynamics`."""
+    """A ball whose nominal model is the file of its name in `ballfg/dynamics`.
 
-    ball: Ball  # radius m and mass kg, the middle of what the rules allow
-    source: str  # of radius and mass
+    Attributes:
+        ball: radius m and mass kg, the middle of what the rules allow.
+        source: of radius and mass.
+        spreads: prior standard deviations as shares of the values, by effect; the effect's own where it is not named.
+        inertia_factor: moment of inertia over m R^2, dimensionless.
+        court: (length, width) m of table, court or pitch; None where the rules have no rectangle.
+    """
+
+    ball: Ball
+    source: str
     spreads: Mapping[str, float] = field(default_factory=dict)
-    """Prior standard deviations as shares of the values, by effect; the effect's own where it is not named."""
-    inertia_factor: float = THIN_SHELL  # moment of inertia over m R^2, dimensionless
+    inertia_factor: float = THIN_SHELL
     court: tuple[float, float] | None = None
-    """(length, width) m of table, court or pitch; None where the rules have no rectangle."""
 
 
 def _read_ball(path: Traversable) -> tuple[KnownBall, dict[str, Any]]:

@@ -24,12 +24,16 @@ class SpinGroup:
 
     Across is z x forward: topspin turns about it.
 
+    Attributes:
+        mean: (3,) rad/s.  sigma: (3,) rad/s, standard deviations of a new shot about the mean.
+        tracks: number of tracks behind both, the weight in the mixture.
+
     Raises: ValueError: a number that is not finite, a sigma that is not positive, no track. TypeError: no number.
     """
 
-    mean: tuple[float, float, float]  # (3,) rad/s
-    sigma: tuple[float, float, float]  # (3,) rad/s, standard deviations of a new shot about the mean
-    tracks: int  # number of tracks behind both, the weight in the mixture
+    mean: tuple[float, float, float]
+    sigma: tuple[float, float, float]
+    tracks: int
 
     def __post_init__(self) -> None:
         for name, values, above in (("mean", self.mean, None), ("sigma", self.sigma, 0.0)):
@@ -45,11 +49,15 @@ class SpinGroup:
 class SpinPopulation:
     """The spins of groups of shots.
 
+    Attributes:
+        by: the label that names a track's group; tracks without it belong to no known group.
+        groups: by the label's text.
+
     Raises: ValueError: without a group.
     """
 
-    by: str  # the label that names a track's group; tracks without it belong to no known group
-    groups: Mapping[str, SpinGroup]  # by the label's text
+    by: str
+    groups: Mapping[str, SpinGroup]
 
     def __post_init__(self) -> None:
         if not self.groups:

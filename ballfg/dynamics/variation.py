@@ -34,18 +34,21 @@ def number_of(name: str) -> int | None:
 class Variation:
     """The differences of one coefficient between tracks.
 
+    Attributes:
+        by: the label that tells tracks apart, or "track" for their place in the recording, which their names tell.
+        values: the coefficient by the label's text; or by the name of the track from which it holds until the next
+            named one. A track with another label, or before the first name, has the model's own value.
+        line: for places in the recording: the coefficient is interpolated linearly over the numbers in the tracks'
+            names, and constant beyond them.
+
     Raises:
         ValueError: if there is no value, one is not finite, or a line lacks numbers in its names.
         TypeError: if a value is no number.
     """
 
-    by: str  # the label that tells tracks apart, or "track" for their place in the recording, which their names tell
+    by: str
     values: Mapping[str, float]
-    """The coefficient by the label's text; or by the name of the track from which it holds until the next named one. A
-    track with another label, or before the first name, has the model's own value."""
     line: bool = False
-    """For places in the recording: the coefficient is interpolated linearly over the numbers in the tracks' names, and
-    constant beyond them."""
 
     def __post_init__(self) -> None:
         if not self.values:

@@ -23,22 +23,32 @@ SAME_EVENT = 0.03  # s. Two events of a kind that lie closer are the same.
 
 @dataclass(frozen=True, order=True)
 class Kept:
-    """A sample of a ball."""
+    """A sample of a ball.
 
-    time: float  # s
-    position: Array = field(compare=False)  # (3,) m
-    sigma: Array | None = field(compare=False, default=None)  # (3,) m, or None
+    Attributes:
+        time: s.  position: (3,) m.  sigma: (3,) m, or None.
+        by_hit: True if the sample was taken as one after a hit: it was off the ball's path.
+    """
+
+    time: float
+    position: Array = field(compare=False)
+    sigma: Array | None = field(compare=False, default=None)
     by_hit: bool = field(compare=False, default=False)
-    """True if the sample was taken as one after a hit: it was off the ball's path."""
 
 
 @dataclass(frozen=True)
 class BallEvent:
-    """An event of a ball."""
+    """An event of a ball.
 
-    kind: str  # `bounce`, `hit`, `rest` (the ball came to lie) or `gap` (too long for a link)
-    time: float  # s; of a bounce its own, of a hit the middle of its interval, of the others the first sample after it
-    height: float | None = None  # m, of the surface; None without one
+    Attributes:
+        kind: `bounce`, `hit`, `rest` (the ball came to lie) or `gap` (too long for a link).
+        time: s; of a bounce its own, of a hit the middle of its interval, of the others the first sample after it.
+        height: m, of the surface; None without one.
+    """
+
+    kind: str
+    time: float
+    height: float | None = None
 
 
 class Ball:

@@ -57,18 +57,27 @@ class BallUpdate:
 
 @dataclass
 class Counts:
-    """Counts of a tracker's input."""
+    """Counts of a tracker's input.
 
-    positions: int = 0  # received
-    balls: int = 0  # begun
-    lost: int = 0  # of these
-    late: int = 0  # positions inserted before others
-    old: int = 0  # positions older than the lag, dropped
-    repeated: int = 0  # positions at a stamp that the ball had already, dropped
-    malformed: int = 0  # positions that are not finite or not in m, dropped
-    stray: int = 0  # stamps that the next one disproved
-    restarts: int = 0  # of the sender's clock
-    failed: int = 0  # samples that the estimator could not explain
+    Attributes:
+        positions: received.  balls: begun.  lost: of these.
+        late: positions inserted before others.  old: positions older than the lag, dropped.
+        repeated: positions at a stamp that the ball had already, dropped.
+        malformed: positions that are not finite or not in m, dropped.
+        stray: stamps that the next one disproved.  restarts: of the sender's clock.
+        failed: samples that the estimator could not explain.
+    """
+
+    positions: int = 0
+    balls: int = 0
+    lost: int = 0
+    late: int = 0
+    old: int = 0
+    repeated: int = 0
+    malformed: int = 0
+    stray: int = 0
+    restarts: int = 0
+    failed: int = 0
 
 
 @dataclass

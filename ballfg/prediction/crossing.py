@@ -40,12 +40,17 @@ JUST_NOW = 1e-9  # s. Least delay of a new event after the time from which event
 
 @dataclass(frozen=True, eq=False)
 class Crossing:
-    """One event of one ball."""
+    """One event of one ball.
 
-    time: float  # s, on the ball's clock
-    time_sigma: float  # s
-    state: Array  # (9,) at the event
-    covariance: Array  # (9, 9) of the state at the event, at the event's own uncertain time
+    Attributes:
+        time: s, on the ball's clock.  time_sigma: s.  state: (9,) at the event.
+        covariance: (9, 9) of the state at the event, at the event's own uncertain time.
+    """
+
+    time: float
+    time_sigma: float
+    state: Array
+    covariance: Array
 
     def later(self, seconds: float) -> "Crossing":
         """The same event on a clock that is ahead by some seconds."""

@@ -41,11 +41,16 @@ AT_ONCE = 64
 
 @dataclass(frozen=True)
 class Prediction:
-    """Future states. Near a contact they include the balls that have bounced and those that have not."""
+    """Future states. Near a contact they include the balls that have bounced and those that have not.
 
-    times: Array  # (n, k) s, on each track's clock
-    states: Array  # (n, k, 9) position m, velocity m/s, spin rad/s
-    covariances: Array  # (n, k, 9, 9) of the states, in the products of those units; without measurement noise
+    Attributes:
+        times: (n, k) s, on each track's clock.  states: (n, k, 9) position m, velocity m/s, spin rad/s.
+        covariances: (n, k, 9, 9) of the states, in the products of those units; without measurement noise.
+    """
+
+    times: Array
+    states: Array
+    covariances: Array
 
     def plot(self, ball: int = 0) -> Figure:
         """A picture of x, y and z of one ball over time, each with the band that holds 90 %.
@@ -64,13 +69,17 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Found:
-    """The result of a search for an event."""
+    """The result of a search for an event.
+
+    Attributes:
+        end: `events.NONE`, `FOUND`, or `HARD` before a step of rest, several bounces, or a bounce at a table's edge.
+        belief: at the end.  gradient: (9 + p,) of the event there.  rate: (9 + p,) 1/s, the state's rate of change.
+    """
 
     end: float
-    """`events.NONE`, `FOUND`, or `HARD` before a step of rest, several bounces, or a bounce at a table's edge."""
-    belief: Belief  # at the end
-    gradient: Array  # (9 + p,) of the event there
-    rate: Array  # (9 + p,) 1/s, the state's rate of change
+    belief: Belief
+    gradient: Array
+    rate: Array
 
 
 @dataclass(frozen=True)

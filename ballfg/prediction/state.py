@@ -19,11 +19,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class World:
-    """The model, surfaces and noise for predictions from a state."""
+    """The model, surfaces and noise for predictions from a state.
 
-    model: BallModel  # of the ball
-    surfaces: Surfaces  # table and floor
-    process: ProcessNoise = field(default_factory=ProcessNoise)  # noise of the motion
+    Attributes: model: of the ball.  surfaces: table and floor.  process: noise of the motion.
+    """
+
+    model: BallModel
+    surfaces: Surfaces
+    process: ProcessNoise = field(default_factory=ProcessNoise)
 
 
 @dataclass(frozen=True, eq=False)

@@ -71,22 +71,30 @@ class DatasetInfo:
     Raises: ValueError, TypeError: a field of a wrong type or range; the message names it.
     """
 
-    name: str  # One line of text
+    name: str
+    """One line of text."""
     table_height: float | None
     """z of the table's surface, m; None where balls meet no surface (`table_height: none` in the file)."""
-    ball: Ball  # Radius (m) and mass (kg)
-    rate: float | None = None  # Nominal sampling rate, Hz. Computations use the stamps of the tracks
-    position_noise: float | None = None  # Standard deviation of one measured coordinate, m
-    spin_noise: float | None = None  # Standard deviation of one component of the spin labels, rad/s
-    source: str | None = None  # Origin of the data
-    licence: str | None = None  # Terms of use
+    ball: Ball
+    """Radius (m) and mass (kg)."""
+    rate: float | None = None
+    """Nominal sampling rate, Hz. Computations use the stamps of the tracks."""
+    position_noise: float | None = None
+    """Standard deviation of one measured coordinate, m."""
+    spin_noise: float | None = None
+    """Standard deviation of one component of the spin labels, rad/s."""
+    source: str | None = None
+    """Origin of the data."""
+    licence: str | None = None
+    """Terms of use."""
     table_extent: tuple[float, float, float, float] | None = None
     """(x_low, x_high, y_low, y_high) m, the table's ends; None if unknown."""
     noise: TrackNoise | None = None
     """All known noise of the tracks, as from `ballfg noise`; it takes precedence over the two numbers above."""
     imported: Mapping[str, Any] | None = None
     """Origin and conversion of the tracks, as `ballfg import` records them in the section `import`; for people."""
-    doubts: tuple[str, ...] = ()  # What is not sure about the tracks, one line of text each; commands repeat it
+    doubts: tuple[str, ...] = ()
+    """What is not sure about the tracks, one line of text each; commands repeat it."""
 
     def __post_init__(self) -> None:
         check_name("name", self.name)

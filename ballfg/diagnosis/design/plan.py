@@ -113,21 +113,33 @@ MOST_SHOTS = 1000
 
 @dataclass(frozen=True)
 class ShotPlan:
-    """The next shots, in order, and their gain."""
+    """The next shots, in order, and their gain.
 
-    settings: Array  # (k, s) of the launcher, in the units of the labels
-    setting_names: tuple[str, ...]  # of the s settings
+    Attributes:
+        settings: (k, s) of the launcher, in the units of the labels.
+        setting_names: of the s settings.
+        sides: coefficients to separate or shrink, by effect and coefficient, for instance (("wind.x",), ("drag.k",)).
+        names: of the p coefficients of all sides, by effect and coefficient.
+        units: of the coefficients.
+        sigmas: (k + 1, p) in `units`, standard deviation of each, all else unknown, before the shots and after each.
+        error: (k + 1,) dimensionless, mean error bar of the sides over the priors of the fit.
+        random: (k + 1,) dimensionless, the same after as many random shots.
+        as_random: number of random shots with the same gain as all k.
+        candidates: number of usable candidates.
+        remarks: sentences on unusable candidates and on the accuracy of the launcher's map.
+    """
+
+    settings: Array
+    setting_names: tuple[str, ...]
     sides: tuple[tuple[str, ...], ...]
-    """Coefficients to separate or shrink, by effect and coefficient, for instance (("wind.x",), ("drag.k",))."""
-    names: tuple[str, ...]  # of the p coefficients of all sides, by effect and coefficient
-    units: tuple[str, ...]  # of the coefficients
+    names: tuple[str, ...]
+    units: tuple[str, ...]
     sigmas: Array
-    """(k + 1, p) in `units`, standard deviation of each, all else unknown, before the shots and after each."""
-    error: Array  # (k + 1,) dimensionless, mean error bar of the sides over the priors of the fit
-    random: Array  # (k + 1,) dimensionless, the same after as many random shots
-    as_random: float  # number of random shots with the same gain as all k
-    candidates: int  # number of usable candidates
-    remarks: tuple[str, ...]  # sentences on unusable candidates and on the accuracy of the launcher's map
+    error: Array
+    random: Array
+    as_random: float
+    candidates: int
+    remarks: tuple[str, ...]
 
 
 def design_shots(

@@ -36,10 +36,15 @@ HANDS: Final = 30.0  # nats, by which hands must explain a recording better than
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """The labels of a track of n samples, and its bounces."""
+    """The labels of a track of n samples, and its bounces.
 
-    values: NDArray[np.int8]  # (n,) values of `Label`
-    bounces: NDArray[np.int64]  # (b,) intervals in which a flying ball bounced on something
+    Attributes:
+        values: (n,) values of `Label`.
+        bounces: (b,) intervals in which a flying ball bounced on something.
+    """
+
+    values: NDArray[np.int8]
+    bounces: NDArray[np.int64]
 
     def estimable(self, heights: Array, levels: Sequence[float]) -> NDArray[np.bool_]:
         """(n,) True for samples of flight, and of rolling or rest on known surfaces: estimators explain them.

@@ -16,14 +16,20 @@ LEAST_INFORMATION = 1e-6  # Least share of the posterior's information that the 
 
 @dataclass(frozen=True)
 class FilterInnovation:
-    """One factor on a filter's predicted state, linearised there, as the input of its update."""
+    """One factor on a filter's predicted state, linearised there, as the input of its update.
 
-    residual: Array  # (r,) whitened
-    H: Array  # (r, d) whitened, per unit of the filter's state
+    Attributes:
+        residual: (r,) whitened.  H: (r, d) whitened, per unit of the filter's state.
+        R: (r, r) noise of the whitened residual: one, divided by the weight that a robust loss gives the innovation.
+        spread: (r, r) H P H^T, the covariance that the prediction adds to it.
+        whitened: (r,) the innovation divided by the root of its covariance before the loss, H P H^T + 1.
+    """
+
+    residual: Array
+    H: Array
     R: Array
-    """(r, r) noise of the whitened residual: one, divided by the weight that a robust loss gives the innovation."""
-    spread: Array  # (r, r) H P H^T, the covariance that the prediction adds to it
-    whitened: Array  # (r,) the innovation divided by the root of its covariance before the loss, H P H^T + 1
+    spread: Array
+    whitened: Array
 
     @classmethod
     def of(cls, factor: FactorBatch, mean: Array, covariance: Array, biases: int = 0) -> "FilterInnovation":

@@ -49,17 +49,22 @@ class Unknowns:
 
 @dataclass(frozen=True)
 class Context:
-    """The inputs that an observation needs to make its factors."""
+    """The inputs that an observation needs to make its factors.
 
-    track: Track  # of the observation
-    model: BallModel  # the ball
-    settings: Settings  # noise, losses and priors
+    Attributes:
+        track: of the observation.  model: the ball.  settings: noise, losses and priors.
+        sigma: (n, 3) m, standard deviation of the white error of each position of the track, including samples of bad
+            quality.
+        velocities: (n, 3) m/s, rough, of the ball; None if stamps are exact.
+        columns: place of each unknown, by name, among the coefficients that all factors of the track share.
+    """
+
+    track: Track
+    model: BallModel
+    settings: Settings
     sigma: Array
-    """(n, 3) m, standard deviation of the white error of each position of the track, including samples of bad
-    quality."""
     columns: Mapping[str, int] = field(default_factory=dict)
-    """Place of each unknown, by name, among the coefficients that all factors of the track share."""
-    velocities: Array | None = None  # (n, 3) m/s, rough, of the ball; None if stamps are exact
+    velocities: Array | None = None
 
 
 class Observation(ABC):
