@@ -130,10 +130,7 @@ def _root(context: typer.Context) -> None:
 
 
 @_benchmark
-def estimators(
-    run: Run,
-    data: Data = None,
-) -> None:
+def estimators(run: Run, data: Data = None) -> None:
     """Comparison of sliding window, EKF, RTS, online estimator and smoother on the same tracks.
 
     Without --data: synthetic tracks with known truth, by the paper's protocol and by a fair one. With --data: each
@@ -154,11 +151,7 @@ def estimators(
 
 
 @_benchmark
-def cameras(
-    run: Run,
-    data: Data = None,
-    view: Views = None,
-) -> None:
+def cameras(run: Run, data: Data = None, view: Views = None) -> None:
     """Tracking from rendered videos of three cameras: points, velocities and clocks against the truth.
 
     With --data and --view: states from the detections of one camera at a time, against the measured tracks; with two
@@ -261,11 +254,7 @@ def loop(
 
 
 @_benchmark
-def planted(
-    run: Run,
-    data: Planted = None,
-    change: Changes = None,
-) -> None:
+def planted(run: Run, data: Planted = None, change: Changes = None) -> None:
     """Test of the diagnosis on measured tracks: effects planted in them that it names and measures.
 
     Each set is diagnosed as it was, and as another instrument, tracker or air would have made it: frame turned, clock
