@@ -1,46 +1,52 @@
-from . import benchmarks as benchmarks
-from . import diagnosis as diagnosis
-from . import dynamics as dynamics
-from . import estimation as estimation
-from . import factors as factors
-from . import importing as importing
-from . import learning as learning
-from . import live as live
-from . import prediction as prediction
-from . import simulation as simulation
-from . import tracks as tracks
-from . import vision as vision
+from . import (
+    benchmarks as benchmarks,
+    diagnosis as diagnosis,
+    dynamics as dynamics,
+    estimation as estimation,
+    factors as factors,
+    importing as importing,
+    learning as learning,
+    live as live,
+    prediction as prediction,
+    simulation as simulation,
+    tracks as tracks,
+    vision as vision,
+)
 from .diagnosis import Diagnosis as Diagnosis
-from .dynamics import AnalyticModel as AnalyticModel
-from .dynamics import Surfaces as Surfaces
-from .dynamics import load_model as load_model
-from .dynamics import nominal_model as nominal_model
-from .dynamics import register as register
-from .dynamics import save_model as save_model
-from .estimation import Estimate as Estimate
-from .estimation import ExtendedKalmanFilter as ExtendedKalmanFilter
-from .estimation import Online as Online
-from .estimation import RadarSpeed as RadarSpeed
-from .estimation import Settings as Settings
-from .estimation import Smoother as Smoother
-from .estimation import SpinReading as SpinReading
-from .estimation import Status as Status
-from .estimation import TrackGraph as TrackGraph
-from .estimation import read as read
-from .estimation import register_estimator as register_estimator
-from .estimation import register_observation as register_observation
-from .front import diagnose as diagnose
-from .front import error_budget as error_budget
-from .front import estimate as estimate
-from .front import flights as flights
-from .front import graph as graph
-from .front import predict as predict
+from .dynamics import (
+    AnalyticModel as AnalyticModel,
+    Surfaces as Surfaces,
+    load_model as load_model,
+    nominal_model as nominal_model,
+    register as register,
+    save_model as save_model,
+)
+from .estimation import (
+    Estimate as Estimate,
+    ExtendedKalmanFilter as ExtendedKalmanFilter,
+    Online as Online,
+    RadarSpeed as RadarSpeed,
+    Settings as Settings,
+    Smoother as Smoother,
+    SpinReading as SpinReading,
+    Status as Status,
+    TrackGraph as TrackGraph,
+    read as read,
+    register_estimator as register_estimator,
+    register_observation as register_observation,
+)
+from .front import (
+    diagnose as diagnose,
+    error_budget as error_budget,
+    estimate as estimate,
+    flights as flights,
+    graph as graph,
+    predict as predict,
+)
 from .importing import import_tracks as import_tracks
 from .live import Tracker as Tracker
 from .prediction import BallState as BallState
 from .simulation import simulate as simulate
-from .tracks import Ball as Ball
-from .tracks import Dataset as Dataset
-from .tracks import Track as Track
+from .tracks import Ball as Ball, Dataset as Dataset, Track as Track
 
 __version__: str

@@ -8,7 +8,7 @@ import difflib
 import itertools
 import math
 import reprlib
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from numbers import Real
 from os import PathLike
 from pathlib import Path
@@ -90,6 +90,13 @@ def listed(names: Collection[object]) -> str:
     first = [short_text(text if is_visible(text) else repr(text)) for text in texts]
     more = len(names) - len(first)
     return (", ".join(first) or "nothing") + (f" and {more} more" if more else "")
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table whose columns begin below one another."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
+    return [line.rstrip() for line in lines]
 
 
 def check_text(label: str, value: object, *, optional: bool = False) -> None:

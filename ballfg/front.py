@@ -120,7 +120,7 @@ def flights(measured: OneTrack | Dataset | Folder, *, model: Model = None) -> li
     """
     data = _opened(measured)
     if isinstance(data, Track):
-        from ballfg.estimation.flights.cut import flights_of
+        from ballfg.estimation.flights.dataset import flights_of
         from ballfg.estimation.segmentation.physics import physics_of
 
         return flights_of(data, physics_of(_model(model, data.dataset)))

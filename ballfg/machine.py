@@ -1,7 +1,5 @@
 """Describes the machine and the installed packages for results and runs; makes Python collect garbage less often."""
 
-from __future__ import annotations
-
 import gc
 import os
 import platform

@@ -1,7 +1,8 @@
 """Shows the progress of long work: a bar on a terminal, plain lines elsewhere, nothing for under two seconds.
 
 `progress` counts items. `doing` names a stage that cannot be counted. While a command runs, `alive` reports every few
-seconds the stage and its duration, unless one of them has just printed something.
+seconds the stage and its duration, unless one of them has just printed something. Doubts and notes on data are printed
+here too.
 """
 
 import os
@@ -75,6 +76,22 @@ def announce(line: str) -> None:
     if _SIGNS.stages:
         _SIGNS.stages[-1].text, _SIGNS.stages[-1].since = line, time.monotonic()
     say(line)
+
+
+def print_doubts(doubts: Iterable[str]) -> None:
+    """Prints what is not sure about the tracks in one line, before any result: further lines push it out of sight."""
+    from ballfg.checks import visible
+
+    if line := "; ".join(visible(doubt) for doubt in doubts):
+        print(f"doubt: {line}", flush=True)
+
+
+def print_notes(notes: Iterable[str]) -> None:
+    """Prints notes for the user on stderr."""
+    from ballfg.checks import visible
+
+    for note in notes:
+        print(f"note: {visible(note)}", file=sys.stderr)
 
 
 @contextmanager

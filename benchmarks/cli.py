@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ballfg.cli.inputs import CORES, Address, Cluster, Jobs, print_notes, workers
+from ballfg.cli.inputs import CORES, Address, Cluster, Jobs, workers
 from ballfg.cli.start import start
+from ballfg.progress import print_notes
 
 if TYPE_CHECKING:
     from ballfg.benchmarks.results import Results
@@ -129,10 +130,7 @@ def _root(context: typer.Context) -> None:
 
 
 @_benchmark
-def estimators(
-    run: Run,
-    data: Data = None,
-) -> None:
+def estimators(run: Run, data: Data = None) -> None:
     """Comparison of sliding window, EKF, RTS, online estimator and smoother on the same tracks.
 
     Without --data: synthetic tracks with known truth, by the paper's protocol and by a fair one. With --data: each
@@ -153,11 +151,7 @@ def estimators(
 
 
 @_benchmark
-def cameras(
-    run: Run,
-    data: Data = None,
-    view: Views = None,
-) -> None:
+def cameras(run: Run, data: Data = None, view: Views = None) -> None:
     """Tracking from rendered videos of three cameras: points, velocities and clocks against the truth.
 
     With --data and --view: states from the detections of one camera at a time, against the measured tracks; with two
@@ -242,8 +236,7 @@ def loop(
     Example: ballfg-bench loop --data data/aimy --out results/loop
     """
     from ballfg.benchmarks.diagnosis.cases import FULL, QUICK
-    from ballfg.benchmarks.diagnosis.reliability import run_reliability
-    from ballfg.benchmarks.diagnosis.suite import run_loop
+    from ballfg.benchmarks.diagnosis.suite import run_loop, run_reliability
 
     if reliability and data:
         raise typer.BadParameter("its sets are simulated. Leave out --data.", param_hint="--reliability")
@@ -261,11 +254,7 @@ def loop(
 
 
 @_benchmark
-def planted(
-    run: Run,
-    data: Planted = None,
-    change: Changes = None,
-) -> None:
+def planted(run: Run, data: Planted = None, change: Changes = None) -> None:
     """Test of the diagnosis on measured tracks: effects planted in them that it names and measures.
 
     Each set is diagnosed as it was, and as another instrument, tracker or air would have made it: frame turned, clock
@@ -315,8 +304,7 @@ def intervals(
 
     Example: ballfg-bench intervals --data data/aimy --data data/ballgun --out results/intervals
     """
-    from ballfg.benchmarks.intervals import suite
-    from ballfg.benchmarks.intervals import trained as networks
+    from ballfg.benchmarks.intervals import suite, trained as networks
 
     if diagnosed and data:
         raise typer.BadParameter("it is for simulated tracks. Leave out --data.", param_hint="--diagnosed")

@@ -7,6 +7,7 @@ from contextlib import suppress
 from typing import Final, TextIO
 
 from ballfg.benchmarks.results import CURVE_MARK, Row
+from ballfg.checks import aligned
 
 RIGHT: Final = {"nees": 9.0, "nees_velocity": 3.0, "nis_median": 2.37, "nis_mean": 3.0}
 """Value of a metric where stated covariances are right: degrees of freedom; of `nis_median` chi-square's median."""
@@ -209,7 +210,7 @@ def print_table(rows: Iterable[Row], stream: TextIO | None = None) -> None:
         if stream.isatty():
             _print_rich(case, columns, lines, stream)
         else:
-            _print_plain(case, columns, lines, stream)
+            print(f"\n{case}", *aligned([columns, *lines]), sep="\n", file=stream)
         for sentence in conclusions(case, of_case):
             print(f"-> {sentence}", file=stream)
         for words in legend(case, of_case):
@@ -236,13 +237,6 @@ def _number(value: float | None) -> str:
     if value is None:
         return "-"
     return f"{value:.0f}" if value == int(value) and abs(value) < 1e6 else f"{value:.3g}"
-
-
-def _print_plain(case: str, columns: list[str], lines: list[list[str]], stream: TextIO) -> None:
-    widths = [max(len(line[i]) for line in [columns, *lines]) for i in range(len(columns))]
-    print(f"\n{case}", file=stream)
-    for line in [columns, *lines]:
-        print("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip(), file=stream)
 
 
 def _print_rich(case: str, columns: list[str], lines: list[list[str]], stream: TextIO) -> None:

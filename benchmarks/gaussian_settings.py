@@ -38,14 +38,10 @@ class StepNoise(ProcessNoise):
     """A diagonal covariance per step, whatever the step's length; only spin keeps its density.
 
     For comparisons on one frame rate only: on dropped frames it would be another model.
-
-    Attributes:
-        step_position: m, standard deviation of each coordinate gathered in one step.
-        step_velocity: m/s, of each velocity component.
     """
 
-    step_position: float = 0.001
-    step_velocity: float = 0.01
+    step_position: float = 0.001  # m, standard deviation of each coordinate gathered in one step
+    step_velocity: float = 0.01  # m/s, of each velocity component
 
     def flight_along_one(self, dt: Array) -> Array:
         """(n, 3, 3) covariance along one axis gathered in one step of flight; dt (n,) s matters to the spin only."""

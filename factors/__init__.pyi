@@ -1,18 +1,14 @@
-from .batch import COEFFICIENTS as COEFFICIENTS
-from .batch import FactorBatch as FactorBatch
-from .batch import Noise as Noise
-from .batch import Rows as Rows
-from .batch import Values as Values
-from .bridge import Bridge as Bridge
-from .bridge import from_gtsam as from_gtsam
-from .bridge import nonlinear_graph as nonlinear_graph
-from .bridge import to_gtsam as to_gtsam
+from .batch import (
+    COEFFICIENTS as COEFFICIENTS,
+    FactorBatch as FactorBatch,
+    Noise as Noise,
+    Rows as Rows,
+    Values as Values,
+)
+from .bridge import Bridge as Bridge, from_gtsam as from_gtsam, nonlinear_graph as nonlinear_graph, to_gtsam as to_gtsam
 from .check import check_factor as check_factor
-from .dynamics import ContactFactors as ContactFactors
-from .dynamics import FlightFactors as FlightFactors
-from .graph import BallGraph as BallGraph
-from .graph import LevenbergMarquardt as LevenbergMarquardt
+from .dynamics import ContactFactors as ContactFactors, FlightFactors as FlightFactors
+from .graph import BallGraph as BallGraph, LevenbergMarquardt as LevenbergMarquardt
 from .noise import ProcessNoise as ProcessNoise
 from .position import PositionFactors as PositionFactors
-from .prior import spin_prior as spin_prior
-from .prior import state_prior as state_prior
+from .prior import spin_prior as spin_prior, state_prior as state_prior

@@ -1,11 +1,12 @@
 from .config.config_file import read_config as read_config
 from .config.training import TrainConfig as TrainConfig
 from .gradient.implicit import ImplicitGradient as ImplicitGradient
-from .registry import TraineeKind as TraineeKind
-from .registry import register_trainee as register_trainee
-from .run.training import build as build
-from .run.training import run_training as run_training
-from .trainee import BatchLoss as BatchLoss
-from .trainee import Prepared as Prepared
-from .trainee import Trainee as Trainee
+from .run.training import build as build, run_training as run_training
+from .trainee import (
+    BatchLoss as BatchLoss,
+    Prepared as Prepared,
+    Trainee as Trainee,
+    TraineeKind as TraineeKind,
+    register_trainee as register_trainee,
+)
 from .training_data import read_training_data as read_training_data

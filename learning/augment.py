@@ -6,8 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-SHIFT = 1.0
-"""m, largest shift along x and along y: the size of a table, so that no place in the room is special."""
+SHIFT = 1.0  # m, largest shift along x and along y: the size of a table, so that no place in the room is special
 
 
 def augmentation(seed: int, epoch: int, track: int) -> tuple[Tensor, Tensor]:

@@ -81,8 +81,7 @@ def _train(config: TrainConfig, folder: Path, resume: bool, typed: str) -> int:
 
     Returns: the exit status.
     """
-    from ballfg.learning.run.launch import launch
-    from ballfg.learning.run.ranks import started_by_launcher
+    from ballfg.learning.run.ranks import launch, started_by_launcher
     from ballfg.learning.run.run_folder import check
 
     jobs = config.jobs or usable_cores()
@@ -102,7 +101,7 @@ def _train_here(config: TrainConfig, folder: Path, resume: bool, typed: str) -> 
 
 def _train_guarded(config: TrainConfig, folder: Path, resume: bool, typed: str) -> int:
     """The work of each process that this command starts. Returns: its exit status; none where it was interrupted."""
-    from ballfg.learning.run.launch import NO_STATUS
+    from ballfg.learning.run.ranks import NO_STATUS
 
     def work() -> int:
         try:

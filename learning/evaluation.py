@@ -16,17 +16,13 @@ from ballfg.estimation.observations.sightings import sightings_of
 from ballfg.estimation.track_prediction import TrackPrediction
 from ballfg.tracks import Track
 
-NINETY = float(ndtri(0.95))
-"""Standard deviations to each side of a central 90 % interval."""
+NINETY = float(ndtri(0.95))  # Standard deviations to each side of a central 90 % interval
 
-OUTLIERS: Final = 0.01
-"""Share of coordinates that a prediction may miss, as after a hit that nobody foresees."""
-WIDER: Final = 10.0
-"""Width of their density, in standard deviations: one missed bounce does not decide a comparison."""
+OUTLIERS: Final = 0.01  # Share of coordinates that a prediction may miss, as after a hit that nobody foresees
+WIDER: Final = 10.0  # Width of their density, in standard deviations: one missed bounce does not decide a comparison
 
 
-JUDGED: Final = (Status.OK, Status.DEPTH_UNCERTAIN)
-"""Statuses of estimates whose predictions count."""
+JUDGED: Final = (Status.OK, Status.DEPTH_UNCERTAIN)  # Statuses of estimates whose predictions count
 
 
 class TrackScore(BaseModel):
@@ -35,12 +31,9 @@ class TrackScore(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     name: str
-    samples: int = Field(ge=1)
-    """Number of predicted samples."""
-    rmse: float = Field(ge=0.0, le=1e9)
-    """m, root of the mean squared distance between predicted and measured positions."""
-    covered: float = Field(ge=0.0, le=1.0)
-    """Share of measured coordinates inside the central 90 % intervals."""
+    samples: int = Field(ge=1)  # Number of predicted samples
+    rmse: float = Field(ge=0.0, le=1e9)  # m, root of the mean squared distance between predicted and measured positions
+    covered: float = Field(ge=0.0, le=1.0)  # Share of measured coordinates inside the central 90 % intervals
     prediction_nis: float = Field(ge=0.0, le=1e100)
     """Mean over the predicted samples of the squared errors in standard deviations, x, y and z added; 3 is right. Those
     of sightings are scaled from two coordinates to three."""
@@ -56,16 +49,11 @@ class Summary(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
     tracks: int
-    rmse_median: float
-    """m, median over tracks."""
-    rmse_pooled: float
-    """m, root mean square over all predicted samples, which the worst tracks dominate."""
-    coverage_90: float
-    """Share of measured coordinates inside the central 90 % intervals."""
-    prediction_nis: float
-    """Mean over predicted samples; 3 is right."""
-    nis: float
-    """Mean over tracks of the observed part's NIS; 3 is right."""
+    rmse_median: float  # m, median over tracks
+    rmse_pooled: float  # m, root mean square over all predicted samples, which the worst tracks dominate
+    coverage_90: float  # Share of measured coordinates inside the central 90 % intervals
+    prediction_nis: float  # Mean over predicted samples; 3 is right
+    nis: float  # Mean over tracks of the observed part's NIS; 3 is right
 
 
 def judge_track(estimator: Estimator, track: Track, observed_share: float, horizon: float) -> TrackScore | None:

@@ -12,32 +12,21 @@ from ballfg.estimation import Settings, Smoother
 from ballfg.estimation.segmentation.result import Segmentation
 from ballfg.tracks import Track
 
-LEAST_OBSERVED = 5
-"""Samples that an estimate needs."""
-LEAST_PREDICTED = 3
-"""Samples that a prediction is judged on."""
+LEAST_OBSERVED = 5  # Samples that an estimate needs
+LEAST_PREDICTED = 3  # Samples that a prediction is judged on
 
 
 @dataclass(frozen=True)
 class TrainingShot:
-    """One track, cut into an observed part and a part to predict.
+    """One track, cut into an observed part and a part to predict."""
 
-    Attributes:
-        track: the undisturbed part of the flight, up to the first hit.
-        observed: number of samples that the estimate sees; they come first.
-        usable: (n,) bool, samples that measure the ball.
-        segmentation: events of the observed part.
-        settings: of the estimator, before anything is learned.
-        room: name of the dataset.
-    """
-
-    track: Track
-    observed: int
-    usable: NDArray[np.bool_]
-    segmentation: Segmentation
-    settings: Settings
+    track: Track  # the undisturbed part of the flight, up to the first hit
+    observed: int  # number of samples that the estimate sees; they come first
+    usable: NDArray[np.bool_]  # (n,) bool, samples that measure the ball
+    segmentation: Segmentation  # events of the observed part
+    settings: Settings  # of the estimator, before anything is learned
     surfaces: Surfaces
-    room: str = ""
+    room: str = ""  # name of the dataset
 
     @property
     def name(self) -> str:

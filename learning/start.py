@@ -5,8 +5,6 @@ tracks then compare the two by the log score of predictions, intervals included:
 calibration and its population hold.
 """
 
-from __future__ import annotations
-
 import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,13 +13,13 @@ from typing import Final
 from ballfg.dynamics import AnalyticModel, load_model, save_model
 from ballfg.dynamics.domain import Domain
 from ballfg.dynamics.nominal import inertia_factor
+from ballfg.estimation import Settings
 from ballfg.estimation.configure import dataset_surfaces, fitted_settings
 from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.estimation.registry import make_estimator
 from ballfg.learning.calibration.auto import LEAST, NEAR, UNLEARNED, Choice, choose_candidate, compared
 from ballfg.learning.calibration.calibrate import (
     Problem,
-    Step,
     fitted_noise,
     population_model,
     population_settings,
@@ -35,8 +33,7 @@ from ballfg.learning.training_data import analytic_model, open_dataset
 from ballfg.progress import Watch
 from ballfg.tracks import Dataset, Track
 
-CALIBRATED: Final = "calibrated.yaml"
-"""File of the calibrated model."""
+CALIBRATED: Final = "calibrated.yaml"  # File of the calibrated model
 BASE: Final = "base.yaml"
 """File of the same with one value of each coefficient for all tracks, from which the network starts."""
 WITHOUT: Final = "calibrated, without network"
@@ -45,17 +42,13 @@ NETWORK: Final = "with network"
 
 @dataclass(frozen=True)
 class Start:
-    """Files of a calibrated model, and the tracks of a dataset that compare a network with it.
-
-    Attributes:
-        judge: names of these tracks.  observe: their observed part.
-    """
+    """Files of a calibrated model, and the tracks of a dataset that compare a network with it."""
 
     calibrated: Path
     base: Path
     dataset: Dataset
-    judge: tuple[str, ...]
-    observe: ObserveConfig
+    judge: tuple[str, ...]  # names of these tracks
+    observe: ObserveConfig  # their observed part
 
     def compare(self, network: Path) -> Choice | None:
         """The calibrated model and a network's file by their predictions; None: no track could be judged by both."""
@@ -107,9 +100,9 @@ def calibrated_start(config: TrainConfig, folder: Path, *, resume: bool, watch: 
         print(f"the training tracks choose what the network starts from:\n{choice.table()}\n{choice.verdict()}")
         if choice.chosen not in UNLEARNED:
             posed, last = found[choice.chosen].problem, found[choice.chosen].steps[-1]
-            settings = population_settings(posed, last)
-            noise = fitted_noise(posed, population_model(posed, last), settings, watch, errors=False)
-            model = written_model(posed, last, noise)
+            model, settings = population_model(posed, last), population_settings(posed, last)
+            noise = fitted_noise(posed, model, settings, watch, errors=False)
+            describe(model, posed, settings, noise)
         save_model(model, start.calibrated)
         base = copy.copy(model)
         base.variations = {}
@@ -117,11 +110,8 @@ def calibrated_start(config: TrainConfig, folder: Path, *, resume: bool, watch: 
     return start
 
 
-def written_model(problem: Problem, last: Step, noise: NoiseEstimate | None) -> AnalyticModel:
-    """A calibration's means, its population's spins, the noise, and the extent of the fitted tracks, for a file."""
-    model = population_model(problem, last)
-    model.noise = None if noise is None else noise.noise
-    model.spins = population_settings(problem, last).spins
+def describe(model: AnalyticModel, problem: Problem, settings: Settings, noise: NoiseEstimate | None) -> None:
+    """Give a calibrated model its population's spins, the noise, and the extent of the fitted tracks, for a file."""
+    model.noise, model.spins = None if noise is None else noise.noise, settings.spins
     if isinstance(problem.dataset, Dataset):
         model.domain = Domain.of(track for track in problem.dataset if track.name in problem.split.fit)
-    return model

@@ -1,6 +1,5 @@
 """Reads the data of a training from a config: datasets, split, shots, and the settings of the estimator."""
 
-import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,13 +19,13 @@ from ballfg.estimation.reading import has_positions, with_readings
 from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.shots import TrainingShot, shots_of
 from ballfg.learning.split import training_split
+from ballfg.progress import print_doubts, print_notes
 from ballfg.tracks import Ball, Dataset, Track, read_dataset
 
 D = TypeVar("D", Dataset, SightedDataset)
 FIRST_SPIN = {"topspin": (0.0, 50.0, 0.0), "sidespin": (0.0, 0.0, 50.0)}
 """rad/s about (forward, across, up) per level of the settings with a known axis; other settings start at no spin."""
-FIRST_SPIN_NOISE = 60.0
-"""rad/s, standard deviation of the spin given the settings, before anything is learned."""
+FIRST_SPIN_NOISE = 60.0  # rad/s, standard deviation of the spin given the settings, before anything is learned
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,7 @@ def open_dataset(folder: str, anyway: bool | None = None) -> Dataset:
     """
     dataset = noted(with_readings(read_dataset(folder)))
     found = in_flight(dataset)
-    _print_doubts(found.lines)
+    print_doubts(found.lines)
     found.check(folder, bool(anyway), "" if anyway is None else ", or set anyway: true")
     return found.dataset
 
@@ -98,14 +97,9 @@ def open_source(folder: str, source: str | None, anyway: bool = False) -> Datase
 
 def noted(dataset: D) -> D:
     """The dataset, after its doubts and, on stderr, its notes."""
-    _print_doubts(dataset.info.doubts)
-    for note in (*dataset.notes, *filter(None, [table_note(dataset)])):
-        print(f"note: {note}", file=sys.stderr)
+    print_doubts(dataset.info.doubts)
+    print_notes([*dataset.notes, *filter(None, [table_note(dataset)])])
     return dataset
-
-
-def _print_doubts(doubts: Sequence[str]) -> None:
-    print(f"doubt: {'; '.join(doubts)}\n" if doubts else "", end="", flush=True)
 
 
 def analytic_model(path: str | None, ball: Ball) -> AnalyticModel:
@@ -184,6 +178,5 @@ def _shots(
             else:
                 kept[k] = len(shots)
                 shots.append(replace(shot, room=dataset.info.name))
-    for reason, count in reasons.items():
-        print(f"note: {count} tracks of {reason}", file=sys.stderr)
+    print_notes(f"{count} tracks of {reason}" for reason, count in reasons.items())
     return shots, kept

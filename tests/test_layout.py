@@ -10,7 +10,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 LEVELS = (
     ("interrupts",),
-    ("state", "arrays", "checks", "progress", "registry", "machine", "collector"),
+    ("state", "arrays", "checks", "registry", "machine", "collector"),
+    ("progress",),
     ("files",),
     ("parallel",),
     ("tracks",),

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
 import typer
 
 from ballfg.machine import usable_cores
-from ballfg.progress import progress
+from ballfg.progress import print_doubts, print_notes, progress
 
 if TYPE_CHECKING:
     from ballfg.dynamics import AnalyticModel, BallModel
@@ -332,22 +332,6 @@ def check_out(out: Path, dataset: Path) -> None:
     """Refuses a result in the place of the measurements. Raises: ValueError: if `out` is a table of the dataset."""
     if out.stem in DATASET_TABLES and out.resolve().parent == dataset.resolve():
         raise ValueError(f"out must not be a table of the dataset itself; got {out}. Choose another name.")
-
-
-def print_doubts(doubts: Iterable[str]) -> None:
-    """Prints what is not sure about the tracks in one line, before any result: further lines push it out of sight."""
-    from ballfg.checks import visible
-
-    if line := "; ".join(visible(doubt) for doubt in doubts):
-        print(f"doubt: {line}", flush=True)
-
-
-def print_notes(notes: Iterable[str]) -> None:
-    """Prints notes for the user on stderr."""
-    from ballfg.checks import visible
-
-    for note in notes:
-        print(f"note: {visible(note)}", file=sys.stderr)
 
 
 @contextmanager

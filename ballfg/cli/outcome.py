@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from ballfg.cli.inputs import print_notes
 from ballfg.cli.start import NOT_ESTIMATED
+from ballfg.progress import print_notes
 
 if TYPE_CHECKING:
     from ballfg.estimation import Status

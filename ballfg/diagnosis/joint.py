@@ -25,8 +25,7 @@ from ballfg.diagnosis.fit.stretches import Stretches, joined
 from ballfg.diagnosis.hypotheses.hypothesis import effects_of, has_effect, with_effects, without_effect
 from ballfg.diagnosis.hypotheses.varying import Grouping, Varying
 from ballfg.diagnosis.label_verdicts import LabelCheck
-from ballfg.diagnosis.report.wording import joined as listed
-from ballfg.diagnosis.report.wording import sentence
+from ballfg.diagnosis.report.wording import joined as listed, sentence
 from ballfg.diagnosis.residual_tests.generic import generic_tests
 from ballfg.diagnosis.residual_tests.label_check import judged, label_evidence, label_test
 from ballfg.diagnosis.residual_tests.residuals import residuals_of

@@ -1,21 +1,20 @@
 from .analytic import AnalyticModel as AnalyticModel
-from .effect import BounceEffect as BounceEffect
-from .effect import Coefficient as Coefficient
-from .effect import Flight as Flight
-from .effect import FlightEffect as FlightEffect
-from .effect import Impact as Impact
-from .effect import Range as Range
-from .effect import Scene as Scene
-from .effect import Usual as Usual
-from .effect import length as length
-from .effect import vector as vector
-from .effects.registry import EFFECTS as EFFECTS
-from .effects.registry import load_effects as load_effects
-from .effects.registry import register as register
+from .effect import (
+    BounceEffect as BounceEffect,
+    Coefficient as Coefficient,
+    Flight as Flight,
+    FlightEffect as FlightEffect,
+    Impact as Impact,
+    Range as Range,
+    Scene as Scene,
+    Usual as Usual,
+    length as length,
+    vector as vector,
+)
+from .effects.registry import EFFECTS as EFFECTS, load_effects as load_effects, register as register
 from .measurement import MeasurementEffect as MeasurementEffect
 from .model import BallModel as BallModel
-from .model_file import load_model as load_model
-from .model_file import save_model as save_model
+from .model_file import load_model as load_model, save_model as save_model
 from .motion.rollout import rollout as rollout
 from .networks.architecture import Architecture as Architecture
 from .networks.learned import build as build

@@ -1,10 +1,8 @@
 """The range of speeds, spins and places that a model was fitted on, and what lies outside of it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 
@@ -39,7 +37,7 @@ class Domain:
         object.__setattr__(self, "ranges", {name: (float(a), float(b)) for name, (a, b) in self.ranges.items()})
 
     @classmethod
-    def of(cls, tracks: Iterable[Track]) -> Domain | None:
+    def of(cls, tracks: Iterable[Track]) -> Self | None:
         """The ranges of tracks; None without samples."""
         found = [quantities(track) for track in tracks]
         held = {name: [own[name] for own in found if name in own] for name in UNITS}

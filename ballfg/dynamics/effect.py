@@ -29,8 +29,7 @@ class Range:
     source: str
 
 
-SEEN = "larger ones are seen by eye in a picture of the table"
-"""Source of the ranges of errors of cameras and frames."""
+SEEN = "larger ones are seen by eye in a picture of the table"  # Source of the ranges of errors of cameras and frames
 
 
 @dataclass(frozen=True)
@@ -66,8 +65,7 @@ class Coefficient:
     while all other coefficients of its effect are absent."""
 
 
-TINY_LENGTH = 1e-12
-"""In the vector's own unit. Autograd takes shorter lengths as constant."""
+TINY_LENGTH = 1e-12  # In the vector's own unit. Autograd takes shorter lengths as constant
 
 
 def length(vector: Tensor) -> Tensor:

@@ -23,13 +23,11 @@ if TYPE_CHECKING:
     from ballfg.tracks import Track
     from ballfg.tracks.noise import TrackNoise
 
-THIN_SHELL: Final = 2.0 / 3.0
-"""Moment of inertia of a thin spherical shell divided by m R^2."""
+BASE: Final = "base."  # Prefix of the names of the coefficients of the model that a learned one corrects
+THIN_SHELL: Final = 2.0 / 3.0  # Moment of inertia of a thin spherical shell divided by m R^2
 
-ROLLING_FRICTION: Final = 0.25
-"""Coulomb coefficient that turns a resting ball's slip into rolling."""
-ROLLING_RESISTANCE: Final = 0.01
-"""Deceleration of a rolling ball divided by g."""
+ROLLING_FRICTION: Final = 0.25  # Coulomb coefficient that turns a resting ball's slip into rolling
+ROLLING_RESISTANCE: Final = 0.01  # Deceleration of a rolling ball divided by g
 SOFT_SLIP: Final = 0.2
 """m/s. Slip below which rolling friction falls to zero linearly, so that the equations stay smooth and not stiff."""
 

@@ -13,7 +13,7 @@ from ballfg.dynamics.analytic import AnalyticModel, after_needs
 from ballfg.dynamics.domain import Domain
 from ballfg.dynamics.effect import Effect, Kind
 from ballfg.dynamics.effects.registry import effect_class
-from ballfg.dynamics.model import THIN_SHELL, BallModel
+from ballfg.dynamics.model import BASE, THIN_SHELL, BallModel
 from ballfg.dynamics.population import SpinPopulation
 from ballfg.dynamics.variation import Variation
 from ballfg.files.strict_yaml import read_yaml
@@ -24,12 +24,10 @@ from ballfg.tracks.noise import TrackNoise
 KINDS: Final[tuple[Kind, ...]] = ("flight", "bounce", "measurement")
 VARIATIONS: Final = "variations"
 POPULATIONS: Final = "populations"
-SPIN: Final = "spin"
-"""Entry of the section `populations`."""
+SPIN: Final = "spin"  # Entry of the section `populations`
 DOMAIN: Final = "domain"
 SECTIONS = (*KINDS, VARIATIONS, POPULATIONS, DOMAIN, "learned")
-LONGEST_NAME: Final = 255
-"""Characters of a folder's name."""
+LONGEST_NAME: Final = 255  # Characters of a folder's name
 NOISE: Final = "noise"
 """Entry of the section `measurement` that is not an effect: the scatter of tracks about the model."""
 
@@ -207,7 +205,7 @@ def model_to_dict(model: AnalyticModel) -> dict[str, Any]:
 
 def _listed(variations: Mapping[str, Variation]) -> dict[str, Any]:
     """The section `variations` of a model file; a learned model lists those of its base."""
-    section = {name.removeprefix("base."): variation.to_mapping() for name, variation in variations.items()}
+    section = {name.removeprefix(BASE): variation.to_mapping() for name, variation in variations.items()}
     return {VARIATIONS: section} if section else {}
 
 
@@ -224,7 +222,7 @@ def save_model(model: BallModel, path: str | Path) -> None:
     path = check_path("path", path)
     content = model_to_dict(_analytic_part(model)) | _listed(model.variations)
     if model.noise is not None:
-        listed = {name.removeprefix("base."): sigma for name, sigma in model.noise.coefficients.items()}
+        listed = {name.removeprefix(BASE): sigma for name, sigma in model.noise.coefficients.items()}
         content["measurement"][NOISE] = replace(model.noise, coefficients=listed).to_mapping()
     if has_learned_part(model):
         content["learned"] = write_learned(model, path.parent, path.stem)

@@ -12,14 +12,11 @@ from ballfg.dynamics.model import THIN_SHELL
 from ballfg.dynamics.model_file import model_from_dict
 from ballfg.tracks import TABLE_TENNIS, Ball
 
-TOLERANCE: Final = 0.15
-"""Relative. A ball whose radius and mass differ by less from a known ball's counts as that ball."""
-AIR_DENSITY: Final = 1.2
-"""kg/m^3, dry air at 20 degrees C and 1013 hPa."""
+TOLERANCE: Final = 0.15  # Relative. A ball whose radius and mass differ by less from a known ball's counts as that ball
+AIR_DENSITY: Final = 1.2  # kg/m^3, dry air at 20 degrees C and 1013 hPa
 DRAG_COEFFICIENT: Final = 0.5
 """Of an unknown ball: rough or smooth spheres have 0.4 to 0.6 below the drag crisis, 0.2 beyond it."""
-SPIN_RATIO: Final = 0.2
-"""R w / v at which the lift is made linear: a tennis ball at 25 m/s with 150 rad/s."""
+SPIN_RATIO: Final = 0.2  # R w / v at which the lift is made linear: a tennis ball at 25 m/s with 150 rad/s
 GUESSED_BOUNCE: Final = {"restitution": {"e": 0.75}, "friction": {"mu": 0.4}, "tangential_restitution": {"e_t": 0.15}}
 """Between those of table-tennis, tennis and rubber balls on hard ground."""
 WIDE: Final = {"drag": 0.5, "magnus": 0.6, "restitution": 0.2, "friction": 0.5, "tangential_restitution": 2.0}

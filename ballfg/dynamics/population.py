@@ -4,11 +4,9 @@ Most of a short flight's prediction error comes from a spin that nobody measured
 spins have a mean and a spread of their own about each axis, which tell more than a wide prior about zero.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 
@@ -16,8 +14,7 @@ from ballfg.arrays import Array
 from ballfg.checks import check_number, listed, shown
 from ballfg.dynamics.networks.spin_embedding import SOFT_SPEED
 
-FASTEST: Final = 5000.0
-"""rad/s. Largest mean and spread; a larger one is in another unit."""
+FASTEST: Final = 5000.0  # rad/s. Largest mean and spread; a larger one is in another unit
 _FIELDS: Final = ("by", "groups")
 
 
@@ -89,7 +86,7 @@ class SpinPopulation:
             )
 
     @classmethod
-    def from_mapping(cls, content: Any) -> SpinPopulation:
+    def from_mapping(cls, content: Any) -> Self:
         """The population in a model file. Raises: ValueError: an entry is missing, unknown, or of another kind."""
         if not isinstance(content, Mapping) or set(content) != set(_FIELDS):
             raise ValueError(f"must be a mapping with 'by' and 'groups'; got {shown(content)}")

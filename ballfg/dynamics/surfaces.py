@@ -1,10 +1,8 @@
 """Describes the horizontal surfaces that a ball can meet: a table, and the floor for a ball that falls beside it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import torch
 from numba.extending import register_jitable
@@ -14,12 +12,9 @@ from ballfg.checks import check_array, check_number, is_number
 from ballfg.dynamics.motion.limits import DEEPEST
 from ballfg.state import Z
 
-TABLE_ABOVE_FLOOR: Final = 0.76
-"""m, height of a table-tennis table (ITTF Laws 2.1.1)."""
-TABLE_LENGTH: Final = 2.74
-"""m (ITTF Laws 2.1.1)."""
-TABLE_WIDTH: Final = 1.525
-"""m (ITTF Laws 2.1.1)."""
+TABLE_ABOVE_FLOOR: Final = 0.76  # m, height of a table-tennis table (ITTF Laws 2.1.1)
+TABLE_LENGTH: Final = 2.74  # m (ITTF Laws 2.1.1)
+TABLE_WIDTH: Final = 1.525  # m (ITTF Laws 2.1.1)
 
 
 @register_jitable
@@ -62,12 +57,12 @@ class Surfaces:
             raise ValueError(f"edge_sigmas must be finite and not negative, in m; got {self.edge_sigmas}")
 
     @classmethod
-    def table_tennis(cls, table_height: float) -> Surfaces:
+    def table_tennis(cls, table_height: float) -> Self:
         """A table at a height in the room, with the floor 0.76 m below its surface; of -inf none."""
         return cls.none() if table_height == -math.inf else cls(table_height, table_height - TABLE_ABOVE_FLOOR)
 
     @classmethod
-    def none(cls) -> Surfaces:
+    def none(cls) -> Self:
         """No surface: a ball flies, is struck, thrown or caught, and never bounces."""
         return cls(-math.inf)
 

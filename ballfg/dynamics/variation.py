@@ -14,8 +14,7 @@ import numpy as np
 from ballfg.checks import check_number, listed, shown
 from ballfg.tracks import Track
 
-TRACK: Final = "track"
-"""Takes the place of a label's name: tracks are told apart by their own names."""
+TRACK: Final = "track"  # Takes the place of a label's name: tracks are told apart by their own names
 _FIELDS: Final = ("by", "values", "line")
 
 

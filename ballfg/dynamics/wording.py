@@ -16,10 +16,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Protocol
 
-MOSTLY_ALONG: Final = 0.9
-"""Share of a vector's length along one axis above which the vector is said to point along it."""
-CLEAR: Final = 2.0
-"""Standard deviations from which a component is mentioned."""
+MOSTLY_ALONG: Final = 0.9  # Share of a vector's length along one axis above which the vector is said to point along it
+CLEAR: Final = 2.0  # Standard deviations from which a component is mentioned
 
 
 class Fitted(Protocol):

@@ -21,12 +21,10 @@ from ballfg.tracks import Track
 T = TypeVar("T")
 R = TypeVar("R")
 
-PROBED = 10
-"""Tracks done in this process first, to time one; the first of them warms up and does not count."""
+PROBED = 10  # Tracks done in this process first, to time one; the first of them warms up and does not count
 START_UP = 5.0
 """s for starting worker processes (they import torch and gtsam): less work than that stays in this process."""
-HAND_OVER = 0.3
-"""s for handing work to running processes."""
+HAND_OVER = 0.3  # s for handing work to running processes
 
 
 def estimate_tracks(

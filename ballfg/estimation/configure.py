@@ -30,17 +30,13 @@ from ballfg.tracks import Dataset, Track
 from ballfg.tracks.info import DatasetInfo
 from ballfg.tracks.noise import TrackNoise
 
-TRACKS_FOR_NOISE = 50
-"""Number of tracks for the estimate of the measurement noise when a dataset does not state it."""
+TRACKS_FOR_NOISE = 50  # Number of tracks for the estimate of the measurement noise when a dataset does not state it
 QUICK_TRACKS = 20
 """Number of tracks for all other noise, spread over the first `TRACKS_FOR_TABLE`, which may be of several groups."""
-KEPT = 8
-"""Number of datasets whose noise is cached: their tracks may be estimated one by one."""
-LEAST_TRACKS = 5
-"""Least number of tracks that shows how much tracks differ."""
+KEPT = 8  # Number of datasets whose noise is cached: their tracks may be estimated one by one
+LEAST_TRACKS = 5  # Least number of tracks that shows how much tracks differ
 FEW_TRACKS = "too few tracks to show their noise: that of bounces and coefficients is the usual one"
-STATED_EDGE_SIGMA = 0.01
-"""m, of a stated table end: a ball touches an edge up to its radius beside it."""
+STATED_EDGE_SIGMA = 0.01  # m, of a stated table end: a ball touches an edge up to its radius beside it
 TRACKS_FOR_TABLE = 200
 """Number of tracks for the table's ends. Few balls miss the table; 200 tracks hold some of them and take 0.1 s."""
 

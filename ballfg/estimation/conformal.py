@@ -29,18 +29,12 @@ if TYPE_CHECKING:
     from ballfg.estimation.track_prediction import TrackPrediction
     from ballfg.tracks import Dataset
 
-LEVEL: Final = 0.9
-"""Probability of the intervals."""
-HALF_WIDTH: Final = 1.6448536269514722
-"""Sigmas on either side of a normal distribution's mean that hold `LEVEL`."""
-FEWEST: Final = 9
-"""Calibration tracks below which no finite interval has the guarantee: LEVEL (n + 1) <= n."""
-BIN: Final = 0.05
-"""s, width of the bins of the horizon. On the measured tracks a bin holds 3 to 9 samples of a track."""
-EDGE: Final = 1e-5
-"""Share of a bin by which a stamp may exceed the bin's end: stamps are rounded."""
-ROUNDING: Final = 1e-9
-"""Tolerance on sums of weights, so that exactly `FEWEST` tracks are enough."""
+LEVEL: Final = 0.9  # Probability of the intervals
+HALF_WIDTH: Final = 1.6448536269514722  # Sigmas on either side of a normal distribution's mean that hold `LEVEL`
+FEWEST: Final = 9  # Calibration tracks below which no finite interval has the guarantee: LEVEL (n + 1) <= n
+BIN: Final = 0.05  # s, width of the bins of the horizon. On the measured tracks a bin holds 3 to 9 samples of a track
+EDGE: Final = 1e-5  # Share of a bin by which a stamp may exceed the bin's end: stamps are rounded
+ROUNDING: Final = 1e-9  # Tolerance on sums of weights, so that exactly `FEWEST` tracks are enough
 TABLE_TOLERANCE: Final = 1e-3
 """m, by which the tables of the calibration tracks and the predicted ones may differ in height."""
 FILE_SECTION: Final = "conformal"

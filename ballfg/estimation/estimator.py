@@ -19,8 +19,7 @@ from ballfg.prediction.state import World
 from ballfg.tracks import Ball, Track
 from ballfg.tracks.checks import check_scale, doubts_about
 
-LEAST_CHECKED = 3
-"""Least number of samples for a check of a track's scale."""
+LEAST_CHECKED = 3  # Least number of samples for a check of a track's scale
 
 
 class Estimator(ABC):

@@ -1,9 +1,8 @@
 """A launcher gives the spin of a shot from the launcher settings in a track's labels."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 import torch
@@ -16,8 +15,7 @@ from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.tracks import Track
 from ballfg.tracks.track import SPIN_LABELS
 
-FIRST_SAMPLES = 10
-"""Number of samples whose mean direction of flight is the launch direction."""
+FIRST_SAMPLES = 10  # Number of samples whose mean direction of flight is the launch direction
 
 
 @dataclass(frozen=True)
@@ -65,7 +63,7 @@ class Launcher:
         check_number("sigma", self.sigma, "rad/s", above=0.0)
 
     @classmethod
-    def of_levels(cls, topspin: float, sidespin: float, sigma: float) -> Launcher:
+    def of_levels(cls, topspin: float, sidespin: float, sigma: float) -> Self:
         """A launcher with a known spin per level of the labels `topspin` and `sidespin`.
 
         Topspin turns about the horizontal axis across the flight (the top of the ball moves forward), sidespin about

@@ -14,8 +14,7 @@ from ballfg.tracks import Track
 from ballfg.tracks.checks import MAX_COORDINATE
 from ballfg.tracks.track import FASTEST_BALL, FASTEST_SPIN
 
-LEAST_POSITION_SIGMA = 0.05
-"""m. Least standard deviation of a position in a track that no graph explains."""
+LEAST_POSITION_SIGMA = 0.05  # m. Least standard deviation of a position in a track that no graph explains
 
 
 def plausible(estimate: Estimate, track: Track, sigma: Array, settings: Settings) -> Estimate:

@@ -228,25 +228,19 @@ _TYPES: dict[str, type] = {
     "time_offsets": Mapping,
 }
 
-WIDEST_PRIOR = 1e5
-"""m/s or rad/s, widest prior of an unknown velocity or spin; a wider one adds nothing."""
-NARROWEST_PRIOR = 1e-6
-"""m/s or rad/s. Narrowest prior; double precision cannot resolve less beside free states."""
-WIDEST_COEFFICIENT = 1e9
-"""Widest prior of a coefficient, in its own unit, and of a time offset, s."""
+WIDEST_PRIOR = 1e5  # m/s or rad/s, widest prior of an unknown velocity or spin; a wider one adds nothing
+NARROWEST_PRIOR = 1e-6  # m/s or rad/s. Narrowest prior; double precision cannot resolve less beside free states
+WIDEST_COEFFICIENT = 1e9  # Widest prior of a coefficient, in its own unit, and of a time offset, s
 NARROWEST_COEFFICIENT = 1e-12
 """Narrowest prior of a coefficient, in its own unit, and of a time offset, s: its square would be lost to rounding.
 Leave a known coefficient out."""
-MOST_JITTER = 1.0
-"""s. Over a second a ball goes and comes back: stamps with such an error carry no information."""
+MOST_JITTER = 1.0  # s. Over a second a ball goes and comes back: stamps with such an error carry no information
 
-LEAST_BIAS = 1e-6
-"""m. Errors of this size are negligible; the linear algebra needs a number above zero."""
+LEAST_BIAS = 1e-6  # m. Errors of this size are negligible; the linear algebra needs a number above zero
 
 LEAST_NOISE = 1e-6
 """m. Nothing measures a ball to a micrometre; double precision cannot resolve less beside a free velocity."""
-MOST_NOISE = 1e4
-"""m. Larger noise is cut to this: such a sample carries no information."""
+MOST_NOISE = 1e4  # m. Larger noise is cut to this: such a sample carries no information
 
 MEASURED = ProcessNoise(contact_tangential=0.2, contact_spin=10.0)
 """Process noise on measured tracks: the effect of friction in a bounce is known to some 0.2 m/s only. Friction and

@@ -17,20 +17,15 @@ from ballfg.dynamics.surfaces import TABLE_LENGTH, TABLE_WIDTH
 from ballfg.state import STANDARD_GRAVITY, Z
 from ballfg.tracks import TABLE_TENNIS, Track
 
-BASELINE: Final = 0.01
-"""s, least distance between three samples that give a velocity; 3 mm of noise then give 0.2 m/s."""
-LEAST_BOUNCES: Final = 5
-"""Least number of bounces that shows at which height the ball meets the table."""
-MISTAKEN: Final = 0.02
-"""Probability of a false bounce or fall: a hit at the table's height, an outlier."""
+BASELINE: Final = 0.01  # s, least distance between three samples that give a velocity; 3 mm of noise then give 0.2 m/s
+LEAST_BOUNCES: Final = 5  # Least number of bounces that shows at which height the ball meets the table
+MISTAKEN: Final = 0.02  # Probability of a false bounce or fall: a hit at the table's height, an outlier
 MOST_CONTRADICTING: Final = 0.1
 """Largest share of balls that may contradict the best place; above it the table has another size or direction."""
 EDGE_TOLERANCE: Final = 0.03
 """m. A ball this near to an edge may touch or fall: its radius, half a degree between table and frame, 1 % of scale."""
-GRID_STEP: Final = 0.01
-"""m."""
-SURE: Final = 0.9
-"""A side ends the table if at least one ball fell beyond it with this probability."""
+GRID_STEP: Final = 0.01  # m
+SURE: Final = 0.9  # A side ends the table if at least one ball fell beyond it with this probability
 RADIUS_TOLERANCE: Final = 0.15
 """Largest relative difference from the radius of a table-tennis ball; balls of 38 and 44 mm exist, too."""
 _UPWARD_GRAVITY: Final = np.array([0.0, 0.0, STANDARD_GRAVITY])
@@ -38,18 +33,13 @@ _UPWARD_GRAVITY: Final = np.array([0.0, 0.0, STANDARD_GRAVITY])
 
 @dataclass(frozen=True)
 class TableExtent:
-    """A table's ends, as far as the tracks show them.
-
-    Attributes:
-        sides: (x_low, x_high, y_low, y_high) m; infinite if no ball fell beyond the side.
-        sigmas: m, of each side; 0 where it is infinite.  bounces: number of bounces on the table.
-        falls: number of balls that fell past it.
-    """
+    """A table's ends, as far as the tracks show them."""
 
     sides: tuple[float, float, float, float]
-    sigmas: tuple[float, float, float, float]
-    bounces: int
-    falls: int
+    """(x_low, x_high, y_low, y_high) m; infinite if no ball fell beyond the side."""
+    sigmas: tuple[float, float, float, float]  # m, of each side; 0 where it is infinite
+    bounces: int  # number of bounces on the table
+    falls: int  # number of balls that fell past it
 
     def __str__(self) -> str:
         ends = [

@@ -1,4 +1,3 @@
 from .choices import Choices as Choices
-from .formats.registry import Format as Format
-from .formats.registry import register_format as register_format
+from .formats.registry import Format as Format, register_format as register_format
 from .importer import import_tracks as import_tracks

@@ -11,14 +11,13 @@ from ballfg.checks import did_you_mean, listed, short_text, shown
 from ballfg.importing.choices import Choices, UndecidedError
 from ballfg.importing.fall import LENGTHS
 from ballfg.importing.formats.raw import RawTable, is_number, numbers
-from ballfg.importing.identities import identified
 from ballfg.importing.names import Meaning, meanings
+from ballfg.importing.several_balls import identified
 from ballfg.importing.stamps import as_stamps
 
 RATES: Final = ("rate", "fps", "frame_rate", "framerate", "hz", "sampling_rate", "frequency")  # frames per second
 UNITS: Final = ("unit", "units", "length_unit", "position_unit")
-UNMEASURED: Final = "(not measured)"
-"""In place of the column of an axis."""
+UNMEASURED: Final = "(not measured)"  # In place of the column of an axis
 _REGULAR: Final = 0.3  # largest median deviation of the steps of a time column, in median steps; coordinates vary more
 _FORWARD: Final = 0.9
 _PIECES: Final = 0.2  # largest number of changes, per row, of a column with the names of trajectories

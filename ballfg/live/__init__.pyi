@@ -1,2 +1,1 @@
-from .tracker import BallUpdate as BallUpdate
-from .tracker import Tracker as Tracker
+from .tracker import BallUpdate as BallUpdate, Tracker as Tracker

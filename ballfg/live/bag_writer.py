@@ -1,10 +1,8 @@
 """Writes states and predictions as ROS 2 messages to an MCAP file, without ROS; it needs the extra `ros`."""
 
-from __future__ import annotations
-
 import threading
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -51,7 +49,7 @@ class BagWriter:
             raise ValueError(f"out must be a new file for a bag; {out} holds something. Choose another name.")
         self._recording.append(self._opening)
 
-    def __enter__(self) -> BagWriter:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

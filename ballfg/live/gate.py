@@ -29,15 +29,11 @@ FAR = 1e6  # Cost of an impossible pair
 
 @dataclass(frozen=True)
 class Known:
-    """The belief on a ball at a time.
+    """The belief on a ball at a time."""
 
-    Attributes:
-        time: s.  mean: (6,) position m and velocity m/s.  covariance: (6, 6) of that, in the products of those units.
-    """
-
-    time: float
-    mean: Array
-    covariance: Array
+    time: float  # s
+    mean: Array  # (6,) position m and velocity m/s
+    covariance: Array  # (6, 6) of that, in the products of those units
 
     @classmethod
     def of(cls, state: BallState) -> "Known":

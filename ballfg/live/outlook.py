@@ -1,7 +1,5 @@
 """Predicts a ball's next bounce, its apex and the crossing of a plane, without exceptions."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Recordings grow under their own name, reach the disk within a second, and are never replaced or removed."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os
@@ -9,6 +7,7 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Self
 
 from ballfg.files.json_file import parse_json
 from ballfg.files.whole_file import check_file
@@ -76,7 +75,7 @@ class Recording:
         if self._error is not None:
             raise self._error
 
-    def __enter__(self) -> Recording:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

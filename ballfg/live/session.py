@@ -61,16 +61,12 @@ class Watcher(Protocol):
 
 @dataclass(frozen=True)
 class Wanted:
-    """The predictions for every state.
+    """The predictions for every state."""
 
-    Attributes:
-        horizon: s, range of the search for events.  plane: whose crossing is predicted; None without one.
-        patience: s. A live line that waited longer gets no prediction if another one waits, so that states catch up.
-    """
-
-    horizon: float = 1.0
-    plane: Plane | None = None
+    horizon: float = 1.0  # s, range of the search for events
+    plane: Plane | None = None  # whose crossing is predicted; None without one
     patience: float = 0.1
+    """s. A live line that waited longer gets no prediction if another one waits, so that states catch up."""
 
 
 class Session:

@@ -1,13 +1,15 @@
-"""Builds the elements of a page: escaped text, tables, lists, pictures, bars, explained words."""
+"""Writes one self-contained HTML file of escaped text, tables, lists, pictures, bars, explained words."""
 
 from __future__ import annotations
 
 import base64
 import html
 import io
+import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -112,3 +114,43 @@ def picture(figure: Figure, caption: str) -> Html:
     least = f"--least: {READABLE * figure.get_figwidth():.0f}px"
     image = Html(f'<img alt="{html.escape(caption)}" style="{least}" src="data:image/png;base64,{data}">')
     return tag("figure", tag("div", image, kind="scroll"), tag("figcaption", caption))
+
+
+def whole_page(
+    title: str,
+    *content: str,
+    style: str = "",
+    data: Mapping[str, Any] | None = None,
+    scripts: Sequence[str] = (),
+    plotly: bool = False,
+) -> str:
+    """The text of a page that adapts to wide and narrow screens and to paper.
+
+    Args:
+        title: of the window.  content: text or HTML of the page, part by part.
+        style: CSS rules of this page, added to those of all pages.
+        data: for the scripts, as JSON in the element `data`; without NaN and infinity.
+        scripts: JavaScript, run in this order after the page has loaded.
+        plotly: embed plotly.js before them; it has 4.8 MB.
+    Raises: ValueError: data with NaN or infinity.
+    """
+    parts = ['<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">']
+    parts += [f"<title>{html.escape(title)}</title>", f"<style>\n{own('style.css')}{style}</style>"]
+    end = []
+    if data is not None:
+        plain = json.dumps(data, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
+        for sign in "<>&\u2028\u2029":  # a name such as `</script>` must not end the element
+            plain = plain.replace(sign, f"\\u{ord(sign):04x}")
+        end.append(f'<script type="application/json" id="data">{plain}</script>')
+    if plotly:
+        from plotly.offline import get_plotlyjs
+
+        end.append(f"<script>{get_plotlyjs()}</script>")
+    end += [f"<script>\n{script}</script>" for script in scripts]
+    body = tag("main", *content)
+    return f'<!DOCTYPE html>\n<html lang="en"><head>{"".join(parts)}</head>\n<body>{body}{"".join(end)}</body></html>\n'
+
+
+def own(name: str) -> str:
+    """The text of a style or a script of this room."""
+    return files(__package__).joinpath(name).read_text(encoding="utf-8")

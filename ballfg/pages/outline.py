@@ -17,19 +17,13 @@ MARGIN = 0.2  # m by which a surface with unknown ends extends beyond the sample
 
 @dataclass(frozen=True)
 class Outline:
-    """Heights and ends of table and floor.
+    """Heights and ends of table and floor."""
 
-    Attributes:
-        height: m, of the surface.  extent: (x_low, x_high, y_low, y_high) m.
-        net: True if a net stands across the longer side.  floor: m, height of the floor; None if unknown.
-        words: a sentence on the origin of the ends.
-    """
-
-    height: float
-    extent: tuple[float, float, float, float]
-    net: bool
-    floor: float | None
-    words: str
+    height: float  # m, of the surface
+    extent: tuple[float, float, float, float]  # (x_low, x_high, y_low, y_high) m
+    net: bool  # True if a net stands across the longer side
+    floor: float | None  # m, height of the floor; None if unknown
+    words: str  # a sentence on the origin of the ends
 
     @property
     def surfaces(self) -> tuple[float, ...]:

@@ -76,28 +76,22 @@ def _mark(kind: str, time: float, before: Array, later: float) -> Mark:
 
 @dataclass(frozen=True, eq=False)
 class ShownShot:
-    """The contents of one track's drawing; arrays without rows stand for missing ones.
+    """The contents of one track's drawing; arrays without rows stand for missing ones."""
 
-    Attributes:
-        name: of the track.  times: (n,) s, stamps of the samples.  positions: (n, 3) m, as measured.
-        noise: (n, 3) m, standard deviation of each measured coordinate; NaN if unknown.  state_times: (m,) s.
-        states: (m, 9) position m, velocity m/s, spin rad/s.  state_sigmas: (m, 9) in the same units.
-        predicted_times: (k,) s.  predicted: (k, 3) m.  predicted_sigmas: (k, 3) m, of a measured position.
-        marks: contacts and hits in the states.  labels: (m,) what the ball does at each state; empty if unknown.
-    """
-
-    name: str
-    times: Array = field(default_factory=lambda: np.zeros(0))
-    positions: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    name: str  # of the track
+    times: Array = field(default_factory=lambda: np.zeros(0))  # (n,) s, stamps of the samples
+    positions: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (n, 3) m, as measured
     noise: Array = field(default_factory=lambda: np.zeros((0, 3)))
-    state_times: Array = field(default_factory=lambda: np.zeros(0))
-    states: Array = field(default_factory=lambda: np.zeros((0, 9)))
-    state_sigmas: Array = field(default_factory=lambda: np.zeros((0, 9)))
-    predicted_times: Array = field(default_factory=lambda: np.zeros(0))
-    predicted: Array = field(default_factory=lambda: np.zeros((0, 3)))
-    predicted_sigmas: Array = field(default_factory=lambda: np.zeros((0, 3)))
-    marks: tuple[Mark, ...] = ()
+    """(n, 3) m, standard deviation of each measured coordinate; NaN if unknown."""
+    state_times: Array = field(default_factory=lambda: np.zeros(0))  # (m,) s
+    states: Array = field(default_factory=lambda: np.zeros((0, 9)))  # (m, 9) position m, velocity m/s, spin rad/s
+    state_sigmas: Array = field(default_factory=lambda: np.zeros((0, 9)))  # (m, 9) in the same units
+    predicted_times: Array = field(default_factory=lambda: np.zeros(0))  # (k,) s
+    predicted: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (k, 3) m
+    predicted_sigmas: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (k, 3) m, of a measured position
+    marks: tuple[Mark, ...] = ()  # contacts and hits in the states
     labels: NDArray[np.str_] = field(default_factory=lambda: np.zeros(0, np.str_))
+    """(m,) what the ball does at each state; empty if unknown."""
 
     @property
     def flying(self) -> list[bool] | None:
@@ -152,18 +146,12 @@ BIN = 0.05  # s, width of the bins of the horizon
 
 @dataclass(frozen=True)
 class Coverage:
-    """Shares by horizon, the time since the last sample before the first predicted one.
+    """Shares by horizon, the time since the last sample before the first predicted one."""
 
-    Attributes:
-        horizons: (b,) s, the middle of each bin that holds samples.
-        shares: (b, 3) of the coordinates x, y, z inside their intervals, 0 to 1.
-        samples: (b,) counts.  shots: (b,) counts.
-    """
-
-    horizons: Array
-    shares: Array
-    samples: Index
-    shots: Index
+    horizons: Array  # (b,) s, the middle of each bin that holds samples
+    shares: Array  # (b, 3) of the coordinates x, y, z inside their intervals, 0 to 1
+    samples: Index  # (b,) counts
+    shots: Index  # (b,) counts
 
 
 def coverage(shots: Iterable[ShownShot]) -> Coverage:

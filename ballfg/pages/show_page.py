@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.pages.html import Html, doubtful, explained, items, section, table, tag
+from ballfg.pages.html import Html, doubtful, explained, items, own, section, table, tag, whole_page
 from ballfg.pages.outline import NET_HEIGHT, Outline
-from ballfg.pages.page import own, whole_page
 from ballfg.pages.shot import FLIGHT, GAP, HALF_WIDTH, LEVEL, ShownShot
 from ballfg.pages.shown import Shown
 from ballfg.state import POSITION, SPIN, VELOCITY

@@ -21,23 +21,16 @@ ROBUST = 1.4826  # Standard deviation of a normal distribution over its median a
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """The contents of a page.
+    """The contents of a page."""
 
-    Attributes:
-        given: all given files.  shots: the chosen ones, in the dataset's order.  count: total number of shots.
-        table: its place; None without a dataset or a surface.
-        coverage: of all predicted shots, not only the chosen ones; None without measured tracks or predictions.
-        noise: a sentence on the standard deviation of the measured coordinates; empty if unknown.
-        notes: sentences for the reader.
-    """
-
-    given: Given
-    shots: tuple[ShownShot, ...]
-    count: int
-    table: Outline | None
+    given: Given  # all given files
+    shots: tuple[ShownShot, ...]  # the chosen ones, in the dataset's order
+    count: int  # total number of shots
+    table: Outline | None  # its place; None without a dataset or a surface
     coverage: Coverage | None
-    noise: str
-    notes: tuple[str, ...]
+    """Of all predicted shots, not only the chosen ones; None without measured tracks or predictions."""
+    noise: str  # a sentence on the standard deviation of the measured coordinates; empty if unknown
+    notes: tuple[str, ...]  # sentences for the reader
 
 
 def collect(given: Given, names: Sequence[str] = (), limited: bool = True) -> Shown:

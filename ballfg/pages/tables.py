@@ -33,19 +33,13 @@ class Kind(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class ResultTable:
-    """A table of results.
+    """A table of results."""
 
-    Attributes:
-        path: of the file.  kind: of the table.  rows: of each track, in the order in which the tracks first appear.
-        values: (rows, 1 + c) t in s and the columns of the kind, sorted by track and time.
-        labels: (rows,) what the ball does at each state; empty without the column `label`.
-    """
-
-    path: Path
-    kind: Kind
-    rows: Mapping[str, slice]
-    values: Array
-    labels: NDArray[np.str_]
+    path: Path  # of the file
+    kind: Kind  # of the table
+    rows: Mapping[str, slice]  # of each track, in the order in which the tracks first appear
+    values: Array  # (rows, 1 + c) t in s and the columns of the kind, sorted by track and time
+    labels: NDArray[np.str_]  # (rows,) what the ball does at each state; empty without the column `label`
 
     def of(self, name: str) -> Array:
         """(k, 1 + c) rows of a track in the units of the columns; empty for an unknown track."""

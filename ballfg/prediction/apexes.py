@@ -10,10 +10,8 @@ from ballfg.state import POSITION, VELOCITY, VZ
 HALF_WIDTH: Final = 0.05
 """s to each side of the highest sample over which a parabola is fitted. Drag bends a path off its parabola by less than
 0.1 mm there; of 3 mm of noise it leaves 1.5 mm at 120 Hz."""
-LEAST_FITTED: Final = 5
-"""Least number of samples for the fit of a parabola to noisy positions."""
-FLIGHTS: Final = 3
-"""Number of flights whose apex is searched: before the first bounce, after it, after the second."""
+LEAST_FITTED: Final = 5  # Least number of samples for the fit of a parabola to noisy positions
+FLIGHTS: Final = 3  # Number of flights whose apex is searched: before the first bounce, after it, after the second
 
 _NO_POINT: Final = np.full(3, np.nan)
 

@@ -1,7 +1,5 @@
 """Writes a model as one C99 header: flight, contacts, Jacobians and predictions with covariance, without a library."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

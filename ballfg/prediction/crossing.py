@@ -34,10 +34,8 @@ EventFunction = Callable[[Tensor], Tensor]
 SearchStep = Callable[[Belief, float, float], tuple["Crossing | None", Belief]]
 """From a belief, the end of a search and the time (s) from which events count to an event and the belief then."""
 
-VALUE_JUMP = 1e-6
-"""Largest value, in the event's own unit, of a crossing; a larger one jumped through zero in a bounce."""
-JUST_NOW = 1e-9
-"""s. Least delay of a new event after the time from which events count."""
+VALUE_JUMP = 1e-6  # Largest value, in the event's own unit, of a crossing; a larger one jumped through zero in a bounce
+JUST_NOW = 1e-9  # s. Least delay of a new event after the time from which events count
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from ballfg.prediction.state import BallState
 
 APEX, CONTACT = "apex", "next-contact"
-HALF: Final = 0.5
-"""Least probability of an event on the mean path."""
+HALF: Final = 0.5  # Least probability of an event on the mean path
 LATER: Final = 1.0
 """s beyond the horizon in which a contact is looked for, which other balls than the mean one may have within it."""
 Carried: TypeAlias = tuple[Propagator, Belief]

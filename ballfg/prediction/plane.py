@@ -1,11 +1,9 @@
 """Describes a plane that a ball may cross: where it is, in which direction, and after how many bounces."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
@@ -14,8 +12,7 @@ from ballfg.checks import check_array, check_choice, check_count, check_number, 
 
 AXES: Final = ("x", "y", "z")
 DIRECTIONS: Final = ("either", "up", "down")
-MOST_BOUNCES: Final = 20
-"""Largest number of bounces before a crossing: after so many a ball rolls."""
+MOST_BOUNCES: Final = 20  # Largest number of bounces before a crossing: after so many a ball rolls
 
 
 @dataclass(frozen=True)
@@ -46,7 +43,7 @@ class Plane:
         check_count("after", self.after, 0, MOST_BOUNCES)
 
     @classmethod
-    def parse(cls, text: str) -> Plane:
+    def parse(cls, text: str) -> Self:
         """The plane of a text such as `x=2.0`, `z=3.05,down`, `z=0.9,up,after=1`, or `0.6:0:0.8=1.2` for any normal.
 
         Raises: ValueError: any other text.

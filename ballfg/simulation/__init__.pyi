@@ -1,11 +1,11 @@
-from .balls import table_tennis as table_tennis
-from .balls import tennis as tennis
+from .balls import table_tennis as table_tennis, tennis as tennis
 from .cameras import table_rig as table_rig
-from .config import MeasurementNoise as MeasurementNoise
-from .config import MotionNoise as MotionNoise
-from .config import SimulationConfig as SimulationConfig
-from .scene.config import Clock as Clock
-from .scene.config import SceneConfig as SceneConfig
+from .config import (
+    MeasurementNoise as MeasurementNoise,
+    MotionNoise as MotionNoise,
+    SimulationConfig as SimulationConfig,
+)
+from .scene.config import Clock as Clock, SceneConfig as SceneConfig
 from .scene.recording import record as record
 from .scene.writing import write_scene as write_scene
 from .synthetic import simulate as simulate

@@ -27,14 +27,10 @@ _FILE_KEYS: Final = ("name", "radius", "mass", "inertia_factor", "surface", "fli
 class BallKind:
     """A ball with its declared model, its surface and its launcher."""
 
-    name: str
-    """Part of the dataset's name."""
-    ball: Ball
-    """Radius m, mass kg."""
-    model: AnalyticModel
-    """Model of its motion, with the radius."""
-    surfaces: Surfaces
-    """Its surfaces; z of the table's or the court's surface in `table_height`, m."""
+    name: str  # Part of the dataset's name
+    ball: Ball  # Radius m, mass kg
+    model: AnalyticModel  # Model of its motion, with the radius
+    surfaces: Surfaces  # Its surfaces; z of the table's or the court's surface in `table_height`, m
     launcher: SimulatedLauncher = field(default=TABLE_LAUNCHER)
     """Place and speed of its start, and the end of its track."""
 

@@ -11,8 +11,7 @@ from ballfg.checks import shown
 from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR, TABLE_LENGTH
 from ballfg.vision.camera import Camera
 
-FOCAL_BY_WIDTH: Final = 0.78125
-"""Focal length over the image's width: 1000 px at 1280, 65 degrees from side to side."""
+FOCAL_BY_WIDTH: Final = 0.78125  # Focal length over the image's width: 1000 px at 1280, 65 degrees from side to side
 TARGET: Final = (TABLE_LENGTH / 2, 0.0, TABLE_ABOVE_FLOOR + 0.2)
 """m, target of the rig: the middle of the flights, 0.2 m over the middle of the table."""
 _UP: Final = (0.0, 0.0, 1.0)

@@ -5,11 +5,9 @@ spin of `topspin` about the horizontal axis across the launch (y) and of `sidesp
 not give the rad/s and m/s of a level; docs/simulate.md derives the chosen scales.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 import torch
@@ -31,38 +29,25 @@ class SimulatedLauncher:
     Raises: ValueError, TypeError: a field that is not a number within its bounds; the message names it.
     """
 
-    x: float = bounded(0.0, -100.0, 100.0)
-    """m, muzzle; x = 0 is the launcher's end of the table."""
-    height: float = bounded(0.56, 0.05, 10.0)
-    """m, muzzle above the surface."""
-    speed_slow: float = bounded(3.4, 0.5, 100.0)
-    """m/s at velocity level 8; levels between are linear."""
-    speed_fast: float = bounded(4.1, 0.5, 100.0)
-    """m/s at velocity level 14."""
+    x: float = bounded(0.0, -100.0, 100.0)  # m, muzzle; x = 0 is the launcher's end of the table
+    height: float = bounded(0.56, 0.05, 10.0)  # m, muzzle above the surface
+    speed_slow: float = bounded(3.4, 0.5, 100.0)  # m/s at velocity level 8; levels between are linear
+    speed_fast: float = bounded(4.1, 0.5, 100.0)  # m/s at velocity level 14
     elevation_slow: float = bounded(1.24, -1.5, 1.5)
     """rad above the horizontal at velocity level 8; the head is lowered as the speed goes up."""
-    elevation_fast: float = bounded(-0.18, -1.5, 1.5)
-    """rad above the horizontal at velocity level 14."""
-    topspin_scale: float = bounded(58.0, 0.0, 1000.0)
-    """rad/s per level of topspin."""
-    sidespin_scale: float = bounded(48.0, 0.0, 1000.0)
-    """rad/s per level of sidespin."""
+    elevation_fast: float = bounded(-0.18, -1.5, 1.5)  # rad above the horizontal at velocity level 14
+    topspin_scale: float = bounded(58.0, 0.0, 1000.0)  # rad/s per level of topspin
+    sidespin_scale: float = bounded(48.0, 0.0, 1000.0)  # rad/s per level of sidespin
     position_spread: float = bounded(0.003, 0.0, 0.5)
     """m, standard deviation of each coordinate of the muzzle from shot to shot."""
-    speed_spread: float = bounded(0.005, 0.0, 0.2)
-    """Standard deviation of the speed from shot to shot, relative."""
-    aim_spread: float = bounded(0.005, 0.0, 0.5)
-    """rad, standard deviation of azimuth and elevation from shot to shot."""
+    speed_spread: float = bounded(0.005, 0.0, 0.2)  # Standard deviation of the speed from shot to shot, relative
+    aim_spread: float = bounded(0.005, 0.0, 0.5)  # rad, standard deviation of azimuth and elevation from shot to shot
     spin_spread: float = bounded(3.0, 0.0, 500.0)
     """rad/s, standard deviation of each component of the spin from shot to shot."""
-    x_low: float = bounded(-0.4, -200.0, 200.0)
-    """m, a track ends where the ball comes back behind this."""
-    x_high: float = bounded(3.2, -200.0, 200.0)
-    """m, a track ends where the ball goes beyond this."""
-    y_far: float = bounded(1.2, 0.01, 200.0)
-    """m, a track ends where the ball is farther than this from the x axis."""
-    duration: float = bounded(1.32, 0.05, 20.0)
-    """s, longest track."""
+    x_low: float = bounded(-0.4, -200.0, 200.0)  # m, a track ends where the ball comes back behind this
+    x_high: float = bounded(3.2, -200.0, 200.0)  # m, a track ends where the ball goes beyond this
+    y_far: float = bounded(1.2, 0.01, 200.0)  # m, a track ends where the ball is farther than this from the x axis
+    duration: float = bounded(1.32, 0.05, 20.0)  # s, longest track
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -71,7 +56,7 @@ class SimulatedLauncher:
                 f"x must lie between x_low and x_high; got {self.x_low:g}, {self.x:g}, {self.x_high:g} m. Correct them."
             )
 
-    def with_fields(self, changes: Mapping[str, Any]) -> SimulatedLauncher:
+    def with_fields(self, changes: Mapping[str, Any]) -> Self:
         """This launcher with some fields changed.
 
         Raises: ValueError, TypeError: changes that are not a mapping, an unknown field or a bad value.

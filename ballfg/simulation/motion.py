@@ -24,10 +24,8 @@ from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ, Z
 NOISE_STEP = 0.005
 """s. Largest step of process noise. In free flight its discretisation is exact for any step; in a step with a contact
 the noise is added after the bounce, so that the step must be short."""
-TOGETHER = 32
-"""Number of frames computed at once; a ball that has left the view is followed for as many more at most."""
-MIN_FRAMES = 5
-"""Least number of frames of a track, even if the ball leaves the view at once."""
+TOGETHER = 32  # Number of frames computed at once; a ball that has left the view is followed for as many more at most
+MIN_FRAMES = 5  # Least number of frames of a track, even if the ball leaves the view at once
 
 
 def true_model(declared: AnalyticModel, undeclared: Iterable[Effect]) -> AnalyticModel:
@@ -94,10 +92,8 @@ class KickedModel(BallModel):
 class TrueMotion:
     """The true states of a block of shots at their frames, frame k at k / rate seconds."""
 
-    states: NDArray[np.float64]
-    """(n, k, 9); undefined after the end of a track."""
-    lengths: NDArray[np.int64]
-    """(n,) frames of each track."""
+    states: NDArray[np.float64]  # (n, k, 9); undefined after the end of a track
+    lengths: NDArray[np.int64]  # (n,) frames of each track
 
 
 @torch.no_grad()

@@ -9,8 +9,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-JITTER_LIMIT = 3.0
-"""Sigmas at which jitter is cut off: at the largest sigma, 0.15 frames, stamps stay 0.1 frames apart."""
+JITTER_LIMIT = 3.0  # Sigmas at which jitter is cut off: at the largest sigma, 0.15 frames, stamps stay 0.1 frames apart
 
 
 class Purpose(IntEnum):

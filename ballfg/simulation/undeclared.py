@@ -15,10 +15,8 @@ from torch import Tensor
 from ballfg.dynamics.effect import Coefficient, Effect, Flight, FlightEffect, vector
 from ballfg.dynamics.effects.registry import EFFECTS
 
-SOFT_START: Final = 0.1
-"""m. Distance over which the growth of thick air sets in, so that the force has no kink."""
-SOFT_SPEED: Final = 0.1
-"""m/s. Below it the direction of flight fades, so that a ball at rest has none."""
+SOFT_START: Final = 0.1  # m. Distance over which the growth of thick air sets in, so that the force has no kink
+SOFT_SPEED: Final = 0.1  # m/s. Below it the direction of flight fades, so that a ball at rest has none
 
 
 class Pull(FlightEffect):

@@ -15,8 +15,7 @@ from ballfg.dynamics.model_file import model_to_dict
 from ballfg.files.whole_folder import check_replaceable, whole_folder
 from ballfg.progress import Watch, unwatched
 from ballfg.simulation.config import SimulationConfig
-from ballfg.simulation.measure import SimulatedTrack
-from ballfg.simulation.synthetic import dataset_info, simulate
+from ballfg.simulation.synthetic import SimulatedTrack, dataset_info, simulate
 from ballfg.state import STATE_NAMES
 from ballfg.tracks import TableWriter, Track, write_dataset
 from ballfg.tracks.writing import DATASET_FILES, TRUTH_FILE, TRUTH_FILES

@@ -1,7 +1,7 @@
 """Reads and writes `detections.csv`: its columns, their rules and noise, and the sightings of each ball."""
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -18,7 +18,6 @@ from ballfg.tracks import csv_files
 from ballfg.tracks.checks import check_step
 from ballfg.tracks.rows import KEY, distinct
 from ballfg.tracks.sightings import Sightings
-from ballfg.tracks.table import TableWriter
 
 Texts = NDArray[np.str_]
 Rule = tuple[str, Callable[[Array], NDArray[np.bool_]]]  # the rule for the numbers of a column, in words and as a test
@@ -94,19 +93,6 @@ def read_sightings(
         radii = _radii(own) if RADIUS[0] in own else None
         found[name] = Sightings(tuple(time_offsets), seen_by[mine], own["t"], pixels, covariances(own), radii)
     return found, notes
-
-
-def write_sightings(path: str | os.PathLike[str], balls: Iterable[tuple[str, Sightings]]) -> None:
-    """Writes a `detections.csv` with the trajectory of each row; pixels and stamps read back bit for bit.
-
-    Args: path: ends in .csv.  balls: name of the trajectory and sightings of each.
-    Raises: ValueError: no balls, or another ending. FileNotFoundError: the folder does not exist.
-    """
-    with TableWriter(path) as table:
-        for name, seen in balls:
-            camera = np.array(seen.cameras, dtype=object)[seen.camera]
-            radii = {} if seen.radii is None else dict(zip(RADIUS, seen.radii.T, strict=True))
-            table.write({KEY: name} | seen_columns(seen.times, camera, seen.pixels, seen.covariances) | radii)
 
 
 def _chosen(path: Path, lines: Index, names: Texts, camera: Index, values: Mapping[str, Array]) -> tuple[Index, int]:

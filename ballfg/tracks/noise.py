@@ -1,11 +1,9 @@
 """Holds the noise of a set of tracks as files state it: of the tracker, labels, bounces and flights."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any, Final
+from typing import Any, Final, Self
 
 from ballfg.checks import check_instance, check_number, did_you_mean, shown, type_name
 
@@ -58,7 +56,7 @@ class TrackNoise:
             check_number(f"noise.coefficients.{name}", value, "its own unit", above=0.0)
 
     @classmethod
-    def from_mapping(cls, content: Any) -> TrackNoise:
+    def from_mapping(cls, content: Any) -> Self:
         """The noise in a parsed section of a file. Raises: ValueError: an unknown key, or a number out of its range."""
         if not isinstance(content, Mapping):
             raise ValueError(f"noise must be a mapping such as {{memory_time: 0.02}}; got {type_name(content)}.")

@@ -1,7 +1,5 @@
 """A track holds stamps, positions, other observations and labels of one shot."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, Self
@@ -111,7 +109,7 @@ class Track:
         beside = "".join(f", {observation!r}" for observation in self.observations)
         return f"Track({self.name!r}, {len(self)} samples, {self.duration:.3f} s{beside})"
 
-    def observed(self, *observations: Measurements) -> Track:
+    def observed(self, *observations: Measurements) -> Self:
         """The track with further observations.
 
         Args: observations: `ballfg.estimation.Observation`s, one of a name.
@@ -129,11 +127,11 @@ class Track:
         """Time from the first sample to the last, s."""
         return float(self.seconds[-1])
 
-    def since_first(self) -> Track:
+    def since_first(self) -> Self:
         """The same track with stamps counted from its first, for estimators."""
         return self if self.times[0] == 0.0 else replace(self, times=self.seconds)
 
-    def opening(self, seconds: float) -> Track:
+    def opening(self, seconds: float) -> Self:
         """The samples of the first seconds, including a stamp at their end, as a new track.
 
         Args: seconds: since the first sample; not negative.
@@ -152,7 +150,7 @@ class Track:
         values = [self.labels[key] for key in SPIN_LABELS if key in self.labels]
         return np.array(values, dtype=np.float64) if len(values) == len(SPIN_LABELS) else None
 
-    def between(self, start: float, end: float) -> Track:
+    def between(self, start: float, end: float) -> Self:
         """The samples with start <= time <= end, as a new track.
 
         The spin labels belong to the first sample, so a part without that sample does not have them.
@@ -180,7 +178,7 @@ class Track:
             part=self.part or not inside.all(),
         )
 
-    def until(self, end: float) -> Track:
+    def until(self, end: float) -> Self:
         """The samples with time <= end (s, in the track's own time), as a new track.
 
         Raises: ValueError: if the first sample is later than that.

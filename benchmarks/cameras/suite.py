@@ -17,8 +17,7 @@ from ballfg.benchmarks.cameras.clocks import FACTORS, NAIVE, Velocities, clocks,
 from ballfg.benchmarks.cameras.scenes import Filmed, Judged, Scenario, film, judge, scenarios
 from ballfg.benchmarks.metrics import bootstrap, median_and_quartiles, median_and_range, pooled_rms, ratio, share
 from ballfg.benchmarks.pictures import BLUE, ORANGE, save
-from ballfg.benchmarks.results import Results
-from ballfg.benchmarks.resumable import in_processes
+from ballfg.benchmarks.results import Results, in_processes
 from ballfg.benchmarks.speed.stopwatch import milliseconds
 from ballfg.dynamics import nominal_model
 from ballfg.estimation import Online, Settings

@@ -41,33 +41,22 @@ class Recording:
 
 @dataclass(frozen=True)
 class Case:
-    """One dataset, one diagnosis.
+    """One dataset, one diagnosis."""
 
-    Attributes:
-        part: of the benchmark.
-        subject: the planted effect, in a word.  size: of it; 1 is typical.  seed: number of the repetition.
-        planted: names of the effects that the declared model lacks.
-        left_out: effects of the nominal model that the declared one lacks.
-        sessions: undeclared effects, as texts, of each session that the dataset consists of.
-        recording: settings of its tracks.  data: folder of measured tracks, which take the place of simulated ones.
-        change: name of a change of `CHANGES` that the measured tracks undergo; empty for none.
-        most: number of measured tracks, evenly spread; None for all.
-        repair: fit the true model too.  jobs: processes of the diagnosis.
-    """
-
-    part: str
-    subject: str
-    size: float
-    seed: int
-    planted: tuple[str, ...] = ()
-    left_out: tuple[str, ...] = ()
+    part: str  # of the benchmark
+    subject: str  # the planted effect, in a word
+    size: float  # of it; 1 is typical
+    seed: int  # number of the repetition
+    planted: tuple[str, ...] = ()  # names of the effects that the declared model lacks
+    left_out: tuple[str, ...] = ()  # effects of the nominal model that the declared one lacks
     sessions: tuple[tuple[str, ...], ...] = ((),)
-    recording: Recording = field(default_factory=Recording)
-    data: Path | None = None
-    change: str = ""
-    most: int | None = None
-    repair: bool = False
-    jobs: int = 1
+    """Undeclared effects, as texts, of each session that the dataset consists of."""
+    recording: Recording = field(default_factory=Recording)  # settings of its tracks
+    data: Path | None = None  # folder of measured tracks, which take the place of simulated ones
+    change: str = ""  # name of a change of `CHANGES` that the measured tracks undergo; empty for none
+    most: int | None = None  # number of measured tracks, evenly spread; None for all
+    repair: bool = False  # fit the true model too
+    jobs: int = 1  # processes of the diagnosis
 
     @property
     def name(self) -> str:

@@ -28,7 +28,7 @@ from ballfg.simulation.motion import true_model
 from ballfg.simulation.synthetic import dataset_info
 from ballfg.state import SPIN
 from ballfg.tracks import Dataset, read_dataset, write_dataset
-from ballfg.tracks.memory import dataset_in_memory
+from ballfg.tracks.dataset import dataset_in_memory
 
 
 def make_dataset(case: Case, folder: Path) -> Dataset:

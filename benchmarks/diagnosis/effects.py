@@ -16,23 +16,16 @@ from ballfg.dynamics import EFFECTS, nominal_model
 
 @dataclass(frozen=True)
 class Plant:
-    """An effect that acts although the declared model lacks it.
+    """An effect that acts although the declared model lacks it."""
 
-    Attributes:
-        name: of the effect.  amounts: by coefficient, the addition at size 1.
-        base: value of those coefficients at size 0: the effect is absent, or as declared.
-        left_out: the nominal model has it; the declared model is the nominal one without it.
-        hidden: other effects or free coefficients do the same; an honest answer names one of those effects or says that
-            it cannot be seen.
-        sized: it comes in sizes; else it is there or not.
-    """
-
-    name: str
-    amounts: tuple[tuple[str, float], ...]
-    base: float = 0.0
-    left_out: bool = False
+    name: str  # of the effect
+    amounts: tuple[tuple[str, float], ...]  # by coefficient, the addition at size 1
+    base: float = 0.0  # value of those coefficients at size 0: the effect is absent, or as declared
+    left_out: bool = False  # the nominal model has it; the declared model is the nominal one without it
     hidden: bool = False
-    sized: bool = True
+    """Other effects or free coefficients do the same; an honest answer names one of those effects or says that it
+    cannot be seen."""
+    sized: bool = True  # it comes in sizes; else it is there or not
 
     def texts(self, size: float) -> tuple[str, ...]:
         """The effect at a size, 1 being typical, as a simulation reads it: `wind.x=0.2`."""

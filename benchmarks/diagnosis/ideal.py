@@ -23,7 +23,7 @@ from ballfg.benchmarks.diagnosis.cases import Case, Recording, planted_case
 from ballfg.benchmarks.diagnosis.data import declared_model, make_dataset
 from ballfg.benchmarks.diagnosis.effects import PLANTS
 from ballfg.benchmarks.diagnosis.record import case_digest
-from ballfg.benchmarks.resumable import Kept
+from ballfg.benchmarks.results import Kept
 from ballfg.diagnosis.fit.fit import fit_model
 from ballfg.diagnosis.fit.holdout import launcher_labels
 from ballfg.diagnosis.fit.problem import Fit
@@ -38,15 +38,11 @@ POWER = 0.9  # Probability at which an effect counts as detectable
 
 @dataclass(frozen=True)
 class Ideal(Kept):
-    """The ideal test of an effect.
-
-    Attributes:
-        rank: degrees of freedom; 0 where the data do not show the effect.  information: non-centrality at size 1.
-    """
+    """The ideal test of an effect."""
 
     what = "an ideal test"
-    rank: int
-    information: float
+    rank: int  # degrees of freedom; 0 where the data do not show the effect
+    information: float  # non-centrality at size 1
 
     @property
     def size(self) -> float:

@@ -20,8 +20,7 @@ from ballfg.benchmarks.diagnosis.record import Found, Record, is_one_of
 from ballfg.benchmarks.diagnosis.suite import collect_records, run_case
 from ballfg.benchmarks.metrics import Figure, share
 from ballfg.benchmarks.pictures import BLUE, GREY, ORANGE, save
-from ballfg.benchmarks.results import Results
-from ballfg.benchmarks.resumable import RUNS_FOLDER
+from ballfg.benchmarks.results import RUNS_FOLDER, Results
 from ballfg.diagnosis.residual_tests.tracker_errors import UNITS
 from ballfg.dynamics import EFFECTS, Coefficient
 from ballfg.estimation.noise.tracker_errors import JITTER, MEMORY
@@ -40,19 +39,13 @@ Strength = tuple[float, float]  # Value and standard deviation
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one change in one set.
+    """What became of one change in one set."""
 
-    Attributes:
-        named: its effect is among the names.
-        changes: of each coefficient, with its standard deviation, against the set as it was; empty if it is not named.
-        planted: what the change of each coefficient should be.
-        names: all names of the changed set; None if its diagnosis failed.
-    """
-
-    named: bool
+    named: bool  # its effect is among the names
     changes: Mapping[str, Strength]
-    planted: Mapping[str, float]
-    names: tuple[str, ...] | None
+    """Of each coefficient, with its standard deviation, against the set as it was; empty if it is not named."""
+    planted: Mapping[str, float]  # what the change of each coefficient should be
+    names: tuple[str, ...] | None  # all names of the changed set; None if its diagnosis failed
 
     @property
     def ratio(self) -> Strength | None:

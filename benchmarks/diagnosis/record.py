@@ -8,7 +8,7 @@ from importlib import metadata
 
 from ballfg.benchmarks.diagnosis.cases import Case, Recording
 from ballfg.benchmarks.diagnosis.effects import PLANTS
-from ballfg.benchmarks.resumable import Kept
+from ballfg.benchmarks.results import Kept
 from ballfg.diagnosis.hypotheses.hypothesis import TWINS
 from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Outcome, Value, Verdict
 

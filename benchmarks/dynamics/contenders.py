@@ -12,7 +12,7 @@ import torch
 
 from ballfg.arrays import Array
 from ballfg.benchmarks.dynamics.task import PathScore, Task
-from ballfg.benchmarks.resumable import Kept
+from ballfg.benchmarks.results import Kept
 from ballfg.dynamics import BallModel, Surfaces, nominal_model
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.motion.paths import paths
@@ -32,20 +32,13 @@ a fifth of it changes the errors by less than 1 %."""
 
 @dataclass(frozen=True)
 class Job:
-    """One method to be made and judged.
+    """One method to be made and judged."""
 
-    Attributes:
-        tasks: what it learns from, all of it together, and is judged by, each by itself.
-        method: its name in `METHODS`.  seed: of its training.
-        folder: its own, for what training writes; it may hold an unfinished training to go on with.
-        quick: train just enough to see that everything works.
-    """
-
-    tasks: tuple[Task, ...]
-    method: str
-    seed: int
-    folder: Path
-    quick: bool
+    tasks: tuple[Task, ...]  # what it learns from, all of it together, and is judged by, each by itself
+    method: str  # its name in `METHODS`
+    seed: int  # of its training
+    folder: Path  # its own, for what training writes; it may hold an unfinished training to go on with
+    quick: bool  # train just enough to see that everything works
 
     @property
     def measured(self) -> bool:
@@ -179,13 +172,10 @@ Point = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Fan:
-    """Paths from one launch.
+    """Paths from one launch."""
 
-    Attributes: topspin: by level, m, without sidespin, to `DIGITS`.  sidespin: by level, m, without topspin.
-    """
-
-    topspin: dict[int, list[Point]]
-    sidespin: dict[int, list[Point]]
+    topspin: dict[int, list[Point]]  # by level, m, without sidespin, to `DIGITS`
+    sidespin: dict[int, list[Point]]  # by level, m, without topspin
 
 
 def _paths(contender: GraphContender, setting: str) -> dict[int, list[Point]]:

@@ -14,28 +14,22 @@ from ballfg.benchmarks.dynamics import contenders
 from ballfg.benchmarks.dynamics.contenders import Contender, GraphContender, Job, Record, fan_of, job_digest
 from ballfg.benchmarks.dynamics.task import Task, score_path
 from ballfg.benchmarks.dynamics.trained import RESIDUAL, recipe, trained_contender
-from ballfg.benchmarks.resumable import collect
+from ballfg.benchmarks.results import collect
 from ballfg.benchmarks.speed.stopwatch import milliseconds
 from ballfg.learning.run.loop import TrainingStoppedError
 
 
 @dataclass(frozen=True)
 class Method:
-    """A row of the comparison.
-
-    Attributes:
-        make: a contender for one of the job's tasks; what the method learns is learned at the first of them.
-        trained: True if a seed makes a difference; if not it runs once.
-        takes_part: on which tracks: `all`, `simulated` or `measured` ones.
-        transfers: True if it can be judged on tracks of a launcher outside of its training.
-        package: required package of an extra; empty if there is none.
-    """
+    """A row of the comparison."""
 
     make: Callable[[Job, Task], Contender]
-    trained: bool = True
+    """A contender for one of the job's tasks; what the method learns is learned at the first of them."""
+    trained: bool = True  # True if a seed makes a difference; if not it runs once
     takes_part: Literal["all", "simulated", "measured"] = "all"
-    transfers: bool = True
-    package: str = ""
+    """On which tracks: `all`, `simulated` or `measured` ones."""
+    transfers: bool = True  # True if it can be judged on tracks of a launcher outside of its training
+    package: str = ""  # required package of an extra; empty if there is none
 
     @property
     def installed(self) -> bool:

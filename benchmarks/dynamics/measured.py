@@ -25,17 +25,11 @@ GROUP: Final = "group"
 
 @dataclass(frozen=True)
 class Measured:
-    """Measured tracks.
+    """Measured tracks."""
 
-    Attributes:
-        datasets: one model learns from all of them; it is judged on each.
-        transfer: the models are judged on it, but learn nothing from it; None for none.
-        transfer_tracks: how many of its first tracks; None for all.
-    """
-
-    datasets: Sequence[Dataset]
-    transfer: Dataset | None = None
-    transfer_tracks: int | None = None
+    datasets: Sequence[Dataset]  # one model learns from all of them; it is judged on each
+    transfer: Dataset | None = None  # the models are judged on it, but learn nothing from it; None for none
+    transfer_tracks: int | None = None  # how many of its first tracks; None for all
 
 
 def measured_tasks(data: Measured, jobs: int, most: int | None) -> list[Task]:

@@ -16,8 +16,7 @@ from ballfg.benchmarks.dynamics.measured import Measured, measured_tasks
 from ballfg.benchmarks.dynamics.task import APEXES, Task, pooled_rmse
 from ballfg.benchmarks.dynamics.truth import TRACKS, synthetic_task
 from ballfg.benchmarks.metrics import Figure
-from ballfg.benchmarks.results import CURVE_MARK, Results
-from ballfg.benchmarks.resumable import RUNS_FOLDER
+from ballfg.benchmarks.results import CURVE_MARK, RUNS_FOLDER, Results
 
 
 def add_rows(results: Results, task: Task, records: Sequence[Record]) -> None:
@@ -70,17 +69,12 @@ def figures(record: Record, measured: bool) -> Iterator[tuple[str, str, float, i
 
 @dataclass(frozen=True)
 class Plan:
-    """The amount of computation.
+    """The amount of computation."""
 
-    Attributes:
-        tracks: synthetic ones.  measured: measured tracks at most; None for all.
-        seeds: how often each trained method is trained.  quick: train just enough to see that everything works.
-    """
-
-    tracks: int
-    measured: int | None
-    seeds: int
-    quick: bool
+    tracks: int  # synthetic ones
+    measured: int | None  # measured tracks at most; None for all
+    seeds: int  # how often each trained method is trained
+    quick: bool  # train just enough to see that everything works
 
 
 FULL: Final = Plan(tracks=TRACKS, measured=None, seeds=3, quick=False)

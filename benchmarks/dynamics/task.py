@@ -1,7 +1,5 @@
 """Holds the tracks of the dynamics comparison, shots for training and for judging, and scores predicted paths."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,26 +25,17 @@ SPLIT_LABEL: Final = "split"  # The label in a written task that says which part
 
 @dataclass(frozen=True)
 class TaskShot:
-    """One track with its reference.
+    """One track with its reference."""
 
-    Attributes:
-        track: stamps, measured positions and labels: all that a model may see.
-        reference: (n, 3) m, the positions that count: the true ones where there is truth, else the measured ones.
-        observed: number of first samples that a model is given.
-        judged: number of first samples for the errors; the rest of the track serves for apexes only.
-        bounces: (b,) s, on the track's clock, in order.
-        apexes: (3, 3) m, the highest points of the flights in `APEXES`; NaN where a flight has none inside the track.
-        apex_times: (3,) s; NaN likewise.  states: (n, 9) the true states; None for measured tracks.
-    """
-
-    track: Track
-    reference: Array
-    observed: int
-    judged: int
-    bounces: Array
+    track: Track  # stamps, measured positions and labels: all that a model may see
+    reference: Array  # (n, 3) m, the positions that count: the true ones where there is truth, else the measured ones
+    observed: int  # number of first samples that a model is given
+    judged: int  # number of first samples for the errors; the rest of the track serves for apexes only
+    bounces: Array  # (b,) s, on the track's clock, in order
     apexes: Array
-    apex_times: Array
-    states: Array | None = None
+    """(3, 3) m, the highest points of the flights in `APEXES`; NaN where a flight has none inside the track."""
+    apex_times: Array  # (3,) s; NaN likewise
+    states: Array | None = None  # (n, 9) the true states; None for measured tracks
 
     @property
     def seen(self) -> Track:
@@ -56,28 +45,18 @@ class TaskShot:
 
 @dataclass(frozen=True)
 class Task:
-    """A comparison.
+    """A comparison."""
 
-    Attributes:
-        case: its name in `results.json`.  info: the declared table, ball, rate and position noise.
-        surfaces: table and floor, for every model.
-        settings: of the estimator, the same for every model but for noise that a model has learned.
-        launcher: spin per level for models that do not learn it; None where the tracks have no levels.
-        launcher_labels: labels from which trained models learn the spin.
-        observe: the observed part of a shot, as in a training config.
-        truth: the true dynamics; None for measured tracks.  train: shots to learn from.  validation: shots to judge by.
-    """
-
-    case: str
-    info: DatasetInfo
-    surfaces: Surfaces
-    settings: Settings
-    launcher: Launcher | None
-    launcher_labels: tuple[str, ...]
-    observe: Mapping[str, float]
-    truth: BallModel | None
-    train: tuple[TaskShot, ...]
-    validation: tuple[TaskShot, ...]
+    case: str  # its name in `results.json`
+    info: DatasetInfo  # the declared table, ball, rate and position noise
+    surfaces: Surfaces  # table and floor, for every model
+    settings: Settings  # of the estimator, the same for every model but for noise that a model has learned
+    launcher: Launcher | None  # spin per level for models that do not learn it; None where the tracks have no levels
+    launcher_labels: tuple[str, ...]  # labels from which trained models learn the spin
+    observe: Mapping[str, float]  # the observed part of a shot, as in a training config
+    truth: BallModel | None  # the true dynamics; None for measured tracks
+    train: tuple[TaskShot, ...]  # shots to learn from
+    validation: tuple[TaskShot, ...]  # shots to judge by
 
     def write(self, folder: Path, *, validate: bool = True) -> None:
         """Write the tracks of both parts into a new folder, as a dataset with a label `split`.
@@ -96,19 +75,14 @@ class Task:
 
 @dataclass(frozen=True)
 class PathScore:
-    """The errors of one predicted path.
-
-    Attributes:
-        track: m^2, of the squared distances over all judged samples (None if some were not predicted); their number.
-        rest: the same over the judged samples after the observed ones.
-        apex: m, distance between predicted and reference apex by flight (`APEXES`); None where either is missing.
-        apex_ahead: True if the reference apex lies after the observed part.
-    """
+    """The errors of one predicted path."""
 
     track: tuple[float | None, int]
-    rest: tuple[float | None, int]
+    """m^2, of the squared distances over all judged samples (None if some were not predicted); their number."""
+    rest: tuple[float | None, int]  # the same over the judged samples after the observed ones
     apex: tuple[float | None, float | None, float | None]
-    apex_ahead: tuple[bool, bool, bool]
+    """m, distance between predicted and reference apex by flight (`APEXES`); None where either is missing."""
+    apex_ahead: tuple[bool, bool, bool]  # True if the reference apex lies after the observed part
 
     @property
     def track_rmse(self) -> float:

@@ -33,9 +33,8 @@ from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction.apexes import true_apexes
 from ballfg.progress import progress
 from ballfg.simulation import MeasurementNoise, SimulationConfig, parse_effects, simulate, table_tennis
-from ballfg.simulation.measure import SimulatedTrack
 from ballfg.simulation.motion import true_model
-from ballfg.simulation.synthetic import dataset_info
+from ballfg.simulation.synthetic import SimulatedTrack, dataset_info
 from ballfg.state import POSITION, VZ
 
 CASE: Final = "synthetic"

@@ -64,18 +64,12 @@ WITHIN = 5.0  # Standard deviations within which a whitened innovation is explai
 
 @dataclass(frozen=True)
 class Measured:
-    """The estimates and predictions of a dataset's tracks.
+    """The estimates and predictions of a dataset's tracks."""
 
-    Attributes:
-        name: of the dataset.  predictions: by method, of the tracks that last longer than the observed part.
-        smoothed: the smoother's estimates of the whole tracks.
-        unseen: number of tracks that end within the observed part.
-    """
-
-    name: str
-    predictions: dict[str, list[TrackPrediction]]
-    smoothed: list[Estimate]
-    unseen: int
+    name: str  # of the dataset
+    predictions: dict[str, list[TrackPrediction]]  # by method, of the tracks that last longer than the observed part
+    smoothed: list[Estimate]  # the smoother's estimates of the whole tracks
+    unseen: int  # number of tracks that end within the observed part
 
 
 def run_measured(results: Results, dataset: Dataset, tracks: int | None, jobs: int) -> Measured:

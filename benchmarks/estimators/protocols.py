@@ -36,16 +36,11 @@ The velocities before and after differ by several m/s, so that the error there w
 
 @dataclass(frozen=True)
 class Case:
-    """A measured track and its truth.
+    """A measured track and its truth."""
 
-    Attributes:
-        track: all that an estimator sees.  true_states: (n, 9).
-        away: (n,) False for samples within `AT_BOUNCE` of a true bounce.
-    """
-
-    track: Track
-    true_states: Array
-    away: NDArray[np.bool_]
+    track: Track  # all that an estimator sees
+    true_states: Array  # (n, 9)
+    away: NDArray[np.bool_]  # (n,) False for samples within `AT_BOUNCE` of a true bounce
 
 
 @dataclass(frozen=True)
@@ -65,18 +60,13 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Protocol:
-    """Synthetic tracks and the estimators that are compared on them, with the same settings for all.
+    """Synthetic tracks and the estimators that are compared on them, with the same settings for all."""
 
-    Attributes:
-        name: the case in `results.json`.  settings: of every estimator.  tracks: with their truth.
-        candidates: by method.  surfaces: that the ball bounces on.
-    """
-
-    name: str
-    settings: Settings
-    tracks: list[Case]
-    candidates: Mapping[str, Candidate]
-    surfaces: Surfaces
+    name: str  # the case in `results.json`
+    settings: Settings  # of every estimator
+    tracks: list[Case]  # with their truth
+    candidates: Mapping[str, Candidate]  # by method
+    surfaces: Surfaces  # that the ball bounces on
 
 
 def paper_protocol(count: int, seed: int) -> Protocol:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array
 from ballfg.benchmarks.estimators.protocols import Candidate, Case
 from ballfg.benchmarks.metrics import inside, nees, square_norms
-from ballfg.benchmarks.resumable import in_processes
+from ballfg.benchmarks.results import in_processes
 from ballfg.estimation import Status
 from ballfg.estimation.filters.sliding_window import WINDOW
 from ballfg.state import POSITION, SPIN, VELOCITY
@@ -19,26 +19,17 @@ LEVELS = (0.5, 0.9)  # Levels of the intervals with a reported coverage
 
 @dataclass(frozen=True)
 class TrackScore:
-    """The errors of one estimate of n samples.
+    """The errors of one estimate of n samples."""
 
-    Attributes:
-        velocity: (n,) m/s, length of the error.  position: (n,) m.  spin: (n,) rad/s.
-        nees: (n,) of the whole state, 9 degrees of freedom.  velocity_nees: (n,) 3 degrees of freedom.
-        covered: (levels, n, 9) whether each component lies in the central interval of each of `LEVELS`.
-        away: (n,) the sample is not at a bounce (`away_from_bounces`).
-        newest: (k,) m/s, velocity error at the newest sample for each number of observations; NaN beyond the track.
-        ok: True if the estimate succeeded.
-    """
-
-    velocity: Array
-    position: Array
-    spin: Array
-    nees: Array
-    velocity_nees: Array
-    covered: NDArray[np.bool_]
-    away: NDArray[np.bool_]
-    newest: Array
-    ok: bool
+    velocity: Array  # (n,) m/s, length of the error
+    position: Array  # (n,) m
+    spin: Array  # (n,) rad/s
+    nees: Array  # (n,) of the whole state, 9 degrees of freedom
+    velocity_nees: Array  # (n,) 3 degrees of freedom
+    covered: NDArray[np.bool_]  # (levels, n, 9) whether each component lies in the central interval of each of `LEVELS`
+    away: NDArray[np.bool_]  # (n,) the sample is not at a bounce (`away_from_bounces`)
+    newest: Array  # (k,) m/s, velocity error at the newest sample for each number of observations; NaN beyond the track
+    ok: bool  # True if the estimate succeeded
 
 
 Scores = dict[str, list[TrackScore]]  # By method, in the order of the tracks

@@ -133,17 +133,12 @@ def _place(score: TrackScore, share: float) -> int:
 
 @dataclass(frozen=True)
 class Size:
-    """The amount of computation.
+    """The amount of computation."""
 
-    Attributes:
-        compared: synthetic tracks in each protocol.  consistency: synthetic tracks whose NEES is taken.
-        measured: measured tracks at most; None for all.  counts: numbers of observations on the curves.
-    """
-
-    compared: int
-    consistency: int
-    measured: int | None
-    counts: Sequence[int]
+    compared: int  # synthetic tracks in each protocol
+    consistency: int  # synthetic tracks whose NEES is taken
+    measured: int | None  # measured tracks at most; None for all
+    counts: Sequence[int]  # numbers of observations on the curves
 
 
 COUNTS = (5, 6, 7, 8, 10, 12, 15, 20, 25, 30, 40, 50, 60, 70, 80)

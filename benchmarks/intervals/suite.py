@@ -45,17 +45,12 @@ METHODS: Final = (USUAL, OBSERVED_PARTS, OTHER_TRACKS)
 
 @dataclass(frozen=True)
 class Judged:
-    """Predictions of some tracks against what was measured.
+    """Predictions of some tracks against what was measured."""
 
-    Attributes:
-        errors: (n, 3) m, of all predicted samples.  sigmas: (n, 3) m.  tracks: (n,) number of the track of each.
-        failed: number of tracks without an estimate.
-    """
-
-    errors: Array
-    sigmas: Array
-    tracks: Array
-    failed: int
+    errors: Array  # (n, 3) m, of all predicted samples
+    sigmas: Array  # (n, 3) m
+    tracks: Array  # (n,) number of the track of each
+    failed: int  # number of tracks without an estimate
 
     @property
     def nis(self) -> Array:

@@ -28,18 +28,13 @@ def milliseconds(action: Callable[[], object]) -> float:
 
 @dataclass(frozen=True)
 class Stopwatch:
-    """Times actions and adds their rows.
+    """Times actions and adds their rows."""
 
-    Attributes:
-        results: gets the rows.  case: of all of them.  runs: timed ones.  warm_up: runs before them, not counted.
-        banded: the problem that the control solves.
-    """
-
-    results: Results
-    case: str
-    runs: int
-    warm_up: int
-    banded: BandedProblem
+    results: Results  # gets the rows
+    case: str  # of all of them
+    runs: int  # timed ones
+    warm_up: int  # runs before them, not counted
+    banded: BandedProblem  # the problem that the control solves
 
     def time(self, method: str, metric: str, action: Callable[[], object]) -> Figure:
         """Median and quartiles of an action's time, ms; adds them as a row."""

@@ -89,22 +89,15 @@ ONLINE: Final[Mapping[Solver, str]] = {"gtsam": "online_update", "ballfg": "onli
 
 @dataclass(frozen=True)
 class Size:
-    """The amount of computation.
+    """The amount of computation."""
 
-    Attributes:
-        runs: timed runs of each action.  warm_up: runs before them.
-        fit_iterations: that fit the network to the analytic model.
-        pretrain_iterations: that fit the learned model to the analytic one; after 200 its flight is off by 0.1 m/s^2.
-        dataset_tracks: tracks of a dataset that are timed.
-        flights: simulated ones in a stream at 200 Hz; 80 last 61 s.
-    """
-
-    runs: int
-    warm_up: int
-    fit_iterations: int = FIT_ITERATIONS
+    runs: int  # timed runs of each action
+    warm_up: int  # runs before them
+    fit_iterations: int = FIT_ITERATIONS  # that fit the network to the analytic model
     pretrain_iterations: int = 200
-    dataset_tracks: int = 20
-    flights: int = 80
+    """That fit the learned model to the analytic one; after 200 its flight is off by 0.1 m/s^2."""
+    dataset_tracks: int = 20  # tracks of a dataset that are timed
+    flights: int = 80  # simulated ones in a stream at 200 Hz; 80 last 61 s
 
 
 FULL = Size(runs=60, warm_up=5)

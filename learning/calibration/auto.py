@@ -6,8 +6,6 @@ in the mean log score by more than its standard error over the tracks, calibrati
 docs/train.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -15,7 +13,7 @@ from typing import Final
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from ballfg.arrays import Array
+from ballfg.checks import aligned
 from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.estimation.noise.parameters import with_noise
 from ballfg.learning.calibration.calibrate import (
@@ -35,7 +33,7 @@ from ballfg.learning.calibration.calibrate import (
 )
 from ballfg.learning.calibration.groups import OWN, Groups
 from ballfg.learning.config.calibration import CalibrationConfig
-from ballfg.learning.evaluation import Summary, TrackScore, summary
+from ballfg.learning.evaluation import TrackScore, summary
 from ballfg.progress import Watch, unwatched
 
 NOMINAL: Final = "nominal"
@@ -43,10 +41,8 @@ PER_TRACK: Final = "per-track coefficients"
 CALIBRATED: Final = "calibrated"
 GROUPED: Final = "with groups"
 CORRECTED: Final = "with correction"
-CANDIDATES: Final = (NOMINAL, PER_TRACK, CALIBRATED, GROUPED, CORRECTED)
-"""Simple ones first."""
-UNLEARNED: Final = (NOMINAL, PER_TRACK)
-"""Without calibration: coefficients as they are, or estimated with each track."""
+CANDIDATES: Final = (NOMINAL, PER_TRACK, CALIBRATED, GROUPED, CORRECTED)  # Simple ones first
+UNLEARNED: Final = (NOMINAL, PER_TRACK)  # Without calibration: coefficients as they are, or estimated with each track
 SURELY: Final = 1.0
 """Standard errors by which a richer model must gain. Two leave out models that pay where tracks are few; one misleads
 in none of forty nominal worlds, where no candidate gains as much as `NOTICED`. Calibration needs `NOTICED` alone: its
@@ -55,10 +51,8 @@ NOTICED: Final = 0.005
 """Least gain in the mean log density of a coordinate: half a per cent, which no user of a prediction notices."""
 NEAR: Final = 0.3
 """s, longest judged forecast, as for the noise (`estimate_noise`): later on, contacts decide more than the air."""
-LEAST: Final = 4
-"""Fitted tracks that a choice needs."""
-FOLDS: Final = 5
-"""Parts of the fitted tracks; the others calibrate the candidates that judge a part."""
+LEAST: Final = 4  # Fitted tracks that a choice needs
+FOLDS: Final = 5  # Parts of the fitted tracks; the others calibrate the candidates that judge a part
 
 
 @dataclass(frozen=True)
@@ -76,16 +70,11 @@ class Candidate(BaseModel):
 
     name: str
     tracks: int
-    rmse_median: float
-    """m."""
-    coverage_90: float
-    """Share of measured coordinates inside their 90 % intervals."""
-    log_score: float
-    """Mean over tracks, per coordinate and metre."""
-    gain: float
-    """Mean difference from the best simpler candidate; 0 for the first."""
-    gain_error: float
-    """Standard error of the gain over tracks."""
+    rmse_median: float  # m
+    coverage_90: float  # Share of measured coordinates inside their 90 % intervals
+    log_score: float  # Mean over tracks, per coordinate and metre
+    gain: float  # Mean difference from the best simpler candidate; 0 for the first
+    gain_error: float  # Standard error of the gain over tracks
 
 
 class Choice(BaseModel):
@@ -103,9 +92,7 @@ class Choice(BaseModel):
             gain = "" if one is self.candidates[0] else f"{one.gain:+.3f} ± {one.gain_error:.3f}"
             numbers = (f"{1e3 * one.rmse_median:.1f}", f"{100 * one.coverage_90:.0f}", f"{one.log_score:.3f}")
             rows.append((one.name, str(one.tracks), *numbers, gain))
-        widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-        lines = ("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
-        return "\n".join(line.rstrip() for line in lines)
+        return "\n".join(aligned(rows))
 
     def verdict(self) -> str:
         """A sentence on the choice."""
@@ -207,19 +194,10 @@ def compared(scores: dict[str, Sequence[TrackScore | None]]) -> Choice:
         found = summary([one for one in kept[name] if one is not None])
         if found is None:
             raise ValueError("tracks must be judged by every candidate; none was. Look at them with ballfg show.")
-        gain, error = _gain(logs[name] - logs[chosen])
-        candidates.append(_candidate(name, found, logs[name], gain, error))
+        own, gains, count = logs[name], logs[name] - logs[chosen], found.tracks
+        gain, error = float(gains.mean()), float(gains.std(ddof=1) / np.sqrt(count)) if count > 1 else 0.0
+        numbers = {"rmse_median": found.rmse_median, "coverage_90": found.coverage_90, "log_score": float(own.mean())}
+        candidates.append(Candidate(name=name, tracks=count, gain=gain, gain_error=error, **numbers))
         if gain > max(0.0 if name == CALIBRATED else SURELY * error, NOTICED):
             chosen = name
     return Choice(chosen=chosen, candidates=tuple(candidates))
-
-
-def _gain(differences: Array) -> tuple[float, float]:
-    """Mean and its standard error."""
-    count = len(differences)
-    return float(differences.mean()), float(differences.std(ddof=1) / np.sqrt(count)) if count > 1 else 0.0
-
-
-def _candidate(name: str, found: Summary, logs: Array, gain: float, error: float) -> Candidate:
-    numbers = {"rmse_median": found.rmse_median, "coverage_90": found.coverage_90, "log_score": float(logs.mean())}
-    return Candidate(name=name, tracks=found.tracks, gain=gain, gain_error=error, **numbers)

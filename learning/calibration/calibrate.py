@@ -5,12 +5,10 @@ finds the population's mean and spread, and puts the mean into the model. It end
 docs/train.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
@@ -48,8 +46,7 @@ from ballfg.tracks.noise import TrackNoise
 
 ROUGHLY: Final = 0.3
 """Tolerance of a correction at least: its weights move slowly along directions that hardly change a prediction."""
-FIRST: Final = 0.75
-"""s, the part of each track that teaches a correction: later on contacts say more than the air does."""
+FIRST: Final = 0.75  # s, the part of each track that teaches a correction: later on contacts say more than the air does
 
 
 class TooManyFailures(ValueError):  # noqa: N818 - the name is the statement
@@ -70,8 +67,7 @@ class Problem:
     jobs: int
     groups: Groups | None = None
     correction: Correction | None = None
-    shown: TrackNoise | None = None
-    """The noise that the fitted tracks are linearised with; None: the settings'."""
+    shown: TrackNoise | None = None  # The noise that the fitted tracks are linearised with; None: the settings'
 
     @property
     def linearising(self) -> Settings:
@@ -104,26 +100,18 @@ class Step(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     number: int
-    mean: tuple[float, ...]
-    """(p,) the population's mean: the coefficients of the next model."""
-    sigma: tuple[float, ...] = ()
-    """(p,) standard errors of the mean."""
-    spread: tuple[float, ...] = ()
-    """(p,) standard deviations between tracks."""
-    next_track: tuple[float, ...] = ()
-    """(p,) standard deviations of a new track's coefficients about the mean."""
-    spins: tuple[GroupSpin, ...] = ()
-    """The spins of each group, in the order of `Groups.names`; none without groups."""
+    mean: tuple[float, ...]  # (p,) the population's mean: the coefficients of the next model
+    sigma: tuple[float, ...] = ()  # (p,) standard errors of the mean
+    spread: tuple[float, ...] = ()  # (p,) standard deviations between tracks
+    next_track: tuple[float, ...] = ()  # (p,) standard deviations of a new track's coefficients about the mean
+    spins: tuple[GroupSpin, ...] = ()  # The spins of each group, in the order of `Groups.names`; none without groups
     by_group: dict[str, tuple[float, ...]] = {}
     """Means by group, in the same order, of the coefficients that differ between groups."""
     doubts: tuple[tuple[float, ...], ...] = ()
     """Directions of the uncertainty of a correction's weights; none without a correction."""
-    moved: float | None = None
-    """Largest move of a mean in this step, in standard errors."""
-    fits: tuple[TrackFit, ...] = ()
-    """Posteriors of the tracks that were used."""
-    skipped: tuple[tuple[str, str], ...] = ()
-    """Name and reason of each track that was not used."""
+    moved: float | None = None  # Largest move of a mean in this step, in standard errors
+    fits: tuple[TrackFit, ...] = ()  # Posteriors of the tracks that were used
+    skipped: tuple[tuple[str, str], ...] = ()  # Name and reason of each track that was not used
     scores: tuple[TrackScore | None, ...] = ()
     """Scores of the judging tracks with the mean of this step; None where a track could not be judged."""
 
@@ -136,7 +124,7 @@ class Linear:
     evidences: tuple[Evidence, ...]
     skipped: tuple[tuple[str, str], ...]
 
-    def without(self, names: Sequence[str]) -> Linear:
+    def without(self, names: Sequence[str]) -> Self:
         """Without some tracks."""
         kept = [k for k, fit in enumerate(self.fits) if fit.name not in names]
         return replace(self, fits=tuple(self.fits[k] for k in kept), evidences=tuple(self.evidences[k] for k in kept))

@@ -4,8 +4,6 @@ The weights of the effect `air_correction` are shared by all tracks; their prior
 The calibrated model and its spins are where the iteration begins.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -32,44 +30,30 @@ from ballfg.learning.calibration.groups import GroupSpin
 from ballfg.state import SPIN, VELOCITY
 
 SECTION: Final = f"flight.{AirCorrection.name}"
-DRAG: Final = tuple(f"{SECTION}.{name}" for name in WEIGHTS if name.startswith("drag"))
-"""Names of the weights of drag."""
+DRAG: Final = tuple(f"{SECTION}.{name}" for name in WEIGHTS if name.startswith("drag"))  # Names of the weights of drag
 ALL: Final = tuple(f"{SECTION}.{name}" for name in WEIGHTS)
 """With those of lift, which tracks without spin labels cannot tell from another spin."""
 SCALE: Final = "flight.drag.k"
-HELD: Final = 0.1
-"""Prior standard deviation of the mean drag beside a correction, as a share of the usual one."""
+HELD: Final = 0.1  # Prior standard deviation of the mean drag beside a correction, as a share of the usual one
 LINEAR: Final = 0.1
 """Standard deviation of each weight in one track, about the mean at which it is linearised; it is removed again."""
-REACH: Final = (5.0, 95.0)
-"""Percentiles of the speeds and spin ratios of the samples that the functions span."""
-BEYOND: Final = 2.0
-"""Scale of the functions as a multiple of half the span: the kernel's length."""
+REACH: Final = (5.0, 95.0)  # Percentiles of the speeds and spin ratios of the samples that the functions span
+BEYOND: Final = 2.0  # Scale of the functions as a multiple of half the span: the kernel's length
 CONSTANT: Final = np.array([0.5**0.5 if name in ("vv", "ss") else float(name == "one") for name in FUNCTIONS])
 """Weights of a correction that is 1, but for terms of the fourth degree."""
-LEAST_SPEED: Final = 1.0
-"""m/s. Least scale: over less, the drag law hardly changes."""
-LEAST_RATIO: Final = 0.1
-"""Least scale of S / (1 + S) of the spin ratio S."""
-MOST_RATIO: Final = 0.99
-"""Largest S / (1 + S) that is shown."""
-ELSEWHERE: Final = 0.05
-"""Weight of places without data in the order of the directions of uncertainty."""
+LEAST_SPEED: Final = 1.0  # m/s. Least scale: over less, the drag law hardly changes
+LEAST_RATIO: Final = 0.1  # Least scale of S / (1 + S) of the spin ratio S
+MOST_RATIO: Final = 0.99  # Largest S / (1 + S) that is shown
+ELSEWHERE: Final = 0.05  # Weight of places without data in the order of the directions of uncertainty
 
 
 @dataclass(frozen=True)
 class Correction:
-    """Where a correction begins.
+    """Where a correction begins."""
 
-    Attributes:
-        mean: (p,) of all coefficients, those of the calibration first.
-        spins: of each group, as calibrated.
-        terms: (11, 11) mean product of the functions over the samples.
-    """
-
-    mean: Array
-    spins: tuple[GroupSpin, ...]
-    terms: Array
+    mean: Array  # (p,) of all coefficients, those of the calibration first
+    spins: tuple[GroupSpin, ...]  # of each group, as calibrated
+    terms: Array  # (11, 11) mean product of the functions over the samples
 
     def directions(self, chosen: Chosen, mean: Array, covariance: Array) -> tuple[tuple[float, ...], ...]:
         """Of the uncertainty of each force's weights, first of drag; those that move it most at the samples lead.

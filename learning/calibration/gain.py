@@ -1,7 +1,5 @@
 """Decides if a calibrated model predicts better, by an interval of the change of the errors over tracks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 
@@ -10,16 +8,14 @@ from scipy import stats
 
 from ballfg.arrays import Array
 
-SURE: Final = 0.95
-"""Probability of the interval."""
+SURE: Final = 0.95  # Probability of the interval
 LEAST: Final = 0.02
 """Smallest change, as a share of the errors, that counts: fitted coefficients cost about as much where nothing is
 gained."""
 DENSER: Final = 0.1
 """Smallest rise of the logarithm of a coordinate's density that counts where errors do not decide: a population that is
 known narrows intervals by 0.01 to 0.06 where nothing is gained (16 simulated sets, seeds 600 to 615)."""
-SMALLEST: Final = 1e-9
-"""m, of an error."""
+SMALLEST: Final = 1e-9  # m, of an error
 
 
 @dataclass(frozen=True)

@@ -30,10 +30,8 @@ from ballfg.tracks import Dataset
 
 WIDEST: Final = 200.0
 """rad/s, standard deviation of the prior of a group's mean spin about zero; its spread begins there."""
-LABEL_PRIOR: Final = 2000.0
-"""rad/s, the smoother's prior beside a spin label (`UNINFORMATIVE_SPIN`)."""
-OWN: Final = "group"
-"""The label without which a dataset is one group of its own name."""
+LABEL_PRIOR: Final = 2000.0  # rad/s, the smoother's prior beside a spin label (`UNINFORMATIVE_SPIN`)
+OWN: Final = "group"  # The label without which a dataset is one group of its own name
 WIDTHS: Final = (0.003, 0.03, 0.1, 0.3, 0.6)
 """Standard deviations of the prior of a correction, relative to drag and lift, among which the evidence chooses: next
 to none, and some per cent up to what a law that is wrong by half needs. Beyond them the evidence overfits."""
@@ -47,12 +45,9 @@ class GroupSpin(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     mean: Three = (0.0, 0.0, 0.0)
-    sigma: Three = (0.0, 0.0, 0.0)
-    """Standard errors of the mean."""
-    spread: Three = (0.0, 0.0, 0.0)
-    """Standard deviations between tracks."""
-    next_track: Three = (0.0, 0.0, 0.0)
-    """Standard deviations of a new track's spin about the mean."""
+    sigma: Three = (0.0, 0.0, 0.0)  # Standard errors of the mean
+    spread: Three = (0.0, 0.0, 0.0)  # Standard deviations between tracks
+    next_track: Three = (0.0, 0.0, 0.0)  # Standard deviations of a new track's spin about the mean
 
     @classmethod
     def rows(cls, mean: Array, sigma: Array, spread: Array, next_track: Array, first: int) -> tuple[GroupSpin, ...]:
@@ -66,21 +61,13 @@ class GroupSpin(BaseModel):
 
 @dataclass(frozen=True)
 class Groups:
-    """The groups of a calibration.
+    """The groups of a calibration."""
 
-    Attributes:
-        by: the label that names them.
-        names: of the fitted tracks' groups, sorted.
-        tracks: the group of each fitted track, by the track's name.
-        labelled: names of the fitted tracks with a spin label, which takes the place of the group's prior.
-        own: the group of tracks without the label.
-    """
-
-    by: str
-    names: tuple[str, ...]
-    tracks: Mapping[str, str]
-    labelled: frozenset[str]
-    own: str
+    by: str  # the label that names them
+    names: tuple[str, ...]  # of the fitted tracks' groups, sorted
+    tracks: Mapping[str, str]  # the group of each fitted track, by the track's name
+    labelled: frozenset[str]  # names of the fitted tracks with a spin label, which takes the place of the group's prior
+    own: str  # the group of tracks without the label
 
     @classmethod
     def of(cls, dataset: Dataset | SightedDataset, by: str, fit: Sequence[str]) -> Groups:
@@ -171,7 +158,8 @@ class Groups:
                 best, columns, numbers, apart[name] = found, wider, split, first
         next_track = np.sqrt((best.next_track[numbers[:, :size]] ** 2).mean(axis=0))
         values = {name: tuple(best.mean[k : k + len(self.names)].tolist()) for name, k in apart.items()}
-        mean, sigma, spread, next_spin = (values_of[: size + 3 * len(self.names)] for values_of in _columns_of(best))
+        every = (best.mean, best.sigma, best.spread, best.next_track)
+        mean, sigma, spread, next_spin = (numbers_of[: size + 3 * len(self.names)] for numbers_of in every)
         return shared, values, GroupSpin.rows(mean, sigma, spread, next_spin, size), next_track
 
     def variations(self, by_group: Mapping[str, Sequence[float]]) -> dict[str, Variation]:
@@ -229,8 +217,3 @@ def _widest(
     covariance = np.tensordot(share, np.array([found.covariance for _, found in tried]), 1) + away.T @ away
     wide, best = tried[int(share.argmax())]
     return wide, replace(best, mean=mean, covariance=covariance)
-
-
-def _columns_of(population: Population) -> Columns:
-    """Mean, its standard error, spread and standard deviation of a new track, of every number."""
-    return population.mean, population.sigma, population.spread, population.next_track

@@ -21,10 +21,8 @@ matplotlib.use("Agg")
 
 DPI = 130
 TRACKS, BAND, START = "#3b4cc0", "#d95f02", "#7f7f7f"
-AXES: Final = {"speed": "speed, m/s", "ratio": "spin ratio"}
-"""Quantities of a correction: their labels."""
-CURVE: Final = 101
-"""Points of a curve."""
+AXES: Final = {"speed": "speed, m/s", "ratio": "spin ratio"}  # Quantities of a correction: their labels
+CURVE: Final = 101  # Points of a curve
 
 
 def draw(problem: Problem, last: Step, comparison: Comparison, path: Path) -> None:

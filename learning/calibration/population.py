@@ -24,48 +24,31 @@ from scipy.optimize import lsq_linear
 
 from ballfg.arrays import Array, Index
 
-MAX_STEPS = 500
-"""Largest number of iterations, a step of each sort; ten are usual."""
-STEP_TOLERANCE = 1e-11
-"""Relative change of every variance at which the iteration ends."""
-LARGEST_FALL = 10.0
-"""A step of Fisher scoring divides no variance by more."""
+MAX_STEPS = 500  # Largest number of iterations, a step of each sort; ten are usual
+STEP_TOLERANCE = 1e-11  # Relative change of every variance at which the iteration ends
+LARGEST_FALL = 10.0  # A step of Fisher scoring divides no variance by more
 NO_INFORMATION = 1e-2
 """Information of all tracks, as a share of the prior's, below which a coefficient has no spread but its prior."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Gaussian likelihood of p coefficients from one track's measurements, without a prior.
+    """Gaussian likelihood of p coefficients from one track's measurements, without a prior."""
 
-    Attributes:
-        information: (p, p), positive semidefinite.
-        vector: (p,) information times the most likely values, relative to `about`.
-        about: (p,) the values about which the track was linearised.
-    """
-
-    information: Array
-    vector: Array
-    about: Array
+    information: Array  # (p, p), positive semidefinite
+    vector: Array  # (p,) information times the most likely values, relative to `about`
+    about: Array  # (p,) the values about which the track was linearised
 
 
 @dataclass(frozen=True)
 class Population:
-    """The population of coefficients.
+    """The population of coefficients."""
 
-    Attributes:
-        mean: (p,).
-        covariance: (p, p) of the mean, for the spread found.
-        spread: (p,) standard deviation between tracks.
-        log_likelihood: marginal, up to a constant, with the priors of mean and spread.
-        log_evidence: the same with the mean integrated out too, to compare priors of the mean.
-    """
-
-    mean: Array
-    covariance: Array
-    spread: Array
-    log_likelihood: float
-    log_evidence: float
+    mean: Array  # (p,)
+    covariance: Array  # (p, p) of the mean, for the spread found
+    spread: Array  # (p,) standard deviation between tracks
+    log_likelihood: float  # marginal, up to a constant, with the priors of mean and spread
+    log_evidence: float  # the same with the mean integrated out too, to compare priors of the mean
 
     @property
     def sigma(self) -> Array:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from ballfg.checks import aligned
 from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.learning.calibration.calibrate import Problem, Step, has_converged, population_model
 from ballfg.learning.calibration.correction import SCALE, learned, places
@@ -13,33 +14,23 @@ from ballfg.learning.calibration.gain import Gain, gain_of
 from ballfg.learning.evaluation import Summary, TrackScore, summary
 
 AXES = ("forward", "across", "up")
-NEW_INFORMATION = 0.05
-"""Least share by which informative data narrow the prior of a coefficient."""
+NEW_INFORMATION = 0.05  # Least share by which informative data narrow the prior of a coefficient
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Scores of those judging tracks that could be judged both before and after.
-
-    Attributes:
-        with_spread: with the calibrated model, each track's prior as wide as the population.
-        with_noise: with the noise besides that the fitted tracks show.
-        better: number of tracks whose RMSE fell.
-        pairs: (n, 2) m, RMSE before and after of each track.
-        failed: number of tracks that could not be judged each time.
-        written: (n,) m, RMSE of each track with the model that is written, with its population and noise.
-        density: as of `Gain`; None where the errors alone decide.
-    """
+    """Scores of those judging tracks that could be judged both before and after."""
 
     before: Summary | None
     after: Summary | None
-    with_spread: Summary | None
-    with_noise: Summary | None
-    better: int
-    pairs: np.ndarray
-    failed: int
+    with_spread: Summary | None  # with the calibrated model, each track's prior as wide as the population
+    with_noise: Summary | None  # with the noise besides that the fitted tracks show
+    better: int  # number of tracks whose RMSE fell
+    pairs: np.ndarray  # (n, 2) m, RMSE before and after of each track
+    failed: int  # number of tracks that could not be judged each time
     written: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    density: tuple[float, float] | None = None
+    """(n,) m, RMSE of each track with the model that is written, with its population and noise."""
+    density: tuple[float, float] | None = None  # as of `Gain`; None where the errors alone decide
 
     @property
     def gain(self) -> Gain | None:
@@ -229,10 +220,4 @@ def table(problem: Problem, last: Step, comparison: Comparison) -> str:
     ):
         cells = ("-" if s is None else f"{scale * getattr(s, name):.4g}" for s in summaries)
         errors.append((label, unit, *cells))
-    return "\n\n".join(_aligned(part) for part in (rows, errors))
-
-
-def _aligned(rows: Sequence[Sequence[str]]) -> str:
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = ("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
-    return "\n".join(line.rstrip() for line in lines)
+    return "\n\n".join("\n".join(aligned(part)) for part in (rows, errors))

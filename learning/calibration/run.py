@@ -46,7 +46,7 @@ from ballfg.learning.config.config_file import AUTO
 from ballfg.learning.evaluation import TrackScore, summary
 from ballfg.learning.run import run_folder as files
 from ballfg.learning.run.record import NOT_BETTER
-from ballfg.learning.start import written_model
+from ballfg.learning.start import describe
 from ballfg.learning.training_data import analytic_model, open_source
 from ballfg.progress import Watch
 from ballfg.tracks.noise import TrackNoise
@@ -57,14 +57,10 @@ class Checkpoint(BaseModel):
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
-    data: str
-    """Digest of the dataset's content."""
-    model: dict[str, Any]
-    """Content of the model file that the run started from."""
-    steps: tuple[Step, ...]
-    """Finished steps."""
-    corrected: tuple[Step, ...] = ()
-    """Finished steps of the correction."""
+    data: str  # Digest of the dataset's content
+    model: dict[str, Any]  # Content of the model file that the run started from
+    steps: tuple[Step, ...]  # Finished steps
+    corrected: tuple[Step, ...] = ()  # Finished steps of the correction
 
 
 def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jobs: int, watch: Watch) -> int:
@@ -208,7 +204,7 @@ def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch,
     if comparison.gain is not None and comparison.gain.word == "no different" and noise is not None:
         comparison = replace(comparison, density=_density(problem, shown, watch))
     found = report(problem, last, comparison, noise)
-    model = written_model(problem, last, noise)
+    describe(model, problem, population, noise)
     if problem.dataset.one_view:  # its tracks cannot correct a drag: the model file states how sure it is
         model.noise = TrackNoise(coefficients={name: last.next_track[k] for k, name in problem.chosen.listed})
     save_model(model, folder / files.MODEL)

@@ -23,8 +23,7 @@ from ballfg.tracks import Track
 
 STEP: Final = 0.3
 """Prior standard deviations to each side of the posterior, for the slope; 0.1 to 1 give the same within 8 %."""
-HELD: Final = 1e-3
-"""Prior standard deviations, so narrow that a coefficient counts as fixed."""
+HELD: Final = 1e-3  # Prior standard deviations, so narrow that a coefficient counts as fixed
 
 
 def estimate_with_slopes(smoother: Smoother, names: Sequence[str], track: Track) -> tuple[Estimate, Array]:

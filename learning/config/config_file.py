@@ -13,8 +13,7 @@ from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.training import TrainConfig
 
 Config = TrainConfig | CalibrationConfig
-CALIBRATE, AUTO = "calibrate", "auto"
-"""The kinds whose config is a `CalibrationConfig`."""
+CALIBRATE, AUTO = "calibrate", "auto"  # The kinds whose config is a `CalibrationConfig`
 
 
 def read_config(path: str | Path, overrides: Iterable[str] = (), options: Mapping[str, Any] | None = None) -> Config:

@@ -7,7 +7,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_valida
 
 from ballfg.checks import shown
 from ballfg.dynamics.earlier_names import warn_of
-from ballfg.learning.registry import TRAINEES
+from ballfg.learning.trainee import TRAINEES
 
 Positive = Annotated[float, Field(gt=0.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]

@@ -1,21 +1,30 @@
 """Builds a model of the dynamics from a config, for training through the estimator."""
 
 import copy
-from typing import ClassVar
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import ClassVar, Final
 
-from ballfg.dynamics import AnalyticModel, BallModel
+import numpy as np
+import torch
+
+from ballfg.arrays import Array
+from ballfg.dynamics import BallModel
+from ballfg.dynamics.analytic import AnalyticModel, coefficient_sigmas
 from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.dynamics.networks.learned import build as build_model
+from ballfg.dynamics.networks.spin_embedding import SPIN_UNIT, SpinEmbedding
+from ballfg.estimation import Smoother, Status
 from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.end_to_end.end_to_end import EndToEnd
-from ballfg.learning.end_to_end.first_spins import begin_with_tracks
 from ballfg.learning.end_to_end.learnables import Learnables, NoiseScales
 from ballfg.learning.end_to_end.pretrain import Anchor, pretrain
 from ballfg.learning.gradient.implicit import GaussNewtonGradient, ImplicitGradient, UnrolledGradient
-from ballfg.learning.registry import NETWORKS, TraineeKind
-from ballfg.learning.trainee import Prepared
+from ballfg.learning.shots import TrainingShot
+from ballfg.learning.trainee import NETWORKS, Prepared, TraineeKind
 from ballfg.learning.training_data import read_training_data
 from ballfg.progress import doing
+from ballfg.state import SPIN, VELOCITY
 
 GRADIENTS: dict[str, type[ImplicitGradient | UnrolledGradient]] = {
     "implicit": ImplicitGradient,
@@ -104,3 +113,41 @@ class MnnGramSchmidt(Network):
     """The same with multiplications of hidden states."""
 
     name = "mnn+gs"
+
+
+SPIN_PRIOR: Final = 150.0  # rad/s, standard deviation of the prior: launchers reach this spin
+LEAST_SPEED: Final = 0.5  # m/s of horizontal motion below which a launch has no forward direction
+
+
+def begin_with_tracks(embedding: SpinEmbedding, shots: Iterable[TrainingShot], model: AnalyticModel) -> None:
+    """Set an embedding to the spins that a model finds in whole tracks, by least squares over their settings.
+
+    Without spin labels only the flight shows the spin: from no spin, learning needs many epochs to reach 150 rad/s, and
+    a group of shots may end with the wrong sign. An analytic model of a whole track is right within some 10 rad/s.
+
+    Shots with a spin label, or without all settings, are skipped; where none is left the embedding stays as it is.
+    Coefficients of the model that vary from track to track are estimated too.
+    """
+    settings, spins = [], []
+    for shot in shots:
+        told = None if shot.settings.launcher is None else shot.settings.launcher.settings(shot.track)
+        spin = None if told is None else _spin(shot, model)
+        if told is not None and spin is not None:
+            settings.append(told)
+            spins.append(spin)
+    if settings:
+        weight = np.linalg.lstsq(np.stack(settings), np.stack(spins), rcond=None)[0].T / SPIN_UNIT
+        with torch.no_grad():
+            embedding.weight.copy_(torch.from_numpy(weight))
+
+
+def _spin(shot: TrainingShot, model: AnalyticModel) -> Array | None:
+    """(3,) rad/s about forward, across and up at the first sample; None for a failed estimate or a slow launch."""
+    wide = replace(shot.settings, launcher=None, coefficients=coefficient_sigmas(model), spin_prior=SPIN_PRIOR)
+    estimate = Smoother(model, shot.surfaces, wide).estimate(shot.track)
+    velocity, spin = estimate.states[0, VELOCITY], estimate.states[0, SPIN]
+    speed = float(np.hypot(velocity[0], velocity[1]))
+    if estimate.status is not Status.OK or speed < LEAST_SPEED:
+        return None
+    x, y = velocity[:2] / speed
+    return np.array([x * spin[0] + y * spin[1], x * spin[1] - y * spin[0], spin[2]])

@@ -11,21 +11,20 @@ from torch import Tensor
 
 from ballfg.arrays import Array
 from ballfg.dynamics.analytic import coefficient_sigmas
-from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.model import BASE, BallModel
 from ballfg.dynamics.motion.paths import paths
 from ballfg.dynamics.networks.fading import ABROAD, Fading, states_before_contacts
-from ballfg.dynamics.networks.learned import BASE, LearnedModel
+from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.estimation import Smoother, estimate_noise, predict_tracks
+from ballfg.estimation.noise.estimate import spread_over
 from ballfg.estimation.noise.parameters import with_noise
 from ballfg.learning.end_to_end.solving import Solved
 from ballfg.learning.shots import TrainingShot
 from ballfg.state import STATE_DIM
 from ballfg.tracks.noise import TrackNoise
 
-ROOM_TRACKS: Final = 12
-"""Tracks of each room that tell its noise, in a few seconds."""
-HORIZON: Final = 0.3
-"""s after the observed part at which a correction is judged."""
+ROOM_TRACKS: Final = 12  # Tracks of each room that tell its noise, in a few seconds
+HORIZON: Final = 0.3  # s after the observed part at which a correction is judged
 AVERAGED: Final = ("contact_velocity", "contact_tangential", "contact_spin")
 
 
@@ -109,10 +108,7 @@ def by_room(shots: Sequence[TrainingShot]) -> list[list[TrainingShot]]:
     rooms = defaultdict(list)
     for shot in shots:
         rooms[shot.room].append(shot)
-    return [
-        [members[k] for k in np.unique(np.linspace(0, len(members) - 1, ROOM_TRACKS).round().astype(int))]
-        for members in rooms.values()
-    ]
+    return [spread_over(members, len(members), ROOM_TRACKS) for members in rooms.values()]
 
 
 def _log_errors(smoother: Smoother, shots: Sequence[TrainingShot]) -> Array:

@@ -32,16 +32,14 @@ from ballfg.learning.end_to_end.pretrain import Anchor
 from ballfg.learning.end_to_end.solving import TRAINING, BatchSolver, Pose, Solved
 from ballfg.learning.gradient.conjugate_gradients import ConjugateGradients, GaussNewtonFactors, NotAMinimum
 from ballfg.learning.gradient.implicit import GradientMethod, ImplicitGradient, LinearSolver
-from ballfg.learning.gradient.likelihood import negative_log_likelihood
-from ballfg.learning.gradient.objective import BatchObjective
+from ballfg.learning.gradient.objective import BatchObjective, negative_log_likelihood
 from ballfg.learning.run.run_folder import MODEL
 from ballfg.learning.shots import TrainingShot
 from ballfg.learning.trainee import BatchLoss, Learned, PredictedShot, Trainee
 from ballfg.state import POSITION, STATE_DIM
 from ballfg.tracks.noise import TrackNoise
 
-LOSS_UNIT: Final = 0.01
-"""m. Squared errors are divided by its square, so that losses are of order one."""
+LOSS_UNIT: Final = 0.01  # m. Squared errors are divided by its square, so that losses are of order one
 SOLUTION_TOLERANCE: Final = 1e-5
 """Relative error of the linear solution of each track: far below the scatter between batches."""
 NOISE_WORDS: Final = {
@@ -57,10 +55,8 @@ MakeSolver = Callable[[GaussNewtonFactors, Tensor], LinearSolver]
 TRAINING_SOLVER: Final[MakeSolver] = partial(ConjugateGradients, tolerance=SOLUTION_TOLERANCE)
 COEFFICIENT_STEP: Final = 20.0
 """With a learning rate of 2e-3 a coefficient moves by at most 0.04 standard deviations of its prior in a step."""
-NOISE_STEP: Final = 10.0
-"""With a learning rate of 2e-3 a standard deviation changes by at most 2 % in a step."""
-EMBEDDING_STEP: Final = 3.0
-"""The embedding's weights, of order one, move faster than a network's."""
+NOISE_STEP: Final = 10.0  # With a learning rate of 2e-3 a standard deviation changes by at most 2 % in a step
+EMBEDDING_STEP: Final = 3.0  # The embedding's weights, of order one, move faster than a network's
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,7 @@ from ballfg.factors.noise import PROCESS_NOISE, ProcessNoise
 
 LEARNED_NOISE = ("acceleration", "spin", "contact_velocity", "contact_tangential", "contact_spin")
 """Numbers of the process noise that are learned. A hit can have any strength, so that its noise is not."""
-WIDEST = 12.0
-"""Standard deviations stay between exp(-WIDEST) and exp(WIDEST) times their starting values."""
+WIDEST = 12.0  # Standard deviations stay between exp(-WIDEST) and exp(WIDEST) times their starting values
 
 
 class NoiseScales(nn.Module):

@@ -16,22 +16,14 @@ from ballfg.dynamics.model import BallModel, Rates
 from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.state import SPIN, STATE_DIM, VELOCITY, VZ
 
-SAMPLES: Final = 3000
-"""Flights, and as many bounces, that a network is fitted to."""
-ANCHORS: Final = 256
-"""The same of an anchor: enough for a smooth function of six numbers."""
-SPEED: Final = 4.0
-"""m/s, standard deviation of each component of the velocities."""
-SPIN_SPREAD: Final = 120.0
-"""rad/s, the same of the spins."""
-LEAST_FALL: Final = 0.3
-"""m/s, slowest fall of a bounce."""
-ACCELERATION_UNIT: Final = 1.0
-"""m/s^2. Errors are divided by this unit and the next two."""
-VELOCITY_UNIT: Final = 0.1
-"""m/s."""
-SPIN_UNIT: Final = 10.0
-"""rad/s."""
+SAMPLES: Final = 3000  # Flights, and as many bounces, that a network is fitted to
+ANCHORS: Final = 256  # The same of an anchor: enough for a smooth function of six numbers
+SPEED: Final = 4.0  # m/s, standard deviation of each component of the velocities
+SPIN_SPREAD: Final = 120.0  # rad/s, the same of the spins
+LEAST_FALL: Final = 0.3  # m/s, slowest fall of a bounce
+ACCELERATION_UNIT: Final = 1.0  # m/s^2. Errors are divided by this unit and the next two
+VELOCITY_UNIT: Final = 0.1  # m/s
+SPIN_UNIT: Final = 10.0  # rad/s
 
 
 def pretrain(model: LearnedModel, teacher: BallModel, seed: int, iterations: int, *, samples: int = SAMPLES) -> float:

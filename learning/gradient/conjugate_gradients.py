@@ -64,8 +64,7 @@ class ConjugateGradients:
     owners: Tensor
     tolerance: float = 1e-10
     max_iterations: int = 50
-    iterations: int = field(default=0, init=False)
-    """Products with the Hessian in the last solution."""
+    iterations: int = field(default=0, init=False)  # Products with the Hessian in the last solution
 
     def precondition(self, vector: Tensor) -> Tensor:
         """The Gauss-Newton solution (n,), in SI units, of a right side `vector` (n,) in those of the gradient."""

@@ -14,8 +14,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-Solve = Callable[[], Tensor]
-"""Gives the point (n,), without a graph. It may raise anything where it finds none."""
+Solve = Callable[[], Tensor]  # Gives the point (n,), without a graph. It may raise anything where it finds none
 Stationarity = Callable[[Tensor], Tensor]
 """g: from a point (n,) that requires a gradient to the objective's derivative (n,), differentiable in the point and in
 the parameters."""

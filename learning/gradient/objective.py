@@ -2,6 +2,13 @@
 
 The estimator minimises it in numpy, track by track. A gradient through the estimate needs it again in torch, for a
 batch of tracks at once. Factors of the same sort are merged, so that a batch costs few torch calls.
+
+The scale of the noise is learned beside it: scaling all standard deviations does not move the most probable states, so
+that an error of states cannot determine the scale. The likelihood of the observations with all states integrated out
+does. In Laplace's approximation, exact for a linear model with Gaussian noise, its negative logarithm is the objective
+at the minimum + log det(R) + the factors' log spreads, R^T R the Gauss-Newton matrix. Its derivative by the noise is
+that of sum_k tr(T S T^T) / 2 - log det(T) (R. A. Fisher's identity), where T rewhitens factor k and S = r r^T + J C J^T
+is the mean square of its whitened residual under the posterior covariance C of its variables.
 """
 
 import copy
@@ -13,24 +20,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Noise, Values, merge
+from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Noise, Rows, Values, merge
 from ballfg.factors.graph import BallGraph
+from ballfg.factors.linear.covariance import NeighbourCovariances
+from ballfg.factors.linear.step import weighted
+from ballfg.learning.gradient.conjugate_gradients import GaussNewtonFactors
 from ballfg.state import STATE_DIM
 
 
 @dataclass(frozen=True)
 class Layout:
-    """The order of the values of several tracks in one vector: all states of all tracks, then all coefficients.
+    """The order of the values of several tracks in one vector: all states of all tracks, then all coefficients."""
 
-    Attributes:
-        lengths: number of states of each of t tracks.
-        coefficients: number p of coefficients of each track.
-        width: numbers w of a state: 9, or 12 where the tracker's bias stands behind it.
-    """
-
-    lengths: tuple[int, ...]
-    coefficients: int
-    width: int = STATE_DIM
+    lengths: tuple[int, ...]  # number of states of each of t tracks
+    coefficients: int  # number p of coefficients of each track
+    width: int = STATE_DIM  # numbers w of a state: 9, or 12 where the tracker's bias stands behind it
 
     @property
     def states(self) -> int:
@@ -133,3 +137,45 @@ def _block(members: Sequence[tuple[int, FactorBatch]], starts: Sequence[int]) ->
     places = tuple(zip(is_shared.tolist(), columns, strict=True))
     tracks = torch.tensor([track for track, _ in members])
     return _Block(whole, places, tracks.repeat_interleave(torch.tensor([len(kind) for _, kind in members])))
+
+
+def negative_log_likelihood(
+    graphs: Sequence[BallGraph], minima: Sequence[Values], factors: GaussNewtonFactors, noise: Noise
+) -> Tensor:
+    """(t,) of each track's observations, up to a constant; differentiable in the noise alone.
+
+    Robust losses count as Gaussians with each residual's weight at the minimum.
+
+    Args:
+        factors: their Gauss-Newton factorisations there.
+        noise: relative to that of the graphs, to which its value must be equal.
+    """
+    totals = []
+    for root, graph, minimum in zip(factors.roots, graphs, minima, strict=True):
+        posterior = NeighbourCovariances.of(root)
+        rows = graph.linearize(minimum)
+        kinds = [kind for kind in graph.batches if len(kind)]
+        value = root.log_determinant + sum(r.error() for r in rows) + sum(kind.log_spread() for kind in kinds)
+        expected = torch.zeros((), dtype=torch.float64)
+        for kind, linearized in zip(kinds, rows, strict=True):
+            change = kind.noise_scale(noise)
+            if change is not None:
+                expected = expected + _expected(kind, linearized, posterior, change)
+        totals.append(float(value) + expected - expected.detach())
+    return torch.stack(totals)
+
+
+def _expected(kind: FactorBatch, rows: Rows, posterior: NeighbourCovariances, change: Tensor) -> Tensor:
+    """Expected negative log density of a kind's factors, as a function of the change that rewhitens them."""
+    # (m, r, r) r r^T + J C J^T of each factor; residuals and Jacobians weighted as those of C
+    weight = rows.loss.weight(np.linalg.norm(rows.residual, axis=-1))
+    total = weight[:, None, None] * rows.residual[:, :, None] * rows.residual[:, None, :]
+    _, jacobians = weighted(rows)
+    for a, left in enumerate(jacobians):
+        for b, right in enumerate(jacobians):
+            total += left @ posterior.joint(rows.variables[:, a], rows.variables[:, b]) @ right.swapaxes(-1, -2)
+    square = torch.from_numpy(total)
+    if change.dim():
+        spread = -change.diagonal(dim1=-2, dim2=-1).log().sum()
+        return 0.5 * (change * (change @ square)).sum() + spread
+    return 0.5 * change.square() * torch.einsum("nii->", square) - len(kind) * kind.dim * change.log()

@@ -19,10 +19,8 @@ from ballfg.files.whole_folder import whole_folder
 
 NAME = "checkpoint"
 STATE = "state.yaml"
-DIGESTS = "digests"
-"""In `state.yaml`: the SHA-256 of every file of tensors."""
-TENSORS = ("weights", "optimizer", "memory", "best")
-"""One file `<name>.safetensors` each."""
+DIGESTS = "digests"  # In `state.yaml`: the SHA-256 of every file of tensors
+TENSORS = ("weights", "optimizer", "memory", "best")  # One file `<name>.safetensors` each
 
 
 class RunProgress(BaseModel):
@@ -32,8 +30,7 @@ class RunProgress(BaseModel):
 
     epoch: int
     best_epoch: int
-    best_rmse: float | None
-    """m, RMSE of the best weights on the validation tracks; null: none was judged."""
+    best_rmse: float | None  # m, RMSE of the best weights on the validation tracks; null: none was judged
     skipped_in_row: int
     train: int
     validation: int

@@ -1,28 +1,33 @@
-"""Lets processes that train one model add up sums, exchange values, and end together.
+"""Starts processes that train one model; they add up sums, exchange values, and end together.
 
 A process is a rank. Each rank owns tracks by their number, independent of the batch, so that its memory of a track
 stays with it. A single process is the case of one rank: nothing is sent, and the numbers are the same up to rounding.
 """
 
+import multiprocessing
 import os
 import signal
+import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from ctypes import c_int
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
+from threading import Thread
 from types import FrameType
 from typing import Any, TypeVar
 
 import torch
 import torch.distributed as dist
-
-# its functions take the group of the first import as their default: imported after `init` they would keep it alive
 import torch.distributed.nn.functional
 from torch import Tensor
+from torch.distributed import TCPStore
+from torch.multiprocessing import get_context
+from torch.multiprocessing.spawn import ProcessContext, ProcessExitedException, start_processes
 
 T = TypeVar("T")
-TOLD_BY_FIRST = 1
-"""Exit status of a process that prints nothing because the first one prints the reason."""
+TOLD_BY_FIRST = 1  # Exit status of a process that prints nothing because the first one prints the reason
 
 
 def for_others(rank: int, error: BaseException) -> BaseException:
@@ -165,3 +170,98 @@ def join_ranks() -> Iterator[Ranks]:
 def started_by_launcher() -> bool:
     """True if this process is one of several that a launcher has started."""
     return "RANK" in os.environ and "WORLD_SIZE" in os.environ
+
+
+HOST = "127.0.0.1"
+GRACE = 60.0
+"""s that interrupted processes have to end by themselves: compiled code notices Ctrl-C only when it returns."""
+NO_STATUS = -1  # Exit status of a process that has not returned
+LAST_WORDS = 10.0  # s that the other processes have to print their errors once one of them has died
+
+
+def launch(processes: int, work: Callable[..., int], *arguments: Any) -> int:
+    """Run `work` in several processes, which `join_ranks` joins to one group.
+
+    Args: work: a function of a module, which returns an exit status; its arguments can be pickled.
+    Returns: the status of the first process.
+    Raises:
+        ChildProcessError: if a process was killed.
+        KeyboardInterrupt: after Ctrl-C, and if the first process ended before it could return.
+    """
+    store = TCPStore(HOST, 0, is_master=True, wait_for_workers=False)
+    # without a lock: its semaphore would outlive a kill
+    status: c_int = get_context("spawn").Value("i", NO_STATUS, lock=False)
+    resource_tracker.ensure_running()  # it lets signals through in this process
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a process that still imports prints tracebacks
+    try:
+        shared = processes, store.port, status, work, arguments
+        group = start_processes(_take_part, shared, nprocs=processes, join=False)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    try:
+        _wait(group)
+    except ProcessExitedException as error:
+        raise ChildProcessError(
+            f"training process {error.error_index} was ended from outside ({error.signal_name or error.exit_code}). "
+            "Memory may have run out: set jobs lower, and continue with --resume."
+        ) from None
+    if status.value == NO_STATUS:  # a process interrupted while torch starts it ends without a message
+        raise KeyboardInterrupt
+    return status.value
+
+
+def _take_part(
+    rank: int, processes: int, port: int, status: c_int, work: Callable[..., int], arguments: tuple[Any, ...]
+) -> None:
+    """Set the environment as torchrun does, then work."""
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    Thread(target=_end_with_parent, daemon=True).start()
+    os.environ.update(
+        RANK=str(rank),
+        LOCAL_RANK=str(rank),
+        WORLD_SIZE=str(processes),
+        MASTER_ADDR=HOST,
+        MASTER_PORT=str(port),
+        TORCHELASTIC_USE_AGENT_STORE=str(True),  # the parent holds the store: its port cannot be taken meanwhile
+        TORCHELASTIC_RESTART_COUNT="0",
+    )
+    try:
+        found = work(*arguments)
+    except SystemExit:  # the first process prints the reason
+        return
+    if rank == 0:
+        status.value = found
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def _wait(group: ProcessContext) -> None:
+    """Wait until all have ended. Ctrl-C is handed on, and processes that do not end in time are killed."""
+    deadline: float | None = None
+    while True:
+        try:
+            left = None if deadline is None else deadline - time.monotonic()
+            if left is not None and left <= 0.0:
+                _kill(group)
+                return
+            if group.join(left, grace_period=LAST_WORDS):
+                return
+        except KeyboardInterrupt:
+            if deadline is not None:
+                _kill(group)
+                raise
+            deadline = time.monotonic() + GRACE
+            for process in group.processes:
+                if process.is_alive():
+                    os.kill(process.pid, signal.SIGINT)
+
+
+def _kill(group: ProcessContext) -> None:
+    for process in group.processes:
+        process.kill()
+        process.join()

@@ -39,13 +39,10 @@ SCALARS = {
     "time/seconds": ("seconds", 1.0),
 }
 """Name of each TensorBoard curve, the number of an epoch that it shows, and its scale."""
-Points = list[tuple[int, float]]
-"""Epochs and values."""
+Points = list[tuple[int, float]]  # Epochs and values
 TRAIN, VALIDATION, BEST = "#3b4cc0", "#d95f02", "#7f7f7f"
-NOT_BETTER: Final = 1
-"""Exit status of a training that ended and whose model is not better than before."""
-MOST_JUDGED: Final = 25
-"""Validation tracks that are judged one by one, to show the median one."""
+NOT_BETTER: Final = 1  # Exit status of a training that ended and whose model is not better than before
+MOST_JUDGED: Final = 25  # Validation tracks that are judged one by one, to show the median one
 
 
 class Record:

@@ -16,12 +16,10 @@ from ballfg.machine import versions
 
 CONFIG, VERSIONS, MODEL = "config.yaml", "versions.json", "model.yaml"
 STEPS, REPORT, PICTURE = "checkpoint.json", "report.json", "calibration.png"
-CHOICE = "choice.json"
-"""The comparison of `kind: auto`."""
+CHOICE = "choice.json"  # The comparison of `kind: auto`
 CHECKPOINT, METRICS, CURVES, EVENTS = "checkpoint", "metrics.csv", "curves.png", "tensorboard"
 PAGE = "training.html"
-CALIBRATION = (CONFIG, VERSIONS, MODEL, STEPS, REPORT, PICTURE)
-"""Files of a calibration."""
+CALIBRATION = (CONFIG, VERSIONS, MODEL, STEPS, REPORT, PICTURE)  # Files of a calibration
 TRAINING = (CONFIG, VERSIONS, MODEL, CHECKPOINT, METRICS, CURVES, EVENTS, PAGE)
 """Files and folders of a training; a learned model adds a folder of its own."""
 PACKAGES = ("ballfg", "gtsam", "torch", "numpy", "scipy", "safetensors")

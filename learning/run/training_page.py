@@ -8,8 +8,19 @@ from matplotlib.figure import Figure
 from ballfg.arrays import Array
 from ballfg.learning.run.metrics import Epoch
 from ballfg.learning.trainee import Learned, PredictedShot
-from ballfg.pages.html import Html, doubtful, explained, items, meanings, picture, section, table, tag, typed
-from ballfg.pages.page import whole_page
+from ballfg.pages.html import (
+    Html,
+    doubtful,
+    explained,
+    items,
+    meanings,
+    picture,
+    section,
+    table,
+    tag,
+    typed,
+    whole_page,
+)
 
 MEASURED, PREDICTED = "#8c8c8c", "#0072b2"
 TERMS = {

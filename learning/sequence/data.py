@@ -16,8 +16,7 @@ from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.learning.augment import apply
 from ballfg.tracks import Track
 
-LEAST_OBSERVED = 2
-"""Fewest observations that show a direction."""
+LEAST_OBSERVED = 2  # Fewest observations that show a direction
 
 
 @dataclass(frozen=True)
@@ -59,21 +58,13 @@ class LauncherSettings:
 
 @dataclass(frozen=True)
 class Example:
-    """One track, cut where its observed part ends. Times count from the last observed sample.
+    """One track, cut where its observed part ends. Times count from the last observed sample."""
 
-    Attributes:
-        observed_times: (n,) s, increasing to 0.
-        observed: (n, 3) m, world frame.
-        settings: (k,) the launcher's settings as numbers.
-        times: (m,) s, increasing and positive, to predict.
-        rest: (m, 3) m, measured there; nan without a measurement.
-    """
-
-    observed_times: Tensor
-    observed: Tensor
-    settings: Tensor
-    times: Tensor
-    rest: Tensor
+    observed_times: Tensor  # (n,) s, increasing to 0
+    observed: Tensor  # (n, 3) m, world frame
+    settings: Tensor  # (k,) the launcher's settings as numbers
+    times: Tensor  # (m,) s, increasing and positive, to predict
+    rest: Tensor  # (m, 3) m, measured there; nan without a measurement
 
     def seen_from(self, angle: Tensor, shift: Tensor) -> Self:
         """The same shot, rotated by () rad and shifted by (2,) m (`augment.apply`); launcher settings stay the same."""

@@ -20,34 +20,22 @@ from torch import Tensor, nn
 from ballfg.learning.sequence.data import Batch
 from ballfg.learning.sequence.model import Draw, Frame, SequenceModel
 
-LEVELS = 1000
-"""Noise levels; the last is pure noise."""
-DRAWS = 2
-"""Noise levels per track and epoch; the observations are encoded once for all of them."""
-PURE = 0.2
-"""Share of the draws at pure noise, where sampling starts and its first step decides most."""
-STEPS = 4
-"""Steps of the sampling. On simulated tracks ten steps predict no better."""
-SAMPLES = 4
-"""Paths whose mean is the prediction: 6 % less error than one path on simulated tracks; eight gain no more."""
-START_SEED = 0
-"""Seed of the noise that sampling starts from, the same for every track."""
-NOISE_STREAM = 1
-"""Makes the noise differ from the augmentation of the same seed, epoch and track."""
-HEADS = 4
-"""Number of heads of the attention between tokens and of the final pooling."""
-WAVES = 8
-"""Periods of the features of a place in time."""
+LEVELS = 1000  # Noise levels; the last is pure noise
+DRAWS = 2  # Noise levels per track and epoch; the observations are encoded once for all of them
+PURE = 0.2  # Share of the draws at pure noise, where sampling starts and its first step decides most
+STEPS = 4  # Steps of the sampling. On simulated tracks ten steps predict no better
+SAMPLES = 4  # Paths whose mean is the prediction: 6 % less error than one path on simulated tracks; eight gain no more
+START_SEED = 0  # Seed of the noise that sampling starts from, the same for every track
+NOISE_STREAM = 1  # Makes the noise differ from the augmentation of the same seed, epoch and track
+HEADS = 4  # Number of heads of the attention between tokens and of the final pooling
+WAVES = 8  # Periods of the features of a place in time
 SHORTEST_PERIOD, PERIOD_RANGE = 4.0, 256.0
 """Grid steps, and the ratio of the longest period to it: from a bounce to several tracks."""
-LONG = 100.0
-"""Grid steps by which a place in time is divided, to be of order one."""
-DILATIONS = (1, 2, 4, 8, 16, 32, 1, 2)
-"""Dilations of the blocks; together they look back 132 grid steps."""
+LONG = 100.0  # Grid steps by which a place in time is divided, to be of order one
+DILATIONS = (1, 2, 4, 8, 16, 32, 1, 2)  # Dilations of the blocks; together they look back 132 grid steps
 
 
-PLACE = 2 * WAVES + 1
-"""Length of `place_features`."""
+PLACE = 2 * WAVES + 1  # Length of `place_features`
 
 
 def place_features(steps: Tensor) -> Tensor:

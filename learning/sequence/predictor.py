@@ -20,16 +20,13 @@ from ballfg.files.weights import read_tensors
 from ballfg.files.whole_folder import of_one_state, whole_folder
 from ballfg.learning.sequence.data import Example, LauncherSettings, collate, example
 from ballfg.learning.sequence.diffusion import DiffusionModel
-from ballfg.learning.sequence.lstm import LstmModel
-from ballfg.learning.sequence.model import Frame, SequenceModel
+from ballfg.learning.sequence.model import Frame, LstmModel, SequenceModel
 from ballfg.tracks import Track
 
 SequenceKind = Literal["lstm", "diffusion"]
-DEFAULT_WIDTH: dict[SequenceKind, int] = {"lstm": 96, "diffusion": 64}
-"""Chosen by validation on simulated tracks."""
+DEFAULT_WIDTH: dict[SequenceKind, int] = {"lstm": 96, "diffusion": 64}  # Chosen by validation on simulated tracks
 _MODELS: dict[SequenceKind, type[LstmModel] | type[DiffusionModel]] = {"lstm": LstmModel, "diffusion": DiffusionModel}
-CHUNK = 64
-"""Tracks that are predicted at once, which bounds the memory."""
+CHUNK = 64  # Tracks that are predicted at once, which bounds the memory
 CONFIG, WEIGHTS = "config.yaml", "weights.safetensors"
 
 
@@ -81,8 +78,7 @@ class FolderConfig(BaseModel):
     points: Annotated[int, Field(ge=1, le=100_000)]
     labels: Annotated[tuple[str, ...], Field(strict=False)]
     categories: dict[str, Annotated[tuple[str, ...], Field(strict=False)]]
-    digest: str | None = None
-    """SHA-256 of the weights; null in folders of earlier versions."""
+    digest: str | None = None  # SHA-256 of the weights; null in folders of earlier versions
 
 
 @dataclass(eq=False)

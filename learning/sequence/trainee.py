@@ -10,16 +10,14 @@ from torch import Tensor
 
 from ballfg.learning.augment import augmentation
 from ballfg.learning.config.training import TrainConfig
-from ballfg.learning.registry import TraineeKind
 from ballfg.learning.sequence.data import Batch, Example, LauncherSettings, collate, example
 from ballfg.learning.sequence.model import SequenceModel
 from ballfg.learning.sequence.predictor import SequenceArchitecture, SequenceKind, SequencePredictor
-from ballfg.learning.trainee import BatchLoss, PredictedShot, Prepared, Trainee
+from ballfg.learning.trainee import BatchLoss, PredictedShot, Prepared, Trainee, TraineeKind
 from ballfg.learning.training_data import read_training_data
 from ballfg.tracks import Track
 
-FOLDER = "model"
-"""Folder of the predictor, in that of a training."""
+FOLDER = "model"  # Folder of the predictor, in that of a training
 
 
 class SequenceTrainee(Trainee):

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from ballfg.tracks.detections_file import write_sightings
 from ballfg.tracks.info import TABLE_TENNIS, DatasetInfo, write_info
 from ballfg.vision.camera_file import write_cameras
 from tests.commands import status
 from tests.estimation.observations.sighted_rig import RIG, TABLE, scene, world
 from tests.pages.made import Fall, Made, make
+from tests.written_tables import write_sightings
 
 
 @pytest.fixture

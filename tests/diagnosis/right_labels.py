@@ -29,13 +29,12 @@ from ballfg.dynamics.motion.rollout import advance
 from ballfg.estimation.settings import MEASURED
 from ballfg.simulation import SimulationConfig
 from ballfg.simulation.config import MeasurementNoise, MotionNoise
-from ballfg.simulation.measure import measure
 from ballfg.simulation.motion import MIN_FRAMES, NOISE_STEP, KickedModel, TrueMotion, process_noise
 from ballfg.simulation.settings import settings_of_shots
-from ballfg.simulation.synthetic import dataset_info
+from ballfg.simulation.synthetic import dataset_info, measure
 from ballfg.state import STATE_DIM
 from ballfg.tracks import Dataset, Track
-from ballfg.tracks.memory import dataset_in_memory
+from ballfg.tracks.dataset import dataset_in_memory
 from ballfg.tracks.track import SPIN_LABELS
 
 TRACKS, RATE, NOISE, LABEL_NOISE = 25, 100.0, 0.002, 4.0

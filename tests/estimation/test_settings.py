@@ -15,8 +15,8 @@ from ballfg.estimation.settings import MEASURED, Settings, sample_sigmas
 from ballfg.estimation.smoother.problem import QUALITY_SIGMA, effective_sigmas
 from ballfg.simulation import SimulationConfig, simulate
 from ballfg.tracks import Ball, Track, read_dataset
+from ballfg.tracks.dataset import dataset_in_memory
 from ballfg.tracks.info import DatasetInfo
-from ballfg.tracks.memory import dataset_in_memory
 
 NONE = np.zeros(0, dtype=np.int64)
 

@@ -18,8 +18,7 @@ from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
-from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate
-from ballfg.simulation import MotionNoise as TrueNoise
+from ballfg.simulation import MeasurementNoise, MotionNoise as TrueNoise, SimulationConfig, simulate
 from tests.estimation.tracker_noise import measured_by
 
 TRACKS = 16

@@ -21,8 +21,8 @@ from ballfg.factors.loss import Loss
 from ballfg.prediction import Plane
 from ballfg.prediction.state import World
 from ballfg.simulation.launcher import SimulatedLauncher
+from ballfg.tracks.dataset import dataset_in_memory
 from ballfg.tracks.info import DatasetInfo
-from ballfg.tracks.memory import dataset_in_memory
 from ballfg.tracks.noise import TrackNoise
 from ballfg.tracks.sightings import Sightings
 from ballfg.vision.projection import CameraBank

@@ -25,8 +25,8 @@ from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate
 from ballfg.state import POSITION, STANDARD_GRAVITY
 from ballfg.tracks import TABLE_TENNIS, Track
 from ballfg.tracks.checks import check_scale
+from ballfg.tracks.dataset import dataset_in_memory
 from ballfg.tracks.info import DatasetInfo
-from ballfg.tracks.memory import dataset_in_memory
 from ballfg.tracks.track import SPIN_LABELS
 
 METHODS = ("smoother", "online", "ekf", "sliding-window")

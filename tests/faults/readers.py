@@ -10,7 +10,7 @@ from ballfg.benchmarks.diagnosis.ideal import Ideal
 from ballfg.benchmarks.diagnosis.record import Record as Case
 from ballfg.benchmarks.dynamics.contenders import Record as Contender
 from ballfg.benchmarks.speed.stopwatch import SlowerError, check_ratios
-from ballfg.diagnosis.design.reported import reported_pairs
+from ballfg.diagnosis.design.goal import reported_pairs
 from ballfg.dynamics import load_model
 from ballfg.estimation.conformal import load_conformal
 from ballfg.estimation.observations.sighted_dataset import read_sighted
@@ -32,7 +32,7 @@ from ballfg.simulation.scene.writing import earlier_files
 from ballfg.tracks import read_dataset
 from ballfg.vision import open_video, read_cameras
 from ballfg.vision.calibration.table_points import read_table
-from ballfg.vision.detection.detections_table import read_detections
+from ballfg.vision.detection.detections import read_detections
 from ballfg.vision.detection.video import read_stamps
 from tests.estimation.observations.sighted_rig import RIG
 from tests.faults.seeds_of_models import posed, timed_rows

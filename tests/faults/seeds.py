@@ -84,7 +84,7 @@ def _parquet_dataset(folder: Path) -> None:
 
 
 def _sighted(folder: Path) -> None:
-    from ballfg.tracks.detections_file import write_sightings
+    from tests.written_tables import write_sightings
 
     (folder / "dataset.yaml").write_text(INFO)
     write_cameras(folder / "cameras.yaml", RIG)

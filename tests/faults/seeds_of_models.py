@@ -12,10 +12,8 @@ import torch
 from safetensors.torch import save_file
 
 from ballfg.benchmarks.diagnosis.ideal import Ideal
-from ballfg.benchmarks.diagnosis.record import Found, Ranked
-from ballfg.benchmarks.diagnosis.record import Record as CaseRecord
-from ballfg.benchmarks.dynamics.contenders import Fan
-from ballfg.benchmarks.dynamics.contenders import Record as ContenderRecord
+from ballfg.benchmarks.diagnosis.record import Found, Ranked, Record as CaseRecord
+from ballfg.benchmarks.dynamics.contenders import Fan, Record as ContenderRecord
 from ballfg.benchmarks.dynamics.task import PathScore
 from ballfg.benchmarks.results import Row
 from ballfg.dynamics import Architecture, build, nominal_model, save_model

@@ -15,7 +15,7 @@ from ballfg.estimation import Settings, Status
 from ballfg.estimation.plausible import possible
 from ballfg.factors.linear.definite import compatible, definite, raised, variances_positive, whitened
 from ballfg.tracks import TABLE_TENNIS, Track
-from ballfg.tracks.memory import dataset_in_memory
+from ballfg.tracks.dataset import dataset_in_memory
 from tests.commands import status
 from tests.faults.odd_tracks import INFO, estimator_of, judged, realistic, sound, still, wild
 

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from ballfg.files.spreadsheet import bare, guarded
 from ballfg.pages.tables import Kind, read_table

@@ -12,8 +12,8 @@ import pytest
 import ballfg as bf
 from ballfg.importing import Choices
 from ballfg.importing.choices import UndecidedError
+from ballfg.importing.importer import _drawing
 from ballfg.importing.proposal import propose
-from ballfg.importing.writing import _drawing
 from ballfg.tracks import Track
 from tests.importing.throws import thrown, write_rows
 

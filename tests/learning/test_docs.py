@@ -10,8 +10,8 @@ import yaml
 from safetensors.torch import load_file
 
 from ballfg.learning import read_config
-from ballfg.learning.registry import TRAINEES
 from ballfg.learning.run.metrics import read_metrics
+from ballfg.learning.trainee import TRAINEES
 from ballfg.simulation import SimulationConfig, write_simulation
 from tests.learning.estimates import directional
 from tests.places import DOCS

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from ballfg.learning import Prepared, TrainConfig, TraineeKind, build, register_trainee
-from ballfg.learning.registry import TRAINEES
+from ballfg.learning.trainee import TRAINEES
 from tests.learning.run.falling_ball import FallingBalls
 
 GIVEN = {"kind": "heavy", "options": {"masses": [1.0, 2.0]}, "data": "plain"}

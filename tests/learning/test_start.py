@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from ballfg.dynamics import AnalyticModel, load_model
+from ballfg.dynamics.model import BASE as PREFIX
 from ballfg.dynamics.model_file import model_to_dict
-from ballfg.dynamics.networks.learned import BASE as PREFIX
 from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.estimation import Smoother, dataset_settings, dataset_surfaces, predict_tracks
 from ballfg.learning.config.training import TrainConfig

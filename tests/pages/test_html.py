@@ -2,8 +2,7 @@
 
 import pytest
 
-from ballfg.pages.html import Html, explained, table, tag, text, typed
-from ballfg.pages.page import whole_page
+from ballfg.pages.html import Html, explained, table, tag, text, typed, whole_page
 
 
 def test_content_and_attributes_are_escaped() -> None:

@@ -29,7 +29,7 @@ from ballfg.simulation import MeasurementNoise, MotionNoise, SimulationConfig
 from ballfg.simulation.synthetic import dataset_info, simulate
 from ballfg.state import POSITION, VZ
 from ballfg.tracks import Track
-from ballfg.tracks.memory import dataset_in_memory
+from ballfg.tracks.dataset import dataset_in_memory
 
 DENSE, EACH = 1000.0, 10
 """Hz of the true path, and how many of its samples make one that is measured."""

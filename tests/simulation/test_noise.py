@@ -12,8 +12,8 @@ from ballfg.dynamics.model_file import model_from_dict
 from ballfg.factors.noise import ProcessNoise
 from ballfg.simulation import MeasurementNoise, MotionNoise, SimulationConfig, simulate, table_tennis
 from ballfg.simulation.balls import with_model
-from ballfg.simulation.measure import SimulatedTrack
 from ballfg.simulation.motion import KickedModel, process_noise
+from ballfg.simulation.synthetic import SimulatedTrack
 from ballfg.tracks.track import SPIN_LABELS
 
 QUIET = MeasurementNoise(position=0.0, spin=0.0)

@@ -13,8 +13,8 @@ from ballfg.dynamics.model import substitute
 from ballfg.dynamics.model_file import model_from_dict
 from ballfg.simulation import MeasurementNoise, SimulationConfig, parse_effects, simulate, table_tennis
 from ballfg.simulation.balls import with_model
-from ballfg.simulation.measure import SimulatedTrack
 from ballfg.simulation.motion import true_model
+from ballfg.simulation.synthetic import SimulatedTrack
 from ballfg.simulation.undeclared import UNDECLARED
 from ballfg.tracks.track import SPIN_LABELS
 

@@ -16,7 +16,7 @@ import yaml
 from ballfg.dynamics import load_model, nominal_model
 from ballfg.dynamics.model_file import model_to_dict
 from ballfg.simulation import MeasurementNoise, MotionNoise, SimulationConfig, parse_effects, simulate, write_simulation
-from ballfg.simulation.measure import SimulatedTrack
+from ballfg.simulation.synthetic import SimulatedTrack
 from ballfg.state import STATE_NAMES
 from ballfg.tracks import read_dataset
 

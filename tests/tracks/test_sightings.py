@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ballfg.tracks.detections_file import read_sightings, write_sightings
+from ballfg.tracks.detections_file import read_sightings
 from ballfg.tracks.sightings import Sightings
+from tests.written_tables import write_sightings
 
 OFFSETS = {"left": 0.0, "right": 0.004}
 

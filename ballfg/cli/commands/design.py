@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ballfg.cli import inputs
+from ballfg.progress import print_notes
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -73,7 +74,7 @@ def design(
         watch=_say,
     )
     print(*_lines(plan), sep="\n")
-    inputs.print_notes(plan.remarks)
+    print_notes(plan.remarks)
     if out is not None:
         columns: Mapping[str, ArrayLike] = {
             "shot": list(range(1, len(plan.settings) + 1)),
@@ -96,7 +97,7 @@ def _pairs(
 ) -> Sequence[tuple[str, str]]:
     """The pairs of effects to separate: from the options, else those that a diagnosis left open; none with --shrink."""
     from ballfg.diagnosis import diagnose
-    from ballfg.diagnosis.design.reported import pairs_of, reported_pairs
+    from ballfg.diagnosis.design.goal import pairs_of, reported_pairs
 
     given = [name for name, value in (("--between", between), ("--shrink", shrink), ("--diagnosis", folder)) if value]
     if len(given) > 1:

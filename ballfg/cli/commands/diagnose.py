@@ -46,8 +46,7 @@ def diagnose(
     model.NAME.yaml that of each room.
     """
     from ballfg.checks import check_range
-    from ballfg.diagnosis import diagnose as find
-    from ballfg.diagnosis import diagnose_jointly
+    from ballfg.diagnosis import diagnose as find, diagnose_jointly
     from ballfg.diagnosis.report.origin import Origin
     from ballfg.diagnosis.report.report import MODEL, PAGE, REPORT, check_report_folder, room_file, write_report
     from ballfg.dynamics import AnalyticModel
@@ -107,6 +106,7 @@ def _typed(
 
 def _summary(diagnosis: Diagnosis) -> Iterator[str]:
     """The diagnosis in lines: the sentence, effects, errors on the held-out half, the rest."""
+    from ballfg.checks import aligned
     from ballfg.diagnosis.report.headline import headline, of_population
     from ballfg.diagnosis.report.wording import fixed, listed, odds, probability
 
@@ -119,7 +119,7 @@ def _summary(diagnosis: Diagnosis) -> Iterator[str]:
         there = odds(f.probability) + (f" (one of them {odds(f.together)})" if f.indistinguishable_from else "")
         rows.append((f.name, there, f.kind, chance, bic, others, listed(f.parameters)))
     if diagnosis.findings:
-        yield from ("", *_aligned(rows))
+        yield from ("", *aligned(rows))
     before, after = diagnosis.before, diagnosis.after
     errors = [
         (f"on {diagnosis.tracks_judged_on} judging tracks", "before", "after"),
@@ -129,7 +129,7 @@ def _summary(diagnosis: Diagnosis) -> Iterator[str]:
         ("intervals hold, %", fixed(100 * before.intervals_held, 0), fixed(100 * after.intervals_held, 0)),
         ("log likelihood", fixed(before.log_likelihood, 2), fixed(after.log_likelihood, 2)),
     ]
-    yield from ("", *_aligned(errors))
+    yield from ("", *aligned(errors))
     if told := of_population(diagnosis):
         yield told
     left = diagnosis.unexplained
@@ -140,9 +140,3 @@ def _summary(diagnosis: Diagnosis) -> Iterator[str]:
         yield f"  {left.fallback.kind}: {left.fallback.description}; prediction RMSE {error:.1f} mm with it"
     if diagnosis.excluded:
         yield from ("", *(f"left out: {line}" for line in diagnosis.excluded))
-
-
-def _aligned(rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    for row in rows:
-        yield "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()

@@ -11,7 +11,7 @@ import typer
 
 from ballfg.cli import inputs
 from ballfg.cli.outcome import Outcome
-from ballfg.progress import progress
+from ballfg.progress import print_doubts, progress
 
 if TYPE_CHECKING:
     import numpy as np
@@ -65,7 +65,7 @@ def estimate(
         inputs.check_out(out, dataset)
         inputs.know_observations(observations_file)
         opened = inputs.open_source(source, dataset, model, effects_file, ball=ball)
-        inputs.print_doubts(inputs.filtered(opened.dataset))
+        print_doubts(inputs.filtered(opened.dataset))
         count = len(opened.dataset)
         work = partial(_estimated, opened.model, opened.estimator(method, solver, group))
         results = map_tracks(work, opened.dataset, count, workers)
@@ -75,9 +75,7 @@ def estimate(
             outcome.add(result.name, result.status, result.notes, result.outside)
             rows, hits, flying = rows + result.rows, hits + result.hits, flying + result.flying
     if flying < rows:
-        inputs.print_doubts(
-            [f"{100 * flying // rows} % of the samples are flight; the rest is held, rolls, rests or is lost"]
-        )
+        print_doubts([f"{100 * flying // rows} % of the samples are flight; the rest is held, rolls, rests or is lost"])
     print(f"{out}: {rows} states of {count} tracks by {method}; {hits} hits found")
     outcome.print()
     outcome.print_outside()

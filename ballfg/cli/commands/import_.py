@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import typer
 
-from ballfg.cli.inputs import print_doubts
-from ballfg.progress import idle
+from ballfg.progress import idle, print_doubts
 
 if TYPE_CHECKING:
     from ballfg.importing import Choices
@@ -57,7 +56,7 @@ def import_(
     from ballfg.files.whole_folder import check_replaceable
     from ballfg.importing import Choices
     from ballfg.importing.choices import parse_columns
-    from ballfg.importing.writing import write_import
+    from ballfg.importing.importer import write_import
 
     if format not in ("csv", "parquet"):
         raise ValueError(f"--format must be csv or parquet; got {format!r}. Choose one of them.")

@@ -25,7 +25,7 @@ REGISTRIES = (
     ("effects", "ballfg.dynamics.effects.registry", "EFFECTS"),
     ("observations", "ballfg.estimation.observations.registry", "OBSERVATIONS"),
     ("estimators", "ballfg.estimation.registry", "ESTIMATORS"),
-    ("trainees", "ballfg.learning.registry", "TRAINEES"),
+    ("trainees", "ballfg.learning.trainee", "TRAINEES"),
     ("formats", "ballfg.importing.formats.registry", "FORMATS"),
 )
 """Title, module and attribute of each registry, in the order of the output."""

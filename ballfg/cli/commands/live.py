@@ -15,6 +15,7 @@ import typer
 from ballfg import progress
 from ballfg.cli import inputs
 from ballfg.interrupts import heeded
+from ballfg.progress import print_notes
 
 if TYPE_CHECKING:
     from ballfg.dynamics import BallModel, Surfaces
@@ -133,9 +134,9 @@ def _dataset(folder: Path | None) -> Dataset | None:
     from ballfg.tracks import read_dataset
 
     data = read_dataset(folder)
-    inputs.print_notes(data.info.doubts)  # stdout holds the records
+    print_notes(data.info.doubts)  # stdout holds the records
     unused = "is not used: live estimates are made from positions alone"
-    inputs.print_notes(f"{name} {unused}" for name in tables_of_readings(folder))
+    print_notes(f"{name} {unused}" for name in tables_of_readings(folder))
     return data
 
 

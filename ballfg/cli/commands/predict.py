@@ -11,7 +11,7 @@ import typer
 
 from ballfg.cli import inputs
 from ballfg.cli.outcome import Outcome
-from ballfg.progress import progress
+from ballfg.progress import print_doubts, print_notes, progress
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -138,7 +138,7 @@ def predict(
             table.write(columns if result.outside is None else columns | {"outside": result.outside})
             outcome.add(result, plain.sigmas)
     if scales is None:
-        inputs.print_doubts(outcome.contradicted(opened.dataset.rough))
+        print_doubts(outcome.contradicted(opened.dataset.rough))
     print(f"{out}: {outcome.rows} positions of {count} tracks, from the first {observe:g} s of each by {method}")
     outcome.print(observe)
     outcome.tracks.print_outside()
@@ -202,7 +202,7 @@ def _conformal_scales(
         return scales
     calibration = in_flight(with_readings(read_dataset(source))).dataset
     check_calibration_tracks(calibration, dataset)
-    inputs.print_notes(f"calibration tracks: {note}" for note in calibration.notes)
+    print_notes(f"calibration tracks: {note}" for note in calibration.notes)
     count = len(calibration)
     predictions = predict_tracks(estimator, calibration, count, observe, jobs=jobs)
     watched = progress(predictions, count, "calibration tracks predicted")
@@ -225,7 +225,7 @@ def _print_conformal(scales: ConformalScales, outcome: _Outcome) -> None:
         own, held = 100 * outcome.held_by_own / outcome.finite, 100 * outcome.held / outcome.finite
         print(f"  90 % intervals on the {outcome.tracks.statuses.total()} predicted tracks: {what.format(own, held)}")
     if infinite := outcome.infinite:
-        inputs.print_notes(
+        print_notes(
             [
                 f"{infinite} of {3 * outcome.rows} sigmas are infinite: a finite 90 % interval needs {FEWEST} "
                 f"calibration tracks with samples as far ahead; up to {BIN * len(scales.tracks):g} s there are so many"

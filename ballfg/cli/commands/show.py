@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg.cli.inputs import print_doubts, print_notes
 from ballfg.files.whole_file import check_file, whole_file, write_text
+from ballfg.progress import print_doubts, print_notes
 
 if TYPE_CHECKING:
     from ballfg.estimation.observations.sighted_dataset import SightedDataset

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from ballfg.cli.inputs import print_notes
-from ballfg.progress import progress
+from ballfg.progress import print_notes, progress
 
 if TYPE_CHECKING:
     from ballfg.arrays import Array
@@ -93,11 +92,17 @@ def track(
     from ballfg.simulation.balls import ball_kind
     from ballfg.tracks.info import DatasetInfo
     from ballfg.vision.camera_file import read_cameras
-    from ballfg.vision.detection.detections_table import read_detections
+    from ballfg.vision.detection.detections import read_detections
     from ballfg.vision.tracking.dataset import check_result_folder, write_tracking
-    from ballfg.vision.tracking.pipeline import check_rig, track_detections
-    from ballfg.vision.tracking.recordings import without as others
-    from ballfg.vision.tracking.report import blind_cameras, disagreement, no_ball, summary
+    from ballfg.vision.tracking.pipeline import (
+        blind_cameras,
+        check_rig,
+        disagreement,
+        no_ball,
+        summary,
+        track_detections,
+        without as others,
+    )
 
     kind = ball_kind(ball)
     if cameras is None:
@@ -247,8 +252,7 @@ def _from_videos(
     from ballfg.vision.detection.detect import learn_detector, load_detector
     from ballfg.vision.detection.detector import DetectorSettings
     from ballfg.vision.detection.video import open_video
-    from ballfg.vision.tracking.pipeline import detect_videos
-    from ballfg.vision.tracking.recordings import match_videos, stamp_files
+    from ballfg.vision.tracking.pipeline import detect_videos, match_videos, stamp_files
 
     videos, files = match_videos(recordings, rig, without), stamp_files(stamps, rig)
     if detector is not None and colour is not None:
@@ -262,8 +266,7 @@ def _from_videos(
 def _on_one_clock(tracking: Tracking, model: AnalyticModel, surfaces: Surfaces) -> Tracking:
     """The same candidates with time offsets of the cameras estimated from the balls."""
     from ballfg.estimation import Settings, estimate_time_offsets, sighted_track
-    from ballfg.vision.tracking.pipeline import track_detections
-    from ballfg.vision.tracking.report import disagreement
+    from ballfg.vision.tracking.pipeline import disagreement, track_detections
 
     pairs = zip(tracking.names, tracking.balls, strict=True)
     tracks = [sighted_track(name, ball.sightings, tracking.cameras) for name, ball in pairs]

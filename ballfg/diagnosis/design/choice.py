@@ -14,12 +14,9 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.diagnosis.design.information import Information
 
-Measure = Callable[[Array], Array]
-"""(m,) measures of information matrices (m, q, q)."""
-LEAST_GAIN = 1e-9
-"""Least decrease of the measure by an exchange, against cycles."""
-DRAWS = 100
-"""Number of random choices whose median error bars are the comparison."""
+Measure = Callable[[Array], Array]  # (m,) measures of information matrices (m, q, q)
+LEAST_GAIN = 1e-9  # Least decrease of the measure by an exchange, against cycles
+DRAWS = 100  # Number of random choices whose median error bars are the comparison
 
 
 @dataclass(frozen=True)

@@ -1,41 +1,127 @@
-"""Computes the information on coefficients in a dataset's tracks and in each flight of a launcher."""
+"""Predicts the flights of a launcher, and computes the information on coefficients in them and in a dataset."""
 
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 
-from ballfg.arrays import Array, Index
-from ballfg.diagnosis.design.flights import View, planned_flights
+from ballfg.arrays import Array, Index, Mask
 from ballfg.diagnosis.design.goal import Goal
 from ballfg.diagnosis.fit.problem import Fit, Unknowns
+from ballfg.diagnosis.fit.stretches import LEAST_SAMPLES, MOST_CONTACTS, Stretches
 from ballfg.diagnosis.search.candidates import with_hypothesis
-from ballfg.dynamics import Surfaces
+from ballfg.dynamics import BallModel, Surfaces, rollout
+from ballfg.state import SPIN, VZ
 
-AT_ONCE = 500
-"""Number of flights whose derivatives are held at once; a flight takes up to half a megabyte."""
+MARGIN = 0.25
+"""Share of the measured extent, along x and y, by which a flight may leave it on each side. A few tracks do not show
+the whole view of the cameras."""
+LEAST_KICK = 0.3
+"""m/s. Least change of the vertical speed in a contact; a ball that rises slower than half of it comes to rest soon."""
+
+
+@dataclass(frozen=True)
+class View:
+    """The view of the cameras on a flight.
+
+    Attributes:
+        low, high: (3,) m, corners of the box in which the ball is visible. It is open above: lobs are visible too.
+        duration, interval: s, of the longest flight and between samples.
+        sigmas: (3,) m, stated noise of a coordinate.
+        labelled: True if the spin at the first sample is measured.
+    """
+
+    low: Array
+    high: Array
+    duration: float
+    interval: float
+    sigmas: Array
+    labelled: bool
+
+    @classmethod
+    def of(cls, stretches: Stretches) -> "View":
+        """The view of measured stretches."""
+        used = stretches.used.numpy()
+        positions, sigmas = stretches.positions.numpy()[used], stretches.sigmas.numpy()[used]
+        low, high = positions.min(axis=0), positions.max(axis=0)
+        margin = MARGIN * (high - low) * (1.0, 1.0, 0.0)
+        margin[2], high[2] = 0.01 * (high[2] - low[2]), np.inf
+        steps = np.diff(stretches.times.numpy(), axis=1)[used[:, 1:]]
+        first = np.unique(stretches.track, return_index=True)[1]
+        return cls(
+            low - margin,
+            high + margin,
+            float(stretches.ends.max()),
+            float(np.median(steps)),
+            np.median(sigmas, axis=0),
+            bool(stretches.labelled[first].mean() > 0.5),
+        )
+
+
+def planned_flights(
+    model: BallModel, starts: Array, settings: Array, surfaces: Surfaces, view: View
+) -> tuple[Stretches, Mask]:
+    """Flights from first states (m, 9) as stretches, until they leave the view.
+
+    Args: settings: (m, s) launcher settings, as in the stretches of the dataset.
+    Returns: the flights that are long enough, and (m,) a mask of them.
+    """
+    times = torch.arange(0.0, view.duration + 0.5 * view.interval, view.interval, dtype=torch.float64)
+    with torch.no_grad():
+        paths = rollout(model, torch.from_numpy(starts), times, surfaces)
+        heights = surfaces.level_below(paths)
+        gaps = model.gap(paths, heights).numpy()
+    states, n, k = paths.numpy(), len(starts), len(times)
+    lengths, contacts, levels = np.zeros(n, dtype=np.int64), *(np.full((n, MOST_CONTACTS), np.nan) for _ in range(2))
+    for i, path in enumerate(states):
+        lengths[i], met = _seen(path, gaps[i], view)
+        delay = np.clip(gaps[i, met] / -path[met, VZ], 0.0, view.interval)
+        contacts[i, : len(met)] = times.numpy()[met] + delay
+        levels[i, : len(met)] = heights.numpy()[i, met]
+    index = np.minimum(np.arange(k), lengths[:, None] - 1).clip(0)
+    seen = (np.arange(k) < lengths[:, None])[..., None]
+    rows = {
+        "times": times.numpy()[index],
+        "positions": np.take_along_axis(states[..., :3], index[..., None], axis=1),
+        "sigmas": np.where(seen, view.sigmas, np.inf),
+        "starts": starts,
+        "heights": levels,
+        "contacts": contacts,
+        "labels": states[:, 0, SPIN] if view.labelled else np.full((n, 3), np.nan),
+    }
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(row, dtype=np.float64)) for name, row in rows.items()}
+    kept = lengths >= LEAST_SAMPLES
+    return Stretches(tuple(map(str, range(n))), np.arange(n), settings, **tensors).take(kept), kept
+
+
+def _seen(path: Array, gaps: Array, view: View) -> tuple[int, Index]:
+    """Number of visible samples of a path (k, 9), and the samples (c,) before contacts."""
+    inside = ((path[:, :3] >= view.low) & (path[:, :3] <= view.high)).all(axis=1)
+    end = len(path) if inside.all() else int(np.argmin(inside))
+    before, after = path[: end - 1, VZ], path[1:end, VZ]
+    near = gaps[: end - 1] < 1.5 * view.interval * np.abs(before)
+    met = np.flatnonzero((before < 0.0) & (after > 0.0) & (after - before > LEAST_KICK) & near)
+    slow = np.flatnonzero(after[met] < 0.5 * LEAST_KICK)
+    last = min([MOST_CONTACTS, *slow.tolist()])
+    return (int(met[last]) + 1, met[:last]) if len(met) > last else (end, met)
+
+
+AT_ONCE = 500  # Number of flights whose derivatives are held at once; a flight takes up to half a megabyte
 MISSED = 1e-3
 """m. Difference between a planned flight's samples with given and with found contacts that means other contacts."""
 
 
 @dataclass(frozen=True)
 class Information:
-    """Information matrices about q common unknowns, first states eliminated, in units of the priors.
+    """Information matrices about q common unknowns, first states eliminated, in units of the priors."""
 
-    Attributes:
-        names: of the coefficients, which are the first unknowns; launcher settings follow.
-        units: (q,) prior standard deviations, the units of the matrices.
-        known: (q, q) of priors and dataset.
-        shots: (m, q, q) of each candidate.
-        kept: (m,) numbers of the candidates with usable flights.
-    """
-
-    names: tuple[str, ...]
-    units: Array
-    known: Array
-    shots: Array
-    kept: Index
+    names: tuple[str, ...]  # of the coefficients, which are the first unknowns; launcher settings follow
+    units: Array  # (q,) prior standard deviations, the units of the matrices
+    known: Array  # (q, q) of priors and dataset
+    shots: Array  # (m, q, q) of each candidate
+    kept: Index  # (m,) numbers of the candidates with usable flights
 
     def columns(self, names: Sequence[str]) -> list[int]:
         """Places of coefficients among the unknowns."""

@@ -8,8 +8,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 
-MOST = 5000
-"""Largest number of combinations. More take minutes, and neighbours hardly differ."""
+MOST = 5000  # Largest number of combinations. More take minutes, and neighbours hardly differ
 
 
 def parse_levels(text: str) -> dict[str, list[float]]:

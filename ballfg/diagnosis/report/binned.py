@@ -10,12 +10,9 @@ from ballfg.diagnosis.result import ContactResiduals, FlightResiduals
 from ballfg.dynamics.motion.impact import slip_velocity
 from ballfg.state import SPIN, VELOCITY
 
-MOST_BINS, LEAST_BINS = 12, 3
-"""Limits of the number of bins, which hold equal counts."""
-STRETCHES_A_BIN = 6
-"""Number of stretches per bin, so that each mean is over several stretches."""
-LEAST_STRETCHES = 3
-"""Least number of stretches for the standard error of a bin."""
+MOST_BINS, LEAST_BINS = 12, 3  # Limits of the number of bins, which hold equal counts
+STRETCHES_A_BIN = 6  # Number of stretches per bin, so that each mean is over several stretches
+LEAST_STRETCHES = 3  # Least number of stretches for the standard error of a bin
 STEEP = 1e-6
 """Horizontal share of a velocity below which it counts as vertical: its direction along the ground is then x."""
 

@@ -6,16 +6,13 @@ from collections.abc import Iterator, Sequence
 from ballfg.diagnosis.report import pictures
 from ballfg.diagnosis.report.glossary import outcome_badge, term
 from ballfg.diagnosis.report.headline import not_shown
-from ballfg.diagnosis.report.plain_effects import plain_name
-from ballfg.diagnosis.report.wording import NONE, capital, listed, number, probability, sized
+from ballfg.diagnosis.report.wording import NONE, capital, listed, number, plain_name, probability, sized
 from ballfg.diagnosis.result import Candidate, Diagnosis, Outcome
 from ballfg.dynamics import EFFECTS
 from ballfg.pages.html import Html, bar, picture, section, table, tag
 
-COLOURS = {Outcome.ADDED: "added", Outcome.ALIKE: "alike"}
-"""CSS classes for the outcome of a candidate."""
-SHOWN = 8
-"""Number of visible rows of a ranking; the others unfold."""
+COLOURS = {Outcome.ADDED: "added", Outcome.ALIKE: "alike"}  # CSS classes for the outcome of a candidate
+SHOWN = 8  # Number of visible rows of a ranking; the others unfold
 RANKING = (
     "candidate",
     term("squared residual", "squared residual it would explain"),

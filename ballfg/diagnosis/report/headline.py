@@ -12,8 +12,20 @@ import numpy as np
 from ballfg.diagnosis.fit.patterns import EVERYWHERE
 from ballfg.diagnosis.generic_test import ALARM
 from ballfg.diagnosis.report.origin import Origin
-from ballfg.diagnosis.report.plain_effects import BY_GROUP, DRIFT, in_plain_words, plain_name
-from ballfg.diagnosis.report.wording import MOST_CERTAIN, NONE, capital, fixed, joined, number, probability, sized
+from ballfg.diagnosis.report.wording import (
+    BY_GROUP,
+    DRIFT,
+    MOST_CERTAIN,
+    NONE,
+    capital,
+    fixed,
+    in_plain_words,
+    joined,
+    number,
+    plain_name,
+    probability,
+    sized,
+)
 from ballfg.diagnosis.residual_tests.label_check import LABEL
 from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Finding, Outcome, Verdict
 from ballfg.dynamics import EFFECTS
@@ -30,8 +42,7 @@ PLACES: Final = {
 """Beginning of a test's words, and the same within a sentence."""
 SURE: Final = ((1e-6, "practically certain"), (1e-3, "very likely"), (0.05, "likely"))
 """Words for the probability that a finding is false; the larger one of both halves of the tracks counts."""
-SKEWED: Final = 1.5
-"""Ratio of the root mean square to the median track's error beyond which the median is reported."""
+SKEWED: Final = 1.5  # Ratio of the root mean square to the median track's error beyond which the median is reported
 MAIN: Final = ("wind", "drag_speed", "time_scale", "scale", "frame_tilt")
 """Effects whose detectable size is in the first lines of a report without findings."""
 COUNTS: Final = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine")

@@ -10,20 +10,15 @@ PACKAGES: Final = ("ballfg", "torch", "numpy", "scipy")
 
 @dataclass(frozen=True)
 class Origin:
-    """The inputs of a report, as the user typed them: command line, folders of the datasets, files.
-
-    Attributes:
-        model: the declared model's file; empty for the nominal model.
-        doubts: what is not sure about the tracks.
-        models: file of the corrected model of each dataset, in the folder `out` of the report.
-    """
+    """The inputs of a report, as the user typed them: command line, folders of the datasets, files."""
 
     command: str
     datasets: tuple[str, ...]
-    model: str
+    model: str  # the declared model's file; empty for the nominal model
     out: str
     models: tuple[str, ...] = ("model.yaml",)
-    doubts: tuple[str, ...] = ()
+    """File of the corrected model of each dataset, in the folder `out` of the report."""
+    doubts: tuple[str, ...] = ()  # what is not sure about the tracks
 
 
 def packages() -> str:

@@ -12,14 +12,23 @@ from ballfg.diagnosis.report.candidates import invisible, noticed_from, rankings
 from ballfg.diagnosis.report.glossary import glossary, term
 from ballfg.diagnosis.report.headline import advice, answer, certainty, further, headline, where
 from ballfg.diagnosis.report.origin import Origin, packages
-from ballfg.diagnosis.report.plain_effects import in_plain_words, plain_name
 from ballfg.diagnosis.report.predictions import errors, one_shot, parts_of_error
-from ballfg.diagnosis.report.wording import NONE, capital, fixed, joined, number, odds, plus_minus, probability
+from ballfg.diagnosis.report.wording import (
+    NONE,
+    capital,
+    fixed,
+    in_plain_words,
+    joined,
+    number,
+    odds,
+    plain_name,
+    plus_minus,
+    probability,
+)
 from ballfg.diagnosis.result import Diagnosis, Finding, Residuals, Value, Verdict
 from ballfg.dynamics import EFFECTS
 from ballfg.machine import date
-from ballfg.pages.html import Html, doubtful, items, picture, section, table, tag, typed
-from ballfg.pages.page import whole_page
+from ballfg.pages.html import Html, doubtful, items, picture, section, table, tag, typed, whole_page
 
 BADGES = {Verdict.FOUND: "found", Verdict.NOTHING: "nothing", Verdict.UNEXPLAINED: "unexplained"}
 """CSS class of the verdict."""

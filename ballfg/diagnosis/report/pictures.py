@@ -17,8 +17,7 @@ from ballfg.diagnosis.report.binned import at_contact, binned, in_flight, slip_s
 from ballfg.diagnosis.result import Candidate, Errors, Outcome, Residuals
 from ballfg.state import SPIN, VELOCITY, VZ
 
-Series = Mapping[str, Residuals]
-"""Residuals by their name in the legend: `before` and `after`, or a single one."""
+Series = Mapping[str, Residuals]  # Residuals by their name in the legend: `before` and `after`, or a single one
 Parts = tuple[Mapping[str, Array], Array, Array, Index]
 """Conditions by name, components of a residual, their standard deviations, and numbers of stretches."""
 
@@ -27,20 +26,14 @@ BEFORE, AFTER, GREY = "#d55e00", "#0072b2", "#8c8c8c"
 AXIS_COLOURS = ("#0072b2", "#e69f00", "#009e73")
 IN_FLIGHT = ("along the flight", "across, to the left", "across, upwards")
 AT_CONTACT = ("along the ground", "to the left", "up")
-LARGEST_WHITENED = 4.0
-"""Limit of whitened residuals in means, so that one outlier hides no pattern of the others."""
-HISTOGRAM_END = 6.0
-"""Whitened residuals at which the axis of their histogram ends."""
-SHOWN_SHARE = 0.98
-"""Share of the single points inside the axes."""
-LEAST_EXPLAINED = 0.3
-"""Least squared residual in the drawing: chance alone explains about 1."""
+LARGEST_WHITENED = 4.0  # Limit of whitened residuals in means, so that one outlier hides no pattern of the others
+HISTOGRAM_END = 6.0  # Whitened residuals at which the axis of their histogram ends
+SHOWN_SHARE = 0.98  # Share of the single points inside the axes
+LEAST_EXPLAINED = 0.3  # Least squared residual in the drawing: chance alone explains about 1
 MARGINS = (0.8, 0.12, 0.52, 0.32)
 """Inches left and right of a grid of panels and below it, for names and numbers; above it, for a line of a title."""
-NAMED = 6
-"""Number of named candidates of the first round in the picture of the rounds, beside those added later."""
-LINES_OF_TEXT = 18
-"""Number of lines of text beside the picture of the rounds."""
+NAMED = 6  # Number of named candidates of the first round in the picture of the rounds, beside those added later
+LINES_OF_TEXT = 18  # Number of lines of text beside the picture of the rounds
 MARKED = {Outcome.ADDED: ("added", AFTER), Outcome.ALIKE: ("alike", BEFORE)}
 """Word and colour of the prominent candidates there."""
 

@@ -11,10 +11,8 @@ from ballfg.diagnosis.report.wording import NONE, change, fixed
 from ballfg.diagnosis.result import Diagnosis, Errors
 from ballfg.pages.html import Html, bar, items, picture, section, table, tag, text
 
-BY_CHANCE: Final = 2.0
-"""Standard errors within which a NIS counts as 1."""
-NEAR_FLOOR: Final = 1.2
-"""Ratio to the floor below which a model can hardly be improved."""
+BY_CHANCE: Final = 2.0  # Standard errors within which a NIS counts as 1
+NEAR_FLOOR: Final = 1.2  # Ratio to the floor below which a model can hardly be improved
 
 
 def errors(diagnosis: Diagnosis) -> Html:

@@ -23,8 +23,7 @@ from ballfg.files.json_file import read_json
 from ballfg.files.whole_folder import check_replaceable, whole_folder
 
 REPORT: Final = "report.json"
-PROGRAM: Final = "ballfg diagnose"
-"""Value of `program` in `report.json`: other commands write files of that name too."""
+PROGRAM: Final = "ballfg diagnose"  # Value of `program` in `report.json`: other commands write files of that name too
 PAGE: Final = "report.html"
 MODEL: Final = "model.yaml"
 

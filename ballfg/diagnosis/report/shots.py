@@ -12,14 +12,10 @@ from ballfg.arrays import Array
 from ballfg.diagnosis.report.pictures import AFTER, BEFORE, GREY
 from ballfg.diagnosis.result import Errors, PredictedPath
 
-ACROSS, DEEP = 6, 4
-"""Cells of the map along the longer and the shorter side of the table."""
-LEAST_SAMPLES: Final = 5
-"""Least number of samples in a cell or bin for its error."""
-SHEET: Final = 5.2
-"""Inches, width of a picture beside another one: wider ones shrink until they are unreadable."""
-BINS: Final = 8
-"""Number of bins of time."""
+ACROSS, DEEP = 6, 4  # Cells of the map along the longer and the shorter side of the table
+LEAST_SAMPLES: Final = 5  # Least number of samples in a cell or bin for its error
+SHEET: Final = 5.2  # Inches, width of a picture beside another one: wider ones shrink until they are unreadable
+BINS: Final = 8  # Number of bins of time
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,5 @@
 """Compiles generated source to machine code and keeps it on disk under the hash of that source."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import sys
@@ -36,8 +34,7 @@ ONE, TWO, THREE = (types.Array(types.float64, dimensions, "C") for dimensions in
 @machine_code(types.void(TWO, TWO, ONE, THREE, THREE, TWO, THREE))
 '''
 """Beginning of each generated file, before `compute`."""
-HELPERS: Final = ("add_product", "tanh_all")
-"""Functions of `layers.py` that generated ones may call."""
+HELPERS: Final = ("add_product", "tanh_all")  # Functions of `layers.py` that generated ones may call
 
 
 def machine_code(signature: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -115,9 +112,11 @@ def built(source: str) -> Code:
 def _built(text: str) -> Code:
     name = f"ballfg_compiled_{hashlib.sha256(text.encode()).hexdigest()[:20]}"
     found = [path for path in readable(f"{name}.py") if _holds(path, text)]
-    compute = _module(name, found[0] if found else keep(f"{name}.py", text), text).compute
-    compute._compile_for_args()
-    return Code(compute)
+    path = found[0] if found else keep(f"{name}.py", text)
+    module = sys.modules[name] = ModuleType(name)  # Python's own cache, if damaged, would be an error at each start
+    exec(compile(text, path, "exec", dont_inherit=True), module.__dict__)
+    module.compute._compile_for_args()
+    return Code(module.compute)
 
 
 def _holds(path: Path, text: str) -> bool:
@@ -160,10 +159,3 @@ def _digest_of(note: Any) -> str:
 
 def _note_name(about: str) -> str:
     return f"{hashlib.sha256(about.encode()).hexdigest()[:20]}.json"
-
-
-def _module(name: str, path: Path, text: str) -> ModuleType:
-    """The module of a file, without Python's own cache: a damaged one would be an error at each start."""
-    module = sys.modules[name] = ModuleType(name)
-    exec(compile(text, path, "exec", dont_inherit=True), module.__dict__)
-    return module

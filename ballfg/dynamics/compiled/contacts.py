@@ -45,8 +45,7 @@ from ballfg.dynamics.motion.limits import (
     steps_over,
 )
 
-LEAST = 1e-300
-"""Keeps a division by zero away."""
+LEAST = 1e-300  # Keeps a division by zero away
 
 
 @machine_code(several(REAL, 3)(LAW, LAW, ONE, REAL, REAL))

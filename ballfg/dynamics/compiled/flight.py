@@ -12,8 +12,7 @@ from ballfg.dynamics.compiled.build import function_at, machine_code
 from ballfg.dynamics.compiled.signatures import ADDRESS, COUNT, FOUR, LAW, NOTHING, ONE, REAL, THREE, TWO, Law, Laws
 from ballfg.dynamics.motion.limits import STAGES
 
-TOGETHER = 96
-"""Number of balls whose network layers fit into a processor's cache."""
+TOGETHER = 96  # Number of balls whose network layers fit into a processor's cache
 
 
 @register_jitable

@@ -1,7 +1,5 @@
 """Compiles the functions of a ball model, rates, impact and surface, each with its tangents."""
 
-from __future__ import annotations
-
 import sys
 import threading
 import warnings
@@ -30,47 +28,32 @@ from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.progress import doing
 from ballfg.state import STATE_DIM
 
-VALUES_AGREE: Final = 1e-12
-"""Largest relative difference between a compiled value and torch's."""
-SLOPES_AGREE: Final = 1e-10
-"""Largest relative difference between a compiled derivative and torch's."""
-COMPARED: Final = 4
-"""Number of random states at which both are computed."""
+VALUES_AGREE: Final = 1e-12  # Largest relative difference between a compiled value and torch's
+SLOPES_AGREE: Final = 1e-10  # Largest relative difference between a compiled derivative and torch's
+COMPARED: Final = 4  # Number of random states at which both are computed
 
 
 @dataclass(frozen=True)
 class Function:
-    """A compiled function of a state and some coefficients.
-
-    Attributes:
-        compute: `compute(x, c, w, xt, ct, y, yt)`: n states x (n, 9), their coefficients c (n, p), weights w (k,),
-            tangents xt (n, 9, d) and ct (n, p, d); writes the results y (n, m) and their tangents yt (n, m, d).
-        names: of the p coefficients that the function uses, as in `model.named_parameters()`.  size: m.
-        weigh: computes the weights from a model's tables; None if there are none.
-        source: of `compute`; empty where torch computes.
-    """
+    """A compiled function of a state and some coefficients."""
 
     compute: Code
-    names: tuple[str, ...]
-    size: int
-    weigh: Recipe | None = None
-    source: str = ""
+    """`compute(x, c, w, xt, ct, y, yt)`: n states x (n, 9), their coefficients c (n, p), weights w (k,), tangents xt
+    (n, 9, d) and ct (n, p, d); writes the results y (n, m) and their tangents yt (n, m, d)."""
+    names: tuple[str, ...]  # of the p coefficients that the function uses, as in `model.named_parameters()`
+    size: int  # m
+    weigh: Recipe | None = None  # computes the weights from a model's tables; None if there are none
+    source: str = ""  # of `compute`; empty where torch computes
 
 
 @dataclass(frozen=True)
 class CompiledModel:
-    """The functions of a ball model.
+    """The functions of a ball model."""
 
-    Attributes:
-        rates: of the velocity, then of the spin, (6,).  impact: state after an impact, (9,).
-        surface: offset of surfaces above their declared heights in m, and their slopes along x and y, (3,).
-        radius: m, of the ball.
-    """
-
-    rates: Function
-    impact: Function
-    surface: Function
-    radius: float
+    rates: Function  # of the velocity, then of the spin, (6,)
+    impact: Function  # state after an impact, (9,)
+    surface: Function  # offset of surfaces above their declared heights in m, and their slopes along x and y, (3,)
+    radius: float  # m, of the ball
 
     def weights(self, model: BallModel) -> tuple[Array, Array, Array]:
         """Weights of rates, impact and surface from a model's present tables."""
@@ -87,8 +70,7 @@ class CompiledModel:
         return known[2]
 
 
-NONE: Final = np.zeros(0)
-"""The weights of a function without tables."""
+NONE: Final = np.zeros(0)  # The weights of a function without tables
 _Weighed = tuple[Hashable, Sequence[Tensor], tuple[Array, Array, Array]]
 """Stamp of a model's tables; the tables, kept so that no others get their place in memory and with it their stamp; the
 weights of rates, impact and surface that were computed from them."""
@@ -194,8 +176,7 @@ def _surface(model: BallModel, state: Tensor) -> Tensor:
     return torch.cat((offset.expand(state.shape[:-1]).unsqueeze(-1), slope), dim=-1)
 
 
-PARTS: Final = (_rates, _impact, _surface)
-"""The functions that are compiled: of a model and of a state (9,)."""
+PARTS: Final = (_rates, _impact, _surface)  # The functions that are compiled: of a model and of a state (9,)
 
 
 def _function(model: BallModel, function: Callable[[BallModel, Tensor], Tensor], key: Hashable | None) -> Function:

@@ -3,8 +3,6 @@
 Prediction then runs the same code for every model, only more slowly.
 """
 
-from __future__ import annotations
-
 import threading
 import weakref
 from collections.abc import Callable
@@ -25,8 +23,7 @@ from ballfg.dynamics.compiled.places import numbers_of
 from ballfg.dynamics.compiled.signatures import ONE, THREE, TWO
 from ballfg.dynamics.model import BallModel, substitute
 
-SIZES: Final = (6, 9, 3)
-"""Number of outputs of rates, impact and surface."""
+SIZES: Final = (6, 9, 3)  # Number of outputs of rates, impact and surface
 
 _asked: dict[int, Callable[[Tensor, Tensor], Tensor]] = {}
 

@@ -4,8 +4,6 @@ Machine code is run as it is found. So it is read only from folders that this us
 file states its function, its sources, their versions and the processor.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import pickle
@@ -29,8 +27,7 @@ from numba.core.runtime import rtsys
 
 from ballfg.files.own_folder import is_own, own_bytes, temporary_folder
 
-READABLE: Final = 0o755
-"""Mode of the folder of the cache: others may read what an administrator has compiled for them."""
+READABLE: Final = 0o755  # Mode of the folder of the cache: others may read what an administrator has compiled for them
 FOR_OTHERS_TO_READ: Final = 0o644
 DIGEST_SIZE: Final = hashlib.sha256().digest_size
 NOTED: Final = "BALLFG_CACHE_NOTED"

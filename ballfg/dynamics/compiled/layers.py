@@ -11,16 +11,12 @@ from ballfg.dynamics.compiled.signatures import COUNT, NOTHING, ONE, TWO
 LEAST_FOR_BLAS: Final = 256
 """Multiplications from which on a call of BLAS is quicker than loops; ten times so for layers of 80."""
 
-ROUNDING: Final = 1.5 * 2.0**52
-"""Added to a float64, it leaves the nearest whole number in the lowest bits."""
+ROUNDING: Final = 1.5 * 2.0**52  # Added to a float64, it leaves the nearest whole number in the lowest bits
 PER_LN2: Final = 1.4426950408889634
 LN2: Final = 6.93147180369123816490e-01
-LN2_REST: Final = 1.90821492927058770002e-10
-"""ln 2 in two parts, the first of which times a whole number is exact."""
-BITS, BIAS = np.int64(52), np.int64(1023 << 52)
-"""Place of the exponent in a float64."""
-STEEP: Final = 0.625
-"""Below, 1 - 2 / (exp(2x) + 1) would lose digits."""
+LN2_REST: Final = 1.90821492927058770002e-10  # ln 2 in two parts, the first of which times a whole number is exact
+BITS, BIAS = np.int64(52), np.int64(1023 << 52)  # Place of the exponent in a float64
+STEEP: Final = 0.625  # Below, 1 - 2 / (exp(2x) + 1) would lose digits
 
 
 @machine_code(NOTHING(ONE, ONE, TWO))
@@ -41,24 +37,11 @@ def _add_row(whole: Array, row: Array, matrix: Array) -> None:
 
 @machine_code(NOTHING(ONE, COUNT, COUNT, *(ONE, *[COUNT] * 4) * 2, *[COUNT] * 4))
 def add_product(
-    whole: Array,
-    whole_at: int,
-    whole_step: int,
-    left: Array,
-    left_at: int,
-    left_step: int,
-    left_row: int,
-    left_column: int,
-    right: Array,
-    right_at: int,
-    right_step: int,
-    right_row: int,
-    right_column: int,
-    count: int,
-    m: int,
-    k: int,
-    n: int,
-) -> None:
+    whole: Array, whole_at: int, whole_step: int,
+    left: Array, left_at: int, left_step: int, left_row: int, left_column: int,
+    right: Array, right_at: int, right_step: int, right_row: int, right_column: int,
+    count: int, m: int, k: int, n: int,
+) -> None:  # fmt: skip
     """Add matrix products (m, k) (k, n) to `whole`, whose rows lie one behind another.
 
     Args:

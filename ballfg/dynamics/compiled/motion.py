@@ -1,7 +1,5 @@
 """Moves batches of balls through flight and contacts in machine code, with Jacobians."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cache
 

@@ -12,19 +12,14 @@ from ballfg.dynamics.model import BallModel
 
 @dataclass(frozen=True)
 class Numbers:
-    """References to a model's numbers: searching for them takes longer than a flight.
+    """References to a model's numbers: searching for them takes longer than a flight."""
 
-    Attributes:
-        scalars: by name, the dictionary and the key at which a coefficient lies.
-        arrays: the same for parameters that are no scalars, and buffers: derivatives by them are left to torch.
-        parts: of each module of the model, the dictionary of its sub-modules and what that held.
-        ball: radius (m) and inertia factor.
-    """
-
-    scalars: Mapping[str, tuple[dict[str, Any], str]]
+    scalars: Mapping[str, tuple[dict[str, Any], str]]  # by name, the dictionary and the key at which a coefficient lies
     arrays: Mapping[str, tuple[dict[str, Any], str]]
+    """The same for parameters that are no scalars, and buffers: derivatives by them are left to torch."""
     parts: Sequence[tuple[dict[str, Any], tuple[Any, ...]]]
-    ball: tuple[float, float]
+    """Of each module of the model, the dictionary of its sub-modules and what that held."""
+    ball: tuple[float, float]  # radius (m) and inertia factor
 
     def are_of(self, model: BallModel) -> bool:
         """True if a model still consists of the same modules, none of them exchanged."""

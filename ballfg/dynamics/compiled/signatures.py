@@ -25,8 +25,7 @@ class Law(NamedTuple):
     compute: Any
     c: Any
     ct: Any
-    w: Any
-    """(k,) weights."""
+    w: Any  # (k,) weights
 
 
 class Laws(NamedTuple):

@@ -12,14 +12,10 @@ from ballfg.state import STANDARD_GRAVITY, Z
 
 TINY_SPEED: Final = 1e-9
 """m/s. Keeps 0/0 away for a ball that neither moves nor spins; its saturated lift is zero anyway."""
-PLACES: Final = (4, 2, 2)
-"""Centres of gust regions that are tried along x, y and z."""
-REGION_SHARE: Final = 0.25
-"""Size of a region that is tried, as a share of the longest extent of the data."""
-SMALLEST_REGION: Final = 0.01
-"""m. A ball that stays where it is has no extent."""
-LARGEST_REGION: Final = 50.0
-"""m. Of a region that is tried, at most."""
+PLACES: Final = (4, 2, 2)  # Centres of gust regions that are tried along x, y and z
+REGION_SHARE: Final = 0.25  # Size of a region that is tried, as a share of the longest extent of the data
+SMALLEST_REGION: Final = 0.01  # m. A ball that stays where it is has no extent
+LARGEST_REGION: Final = 50.0  # m. Of a region that is tried, at most
 _DOWN = torch.tensor((0.0, 0.0, -1.0), dtype=torch.float64)
 _UP = torch.tensor((0.0, 0.0, 1.0), dtype=torch.float64)
 

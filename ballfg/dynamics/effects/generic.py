@@ -43,28 +43,20 @@ MEASUREMENT_TERMS: Final = {
     **dict.fromkeys(("vx", "vy", "vz"), (0.001, "s")),
 }
 """Terms in the place from the centre and the velocity: standard deviation of the prior and unit; each is worth 5 mm."""
-SOFT_SPEED: Final = 0.1
-"""m/s. Below it the directions of flight fade, so that a ball at rest has none."""
-SOFT_SPIN: Final = 1.0
-"""rad/s. Below it the total spin is smooth at zero."""
-BOUND: Final = 1e3
-"""Of each coefficient, in units of its prior's standard deviation."""
-MEASUREMENT_BOUND: Final = 100.0
-"""The same for an error of a measurement: it is small."""
+SOFT_SPEED: Final = 0.1  # m/s. Below it the directions of flight fade, so that a ball at rest has none
+SOFT_SPIN: Final = 1.0  # rad/s. Below it the total spin is smooth at zero
+BOUND: Final = 1e3  # Of each coefficient, in units of its prior's standard deviation
+MEASUREMENT_BOUND: Final = 100.0  # The same for an error of a measurement: it is small
 
 FUNCTIONS: Final = ("one", "v", "s", "vv", "vs", "ss", "vvv", "vvs", "vss", "sss", "far")
 """Functions of one correction: v is the speed and s the spin ratio S as S / (1 + S), from their centres."""
 POWERS: Final = tuple((name.count("v"), name.count("s")) for name in FUNCTIONS[:-1])
 """Of v and s in all functions but the last."""
 FORCES: Final = ("drag", "lift")
-DOUBTS: Final = 4
-"""Number of directions of the weights of a force whose uncertainty an estimate carries."""
-DOUBT: Final = {"drag": "doubt", "lift": "lift_doubt"}
-"""Prefix of the names of a force's doubts."""
-LEAST_REST: Final = 1e-12
-"""Least share of the variance in the last function: its square root stays differentiable."""
-LIMIT: Final = 10.0
-"""Largest weight: drag or lift eleven times as large."""
+DOUBTS: Final = 4  # Number of directions of the weights of a force whose uncertainty an estimate carries
+DOUBT: Final = {"drag": "doubt", "lift": "lift_doubt"}  # Prefix of the names of a force's doubts
+LEAST_REST: Final = 1e-12  # Least share of the variance in the last function: its square root stays differentiable
+LIMIT: Final = 10.0  # Largest weight: drag or lift eleven times as large
 
 WEIGHTS: Final = tuple(f"{force}_{term}" for force in FORCES for term in FUNCTIONS)
 """Names of all weights, those of drag first."""

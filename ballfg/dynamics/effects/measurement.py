@@ -133,9 +133,7 @@ class RadialBias(MeasurementEffect):
     decide = "Measure a ball at rest in several known places: the error points away from the centre."
     coefficients = (
         Coefficient("offset", 0.0, 0.005, "m", -0.5, 0.5),
-        Coefficient("x", 0.0, 1.0, "m", -100.0, 100.0, absent=None),
-        Coefficient("y", 0.0, 1.0, "m", -100.0, 100.0, absent=None),
-        Coefficient("z", 0.0, 1.0, "m", -100.0, 100.0, absent=None),
+        *(Coefficient(axis, 0.0, 1.0, "m", -100.0, 100.0, absent=None) for axis in "xyz"),
     )
     plausible = Range(-0.02, 0.02, "a camera sees the surface, which lies one radius before the centre")
     usual = Usual({"offset": 0.01}, "an estimate: half of a ball's radius")
@@ -162,9 +160,7 @@ class Distortion(MeasurementEffect):
     decide = "Measure rods of known length, or a ball at rest in known places, in the room's middle and at its edges."
     coefficients = (
         Coefficient("k", 0.0, 0.005, "1/m^2", -0.5, 0.5),
-        Coefficient("x", 0.0, 0.5, "m", -100.0, 100.0, absent=None),
-        Coefficient("y", 0.0, 0.5, "m", -100.0, 100.0, absent=None),
-        Coefficient("z", 0.0, 0.5, "m", -100.0, 100.0, absent=None),
+        *(Coefficient(axis, 0.0, 0.5, "m", -100.0, 100.0, absent=None) for axis in "xyz"),
     )
     plausible = Range(-0.05, 0.05, SEEN)
     usual = Usual({"k": 0.008}, "an estimate: 8 mm at 1 m from the centre")

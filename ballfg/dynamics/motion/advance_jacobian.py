@@ -17,17 +17,12 @@ from ballfg.state import VZ
 
 @dataclass(frozen=True)
 class Advance:
-    """A motion over an interval.
+    """A motion over an interval."""
 
-    Attributes:
-        after: (1, d) the state at the end.
-        jacobian: (d, d) its derivative by the state at the start, at fixed duration.
-        contacts: time since the start, s, and the surface's height, m, of each bounce; a final landing does not count.
-    """
-
-    after: Tensor
-    jacobian: Tensor
+    after: Tensor  # (1, d) the state at the end
+    jacobian: Tensor  # (d, d) its derivative by the state at the start, at fixed duration
     contacts: tuple[tuple[float, float], ...]
+    """Time since the start, s, and the surface's height, m, of each bounce; a final landing does not count."""
 
 
 @torch.no_grad()

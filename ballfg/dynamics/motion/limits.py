@@ -18,18 +18,13 @@ MAX_STEP: Final = 0.02
 20 m/s."""
 SEARCH_STEPS: Final = 12
 """Upper bound on the search for a contact from a guess; one or two are enough for a contact within 20 ms."""
-TIME_TOLERANCE: Final = 1e-13
-"""s. The search stops when the error bound of every contact time is below."""
-GAP_TOLERANCE: Final = 1e-10
-"""m. A grazing ball whose search stalled this close to the surface has touched it."""
-TYPICAL_JERK: Final = 60.0
-"""m/s^3, in the bound on the search's error."""
+TIME_TOLERANCE: Final = 1e-13  # s. The search stops when the error bound of every contact time is below
+GAP_TOLERANCE: Final = 1e-10  # m. A grazing ball whose search stalled this close to the surface has touched it
+TYPICAL_JERK: Final = 60.0  # m/s^3, in the bound on the search's error
 DEEPEST: Final = 0.25
 """m. A ball whose centre is further below the lowest surface meets nothing. Floors are known to some centimetres."""
-LEAST_FALL: Final = 1.0
-"""m/s^2. The search takes a ball to fall at least as fast as this."""
-LONGEST_FALL: Final = 20.0
-"""s. A contact further away counts as none."""
+LEAST_FALL: Final = 1.0  # m/s^2. The search takes a ball to fall at least as fast as this
+LONGEST_FALL: Final = 20.0  # s. A contact further away counts as none
 BEYOND: Final = 0.3
 """s. A contact time further outside of its interval than this, and than the interval's length, is set to NaN."""
 MIN_SPEED: Final = 1e-6
@@ -42,10 +37,8 @@ or faster is never both, so that a hop is the same motion however its time is cu
 NEGLIGIBLE: Final = 1e-4
 """Share of balls that pass a table's edge on the other side than the mean, below which they are neglected; they would
 add 0.05 m/s to a velocity."""
-LEAST_SIGMA: Final = 1e-12
-"""m. Least standard deviation of a place."""
-LONGEST_MOTION: Final = 20.0
-"""s. An untouched ball lies still by then; over a longer interval it stays in place."""
+LEAST_SIGMA: Final = 1e-12  # m. Least standard deviation of a place
+LONGEST_MOTION: Final = 20.0  # s. An untouched ball lies still by then; over a longer interval it stays in place
 MAX_CONTACTS: Final = 32
 """In one step of 20 ms a ball that leaves at `REST_SPEED` under its weight alone bounces at most twice."""
 

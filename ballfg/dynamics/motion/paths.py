@@ -23,8 +23,7 @@ from ballfg.dynamics.motion.rollout import next_surface, rollout, stays
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import POSITION, VELOCITY, VZ
 
-MOST_ARCS = 40
-"""Number of arcs after which a ball is about to come to rest."""
+MOST_ARCS = 40  # Number of arcs after which a ball is about to come to rest
 
 
 def paths(model: BallModel, state: Tensor, times: Tensor, surfaces: Surfaces) -> Tensor:
@@ -63,21 +62,14 @@ def paths(model: BallModel, state: Tensor, times: Tensor, surfaces: Surfaces) ->
 
 @dataclass(frozen=True)
 class _Arc:
-    """Free flight of m balls from a common moment on.
+    """Free flight of m balls from a common moment on."""
 
-    Attributes:
-        nodes: (j + 1, m, 9) states, `MAX_STEP` apart; a ball that has landed stays where it was.
-        slopes: (j + 1, m, 9) their derivatives by time.  landed: (m,) bool, the ball came down on a surface.
-        step: (m,) the step in which it did.  height: (m,) m, of that surface.
-        resting: (m,) bool, the ball lay on a surface from the start.
-    """
-
-    nodes: Tensor
-    slopes: Tensor
-    landed: Tensor
-    step: Tensor
-    height: Tensor
-    resting: Tensor
+    nodes: Tensor  # (j + 1, m, 9) states, `MAX_STEP` apart; a ball that has landed stays where it was
+    slopes: Tensor  # (j + 1, m, 9) their derivatives by time
+    landed: Tensor  # (m,) bool, the ball came down on a surface
+    step: Tensor  # (m,) the step in which it did
+    height: Tensor  # (m,) m, of that surface
+    resting: Tensor  # (m,) bool, the ball lay on a surface from the start
 
     def sample(self, times: Tensor) -> Tensor:
         """(m, k, 9) states at times (m, k) s since the start of the arc."""

@@ -1,15 +1,12 @@
 """Describes the networks of a learned model by numbers for a file."""
 
-from __future__ import annotations
-
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
 Kind = Literal["mlp", "mlp+gs", "skip+gs", "mnn+gs"]
 
-MOST_WIDTH: Final = 2048
-"""Hidden units; such a layer takes 34 MB."""
+MOST_WIDTH: Final = 2048  # Hidden units; such a layer takes 34 MB
 MOST_DEPTH: Final = 20
 
 DEFAULT_SIZES: Final[dict[Kind, tuple[int, int, int]]] = {
@@ -50,7 +47,7 @@ class Architecture(BaseModel):
         depth: int | None = None,
         residual: bool = False,
         spin_rate: bool = False,
-    ) -> Architecture:
+    ) -> Self:
         """An architecture with the kind's default for each size that is not given."""
         given = (width_flight, width_contact, depth)
         sizes = (size if own is None else own for own, size in zip(given, DEFAULT_SIZES[kind], strict=True))

@@ -14,10 +14,8 @@ from torch import Tensor
 
 from ballfg.state import SPIN, VELOCITY
 
-SPEED_SCALE: Final = 6.0
-"""m/s, a usual speed of a table-tennis ball: the middle of a feature's range."""
-SPIN_SCALE: Final = 150.0
-"""rad/s, a usual spin of a table-tennis ball: the middle of a feature's range."""
+SPEED_SCALE: Final = 6.0  # m/s, a usual speed of a table-tennis ball: the middle of a feature's range
+SPIN_SCALE: Final = 150.0  # rad/s, a usual spin of a table-tennis ball: the middle of a feature's range
 CONTACT_SCALE: Final = 5.0
 """m/s, the same for a contact's velocities: of the ball, and of its surface (radius times spin)."""
 LIFT: Final = 0.3
@@ -25,8 +23,7 @@ LIFT: Final = 0.3
 balls do, large enough for derivatives up to the third to be moderate."""
 
 FLIGHT_FEATURES: Final = 3
-FLIGHT_TERMS: Final = 3
-"""Coefficients of the acceleration; there are as many of the angular acceleration."""
+FLIGHT_TERMS: Final = 3  # Coefficients of the acceleration; there are as many of the angular acceleration
 CONTACT_FEATURES: Final = 6
 CONTACT_TERMS: Final = 8
 """Coefficients of a contact: three each for the change of v_xy and of radius z x w, two for that of w_z."""
@@ -84,22 +81,16 @@ def angular_acceleration(frame: FlightFrame, coefficients: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class ContactFrame:
-    """Velocity and spin of a ball at a horizontal surface, taken apart, in units of `CONTACT_SCALE`.
-
-    Attributes:
-        features: (..., 6) invariants in (-1, 1): lengths of slip, of v_xy across the slip, and of radius w_z, then
-            v_xy along the slip, v_z, and `twist` times `turn`, each squashed by x / sqrt(1 + x^2).
-        direction: (..., 2) of the slip, shorter than one where there is little.  velocity: (..., 2) v_xy.
-        side: (..., 2) `twist` z x direction.  turn: (..., 1) z . (direction x v_xy): a pseudoscalar.
-        twist: (..., 1) radius times w_z: a pseudoscalar.
-    """
+    """Velocity and spin of a ball at a horizontal surface, taken apart, in units of `CONTACT_SCALE`."""
 
     features: Tensor
-    direction: Tensor
-    velocity: Tensor
-    side: Tensor
-    turn: Tensor
-    twist: Tensor
+    """(..., 6) invariants in (-1, 1): lengths of slip, of v_xy across the slip, and of radius w_z, then v_xy along the
+    slip, v_z, and `twist` times `turn`, each squashed by x / sqrt(1 + x^2)."""
+    direction: Tensor  # (..., 2) of the slip, shorter than one where there is little
+    velocity: Tensor  # (..., 2) v_xy
+    side: Tensor  # (..., 2) `twist` z x direction
+    turn: Tensor  # (..., 1) z . (direction x v_xy): a pseudoscalar
+    twist: Tensor  # (..., 1) radius times w_z: a pseudoscalar
 
 
 def contact_frame(state: Tensor, radius: float) -> ContactFrame:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ballfg.checks import shown
 from ballfg.dynamics.analytic import AnalyticModel
-from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.model import BASE, BallModel
 from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.dynamics.networks.fading import Fading
 from ballfg.dynamics.networks.learned import LearnedModel, build
@@ -32,12 +32,11 @@ from ballfg.tracks.noise import TrackNoise
 CONFIG, WEIGHTS = "config.yaml", "weights.safetensors"
 LEARNED = ".learned-"
 """Part of a folder's name, between the stem of the model file that named it first and the digest of its content."""
-_MODEL, _LAUNCHER, BASE = "model.", "launcher.", "base."
+_MODEL, _LAUNCHER = "model.", "launcher."
 """Prefixes of tensor names: of the networks and of the spin embedding; of the base, whose values stand in the model
 file itself."""
 
-LARGEST_DENSITY = 100_000
-"""Largest number of centres of a feature density; training chooses a few hundred."""
+LARGEST_DENSITY = 100_000  # Largest number of centres of a feature density; training chooses a few hundred
 
 
 class _Section(BaseModel):

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 CPU = torch.device("cpu")
-Weights = tuple[Tensor, Tensor]
-"""Of a linear layer: weight (outputs, inputs), bias (outputs,)."""
+Weights = tuple[Tensor, Tensor]  # Of a linear layer: weight (outputs, inputs), bias (outputs,)
 
 
 def expand(first: Weights, step: Weights, last: Weights, depth: int) -> Tensor:
@@ -57,21 +56,16 @@ def evaluation_cost(features: int, outputs: int, depth: int) -> int:
 
 @dataclass(frozen=True)
 class _Tables:
-    """Places of products of monomials.
-
-    Attributes:
-        raised: for degree k = 1, 2, ...: (variables, m_k), number of each monomial times each variable in degree k + 1,
-            and how many monomials there are in degree k + 1.
-        powers: for degree k = 2, 3, ...: the monomial of degree k - 1 and the variable whose product each is.
-        pairs: (left, right), number of their product in the full degree.
-        shares: (left, right), one over the number of pairs that give the same product.
-    """
+    """Places of products of monomials."""
 
     raised: tuple[tuple[Tensor, int], ...]
+    """For degree k = 1, 2, ...: (variables, m_k), number of each monomial times each variable in degree k + 1, and how
+    many monomials there are in degree k + 1."""
     powers: tuple[tuple[Tensor, Tensor], ...]
+    """For degree k = 2, 3, ...: the monomial of degree k - 1 and the variable whose product each is."""
     left: int
-    pairs: Tensor
-    shares: Tensor
+    pairs: Tensor  # (left, right), number of their product in the full degree
+    shares: Tensor  # (left, right), one over the number of pairs that give the same product
 
 
 @functools.cache

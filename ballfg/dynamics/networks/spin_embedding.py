@@ -14,8 +14,7 @@ from torch import Tensor, nn
 
 from ballfg.checks import shown
 
-SPIN_UNIT: Final = 100.0
-"""rad/s for a weight of one, so that weights are of order one."""
+SPIN_UNIT: Final = 100.0  # rad/s for a weight of one, so that weights are of order one
 SOFT_SPEED: Final = 0.05
 """m/s. Well below it a launch has no horizontal direction and its forward and across axes fade out; at 5 m/s they are
 5e-5 short of one."""

@@ -38,16 +38,12 @@ from ballfg.tracks import Ball, Track
 if TYPE_CHECKING:
     from ballfg.estimation.filters.ball_filter import BallFilter
 
-REJECTED_FOR_HIT = 4
-"""Number of consecutive samples beyond the gate that make a hit before the first of them."""
-HIT_POSITION = 1.0
-"""m, standard deviation of the position after a hit, where it restarts at the measurement."""
-LEAST_USED = 0.5
-"""Least share of samples within the gate for a filter that has followed the ball."""
+REJECTED_FOR_HIT = 4  # Number of consecutive samples beyond the gate that make a hit before the first of them
+HIT_POSITION = 1.0  # m, standard deviation of the position after a hit, where it restarts at the measurement
+LEAST_USED = 0.5  # Least share of samples within the gate for a filter that has followed the ball
 LEAST_SHARE = 1e-3
 """Least standard deviation, as a share of one sample's noise over the root of their number, or of a prior."""
-LEAST_MOTION = 1e-6
-"""m/s and rad/s, the same for velocity and spin."""
+LEAST_MOTION = 1e-6  # m/s and rad/s, the same for velocity and spin
 NEAR_SURFACE = 0.05
 """m. Samples this close to a surface need not lie on one parabola with others: a bounce may be between."""
 

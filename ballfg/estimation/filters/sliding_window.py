@@ -24,8 +24,7 @@ from ballfg.factors.batch import FactorBatch
 from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, STATE_DIM, VELOCITY, Z
 from ballfg.tracks import Track
 
-START_SEARCH = 12
-"""Number of samples among which the first good ones of a flight are searched."""
+START_SEARCH = 12  # Number of samples among which the first good ones of a flight are searched
 START_GATE = 30.7
 """Squared whitened miss beyond which three samples are not one flight: chi-square, 3 degrees of freedom, 1e-6."""
 START_ACCELERATION = 20.0

@@ -7,8 +7,7 @@ from ballfg.arrays import Array
 from ballfg.state import STANDARD_GRAVITY, Z
 from ballfg.tracks.track import FASTEST_BALL
 
-WINDOW = 5
-"""Samples in a window."""
+WINDOW = 5  # Samples in a window
 
 
 def window_velocities(times: Array, positions: Array, breaks: ArrayLike = ()) -> Array:

@@ -1,9 +1,9 @@
-"""Gives the flights of a dataset as a dataset, with what commands that presume flight say about the rest."""
+"""Cuts flights out of tracks, and gives those of a dataset as a dataset, with what commands say about the rest."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import islice, pairwise
 from typing import Final
@@ -12,35 +12,27 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.dynamics.nominal import nominal_model
-from ballfg.estimation.flights.cut import Piece, names_of, pieces_of, tracks_of
 from ballfg.estimation.flights.falling import contrasts, scatter
-from ballfg.estimation.flights.labels import FEWEST, Labels, label_samples
+from ballfg.estimation.flights.labels import FEWEST, SHORTEST, Labels, label_samples
 from ballfg.estimation.result import Label
-from ballfg.estimation.segmentation.physics import physics_of
+from ballfg.estimation.segmentation.physics import SegmentationPhysics, physics_of
 from ballfg.tracks import Dataset, Track
+from ballfg.tracks.track import Label as TrackLabel
 
-ENOUGH: Final = 0.5
-"""Share of the samples in flight below which commands that presume flight refuse."""
+ENOUGH: Final = 0.5  # Share of the samples in flight below which commands that presume flight refuse
 SMOOTHED: Final = 1.35
 """Ratio of the errors over 0.25 s to those from sample to sample beyond which a filter smoothed the positions: on five
 measured sets it is at most 1.18, on simulated recordings (seeds 0 to 83) at most 1.08, after a low-pass of 6 Hz at
 least 1.58."""
-OTHERS: Final = 0.1
-"""Share of the samples that no motion of the ball explains from which they are worth a doubt."""
-FARTHEST: Final = 0.1
-"""m. Scatter from sample to sample beyond that of trackers."""
-UNDISTURBED: Final = 0.2
-"""Quantile of that ratio: stretches with a bounce or a hit have larger ones."""
+OTHERS: Final = 0.1  # Share of the samples that no motion of the ball explains from which they are worth a doubt
+FARTHEST: Final = 0.1  # m. Scatter from sample to sample beyond that of trackers
+UNDISTURBED: Final = 0.2  # Quantile of that ratio: stretches with a bounce or a hit have larger ones
 SMOOTHING: Final = "a filter smoothed the positions"
 OTHER: Final = "of another ball, or outliers"
-SPAN: Final = 0.25
-"""s, of the cubics whose residuals show the errors."""
-LEAST_SPAN: Final = 8
-"""Samples, likewise."""
-ROUNDING: Final = 5e-5
-"""m. Errors below are those of rounding."""
-LOOKED_AT: Final = 200
-"""Number of tracks that show whether a filter smoothed the positions."""
+SPAN: Final = 0.25  # s, of the cubics whose residuals show the errors
+LEAST_SPAN: Final = 8  # Samples, likewise
+ROUNDING: Final = 5e-5  # m. Errors below are those of rounding
+LOOKED_AT: Final = 200  # Number of tracks that show whether a filter smoothed the positions
 
 
 class FlightsOf(Dataset):
@@ -214,3 +206,63 @@ def _ratios(times: Array, positions: Array) -> list[float]:
         fast = (np.einsum("ni,nix->nx", contrasts(t), neighbours) ** 2).mean(axis=0).sum()
         found.append(float(np.sqrt((slow + ROUNDING**2) / (fast + ROUNDING**2))))
     return found
+
+
+BEFORE: Final = {Label.HELD: "thrown", Label.ROLLING: "left a surface", Label.RESTING: "left a surface"}
+"""Reasons of the beginning of a flight, by what was before."""
+AFTER: Final = {Label.HELD: "caught", Label.ROLLING: "rolled", Label.RESTING: "came to rest"}
+"""Reasons of its end, by what came after."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A flight in a track: first and last sample, inclusive, and why it begins and ends there."""
+
+    first: int
+    last: int
+    begins: str
+    ends: str
+
+    def of(self, track: Track, name: str) -> Track:
+        """The flight as a track, with the reasons among its labels."""
+        reasons: dict[str, TrackLabel] = {"recording": track.name, "begins": self.begins, "ends": self.ends}
+        part = track.between(float(track.times[self.first]), float(track.times[self.last]))
+        return replace(part, name=name, labels={**part.labels, **reasons})
+
+
+def pieces_of(labels: Labels) -> list[Piece]:
+    """The flights of a labelled track."""
+    values, found = labels.values, list[Piece]()
+    for first, last in labels.stretches(Label.FLIGHT):
+        before = Label(int(values[first - 1])) if first else None
+        after = Label(int(values[last + 1])) if last + 1 < len(values) else None
+        if last - first + 1 >= SHORTEST:
+            begins = "start" if before is None else BEFORE.get(before, "seen again")
+            found.append(Piece(first, last, begins, "end" if after is None else AFTER.get(after, "lost")))
+    return found
+
+
+def flights_of(track: Track, physics: SegmentationPhysics, levels: Sequence[float] = ()) -> list[Track]:
+    """The flights of a track: itself, where nothing else is in it.
+
+    Args: physics: of the ball.  levels: m, heights of its centre at which it is known to lie.
+    """
+    labels = label_samples(track, physics, levels)
+    if flies_throughout(labels):
+        return [track]
+    return tracks_of(track, pieces_of(labels))
+
+
+def names_of(track: str, pieces: Sequence[Piece]) -> list[str]:
+    """The names of the flights in a track of a name."""
+    return [f"{track}-{i:03d}" for i in range(len(pieces))]
+
+
+def tracks_of(track: Track, pieces: Sequence[Piece]) -> list[Track]:
+    """The flights in a track as tracks."""
+    return [piece.of(track, name) for name, piece in zip(names_of(track.name, pieces), pieces, strict=True)]
+
+
+def flies_throughout(labels: Labels) -> bool:
+    """True if all samples of a track show a flight, apart from single lost ones."""
+    return bool(np.isin(labels.values, (Label.FLIGHT, Label.LOST)).all() and (labels.values == Label.FLIGHT).any())

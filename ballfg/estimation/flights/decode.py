@@ -57,26 +57,18 @@ from ballfg.estimation.segmentation.bank import (
 )
 from ballfg.estimation.segmentation.log import chain, compact
 
-RATE: Final = 1.0
-"""1/s. Prior rate of every event."""
-SHORTEST: Final = 1e-3
-"""s. Least interval for the price of an event."""
+RATE: Final = 1.0  # 1/s. Prior rate of every event
+SHORTEST: Final = 1e-3  # s. Least interval for the price of an event
 PRICES: Final = np.array([0.0, 1.0, 4.0, 3.0, 4.0])
 """nats in addition to the prior rate: none, of a bounce, a strike, a change of the mode, a shift."""
-LETTING_GO: Final = 1.0
-"""nats, besides, of a hand that lets a ball fly or roll."""
-BRIEF: Final = 8.0
-"""nats, the price of the end of a flight in a hand that has just begun."""
-BRIEFLY: Final = 0.1
-"""s. Time constant with which that price fades."""
+LETTING_GO: Final = 1.0  # nats, besides, of a hand that lets a ball fly or roll
+BRIEF: Final = 8.0  # nats, the price of the end of a flight in a hand that has just begun
+BRIEFLY: Final = 0.1  # s. Time constant with which that price fades
 BRIEF_HOLD: Final = 20.0
 """nats, of a flight that begins just after a hold, roll or rest did: what a hand cannot hold as briefly is a strike."""
-BRIEFLY_HELD: Final = 0.05
-"""s."""
-BRANCHES: Final = 6 * 7 + 4
-"""Largest number of hypotheses that events add to a sample."""
-SPARE: Final = 200_000
-"""Rows of the log from which it is compacted."""
+BRIEFLY_HELD: Final = 0.05  # s
+BRANCHES: Final = 6 * 7 + 4  # Largest number of hypotheses that events add to a sample
+SPARE: Final = 200_000  # Rows of the log from which it is compacted
 
 
 @machine_code(NOTHING(WORK, COUNT, COUNT, COUNT, REAL))

@@ -1,11 +1,9 @@
 """Estimates the flights of a track, and leaves what is no flight as it was measured."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
@@ -18,8 +16,7 @@ from ballfg.estimation.settings import sample_sigmas
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 from ballfg.tracks import Track
 
-UNKNOWN_SPEED: Final = 5.0
-"""m/s. Standard deviation of the velocity of a ball that does not fly, per axis."""
+UNKNOWN_SPEED: Final = 5.0  # m/s. Standard deviation of the velocity of a ball that does not fly, per axis
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +28,7 @@ class Seen:
     parts: list[tuple[int, int]]
 
     @classmethod
-    def of(cls, estimator: Estimator, track: Track) -> Seen:
+    def of(cls, estimator: Estimator, track: Track) -> Self:
         """A track as an estimator may explain it: flights, and rolling and rest on its surfaces."""
         estimator.prepared(track)  # refuses what is no track before anything looks at it
         levels = [height + estimator.model.radius for height in estimator.surfaces.heights()]

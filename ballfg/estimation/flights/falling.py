@@ -1,7 +1,5 @@
 """Tests positions quickly for white noise, for a fall of all of them, and for a filter that smoothed them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Final
 
@@ -12,28 +10,20 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 
-CALM: Final = 0.3
-"""Share of the samples that show the noise: others are near bounces, throws and catches."""
-CALM_QUANTILE: Final = 0.3853
-"""Its quantile of the absolute value of a standard normal variable."""
-WINDOW: Final = 0.12
-"""s, of the fit of an acceleration."""
-LEAST_WINDOW: Final = 5
-"""Samples, likewise, at least."""
+CALM: Final = 0.3  # Share of the samples that show the noise: others are near bounces, throws and catches
+CALM_QUANTILE: Final = 0.3853  # Its quantile of the absolute value of a standard normal variable
+WINDOW: Final = 0.12  # s, of the fit of an acceleration
+LEAST_WINDOW: Final = 5  # Samples, likewise, at least
 MOST_OFF: Final = 20.0
 """Squared whitened distance of an acceleration from that of a ball, of 3 degrees of freedom: one in 6,000 is larger."""
-CLEARLY: Final = 3.0
-"""Multiple of that distance at which a ball at rest would have to stand for a window to tell."""
+CLEARLY: Final = 3.0  # Multiple of that distance at which a ball at rest would have to stand for a window to tell
 BESIDE: Final = 0.04
 """s. Windows with a bounce or a hit do not fall, for the length of a window and this; longer means something else."""
-AT_END: Final = 0.05
-"""s, likewise where a track begins or ends."""
-STILL_AIR: Final = 0.7
-"""m/s^2. Spread of the acceleration of a slow flying ball beside gravity and drag."""
+AT_END: Final = 0.05  # s, likewise where a track begins or ends
+STILL_AIR: Final = 0.7  # m/s^2. Spread of the acceleration of a slow flying ball beside gravity and drag
 AIR: Final = 1.25
 """Its growth, over the ball's own drag: lift of a spinning ball, and drag of another ball than assumed."""
-BLOCK: Final = 20_000
-"""Samples that are looked at together; memory grows with it."""
+BLOCK: Final = 20_000  # Samples that are looked at together; memory grows with it
 
 
 def contrasts(times: Array) -> Array:

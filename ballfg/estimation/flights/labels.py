@@ -1,7 +1,5 @@
 """Labels the samples of a track: flight, held, rolling, resting or lost."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -22,28 +20,18 @@ from ballfg.estimation.segmentation.result import OUTLIER
 from ballfg.estimation.segmentation.settings import SegmentationSettings
 from ballfg.tracks import Track
 
-FEWEST: Final = 5
-"""Least number of samples for labels."""
-SHORTEST: Final = 5
-"""Least number of samples of a flight that is used: fewer show no velocity."""
+FEWEST: Final = 5  # Least number of samples for labels
+SHORTEST: Final = 5  # Least number of samples of a flight that is used: fewer show no velocity
 LEAST_SIGMA: Final = 1.5e-3
 """m. Least standard deviation of a sample: slow errors of trackers do not show in the scatter."""
-MERGED: Final = 0.15
-"""s since its last event after which a hypothesis merges with others of its mode."""
-LEAST_MERGED: Final = 12
-"""Samples, likewise, at least."""
-MOST: Final = 400
-"""Largest number of hypotheses."""
-MARGIN: Final = 25.0
-"""nats. Hypotheses this far behind the best are dropped."""
-GAP: Final = 0.5
-"""s. Nothing links the two sides of a longer gap."""
-ROLLED: Final = 0.03
-"""m. A ball that gets less far does not roll."""
-ALIKE: Final = 0.03
-"""m. Places within this height of each other are on one surface."""
-HANDS: Final = 30.0
-"""nats, by which hands must explain a recording better than flights, strikes and bounces alone."""
+MERGED: Final = 0.15  # s since its last event after which a hypothesis merges with others of its mode
+LEAST_MERGED: Final = 12  # Samples, likewise, at least
+MOST: Final = 400  # Largest number of hypotheses
+MARGIN: Final = 25.0  # nats. Hypotheses this far behind the best are dropped
+GAP: Final = 0.5  # s. Nothing links the two sides of a longer gap
+ROLLED: Final = 0.03  # m. A ball that gets less far does not roll
+ALIKE: Final = 0.03  # m. Places within this height of each other are on one surface
+HANDS: Final = 30.0  # nats, by which hands must explain a recording better than flights, strikes and bounces alone
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,74 +11,45 @@ from ballfg.estimation.flights.falling import AIR, STILL_AIR
 from ballfg.estimation.segmentation.bank import FLYING, ONE_HYPOTHESIS, SCENE, Record
 from ballfg.estimation.segmentation.surface_contact import carry
 
-HANDLED: Final = 1
-"""Value of `surface` for a ball that a hand moves quickly: throws, catches, pushes."""
-CARRIED: Final = 2
-"""For a ball that a hand moves slowly."""
-SWAYED: Final = 3
-"""For a ball in a hand that hardly moves."""
-ROLLING: Final = 4
-"""For a ball that rolls at a constant height."""
-STILL: Final = 5
-"""For a ball that does not move."""
+HANDLED: Final = 1  # Value of `surface` for a ball that a hand moves quickly: throws, catches, pushes
+CARRIED: Final = 2  # For a ball that a hand moves slowly
+SWAYED: Final = 3  # For a ball in a hand that hardly moves
+ROLLING: Final = 4  # For a ball that rolls at a constant height
+STILL: Final = 5  # For a ball that does not move
 MODES: Final = (FLYING, HANDLED, CARRIED, SWAYED, ROLLING, STILL)
 
-BOUNCE: Final = 1
-"""Kind of an event: a flying ball bounces on something level."""
-STRIKE: Final = 2
-"""A flying ball is hit, and flies on."""
-CHANGE: Final = 3
-"""The mode changes."""
-SHIFT: Final = 4
-"""The measurements of a flying ball jump, its velocity stays: the tracker follows something else."""
+BOUNCE: Final = 1  # Kind of an event: a flying ball bounces on something level
+STRIKE: Final = 2  # A flying ball is hit, and flies on
+CHANGE: Final = 3  # The mode changes
+SHIFT: Final = 4  # The measurements of a flying ball jump, its velocity stays: the tracker follows something else
 
-AIR_MEMORY: Final = 0.5
-"""s. Time constant of that acceleration."""
+AIR_MEMORY: Final = 0.5  # s. Time constant of that acceleration
 SHORT: Final = 0.02
 """Time constants up to which a series is exact to 2 % and better than differences of rounded numbers."""
-MOST_AIR: Final = 30.0
-"""m/s^2, of that spread."""
+MOST_AIR: Final = 30.0  # m/s^2, of that spread
 
-QUICK: Final = 30.0
-"""m/s^2. Spread, per axis, of the acceleration of a hand that throws or catches."""
-QUICK_MEMORY: Final = 0.08
-"""s. Time constant of that acceleration."""
-STOPPING: Final = 120.0
-"""m/s^2. Spread of the acceleration at the start of a catch."""
-SLOW: Final = 8.0
-"""m/s^2. Spread of the acceleration of a hand that carries."""
-SLOW_MEMORY: Final = 0.15
-"""s."""
-SWAY: Final = 1.0
-"""m/s^2. Spread of the acceleration of a hand that holds the ball."""
-SWAY_MEMORY: Final = 0.3
-"""s."""
-HAND_SPEED: Final = 2.0
-"""m/s. Spread of the velocity of a hand, per axis."""
+QUICK: Final = 30.0  # m/s^2. Spread, per axis, of the acceleration of a hand that throws or catches
+QUICK_MEMORY: Final = 0.08  # s. Time constant of that acceleration
+STOPPING: Final = 120.0  # m/s^2. Spread of the acceleration at the start of a catch
+SLOW: Final = 8.0  # m/s^2. Spread of the acceleration of a hand that carries
+SLOW_MEMORY: Final = 0.15  # s
+SWAY: Final = 1.0  # m/s^2. Spread of the acceleration of a hand that holds the ball
+SWAY_MEMORY: Final = 0.3  # s
+HAND_SPEED: Final = 2.0  # m/s. Spread of the velocity of a hand, per axis
 SLOPE: Final = 0.02
 """m/s. Spread of the vertical velocity of a rolling ball: the surface or the frame is not quite level."""
-ROLLING_SLACK: Final = 0.3
-"""m/s^2. Spread of the horizontal acceleration of a rolling ball."""
-ROLLING_DRIFT: Final = 0.02
-"""m/s per sqrt(s). Random walk of its horizontal velocity."""
-LANDING: Final = 0.3
-"""m/s. Spread of the vertical speed with which a ball begins to roll or stops."""
-STIR: Final = 1e-3
-"""m per sqrt(s). Random walk of a ball that does not move."""
+ROLLING_SLACK: Final = 0.3  # m/s^2. Spread of the horizontal acceleration of a rolling ball
+ROLLING_DRIFT: Final = 0.02  # m/s per sqrt(s). Random walk of its horizontal velocity
+LANDING: Final = 0.3  # m/s. Spread of the vertical speed with which a ball begins to roll or stops
+STIR: Final = 1e-3  # m per sqrt(s). Random walk of a ball that does not move
 
-RESTITUTION: Final = 0.75
-"""Of a bounce of any ball on any surface."""
+RESTITUTION: Final = 0.75  # Of a bounce of any ball on any surface
 RESTITUTION_SIGMA: Final = 0.2
-KEPT: Final = 0.9
-"""Share of the tangential velocity that a bounce leaves."""
-SLIDE: Final = 0.4
-"""Spread of its change, as a share of the normal speed."""
-BOUNCE_JITTER: Final = 0.1
-"""m/s."""
-SLOWEST_FALL: Final = 0.3
-"""m/s. Slower balls are not tried with a bounce."""
-STRIKE_SPEED: Final = 8.0
-"""m/s. Spread of the velocity after a strike, per axis."""
+KEPT: Final = 0.9  # Share of the tangential velocity that a bounce leaves
+SLIDE: Final = 0.4  # Spread of its change, as a share of the normal speed
+BOUNCE_JITTER: Final = 0.1  # m/s
+SLOWEST_FALL: Final = 0.3  # m/s. Slower balls are not tried with a bounce
+STRIKE_SPEED: Final = 8.0  # m/s. Spread of the velocity after a strike, per axis
 
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, REAL, SCENE))
@@ -95,7 +66,7 @@ def move(h: Record, dt: float, scene: Record) -> None:
         _wander(h, dt, SWAY, SWAY_MEMORY)
     elif h.surface == ROLLING:
         for axis in range(3):
-            _constant(h, axis, dt)
+            _transform(h, axis, dt, 0.5 * dt * dt, dt, 1.0)  # constant acceleration
         for axis in range(2):
             h.cov[axis, 1, 1] += ROLLING_DRIFT**2 * dt
         h.cov[2, 0, 0] += STIR**2 * dt
@@ -120,12 +91,6 @@ def _relax(h: Record, t: float, scene: Record) -> None:
             h.cov[axis, 2, k] *= memory
             h.cov[axis, k, 2] *= memory
         h.cov[axis, 2, 2] += spread * spread * (1.0 - memory * memory)
-
-
-@machine_code(NOTHING(ONE_HYPOTHESIS, COUNT, REAL))
-def _constant(h: Record, axis: int, t: float) -> None:
-    """One axis t s later, with constant acceleration."""
-    _transform(h, axis, t, 0.5 * t * t, t, 1.0)
 
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, COUNT, REAL, REAL, REAL, REAL))

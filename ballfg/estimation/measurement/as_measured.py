@@ -1,9 +1,8 @@
 """Converts between true and recorded stamps, positions and spin labels by a model's measurement effects."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import torch
@@ -15,8 +14,7 @@ from ballfg.dynamics.motion.rollout import advance
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import POSITION, STATE_DIM
 
-_MEASUREMENT = "measurement"
-"""Attribute of an `AnalyticModel` that holds its measurement effects."""
+_MEASUREMENT = "measurement"  # Attribute of an `AnalyticModel` that holds its measurement effects
 LARGEST_CONDITION = 1e6
 """Largest condition of the map from spins to labels: beyond it a label leaves a component of the spin undetermined."""
 
@@ -84,7 +82,7 @@ class LabelMap:
     offset: Array
 
     @classmethod
-    def of(cls, model: BallModel) -> LabelMap:
+    def of(cls, model: BallModel) -> Self:
         """The map of a model. Raises: ValueError: if it gives different spins the same label."""
         with torch.no_grad():
             offset = model.labelled(torch.zeros(3, dtype=torch.float64)).numpy()

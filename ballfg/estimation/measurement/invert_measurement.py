@@ -34,15 +34,12 @@ from ballfg.tracks.track import FASTEST_SPIN, SPIN_LABELS
 
 ROUNDS: Final = 20
 """Largest number of estimates of a track; a lag of 5 ms takes four or five, an offset of 30 ms a dozen."""
-FIRST_ROUNDS: Final = 8
-"""Steps of the fixed point on positions alone: they undo a stretch by 10 % to 1e-8."""
-SETTLED: Final = 1e-3
-"""Standard deviations of a sample: shifts that change by less have converged."""
+FIRST_ROUNDS: Final = 8  # Steps of the fixed point on positions alone: they undo a stretch by 10 % to 1e-8
+SETTLED: Final = 1e-3  # Standard deviations of a sample: shifts that change by less have converged
 IMPOSSIBLE: Final = (
     f"the model reads the spin label as more than {FASTEST_SPIN:g} rad/s, as no ball spins: the label is not used"
 )
-LOST: Final = 1e4
-"""Standard deviations of a sample, tens of metres: shifts that change by more diverge."""
+LOST: Final = 1e4  # Standard deviations of a sample, tens of metres: shifts that change by more diverge
 
 
 @dataclass(frozen=True)

@@ -9,33 +9,23 @@ from ballfg.arrays import Array, median
 from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
 from ballfg.tracks import Track
 
-HALF_WINDOW = 5
-"""Number of samples on each side of the tested one."""
-DEGREE = 3
-"""Of the polynomials. Over `LONGEST_WINDOW` a flight differs from a cubic by less than 0.1 mm."""
-LONGEST_WINDOW = 0.3
-"""s. Windows with a gap, or of a slow tracker, are left out."""
-REJECT = 5.0
-"""Windows with a residual above this many sigma hold a bounce, a hit or an outlier, and are left out."""
-ROUNDS = 4
-"""Repetitions of estimate and rejection; the first one rejects nothing."""
-ENOUGH = 20_000
-"""Number of windows that gives sigma to 1 %; no further track is read."""
-FLOOR = 2e-4
-"""m. Least noise of a tracker of flying balls; identical or computed positions would give zero."""
-FALLBACK = 2e-3
-"""m. Noise of a camera tracker in a room, for data in which no track has a window."""
+HALF_WINDOW = 5  # Number of samples on each side of the tested one
+DEGREE = 3  # Of the polynomials. Over `LONGEST_WINDOW` a flight differs from a cubic by less than 0.1 mm
+LONGEST_WINDOW = 0.3  # s. Windows with a gap, or of a slow tracker, are left out
+REJECT = 5.0  # Windows with a residual above this many sigma hold a bounce, a hit or an outlier, and are left out
+ROUNDS = 4  # Repetitions of estimate and rejection; the first one rejects nothing
+ENOUGH = 20_000  # Number of windows that gives sigma to 1 %; no further track is read
+FLOOR = 2e-4  # m. Least noise of a tracker of flying balls; identical or computed positions would give zero
+FALLBACK = 2e-3  # m. Noise of a camera tracker in a room, for data in which no track has a window
 LEAST_LEFT = 1e-6
 """Least share of a sample's variance that a fit leaves: a sample far from all others determines the cubic alone."""
 LOOKED_AT = 128
 """Number of samples of a track whose scatter is compared with the stated noise; they give it to some 10 %."""
-LEAST_WINDOWS = 20
-"""Least number of windows for the scatter of a track."""
+LEAST_WINDOWS = 20  # Least number of windows for the scatter of a track
 MOST_SCATTER = 1.75
 """Of the stated noise. Of 300 simulated tracks of each of nine kinds (seed 5; 60 to 200 Hz, with 5 % outliers or
 jittering stamps) at most one in a hundred scatters so much."""
-MAD_TO_SIGMA = 1.4826
-"""Standard deviation of a normal variable divided by the median of its absolute value."""
+MAD_TO_SIGMA = 1.4826  # Standard deviation of a normal variable divided by the median of its absolute value
 
 
 def estimate_position_noise(tracks: Iterable[Track]) -> Array:

@@ -5,8 +5,6 @@ Drag stretches a flight's time s to ln(1 + k v s) / (k v), with the speed v of t
 g s^2 / 2 by 1 + k v s / 3. Spin, where a scene has it, accelerates each flight evenly.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
@@ -20,27 +18,19 @@ from ballfg.estimation.observations.ray_path import NEAREST, ROBUST, ROUNDS, SPR
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.state import Z
 
-SPEED: Final = 15.0
-"""m/s, prior standard deviation of each component of a velocity."""
+SPEED: Final = 15.0  # m/s, prior standard deviation of each component of a velocity
 PLAY: Final = 1.0
 """Half diagonals of a table, prior standard deviation along each axis of the ball's place about its centre."""
-KEPT: Final = 0.8
-"""Share of the horizontal velocity that a bounce leaves; friction takes or adds some."""
-FRICTION_SIGMA: Final = 1.0
-"""m/s, standard deviation about it: the spin is unknown."""
-RESTITUTION_SIGMA: Final = 0.15
-"""m/s, of the vertical velocity after a bounce."""
-PLANE_SIGMA: Final = 1e-3
-"""m, of the height at which a ball bounces."""
-LAWS: Final = 5e-3
-"""m, standard deviation of the ball's place about a path of these laws, which leave out spin."""
+KEPT: Final = 0.8  # Share of the horizontal velocity that a bounce leaves; friction takes or adds some
+FRICTION_SIGMA: Final = 1.0  # m/s, standard deviation about it: the spin is unknown
+RESTITUTION_SIGMA: Final = 0.15  # m/s, of the vertical velocity after a bounce
+PLANE_SIGMA: Final = 1e-3  # m, of the height at which a ball bounces
+LAWS: Final = 5e-3  # m, standard deviation of the ball's place about a path of these laws, which leave out spin
 LIFT: Final = (2.0, 6.0, 6.0)
 """m/s^2, prior standard deviation of the acceleration by spin: 12 m/s and 170 rad/s; it stands across the flight, which
 goes along x."""
-ASIDE: Final = 0.1
-"""m beside the table where a bounce may seem to be."""
-STRETCH_LIMIT: Final = -0.8
-"""Least k v s: before that the ball would have come from infinity."""
+ASIDE: Final = 0.1  # m beside the table where a bounce may seem to be
+STRETCH_LIMIT: Final = -0.8  # Least k v s: before that the ball would have come from infinity
 
 
 @dataclass(frozen=True)

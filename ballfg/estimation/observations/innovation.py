@@ -11,8 +11,7 @@ from ballfg.factors.linear.definite import whitened
 from ballfg.factors.linear.step import weighted
 from ballfg.state import POSITION, STATE_DIM
 
-LEAST_INFORMATION = 1e-6
-"""Least share of the posterior's information that the other measurements get."""
+LEAST_INFORMATION = 1e-6  # Least share of the posterior's information that the other measurements get
 
 
 @dataclass(frozen=True)

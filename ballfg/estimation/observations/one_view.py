@@ -5,8 +5,6 @@ At a guessed time the ball bounces where the ray then meets a surface, with flig
 much better. Without a bounce, gravity gives the scale.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -20,26 +18,20 @@ from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.estimation.segmentation.result import Contact
 from ballfg.state import Z
 
-STEPS: Final = 0.25
-"""Of the camera's period, between guessed times of a bounce; the smoother finds the time itself."""
+STEPS: Final = 0.25  # Of the camera's period, between guessed times of a bounce; the smoother finds the time itself
 WIDEST: Final = 1.0
 """m, largest standard deviation that is stated of a rough position: what is beyond is not known at all."""
-LEAST_STEP: Final = 4e-3
-"""s, least of these steps."""
-ENOUGH: Final = 60
-"""Sightings that show the bounces: of more, some are left out."""
-PRICE: Final = 10.0
-"""Twice the log likelihood that a bounce must gain over a path without it."""
-BETTER: Final = 1.15
-"""Factor by which a further bounce must lower the misfit: spin bends flights too, but less."""
+LEAST_STEP: Final = 4e-3  # s, least of these steps
+ENOUGH: Final = 60  # Sightings that show the bounces: of more, some are left out
+PRICE: Final = 10.0  # Twice the log likelihood that a bounce must gain over a path without it
+BETTER: Final = 1.15  # Factor by which a further bounce must lower the misfit: spin bends flights too, but less
 POOR: Final = 20.0
 """Misfit for each sighting from which the first bounces may be wrong, and are scanned again beside a further one."""
 MOST_BOUNCES: Final = 4
 RIVAL: Final = 50.0
 """Twice the log likelihood by which a bounce between two other samples may fit worse and is tried all the same."""
 MOST_RIVALS: Final = 3
-APART: Final = 0.009
-"""s, least time between the bounces of rivals: the smoother moves a bounce from sample to sample."""
+APART: Final = 0.009  # s, least time between the bounces of rivals: the smoother moves a bounce from sample to sample
 
 
 @dataclass(frozen=True)

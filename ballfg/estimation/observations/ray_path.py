@@ -23,22 +23,16 @@ from ballfg.vision.camera import Camera
 
 AROUND: Final = ((-1.6, 1.6), (-2.2, 0.0), (0.0, 2.2), (-1.2, 0.0), (0.0, 1.2))
 """Windows about a moment, in periods of the slowest camera: each holds two sightings or more of every camera."""
-BEFORE: Final = ((-3.2, 0.0), (-2.2, 0.0), (-1.2, 0.0))
-"""Windows for a stream, without later sightings."""
+BEFORE: Final = ((-3.2, 0.0), (-2.2, 0.0), (-1.2, 0.0))  # Windows for a stream, without later sightings
 LEAST_SPARE: Final = 2
 """Least number of equations beyond the six unknowns, for residuals to show a bounce within a window."""
-ROUNDS: Final = 4
-"""Solutions of a window: the first assumes equal depths, the others weight wrong candidates down."""
-ROBUST: Final = 5.0
-"""Scale of Cauchy's loss on a sighting, in standard deviations of its noise."""
+ROUNDS: Final = 4  # Solutions of a window: the first assumes equal depths, the others weight wrong candidates down
+ROBUST: Final = 5.0  # Scale of Cauchy's loss on a sighting, in standard deviations of its noise
 SPEED: Final = 30.0
 """m/s, prior standard deviation of the velocity: bounds the direction that a single camera leaves undetermined."""
-SPREAD: Final = 100.0
-"""m, prior standard deviation of the position about the cameras."""
-NEAREST: Final = 0.05
-"""m, least depth that a ball may have while its window is solved."""
-LOOSE: Final = 0.05
-"""m. If the rays at a moment leave the position more uncertain, its neighbours in time replace it."""
+SPREAD: Final = 100.0  # m, prior standard deviation of the position about the cameras
+NEAREST: Final = 0.05  # m, least depth that a ball may have while its window is solved
+LOOSE: Final = 0.05  # m. If the rays at a moment leave the position more uncertain, its neighbours in time replace it
 LOOSE_SIGMA: Final = 0.1
 """m, standard deviation of a position that was interpolated in time: a bounce may lie between its neighbours."""
 LOOSE_GROWTH: Final = 2.0
@@ -60,21 +54,15 @@ class Path:
 
 @dataclass(frozen=True)
 class Rays:
-    """Sightings as linear equations A X = b of the ball's position, in units of x/z and y/z times depth.
+    """Sightings as linear equations A X = b of the ball's position, in units of x/z and y/z times depth."""
 
-    Attributes:
-        times: (m,) s, true, ascending.  camera: (m,) number of the camera.  matrix: (m, 2, 3).  target: (m, 2).
-        root: (m, 2, 2) whitens a residual divided by the depth.  depth_row: (m, 4): depth = row[:3] X + row[3].
-        period: s, of the slowest camera.
-    """
-
-    times: Array
-    camera: Index
-    matrix: Array
-    target: Array
-    root: Array
-    depth_row: Array
-    period: float
+    times: Array  # (m,) s, true, ascending
+    camera: Index  # (m,) number of the camera
+    matrix: Array  # (m, 2, 3)
+    target: Array  # (m, 2)
+    root: Array  # (m, 2, 2) whitens a residual divided by the depth
+    depth_row: Array  # (m, 4): depth = row[:3] X + row[3]
+    period: float  # s, of the slowest camera
 
     @classmethod
     def of(cls, sightings: Sightings, times: Array, cameras: Sequence[Camera]) -> Rays:

@@ -1,7 +1,5 @@
 """A reading compares an instrument's numbers with one torch function of the ball's state."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Hashable, Mapping
 from functools import partial
@@ -25,10 +23,8 @@ from ballfg.tracks import Track
 from ballfg.tracks.stamps import elapsed
 from ballfg.tracks.track import FASTEST_BALL, FASTEST_SPIN
 
-FARTHEST: Final = 0.05
-"""s. A reading farther from every sample is refused: the ball may bounce in so long a time."""
-LEAST_SPEED: Final = 1e-6
-"""m/s. Below it the derivative of the velocity's length is set to zero."""
+FARTHEST: Final = 0.05  # s. A reading farther from every sample is refused: the ball may bounce in so long a time
+LEAST_SPEED: Final = 1e-6  # m/s. Below it the derivative of the velocity's length is set to zero
 
 
 class Reading(Observation):
@@ -172,7 +168,7 @@ class RadarSpeed(Reading):
         """(..., 1) m/s, length of the velocity."""
         return state[..., VELOCITY].square().sum(-1, keepdim=True).clamp_min(LEAST_SPEED**2).sqrt()
 
-    def turned(self, rotation: Tensor, shift: Tensor) -> RadarSpeed:
+    def turned(self, rotation: Tensor, shift: Tensor) -> Self:
         """A speed is the same in every frame."""
         return self
 

@@ -1,7 +1,7 @@
 """Registers the kinds of observation by name, and reads and writes their tables: `trajectory,t,<values>,sigma`."""
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -17,11 +17,10 @@ from ballfg.estimation.observations.reading import RadarSpeed, SpinReading
 from ballfg.estimation.observations.sightings import CameraSightings
 from ballfg.files.python_file import load_classes
 from ballfg.registry import Registry
-from ballfg.tracks import TableWriter, Track, csv_files
+from ballfg.tracks import Track, csv_files
 from ballfg.tracks.rows import KEY
 
-LONGEST_HEADER: Final = 4096
-"""Largest number of bytes read from a table's first line."""
+LONGEST_HEADER: Final = 4096  # Largest number of bytes read from a table's first line
 
 OBSERVATIONS: Final[Registry[Observation]] = Registry(
     "observation", group="ballfg.observations", base=Observation, remedy="docs/custom_factors.md has an example."
@@ -92,24 +91,6 @@ def tables_of_readings(folder: str | PathLike[str]) -> dict[str, type[Observatio
                 "Name the file of its class with --observations-file, register the class, or move the table away."
             )
     return found
-
-
-def write_readings(folder: str | PathLike[str], tracks: Iterable[Track]) -> list[Path]:
-    """Writes the readings of tracks as tables into the folder of their dataset.
-
-    Args: folder: it exists.  tracks: with their observations.
-    Returns: the files; empty if no track has readings.
-    """
-    tables: defaultdict[str, list[tuple[str, dict[str, Array]]]] = defaultdict(list)
-    for track in tracks:
-        for observation in track.observations:
-            if observation.file is not None:
-                tables[observation.file].append((track.name, dict(observation.table(track))))
-    for name, parts in tables.items():
-        with TableWriter(Path(folder) / name) as writer:
-            for trajectory, columns in parts:
-                writer.write({KEY: trajectory, **columns})
-    return [Path(folder) / name for name in tables]
 
 
 def _read(path: Path, sort: type[Observation], known: set[str], notes: list[str]) -> dict[str, Array]:

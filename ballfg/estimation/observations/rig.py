@@ -11,8 +11,7 @@ from ballfg.checks import listed, shown
 from ballfg.tracks.sightings import Sightings
 from ballfg.vision.camera import Camera
 
-APART: Final = 0.01
-"""m. Least distance of two cameras: rays from one point do not meet anywhere else, and count twice."""
+APART: Final = 0.01  # m. Least distance of two cameras: rays from one point do not meet anywhere else, and count twice
 
 
 def check_apart(cameras: Sequence[Camera]) -> None:

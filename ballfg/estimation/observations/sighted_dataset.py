@@ -1,4 +1,4 @@
-"""Makes tracks from the sightings in a dataset's folder: `detections.csv` and `cameras.yaml`."""
+"""Makes tracks from the sightings in a dataset's folder: `detections.csv`, `cameras.yaml`, `events.csv`."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -13,12 +13,13 @@ from ballfg.arrays import Array
 from ballfg.checks import shown
 from ballfg.dynamics.nominal import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.observations.events_file import EVENTS_FILE, read_bounces
 from ballfg.estimation.observations.sightings import TooFewSightingsError, sighted_track
 from ballfg.files.whole_folder import of_one_state
+from ballfg.tracks import csv_files
 from ballfg.tracks.detections_file import DETECTIONS_FILE, check_inside, read_sightings
 from ballfg.tracks.info import INFO_FILE, DatasetInfo, TrackFolder, read_info
 from ballfg.tracks.labels import LABELS_FILE, LabelTable, read_labels
+from ballfg.tracks.rows import KEY
 from ballfg.tracks.sightings import Sightings
 from ballfg.tracks.track import Track
 from ballfg.vision.camera import Camera
@@ -35,11 +36,9 @@ class SightedDataset(TrackFolder):
     Raises: ValueError: cameras with numbers that no lens has.
     """
 
-    rough: Final = True
-    """The positions of the tracks are made from the sightings."""
+    rough: Final = True  # The positions of the tracks are made from the sightings
 
-    has_sigmas: Final = False
-    """The errors of these positions are not stated."""
+    has_sigmas: Final = False  # The errors of these positions are not stated
 
     def __init__(
         self,
@@ -128,3 +127,27 @@ def read_sighted(folder: str | PathLike[str]) -> SightedDataset:
             f"none ({len(balls)} named). Find balls with 'ballfg track', or look at the calibration."
         )
     return dataset
+
+
+EVENTS_FILE: Final = "events.csv"
+NEEDED: Final = (KEY, "t", "kind")
+
+
+def read_bounces(path: Path) -> dict[str, Array]:
+    """The stamps (b,) s of the bounces of each trajectory that the file names, ascending.
+
+    Args: path: a table with the columns `trajectory`, `t` (s) and `kind`.
+    Raises: ValueError: a column that is missing, a stamp that is no number; the message names the file and the line.
+    """
+    names = [name.strip() for name in csv_files.read_header(path)]
+    if missing := [name for name in NEEDED if name not in names]:
+        raise ValueError(f"{path} must have the columns {', '.join(NEEDED)}; {missing[0]} is missing. Track again.")
+    found = dict[str, list[float]]()
+    for line, cells in csv_files.records(path):
+        row = dict(zip(names, (cell.strip() for cell in cells), strict=False))
+        if not csv_files.is_number(row.get("t", "")):
+            raise ValueError(f"{path}, line {line}: t must be a number; got {row.get('t')!r}. Track again.")
+        mine = found.setdefault(row[KEY], [])
+        if row.get("kind") == "bounce":
+            mine.append(float(row["t"]))
+    return {name: np.sort(np.array(times, dtype=np.float64)) for name, times in found.items()}

@@ -37,20 +37,16 @@ from ballfg.vision.camera import Camera
 from ballfg.vision.camera_change import CHANGES
 from ballfg.vision.projection import CameraBank
 
-TIME_OFFSET: Final = "time_offset."
-"""Prefix of the name of a camera's time offset among the unknowns of a track."""
+TIME_OFFSET: Final = "time_offset."  # Prefix of the name of a camera's time offset among the unknowns of a track
 CHANGE: Final = "camera."
 """Prefix of the names of the seven numbers by which a camera with a covariance may differ, each of prior sigma 1."""
-OFFSET_SETTLED: Final = 1e-5
-"""s. An offset that changes by less has converged: the path bends by a nanometre meanwhile."""
+OFFSET_SETTLED: Final = 1e-5  # s. An offset that changes by less has converged: the path bends by a nanometre meanwhile
 
 SAME_MOMENT: Final = 2e-4
 """s. Sightings closer than this share a state, and a camera factor carries it over the rest in a straight line: at 20
 m/s^2 that is wrong by 0.4 um. States closer together would cost time without gain."""
-LEAST_SEEN: Final = 5
-"""Least number of sightings from one point: a flight has six unknowns, and noise must show."""
-LOOSE_DEPTH: Final = 0.5
-"""m, standard deviation of the depth from which the status of an estimate says so."""
+LEAST_SEEN: Final = 5  # Least number of sightings from one point: a flight has six unknowns, and noise must show
+LOOSE_DEPTH: Final = 0.5  # m, standard deviation of the depth from which the status of an estimate says so
 
 
 class TooFewSightingsError(ValueError):

@@ -15,8 +15,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.estimation.rally.files import COURT, EVENTS, MOTION, STATES, STROKES, VIDEOS
 from ballfg.estimation.rally.tables import POSE
-from ballfg.pages.html import Html, items, section, tag
-from ballfg.pages.page import own, whole_page
+from ballfg.pages.html import Html, items, own, section, tag, whole_page
 from ballfg.state import STANDARD_GRAVITY
 from ballfg.tracks import csv_files
 from ballfg.tracks.detections_file import DETECTIONS_FILE

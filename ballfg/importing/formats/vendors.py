@@ -1,7 +1,5 @@
 """Reads the text exports of motion capture: Qualisys (TSV), Vicon Nexus (CSV), OptiTrack Motive (CSV)."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

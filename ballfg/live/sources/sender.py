@@ -21,17 +21,12 @@ SIGMAS = ("sigma_x", "sigma_y", "sigma_z")
 
 @dataclass(frozen=True)
 class Sample:
-    """The content of one line: the positions of one stamp.
+    """The content of one line: the positions of one stamp."""
 
-    Attributes:
-        time: s.  positions: of each ball x, y, z in m.  sigmas: as many standard deviations, m; None without them.
-        tag: further fields of the answer, such as the trajectory of a replay.
-    """
-
-    time: float
-    positions: list[list[float]]
-    sigmas: list[list[float]] | None = None
-    tag: tuple[tuple[str, Any], ...] = ()
+    time: float  # s
+    positions: list[list[float]]  # of each ball x, y, z in m
+    sigmas: list[list[float]] | None = None  # as many standard deviations, m; None without them
+    tag: tuple[tuple[str, Any], ...] = ()  # further fields of the answer, such as the trajectory of a replay
 
 
 class LineReader:
@@ -137,16 +132,11 @@ PAUSE = 0.005  # s between two checks whether a full sender may continue
 
 @dataclass(frozen=True)
 class Arrival:
-    """One line of input.
+    """One line of input."""
 
-    Attributes:
-        read: s, `time.perf_counter` when it was read.  sample: its content; None for an unusable line.
-        problem: reason for an unusable line.
-    """
-
-    read: float
-    sample: Sample | None
-    problem: str = ""
+    read: float  # s, `time.perf_counter` when it was read
+    sample: Sample | None  # its content; None for an unusable line
+    problem: str = ""  # reason for an unusable line
 
 
 class LineBuffer:

@@ -27,32 +27,23 @@ from ballfg.vision.camera import Camera
 
 Image = NDArray[np.float32]
 
-SAMPLES: Final = 6
-"""Number of rays along each axis of a pixel on an edge: an edge is drawn to a twelfth of a pixel."""
-EDGE_REACH: Final = 5
-"""px, side of the finely drawn square around an edge."""
-TEXTURE_SIDE: Final = 512
-"""Number of texels along a side of the repeated texture."""
-TEXELS_PER_METRE: Final = 90.0
-"""About one texel to four pixels at 3 m: smooth for a camera, yet nowhere flat."""
-TEXTURE_DEPTH: Final = 0.09
-"""Standard deviation of the texture, relative to the colour."""
-ROW: Final = 1024
-"""Number of points looked up in the texture as one row: OpenCV counts rows and columns in 16 bits."""
+SAMPLES: Final = 6  # Number of rays along each axis of a pixel on an edge: an edge is drawn to a twelfth of a pixel
+EDGE_REACH: Final = 5  # px, side of the finely drawn square around an edge
+TEXTURE_SIDE: Final = 512  # Number of texels along a side of the repeated texture
+TEXELS_PER_METRE: Final = 90.0  # About one texel to four pixels at 3 m: smooth for a camera, yet nowhere flat
+TEXTURE_DEPTH: Final = 0.09  # Standard deviation of the texture, relative to the colour
+ROW: Final = 1024  # Number of points looked up in the texture as one row: OpenCV counts rows and columns in 16 bits
 FACES: Final = 6
 """Numbers of faces for each box: across x, y and z, and a line on the last. Two opposite faces are never neighbours."""
-_SIDE_LIGHT: Final = (0.72, 0.85, 1.0)
-"""Light on faces across x, y and z, relative to that from straight above."""
+_SIDE_LIGHT: Final = (0.72, 0.85, 1.0)  # Light on faces across x, y and z, relative to that from straight above
 
 
 @dataclass(frozen=True, eq=False)
 class Backdrop:
     """The still picture of a camera, before the lens blurs it."""
 
-    image: Image
-    """(h, w, 3) blue, green, red, grey levels."""
-    distance: Image
-    """(h, w) m, from the camera to the visible surface."""
+    image: Image  # (h, w, 3) blue, green, red, grey levels
+    distance: Image  # (h, w) m, from the camera to the visible surface
 
 
 def backdrop(camera: Camera, kind: BallKind, rng: np.random.Generator) -> Backdrop:

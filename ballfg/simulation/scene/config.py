@@ -15,8 +15,7 @@ from ballfg.simulation.settings import Settings, all_settings
 
 MAX_SHOTS: Final = 10_000
 COLOURS: Final = ("white", "orange")
-LONGEST_EXPOSURE: Final = 0.95
-"""As a share of the frame interval; a sensor needs the rest for its readout."""
+LONGEST_EXPOSURE: Final = 0.95  # As a share of the frame interval; a sensor needs the rest for its readout
 
 
 @dataclass(frozen=True)

@@ -22,12 +22,9 @@ from ballfg.simulation.settings import settings_of_shots
 from ballfg.simulation.streams import Purpose, generator
 from ballfg.state import STATE_DIM
 
-KNOT_RATE: Final = 200.0
-"""Hz. A knot every 5 ms is one step of the simulator's integration."""
-BEFORE: Final = 0.5
-"""s of empty scene before the first launch, and after the last flight."""
-START_SPREAD: Final = 0.05
-"""s, spread of launches about their interval, so that they do not keep step with the frames."""
+KNOT_RATE: Final = 200.0  # Hz. A knot every 5 ms is one step of the simulator's integration
+BEFORE: Final = 0.5  # s of empty scene before the first launch, and after the last flight
+START_SPREAD: Final = 0.05  # s, spread of launches about their interval, so that they do not keep step with the frames
 
 
 @dataclass(frozen=True, eq=False)

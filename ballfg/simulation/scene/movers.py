@@ -17,38 +17,27 @@ from ballfg.vision.camera import Camera
 PEOPLE: Final = ((0.35, -3.1, 1.5, 0.0), (2.6, 3.2, -1.7, 0.4))
 """m, m, rad, s: x and y of each person, direction (from +x), delay of sway and swing. They stand at the sides, behind
 the cameras of `ballfg.simulation.cameras.table_rig` or behind the table, never between."""
-SWAY: Final = (0.03, 0.35)
-"""m and Hz."""
-SWING: Final = (0.9, 0.8)
-"""rad and Hz, of the arm; the hand moves at up to 3 m/s."""
-GLIDE: Final = (1.1, 0.23)
-"""m and Hz, of the reflection on the floor; up to 1.6 m/s."""
+SWAY: Final = (0.03, 0.35)  # m and Hz
+SWING: Final = (0.9, 0.8)  # rad and Hz, of the arm; the hand moves at up to 3 m/s
+GLIDE: Final = (1.1, 0.23)  # m and Hz, of the reflection on the floor; up to 1.6 m/s
 _SHIRT: Final[Colour] = (222.0, 224.0, 222.0)
 _TROUSERS: Final[Colour] = (62.0, 46.0, 40.0)
 _SKIN: Final[Colour] = (108.0, 138.0, 192.0)
 _REFLECTION: Final[Colour] = (232.0, 240.0, 238.0)
-_SHOULDER: Final = np.array([0.05, 0.24, 1.42])
-"""m, of the swinging arm: ahead, to the left, up."""
-SHORTLY: Final = 1e-4
-"""s, interval for speeds: within it nothing moves by a pixel."""
-SHORTEST: Final = 1e-6
-"""px^2, least squared length of a segment; a shorter one is drawn as a disc."""
-ROUND_SHADE: Final = 0.3
-"""Difference in brightness between a capsule's edge and its middle."""
+_SHOULDER: Final = np.array([0.05, 0.24, 1.42])  # m, of the swinging arm: ahead, to the left, up
+SHORTLY: Final = 1e-4  # s, interval for speeds: within it nothing moves by a pixel
+SHORTEST: Final = 1e-6  # px^2, least squared length of a segment; a shorter one is drawn as a disc
+ROUND_SHADE: Final = 0.3  # Difference in brightness between a capsule's edge and its middle
 
 
 @dataclass(frozen=True, eq=False)
 class Capsule:
     """A ball swept along a segment."""
 
-    ends: Array
-    """(2, 3) m."""
-    radius: float
-    """m."""
-    colour: Colour
-    """Grey levels, blue green red."""
-    velocity: Array
-    """(2, 3) m/s of the ends, for the blur of the outline."""
+    ends: Array  # (2, 3) m
+    radius: float  # m
+    colour: Colour  # Grey levels, blue green red
+    velocity: Array  # (2, 3) m/s of the ends, for the blur of the outline
 
 
 def movers(time: float) -> list[Capsule]:

@@ -20,16 +20,11 @@ from ballfg.vision.camera import Camera
 class Recording:
     """Balls and frames of a recording. Cameras are counted in the order of `cameras`."""
 
-    config: SceneConfig
-    """The settings."""
-    cameras: tuple[Camera, ...]
-    """The rig."""
-    flights: tuple[Flight, ...]
-    """The balls, in the order of their launches."""
-    frames: tuple[Frames, ...]
-    """Frames of each camera."""
-    passages: tuple[tuple[Passage, ...], ...]
-    """Passages of each camera, in the order of `flights`."""
+    config: SceneConfig  # The settings
+    cameras: tuple[Camera, ...]  # The rig
+    flights: tuple[Flight, ...]  # The balls, in the order of their launches
+    frames: tuple[Frames, ...]  # Frames of each camera
+    passages: tuple[tuple[Passage, ...], ...]  # Passages of each camera, in the order of `flights`
 
     def clock(self, name: str) -> Clock:
         """The clock of the camera with this name."""

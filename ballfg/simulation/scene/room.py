@@ -9,13 +9,10 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array
 from ballfg.simulation.balls import BallKind
 
-Colour = tuple[float, float, float]
-"""Blue, green, red, grey levels 0 to 255 in the light of the lamps."""
+Colour = tuple[float, float, float]  # Blue, green, red, grey levels 0 to 255 in the light of the lamps
 
-LINE_WIDTH: Final = 0.02
-"""m, white lines along the edges of the table (ITTF Laws 2.1.4)."""
-MIDDLE_LINE_WIDTH: Final = 0.003
-"""m, white line that halves the table lengthwise (ITTF Laws 2.1.5)."""
+LINE_WIDTH: Final = 0.02  # m, white lines along the edges of the table (ITTF Laws 2.1.4)
+MIDDLE_LINE_WIDTH: Final = 0.003  # m, white line that halves the table lengthwise (ITTF Laws 2.1.5)
 LINE_COLOUR: Final[Colour] = (205.0, 208.0, 205.0)
 TABLE_COLOUR: Final[Colour] = (112.0, 72.0, 30.0)
 _APRON: Final[Colour] = (60.0, 42.0, 25.0)
@@ -35,14 +32,10 @@ WALLS: Final = (np.array([-3.5, -4.2, 0.0]), np.array([6.0, 4.2, 3.4]))
 class Box:
     """An upright box with one colour, and another on top if it is the table."""
 
-    low: Array
-    """(3,) m."""
-    high: Array
-    """(3,) m."""
-    colour: Colour
-    """Of its sides, and of its top unless `lined`."""
-    lined: bool = False
-    """True if its top is the playing surface."""
+    low: Array  # (3,) m
+    high: Array  # (3,) m
+    colour: Colour  # Of its sides, and of its top unless `lined`
+    lined: bool = False  # True if its top is the playing surface
 
     def corners(self) -> Array:
         """(8, 3) m."""

@@ -23,22 +23,18 @@ one at the stamp. Sixteen chords: a bounce within 2 ms is off by less than 0.1 m
 class Frames:
     """The frames of one camera."""
 
-    times: Array
-    """(f,) s, true time of the middle of each exposure."""
-    stamps: Array
-    """(f,) s, stamps recorded by the camera."""
+    times: Array  # (f,) s, true time of the middle of each exposure
+    stamps: Array  # (f,) s, stamps recorded by the camera
 
 
 @dataclass(frozen=True, eq=False)
 class Passage:
     """One ball's way through the frames of one camera, visible or not."""
 
-    name: str
-    """Of the ball's track."""
+    name: str  # Of the ball's track
     frames: NDArray[np.int64]
     """(n,) numbers of the frames whose whole exposure lies within the flight; in no other frame is the ball there."""
-    paths: Array
-    """(n, `PATH_POINTS`, 3) m, its centre from the opening of the shutter to its closing, evenly in time."""
+    paths: Array  # (n, `PATH_POINTS`, 3) m, its centre from the opening of the shutter to its closing, evenly in time
 
     @property
     def centres(self) -> Array:

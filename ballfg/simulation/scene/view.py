@@ -6,8 +6,7 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array
 from ballfg.vision.camera import Camera
 
-Rect = tuple[int, int, int, int]
-"""Left, top, right, bottom in pixels; right and bottom are the first ones outside."""
+Rect = tuple[int, int, int, int]  # Left, top, right, bottom in pixels; right and bottom are the first ones outside
 
 
 def inside(camera: Camera, pixels: Array, reach: Array | float = 0.0) -> NDArray[np.bool_]:

@@ -28,8 +28,7 @@ Pixels = NDArray[np.uint8]
 SCENE_FILE: Final = "scene.yaml"
 TRUTH_RATE: Final = 1000.0
 """Hz, rows of `truth.csv`: between them a line is off by less than 2 micrometres, except over a bounce."""
-CODEC: Final = "mp4v"
-"""MPEG-4 part 2: every build of OpenCV writes and reads it."""
+CODEC: Final = "mp4v"  # MPEG-4 part 2: every build of OpenCV writes and reads it
 
 
 def write_scene(

@@ -17,7 +17,7 @@ from ballfg.arrays import Array
 from ballfg.vision.association.gathering import SeenBall
 from ballfg.vision.association.paths import path
 from ballfg.vision.association.triangulate import triangulate
-from ballfg.vision.calibration.lens_covariance import POSE, slopes_of
+from ballfg.vision.calibration.intrinsics import POSE, slopes_of
 from ballfg.vision.camera import Camera
 
 LEAST_MISFIT: Final = 3.0  # squared error of agreeing cameras over the noise's: half a pixel for centres good to 0.3

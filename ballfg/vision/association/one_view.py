@@ -19,19 +19,14 @@ from ballfg.vision.association.tracklets import MAX_TURN, find_tracklets
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections
 
-LONGEST_GAP: Final = 0.2
-"""s. A ball that reappears after a longer gap is a new one."""
-ENDS: Final = 3
-"""Candidates at the end of a piece that its continuation is fitted to."""
+LONGEST_GAP: Final = 0.2  # s. A ball that reappears after a longer gap is a new one
+ENDS: Final = 3  # Candidates at the end of a piece that its continuation is fitted to
 PULL: Final = 20.0
 """rad/s^2, standard deviation of the acceleration across the view that a straight line leaves out: gravity and drag at
 less than a metre."""
-FLOOR: Final = 1.0
-"""px, standard deviation of a continuation apart from that and from noise."""
-GATE: Final = 16.0
-"""Largest squared distance of two continuations, whitened: 4 sigma."""
-STEPS: Final = 25
-"""Number of times in a gap at which continuations are compared."""
+FLOOR: Final = 1.0  # px, standard deviation of a continuation apart from that and from noise
+GATE: Final = 16.0  # Largest squared distance of two continuations, whitened: 4 sigma
+STEPS: Final = 25  # Number of times in a gap at which continuations are compared
 
 
 def chains(

@@ -8,7 +8,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.checks import listed, shown
-from ballfg.vision.calibration.lens_covariance import POSE, slopes_of
+from ballfg.vision.calibration.intrinsics import POSE, slopes_of
 from ballfg.vision.calibration.table_points import Marked
 from ballfg.vision.camera import Camera
 

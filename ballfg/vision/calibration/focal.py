@@ -14,13 +14,11 @@ from ballfg.vision.camera import Camera
 from ballfg.vision.camera_change import CHANGES, ZOOM, changed, slopes_of
 from ballfg.vision.projection import CameraBank
 
-ROUGHLY: Final = (1e-4, 0.3)
-"""Smallest and largest relative standard deviation of a focal length."""
+ROUGHLY: Final = (1e-4, 0.3)  # Smallest and largest relative standard deviation of a focal length
 TRIED: Final = (0.0, -1.0, 1.0, -2.0, 2.0)
 """Standard deviations of a focal length at which a pose may explain the points."""
 ROUNDS: Final = 20
-SETTLED: Final = 1e-6
-"""Standard deviations. A step that is shorter ends the search."""
+SETTLED: Final = 1e-6  # Standard deviations. A step that is shorter ends the search
 
 
 def pose_and_focal(lens: Camera, marked: Marked, focal_sigma: float) -> Extrinsics:

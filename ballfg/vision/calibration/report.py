@@ -11,7 +11,7 @@ from matplotlib.patheffects import withStroke
 
 from ballfg.vision.arrays import Image
 from ballfg.vision.calibration.extrinsics import Extrinsics
-from ballfg.vision.calibration.intrinsics import CELLS, RAYS, USUAL_VIEWS, FittedView, Intrinsics
+from ballfg.vision.calibration.intrinsics import CELLS, RAYS, USUAL_VIEWS, Intrinsics
 from ballfg.vision.calibration.table_points import TABLE_HEIGHT, table_outline
 from ballfg.vision.camera import Camera
 
@@ -94,7 +94,10 @@ def content(found: Calibration) -> dict[str, Any]:
             "worst_ray_sigma": lens.ray_sigma[1],
             "values": values,
             "sigmas": sigmas,
-            **{kind: [_view(fitted) for fitted in getattr(lens, kind)] for kind in ("views", "left_out")},
+            **{
+                kind: [{"image": v.view.name, "corners": len(v.view.pixels), "rms": v.rms} for v in getattr(lens, kind)]
+                for kind in ("views", "left_out")
+            },
             "missed": list(lens.missed),
         }
     if found.place is not None:
@@ -111,10 +114,6 @@ def content(found: Calibration) -> dict[str, Any]:
             result["place"]["focal"] = float(place.camera.matrix[0, 0])
             result["place"]["focal_sigma"] = float(place.camera.matrix[0, 0] * np.sqrt(place.camera.covariance[-1, -1]))
     return result
-
-
-def _view(fitted: FittedView) -> dict[str, Any]:
-    return {"image": fitted.view.name, "corners": len(fitted.view.pixels), "rms": fitted.rms}
 
 
 def _lens_numbers(lens: Intrinsics) -> tuple[dict[str, float], dict[str, float]]:

@@ -1,18 +1,21 @@
-"""Holds the candidates of a frame and of a recording, and defines the interface of a detector."""
+"""Holds the candidates of a frame and of a recording, reads them from tables, and defines a detector."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from pathlib import Path
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ballfg.arrays import Array, Index, Mask
 from ballfg.checks import check_array, shown
+from ballfg.tracks import detections_file
+from ballfg.tracks.checks import check_step
+from ballfg.tracks.rows import KEY
 from ballfg.tracks.sightings import are_covariances
 from ballfg.vision.arrays import Image
+from ballfg.vision.camera import Camera
 
 _SHAPES: Final = {"pixels": (2,), "covariances": (2, 2), "scores": (), "streaks": (2, 2)}  # of each
 
@@ -41,12 +44,12 @@ class Candidates:
         return len(self.pixels)
 
     @classmethod
-    def none(cls) -> Candidates:
+    def none(cls) -> Self:
         """The candidates of a frame without any."""
         return cls(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros((0, 2, 2)))
 
     @classmethod
-    def at(cls, pixels: ArrayLike, sigma: float, scores: ArrayLike | None = None) -> Candidates:
+    def at(cls, pixels: ArrayLike, sigma: float, scores: ArrayLike | None = None) -> Self:
         """The candidates of a detector that gives centres only.
 
         Args: pixels: (k, 2).  sigma: px, of each coordinate.  scores: (k,) dimensionless, in [0, 1]; 1 by default.
@@ -121,7 +124,7 @@ class Detections:
         rows = slice(*np.searchsorted(self.frame, (number, number + 1)))
         return Candidates(*(getattr(self, field)[rows] for field in _SHAPES))
 
-    def select(self, keep: Mask) -> Detections:
+    def select(self, keep: Mask) -> Self:
         """The detections with the candidates of `keep` (n,) bool, and all frames."""
         return replace(self, **{field: getattr(self, field)[keep] for field in ("frame", *_SHAPES)})
 
@@ -130,7 +133,7 @@ class Detections:
         return np.sort(self.scores)[::-1][:count].copy()
 
     @classmethod
-    def of_frames(cls, camera: str, seen: Iterable[tuple[float, Candidates]]) -> Detections:
+    def of_frames(cls, camera: str, seen: Iterable[tuple[float, Candidates]]) -> Self:
         """Joins the candidates of frames.
 
         Args: camera: name of the camera.  seen: stamp (s) and candidates of each frame, in order.
@@ -167,3 +170,56 @@ def _check_fields(owner: Candidates | Detections, what: str) -> None:
 def _refuse(wrong: Mask, what: str, field: str, rule: str) -> None:
     if wrong.any():
         raise ValueError(f"{what}: {field} must {rule}; those of candidate {int(np.argmax(wrong))} do not.")
+
+
+REQUIRED: Final = ("t", detections_file.CAMERA, "u", "v")
+UNUSED: Final = (KEY,)  # columns that may be there and are not needed: which ball a row belongs to is found anew
+SURE: Final = 1.0  # score of all rows of a table without one: somebody has chosen them
+_UNSTATED: Final = detections_file.UNSTATED | {detections_file.SCORE: SURE}
+_RULES: Final = {**detections_file.RULES, detections_file.SCORE: ("0 to 1", lambda x: (x >= 0.0) & (x <= 1.0))}
+
+
+def read_detections(
+    path: Path, cameras: Sequence[Camera], ignored: Sequence[str] = ()
+) -> tuple[list[Detections], list[str]]:
+    """The candidates of each camera.
+
+    A camera's frames are the stamps at which it has a row: rows at one stamp are candidates of one frame. The order of
+    rows is free.
+
+    Args:
+        path: `t` (s, as the camera writes it), `camera`, `u`, `v` (px), optionally `sigma_u`, `sigma_v` (px), `rho_uv`
+            and `score`.
+        ignored: names of cameras whose rows are passed over.
+    Returns: detections in the order of the cameras, and what was ignored, one sentence each.
+    Raises: FileNotFoundError: there is no such file. ValueError: a column that is missing, a cell out of its range, an
+        unknown camera, a camera without rows; the message names file, line and column.
+    """
+    header, texts, values = detections_file.read_columns(path, REQUIRED)
+    names = texts[detections_file.CAMERA]
+    rows = np.arange(len(names))
+    detections_file.check_values(path, values, rows, _RULES)
+    detections_file.check_cameras(path, names, rows, [camera.name for camera in cameras], ignored)
+    blind = [camera.name for camera in cameras if not (names == camera.name).any()]
+    if blind:
+        problem = f"{path}: every camera must have rows; got none of {' and '.join(map(repr, blind))}"
+        raise ValueError(f"{problem}. Add them, or leave the camera out with --without {blind[0]}.")
+    values |= {name: np.full(len(names), value) for name, value in _UNSTATED.items() if name not in values}
+    known = (*REQUIRED, *detections_file.OPTIONAL, *UNUSED)
+    notes = [f"{path.name}: column {shown(name)} ignored" for name in header if name not in known]
+    number = np.unique(names, return_inverse=True)[1]
+    kept = np.sort(np.unique(np.column_stack((number, *values.values())), axis=0, return_index=True)[1])
+    if len(kept) < len(names):
+        notes.append(f"{path.name}: {len(names) - len(kept)} exact repeats of rows dropped")
+    names, values = names[kept], {name: column[kept] for name, column in values.items()}
+    found = []
+    for camera in cameras:
+        mine = {column: numbers[names == camera.name] for column, numbers in values.items()}
+        frames, frame = np.unique(mine["t"], return_inverse=True)
+        detections_file.check_inside(path, camera.name, camera.size, np.column_stack((mine["u"], mine["v"])))
+        order = np.argsort(frame, kind="stable")
+        pixels, streaks = np.column_stack((mine["u"], mine["v"])), np.full((len(order), 2, 2), np.nan)
+        spread, scores = detections_file.covariances(mine)[order], mine[detections_file.SCORE][order]
+        found.append(Detections(camera.name, frames, frame[order], pixels[order], spread, scores, streaks))
+        check_step(f"{path}, camera {shown(camera.name)}", frames)
+    return found, notes

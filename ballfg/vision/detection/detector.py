@@ -3,11 +3,9 @@
 The score marks the similarity of a candidate to a ball by shape, contrast, size and colour.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import Final, Literal, Self
 
 import numpy as np
 
@@ -71,7 +69,7 @@ class BallDetector:
         self._look = Look.unknown()
 
     @classmethod
-    def learn(cls, images: Sequence[Image], settings: DetectorSettings | None = None) -> BallDetector:
+    def learn(cls, images: Sequence[Image], settings: DetectorSettings | None = None) -> Self:
         """A detector with the background of frames (h, w, 3). Raises: ValueError: too few, or of several sizes."""
         return cls(Background(images), settings)
 

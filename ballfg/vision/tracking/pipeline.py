@@ -1,6 +1,6 @@
-"""Turns camera recordings into balls: detections, tracks, and the agreement of the cameras."""
+"""Turns the videos of a rig into balls: detections, tracks, the agreement of the cameras, and a summary."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -8,17 +8,16 @@ from typing import Final
 import numpy as np
 
 from ballfg.arrays import Array, Index
-from ballfg.checks import shown
+from ballfg.checks import did_you_mean, listed, shown
 from ballfg.progress import Watch, unwatched
 from ballfg.tracks import Track
-from ballfg.vision.association.agreement import Agreement, check_agreement
+from ballfg.vision.association.agreement import LEAST_MISFIT, Agreement, check_agreement
 from ballfg.vision.association.associate import AssociationSettings, associate
 from ballfg.vision.association.gathering import SeenBall
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detect import detect_all, learn_detector
 from ballfg.vision.detection.detections import Detections, Detector
 from ballfg.vision.detection.video import Video, open_video
-from ballfg.vision.tracking.recordings import check_sizes
 
 FEWEST: Final = 2  # least number of cameras: candidates of a single one agree with nothing
 DIGITS: Final = 3  # least number of digits in a track's name: names then sort as their tracks do
@@ -160,3 +159,119 @@ def check_overlap(detections: Sequence[Detections], cameras: Sequence[Camera]) -
             when = "; ".join(f"{shown(other)} {first:g} to {last:g} s" for other, (first, last) in spans.items())
             problem = f"videos must overlap in time; camera {shown(name)} overlaps with no other: {when} (true time)"
             raise ValueError(f"{problem}. Check stamps and time_offset, or that the files are of one recording.")
+
+
+def summary(tracking: Tracking) -> Iterator[str]:
+    """Lines: the detections of each camera, and their use."""
+    for number, (camera, seen) in enumerate(zip(tracking.cameras, tracking.detections, strict=True)):
+        used = sum(int((ball.sightings.camera == number).sum()) for ball in tracking.balls)
+        yield f"  {camera.name}: {len(seen.frames)} frames, {len(seen)} candidates, {used} of them a ball"
+
+
+def blind_cameras(tracking: Tracking) -> Iterator[str]:
+    """A sentence for each camera without a part in any ball, if there are balls."""
+    for number, camera in enumerate(tracking.cameras):
+        if tracking.balls and not any((ball.sightings.camera == number).any() for ball in tracking.balls):
+            yield f"camera {shown(camera.name)} saw none of the balls. Check its stamps, its pose and its candidates."
+
+
+def disagreement(tracking: Tracking) -> str | None:
+    """A sentence on the calibration; None if the cameras agree or too little was seen."""
+    found = tracking.agreement
+    return found.sentence if found and (found.culprit is not None or found.misfit > LEAST_MISFIT) else None
+
+
+def no_ball(tracking: Tracking) -> str:
+    """One sentence with the best scores of each camera, for a recording in which no ball was found."""
+    best = "; ".join(
+        f"{seen.camera}: {', '.join(f'{score:.2f}' for score in seen.best_scores()) or 'no candidate'}"
+        f" in {len(seen.frames)} frames"
+        for seen in tracking.detections
+    )
+    return f"no ball was found. Best candidates' scores (1 is a ball): {best}."
+
+
+SAME_SHAPE: Final = 0.01  # largest relative difference between the proportions of a scaled video and its camera's
+
+
+def match_videos(given: Sequence[str], cameras: Sequence[Camera], ignored: Sequence[str] = ()) -> dict[str, Path]:
+    """The video of each camera.
+
+    Args: given: paths, each with a camera's name as its stem, or `name=path`.
+        ignored: names of cameras whose videos are passed over.
+    Returns: camera -> path, in the order of the cameras.
+    Raises: ValueError: a video of no camera, two of one, or a camera without one.
+    """
+    names = [camera.name for camera in cameras]
+    found: dict[str, Path] = {}
+    for text in given:
+        name, path = named_path(text, [*names, *ignored])
+        if name in ignored:
+            continue
+        if name not in names:
+            problem = f"video {shown(text)} must be of a camera: {listed(names)}; got {shown(name)}"
+            raise ValueError(f"{problem}. Rename it, or write NAME={path}.{did_you_mean(name, names)}")
+        if name in found:
+            both = f"{found[name]} and {path}"
+            raise ValueError(f"camera {shown(name)} must have one video; got {both}. Drop one of them.")
+        found[name] = path
+    missing = [name for name in names if name not in found]
+    if missing:
+        raise ValueError(
+            f"every camera must have a video; got none for {' and '.join(map(shown, missing))}. "
+            f"Give it as {missing[0]}=FILE, or leave the camera out with --without {missing[0]}."
+        )
+    return {name: found[name] for name in names}
+
+
+def named_path(text: str, names: Sequence[str]) -> tuple[str, Path]:
+    """The name and the path in a command-line argument: `name=path`, or a path with the name as its stem."""
+    name, equals, rest = text.partition("=")
+    if equals and rest and (name in names or not Path(text).exists()):
+        return name, Path(rest)
+    path = Path(text)
+    return (path.name if path.is_dir() else path.stem), path
+
+
+def stamp_files(given: Sequence[str], cameras: Sequence[Camera]) -> dict[str, Path]:
+    """The files of stamps of cameras, given as `name=path`. Raises: ValueError: no name, no camera's, or twice."""
+    names = [camera.name for camera in cameras]
+    found: dict[str, Path] = {}
+    for text in given:
+        name, equals, path = text.partition("=")
+        if not (equals and path):
+            raise ValueError(f"stamps must be NAME=FILE; got {shown(text)}. Put the camera's name before the file.")
+        if name not in names or name in found:
+            problem = "is given twice" if name in found else "is no camera's"
+            raise ValueError(f"stamps must be one file a camera; {shown(name)} {problem}. Cameras: {listed(names)}.")
+        found[name] = Path(path)
+    return found
+
+
+def without(cameras: Sequence[Camera], names: Sequence[str]) -> list[Camera]:
+    """The remaining cameras. Raises: ValueError: a name of no camera."""
+    known = [camera.name for camera in cameras]
+    for name in names:
+        if name not in known:
+            hint = did_you_mean(name, known)
+            raise ValueError(f"without must name a camera: {listed(known)}; got {shown(name)}. Correct it.{hint}")
+    return [camera for camera in cameras if camera.name not in names]
+
+
+def check_sizes(sizes: Mapping[str, tuple[int, int]], cameras: Sequence[Camera]) -> None:
+    """Refuses a calibration of another resolution than the videos' (px). Raises: ValueError: with both sizes."""
+    for camera in cameras:
+        (width, height), (old_width, old_height) = sizes[camera.name], camera.size
+        if (width, height) == camera.size:
+            continue
+        across = width / old_width
+        remedy = (
+            f"If the whole picture was scaled, set size to [{width}, {height}] and multiply fx, fy by {across:.6g}; "
+            f"cx, cy become {across:.6g} (c + 0.5) - 0.5. If it was cropped, calibrate again."
+        )
+        if abs(across / (height / old_height) - 1.0) > SAME_SHAPE:
+            remedy = "Calibrate it again at that size: the pictures have different proportions."
+        raise ValueError(
+            f"camera {shown(camera.name)} must be calibrated at the size of its video; got {old_width}x{old_height} in "
+            f"the cameras' file and a video of {width}x{height}. {remedy}"
+        )

@@ -6,8 +6,7 @@ from problem import LOSS_STEPS, ROLLOUT_STEPS, Array, Problem
 from torch import Tensor, nn
 
 from ballfg.arrays import Index
-from ballfg.dynamics import BallModel, Surfaces
-from ballfg.dynamics import rollout as roll_out
+from ballfg.dynamics import BallModel, Surfaces, rollout as roll_out
 from ballfg.dynamics.compiled.functions import compiled
 from ballfg.dynamics.model import Rates
 from ballfg.dynamics.model_file import model_from_dict

@@ -13,12 +13,12 @@ from ballfg.benchmarks.results import Results
 from ballfg.dynamics.motion.rollout import rollout
 from ballfg.estimation import read_sighted
 from ballfg.tracks import Track
-from ballfg.tracks.detections_file import write_sightings
+from ballfg.tracks.dataset import dataset_in_memory
 from ballfg.tracks.info import TABLE_TENNIS, DatasetInfo, write_info
-from ballfg.tracks.memory import dataset_in_memory
 from ballfg.vision.camera_file import write_cameras
 from tests.estimation.observations.sighted_rig import TABLE, world
 from tests.estimation.observations.test_one_view import SIDE, pixels_of, stroke
+from tests.written_tables import write_sightings
 
 EXTENT = (-1.37, 1.37, -0.76, 0.76)
 

@@ -13,7 +13,7 @@ from ballfg.benchmarks.diagnosis.changes import CHANGES, Changed, across, applic
 from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate, table_tennis
 from ballfg.simulation.synthetic import dataset_info
 from ballfg.tracks import Dataset, Track
-from ballfg.tracks.memory import dataset_in_memory
+from ballfg.tracks.dataset import dataset_in_memory
 
 EXACT = SimulationConfig(tracks=8, seed=3, rate=100.0, noise=MeasurementNoise(position=2e-5, spin=1e-3))
 SHOTS = [one.track for one in simulate(EXACT)]

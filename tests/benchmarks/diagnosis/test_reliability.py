@@ -13,7 +13,7 @@ from ballfg.benchmarks.cli import run as bench
 from ballfg.benchmarks.diagnosis.cases import Case
 from ballfg.benchmarks.diagnosis.data import actual_model
 from ballfg.benchmarks.diagnosis.record import Record, case_digest, record_of
-from ballfg.benchmarks.diagnosis.reliability import ALL, TITLE, add_reliability, reliability_cases, run_reliability
+from ballfg.benchmarks.diagnosis.suite import ALL, TITLE, add_reliability, reliability_cases, run_reliability
 from ballfg.benchmarks.results import Results
 from ballfg.dynamics import EFFECTS
 from tests.diagnosis.made_diagnosis import found

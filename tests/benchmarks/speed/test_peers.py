@@ -11,7 +11,7 @@ from ballfg.benchmarks.cli import run
 from ballfg.benchmarks.results import Results
 from ballfg.benchmarks.speed.peers import suite
 from ballfg.benchmarks.speed.peers.problem import Problem
-from ballfg.benchmarks.speed.peers.session import LibraryError, Session
+from ballfg.benchmarks.speed.peers.suite import LibraryError, Session
 from ballfg.benchmarks.speed.stopwatch import SlowerError, check_ratios
 
 

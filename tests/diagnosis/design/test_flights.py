@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.diagnosis.design.flights import View, planned_flights
-from ballfg.diagnosis.design.launcher_map import learn_launcher
+from ballfg.diagnosis.design.information import View, planned_flights
+from ballfg.diagnosis.design.plan import learn_launcher
 from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate, table_tennis
 from ballfg.simulation.settings import all_settings
 

@@ -12,7 +12,7 @@ import pytest
 from ballfg.diagnosis.fit.holdout import hold_out
 from ballfg.diagnosis.fit.stamps import Evidence, Stamps
 from ballfg.diagnosis.hypotheses.hypothesis import with_effects
-from ballfg.diagnosis.report.plain_effects import in_plain_words
+from ballfg.diagnosis.report.wording import in_plain_words
 from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_findings, stamp_hypotheses
 from ballfg.dynamics.effects.measurement import CountedFrames, TimeScale
 from ballfg.simulation import SimulationConfig, write_simulation

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from ballfg.benchmarks.diagnosis.effects import PLANTS
-from ballfg.diagnosis.report.plain_effects import in_plain_words, plain_name
+from ballfg.diagnosis.report.wording import in_plain_words, plain_name
 from ballfg.diagnosis.result import Finding, Value
 from ballfg.diagnosis.search.plausible import implausible, range_of
 from ballfg.dynamics import EFFECTS, Coefficient, FlightEffect, MeasurementEffect, Range, Usual, register

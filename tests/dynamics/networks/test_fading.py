@@ -12,8 +12,7 @@ import torch
 from ballfg.dynamics import Architecture, build, load_model, nominal_model, save_model
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.motion.integrate import fly_jacobian
-from ballfg.dynamics.networks.density import FeatureDensity
-from ballfg.dynamics.networks.fading import ABROAD, Fading, states_before_contacts
+from ballfg.dynamics.networks.fading import ABROAD, Fading, FeatureDensity, states_before_contacts
 from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.dynamics.trained import Trained

@@ -12,7 +12,7 @@ from ballfg.dynamics.model import substitute, take_rows
 from ballfg.dynamics.motion.contact import contact_time, fly_through, fly_through_jacobian
 from ballfg.dynamics.motion.flight_step import rate_jacobian
 from ballfg.dynamics.motion.integrate import batch_jacobian, fly, fly_jacobian
-from ballfg.dynamics.networks.learned_parts import HIGHEST_RESTITUTION, START_RESTITUTION
+from ballfg.dynamics.networks.learned import HIGHEST_RESTITUTION, START_RESTITUTION
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.estimation.segmentation.physics import physics_of
 from tests.small_networks import SMALL

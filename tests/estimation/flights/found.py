@@ -17,11 +17,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.estimation.flights.cut import pieces_of
-from ballfg.estimation.flights.dataset import ENOUGH, SMOOTHED, UNDISTURBED, error_ratios
+from ballfg.estimation.flights.dataset import ENOUGH, SMOOTHED, UNDISTURBED, error_ratios, pieces_of
 from ballfg.estimation.flights.labels import label_samples
 from ballfg.estimation.result import Label
-from ballfg.importing.recordings import ANY_BALL
+from ballfg.importing.proposal import ANY_BALL
 from tests.estimation.flights.recordings import FLIGHT, KINDS, Recording, recording
 
 LEAST_ROWS = 4

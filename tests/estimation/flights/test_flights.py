@@ -10,8 +10,7 @@ import pytest
 
 import ballfg as bf
 from ballfg.dynamics import nominal_model
-from ballfg.estimation.flights.cut import flies_throughout, flights_of, pieces_of
-from ballfg.estimation.flights.dataset import error_ratios, in_flight
+from ballfg.estimation.flights.dataset import error_ratios, flies_throughout, flights_of, in_flight, pieces_of
 from ballfg.estimation.flights.estimates import estimated
 from ballfg.estimation.flights.falling import falls_throughout, scatter
 from ballfg.estimation.flights.labels import label_samples
@@ -21,8 +20,8 @@ from ballfg.estimation.segmentation.bank import HYPOTHESIS, LOGGED
 from ballfg.estimation.segmentation.log import chain, compact
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.tracks import TABLE_TENNIS, Track, read_dataset, write_dataset
+from ballfg.tracks.dataset import dataset_in_memory
 from ballfg.tracks.info import DatasetInfo
-from ballfg.tracks.memory import dataset_in_memory
 from tests.commands import status
 from tests.estimation.flights.found import Count, take
 from tests.estimation.flights.recordings import recording

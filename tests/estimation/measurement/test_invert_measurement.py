@@ -18,7 +18,7 @@ from ballfg.estimation.measurement.invert_measurement import InvertMeasurement
 from ballfg.estimation.registry import ESTIMATORS, make_estimator
 from ballfg.factors.noise import ProcessNoise
 from ballfg.simulation import MeasurementNoise, SimulationConfig, parse_effects, simulate
-from ballfg.simulation.measure import SimulatedTrack
+from ballfg.simulation.synthetic import SimulatedTrack
 from ballfg.state import POSITION, SPIN, VELOCITY
 from ballfg.tracks.track import SPIN_LABELS
 

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from ballfg.estimation import RadarSpeed, SpinReading, read
-from ballfg.estimation.observations.registry import read_readings, write_readings
+from ballfg.estimation.observations.registry import read_readings
 from ballfg.simulation import MeasurementNoise, SimulationConfig, write_simulation
 from ballfg.tracks import Dataset, Track, read_dataset
+from tests.written_tables import write_readings
 
 
 @pytest.fixture

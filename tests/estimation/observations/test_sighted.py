@@ -18,8 +18,7 @@ from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
-from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate
-from ballfg.simulation import MotionNoise as TrueNoise
+from ballfg.simulation import MeasurementNoise, MotionNoise as TrueNoise, SimulationConfig, simulate
 from ballfg.tracks import Track
 from ballfg.tracks.sightings import Sightings
 from tests.estimation.observations.sighted_rig import NOISE, RIG, Scene, World, scene, seen, track_of, world

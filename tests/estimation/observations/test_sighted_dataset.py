@@ -15,11 +15,11 @@ from ballfg.estimation.configure import dataset_settings, dataset_surfaces
 from ballfg.estimation.observations.sighted_dataset import read_sighted
 from ballfg.estimation.registry import make_estimator
 from ballfg.state import SIGMA_NAMES, STATE_NAMES
-from ballfg.tracks.detections_file import write_sightings
 from ballfg.tracks.info import TABLE_TENNIS, DatasetInfo, write_info
 from ballfg.vision.camera_file import read_cameras, write_cameras
-from ballfg.vision.detection.detections_table import read_detections
+from ballfg.vision.detection.detections import read_detections
 from tests.estimation.observations.sighted_rig import RIG, TABLE, Scene, launch, scene, seen, track_of, truth, world
+from tests.written_tables import write_sightings
 
 
 @pytest.fixture(scope="module")

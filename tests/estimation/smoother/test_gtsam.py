@@ -21,8 +21,8 @@ from ballfg.factors import LevenbergMarquardt
 from ballfg.factors.gtsam_solver import GtsamLevenbergMarquardt
 from ballfg.factors.loss import Loss
 from ballfg.simulation import SimulationConfig
+from ballfg.tracks.dataset import dataset_in_memory
 from ballfg.tracks.info import DatasetInfo
-from ballfg.tracks.memory import dataset_in_memory
 from tests.estimation.gtsam_solver import SAME, Solvers, difference, distance, simulated
 from tests.estimation.observations.sighted_rig import scene, track_of, world
 

@@ -18,8 +18,7 @@ from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.graph import LevenbergMarquardt
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
-from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate
-from ballfg.simulation import MotionNoise as TrueNoise
+from ballfg.simulation import MeasurementNoise, MotionNoise as TrueNoise, SimulationConfig, simulate
 from ballfg.tracks import Track
 
 G, DRAG, MAGNUS, E, MU, E_T, OFFSET, RADIUS, SHELL = 9.81, 0.12, 0.0028, 0.93, 0.25, 0.15, -0.003, 0.02, 2 / 3

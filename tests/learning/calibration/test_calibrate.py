@@ -11,8 +11,7 @@ import pytest
 
 from ballfg.dynamics import nominal_model
 from ballfg.estimation import Status
-from ballfg.learning.calibration import calibrate as module
-from ballfg.learning.calibration import run
+from ballfg.learning.calibration import calibrate as module, run
 from ballfg.learning.calibration.calibrate import Problem, Step, TooManyFailures, calibrate, has_converged, pose
 from ballfg.learning.calibration.coefficients import choose, values_of, with_values
 from ballfg.learning.calibration.report import compare, table

@@ -20,11 +20,11 @@ from ballfg.learning.calibration.coefficients import with_values
 from ballfg.learning.calibration.volume import estimate_with_slopes
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.progress import unwatched
-from ballfg.tracks.detections_file import write_sightings
 from ballfg.tracks.info import TABLE_TENNIS, DatasetInfo, write_info
 from ballfg.vision.camera_file import write_cameras
 from tests.estimation.observations.sighted_rig import TABLE, world
 from tests.estimation.observations.test_one_view import SIDE, pixels_of, stroke
+from tests.written_tables import write_sightings
 
 DRAG, PLANTED, STROKES = "flight.drag.k", 0.16, 16
 EXTENT = (-1.37, 1.37, -0.76, 0.76)

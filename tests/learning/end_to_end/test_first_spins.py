@@ -14,7 +14,7 @@ from ballfg.dynamics import nominal_model
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.estimation import Smoother
 from ballfg.learning.config.training import TrainConfig
-from ballfg.learning.end_to_end import first_spins
+from ballfg.learning.end_to_end.build import SPIN_PRIOR, _spin
 from ballfg.learning.run.training import build
 from ballfg.simulation import MeasurementNoise, SimulationConfig, table_tennis, write_simulation
 from ballfg.tracks import read_dataset, write_dataset
@@ -68,10 +68,8 @@ def test_a_spin_is_about_the_axes_of_the_launch(launched: Path) -> None:
     given = {"data": [str(launched)], "split": {"by": "none"}, "observe": {"samples": 25}, "kind": "a-tune"}
     trainee, *_ = build(TrainConfig.model_validate(given | {"launcher": {"labels": list(LEVELS)}}))
     shot, model = trainee.shots[0], nominal_model()
-    wide = replace(
-        shot.settings, launcher=None, coefficients=coefficient_sigmas(model), spin_prior=first_spins.SPIN_PRIOR
-    )
+    wide = replace(shot.settings, launcher=None, coefficients=coefficient_sigmas(model), spin_prior=SPIN_PRIOR)
     launch = Smoother(model, shot.surfaces, wide).estimate(shot.track).states[0]
     heading = np.arctan2(launch[4], launch[3])
     expected = Rotation.from_euler("z", -heading).apply(launch[6:9])
-    np.testing.assert_allclose(first_spins._spin(shot, model), expected, atol=1e-9)
+    np.testing.assert_allclose(_spin(shot, model), expected, atol=1e-9)

@@ -16,7 +16,7 @@ from ballfg.estimation.segmentation.result import Segmentation
 from ballfg.factors.linear.covariance import NeighbourCovariances, marginal_covariances
 from ballfg.factors.loss import Loss
 from ballfg.learning.end_to_end.learnables import NoiseScales
-from ballfg.learning.gradient.likelihood import negative_log_likelihood
+from ballfg.learning.gradient.objective import negative_log_likelihood
 from tests.learning.estimates import (
     NOISE,
     SETTINGS,

@@ -17,8 +17,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from ballfg.learning.config.training import TrainConfig
-from ballfg.learning.registry import TraineeKind, register_trainee
-from ballfg.learning.trainee import BatchLoss, Prepared, Trainee
+from ballfg.learning.trainee import BatchLoss, Prepared, Trainee, TraineeKind, register_trainee
 
 TRUE_DRAG, TRUE_GRAVITY = 0.4, 9.81
 TIMES = torch.linspace(0.0, 0.6, 13, dtype=torch.float64)

@@ -18,11 +18,10 @@ from safetensors.torch import load_file
 from ballfg.learning.cli import run
 from ballfg.learning.config.config_file import read_config
 from ballfg.learning.config.training import TrainConfig
-from ballfg.learning.run import launch as launching
+from ballfg.learning.run import ranks as launching
 from ballfg.learning.run.checkpoint import read_checkpoint
-from ballfg.learning.run.launch import launch
 from ballfg.learning.run.metrics import read_metrics
-from ballfg.learning.run.ranks import Ranks, SharedMemory, for_others, join_ranks
+from ballfg.learning.run.ranks import Ranks, SharedMemory, for_others, join_ranks, launch
 from ballfg.learning.run.training import run_training
 from ballfg.progress import progress
 from tests.faults.kills import in_fork
@@ -188,7 +187,7 @@ def test_processes_end_with_the_one_that_started_them(tmp_path: Path) -> None:
     (tmp_path / "waits.py").write_text(
         "import os, time\ndef wait():\n    print(os.getpid(), flush=True)\n    time.sleep(60)\n"
     )
-    code = "from ballfg.learning.run.launch import launch\nfrom waits import wait\nlaunch(2, wait)"
+    code = "from ballfg.learning.run.ranks import launch\nfrom waits import wait\nlaunch(2, wait)"
     path = os.pathsep.join((str(tmp_path), str(ROOT)))
     process = subprocess.Popen(
         [sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": path}, stdout=subprocess.PIPE, text=True

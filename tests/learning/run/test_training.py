@@ -15,8 +15,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import tests.learning.run.falling_ball  # noqa: F401 - registers its kind
 from ballfg.learning.config.training import OptimizerConfig, TrainConfig
-from ballfg.learning.run import record, training
-from ballfg.learning.run import run_folder as files
+from ballfg.learning.run import record, run_folder as files, training
 from ballfg.learning.run.checkpoint import read_checkpoint
 from ballfg.learning.run.metrics import Epoch, epoch_line, read_metrics, write_metrics
 

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ballfg.simulation.cameras import table_rig
-from ballfg.simulation.scene.ball_image import SHADING, BallImage, ball_image
+from ballfg.simulation.scene.renderer import SHADING, BallImage, ball_image
 from ballfg.vision.camera import Camera
 
 RADIUS = 0.02

@@ -17,10 +17,12 @@ from ballfg.vision.calibration.intrinsics import (
     _fit,
     _has_pole,
     calibrate_intrinsics,
+    covariance_of_lens,
     coverage,
+    pixel_grid,
+    sigma_of_rays,
     turn,
 )
-from ballfg.vision.calibration.lens_covariance import covariance_of_lens, pixel_grid, sigma_of_rays
 from ballfg.vision.calibration.report import Calibration, summary
 from tests.vision.calibration.board_scenes import CHARUCO, CHESSBOARD, TRUE, exact_views, image_of, poses
 

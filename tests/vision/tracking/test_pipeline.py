@@ -19,13 +19,11 @@ from ballfg.tracks.info import DatasetInfo
 from ballfg.vision import Camera
 from ballfg.vision.camera_file import read_cameras
 from ballfg.vision.detection.detect import load_detector
-from ballfg.vision.detection.detections import Candidates, Detections
-from ballfg.vision.detection.detections_table import read_detections
+from ballfg.vision.detection.detections import Candidates, Detections, read_detections
 from ballfg.vision.detection.video import Video, open_video
 from ballfg.vision.tracking.dataset import FILES, check_result_folder, write_tracking
 from ballfg.vision.tracking.overlay import Image
-from ballfg.vision.tracking.pipeline import Tracking, track_detections
-from ballfg.vision.tracking.report import no_ball, summary
+from ballfg.vision.tracking.pipeline import Tracking, no_ball, summary, track_detections
 from tests.places import DOCS
 
 RATE = 100.0

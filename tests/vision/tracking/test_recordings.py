@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ballfg.vision import Camera
-from ballfg.vision.tracking.recordings import check_sizes, match_videos, stamp_files, without
+from ballfg.vision.tracking.pipeline import check_sizes, match_videos, stamp_files, without
 
 SIZE = (1280, 720)
 

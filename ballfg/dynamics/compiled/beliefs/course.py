@@ -21,10 +21,8 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, Z
 
-BOUNCES: Final = 1.0
-"""A ball whose bounce is not plain."""
-RESTS: Final = 2.0
-"""A ball that lies on a surface."""
+BOUNCES: Final = 1.0  # A ball whose bounce is not plain
+RESTS: Final = 2.0  # A ball that lies on a surface
 
 
 @dataclass(frozen=True)

@@ -11,14 +11,10 @@ from ballfg.dynamics.compiled.flight import glide, laws_of, value_of
 from ballfg.dynamics.compiled.signatures import FLAG, GIVEN, LAW, LAWS, ONE, REAL, TWO, several
 from ballfg.dynamics.motion.limits import MAX_STEP
 
-LOOKS = 16
-"""Number of looks in a step of `MAX_STEP`: two crossings within 1.25 ms may pass unseen."""
-NEWTON_STEPS = 20
-"""Largest number of steps to a crossing; three or four are enough."""
-TIME_TOLERANCE = 1e-12
-"""s. Accuracy of the time of a crossing."""
-INSTANT = 1e-9
-"""s, within which a ball that has already touched a surface bounces."""
+LOOKS = 16  # Number of looks in a step of `MAX_STEP`: two crossings within 1.25 ms may pass unseen
+NEWTON_STEPS = 20  # Largest number of steps to a crossing; three or four are enough
+TIME_TOLERANCE = 1e-12  # s. Accuracy of the time of a crossing
+INSTANT = 1e-9  # s, within which a ball that has already touched a surface bounces
 NONE, FOUND, HARD = 0.0, 1.0, 2.0
 """Ends of a search: nothing within the horizon; the event; a step other than flight or a plain bounce."""
 

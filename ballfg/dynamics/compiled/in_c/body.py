@@ -29,13 +29,10 @@ from ballfg.dynamics.compiled.in_c.values import (
 if TYPE_CHECKING:
     from ballfg.dynamics.compiled.in_c.routines import Routine, Translator
 
-SMALL: Final = 9
-"""Largest number of entries of an array that begins with zeros."""
+SMALL: Final = 9  # Largest number of entries of an array that begins with zeros
 WRAPPED: Final[Mapping[str, Any]] = {"break_long_words": False, "break_on_hyphens": False, "drop_whitespace": True}
-TANGENTS: Final = 3
-"""Place of an array of tangents among the arguments of a function of a model."""
-WIDTH: Final = "d"
-"""Name of their number there."""
+TANGENTS: Final = 3  # Place of an array of tangents among the arguments of a function of a model
+WIDTH: Final = "d"  # Name of their number there
 CONSTANT: Final = re.compile(r" *const \w+ (\w+) = (?!.*\w_\w+\().*;")
 """A line that declares one without a call of another function of the text, which may have effects."""
 

@@ -1,7 +1,5 @@
 """Translates Python functions to C functions, one for each form of the arguments with which they are called."""
 
-from __future__ import annotations
-
 import ast
 import inspect
 import re
@@ -9,42 +7,35 @@ import textwrap
 from collections import Counter
 from collections.abc import Callable, Hashable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
 from ballfg.dynamics.compiled.in_c.body import TANGENTS, WIDTH, Body
 from ballfg.dynamics.compiled.in_c.helpers import BY_HAND
 from ballfg.dynamics.compiled.in_c.statements import block
-from ballfg.dynamics.compiled.in_c.values import Array, Scalar, UntranslatableError, Value, form
+from ballfg.dynamics.compiled.in_c.values import Array, UntranslatableError, Value, form
 
-Blocks = tuple[int, ...]
-"""The blocks around a place in a function."""
+Blocks = tuple[int, ...]  # The blocks around a place in a function
 
 
 @dataclass(frozen=True, eq=False)
 class Routine:
-    """A Python function as syntax.
+    """A Python function as syntax."""
 
-    Attributes:
-        name: in C.  tree: of the function.  known: the names of its module.
-        changing: names of numbers that are variables.
-        generated: true for a function of a model: one in C serves any number of tangents.
-    """
-
-    name: str
-    tree: ast.FunctionDef
-    known: Mapping[str, Any]
-    changing: Set[str]
-    generated: bool = False
+    name: str  # in C
+    tree: ast.FunctionDef  # of the function
+    known: Mapping[str, Any]  # the names of its module
+    changing: Set[str]  # names of numbers that are variables
+    generated: bool = False  # true for a function of a model: one in C serves any number of tangents
 
     @classmethod
-    def of(cls, function: Callable[..., Any]) -> Routine:
+    def of(cls, function: Callable[..., Any]) -> Self:
         """Of a function with a file."""
         (tree,) = ast.parse(textwrap.dedent(inspect.getsource(function))).body
         assert isinstance(tree, ast.FunctionDef)
         return cls(function.__name__.strip("_"), tree, function.__globals__, _changing(tree))
 
     @classmethod
-    def of_source(cls, name: str, source: str, known: Mapping[str, Any]) -> Routine:
+    def of_source(cls, name: str, source: str, known: Mapping[str, Any]) -> Self:
         """Of the one function in a generated text, which computes a number anew in each loop that needs it."""
         (tree,) = ast.parse(source).body
         assert isinstance(tree, ast.FunctionDef)
@@ -105,13 +96,10 @@ class Made:
 
 @dataclass
 class Translator:
-    """The C functions that were asked for and all those that they call.
+    """The C functions that were asked for and all those that they call."""
 
-    Attributes: prefix: of their names.  texts: in an order in which each comes after what it calls.
-    """
-
-    prefix: str
-    texts: list[str] = field(default_factory=list)
+    prefix: str  # of their names
+    texts: list[str] = field(default_factory=list)  # in an order in which each comes after what it calls
     _made: dict[tuple[Hashable, ...], Made] = field(default_factory=dict)
     _routines: dict[Any, Routine] = field(default_factory=dict)
     _names: Counter[str] = field(default_factory=Counter)
@@ -165,11 +153,7 @@ class Translator:
         head = f"static inline {kind or 'void'} {name}({', '.join(passed) or 'void'}) {{"
         lines = body.finished()
         words = set(re.findall(r"\w+", "\n".join(lines)))
-        unused = [leaf for leaf in map(_name, arguments) if leaf not in words]
+        unused = [leaf for a in arguments if (leaf := a.pointer if isinstance(a, Array) else a.text) not in words]
         above = [f"/* {told} */"] if number == 1 else []
         self.texts.append("\n".join([*above, head, *(f" (void){leaf};" for leaf in unused), *lines, "}"]))
         return Made(name, kind, outputs, [isinstance(a, Array) and a.root in body.written for a in arguments])
-
-
-def _name(argument: Scalar | Array) -> str:
-    return argument.pointer if isinstance(argument, Array) else argument.text

@@ -42,7 +42,8 @@ def _statement(body: Body, node: ast.stmt) -> bool:
             for target in node.targets:
                 bind(body, target, value)
         case ast.AugAssign():
-            sum_of = ast.BinOp(_read(node.target), node.op, node.value)
+            target = ast.parse(ast.unparse(node.target), mode="eval").body  # as an expression that is read
+            sum_of = ast.BinOp(target, node.op, node.value)
             bind(body, node.target, expression(body, sum_of))
         case ast.If():
             return _if(body, node)
@@ -63,11 +64,6 @@ def _statement(body: Body, node: ast.stmt) -> bool:
         case _:
             raise UntranslatableError(f"{ast.unparse(node)} has no translation to C")
     return False
-
-
-def _read(target: ast.expr) -> ast.expr:
-    """The target of an assignment as an expression."""
-    return ast.parse(ast.unparse(target), mode="eval").body
 
 
 def bind(body: Body, target: ast.expr, value: Value) -> None:

@@ -1,7 +1,5 @@
 """Values of a function that is translated to C: constants, C expressions, and arrays whose sizes are known."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
@@ -9,12 +7,10 @@ from math import prod
 from typing import Any, Final, TypeAlias
 
 DOUBLE: Final = "double"
-INT: Final = "int"
-"""C's types of numbers; truth values are int."""
+INT: Final = "int"  # C's types of numbers; truth values are int
 
 
-ATOM, TIMES, PLUS, ANY = range(4)
-"""Ranks of operators: none, products, sums, and all that bind less than these."""
+ATOM, TIMES, PLUS, ANY = range(4)  # Ranks of operators: none, products, sums, and all that bind less than these
 
 
 class UntranslatableError(Exception):
@@ -30,31 +26,22 @@ class Constant:
 
 @dataclass(frozen=True)
 class Scalar:
-    """A C expression without effects.
+    """A C expression without effects."""
 
-    Attributes: text: without brackets around it.  kind: its type.  rank: of its operator; more binds less.
-    """
-
-    text: str
-    kind: str
-    rank: int = ATOM
+    text: str  # without brackets around it
+    kind: str  # its type
+    rank: int = ATOM  # of its operator; more binds less
 
 
 @dataclass(frozen=True)
 class Array:
-    """Numbers that lie one behind another.
+    """Numbers that lie one behind another."""
 
-    Attributes:
-        pointer: C expression.  shape: a length is a number, the name of an int of the function, or None, which nobody
-            knows; only the first may be.
-        root: name of the storage, to tell which arguments a function writes to.
-        fixed: true for a table of the whole text, which functions read without an argument.
-    """
-
-    pointer: str
+    pointer: str  # C expression
     shape: tuple[int | str | None, ...]
-    root: str
-    fixed: bool = False
+    """A length is a number, the name of an int of the function, or None, which nobody knows; only the first may be."""
+    root: str  # name of the storage, to tell which arguments a function writes to
+    fixed: bool = False  # true for a table of the whole text, which functions read without an argument
 
     @property
     def size(self) -> int:

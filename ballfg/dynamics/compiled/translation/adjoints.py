@@ -1,7 +1,5 @@
 """Writes numba source for reverse-mode derivatives of a few entries of an array by all its operands."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -17,25 +17,18 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from ballfg.dynamics.compiled.translation.program import Number, Operation, Program
 
-INPUTS: Final = ("input",)
-"""Operations that give inputs, by which derivatives are taken."""
-SMALL: Final = 12
-"""Largest number of entries in an array that is split into numbers."""
+INPUTS: Final = ("input",)  # Operations that give inputs, by which derivatives are taken
+SMALL: Final = 12  # Largest number of entries in an array that is split into numbers
 
 
 @dataclass(frozen=True)
 class View:
-    """An array: where its numbers lie, in a block or among the weights.
+    """An array: where its numbers lie, in a block or among the weights."""
 
-    Attributes:
-        block: its number; None for an array among the weights.  shape: of the array.
-        strides: how many numbers further the next entry along each dimension lies.  offset: of the first number.
-    """
-
-    block: int | None
-    shape: tuple[int, ...]
-    strides: tuple[int, ...]
-    offset: int = 0
+    block: int | None  # its number; None for an array among the weights
+    shape: tuple[int, ...]  # of the array
+    strides: tuple[int, ...]  # how many numbers further the next entry along each dimension lies
+    offset: int = 0  # of the first number
 
     @classmethod
     def whole(cls, block: int | None, shape: Sequence[int], offset: int = 0) -> View:
@@ -150,17 +143,13 @@ def operands_of(making: Making) -> list[View]:
 
 @dataclass
 class Arrays:
-    """The blocks of a program.
+    """The blocks of a program."""
 
-    Attributes:
-        program: that reads them.  makings: how each is made.  sizes: of each.
-        asked: places of a block that are read, where their derivatives run backward.
-    """
-
-    program: Program
-    makings: list[Making] = field(default_factory=list)
-    sizes: list[int] = field(default_factory=list)
+    program: Program  # that reads them
+    makings: list[Making] = field(default_factory=list)  # how each is made
+    sizes: list[int] = field(default_factory=list)  # of each
     asked: dict[int, list[int]] = field(default_factory=dict)
+    """Places of a block that are read, where their derivatives run backward."""
 
     def make(self, making: Making, shape: Sequence[int]) -> View:
         """A new block of a shape."""

@@ -4,8 +4,6 @@ Array `k` of all states lies one behind another in `a<k>`: number i of state r a
 `count` numbers lie in an array of another name, the q-th of state r at (r * count + q) * size + i.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -23,15 +21,11 @@ CALLS: Final = {
 
 @dataclass(frozen=True)
 class Entries:
-    """Names of the entries of blocks: values, or derivatives of which every state has `count`.
+    """Names of the entries of blocks: values, or derivatives of which every state has `count`."""
 
-    Attributes:
-        arrays: all of them.  kind: what the names of the blocks begin with.  count: of derivatives; None for values.
-    """
-
-    arrays: Arrays
-    kind: str = "a"
-    count: int | None = None
+    arrays: Arrays  # all of them
+    kind: str = "a"  # what the names of the blocks begin with
+    count: int | None = None  # of derivatives; None for values
 
     def name(self, block: int | None) -> str:
         """Name of a block, or of the weights."""

@@ -4,15 +4,12 @@ A program is a list of operations on numbers, each used as often as it is needed
 programs too: the chain rule adds their operations, and terms that are zero or one never become operations.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-Number = int
-"""The place of a scalar in its program."""
+Number = int  # The place of a scalar in its program
 
 COMMUTATIVE: Final = frozenset({"add", "mul", "minimum", "maximum"})
 FOLDED: Final[dict[str, Callable[..., float]]] = {
@@ -33,19 +30,14 @@ FOLDED: Final[dict[str, Callable[..., float]]] = {
 
 @dataclass(frozen=True)
 class Operation:
-    """One operation.
+    """One operation."""
 
-    Attributes:
-        name: what it does.  operands: the numbers it takes.
-        constant: a number of the operation itself, such as an exponent or a value.
-        where: for a number read from an array or its derivatives: the array, the place in it, the number of operands by
-            which derivatives are taken (0: they run backward, to each operand), and the operand.
-    """
-
-    name: str
-    operands: tuple[Number, ...] = ()
-    constant: float | None = None
+    name: str  # what it does
+    operands: tuple[Number, ...] = ()  # the numbers it takes
+    constant: float | None = None  # a number of the operation itself, such as an exponent or a value
     where: tuple[int, ...] = ()
+    """For a number read from an array or its derivatives: the array, the place in it, the number of operands by which
+    derivatives are taken (0: they run backward, to each operand), and the operand."""
 
 
 @dataclass

@@ -1,7 +1,5 @@
 """Records torch operations on tables in a file; they compute the weights of compiled functions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -18,16 +16,12 @@ class Recipe:
     """Operations on tables, in a form for files.
 
     Values are numbered: tables first, then constants, then the result of each step.
-
-    Attributes:
-        constants: as nested lists, with their type.
-        steps: name of the operation, arguments, further ones by name; {"value": k} stands for a value.
-        taken: numbers of the values that are the weights.
     """
 
-    constants: Sequence[tuple[Any, str]]
+    constants: Sequence[tuple[Any, str]]  # as nested lists, with their type
     steps: Sequence[tuple[str, Any, Any]]
-    taken: Sequence[int]
+    """Name of the operation, arguments, further ones by name; {"value": k} stands for a value."""
+    taken: Sequence[int]  # numbers of the values that are the weights
 
     def __call__(self, *tables: Tensor) -> Tensor:
         """All weights (k,)."""

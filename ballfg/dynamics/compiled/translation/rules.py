@@ -1,7 +1,5 @@
 """Translates torch's operations on small tensors to operations on numbers of a program."""
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Callable, Sequence
 from typing import Any, Final
@@ -13,8 +11,7 @@ from torch import Tensor
 
 from ballfg.dynamics.compiled.translation.program import Program
 
-Numbers = NDArray[np.object_]
-"""A tensor of numbers of a program."""
+Numbers = NDArray[np.object_]  # A tensor of numbers of a program
 aten: Any = torch.ops.aten
 SQUEEZES: Final = (aten.squeeze.dim, aten.squeeze_.dim)
 RESHAPES: Final = (aten.view.default, aten.reshape.default, aten._unsafe_view.default)

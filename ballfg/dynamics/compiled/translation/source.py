@@ -1,7 +1,5 @@
 """Writes numba source for a program and for the tangents of its outputs."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -11,8 +9,7 @@ from ballfg.dynamics.compiled.translation.loops import EACH_STATE, Entries, expr
 from ballfg.dynamics.compiled.translation.program import Number, Operation
 from ballfg.dynamics.compiled.translation.trace import Traced
 
-OF_ARRAYS = frozenset({"read", "slope", "back"})
-"""Operations that read arrays or their derivatives."""
+OF_ARRAYS = frozenset({"read", "slope", "back"})  # Operations that read arrays or their derivatives
 
 
 def function_source(traced: Traced, state: Sequence[Number], others: Sequence[Number]) -> str:
@@ -45,20 +42,15 @@ def function_source(traced: Traced, state: Sequence[Number], others: Sequence[Nu
 
 @dataclass
 class _Writer:
-    """Writes lines that compute numbers, after lines that fill the arrays they are read from.
+    """Writes lines that compute numbers, after lines that fill the arrays they are read from."""
 
-    Attributes:
-        traced: the program.  names: of its numbers.  inputs: how its inputs are called.  lines: written so far.
-        done: blocks that are filled, or whose derivatives are, by their names.
-        kinds: names of derivatives, by the numbers with respect to which they are taken.
-    """
-
-    traced: Traced
-    names: Mapping[Number, str]
-    inputs: Mapping[Number, str]
-    lines: list[str] = field(default_factory=list)
-    done: set[str] = field(default_factory=set)
+    traced: Traced  # the program
+    names: Mapping[Number, str]  # of its numbers
+    inputs: Mapping[Number, str]  # how its inputs are called
+    lines: list[str] = field(default_factory=list)  # written so far
+    done: set[str] = field(default_factory=set)  # blocks that are filled, or whose derivatives are, by their names
     kinds: dict[tuple[Number, ...], str] = field(default_factory=dict)
+    """Names of derivatives, by the numbers with respect to which they are taken."""
 
     def compute(self, numbers: Sequence[Number], then: Sequence[str]) -> None:
         """Compute numbers of each state and then do something with them.

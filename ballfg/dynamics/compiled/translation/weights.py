@@ -1,7 +1,5 @@
 """Collects the values that a traced function computes from its tables alone, once for all states, as weights."""
 
-from __future__ import annotations
-
 from collections.abc import Hashable
 from dataclasses import dataclass, field
 from math import prod
@@ -20,16 +18,11 @@ IDLE: Final = frozenset({"memory_format", "pin_memory", "device", "layout"})
 
 @dataclass(frozen=True)
 class Known:
-    """A tensor that does not depend on the vectors of a function.
+    """A tensor that does not depend on the vectors of a function."""
 
-    Attributes:
-        node: where it stands in the graph.  example: its value for the tables that were traced.
-        varies: whether other tables give other values.
-    """
-
-    node: Node
-    example: Any
-    varies: bool
+    node: Node  # where it stands in the graph
+    example: Any  # its value for the tables that were traced
+    varies: bool  # whether other tables give other values
 
 
 @dataclass

@@ -1,14 +1,14 @@
-"""Separates several balls that stand side by side in one table, as `left_x, left_y, left_z, right_x, ...`."""
+"""Tells the balls of a recording apart: side by side, as `left_x, left_y, left_z, right_x, ...`, or by a column."""
 
 from collections.abc import Mapping
-from itertools import combinations
+from itertools import combinations, product
 from typing import Final
 
 import numpy as np
 
 from ballfg.importing.choices import Choices
 from ballfg.importing.formats.raw import RawTable, is_number, numbers
-from ballfg.importing.names import meanings
+from ballfg.importing.names import IDENTITIES, meanings, words_of
 
 APART: Final = 0.02
 """Least median distance of two balls over the extent of their paths; nearer places are one ball's, measured twice."""
@@ -68,3 +68,29 @@ def _apart(table: RawTable, groups: Mapping[str, Mapping[str, str]]) -> bool:
             if np.median(np.linalg.norm(one - other, axis=1)[both]) < APART * extent:
                 return False
     return True
+
+
+def identified(
+    table: RawTable, trajectory: str | None, time: tuple[str, ...], used: set[str]
+) -> tuple[str | None, tuple[str, ...]]:
+    """The column of trajectories, and a further one where one stamp of a trajectory has several positions.
+
+    That one has the name of an identity, or text in it, or its whole numbers count the shots of each.
+    """
+    stamps = [table.columns[name].tolist() for name in time]
+    known = [table.columns[trajectory].tolist()] if trajectory else []
+    rows = len(table)
+    if not time or rows == 0 or rows == len(set(zip(*known, *stamps, strict=True))):
+        return trajectory, ()
+    cells = {name: table.texts.get(name, column).tolist() for name, column in table.columns.items() if name not in used}
+    few = {name: values for name, values in cells.items() if len(set(values)) <= rows // 2}
+    said = [n for n in few if set(words_of(n)) & set(IDENTITIES) or not is_number(table.columns[n])]
+    for name in said:
+        if len(set(zip(*known, *stamps, few[name], strict=True))) == rows:
+            return (name, ()) if trajectory is None else (trajectory, (name,))
+    counts = [name for name in few if table.columns[name].dtype.kind == "i" and name not in said]
+    names = {name: few[name] for name in said} if trajectory is None else {trajectory: known[0]}
+    for name, count in product(names, counts):
+        if len(set(zip(names[name], *stamps, few[count], strict=True))) == rows:
+            return name, (count,)
+    return trajectory, ()
