@@ -87,16 +87,17 @@ class Code:
         self.__wrapped__(*args)
 
 
-@intrinsic
-def function_at(_context: Any, address: Any) -> Any:
-    """The function of a model at an address, for machine code."""
-
+def _at_address(_context: Any, address: Any) -> Any:
     def generate(context: Any, builder: Any, _signature: Any, given: Any) -> Any:
         function = cgutils.create_struct_proxy(FUNCTION)(context, builder)
         function.c_addr = builder.inttoptr(given[0], cgutils.voidptr_t)
         return function._getvalue()
 
     return FUNCTION(address), generate
+
+
+function_at: Final[Any] = intrinsic(_at_address)
+"""The function of a model at an address, for machine code."""
 
 
 def built(source: str) -> Code:
