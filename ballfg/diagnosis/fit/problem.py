@@ -51,11 +51,6 @@ class Noise:
     label: float = 20.0
     spin: Array = field(default_factory=lambda: np.full(3, 60.0))
 
-    def same_as(self, other: Self) -> bool:
-        """True if all scales are equal."""
-        same = np.array_equal(self.position, other.position) and np.array_equal(self.spin, other.spin)
-        return same and self.label == other.label
-
 
 @dataclass(frozen=True)
 class Problem:
