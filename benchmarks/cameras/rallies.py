@@ -38,6 +38,8 @@ LENGTH: Final = 6.0
 """s, of a rally."""
 BOUNCE: Final = 0.02
 """s, within which a bounce is found."""
+SPUN: Final = 60.0
+"""rad/s of top- or backspin whose sign counts."""
 VIEWS: Final = {
     "side": ((0.4, -8.0, 3.6), 1000.0),
     "behind": ((-8.5, -0.8, 3.2), 1350.0),
@@ -127,7 +129,7 @@ def film(of: Truth, path: Path, rate: float, seed: int) -> None:
 class Score:
     """Sums over rallies: strokes and those found, false ones, errors (m) of samples, whether 90 % intervals hold.
 
-    And signs of spins that are right, of all beyond 60 rad/s and of those known to 2 sigma, and bounces within `BOUNCE`
+    And signs of spins that are right, of all beyond `SPUN` and of those known to 2 sigma, and bounces within `BOUNCE`
     of the true ones, each with the number of all.
     """
 
@@ -168,20 +170,20 @@ def judged(rally: Rally, of: Truth) -> Score:
     for estimate in (one for shot in rally.shots for one in shot.estimates):
         middle = float(np.median(estimate.times))
         numbers = [i for i, one in enumerate(of.strokes) if one.begin < middle <= one.end]
-        states = [of.at(float(t)) for t in estimate.times]
-        good = [i for i, state in enumerate(states) if state is not None]
-        off = np.array([estimate.states[i, POSITION] - states[i][POSITION] for i in good])
+        states = ((i, of.at(float(t))) for i, t in enumerate(estimate.times))
+        true = {i: state for i, state in states if state is not None}
+        off = np.array([estimate.states[i, POSITION] - state[POSITION] for i, state in true.items()])
         if not numbers or not len(off) or np.median(np.linalg.norm(off, axis=1)) > 0.5:
             false += 1
             continue
         found.add(numbers[0])
         errors.append(float(np.sqrt((off**2).sum(axis=1).mean())))
-        sigmas = np.array([np.sqrt(np.diag(estimate.covariances[i]))[POSITION] for i in good])
+        sigmas = np.array([np.sqrt(np.diag(estimate.covariances[i]))[POSITION] for i in true])
         held += (np.abs(off) < 1.645 * sigmas).ravel().tolist()
-        true = states[good[0]][SPIN]
-        if abs(true[1]) > 60.0:
-            spin, sigma = estimate.states[good[0], SPIN][1], np.sqrt(estimate.covariances[good[0]][SPIN, SPIN][1, 1])
-            right, known = bool(np.sign(true[1]) == np.sign(spin)), bool(abs(spin) > 2.0 * sigma)
+        first, state = next(iter(true.items()))
+        spin, sigma = estimate.states[first, SPIN][1], np.sqrt(estimate.covariances[first][SPIN, SPIN][1, 1])
+        if abs(state[SPIN][1]) > SPUN:
+            right, known = bool(np.sign(state[SPIN][1]) == np.sign(spin)), bool(abs(spin) > 2.0 * sigma)
             spins += (right, 1, right and known, known)
     bounces = [event.t for event in rally.events if event.kind == "bounce"]
     near = sum(any(abs(t - true) < BOUNCE for t in bounces) for true in of.bounces)

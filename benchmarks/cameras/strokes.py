@@ -94,7 +94,7 @@ def drawn_ball(rng: np.random.Generator) -> AnalyticModel:
     with torch.no_grad():
         for name, sigma in SETTINGS.coefficients.items():
             value = ball.get_parameter(name)
-            value += sigma * float(np.clip(rng.standard_normal(), -MOST_ODD, MOST_ODD))
+            value.add_(sigma * float(np.clip(rng.standard_normal(), -MOST_ODD, MOST_ODD)))
     return ball
 
 

@@ -154,7 +154,7 @@ class Size:
     speed_runs: int = 3
 
 
-FULL: Final = Size(shots=8, late=3, rallies={25.0: 8, 60.0: 4})
+FULL: Final = Size(shots=8, late=3, rallies={25.0: 4, 60.0: 2})
 QUICK: Final = Size(shots=2, late=1, rallies={25.0: 1})
 
 
