@@ -158,7 +158,8 @@ def cameras(run: Run, data: Data = None, view: Views = None) -> None:
     views also of two phones at the first two cameras, with clocks that drift apart.
 
     The recordings have one shutter or three, one ball or two, dropped frames, a clock that is late, and a camera that
-    was turned after its calibration. The speed of the tracking is measured too.
+    was turned after its calibration. The speed of the tracking is measured too. Rallies of one camera that pans and
+    zooms follow, whose place nobody tells.
 
     Example: ballfg-bench cameras --out results/cameras
     """

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.benchmarks.cameras.clocks import FACTORS, NAIVE, Velocities, clocks, compare, sighted
+from ballfg.benchmarks.cameras.rallies import run_rallies
 from ballfg.benchmarks.cameras.scenes import Filmed, Judged, Scenario, film, judge, scenarios
 from ballfg.benchmarks.metrics import bootstrap, median_and_quartiles, median_and_range, pooled_rms, ratio, share
 from ballfg.benchmarks.pictures import BLUE, ORANGE, save
@@ -142,16 +143,18 @@ class Size:
 
     Attributes:
         shots: balls in each recording.  late: recordings with a late clock.
+        rallies: of a camera that pans and zooms, at each rate, Hz.
         speed_runs: times that the streams are timed; the median counts.
     """
 
     shots: int
     late: int
+    rallies: Mapping[float, int]
     speed_runs: int = 3
 
 
-FULL: Final = Size(shots=8, late=3)
-QUICK: Final = Size(shots=2, late=1)
+FULL: Final = Size(shots=8, late=3, rallies={25.0: 4, 60.0: 2})
+QUICK: Final = Size(shots=2, late=1, rallies={25.0: 1})
 
 
 def run_cameras(results: Results, out: Path, size: Size, jobs: int) -> list[Path]:
@@ -173,6 +176,7 @@ def run_cameras(results: Results, out: Path, size: Size, jobs: int) -> list[Path
     turned = list(progress(turns(shown[0]), cameras * len(AXES), "cameras turned"))
     add_turns(results, turned, shown[0])
     _add_speed(results, ways[0], shown[1], size.speed_runs)
+    run_rallies(results, size.rallies, jobs)
     return [
         errors_picture({name: found.errors for name, found in judged.items()}, out / "cameras_errors.png"),
         turns_picture(turned, out / "cameras_turned.png"),

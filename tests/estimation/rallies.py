@@ -11,72 +11,22 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-import torch
 
-from ballfg.arrays import Array
-from ballfg.dynamics import AnalyticModel
-from ballfg.dynamics.motion.rollout import rollout
+from ballfg.benchmarks.cameras.strokes import MODEL, SURFACES, TABLE, Stroke, flown, stroke
 from ballfg.estimation.one_camera import track_one_camera
 from ballfg.estimation.result import Estimate
-from ballfg.state import POSITION, STANDARD_GRAVITY, VZ, Z
+from ballfg.state import POSITION
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Candidates, Detections
-from tests.estimation.observations.sighted_rig import TABLE, looking, world
+from tests.estimation.observations.sighted_rig import looking
 
-MODEL: Final = world().model
-SURFACES: Final = replace(world().surfaces, extent=(-1.37, 1.37, -0.7625, 0.7625))
 CAMERAS: Final = (looking("side", (-0.2, -4.0, 2.2)), looking("oblique", (-3.6, -3.0, 2.4)))
 RATE, LENGTH, BEGIN = 50.0, 60.0, 100.0  # Hz, s, s: stamp of the first frame
 NOISE, HIDDEN, BURSTS = 0.7, 0.08, 25  # px, share of frames, number of runs of hidden frames
 COVERED, NEAR = 0.5, 0.5  # least share of a found stroke, largest error of one in m
-
-
-@dataclass(frozen=True)
-class Stroke:
-    """A stroke from `begin` to `end`, s in its rally, and its first state (9,)."""
-
-    begin: float
-    end: float
-    state: Array
-
-
-def flown(state: Array, times: Array, ball: AnalyticModel = MODEL) -> Array:
-    """(n, 9) states at times (n,) s after a first one (9,)."""
-    with torch.no_grad():
-        given = torch.from_numpy(state[None]), torch.from_numpy(np.append(0.0, times))
-        return np.asarray(rollout(ball, *given, SURFACES)[0, 1:])
-
-
-def stroke(
-    place: Array, to: float, rng: np.random.Generator, ball: AnalyticModel = MODEL, given: Array | None = None
-) -> tuple[Array, float] | None:
-    """First state and duration of a stroke from a place to a half of the table, to: 1 or -1; None if none was drawn.
-
-    Args: given: its spin (3,) rad/s; None: drawn.
-    """
-    for _ in range(60):
-        aim = np.array([to * rng.uniform(0.35, 1.15), rng.uniform(-0.5, 0.5), TABLE + 0.02])
-        time = rng.uniform(0.28, 0.45)
-        spin = np.array([rng.normal(0, 15), to * rng.normal(60, 60), rng.normal(0, 15)])
-        spin = spin if given is None else given
-        velocity = (aim - place) / time
-        velocity[2] += 0.5 * STANDARD_GRAVITY * time
-        for _ in range(4):
-            end = flown(np.concatenate((place, velocity, spin)), np.array([0.999 * time]), ball)[0]
-            velocity = velocity + (np.array([0.0, 0.0, 0.3]) if end[VZ] > 0.0 else (aim - end[POSITION]) / time)
-        state, lasts = np.concatenate((place, velocity, spin)), time + rng.uniform(0.15, 0.32)
-        moments = np.arange(0.004, lasts, 0.004)
-        path = flown(state, moments, ball)
-        (turns,) = np.nonzero(np.diff(path[:, VZ]) > 1.0)
-        above = path[-1, Z] - TABLE
-        fine = len(turns) == 1 and abs(moments[turns[0]] - time) < 0.08 and 0.03 < above < 0.6
-        if fine and abs(path[-1, 0]) < 2.4 and np.linalg.norm(velocity) < 13.0:
-            return state, lasts
-    return None
 
 
 def rally(seed: int) -> list[Stroke]:

@@ -5,6 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.benchmarks.cameras.hall import COURT
+from ballfg.benchmarks.cameras.rallies import EXPOSURE, Truth, truth
+from ballfg.benchmarks.cameras.strokes import MODEL
 from ballfg.estimation.rally.arcs import arcs
 from ballfg.estimation.rally.field import Field
 from ballfg.estimation.rally.reconstruct import fixed_camera
@@ -14,9 +17,6 @@ from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.state import POSITION, VZ
 from ballfg.vision.broadcast.motion import Motion, Shot
 from ballfg.vision.detection.detections import Candidates, Detections
-from tests.estimation.rallies import MODEL
-from tests.estimation.rendered import EXPOSURE, Truth, truth
-from tests.vision.broadcast.scene import COURT
 
 RATE, NOISE = 25.0, 0.4  # Hz, px
 SURFACES = surfaces_of(COURT)

@@ -11,6 +11,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from ballfg.benchmarks.cameras.hall import COURT
+from ballfg.benchmarks.cameras.rallies import Truth
+from ballfg.benchmarks.cameras.strokes import MODEL
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import Smoother, dataset_settings, dataset_surfaces, read_sighted
 from ballfg.estimation.rally.events import end_of, events_of, net_touches, stroke_row
@@ -27,10 +30,8 @@ from ballfg.tracks import TABLE_TENNIS
 from ballfg.tracks.info import DatasetInfo
 from tests.browser import needs_browser, opened
 from tests.commands import status
-from tests.estimation.rallies import MODEL
 from tests.estimation.rally.planted import SURFACES, planted
-from tests.estimation.rendered import Truth
-from tests.vision.broadcast.scene import COURT, TENNIS
+from tests.vision.broadcast.tennis import TENNIS
 
 NET = 0.1525
 

@@ -13,6 +13,7 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
+from ballfg.benchmarks.cameras.rallies import Truth
 from ballfg.estimation.rally import hits as hits_of
 from ballfg.estimation.rally.arcs import Foretold
 from ballfg.estimation.rally.choose import BEGINS, MOST_BOUNCES, PAUSE, SERVED, best_sequence
@@ -21,7 +22,6 @@ from ballfg.estimation.rally.strokes import LEAST, Grower, Stroke
 from ballfg.state import POSITION
 from ballfg.vision.broadcast.motion import Shot
 from tests.estimation.rally.planted import grower_of, planted, true_stroke
-from tests.estimation.rendered import Truth
 
 
 @pytest.fixture(scope="module", params=["side", "behind"])

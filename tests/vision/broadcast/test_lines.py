@@ -5,9 +5,9 @@ import gtsam
 import numpy as np
 import pytest
 
+from ballfg.benchmarks.cameras.hall import COURT, looking, picture
 from ballfg.vision.broadcast import graph
 from ballfg.vision.broadcast.lines import CROSSING, brightness, ridges
-from tests.vision.broadcast.scene import COURT, looking, picture
 
 CAMERA = looking((0.5, -7.0, 3.0), (0.0, 0.0, 0.0), 1000.0)
 

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
+from ballfg.benchmarks.cameras.hall import COURT, looking, panned, picture
 from ballfg.vision.broadcast.court import read_court
 from ballfg.vision.broadcast.lines import moved, slopes
 from ballfg.vision.broadcast.motion import find_motion
-from tests.vision.broadcast.scene import COURT, TENNIS, looking, panned, picture
+from tests.vision.broadcast.tennis import TENNIS
 
 
 @pytest.mark.parametrize(

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
+from ballfg.benchmarks.cameras.hall import COURT, SIZE, looking, panned, picture
 from ballfg.vision.arrays import Image
 from ballfg.vision.broadcast.background import matched
 from ballfg.vision.broadcast.candidates import aligned_candidates, find_candidates
 from ballfg.vision.broadcast.motion import Shot, find_motion
 from tests.commands import status
-from tests.vision.broadcast.scene import COURT, SIZE, looking, panned, picture
 
 SIDE = looking((0.5, -8.0, 3.5), (0.0, 0.0, 0.0), 1000.0)
 RADIUS, LIMITS = 0.02, np.array([3.0, 8.0])  # m; px, diameters of a ball

@@ -1,9 +1,9 @@
-"""Pictures of a table in a hall, from a camera that pans and zooms, for tests: drawn by projected polygons."""
+"""Draws pictures of a table in a hall from a camera that pans and zooms: projected polygons."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from typing import Final
 
 import cv2
 import numpy as np
@@ -14,18 +14,11 @@ from ballfg.vision.broadcast.court import Court, table_tennis
 from ballfg.vision.broadcast.lines import moved
 from ballfg.vision.broadcast.pinhole import Pinhole
 
-SIZE = (960, 540)
-COURT = table_tennis()
-TENNIS = """
-points: {a: [-11.885, -5.485], b: [11.885, -5.485], c: [11.885, 5.485], d: [-11.885, 5.485],
-  e: [-11.885, -4.115], f: [11.885, -4.115], g: [11.885, 4.115], h: [-11.885, 4.115],
-  i: [-6.4, -4.115], j: [-6.4, 4.115], k: [6.4, -4.115], l: [6.4, 4.115], m: [-6.4, 0], n: [6.4, 0]}
-corners: [a, b, c, d]
-lines: [[a, b], [b, c], [c, d], [d, a], [e, f], [h, g], [i, j], [k, l], [m, n]]
-line_width: 0.05
-net: [0.914, 6.4]
-"""
-FINE = 4  # bits of a drawn coordinate below a pixel
+SIZE: Final = (960, 540)
+"""px, of all pictures."""
+COURT: Final = table_tennis()
+FINE: Final = 4
+"""Bits of a drawn coordinate below a pixel."""
 
 
 def looking(place: Sequence[float], at: Sequence[float], focal: float, bend: float = 0.0) -> Pinhole:
@@ -99,13 +92,3 @@ def _dense(corners: Array) -> Array:
     shares = np.linspace(0.0, 1.0, 12, endpoint=False)[:, None]
     ends = np.roll(corners, -1, axis=0)
     return np.concatenate([a + shares * (b - a) for a, b in zip(corners, ends, strict=True)])
-
-
-def turned(camera: Pinhole, other: Pinhole) -> float:
-    """rad between the directions of two cameras."""
-    return float(np.linalg.norm(cv2.Rodrigues(camera.turn @ other.turn.T)[0]))
-
-
-def straight(camera: Pinhole) -> Pinhole:
-    """The camera without distortion."""
-    return replace(camera, bend=0.0)

@@ -1,4 +1,4 @@
-"""Draws balls and flights from the population that the intervals of one camera's strokes are for.
+"""Draws balls and strokes from the population that the intervals of one camera's strokes are for.
 
 Coefficients have the spreads that the model declares, spins those of strokes; flights and bounces scatter with the
 process noise of such a track. A nominal ball, which nothing scatters, would be inside of all intervals.
@@ -7,24 +7,71 @@ process noise of such a track. A nominal ball, which nothing scatters, would be 
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 import torch
 
 from ballfg.arrays import Array
-from ballfg.dynamics import AnalyticModel
+from ballfg.dynamics import AnalyticModel, Surfaces, nominal_model
+from ballfg.dynamics.motion.rollout import rollout
 from ballfg.estimation.settings import Settings
-from ballfg.state import SPIN, VELOCITY, VZ, Z
+from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, VELOCITY, VZ, Z
 from ballfg.vision.broadcast.court import NET_HEIGHT
-from tests.estimation.observations.sighted_rig import TABLE
-from tests.estimation.rallies import MODEL, Stroke, flown, stroke
 
+TABLE: Final = 0.76
+"""m, height of the table's surface."""
+MODEL: Final = nominal_model()
+SURFACES: Final = replace(Surfaces.table_tennis(TABLE), extent=(-1.37, 1.37, -0.7625, 0.7625))
 SETTINGS: Final = Settings.for_measured(MODEL)
 STEP: Final = 0.004  # s
 MOST_ODD: Final = 2.5  # standard deviations of a ball's coefficients
 TRIES: Final = 40
+
+
+@dataclass(frozen=True)
+class Stroke:
+    """A stroke from `begin` to `end`, s in its rally, and its first state (9,)."""
+
+    begin: float
+    end: float
+    state: Array
+
+
+def flown(state: Array, times: Array, ball: AnalyticModel = MODEL) -> Array:
+    """(n, 9) states at times (n,) s after a first one (9,)."""
+    with torch.no_grad():
+        given = torch.from_numpy(state[None]), torch.from_numpy(np.append(0.0, times))
+        return np.asarray(rollout(ball, *given, SURFACES)[0, 1:])
+
+
+def stroke(
+    place: Array, to: float, rng: np.random.Generator, ball: AnalyticModel = MODEL, given: Array | None = None
+) -> tuple[Array, float] | None:
+    """First state and duration of a stroke from a place to a half of the table, to: 1 or -1; None if none was drawn.
+
+    Args: given: its spin (3,) rad/s; None: drawn.
+    """
+    for _ in range(60):
+        aim = np.array([to * rng.uniform(0.35, 1.15), rng.uniform(-0.5, 0.5), TABLE + 0.02])
+        time = rng.uniform(0.28, 0.45)
+        spin = np.array([rng.normal(0, 15), to * rng.normal(60, 60), rng.normal(0, 15)])
+        spin = spin if given is None else given
+        velocity = (aim - place) / time
+        velocity[2] += 0.5 * STANDARD_GRAVITY * time
+        for _ in range(4):
+            end = flown(np.concatenate((place, velocity, spin)), np.array([0.999 * time]), ball)[0]
+            velocity = velocity + (np.array([0.0, 0.0, 0.3]) if end[VZ] > 0.0 else (aim - end[POSITION]) / time)
+        state, lasts = np.concatenate((place, velocity, spin)), time + rng.uniform(0.15, 0.32)
+        moments = np.arange(0.004, lasts, 0.004)
+        path = flown(state, moments, ball)
+        (turns,) = np.nonzero(np.diff(path[:, VZ]) > 1.0)
+        above = path[-1, Z] - TABLE
+        fine = len(turns) == 1 and abs(moments[turns[0]] - time) < 0.08 and 0.03 < above < 0.6
+        if fine and abs(path[-1, 0]) < 2.4 and np.linalg.norm(velocity) < 13.0:
+            return state, lasts
+    return None
 
 
 @dataclass(frozen=True)
@@ -47,7 +94,7 @@ def drawn_ball(rng: np.random.Generator) -> AnalyticModel:
     with torch.no_grad():
         for name, sigma in SETTINGS.coefficients.items():
             value = ball.get_parameter(name)
-            value += sigma * float(np.clip(rng.standard_normal(), -MOST_ODD, MOST_ODD))
+            value.add_(sigma * float(np.clip(rng.standard_normal(), -MOST_ODD, MOST_ODD)))
     return ball
 
 

@@ -1,0 +1,75 @@
+"""The judge of rendered rallies, on a rally that is known, and the rows of given scores."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ballfg.benchmarks.cameras.rallies import Score, add_rally, camera_judged, film, judged
+from ballfg.benchmarks.results import Results
+from ballfg.estimation.rally.events import events_of
+from ballfg.estimation.rally.reconstruct import reconstruct
+from ballfg.estimation.rally.video import Rally
+from ballfg.vision.broadcast.pinhole import Pinhole
+from ballfg.vision.detection.video import open_video
+from tests.estimation.rally.planted import MODEL, POSE_SIGMAS, RATE, SURFACES, planted
+
+
+def test_strokes_of_a_known_rally_are_found_and_those_of_another_are_false() -> None:
+    of, motion, found = planted("side", 21)
+    one = reconstruct(found, motion.shots[0], MODEL, SURFACES)
+    rally = Rally(motion, (one,), tuple(events_of(one, MODEL, SURFACES, 1.0 / RATE, 0.1525)), ())
+    score = judged(rally, of)
+    assert (score.found, score.false) == (len(one.estimates), 0)
+    assert max(score.errors) < 0.3
+    assert score.bounces[0] == score.found
+    assert np.mean(score.held) > 0.6
+    right, asked, sure, known = score.spins
+    assert sure <= min(right, known) <= asked
+    other, *_ = planted("behind", 4)
+    wrong = judged(rally, other)
+    assert wrong.found + wrong.false == len(one.estimates)
+    assert wrong.false > 0
+
+
+def test_the_errors_of_a_camera_are_shares_of_its_place_and_focal_length() -> None:
+    of, motion, _ = planted("side", 21)
+    (shot,) = motion.shots
+    true = of.cameras[0]
+    off = Pinhole(true.turn, true.place + POSE_SIGMAS[3] * np.eye(3)[0], 1.02 * true.focal, true.size, true.bend)
+    cameras = (off, *of.cameras[1 : len(shot)])
+    score = camera_judged(replace(shot, cameras=cameras), of)
+    assert score.place == pytest.approx(POSE_SIGMAS[3] / np.linalg.norm(true.place))
+    assert score.focal == pytest.approx(np.log(1.02))
+    assert score.held == [True, True, True, False, True, True]
+
+
+def test_rows_are_the_sums_of_all_rallies() -> None:
+    results = Results("cameras", 0)
+    scores = [
+        Score(4, 3, 1, [0.02, 0.03, 0.04], [True, True, False], (2, 3, 1, 1), (3, 4)),
+        Score(2, 2, 0, [0.05, 0.06], [True], (1, 1, 0, 0), (2, 2)),
+    ]
+    add_rally(results, "case", scores)
+    values = {row.metric: (row.value, row.n) for row in results.rows}
+    assert values == {
+        "strokes_found": (5 / 6, 6),
+        "false_strokes": (1 / 6, 6),
+        "bounces_found": (5 / 6, 6),
+        "spin_sign": (3 / 4, 4),
+        "position_rmse": (pytest.approx(40.0), 5),
+        "coverage_90": (3 / 4, 4),
+    }
+    nothing = Results("cameras", 0)
+    add_rally(nothing, "case", [Score(4, 0, 0, [], [], (0, 0, 0, 0), (0, 4))])
+    assert {row.metric: row.value for row in nothing.rows if row.value is not None} == {
+        "strokes_found": 0.0,
+        "bounces_found": 0.0,
+    }
+
+
+def test_a_film_has_a_picture_for_each_camera(tmp_path: Path) -> None:
+    of, *_ = planted("near", 3)
+    film(replace(of, cameras=of.cameras[:6]), tmp_path / "rally.mp4", RATE, 3)
+    assert open_video(tmp_path / "rally.mp4").count == 6
