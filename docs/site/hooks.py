@@ -12,7 +12,7 @@ CODE = re.compile(r"(```.*?```|`[^`\n]*`)", re.DOTALL)
 BLOCK = re.compile(r"\$\$(.+?)\$\$", re.DOTALL)
 INLINE = re.compile(r"(?<![\\$\w])\$(?!\s)([^$\n]+?)(?<!\s)\$(?!\w)")
 ROOM = re.compile(r"^::: (ballfg[\w.]*)$", re.MULTILINE)
-PUBLIC = re.compile(r"import (\w+) as \1$", re.MULTILINE)
+PUBLIC = re.compile(r"\b(\w+) as \1\b")
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
