@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Final
 
 import numpy as np
 
@@ -19,6 +20,8 @@ from ballfg.diagnosis.fit.problem import LABEL_LOSS, POSITION_LOSS
 from ballfg.diagnosis.fit.system import by_track
 from ballfg.state import STATE_DIM
 
+LOST: Final = -1e6
+"""Logarithm of the density of a track under a model that rounding alone decides about."""
 Weights = tuple[Array, Array, Array]
 """Robust weights of samples (n, k) and spins (n,), and their cost (n,)."""
 
@@ -238,13 +241,15 @@ def weighted(rows: Rows, left: Array, spins: Array) -> Likelihood:
 
 
 def posterior(reduced: Reduced, precision: Array, away: Array) -> Posterior:
-    """The evidence with all common unknowns integrated out.
+    """The evidence with all common unknowns integrated out; minus infinity and the prior if rounding left nothing.
 
     Args: precision: (c,) of their priors.  away: (c,) prior mean less present value.
     """
     total = reduced.gram.sum(axis=0)
     information, gradient = total[:-1, :-1] + np.diag(precision), total[:-1, -1] + precision * away
-    lower = np.linalg.cholesky(information)
+    lower = _triangle(information)
+    if not np.isfinite(lower).all():
+        return Posterior(-np.inf, np.inf, np.zeros_like(away), np.diag(1.0 / precision))
     covariance = np.linalg.inv(information)
     mean = covariance @ gradient
     square = total[-1, -1] - gradient @ mean + float((precision * away**2).sum())
@@ -253,18 +258,33 @@ def posterior(reduced: Reduced, precision: Array, away: Array) -> Posterior:
 
 
 def evidences(reduced: Reduced, precision: Array, away: Array) -> Array:
-    """(n,) the evidence of each part alone, with all common unknowns integrated out; arguments as in `posterior`."""
+    """(n,) the evidence of each part alone, with all common unknowns integrated out; NaN if rounding left nothing.
+
+    Args: as in `posterior`.
+    """
     information = reduced.gram[:, :-1, :-1] + np.diag(precision)
     gradient = reduced.gram[:, :-1, -1] + precision * away
-    lower = np.linalg.cholesky(information)
+    lower = _triangle(information)
     solved = np.linalg.solve(lower, gradient[..., None])[..., 0]
     square = reduced.gram[:, -1, -1] - (solved**2).sum(axis=-1) + float((precision * away**2).sum())
     narrow = np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=-1) - 0.5 * np.log(precision).sum()
     return np.asarray(reduced.constant - 0.5 * square - narrow)
 
 
+def _triangle(information: Array) -> Array:
+    """The triangle of matrices (..., c, c); NaN of those that rounding left indefinite, about a path far off, say."""
+    try:
+        return np.asarray(np.linalg.cholesky(information))
+    except np.linalg.LinAlgError:
+        if information.ndim == 2:
+            return np.full_like(information, np.nan)
+        return np.stack([_triangle(one) for one in information])
+
+
 def held_out(tracks: Reduced, precision: Array, away: Array, halves: Mask) -> Array:
     """(t,) logarithm of the density of each track, with common unknowns from the tracks of the other half.
+
+    It is `LOST` of all tracks if one has no density: they bear nothing out.
 
     Args: tracks: the part of each.  precision, away: as in `posterior`.  halves: (t,) which half each belongs to.
     """
@@ -273,4 +293,4 @@ def held_out(tracks: Reduced, precision: Array, away: Array, halves: Mask) -> Ar
         own, others = halves == half, tracks.of(halves != half)
         more = Reduced(others.constant + tracks.constant[own], others.gram + tracks.gram[own])
         found[own] = evidences(more, precision, away) - evidences(others, precision, away)
-    return found
+    return found if np.isfinite(found).all() else np.full(len(found), LOST)

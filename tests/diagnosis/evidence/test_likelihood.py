@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from ballfg.diagnosis.evidence.likelihood import Batches, Likelihood, Noise, posterior, unweighted
+from ballfg.diagnosis.evidence.likelihood import (
+    LOST,
+    Batches,
+    Likelihood,
+    Noise,
+    Reduced,
+    held_out,
+    posterior,
+    unweighted,
+)
 from ballfg.diagnosis.evidence.rows import batches_of, random_motion, rows_of
 from ballfg.diagnosis.evidence.sizes import settled, slopes_at
 from ballfg.state import STATE_DIM
@@ -222,3 +231,16 @@ def test_a_path_far_off_all_samples_has_hardly_any_density(rows, prior, part):
     far[0] *= 1e100
     likelihood, noise = settled([replace(rows, **{part: far})], *prior)
     assert posterior(likelihood.reduced(noise)[0], *prior).evidence < -1e6
+
+
+@pytest.mark.parametrize("bad", [0, 4])
+def test_a_model_that_rounding_left_indefinite_has_no_density_and_bears_nothing_out(likelihood, prior, bad):
+    reduced, _ = likelihood.reduced(NOISE)
+    gram = reduced.gram.copy()
+    gram[bad, 0, 0] = -10.0 * (np.abs(gram[:, 0, 0]).sum() + prior[0][0])
+    broken, halves = Reduced(reduced.constant, gram), np.array([True, False, True, False, False])
+    found = posterior(broken, *prior)
+    assert found.evidence == -np.inf
+    assert found.gain() == 0.0
+    assert (held_out(broken, *prior, halves) == LOST).all()
+    assert (held_out(reduced, *prior, halves) > LOST).all()
