@@ -22,8 +22,7 @@ from ballfg.arrays import Array
 from ballfg.benchmarks.cameras.hall import COURT, looking, panned, picture
 from ballfg.benchmarks.cameras.strokes import MODEL, STEP, TABLE, Scattered, drawn_ball, scattered
 from ballfg.benchmarks.metrics import median_and_quartiles, median_and_range, share
-from ballfg.benchmarks.results import Results
-from ballfg.benchmarks.resumable import in_processes
+from ballfg.benchmarks.results import Results, in_processes
 from ballfg.estimation.rally.video import OwnCandidates, Rally, track_moving_camera
 from ballfg.state import POSITION, SPIN, VZ
 from ballfg.vision.arrays import Image
@@ -90,7 +89,7 @@ def truth(view: str, rate: float, seed: int) -> Truth:
         found.append(drawn)
         place, now, side = drawn.at(drawn.end)[POSITION], drawn.end, -side
     centre, focal = VIEWS[view]
-    first = looking(np.add(centre, rng.normal(0.0, 0.3, 3)), (0.0, 0.0, 0.1), focal * rng.uniform(*ZOOM))
+    first = looking(np.add(centre, rng.normal(0.0, 0.3, 3)).tolist(), (0.0, 0.0, 0.1), focal * rng.uniform(*ZOOM))
     cameras = panned(first, int(LENGTH * rate), rng.normal(0.0, 0.06), rng.normal(0.0, 0.05))
     shaken = [moved(one, np.append(rng.normal(0.0, SHAKE, 3), np.zeros(4))) for one in cameras]
     return Truth(view, tuple(found), tuple(shaken), rng.uniform(*LIGHT), int(rng.integers(*QUALITY)))
@@ -243,5 +242,5 @@ def add_rally(results: Results, case: str, scores: Sequence[Score]) -> None:
     for name, (good, count) in shares.items():
         add(name, "1", share([True] * good + [False] * (count - good)) if count else np.nan, count)
     errors, held = (np.concatenate([getattr(one, name) for one in scores]) for name in ("errors", "held"))
-    add("position_rmse", "mm", median_and_quartiles(1e3 * errors) if found else np.nan, len(errors))
+    add("position_rmse", "mm", median_and_quartiles((1e3 * errors).tolist()) if found else np.nan, len(errors))
     add("coverage_90", "1", float(held.mean()) if found else np.nan, len(held))
