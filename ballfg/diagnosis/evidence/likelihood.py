@@ -20,6 +20,8 @@ from ballfg.diagnosis.fit.problem import LABEL_LOSS, POSITION_LOSS
 from ballfg.diagnosis.fit.system import by_track
 from ballfg.state import STATE_DIM
 
+ROUNDED: Final = 1e-6
+"""Rounding of inner products from which a stretch is reduced by its rows themselves."""
 LOST: Final = -1e6
 """Logarithm of the density of a track under a model that rounding alone decides about."""
 Weights = tuple[Array, Array, Array]
@@ -159,9 +161,27 @@ class Likelihood:
         total[:, kept, kept] += 1.0 + total[:, kept, kept]
         triangle = np.asarray(np.linalg.cholesky(total), dtype=np.float64)
         lower, solved = triangle[:, :end, :end], triangle[:, end:, :end]
+        gram -= solved @ solved.swapaxes(1, 2)
+        for one in np.flatnonzero(~lost & (largest * np.finfo(np.float64).eps > ROUNDED)).tolist():
+            triangle[one] = self._triangle(noise, one)
+            gram[one] = triangle[one, end:, end:] @ triangle[one, end:, end:].T
         narrow = np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)
         constant = np.where(lost, -np.inf, logs + self.rows.volume - narrow - self.penalty)
-        return Reduced(constant, gram - solved @ solved.swapaxes(1, 2)), Local(lower, solved)
+        return Reduced(constant, gram), Local(lower, solved)
+
+    def _triangle(self, noise: Noise, one: int) -> Array:
+        """(d, d) of a stretch, from its rows: their inner products lose half of the digits."""
+        r, count = self.rows, 3 * self.rows.used.shape[1]
+        listed = (r.by_start, r.random, r.by_common, r.residual[..., None])
+        columns = np.concatenate([part[one] for part in listed], axis=-1)
+        weights = np.exp(-noise.white) * np.sqrt(np.repeat(self.samples[one] * r.used[one], 3))
+        spins = self.spin_columns[one] * np.exp(-np.array(noise.spin)[r.spin_kinds[one]])[:, None]
+        rows, size = np.concatenate((columns[:count] * weights[:, None], spins)), columns.shape[-1]
+        priors, end = np.zeros(size), STATE_DIM + r.kinds.shape[1]
+        priors[:STATE_DIM] = ~rows[:, :STATE_DIM].any(axis=0)
+        priors[STATE_DIM:end] = np.exp(-np.append(noise.random, 0.0)[r.kinds[one]])
+        upper = np.linalg.qr(np.concatenate((rows, np.diag(priors))), mode="r")
+        return np.asarray((upper * np.where(np.diagonal(upper) < 0.0, -1.0, 1.0)[:, None]).T)
 
     def local_step(self, noise: Noise, common: Array) -> Array:
         """(n, l) first states and random motion that follow a step (c,) of the common unknowns."""

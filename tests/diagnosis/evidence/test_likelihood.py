@@ -244,3 +244,18 @@ def test_a_model_that_rounding_left_indefinite_has_no_density_and_bears_nothing_
     assert found.gain() == 0.0
     assert (held_out(broken, *prior, halves) == LOST).all()
     assert (held_out(reduced, *prior, halves) > LOST).all()
+
+
+def test_common_columns_that_first_states_nearly_explain_keep_their_digits(likelihood, prior):
+    """First states have no prior here: what of a common column they explain, however large, changes nothing."""
+    rows = replace(likelihood.rows, labelled=np.full(len(likelihood.rows.labelled), True))
+    of_states = np.random.default_rng(5).normal(size=(len(rows.used), 9, rows.by_common.shape[-1]))
+    plain, far = (
+        replace(likelihood, rows=replace(rows, by_common=rows.by_common + size * rows.by_start @ of_states))
+        for size in (0.0, 1e4)
+    )
+    (found, _), (reference, _) = far.reduced(NOISE), plain.reduced(NOISE)
+    total, _ = far.inner(NOISE)
+    assert 1e-6 < np.finfo(float).eps * np.diagonal(total, axis1=1, axis2=2).max() < 1.0
+    np.testing.assert_allclose(found.constant, reference.constant, rtol=1e-9)
+    np.testing.assert_allclose(found.gram, reference.gram, atol=1e-6)
