@@ -208,7 +208,7 @@ def gap_jacobian(model: BallModel, state: Tensor, height: Tensor | float) -> tup
     leaf = state.detach().requires_grad_(True)
     with torch.enable_grad():
         gap = model.gap(leaf, height)
-    (gradient,) = torch.autograd.grad(gap.sum(), leaf)
+        (gradient,) = torch.autograd.grad(gap.sum(), leaf)
     return gap.detach(), gradient
 
 
