@@ -180,8 +180,8 @@ class Likelihood:
         priors, end = np.zeros(size), STATE_DIM + r.kinds.shape[1]
         priors[:STATE_DIM] = ~rows[:, :STATE_DIM].any(axis=0)
         priors[STATE_DIM:end] = np.exp(-np.append(noise.random, 0.0)[r.kinds[one]])
-        upper = np.linalg.qr(np.concatenate((rows, np.diag(priors))), mode="r")
-        return np.asarray((upper * np.where(np.diagonal(upper) < 0.0, -1.0, 1.0)[:, None]).T)
+        upper: Array = np.asarray(np.linalg.qr(np.concatenate((rows, np.diag(priors))), mode="r"))
+        return (upper * np.where(np.diagonal(upper) < 0.0, -1.0, 1.0)[:, None]).T
 
     def local_step(self, noise: Noise, common: Array) -> Array:
         """(n, l) first states and random motion that follow a step (c,) of the common unknowns."""
