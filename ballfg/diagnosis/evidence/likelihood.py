@@ -20,7 +20,7 @@ from ballfg.diagnosis.fit.problem import LABEL_LOSS, POSITION_LOSS
 from ballfg.diagnosis.fit.system import by_track
 from ballfg.state import STATE_DIM
 
-ROUNDED: Final = 1e-6
+ROUNDED: Final = 1e-3
 """Rounding of inner products from which a stretch is reduced by its rows themselves."""
 LOST: Final = -1e6
 """Logarithm of the density of a track under a model that rounding alone decides about."""
