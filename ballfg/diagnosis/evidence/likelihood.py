@@ -153,8 +153,8 @@ class Likelihood:
         """First states and random motion integrated out; stretches that leave all numbers have no density."""
         total, logs = self.inner(noise)
         end = STATE_DIM + self.rows.kinds.shape[1]
-        largest = np.diagonal(total, axis1=1, axis2=2).max(axis=1)
-        lost = ~(largest * np.finfo(np.float64).eps < 1.0)  # rounding alone is a unit of evidence
+        rounding = np.diagonal(total, axis1=1, axis2=2).max(axis=1) * np.finfo(np.float64).eps
+        lost = ~(rounding < 1.0)  # rounding alone is a unit of evidence
         total[lost] = np.eye(total.shape[-1])
         gram, kept = total[:, end:, end:].copy(), np.arange(end, total.shape[-1])
         # its triangle below the eliminated rows is the same whatever these hold; large, they stay definite
@@ -162,15 +162,15 @@ class Likelihood:
         triangle = np.asarray(np.linalg.cholesky(total), dtype=np.float64)
         lower, solved = triangle[:, :end, :end], triangle[:, end:, :end]
         gram -= solved @ solved.swapaxes(1, 2)
-        for one in np.flatnonzero(~lost & (largest * np.finfo(np.float64).eps > ROUNDED)).tolist():
-            triangle[one] = self._triangle(noise, one)
+        for one in np.flatnonzero(~lost & (rounding > ROUNDED)).tolist():
+            triangle[one] = self._from_rows(noise, one)
             gram[one] = triangle[one, end:, end:] @ triangle[one, end:, end:].T
         narrow = np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)
         constant = np.where(lost, -np.inf, logs + self.rows.volume - narrow - self.penalty)
         return Reduced(constant, gram), Local(lower, solved)
 
-    def _triangle(self, noise: Noise, one: int) -> Array:
-        """(d, d) of a stretch, from its rows: their inner products lose half of the digits."""
+    def _from_rows(self, noise: Noise, one: int) -> Array:
+        """(d, d) the triangle of a stretch, from its rows: their inner products lose half of the digits."""
         r, count = self.rows, 3 * self.rows.used.shape[1]
         listed = (r.by_start, r.random, r.by_common, r.residual[..., None])
         columns = np.concatenate([part[one] for part in listed], axis=-1)
