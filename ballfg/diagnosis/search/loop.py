@@ -233,7 +233,7 @@ class _Found:
             candidate = next(s for s in scored if s.hypothesis is other)
             refitted = refit(without_named(best.fit, [own], self.first), candidate)
             named = (*(h for h in best.named if h is not own), other)
-            found = weighed(refitted.fit, named, self.motion, self.halves, best.noise)
+            found = weighed(refitted.fit, named, self.motion, self.halves, best)
             self.models[found.names] = found
             tried.append((found, refitted))
         winner = self.most_probable(found for found, _ in tried)
@@ -282,7 +282,7 @@ class _Found:
         """The same models with something nameless beside their effects."""
         new = {m.names | {NAMELESS}: m for m in models if m.names | {NAMELESS} not in self.models}
         tasks = [
-            partial(weighed, m.fit, m.named, self.motion, self.halves, m.noise, self.patterns) for m in new.values()
+            partial(weighed, m.fit, m.named, self.motion, self.halves, m, self.patterns) for m in new.values()
         ]
         self.models |= dict(zip(new, do_all(tasks, self.loop.jobs), strict=True))
         return [self.models[m.names | {NAMELESS}] for m in models]
@@ -302,7 +302,7 @@ class _Found:
         if known is None or (poor and (model.names, names) not in self.tried):
             self.tried.add((model.names, names))
             fit = without_named(model.fit, gone, self.first)
-            found = weighed(fit, kept, self.motion, self.halves, model.noise)
+            found = weighed(fit, kept, self.motion, self.halves, model)
             self.models[names] = found if known is None else max(known, found, key=_score)
         return self.models[names]
 
@@ -313,7 +313,7 @@ class _Found:
         """
         best = self.best
         tasks = [
-            partial(weighed, r.fit, (*best.named, *r.added), self.motion, self.halves, best.noise)
+            partial(weighed, r.fit, (*best.named, *r.added), self.motion, self.halves, best)
             for r in refits
             if np.isfinite(r.fit.cost)
         ]
@@ -340,7 +340,7 @@ class _Found:
         """
         if before.names in after.nested and after.nested[before.names].score > before.score:
             fit = without_named(after.fit, after.named[len(before.named) :], self.first)
-            again = weighed(fit, before.named, self.motion, self.halves, before.noise)
+            again = weighed(fit, before.named, self.motion, self.halves, before)
             if again.score > before.score:
                 self.models[before.names] = again
                 if self.scores[again.names] > self.scores[after.names]:
