@@ -21,6 +21,8 @@ LEAST, MOST = -5.0, 5.0
 """Bounds of the logarithm of a size over its unit."""
 MOST_STEPS, SETTLED = 30, 0.05
 """Largest number of steps of the sizes, and the gain of evidence that ends them."""
+ENOUGH: Final = 0.05
+"""Share of what a step of the common unknowns should gain that ends the sizes' steps too: it will change them."""
 LONGEST: Final = 1.5
 """Largest step of the logarithm of a size."""
 
@@ -78,11 +80,12 @@ def _climbed(
 ) -> tuple[float, Batches, Noise]:
     """The largest evidence near a start, by steps with the average information, the weights following the sizes."""
 
-    def at(likelihood: Batches, noise: Noise) -> tuple[Posterior, list[Local]]:
+    def at(likelihood: Batches, noise: Noise) -> tuple[Posterior, float, list[Local]]:
         reduced, local = likelihood.reduced(noise)
-        return posterior(reduced, precision, away).held(own), local
+        free = posterior(reduced, precision, away)
+        return free.held(own), free.gain(own), local
 
-    found, local = at(likelihood, noise)
+    found, to_come, local = at(likelihood, noise)
     for _ in range(MOST_STEPS):
         if not np.isfinite(found.evidence):
             break
@@ -92,11 +95,11 @@ def _climbed(
         while gain <= 0.0 and (share == 1.0 or share * promised > SETTLED):
             moved = Noise.of(noise.vector + share * step)
             weights = likelihood.beside(slopes.along, moved)
-            after, eliminated = at(weights, moved)
+            after, ahead, eliminated = at(weights, moved)
             gain, share = after.evidence - found.evidence, 0.5 * share
         if gain > 0.0:
-            likelihood, noise, found, local = weights, moved, after, eliminated
-        if gain < SETTLED:
+            likelihood, noise, found, to_come, local = weights, moved, after, ahead, eliminated
+        if gain < max(SETTLED, ENOUGH * to_come):
             break
     return found.evidence, likelihood, noise
 

@@ -24,6 +24,8 @@ MOST_STEPS = 8
 """Largest number of steps from a deterministic fit to the most probable unknowns."""
 SHARES = (1.0, 0.5, 0.25)
 """Of a step, tried in turn."""
+MOSTLY = 0.5
+"""Share of a step's expected gain from which no shorter step is tried."""
 WORTH_A_STEP = 0.5
 """Least expected gain of a step, natural units."""
 
@@ -290,7 +292,7 @@ class _Question:
                 best, most = after, density
             elif best is not None:
                 break
-            if most > before + step.gain - WORTH_A_STEP:  # as foretold
+            if most > before + MOSTLY * step.gain:
                 break
         return best
 
