@@ -10,7 +10,7 @@ import numpy as np
 
 from ballfg.arrays import Array, Mask
 from ballfg.diagnosis.evidence.halves import unlike_halves
-from ballfg.diagnosis.evidence.likelihood import Batches, Noise, Reduced, Weights, held_out, posterior
+from ballfg.diagnosis.evidence.likelihood import Noise, Reduced, Weights, held_out, posterior
 from ballfg.diagnosis.evidence.nameless import NAMELESS, Patterns
 from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, log_odds, within
 from ballfg.diagnosis.evidence.priors_of_fit import Priors
@@ -237,7 +237,9 @@ class _Question:
         beside = rows if patterns is None else patterns.beside(rows)
         return _Point(fit, beside, Priors.of(fit, self.named, patterns))
 
-    def at(self, point: _Point, starts: Sequence[Start | None], widths: Sequence[int] = ()) -> tuple[Weighed, Step, float]:
+    def at(
+        self, point: _Point, starts: Sequence[Start | None], widths: Sequence[int] = ()
+    ) -> tuple[Weighed, Step, float]:
         """The model at the unknowns of a point, the step to more probable ones, and the density as in `_density`.
 
         Args:

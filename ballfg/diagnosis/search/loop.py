@@ -23,7 +23,7 @@ from ballfg.diagnosis.search.candidates import FIRST_STEPS, Refit, Scored, refit
 from ballfg.diagnosis.search.evaluation import on_all, on_others
 from ballfg.diagnosis.search.ranking import finding_of, ranking
 from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_findings, stamp_hypotheses
-from ballfg.diagnosis.search.trial import try_hypotheses, try_varying
+from ballfg.diagnosis.search.trial import try_beside, try_hypotheses, try_varying
 from ballfg.dynamics import AnalyticModel, BallModel
 from ballfg.dynamics.effect import Effect
 from ballfg.estimation.batch import do_all
@@ -245,21 +245,65 @@ class _Found:
         return refitted
 
     def compare(self) -> None:
-        """Weighs what is left of the best model beside something nameless, without effects that this makes superfluous.
+        """Weighs something nameless beside the best model, and which effects are there beside it.
 
-        The linearised model says which effects are, and a refit confirms it.
+        Patterns make some effects superfluous. They also show others, which a model that lacks them hides: an effect
+        alone takes the values that make up for what no effect describes.
         """
         self.loop.watch("weighing what has no name")
         self.beside_nameless([self.models[frozenset()]])
         (best,) = self.beside_nameless([self.best])
+        best = self._shortened(best)
+        while self.is_better(best) and len(best.named) < MOST_EFFECTS and (more := self._beyond(best)) is not None:
+            best = self._shortened(more)
+        odds = self.odds.models
+        self.best = max(self.models.values(), key=lambda model: odds[model.names])
+
+    def _shortened(self, best: Weighed) -> Weighed:
+        """A model with something nameless, without effects that this makes superfluous.
+
+        The linearised model says which effects are, and a refit confirms it.
+        """
         while gone := self._superfluous(best):
             tried = [self.without([h], best) for h in gone] + [self.without(gone, best)] * (len(gone) > 1)
             shorter = self.most_probable(self.beside_nameless(tried))
             if shorter is None or self.scores[shorter.names] <= self.scores[best.names]:
                 break
             best = shorter
-        odds = self.odds.models
-        self.best = max(self.models.values(), key=lambda model: odds[model.names])
+        return best
+
+    def _beyond(self, best: Weighed) -> Weighed | None:
+        """A more probable model with further effects beside something nameless; None if there is none.
+
+        Effects that are the same for all tracks are tried first. What is found is weighed without patterns as well.
+        """
+        loop, most = self.loop, MOST_EFFECTS - len(best.named)
+        tell: Callable[[str], None] = lambda line: loop.watch(f"beside something nameless: {line}")  # noqa: E731
+        winner = self._named_beside(best, try_beside(best, self.motion, self.patterns, loop.catalogue, tell, most))
+        if winner is None:
+            ways = loop.ways or partial(groupings, loop.holdout.tracks)
+            of_some = loop.of_some or loop.catalogue
+            _, varying = try_varying(best, self.motion, of_some, ways, tell, loop.jobs, self.patterns)
+            winner = self._named_beside(best, varying)
+        if winner is not None and winner.names - {NAMELESS} not in self.models:
+            plain = weighed(winner.fit, winner.named, self.motion, self.halves, winner)
+            self.models[plain.names] = plain
+        return winner
+
+    def _named_beside(self, best: Weighed, refits: Sequence[Refit]) -> Weighed | None:
+        """The most probable of some refits beside something nameless, if it is more probable than the best one."""
+        tasks = [
+            partial(weighed, r.fit, (*best.named, *r.added), self.motion, self.halves, best, self.patterns)
+            for r in refits
+            if np.isfinite(r.fit.cost)
+        ]
+        found = do_all(tasks, self.loop.jobs)
+        for model in found:
+            known = self.models.get(model.names)
+            self.models[model.names] = model if known is None else max(known, model, key=_score)
+        winner = self.most_probable(self.models[model.names] for model in found)
+        better = winner is not None and self.scores[winner.names] > self.scores[best.names]
+        return winner if better else None
 
     def named_at(self, probability: float) -> Weighed:
         """The model with all effects that are at least so probable, or with most of them.
@@ -281,9 +325,7 @@ class _Found:
     def beside_nameless(self, models: Sequence[Weighed]) -> list[Weighed]:
         """The same models with something nameless beside their effects."""
         new = {m.names | {NAMELESS}: m for m in models if m.names | {NAMELESS} not in self.models}
-        tasks = [
-            partial(weighed, m.fit, m.named, self.motion, self.halves, m, self.patterns) for m in new.values()
-        ]
+        tasks = [partial(weighed, m.fit, m.named, self.motion, self.halves, m, self.patterns) for m in new.values()]
         self.models |= dict(zip(new, do_all(tasks, self.loop.jobs), strict=True))
         return [self.models[m.names | {NAMELESS}] for m in models]
 
