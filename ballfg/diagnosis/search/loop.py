@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
 import numpy as np
+import torch
 
 from ballfg.arrays import Mask
 from ballfg.diagnosis.evidence.halves import unlike_halves
@@ -16,7 +17,7 @@ from ballfg.diagnosis.evidence.weighed import WORTH_A_STEP, Weighed, weighed
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.fit.problem import Fit, Problem
-from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, without_effect
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, with_effects, without_effect
 from ballfg.diagnosis.hypotheses.varying import Grouping, groupings
 from ballfg.diagnosis.result import Candidate, Errors, Finding
 from ballfg.diagnosis.search.candidates import FIRST_STEPS, Refit, Scored, refit
@@ -112,6 +113,8 @@ class SearchLoop:
         stamps, odds = self.holdout.stamps, found.odds
         final = found.named_at(self.name_at)
         whole = found.models[final.names - {NAMELESS}].fit
+        if final.nameless and final.named:
+            whole = with_strengths_of(final, whole)
         self.watch("predicting the other half")
         declared = self.predictive(first)
         judged = self.judge(declared)
@@ -399,6 +402,25 @@ class _Found:
 
 def _score(model: Weighed) -> float:
     return model.score
+
+
+def with_strengths_of(model: Weighed, fit: Fit) -> Fit:
+    """A fit without patterns, its named effects as strong as in the model beside them.
+
+    Free, they would make up for what no effect describes. Effects that differ between tracks stay free.
+    """
+    known, problem = model.fit.unknowns.values, fit.problem
+    held = {c: known[c] for h in model.named if not h.deviations() for c in h.columns if c in problem.free}
+    changed = with_effects(problem.model)
+    parameters = dict(changed.named_parameters())
+    with torch.no_grad():
+        for name, value in held.items():
+            parameters[name].fill_(value)
+    free = {name: c for name, c in problem.free.items() if name not in held}
+    values = {name: value for name, value in fit.unknowns.values.items() if name in free}
+    problem = replace(problem, model=changed, free=free)
+    fitted = fit_problem(problem, replace(fit.unknowns, values=values), fit.noise)
+    return fitted if np.isfinite(fitted.cost) else fit
 
 
 def without_named(fit: Fit, gone: Sequence[Hypothesis], first: Fit) -> Fit:
