@@ -35,8 +35,13 @@ class Start:
     weights: Sequence[Weights] | None = None
 
     def begun(self, rows: Sequence[Rows]) -> tuple[Batches, Noise]:
-        """The likelihood of rows with these sizes, and the weights of what they leave."""
-        return Batches.of(rows, self.weights).reweighted(self.noise), self.noise
+        """The likelihood of rows with these sizes, and the weights of what they leave.
+
+        Labels begin with a weight of one: their loss is not convex, and one that a wrong model contradicts would stay
+        out.
+        """
+        known = self.weights and [(samples, np.ones_like(spins), cost) for samples, spins, cost in self.weights]
+        return Batches.of(rows, known).reweighted(self.noise), self.noise
 
 
 @dataclass(frozen=True)

@@ -254,26 +254,41 @@ class _Found:
         alone takes the values that make up for what no effect describes.
         """
         self.loop.watch("weighing what has no name")
-        self.beside_nameless([self.models[frozenset()]])
+        (nothing,) = self.beside_nameless([self.models[frozenset()]])
         (best,) = self.beside_nameless([self.best])
-        best = self._shortened(best)
-        while self.is_better(best) and len(best.named) < MOST_EFFECTS and (more := self._beyond(best)) is not None:
-            best = self._shortened(more)
+        for start in (self._shortened(best), nothing):  # effects found alone may stand for others
+            grown = start
+            while (
+                self._without_name(grown)
+                and len(grown.named) < MOST_EFFECTS
+                and (more := self._beyond(grown)) is not None
+            ):
+                grown = self._shortened(more)
         odds = self.odds.models
         self.best = max(self.models.values(), key=lambda model: odds[model.names])
+
+    @property
+    def is_nameless(self) -> bool:
+        """Whether the most probable model holds something nameless."""
+        best = self.most_probable(self.models.values())
+        return best is not None and best.nameless
 
     def _shortened(self, best: Weighed) -> Weighed:
         """A model with something nameless, without effects that this makes superfluous.
 
         The linearised model says which effects are, and a refit confirms it.
         """
-        while gone := self._superfluous(best):
-            tried = [self.without([h], best) for h in gone] + [self.without(gone, best)] * (len(gone) > 1)
-            shorter = self.most_probable(self.beside_nameless(tried))
-            if shorter is None or self.scores[shorter.names] <= self.scores[best.names]:
-                break
-            best = shorter
-        return best
+        tried = {best.names}
+        while True:
+            scores = self.scores
+            names = max(best.nested, key=lambda names: scores[names], default=best.names)
+            if names in tried or scores[names] <= scores[best.names]:
+                return best
+            tried.add(names)
+            gone = [h for h in best.named if h.name not in names]
+            (shorter,) = self.beside_nameless([self.without(gone, best)])
+            if self.scores[shorter.names] > self.scores[best.names]:
+                best = shorter
 
     def _beyond(self, best: Weighed) -> Weighed | None:
         """A more probable model with further effects beside something nameless; None if there is none.
@@ -300,11 +315,7 @@ class _Found:
             for r in refits
             if np.isfinite(r.fit.cost)
         ]
-        found = do_all(tasks, self.loop.jobs)
-        for model in found:
-            known = self.models.get(model.names)
-            self.models[model.names] = model if known is None else max(known, model, key=_score)
-        winner = self.most_probable(self.models[model.names] for model in found)
+        winner = self.most_probable(self._known(do_all(tasks, self.loop.jobs)))
         better = winner is not None and self.scores[winner.names] > self.scores[best.names]
         return winner if better else None
 
@@ -362,16 +373,19 @@ class _Found:
             for r in refits
             if np.isfinite(r.fit.cost)
         ]
-        found = do_all(tasks, self.loop.jobs)
-        for model in found:
-            if model.names not in self.models or model.score > self.models[model.names].score:
-                self.models[model.names] = model
+        found = self._known(do_all(tasks, self.loop.jobs))
         scores = self.scores
         for model in list(found):
             names = max(model.nested, key=lambda names: scores[names], default=model.names)
             if scores[names] > max(scores[model.names], scores[best.names]):
                 found.append(self.without([h for h in model.named if h.name not in names], model))
-        return self.most_probable(found)
+        return self.most_probable(self.models[model.names] for model in found)  # a smaller one may replace its refit
+
+    def _known(self, found: Sequence[Weighed]) -> list[Weighed]:
+        """Models with their effects in the best minimum of all that were found, each once; they count from now on."""
+        for model in found:
+            self.models[model.names] = max(self.models.get(model.names, model), model, key=_score)
+        return [self.models[names] for names in dict.fromkeys(model.names for model in found)]
 
     def _superfluous(self, model: Weighed) -> list[Hypothesis]:
         """Effects without which a model is more probable, as far as is known."""
