@@ -136,16 +136,16 @@ def shortlist(scored: Sequence[Scored]) -> list[Scored]:
     return [replace(best, shapes=tuple(s.hypothesis for s in others[: MOST_SHAPES - 1])) for best, *others in leading]
 
 
-def leading_sets(screen: Screen, scored: Sequence[Scored], most: int, smallest: int = PAIR) -> list[tuple[int, ...]]:
-    """The most probable set of `smallest` to `most` visible hypotheses, and the most probable of the smallest ones.
+def leading_sets(screen: Screen, scored: Sequence[Scored], most: int) -> list[tuple[int, ...]]:
+    """The most probable set of up to `most` visible hypotheses, and the most probable pair.
 
-    None that is foretold to be less probable than fewer hypotheses.
+    None that is foretold to be less probable than one hypothesis alone.
     """
     seen = {id(s.hypothesis) for s in scored if s.score is not None}
     visible = [one for one, candidate in enumerate(screen.candidates) if id(candidate) in seen]
-    likely = list(takewhile(lambda chosen: len(chosen) >= smallest, screen.sets(visible, most)))
-    small = [chosen for chosen in likely if len(chosen) == smallest]
-    return list(dict.fromkeys((*likely[:1], *small[:1])))
+    likely = list(takewhile(lambda chosen: len(chosen) >= PAIR, screen.sets(visible, most)))
+    pairs = [chosen for chosen in likely if len(chosen) == PAIR]
+    return list(dict.fromkeys((*likely[:1], *pairs[:1])))
 
 
 def refit_set(before: Fit, chosen: Sequence[Scored], step: Step, strengths: Array) -> Refit:

@@ -257,21 +257,18 @@ class _Found:
         (nothing,) = self.beside_nameless([self.models[frozenset()]])
         (best,) = self.beside_nameless([self.best])
         for start in (self._shortened(best), nothing):  # effects found alone may stand for others
-            grown = start
-            while (
-                self._without_name(grown)
-                and len(grown.named) < MOST_EFFECTS
-                and (more := self._beyond(grown)) is not None
-            ):
-                grown = self._shortened(more)
+            self._grow(start)
         odds = self.odds.models
         self.best = max(self.models.values(), key=lambda model: odds[model.names])
 
-    @property
-    def is_nameless(self) -> bool:
-        """Whether the most probable model holds something nameless."""
-        best = self.most_probable(self.models.values())
-        return best is not None and best.nameless
+    def _grow(self, best: Weighed) -> None:
+        """Adds effects to a model with something nameless, if that is more probable than none."""
+        while len(best.named) < MOST_EFFECTS:
+            leading = self.most_probable(self.models.values())
+            more = self._beyond(best) if leading is not None and leading.nameless else None
+            if more is None:
+                return
+            best = self._shortened(more)
 
     def _shortened(self, best: Weighed) -> Weighed:
         """A model with something nameless, without effects that this makes superfluous.
@@ -297,7 +294,9 @@ class _Found:
         """
         loop, most = self.loop, MOST_EFFECTS - len(best.named)
         tell: Callable[[str], None] = lambda line: loop.watch(f"beside something nameless: {line}")  # noqa: E731
-        winner = self._named_beside(best, try_beside(best, self.motion, self.patterns, loop.catalogue, tell, most))
+        winner = self._named_beside(
+            best, try_beside(best, self.motion, self.patterns, loop.catalogue, tell, loop.jobs, most)
+        )
         if winner is None:
             ways = loop.ways or partial(groupings, loop.holdout.tracks)
             of_some = loop.of_some or loop.catalogue

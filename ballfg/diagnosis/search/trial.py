@@ -128,9 +128,10 @@ def try_beside(
     patterns: Patterns,
     catalogue: Sequence[type[Effect]],
     tell: Callable[[str], None],
-    most: int,
+    jobs: int = 1,
+    most: int = 1,
 ) -> list[Refit]:
-    """Refits of the sets of hypotheses that a model most probably lacks beside its patterns without a name.
+    """Refits of the hypotheses, and sets of them, that a model most probably lacks beside its patterns without a name.
 
     Args: as in `try_hypotheses`.  patterns: that the model was weighed with.
     """
@@ -139,8 +140,9 @@ def try_beside(
         return []
     tell(f"testing {len(testable)} hypotheses")
     scored, screen = screened(model, testable, motion, patterns)
-    likely = [chosen for chosen in leading_sets(screen, scored, most, 1) if screen.odds(chosen) > 0.0]
-    return [one() for one in _set_refits(screen, scored, likely, tell)]
+    tasks = _refits(model.fit, shortlist(scored), tell)
+    tasks += _set_refits(screen, scored, leading_sets(screen, scored, most), tell)
+    return do_all(tasks, jobs)
 
 
 def try_hypotheses(
