@@ -404,7 +404,7 @@ class _Found:
         """
         if before.names not in after.nested or after.nested[before.names].score <= before.score:
             return False
-        fit = without_named(after.fit, after.named[len(before.named) :], self.first)
+        fit = without_named(after.fit, [h for h in after.named if h.name not in before.names], self.first)
         patterns = self.patterns if before.nameless else None
         again = weighed(fit, before.named, self.motion, self.halves, before, patterns)
         if again.score > before.score:
