@@ -21,7 +21,8 @@ import torch
 
 from ballfg.arrays import Array
 from ballfg.benchmarks.dynamics.measured import measured_task
-from ballfg.dynamics import AnalyticModel, nominal_model
+from ballfg.dynamics import AnalyticModel, BallModel, nominal_model
+from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import Settings, Status, predict_tracks
 from ballfg.estimation.registry import make_estimator
 from ballfg.learning.calibration.auto import (
@@ -40,7 +41,7 @@ from ballfg.learning.calibration.calibrate import (
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.config_file import AUTO
 from ballfg.learning.evaluation import NINETY, log_density
-from ballfg.tracks import Track, read_dataset, write_dataset
+from ballfg.tracks import Dataset, Track, read_dataset, write_dataset
 from ballfg.tracks.info import DatasetInfo
 
 
@@ -65,23 +66,26 @@ class Halves:
 
         Args: chosen: numbers of the training tracks.
         """
-        parts = (("train", [self.train[k] for k in chosen]), ("test", self.judge))
-        tracks = [
-            replace(track, labels={**track.labels, "split": split}, name=f"{number:04}")
-            for number, (split, track) in enumerate((split, track) for split, part in parts for track in part)
-        ]
-        with tempfile.TemporaryDirectory() as written:
-            write_dataset(Path(written) / "data", self.info, tracks)
-            dataset, model = read_dataset(Path(written) / "data"), nominal_model(self.info.ball)
+        with tempfile.TemporaryDirectory() as folder:
+            dataset, model = self.written(Path(folder) / "data", chosen), nominal_model(self.info.ball)
             problem = pose(dataset, model, CalibrationConfig(split="label"))
             begun = time.process_time()
             choice, candidates = choose_candidate(problem)
             print(choice.table(), choice.verdict(), sep="\n")
             print(f"{time.process_time() - begun:.0f} s of processor time", flush=True)
-            found = {name: errors(problem, *finished(problem, one), self.judge) for name, one in candidates.items()}
-            if choice.chosen not in found:
-                found[choice.chosen] = errors(problem, *finished(problem, choice.chosen), self.judge)
+            kinds: dict[str, Fitted | str] = {choice.chosen: choice.chosen} | dict(candidates)
+            found = {name: errors(problem.surfaces, *finished(problem, one), self.judge) for name, one in kinds.items()}
             return found | {AUTO: found[choice.chosen]}
+
+    def written(self, folder: Path, chosen: Sequence[int]) -> Dataset:
+        """A dataset of some training tracks, and the judging ones, with the label `split`."""
+        parts = (("train", [self.train[k] for k in chosen]), ("test", self.judge))
+        tracks = [
+            replace(track, labels={**track.labels, "split": split}, name=f"{number:04}")
+            for number, (split, track) in enumerate((split, track) for split, part in parts for track in part)
+        ]
+        write_dataset(folder, self.info, tracks)
+        return read_dataset(folder)
 
 
 def finished(problem: Problem, made: Fitted | str) -> tuple[AnalyticModel, Settings]:
@@ -96,9 +100,9 @@ def finished(problem: Problem, made: Fitted | str) -> tuple[AnalyticModel, Setti
     return model, settings if noise is None else noise.settings
 
 
-def errors(problem: Problem, model: AnalyticModel, settings: Settings, judged: Sequence[Track]) -> Array:
+def errors(surfaces: Surfaces, model: BallModel, settings: Settings, judged: Sequence[Track]) -> Array:
     """As `Halves.judged`."""
-    estimator = make_estimator("smoother", model, problem.surfaces, settings)
+    estimator = make_estimator("smoother", model, surfaces, settings)
     rows = []
     for one in predict_tracks(estimator, judged, len(judged), 0.25, horizon=0.3):
         if one.status is Status.OK and len(one.times):
@@ -109,6 +113,13 @@ def errors(problem: Problem, model: AnalyticModel, settings: Settings, judged: S
         else:
             rows.append([np.nan] * 5)
     return np.array(rows)
+
+
+def numbers_of(rows: Array) -> str:
+    """What a line says of rows of `errors`."""
+    held = np.nanmean(rows[:, 2:], axis=0)
+    numbers = f"median {np.nanmedian(rows[:, 0]):.1f} mm, log score {np.nanmean(rows[:, 1]):.3f}"
+    return f"{numbers}, held {held.mean():.0f} % ({' / '.join(f'{axis:.0f}' for axis in held)})"
 
 
 def few(halves: Halves, size: int, draws: int, seed: int) -> str:
@@ -143,10 +154,7 @@ def main() -> None:
             print(f"{folder.name}, {few(halves, size, given.draws, given.seed)}", flush=True)
         kinds = {} if given.tracks else halves.judged(range(len(halves.train)))
         for kind, rows in kinds.items():
-            held = np.nanmean(rows[:, 2:], axis=0)
-            numbers = f"median {np.nanmedian(rows[:, 0]):.1f} mm, log score {np.nanmean(rows[:, 1]):.3f}"
-            axes = " / ".join(f"{axis:.0f}" for axis in held)
-            print(f"{folder.name}, {kind}: {numbers}, held {held.mean():.0f} % ({axes})", flush=True)
+            print(f"{folder.name}, {kind}: {numbers_of(rows)}", flush=True)
 
 
 if __name__ == "__main__":
