@@ -224,6 +224,7 @@ class Effect(nn.Module, ABC):
         needs: names of effects that this one modifies and that must be in the same model.
         learned: True if only a training writes it, so that no search for causes tries it.
         multiplies_spin: True if its strength multiplies the spin: without spin labels its slope at absence is zero.
+        tabled: names of coefficients that no estimate moves: machine code has no derivatives by them.
 
     Raises: ValueError: if a value is given for an unknown coefficient, or lies out of its bounds.
     """
@@ -242,6 +243,7 @@ class Effect(nn.Module, ABC):
     needs: ClassVar[tuple[str, ...]] = ()
     learned: ClassVar[bool] = False
     multiplies_spin: ClassVar[bool] = False
+    tabled: ClassVar[frozenset[str]] = frozenset()
 
     def __init__(self, /, **values: float) -> None:
         super().__init__()
