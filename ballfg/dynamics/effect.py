@@ -224,7 +224,6 @@ class Effect(nn.Module, ABC):
         needs: names of effects that this one modifies and that must be in the same model.
         learned: True if only a training writes it, so that no search for causes tries it.
         multiplies_spin: True if its strength multiplies the spin: without spin labels its slope at absence is zero.
-        tabled: names of coefficients that no estimate moves: machine code has no derivatives by them.
 
     Raises: ValueError: if a value is given for an unknown coefficient, or lies out of its bounds.
     """
@@ -243,7 +242,6 @@ class Effect(nn.Module, ABC):
     needs: ClassVar[tuple[str, ...]] = ()
     learned: ClassVar[bool] = False
     multiplies_spin: ClassVar[bool] = False
-    tabled: ClassVar[frozenset[str]] = frozenset()
 
     def __init__(self, /, **values: float) -> None:
         super().__init__()
@@ -265,6 +263,11 @@ class Effect(nn.Module, ABC):
 
         def __getattr__(self, name: str) -> Tensor:
             """The value of a coefficient: () or (..., 1)."""
+
+    @property
+    def tabled(self) -> frozenset[str]:
+        """Names of coefficients that count as numbers of the model alone: machine code has no derivatives by them."""
+        return frozenset()
 
     def values(self) -> dict[str, float]:
         """The values of the coefficients by name, each in its own unit."""

@@ -128,6 +128,7 @@ def _structure(module: nn.Module) -> Hashable:
     return (
         f"{type(module).__module__}.{type(module).__qualname__}",
         tuple(sorted(own.items())),
+        tuple(sorted(getattr(module, "tabled", ()))),
         parameters,
         buffers,
         parts,
