@@ -4,7 +4,8 @@
 shot, predicts 0.3 s, and prints median errors and the share of coordinates in their 90 % intervals: calibrated, with
 groups, with groups and a correction of drag and lift, and what `kind: auto` chooses of them. With `--tracks 5 10 20`
 and `--draws 30`, so many of the training shots are drawn so often, and the mean log score of `auto` is compared with
-that of `calibrate`.
+that of `calibrate`. Where a correction could be calibrated, the processor time of an estimate with it is compared with
+that of the groups alone.
 """
 
 from __future__ import annotations
@@ -15,18 +16,21 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import torch
 
 from ballfg.arrays import Array
 from ballfg.benchmarks.dynamics.measured import measured_task
-from ballfg.dynamics import AnalyticModel, BallModel, nominal_model
+from ballfg.dynamics import AnalyticModel, BallModel, load_model, nominal_model, save_model
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import Settings, Status, predict_tracks
 from ballfg.estimation.registry import make_estimator
 from ballfg.learning.calibration.auto import (
     CALIBRATED,
+    CORRECTED,
+    GROUPED,
     NOMINAL,
     Fitted,
     choose_candidate,
@@ -43,6 +47,9 @@ from ballfg.learning.config.config_file import AUTO
 from ballfg.learning.evaluation import NINETY, log_density
 from ballfg.tracks import Dataset, Track, read_dataset, write_dataset
 from ballfg.tracks.info import DatasetInfo
+
+TURNS: Final = 5  # Repetitions of a measurement of time
+TIMED: Final = 12  # Tracks of it
 
 
 @dataclass(frozen=True)
@@ -74,7 +81,11 @@ class Halves:
             print(choice.table(), choice.verdict(), sep="\n")
             print(f"{time.process_time() - begun:.0f} s of processor time", flush=True)
             kinds: dict[str, Fitted | str] = {choice.chosen: choice.chosen} | dict(candidates)
-            found = {name: errors(problem.surfaces, *finished(problem, one), self.judge) for name, one in kinds.items()}
+            ready = {name: finished(problem, one) for name, one in kinds.items()}
+            found = {name: errors(problem.surfaces, *one, self.judge) for name, one in ready.items()}
+            if CORRECTED in ready:
+                without, corrected = times(problem.surfaces, (ready[GROUPED], ready[CORRECTED]), self.judge)
+                print(f"an estimate with a correction takes {corrected / without:.2f} times as long as without")
             return found | {AUTO: found[choice.chosen]}
 
     def written(self, folder: Path, chosen: Sequence[int]) -> Dataset:
@@ -113,6 +124,23 @@ def errors(surfaces: Surfaces, model: BallModel, settings: Settings, judged: Seq
         else:
             rows.append([np.nan] * 5)
     return np.array(rows)
+
+
+def times(surfaces: Surfaces, models: Sequence[tuple[AnalyticModel, Settings]], judged: Sequence[Track]) -> Array:
+    """(k,) s of processor time of estimates of some tracks by each of k models: the shortest of some turns."""
+    smoothers, tracks = [], judged[:TIMED]
+    for model, settings in models:
+        with tempfile.TemporaryDirectory() as folder:  # as a user has it: with known weights
+            save_model(model, Path(folder) / "model.yaml")
+            smoothers.append(make_estimator("smoother", load_model(Path(folder) / "model.yaml"), surfaces, settings))
+    taken = np.empty((TURNS, len(smoothers), len(tracks)))
+    for turn in taken:
+        for row, smoother in zip(turn, smoothers, strict=True):
+            for k, track in enumerate(tracks):
+                begun = time.process_time()
+                smoother.estimate(track)
+                row[k] = time.process_time() - begun
+    return np.asarray(taken.min(axis=0).sum(axis=1))
 
 
 def numbers_of(rows: Array) -> str:
