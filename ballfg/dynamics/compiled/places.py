@@ -33,7 +33,7 @@ class Numbers:
     def value(self, name: str) -> float:
         """Present value of a coefficient."""
         owner, key = self.scalars[name]
-        return owner[key].item()  # type: ignore[no-any-return]
+        return owner[key].item()
 
     def tables(self) -> list[Tensor]:
         """Present arrays."""
