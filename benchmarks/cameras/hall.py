@@ -100,7 +100,7 @@ def _filled(image: Image, camera: Pinhole, corners: Array, colour: tuple[float, 
         along = (side[-1] - side[0]) / max(float(np.linalg.norm(side[-1] - side[0])), 1e-9)
         across = inwards * np.array([-along[1], along[0]])
         inside = pixels @ across - np.interp(pixels @ along, side @ along, side @ across)
-        share -= 1.0 - np.clip(inside + 0.5, 0.0, 1.0)
+        share -= 1.0 - np.clip(inside / np.abs(across).sum() + 0.5, 0.0, 1.0)  # a pixel is wider along its diagonal
     _blended(image[box], np.clip(share, 0.0, 1.0), colour)
 
 

@@ -28,9 +28,9 @@ LEAST_SIGMA: Final = 0.01
 LINE_SIGMA, LINES_KNOWN = 0.03, 4.0
 """px, by which a line is off in all pictures, at first: it was painted so, or its net sags, or the ground beside it
 moves it; then what the lines show, with this as that of so many lines more."""
-SHARED: Final = 10.0
-"""Ridges of a line, in a picture and in those after it, and matches of neighbouring points err together: so many
-count as one."""
+SHARED, ALIKE = 10.0, 40.0
+"""Ridges of a line, in a picture and in those after it, and matches of neighbouring points err together: so many count
+as one."""
 ROUNDS: Final = 3
 """In which the noise is found."""
 ROBUST: Final = 2.0
@@ -214,7 +214,7 @@ def _match_factor(k: int, like: Pinhole, match: Match, sigma: float) -> gtsam.Cu
                 H[place] = np.asfortranarray(scale[:, None] * part.reshape(len(left), -1) / sigma)
         return left
 
-    shared = gtsam.noiseModel.Isotropic.Sigma(2 * len(match.now), np.sqrt(SHARED))
+    shared = gtsam.noiseModel.Isotropic.Sigma(2 * len(match.now), np.sqrt(ALIKE))
     return gtsam.CustomFactor(shared, gtsam.KeyVector(keys), error)
 
 

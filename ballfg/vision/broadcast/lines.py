@@ -22,7 +22,7 @@ SAMPLES: Final = 24
 """Along a line of the court."""
 STEP: Final = 0.5
 """px between values along a normal."""
-FLANK: Final = 3.0
+FLANK: Final = 4.0
 """px from the middle of a line to the ground beside it."""
 CROSSING: Final = 2.0 * FLANK
 """px from another line within which it is in the way."""
