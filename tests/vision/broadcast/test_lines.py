@@ -71,7 +71,7 @@ def test_the_noise_is_that_with_which_the_residuals_are_most_probable(seen):
     )
     noise = start
     for _ in range(60):
-        noise = graph._noise([CAMERA] * len(drawn), drawn, [], values, marginals, noise)
+        noise = graph._noise([CAMERA] * len(drawn), drawn, [STILL] * (len(drawn) - 1), values, marginals, noise)
     tried = np.geomspace(0.02, 1.0, 2000)
     for line in range(6):
         left = np.concatenate([one.offset[one.line == line] for one in drawn])
