@@ -37,8 +37,9 @@ ROUNDS: Final = 3
 ROBUST: Final = 2.0
 """Scale of Cauchy's loss, in standard deviations."""
 PLACE, LENS, LINES = gtsam.symbol("p", 0), gtsam.symbol("l", 0), gtsam.symbol("c", 0)
-STEPS, SETTLED = 30, 1e-5
-"""Of the minimiser at most, and the relative change of the sum of squares that ends it."""
+STEPS, ROUGH, SETTLED = 30, 1e-3, 1e-5
+"""Of the minimiser at most, and the relative change of the sum of squares that ends it, while the noise is looked for
+and at last."""
 PLACE_SIGMA, FOCAL_SIGMA, BEND_SIGMA = 30.0, 1.0, 0.1
 """m, and of the logarithm: priors about the first values, far wider than what the court tells. Of k1, about none:
 lenses of broadcasts have up to 0.2."""
@@ -78,9 +79,9 @@ def solve(cameras: Sequence[Pinhole], seen: Sequence[Ridges | None], matched: Se
         first.insert(_zoom(k), np.array([np.log(one.focal)]))
     settings = gtsam.LevenbergMarquardtParams()
     settings.setMaxIterations(STEPS)
-    settings.setRelativeErrorTol(SETTLED)
     found, noise = first, Noise(np.full(count, RIDGE_SIGMA), LINE_SIGMA, MATCH_SIGMA)
     for number in range(ROUNDS):
+        settings.setRelativeErrorTol(ROUGH if number < ROUNDS - 1 else SETTLED)
         graph = _graph(cameras, seen, matched, first, noise)
         found = gtsam.LevenbergMarquardtOptimizer(graph, found, settings).optimize()
         marginals = gtsam.Marginals(graph, found)
