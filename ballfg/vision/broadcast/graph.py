@@ -26,7 +26,7 @@ RIDGE_SIGMA, MATCH_SIGMA = 0.1, 0.15
 """px, of a ridge's place and of a background point's motion, at first; then what the recording shows, line by line."""
 LEAST_SIGMA: Final = 0.01
 """px, of these."""
-LINE_SIGMA, LINES_KNOWN = 0.03, 4.0
+LINE_SIGMA, LINES_KNOWN = 0.05, 4.0
 """px, by which a line is off in all pictures, at first: it was painted so, or its net sags, or the ground beside it
 moves it; then what the lines show, with this as that of so many lines more."""
 SHARED, TOGETHER = 10.0, 40.0
