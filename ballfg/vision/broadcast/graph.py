@@ -27,10 +27,8 @@ RIDGE_SIGMA, MATCH_SIGMA = 0.1, 0.15
 LEAST_SIGMA: Final = 0.01
 """px, of these."""
 LINE_SIGMA, LINES_KNOWN = 0.05, 4.0
-"""px, by which a line is off in all pictures, at first: it was painted so, or the ground beside it moves it; then what
-the lines show, with this as that of so many lines more."""
-NET_SIGMA: Final = 0.2
-"""px, the same of a net's edge: it sags, and seen along the net a strip of it lies between the edge and the court."""
+"""px, by which a line is off in all pictures, at first: it was painted so, or its net sags, or the ground beside it
+moves it; then what the lines show, with this as that of so many lines more."""
 SHARED, TOGETHER = 10.0, 40.0
 """Ridges of a line, in a picture and in those after it, err together, and matches of neighbouring points do: so many
 count as one. Rendered seeds 700 - 718 and the real rally chose it."""
@@ -57,22 +55,19 @@ class Solved:
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Standard deviations, px: `ridges` (l,) of a ridge's place about its line, `lines` (l,), `matches`."""
+    """Standard deviations, px: `ridges` (l,) of a ridge's place about its line, `lines` of the lines, `matches`."""
 
     ridges: Array
-    lines: Array
+    lines: float
     matches: float
 
 
-def solve(
-    cameras: Sequence[Pinhole], seen: Sequence[Ridges | None], matched: Sequence[Match], *, net: bool = False
-) -> Solved:
+def solve(cameras: Sequence[Pinhole], seen: Sequence[Ridges | None], matched: Sequence[Match]) -> Solved:
     """The most probable cameras of a shot, and the noise with which the measurements are most probable.
 
     Args:
         cameras: first values, all at about one place.  seen: ridges of each picture, None where they do not count.
         matched: background of each picture with that of the one before, one less than cameras.
-        net: whether the last line is a net's edge.
     """
     count = max((len(lines.asked) for lines in seen if lines is not None), default=1)
     first = gtsam.Values()
@@ -84,9 +79,7 @@ def solve(
         first.insert(_zoom(k), np.array([np.log(one.focal)]))
     settings = gtsam.LevenbergMarquardtParams()
     settings.setMaxIterations(STEPS)
-    lines = np.full(count, LINE_SIGMA)
-    lines[count - net :] = NET_SIGMA
-    found, noise = first, Noise(np.full(count, RIDGE_SIGMA), lines, MATCH_SIGMA)
+    found, noise = first, Noise(np.full(count, RIDGE_SIGMA), LINE_SIGMA, MATCH_SIGMA)
     for number in range(ROUNDS):
         settings.setRelativeErrorTol(ROUGH if number < ROUNDS - 1 else SETTLED)
         graph = _graph(cameras, seen, matched, first, noise)
@@ -115,7 +108,7 @@ def _graph(
     wide = gtsam.noiseModel.Isotropic.Sigma(3, PLACE_SIGMA)
     graph.add(gtsam.PriorFactorPoint3(PLACE, first.atPoint3(PLACE), wide))
     graph.add(gtsam.PriorFactorVector(LENS, np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, BEND_SIGMA)))
-    graph.add(gtsam.PriorFactorVector(LINES, np.zeros(count), gtsam.noiseModel.Diagonal.Sigmas(noise.lines)))
+    graph.add(gtsam.PriorFactorVector(LINES, np.zeros(count), gtsam.noiseModel.Isotropic.Sigma(count, noise.lines)))
     wide = gtsam.noiseModel.Isotropic.Sigma(1, FOCAL_SIGMA)
     for k, (one, lines) in enumerate(zip(cameras, seen, strict=True)):
         graph.add(gtsam.PriorFactorVector(_zoom(k), first.atVector(_zoom(k)), wide))
@@ -151,11 +144,10 @@ def _noise(
         for before, after, match in zip(solved[:-1], solved[1:], matched, strict=True)
     ]
     turned = _weighed(np.concatenate([np.zeros((0, 2)), *apart]), noise.matches)
-    painted = noise.lines != NET_SIGMA
-    wide = (off**2 + np.diag(marginals.marginalCovariance(LINES)))[painted].sum() + LINES_KNOWN * LINE_SIGMA**2
+    wide = (off**2 + np.diag(marginals.marginalCovariance(LINES))).sum() + LINES_KNOWN * LINE_SIGMA**2
     return Noise(
         np.maximum(np.sqrt(ridges), LEAST_SIGMA),
-        np.where(painted, np.sqrt(wide / (painted.sum() + LINES_KNOWN)), NET_SIGMA),
+        float(np.sqrt(wide / (count + LINES_KNOWN))),
         max(float(np.sqrt(turned.sum() / max(turned.size, 1))), LEAST_SIGMA),
     )
 

@@ -182,7 +182,7 @@ def _followed(
         cameras.append(camera)
         seen.append(lines if fit > FOLLOWED else None)
         fits.append(lines.fit)
-    found: Solved = solve(cameras, seen, links, net=court.net > 0.0)
+    found: Solved = solve(cameras, seen, links)
     return Shot(first, found.cameras, found.covariances, np.array(fits))
 
 
