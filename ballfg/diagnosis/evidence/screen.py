@@ -16,6 +16,7 @@ from scipy import special
 
 from ballfg.arrays import Array, Index
 from ballfg.diagnosis.evidence.likelihood import Batches, Posterior, Reduced, held_out, posterior
+from ballfg.diagnosis.evidence.nameless import Patterns
 from ballfg.diagnosis.evidence.odds import tempered
 from ballfg.diagnosis.evidence.prior import WIDTHS, centres, choice_odds, log_odds, scales, within
 from ballfg.diagnosis.evidence.priors_of_fit import Priors
@@ -49,17 +50,29 @@ class Screen:
     _known: dict[tuple[tuple[tuple[int, int], ...], int], _Gain] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, model: Weighed, motion: Motion, candidates: Sequence[Hypothesis], columns: Array) -> Screen:
+    def of(
+        cls,
+        model: Weighed,
+        motion: Motion,
+        candidates: Sequence[Hypothesis],
+        columns: Array,
+        patterns: Patterns | None = None,
+    ) -> Screen:
         """The screen of a model.
 
-        Args: motion: random columns of its fit.  columns: (n, m, p) of all strengths, as in the fit's system.
+        Args:
+            motion: random columns of its fit.
+            columns: (n, m, p) of all strengths, as in the fit's system.
+            patterns: without a name, that the model was weighed with.
         """
         stretches, strengths = model.fit.problem.stretches, columns / roots(model.fit)
-        batches = zip(rows_of(model.fit, motion), batches_of(stretches.used.numpy()), strict=True)
+        rows = rows_of(model.fit, motion)
+        beside = rows if patterns is None else patterns.beside(rows)
+        batches = zip(beside, batches_of(stretches.used.numpy()), strict=True)
         wide = [rows.beside(batch.of(strengths)) for rows, batch in batches]
         tracks = Batches.of(wide, model.weights).reduced(model.noise)[0].by_track(stretches.track)
         total = tracks.of(np.full(len(model.halves), True))
-        return cls(model, candidates, tracks, total, Priors.of(model.fit, model.named))
+        return cls(model, candidates, tracks, total, Priors.of(model.fit, model.named, patterns))
 
     @cached_property
     def gains(self) -> list[float]:
@@ -167,8 +180,9 @@ class Screen:
         beside = tuple[tuple[int, int], ...]()
         for one in chosen:
             beside = (*beside, (one, self._beside(beside, one).width))
-        mean = self._posterior(beside).mean
-        return Step(mean[: self._own], 0.0), mean[self._own :]
+        mean, fit = self._posterior(beside).mean, self.model.fit
+        own = len(fit.problem.free) + fit.unknowns.launcher.size  # those of patterns come after them
+        return Step(mean[:own], 0.0), mean[self._own :]
 
     def _names(self, chosen: Sequence[int]) -> frozenset[str]:
         return self.model.names | {self.candidates[one].name for one in chosen}

@@ -13,16 +13,35 @@ import numpy as np
 from scipy import linalg
 
 from ballfg.arrays import Array
-from ballfg.diagnosis.evidence.likelihood import Batches, Likelihood, Local, Noise, Posterior, posterior
+from ballfg.diagnosis.evidence.likelihood import Batches, Likelihood, Local, Noise, Posterior, Weights, posterior
 from ballfg.diagnosis.evidence.rows import Rows
 from ballfg.state import STATE_DIM
 
 LEAST, MOST = -5.0, 5.0
 """Bounds of the logarithm of a size over its unit."""
-MOST_STEPS, SETTLED = 30, 0.02
+MOST_STEPS, SETTLED = 30, 0.05
 """Largest number of steps of the sizes, and the gain of evidence that ends them."""
+ENOUGH: Final = 0.05
+"""Share of what a step of the common unknowns should gain that ends the sizes' steps too: it will change them."""
 LONGEST: Final = 1.5
 """Largest step of the logarithm of a size."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a similar model's sizes and robust weights are; weights: batch by batch, one if None."""
+
+    noise: Noise
+    weights: Sequence[Weights] | None = None
+
+    def begun(self, rows: Sequence[Rows]) -> tuple[Batches, Noise]:
+        """The likelihood of rows with these sizes, and the weights of what they leave.
+
+        Labels begin with a weight of one: their loss is not convex, and one that a wrong model contradicts would stay
+        out.
+        """
+        known = self.weights and [(samples, np.ones_like(spins), cost) for samples, spins, cost in self.weights]
+        return Batches.of(rows, known).reweighted(self.noise), self.noise
 
 
 @dataclass(frozen=True)
@@ -42,7 +61,7 @@ def settled(
     rows: Sequence[Rows],
     precision: Array,
     away: Array,
-    starts: Sequence[Noise | None] = (None,),
+    starts: Sequence[Start | None] = (None,),
     own: int | None = None,
 ) -> tuple[Batches, Noise]:
     """The likelihood with the robust weights and sizes of noise that maximise the evidence at the present unknowns.
@@ -52,11 +71,10 @@ def settled(
 
     Args:
         precision, away: as in `posterior`.
-        starts: noise of similar models, or None for almost none beside that of the samples; the best end counts.
+        starts: of similar models, or None for almost no noise beside that of the samples; the best end counts.
         own: number of the common unknowns, the first ones, in which the rows are not linear; None: all.
     """
-    plain = Batches.of(rows)
-    begun = [(plain.reweighted(start) if start else plain, start or Noise()) for start in starts]
+    begun = [(Batches.of(rows), Noise()) if start is None else start.begun(rows) for start in starts]
     ends = [_climbed(*one, precision, away, own) for one in begun]
     _, likelihood, noise = max(ends, key=lambda end: end[0])
     return likelihood, noise
@@ -67,27 +85,26 @@ def _climbed(
 ) -> tuple[float, Batches, Noise]:
     """The largest evidence near a start, by steps with the average information, the weights following the sizes."""
 
-    def at(likelihood: Batches, noise: Noise) -> tuple[Posterior, Slopes | None]:
+    def at(likelihood: Batches, noise: Noise) -> tuple[Posterior, float, list[Local]]:
         reduced, local = likelihood.reduced(noise)
-        found = posterior(reduced, precision, away).held(own)
-        if not np.isfinite(found.evidence):
-            return found, None
-        return found, slopes_at(likelihood, noise, local, found, precision, away)
+        free = posterior(reduced, precision, away)
+        return free.held(own), free.gain(own), local
 
-    found, slopes = at(likelihood, noise)
+    found, to_come, local = at(likelihood, noise)
     for _ in range(MOST_STEPS):
-        if slopes is None:
+        if not np.isfinite(found.evidence):
             break
+        slopes = slopes_at(likelihood, noise, local, found, precision, away)
         step = _bounded_step(noise.vector, slopes)
         gain, share, promised = -np.inf, 1.0, 0.5 * float(step @ slopes.slope)
         while gain <= 0.0 and (share == 1.0 or share * promised > SETTLED):
             moved = Noise.of(noise.vector + share * step)
             weights = likelihood.beside(slopes.along, moved)
-            after, derivatives = at(weights, moved)
+            after, ahead, eliminated = at(weights, moved)
             gain, share = after.evidence - found.evidence, 0.5 * share
         if gain > 0.0:
-            likelihood, noise, found, slopes = weights, moved, after, derivatives
-        if gain < SETTLED:
+            likelihood, noise, found, to_come, local = weights, moved, after, ahead, eliminated
+        if gain < max(SETTLED, ENOUGH * to_come):
             break
     return found.evidence, likelihood, noise
 

@@ -10,12 +10,12 @@ import numpy as np
 
 from ballfg.arrays import Array, Mask
 from ballfg.diagnosis.evidence.halves import unlike_halves
-from ballfg.diagnosis.evidence.likelihood import Batches, Noise, Reduced, Weights, held_out, posterior
+from ballfg.diagnosis.evidence.likelihood import Noise, Reduced, Weights, held_out, posterior
 from ballfg.diagnosis.evidence.nameless import NAMELESS, Patterns
 from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, log_odds, within
 from ballfg.diagnosis.evidence.priors_of_fit import Priors
 from ballfg.diagnosis.evidence.rows import Motion, Rows, random_motion, rows_of
-from ballfg.diagnosis.evidence.sizes import settled
+from ballfg.diagnosis.evidence.sizes import Start, settled
 from ballfg.diagnosis.fit.fit import followed, with_guesses
 from ballfg.diagnosis.fit.problem import Fit, Unknowns
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
@@ -24,6 +24,8 @@ MOST_STEPS = 8
 """Largest number of steps from a deterministic fit to the most probable unknowns."""
 SHARES = (1.0, 0.5, 0.25)
 """Of a step, tried in turn."""
+MOSTLY = 0.5
+"""Share of a step's expected gain from which no shorter step is tried."""
 WORTH_A_STEP = 0.5
 """Least expected gain of a step, natural units."""
 
@@ -96,6 +98,11 @@ class Weighed:
         return frozenset(h.name for h in self.named) | frozenset([NAMELESS] * self.nameless)
 
     @property
+    def start(self) -> Start:
+        """Where the noise of a similar model starts."""
+        return Start(self.noise, self.weights)
+
+    @property
     def weight(self) -> Weight:
         """What decides about it."""
         return Weight(self.evidence, self.odds, self.held_out)
@@ -135,7 +142,7 @@ def weighed(
     named: Sequence[Hypothesis],
     motion: Motion,
     halves: Mask,
-    start: Noise | None = None,
+    like: Weighed | None = None,
     patterns: Patterns | None = None,
 ) -> Weighed:
     """Weighs a model at the most probable values of its unknowns.
@@ -150,27 +157,27 @@ def weighed(
         named: effects added to the declared model.
         motion: random columns of this or a similar model.
         halves: (t,) which half each track belongs to, in the order of the fit's tracks (`unlike_halves`).
-        start: noise of a similar model.
+        like: a similar model.
         patterns: without a name, beside the effects; of this or a similar model.
     """
     with np.errstate(invalid="ignore"):  # differences of models without a density: they lose to all others
-        return _followed(_Question(named, motion, halves, patterns), fit, start)
+        return _followed(_Question(named, motion, halves, patterns), fit, like)
 
 
-def _followed(question: _Question, fit: Fit, start: Noise | None) -> Weighed:
+def _followed(question: _Question, fit: Fit, like: Weighed | None) -> Weighed:
     """The model at the most probable unknowns near a fit."""
     closest = followed(fit, fit.unknowns)
     point = question.point(closest if np.isfinite(closest.cost) else fit)
-    found, step = question.at(point, (start, None) if start else (None,))
+    found, step, density = question.at(point, (like.start, None) if like else (None,))
     for number in range(MOST_STEPS):
         second = number == 0 and question.nameless  # noise and widths of patterns need a second turn
         if step.gain < WORTH_A_STEP and not second:
             break
-        moved = question.moved(point, found, step)
+        moved = question.moved(point, found, step, density)
         if moved is None:
             break
         point = moved
-        found, step = question.at(point, (found.noise,), found.widths)
+        found, step, density = question.at(point, (found.start,), found.widths)
     return found.without(step.gain) if step.gain > WORTH_A_STEP else found
 
 
@@ -230,8 +237,10 @@ class _Question:
         beside = rows if patterns is None else patterns.beside(rows)
         return _Point(fit, beside, Priors.of(fit, self.named, patterns))
 
-    def at(self, point: _Point, starts: Sequence[Noise | None], widths: Sequence[int] = ()) -> tuple[Weighed, Step]:
-        """The model at the unknowns of a point, and the step to more probable ones.
+    def at(
+        self, point: _Point, starts: Sequence[Start | None], widths: Sequence[int] = ()
+    ) -> tuple[Weighed, Step, float]:
+        """The model at the unknowns of a point, the step to more probable ones, and the density as in `_density`.
 
         Args:
             starts: as in `settled`.
@@ -268,15 +277,16 @@ class _Question:
             self.nameless,
             self._nested(priors, total, best, mixed),
         )
-        return weighed, Step(result.mean[:own], gain)
+        return weighed, Step(result.mean[:own], gain), result.evidence - gain
 
-    def moved(self, point: _Point, model: Weighed, step: Step) -> _Point | None:
+    def moved(self, point: _Point, model: Weighed, step: Step, before: float) -> _Point | None:
         """The point after the share of a step that leads to the most probable unknowns; None if all are less probable.
 
         A step may leave the linear range: where samples cannot tell a clock from gravity, say, or hardly show spins.
+
+        Args: before: the density at the point.
         """
-        before = most = self._density(point, model)
-        best = None
+        best, most = None, before
         for share in SHARES:
             fit = followed(point.fit, step.taken(point.fit, share))
             density = self._density(after := self.point(fit), model) if np.isfinite(fit.cost) else -np.inf
@@ -284,7 +294,7 @@ class _Question:
                 best, most = after, density
             elif best is not None:
                 break
-            if most > before + step.gain - WORTH_A_STEP:  # as foretold
+            if most > before + MOSTLY * step.gain:
                 break
         return best
 
@@ -293,7 +303,8 @@ class _Question:
 
         The evidence is what it would be at the end of the step from there, if that were linear.
         """
-        reduced, _ = Batches.of(point.rows).reweighted(model.noise).reduced(model.noise)
+        likelihood, noise = model.start.begun(point.rows)
+        reduced, _ = likelihood.reduced(noise)
         found, own = point.priors.posterior(reduced, model.widths), point.own
         return found.evidence - found.gain(own)
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
 import numpy as np
+import torch
 
 from ballfg.arrays import Mask
 from ballfg.diagnosis.evidence.halves import unlike_halves
@@ -16,14 +17,14 @@ from ballfg.diagnosis.evidence.weighed import WORTH_A_STEP, Weighed, weighed
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.fit.problem import Fit, Problem
-from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, without_effect
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, with_effects, without_effect
 from ballfg.diagnosis.hypotheses.varying import Grouping, groupings
 from ballfg.diagnosis.result import Candidate, Errors, Finding
 from ballfg.diagnosis.search.candidates import FIRST_STEPS, Refit, Scored, refit
 from ballfg.diagnosis.search.evaluation import on_all, on_others
 from ballfg.diagnosis.search.ranking import finding_of, ranking
 from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_findings, stamp_hypotheses
-from ballfg.diagnosis.search.trial import try_hypotheses, try_varying
+from ballfg.diagnosis.search.trial import try_beside, try_hypotheses, try_varying
 from ballfg.dynamics import AnalyticModel, BallModel
 from ballfg.dynamics.effect import Effect
 from ballfg.estimation.batch import do_all
@@ -112,6 +113,8 @@ class SearchLoop:
         stamps, odds = self.holdout.stamps, found.odds
         final = found.named_at(self.name_at)
         whole = found.models[final.names - {NAMELESS}].fit
+        if final.nameless and final.named:
+            whole = with_strengths_of(final, whole)
         self.watch("predicting the other half")
         declared = self.predictive(first)
         judged = self.judge(declared)
@@ -233,7 +236,7 @@ class _Found:
             candidate = next(s for s in scored if s.hypothesis is other)
             refitted = refit(without_named(best.fit, [own], self.first), candidate)
             named = (*(h for h in best.named if h is not own), other)
-            found = weighed(refitted.fit, named, self.motion, self.halves, best.noise)
+            found = weighed(refitted.fit, named, self.motion, self.halves, best)
             self.models[found.names] = found
             tried.append((found, refitted))
         winner = self.most_probable(found for found, _ in tried)
@@ -245,21 +248,75 @@ class _Found:
         return refitted
 
     def compare(self) -> None:
-        """Weighs what is left of the best model beside something nameless, without effects that this makes superfluous.
+        """Weighs something nameless beside the best model, and which effects are there beside it.
+
+        Patterns make some effects superfluous. They also show others, which a model that lacks them hides: an effect
+        alone takes the values that make up for what no effect describes.
+        """
+        self.loop.watch("weighing what has no name")
+        (nothing,) = self.beside_nameless([self.models[frozenset()]])
+        (best,) = self.beside_nameless([self.best])
+        for start in (self._shortened(best), nothing):  # effects found alone may stand for others
+            self._grow(start)
+        odds = self.odds.models
+        self.best = max(self.models.values(), key=lambda model: odds[model.names])
+
+    def _grow(self, best: Weighed) -> None:
+        """Adds effects to a model with something nameless, if that is more probable than none."""
+        while len(best.named) < MOST_EFFECTS:
+            leading = self.most_probable(self.models.values())
+            more = self._beyond(best) if leading is not None and leading.nameless else None
+            if more is None:
+                return
+            best = self._shortened(more)
+
+    def _shortened(self, best: Weighed) -> Weighed:
+        """A model with something nameless, without effects that this makes superfluous.
 
         The linearised model says which effects are, and a refit confirms it.
         """
-        self.loop.watch("weighing what has no name")
-        self.beside_nameless([self.models[frozenset()]])
-        (best,) = self.beside_nameless([self.best])
-        while gone := self._superfluous(best):
-            tried = [self.without([h], best) for h in gone] + [self.without(gone, best)] * (len(gone) > 1)
-            shorter = self.most_probable(self.beside_nameless(tried))
-            if shorter is None or self.scores[shorter.names] <= self.scores[best.names]:
-                break
-            best = shorter
-        odds = self.odds.models
-        self.best = max(self.models.values(), key=lambda model: odds[model.names])
+        tried = {best.names}
+        while True:
+            scores = self.scores
+            names = max(best.nested, key=lambda names: scores[names], default=best.names)
+            if names in tried or scores[names] <= scores[best.names]:
+                return best
+            tried.add(names)
+            gone = [h for h in best.named if h.name not in names]
+            (shorter,) = self.beside_nameless([self.without(gone, best)])
+            if self.scores[shorter.names] > self.scores[best.names]:
+                best = shorter
+
+    def _beyond(self, best: Weighed) -> Weighed | None:
+        """A more probable model with further effects beside something nameless; None if there is none.
+
+        Effects that are the same for all tracks are tried first. What is found is weighed without patterns as well.
+        """
+        loop, most = self.loop, MOST_EFFECTS - len(best.named)
+        tell: Callable[[str], None] = lambda line: loop.watch(f"beside something nameless: {line}")  # noqa: E731
+        winner = self._named_beside(
+            best, try_beside(best, self.motion, self.patterns, loop.catalogue, tell, loop.jobs, most)
+        )
+        if winner is None:
+            ways = loop.ways or partial(groupings, loop.holdout.tracks)
+            of_some = loop.of_some or loop.catalogue
+            _, varying = try_varying(best, self.motion, of_some, ways, tell, loop.jobs, self.patterns)
+            winner = self._named_beside(best, varying)
+        if winner is not None and winner.names - {NAMELESS} not in self.models:
+            plain = weighed(winner.fit, winner.named, self.motion, self.halves, winner)
+            self.models[plain.names] = plain
+        return winner
+
+    def _named_beside(self, best: Weighed, refits: Sequence[Refit]) -> Weighed | None:
+        """The most probable of some refits beside something nameless, if it is more probable than the best one."""
+        tasks = [
+            partial(weighed, r.fit, (*best.named, *r.added), self.motion, self.halves, best, self.patterns)
+            for r in refits
+            if np.isfinite(r.fit.cost)
+        ]
+        winner = self.most_probable(self._known(do_all(tasks, self.loop.jobs)))
+        better = winner is not None and self.scores[winner.names] > self.scores[best.names]
+        return winner if better else None
 
     def named_at(self, probability: float) -> Weighed:
         """The model with all effects that are at least so probable, or with most of them.
@@ -281,9 +338,7 @@ class _Found:
     def beside_nameless(self, models: Sequence[Weighed]) -> list[Weighed]:
         """The same models with something nameless beside their effects."""
         new = {m.names | {NAMELESS}: m for m in models if m.names | {NAMELESS} not in self.models}
-        tasks = [
-            partial(weighed, m.fit, m.named, self.motion, self.halves, m.noise, self.patterns) for m in new.values()
-        ]
+        tasks = [partial(weighed, m.fit, m.named, self.motion, self.halves, m, self.patterns) for m in new.values()]
         self.models |= dict(zip(new, do_all(tasks, self.loop.jobs), strict=True))
         return [self.models[m.names | {NAMELESS}] for m in models]
 
@@ -302,7 +357,7 @@ class _Found:
         if known is None or (poor and (model.names, names) not in self.tried):
             self.tried.add((model.names, names))
             fit = without_named(model.fit, gone, self.first)
-            found = weighed(fit, kept, self.motion, self.halves, model.noise)
+            found = weighed(fit, kept, self.motion, self.halves, model)
             self.models[names] = found if known is None else max(known, found, key=_score)
         return self.models[names]
 
@@ -313,20 +368,23 @@ class _Found:
         """
         best = self.best
         tasks = [
-            partial(weighed, r.fit, (*best.named, *r.added), self.motion, self.halves, best.noise)
+            partial(weighed, r.fit, (*best.named, *r.added), self.motion, self.halves, best)
             for r in refits
             if np.isfinite(r.fit.cost)
         ]
-        found = do_all(tasks, self.loop.jobs)
-        for model in found:
-            if model.names not in self.models or model.score > self.models[model.names].score:
-                self.models[model.names] = model
+        found = self._known(do_all(tasks, self.loop.jobs))
         scores = self.scores
         for model in list(found):
             names = max(model.nested, key=lambda names: scores[names], default=model.names)
             if scores[names] > max(scores[model.names], scores[best.names]):
                 found.append(self.without([h for h in model.named if h.name not in names], model))
-        return self.most_probable(found)
+        return self.most_probable(self.models[model.names] for model in found)  # a smaller one may replace its refit
+
+    def _known(self, found: Sequence[Weighed]) -> list[Weighed]:
+        """Models with their effects in the best minimum of all that were found, each once; they count from now on."""
+        for model in found:
+            self.models[model.names] = max(self.models.get(model.names, model), model, key=_score)
+        return [self.models[names] for names in dict.fromkeys(model.names for model in found)]
 
     def _superfluous(self, model: Weighed) -> list[Hypothesis]:
         """Effects without which a model is more probable, as far as is known."""
@@ -340,7 +398,7 @@ class _Found:
         """
         if before.names in after.nested and after.nested[before.names].score > before.score:
             fit = without_named(after.fit, after.named[len(before.named) :], self.first)
-            again = weighed(fit, before.named, self.motion, self.halves, before.noise)
+            again = weighed(fit, before.named, self.motion, self.halves, before)
             if again.score > before.score:
                 self.models[before.names] = again
                 if self.scores[again.names] > self.scores[after.names]:
@@ -357,6 +415,25 @@ class _Found:
 
 def _score(model: Weighed) -> float:
     return model.score
+
+
+def with_strengths_of(model: Weighed, fit: Fit) -> Fit:
+    """A fit without patterns, its named effects as strong as in the model beside them.
+
+    Free, they would make up for what no effect describes. Effects that differ between tracks stay free.
+    """
+    known, problem = model.fit.unknowns.values, fit.problem
+    held = {c: known[c] for h in model.named if not h.deviations() for c in h.columns if c in problem.free}
+    changed = with_effects(problem.model)
+    parameters = dict(changed.named_parameters())
+    with torch.no_grad():
+        for name, value in held.items():
+            parameters[name].fill_(value)
+    free = {name: c for name, c in problem.free.items() if name not in held}
+    values = {name: value for name, value in fit.unknowns.values.items() if name in free}
+    problem = replace(problem, model=changed, free=free)
+    fitted = fit_problem(problem, replace(fit.unknowns, values=values), fit.noise)
+    return fitted if np.isfinite(fitted.cost) else fit
 
 
 def without_named(fit: Fit, gone: Sequence[Hypothesis], first: Fit) -> Fit:

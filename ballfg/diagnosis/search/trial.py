@@ -5,11 +5,12 @@ from dataclasses import replace
 from functools import partial
 from typing import cast
 
+from ballfg.diagnosis.evidence.nameless import Patterns
 from ballfg.diagnosis.evidence.rows import Motion
 from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.weighed import Weighed
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.hypotheses.hypothesis import has_effect, hypotheses, scene_of
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, hypotheses, scene_of
 from ballfg.diagnosis.hypotheses.varying import Grouping, Varying, near, varying_hypotheses
 from ballfg.diagnosis.search.candidates import (
     ALARM,
@@ -43,6 +44,7 @@ def try_varying(
     ways: Callable[[Sequence[str]], list[Grouping]],
     tell: Callable[[str], None],
     jobs: int = 1,
+    patterns: Patterns | None = None,
 ) -> tuple[list[Scored], list[Refit]]:
     """Tries every hypothesis of an effect that differs between tracks; refits of the leading ones, the best first.
 
@@ -53,19 +55,20 @@ def try_varying(
         ways: groupings of the tracks, by their names.
         tell: called with progress.
         jobs: processes.
+        patterns: without a name, that the model was weighed with.
     """
     before, problem = model.fit, model.fit.problem
     searched = sorted(dict.fromkeys(problem.stretches.names), key=place_of)
     known = ways(searched)
     listed = varying_hypotheses(problem.model, scene_of(before), catalogue, problem.free, known)
     tell(f"testing {len(listed)} ways in which tracks may differ")
-    scored = score_all(model, listed, motion)
+    scored = score_all(model, listed, motion, patterns)
     names = sorted({name for way in known for level in way.weights.values() for name in level}, key=place_of)
     refits = []
     for candidate in shortlist(scored):
         tell(f"fitting with {candidate.hypothesis.name}")
         closer = near(cast(Varying, candidate.hypothesis), searched, names)
-        best = _placed(model, motion, closer) if len(closer) > 1 else candidate
+        best = _placed(model, motion, closer, patterns) if len(closer) > 1 else candidate
         refits.append(refit(before, replace(best, p_value=candidate.p_value)))
     return scored, sorted(refits, key=lambda r: r.delta_bic)
 
@@ -84,29 +87,62 @@ def _refits(before: Fit, leading: Sequence[Scored], tell: Callable[[str], None])
 
 
 def _set_refits(
-    screen: Screen, scored: Sequence[Scored], most: int, tell: Callable[[str], None]
+    screen: Screen, scored: Sequence[Scored], sets: Sequence[tuple[int, ...]], tell: Callable[[str], None]
 ) -> list[Callable[[], Refit]]:
-    """The refits of the leading sets of hypotheses."""
+    """The refits of sets of hypotheses."""
     tested, found = {id(s.hypothesis): s for s in scored}, list[Callable[[], Refit]]()
-    for chosen in leading_sets(screen, scored, most):
+    for chosen in sets:
         members = [tested[id(screen.candidates[one])] for one in chosen]
         tell(f"fitting with {' and '.join(one.hypothesis.name for one in members)}")
         found.append(partial(refit_set, screen.model.fit, members, *screen.step(chosen)))
     return found
 
 
-def _placed(model: Weighed, motion: Motion, closer: Sequence[Varying]) -> Scored:
+def _placed(model: Weighed, motion: Motion, closer: Sequence[Varying], patterns: Patterns | None) -> Scored:
     """The change along the recording at its best place.
 
     Several places explain about the same if tracks between them do not show the coefficient. Then an earlier change's
     place is chosen, since one new table changes several coefficients; else the middle of them.
     """
     known = {deviation.level for deviation in model.fit.problem.deviations.values()}
-    scored = {id(s.hypothesis): s for s in score_all(model, closer, motion)}
+    scored = {id(s.hypothesis): s for s in score_all(model, closer, motion, patterns)}
     most = max(s.explained for s in scored.values())
     good = [scored[id(h)] for h in closer if scored[id(h)].explained >= AS_GOOD * most]
     named = [s for h, s in ((cast(Varying, s.hypothesis), s) for s in good) if known & set(h.grouping.weights)]
     return named[0] if named else good[len(good) // 2]
+
+
+def _offered(model: Weighed, catalogue: Sequence[type[Effect]]) -> tuple[list[Hypothesis], list[Hypothesis]]:
+    """The hypotheses that a model lacks: those of a score test, and those that multiply spins that nobody labelled."""
+    problem = model.fit.problem
+    listed = hypotheses(problem.model, scene_of(model.fit), catalogue)
+    lacking = [h for h in listed if not set(h.columns) & set(problem.free)]
+    unlabelled = problem.stretches.labelled.mean() < LABELLED
+    driven = [h for h in lacking if h.effect.multiplies_spin and unlabelled]
+    return [h for h in lacking if h not in driven and h.strengths], driven
+
+
+def try_beside(
+    model: Weighed,
+    motion: Motion,
+    patterns: Patterns,
+    catalogue: Sequence[type[Effect]],
+    tell: Callable[[str], None],
+    jobs: int = 1,
+    most: int = 1,
+) -> list[Refit]:
+    """Refits of the hypotheses, and sets of them, that a model most probably lacks beside its patterns without a name.
+
+    Args: as in `try_hypotheses`.  patterns: that the model was weighed with.
+    """
+    testable, _ = _offered(model, catalogue)
+    if not testable:
+        return []
+    tell(f"testing {len(testable)} hypotheses")
+    scored, screen = screened(model, testable, motion, patterns)
+    tasks = _refits(model.fit, shortlist(scored), tell)
+    tasks += _set_refits(screen, scored, leading_sets(screen, scored, most), tell)
+    return do_all(tasks, jobs)
 
 
 def try_hypotheses(
@@ -130,19 +166,15 @@ def try_hypotheses(
         most: largest number of effects in a set.
     """
     before, model = weighed.fit, weighed.fit.problem.model
-    listed = hypotheses(model, scene_of(before), catalogue)
-    candidates = [h for h in listed if not set(h.columns) & set(before.problem.free)]
-    tell(f"testing {len(candidates)} hypotheses")
-    unlabelled = before.problem.stretches.labelled.mean() < LABELLED
-    driven = [h for h in candidates if h.effect.multiplies_spin and unlabelled]
-    testable = [h for h in candidates if h not in driven and h.strengths]
+    testable, driven = _offered(weighed, catalogue)
+    tell(f"testing {len(testable) + len(driven)} hypotheses")
     scored, screen = screened(weighed, testable, motion) if testable else ([], None)
     leading = shortlist(scored)
     called = {candidate.hypothesis.name for candidate in leading}
     usual = {h.name: h for h in (s.hypothesis for s in scored) if h.usual and h.name not in called}
     usual = {name: h for name, h in usual.items() if not has_effect(model, name)}
     tasks = _refits(before, leading, tell)
-    tasks += [] if screen is None else _set_refits(screen, scored, most, tell)
+    tasks += [] if screen is None else _set_refits(screen, scored, leading_sets(screen, scored, most), tell)
     for name in usual:
         tell(f"fitting with {name}, which balls usually have")
     for hypothesis in driven:

@@ -47,8 +47,9 @@ def test_a_step_gains_what_it_promises(make_ball, moved_shots, make_fit):
     fit = make_fit(make_ball(), moved_shots)
     question = weighing._Question((), random_motion(fit), unlike_halves(fit), None)
     point = question.point(followed(fit, at_drag(fit, 0.02)))
-    found, step = question.at(point, (None,))
-    after = question.moved(point, found, step)
+    found, step, density = question.at(point, (None,))
+    after = question.moved(point, found, step, density)
+    assert density == pytest.approx(question._density(point, found), abs=0.5)
     gained = question._density(after, found) - question._density(point, found)
     assert step.gain > 10.0
     assert gained == pytest.approx(step.gain, rel=0.4)

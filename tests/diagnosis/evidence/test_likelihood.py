@@ -19,7 +19,7 @@ from ballfg.diagnosis.evidence.likelihood import (
     unweighted,
 )
 from ballfg.diagnosis.evidence.rows import batches_of, random_motion, rows_of
-from ballfg.diagnosis.evidence.sizes import settled, slopes_at
+from ballfg.diagnosis.evidence.sizes import Start, settled, slopes_at
 from ballfg.state import STATE_DIM
 
 NOISE = Noise(0.1, (0.2, -0.3, 0.4, 0.1), (-0.7, -1.1, -0.4, -1.2))
@@ -216,7 +216,7 @@ def test_sizes_of_noise_come_back(make_ball, make_launches, make_shots, make_fit
 
 def test_the_best_of_several_starts_counts(rows, prior):
     """A start with noise that the samples do not have may end elsewhere; beside the usual one it does no harm."""
-    starts = (Noise(-1.0, (1.0,) * 4, (2.0, 2.0, 2.0, 1.0)), None)
+    starts = (Start(Noise(-1.0, (1.0,) * 4, (2.0, 2.0, 2.0, 1.0))), None)
     values = [
         posterior(one.reduced(noise)[0], *prior).evidence
         for one, noise in (settled([rows], *prior, s) for s in ((starts[0],), (None,), starts))
