@@ -12,7 +12,8 @@ from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.stamps import Stamps
 from ballfg.diagnosis.hypotheses.hypothesis import has_effect, without_effect
 from ballfg.diagnosis.result import Errors, Outcome
-from ballfg.diagnosis.search.loop import SearchLoop
+from ballfg.diagnosis.search.loop import NAMELESS, SearchLoop, _Found
+from ballfg.diagnosis.search.stamp_effects import first_fit
 from ballfg.dynamics import EFFECTS
 from ballfg.estimation.settings import Settings
 
@@ -180,3 +181,42 @@ def test_an_effect_goes_with_the_one_that_it_needs(make_ball, make_launches, mak
     search = SearchLoop(holdout(*data), catalogue, predicts_well, judges_alike, unwatched).run(declared)
     assert [finding.name for finding in search.findings] == ["drag", "drag_spin"]
     assert frozenset(["drag_spin"]) not in search.odds.models
+
+
+@pytest.fixture(scope="module")
+def gusty(make_ball, make_launches, make_shots):
+    """A search on shots in a frame that is turned by 1.1 degrees, through a gust in one part of the room."""
+    truth = {"frame_tilt": {"x": 0.02, "y": 0.0}, "gust_region": {"x": 3.0, "y": 6.0, "z": 3.0}}
+    data = (shots(make_ball, make_launches, make_shots, seed, **truth) for seed in (71, 72))
+    catalogue = [EFFECTS[name] for name in ("frame_tilt", "wind", "gravity")]
+    return SearchLoop(holdout(*data), catalogue, predicts_well, judges_alike, unwatched)
+
+
+def test_what_is_named_beside_something_nameless_is_as_strong_in_the_model(gusty, make_ball):
+    """Free, it would make up for the gust that the catalogue lacks."""
+    search = gusty.run(make_ball())
+    assert search.odds.nameless > 0.99
+    tilt = next(finding for finding in search.findings if finding.name == "frame_tilt").parameters["x"]
+    assert abs(tilt.value - 0.02) < 3 * tilt.sigma
+    written = dict(search.fit.problem.model.named_parameters())
+    assert float(written["measurement.frame_tilt.x"]) == pytest.approx(tilt.value)
+
+
+def test_an_effect_is_found_beside_something_nameless_alone(gusty, make_ball):
+    """Patterns first: no search without them leads there."""
+    found = _Found(gusty, first_fit(make_ball(), gusty.holdout))
+    (nothing,) = found.beside_nameless([found.models[frozenset()]])
+    found._grow(nothing)
+    best = max(found.models.values(), key=lambda model: found.scores[model.names])
+    assert {"frame_tilt", NAMELESS} <= best.names
+    assert best.score > nothing.score + np.log(100.0)
+
+
+def test_the_best_minimum_of_the_same_effects_counts(gusty, make_ball):
+    """A set that was refitted, and the same set that is left of a larger one."""
+    found = _Found(gusty, first_fit(make_ball(), gusty.holdout))
+    (better,) = found.models.values()
+    poorer = replace(better, evidence=better.evidence - 100.0)
+    for models in ([poorer, better], [better, poorer]):
+        assert found._known(models) == [better]
+    assert found.models == {frozenset(): better}
