@@ -211,7 +211,8 @@ class _Found:
         gone = [h.name for h in best.named if h not in winner.named]
         tell(" and ".join((*(f"{name} added" for name in names), *(f"{name} removed" for name in gone))))
         self.best = winner
-        self._better_minimum(best, winner)
+        if self._better_minimum(best, winner) and self.scores[best.names] > self.scores[winner.names]:
+            self.best = self.models[best.names]
         self._pruned()
         return True
 
@@ -263,12 +264,17 @@ class _Found:
 
     def _grow(self, best: Weighed) -> None:
         """Adds effects to a model with something nameless, if that is more probable than none."""
-        while len(best.named) < MOST_EFFECTS:
+        for _ in range(MOST_ROUNDS):
             leading = self.most_probable(self.models.values())
-            more = self._beyond(best) if leading is not None and leading.nameless else None
+            if len(best.named) == MOST_EFFECTS or leading is None or not leading.nameless:
+                return
+            more = self._beyond(best)
             if more is None:
                 return
-            best = self._shortened(more)
+            if self._better_minimum(best, more) and self.scores[best.names] > self.scores[more.names]:
+                best = self.models[best.names]
+            else:
+                best = self._shortened(more)
 
     def _shortened(self, best: Weighed) -> Weighed:
         """A model with something nameless, without effects that this makes superfluous.
@@ -391,18 +397,19 @@ class _Found:
         scores = self.scores
         return [h for h in model.named if scores.get(model.names - {h.name}, -np.inf) > scores[model.names]]
 
-    def _better_minimum(self, before: Weighed, after: Weighed) -> None:
+    def _better_minimum(self, before: Weighed, after: Weighed) -> bool:
         """Weighs the earlier model again from the later one's fit: effects may have led out of a poor minimum.
 
-        Only if the later one's linearisation says that they have.
+        Only if the later one's linearisation says that they have. True if the earlier one is more probable then.
         """
-        if before.names in after.nested and after.nested[before.names].score > before.score:
-            fit = without_named(after.fit, after.named[len(before.named) :], self.first)
-            again = weighed(fit, before.named, self.motion, self.halves, before)
-            if again.score > before.score:
-                self.models[before.names] = again
-                if self.scores[again.names] > self.scores[after.names]:
-                    self.best = again
+        if before.names not in after.nested or after.nested[before.names].score <= before.score:
+            return False
+        fit = without_named(after.fit, after.named[len(before.named) :], self.first)
+        patterns = self.patterns if before.nameless else None
+        again = weighed(fit, before.named, self.motion, self.halves, before, patterns)
+        if again.score > before.score:
+            self.models[before.names] = again
+        return again.score > before.score
 
     def _pruned(self) -> None:
         """Removes effects that later ones made superfluous, as the linearisation says and a refit confirms."""
