@@ -59,9 +59,11 @@ def train(
         raise ValueError("a dataset is needed; got none. Give --data FOLDER, or 'data' in the config.")
     folder = Path(settings.out)
     if isinstance(settings, CalibrationConfig):
-        from ballfg.learning.calibration.run import run_calibration
-
-        status = run_calibration(settings, folder, resume=resume is not None, jobs=usable_cores(), watch=progress)
+        if isinstance(settings.data, str):
+            from ballfg.learning.calibration.run import run_calibration as calibrate
+        else:
+            from ballfg.learning.calibration.sets import calibrate_sets as calibrate
+        status = calibrate(settings, folder, resume=resume is not None, jobs=usable_cores(), watch=progress)
     else:
         typed = _typed(config, overrides or (), data or (), out, resume)
         status = _train(settings, folder, resume is not None, typed)

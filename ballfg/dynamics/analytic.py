@@ -182,6 +182,6 @@ def coefficient_sigmas(model: BallModel) -> dict[str, float]:
     """Prior standard deviations of the coefficients that are estimated with each track, by parameter name.
 
     Args: model: a model without declared coefficients gives an empty mapping.
-    Returns: for instance {"flight.drag.k": 0.035}; coefficients that do not vary are left out.
+    Returns: for instance {"flight.drag.k": 0.035}; those that do not vary, or are known, are left out.
     """
-    return {name: c.sigma for name, c in model.declared_coefficients().items() if c.varies}
+    return {name: c.sigma for name, c in model.declared_coefficients().items() if c.varies and c.sigma > 0.0}

@@ -26,10 +26,9 @@ class AugmentedModel(BallModel):
 
     def __init__(self, model: BallModel, names: Sequence[str]) -> None:
         super().__init__(model.radius, model.inertia_factor)
-        parameters = dict(model.named_parameters())
-        for name in names:
-            if name not in parameters or parameters[name].dim() != 0:
-                scalars = ", ".join(n for n, p in parameters.items() if p.dim() == 0)
+        for name in names:  # `named_parameters` would walk through all of a correction's numbers for each track
+            if not _is_scalar(model, name):
+                scalars = ", ".join(n for n, p in model.named_parameters() if p.dim() == 0)
                 raise ValueError(f"'{name}' is not a scalar parameter of the model; there are: {scalars}")
         self.model = model
         self.names = tuple(names)
@@ -42,8 +41,7 @@ class AugmentedModel(BallModel):
 
     def means(self) -> Tensor:
         """(p,) the present values of the model's own parameters."""
-        parameters = dict(self.model.named_parameters())
-        return torch.stack([parameters[name].reshape(()) for name in self.names])
+        return torch.stack([self.model.get_parameter(name).reshape(()) for name in self.names])
 
     def bound(self, state: Tensor) -> BallModel:
         """The model with each state's own coefficients."""
@@ -87,3 +85,10 @@ class AugmentedModel(BallModel):
     def append(self, state: Tensor, coefficients: Tensor) -> Tensor:
         """Augmented states (n, 9 + p) from states (n, 9) and coefficients (p,) or (n, p)."""
         return torch.cat((state, coefficients.expand(*state.shape[:-1], self.width)), dim=-1)
+
+
+def _is_scalar(model: BallModel, name: str) -> bool:
+    try:
+        return model.get_parameter(name).dim() == 0
+    except AttributeError:
+        return False

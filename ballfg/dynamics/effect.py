@@ -264,6 +264,11 @@ class Effect(nn.Module, ABC):
         def __getattr__(self, name: str) -> Tensor:
             """The value of a coefficient: () or (..., 1)."""
 
+    @property
+    def tabled(self) -> frozenset[str]:
+        """Names of coefficients that count as numbers of the model alone: machine code has no derivatives by them."""
+        return frozenset()
+
     def values(self) -> dict[str, float]:
         """The values of the coefficients by name, each in its own unit."""
         return {c.name: float(getattr(self, c.name).detach()) for c in self.coefficients}

@@ -113,7 +113,9 @@ def fitted_settings(
 
 def _noise_is_stated(dataset: Dataset | SightedDataset, model: BallModel) -> bool:
     at_home = model.trained is not None and not model.trained.is_foreign(dataset.info.name)
-    return dataset.info.noise is not None or _own_noise(dataset, model) is not None or at_home
+    own = _own_noise(dataset, model)
+    # spreads of coefficients alone, as of several sets, are a prior: the tracks show the rest
+    return dataset.info.noise is not None or (own is not None and own.states_more_than_spreads) or at_home
 
 
 def usual_noise(dataset: Dataset | SightedDataset, model: BallModel) -> tuple[str, ...]:

@@ -62,8 +62,7 @@ class Belief:
                     f"not {list(names)}. Make them with the same settings."
                 )
         bounded = AugmentedModel(model, names) if names else model
-        parameters = dict(model.named_parameters())
-        prior_mean = np.array([float(parameters[name].detach()) for name in names])
+        prior_mean = np.array([float(model.get_parameter(name).detach()) for name in names])
         known = model.declared_coefficients()
         declared = [known.get(name) for name in names]
         low = np.array([-np.inf if c is None else c.low for c in declared])

@@ -55,6 +55,11 @@ class TrackNoise:
         for name, value in self.coefficients.items():
             check_number(f"noise.coefficients.{name}", value, "its own unit", above=0.0)
 
+    @property
+    def states_more_than_spreads(self) -> bool:
+        """True if a number beside the spreads of coefficients is known."""
+        return any(getattr(self, name) is not None for name in LIMITS)
+
     @classmethod
     def from_mapping(cls, content: Any) -> Self:
         """The noise in a parsed section of a file. Raises: ValueError: an unknown key, or a number out of its range."""

@@ -103,8 +103,8 @@ def with_correction(
         places.append(torch.from_numpy((values - shape[name]) / shape[f"{name}_scale"])[:, None])
     terms = correction_terms(places[0], places[1]).numpy()
     effect = AirCorrection(**shape)
-    known = [] if labelled else [f"{DOUBT['lift']}_{k}" for k in range(1, DOUBTS + 1)]
-    effect.set_sigmas(**dict.fromkeys(WEIGHTS, LINEAR), **dict.fromkeys(known, 0.0))
+    carried = [f"{DOUBT[force]}_{k}" for force in FORCES[: 1 + labelled] for k in range(1, DOUBTS + 1)]
+    effect.set_sigmas(**dict.fromkeys(WEIGHTS, LINEAR), **dict.fromkeys(carried, 1.0))
     effects = [
         copy.deepcopy(cast(Effect, one))
         for group in (model.flight, model.bounce, model.measurement)

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from ballfg.checks import shown
 from ballfg.dynamics import save_model
 from ballfg.dynamics.model_file import model_to_dict
 from ballfg.files.damaged import whole_content
@@ -70,9 +71,11 @@ def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jo
     Returns: the exit status of `ballfg-train`, as of `status_of`; 1 if `kind: auto` keeps the nominal model.
     Raises: ValueError, FileNotFoundError: bad input. KeyboardInterrupt: after Ctrl-C; finished steps are kept.
     """
+    if not isinstance(config.data, str):
+        raise ValueError(
+            f"one dataset is needed; got {shown(config.data)}. Give --data FOLDER, or 'data' in the config."
+        )
     with files.running(folder, config, resume=resume):
-        if config.data is None:
-            raise ValueError("a dataset is needed; got none. Give --data FOLDER, or 'data' in the config.")
         torch.set_num_threads(1)  # the batches are small: threads cost more than they gain
         dataset = open_source(config.data, config.source, config.anyway)
         model = analytic_model(config.model, dataset.info.ball)
@@ -102,12 +105,12 @@ def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jo
         if resume:
             files.start(folder, config)
         try:
-            _steps(problem, calibrated, folder, watch)  # none are left of a candidate that was just compared
+            take_steps(problem, calibrated, folder, watch)  # none are left of a candidate that was just compared
             if not problem.config.correction:
                 return finish(problem, calibrated)
             last = last or pose_correction(problem, calibrated[-1], watch)
             _check_follows(corrected, last, folder / files.STEPS)
-            _steps(last, corrected, folder, watch, (problem, calibrated))
+            take_steps(last, corrected, folder, watch, (problem, calibrated))
             return finish(last, [calibrated[0], *corrected])
         except KeyboardInterrupt:
             kept = len(calibrated) + len(corrected)
@@ -141,7 +144,7 @@ def _resumed(
     return problem, last, (calibrated, list(correction.steps) if chosen == CORRECTED else [])
 
 
-def _steps(
+def take_steps(
     problem: Problem, steps: list[Step], folder: Path, watch: Watch, first: tuple[Problem, Sequence[Step]] | None = None
 ) -> None:
     """Take the steps that are left, with a checkpoint and a line of text after each.

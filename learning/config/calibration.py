@@ -5,8 +5,9 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
+from ballfg.checks import shown
 from ballfg.dynamics.earlier_names import todays_names
-from ballfg.learning.config.training import Count, Positive, Section, Share
+from ballfg.learning.config.training import Count, Names, Positive, Section, Share
 
 Coefficients = Annotated[
     tuple[str, ...],
@@ -15,11 +16,13 @@ Coefficients = Annotated[
 ]
 
 
-def _one_folder(data: object) -> object:
-    """A folder as it is. Raises: ValueError: several."""
-    if isinstance(data, list):
-        raise ValueError("must be one folder: a calibration belongs to one room. Calibrate the datasets one by one.")
-    return data
+def _folders(data: object) -> object:
+    """One folder as text, several as a tuple. Raises: ValueError: anything else."""
+    if data is None or isinstance(data, str):
+        return data
+    if not isinstance(data, list | tuple) or not data or not all(isinstance(one, str) for one in data):
+        raise ValueError(f"must be a folder, or a list of folders; got {shown(data)}.")
+    return data[0] if len(data) == 1 else tuple(data)
 
 
 class CalibrationConfig(Section):
@@ -40,8 +43,9 @@ class CalibrationConfig(Section):
     model: str | None = None
     """Model file to start from; null: the nominal model of the dataset's ball."""
 
-    data: Annotated[str | None, BeforeValidator(_one_folder)] = None
-    """Folder of the dataset. `--data` replaces it."""
+    data: Annotated[str | Names | None, BeforeValidator(_folders)] = None
+    """Folder of the dataset, or a list of several for `kind: calibrate`: each is calibrated by itself, and what they
+    have in common is a model for rooms and balls that none of them shows. `--data` replaces it."""
 
     out: str = "calibration"
     """Folder that is written. `--out` replaces it."""
@@ -91,6 +95,11 @@ class CalibrationConfig(Section):
 
     @model_validator(mode="after")
     def _check_correction(self) -> Self:
+        if isinstance(self.data, tuple) and (self.correction or self.kind == "auto"):
+            raise ValueError(
+                "kind: auto and a correction belong to one room and ball; got several datasets. Give one, or write "
+                "kind: calibrate without a correction."
+            )
         if self.correction and (self.kind == "auto" or self.groups is None):
             raise ValueError(
                 "correction must come with groups, whose spins it needs, and kind: auto decides on it; got neither. "

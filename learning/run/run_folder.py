@@ -36,8 +36,9 @@ def check(folder: Path, config: Config, *, resume: bool) -> None:
         if not (folder / CONFIG).is_file():
             raise FileNotFoundError(f"--resume needs the folder of an earlier run; {folder} has no {CONFIG}.")
         earlier, now = (_flat(each.model_dump(mode="json")) for each in (read_config(folder / CONFIG), config))
+        several = isinstance(earlier.get("data"), list) != isinstance(now["data"], list)
         for name in ("kind", *now):
-            if name not in config.FREE_TO_CHANGE and earlier.get(name) != now[name]:
+            if (several and name == "data") or (name not in config.FREE_TO_CHANGE and earlier.get(name) != now[name]):
                 raise ValueError(
                     f"a resumed run must keep its config; '{name}' was {shown(earlier.get(name))} and is "
                     f"{shown(now[name])}. Give {folder / CONFIG} as the config, or start a new run."

@@ -11,10 +11,12 @@ from ballfg.simulation.balls import with_model
 PLANTED = {"flight.drag.k": 0.155, "bounce.restitution.e": 0.88, "bounce.table_height.offset": 0.006}
 
 
-def simulated(folder: Path, tracks: int, *, spin_labels: bool = True) -> Path:
+def simulated(
+    folder: Path, tracks: int, *, spin_labels: bool = True, drag: float = PLANTED["flight.drag.k"], seed: int = 3
+) -> Path:
     """A dataset of balls that drag more and bounce less than the nominal one, on a table that lies higher."""
     content = {
-        "flight": {"gravity": {}, "drag": {"k": PLANTED["flight.drag.k"]}, "magnus": {"k": 0.0028}},
+        "flight": {"gravity": {}, "drag": {"k": drag}, "magnus": {"k": 0.0028}},
         "bounce": {
             "restitution": {"e": PLANTED["bounce.restitution.e"]},
             "friction": {"mu": 0.25},
@@ -24,7 +26,7 @@ def simulated(folder: Path, tracks: int, *, spin_labels: bool = True) -> Path:
     }
     ball = with_model(table_tennis(), model_from_dict(content))
     noise = MeasurementNoise(position=0.0015)
-    write_simulation(folder, SimulationConfig(tracks, 80.0, seed=3, ball=ball, noise=noise, spin_labels=spin_labels))
+    write_simulation(folder, SimulationConfig(tracks, 80.0, seed=seed, ball=ball, noise=noise, spin_labels=spin_labels))
     return folder
 
 

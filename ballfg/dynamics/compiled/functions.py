@@ -19,7 +19,7 @@ from ballfg.arrays import Array
 from ballfg.dynamics.compiled.build import Code, built, digest, read_note, write_note
 from ballfg.dynamics.compiled.flight import fly_together
 from ballfg.dynamics.compiled.kept import source_stamp
-from ballfg.dynamics.compiled.places import Numbers, numbers_of
+from ballfg.dynamics.compiled.places import Numbers, numbers_of, stamp_of
 from ballfg.dynamics.compiled.translation.recipe import Recipe
 from ballfg.dynamics.model import BallModel, is_substituted, substitute
 from ballfg.dynamics.motion.flight_step import step_jacobian
@@ -60,9 +60,8 @@ class CompiledModel:
         parts = (self.rates, self.impact, self.surface)
         if all(part.weigh is None for part in parts):
             return NONE, NONE, NONE
-        numbers = numbers_of(model)
-        tables, now = numbers.tables(), numbers.stamp()
-        known = _weights.get(model)
+        tables = numbers_of(model).tables()
+        now, known = stamp_of(tables), _weights.get(model)
         if known is None or known[0] != now:
             plain = [table.detach() for table in tables]
             rates, impact, surface = (NONE if p.weigh is None else p.weigh(*plain).numpy() for p in parts)
@@ -72,7 +71,7 @@ class CompiledModel:
 
 NONE: Final = np.zeros(0)  # The weights of a function without tables
 _Weighed = tuple[Hashable, Sequence[Tensor], tuple[Array, Array, Array]]
-"""Stamp of a model's tables; the tables, kept so that no others get their place in memory and with it their stamp; the
+"""Stamp of a model's tables; these, kept so that no others get their place in memory and with it their stamp; the
 weights of rates, impact and surface that were computed from them."""
 _weights: weakref.WeakKeyDictionary[BallModel, _Weighed] = weakref.WeakKeyDictionary()
 _OF_TORCH: Final = frozenset(vars(nn.Module()))
@@ -129,6 +128,7 @@ def _structure(module: nn.Module) -> Hashable:
     return (
         f"{type(module).__module__}.{type(module).__qualname__}",
         tuple(sorted(own.items())),
+        tuple(sorted(getattr(module, "tabled", ()))),
         parameters,
         buffers,
         parts,
@@ -251,8 +251,8 @@ def _traced(model: BallModel, function: Callable[[BallModel, Tensor], Tensor]) -
     from ballfg.dynamics.compiled.translation.trace import trace  # torch's tracer takes a second to import
     from ballfg.dynamics.networks.layers import MNN
 
-    scalars = [name for name, parameter in model.named_parameters() if parameter.dim() == 0]
-    arrays, tables = list(numbers_of(model).arrays), [table.detach() for table in numbers_of(model).tables()]
+    numbers = numbers_of(model)
+    scalars, arrays, tables = list(numbers.scalars), list(numbers.arrays), [one.detach() for one in numbers.tables()]
 
     def of_vectors(state: Tensor, coefficients: Tensor, *given: Tensor) -> Tensor:
         values = {name: coefficients[i] for i, name in enumerate(scalars)}

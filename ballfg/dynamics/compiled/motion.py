@@ -114,10 +114,12 @@ def _plain(given: Tensor) -> Array:
 def functions_of(model: BallModel) -> CompiledModel | None:
     """The functions of a model, also for coefficients that travel with the state.
 
-    A subclass of `AugmentedModel` may compute anything, or draw random numbers: torch evaluates it.
+    A subclass of `AugmentedModel` may compute anything, or draw random numbers: torch evaluates it, and coefficients
+    by which machine code has no derivatives.
     """
     if isinstance(model, AugmentedModel):
-        return compiled(model.model) if type(model) is AugmentedModel else None
+        own = type(model) is AugmentedModel and numbers_of(model.model).scalars.keys() >= set(model.names)
+        return compiled(model.model) if own else None
     return compiled(model)
 
 

@@ -3,7 +3,8 @@
 import weakref
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from operator import attrgetter
+from typing import Any, Final
 
 from torch import Tensor
 
@@ -16,7 +17,8 @@ class Numbers:
 
     scalars: Mapping[str, tuple[dict[str, Any], str]]  # by name, the dictionary and the key at which a coefficient lies
     arrays: Mapping[str, tuple[dict[str, Any], str]]
-    """The same for parameters that are no scalars, and buffers: derivatives by them are left to torch."""
+    """The same for parameters that are no scalars, `Effect.tabled` ones, and buffers: derivatives by them are left to
+    torch."""
     parts: Sequence[tuple[dict[str, Any], tuple[Any, ...]]]
     """Of each module of the model, the dictionary of its sub-modules and what that held."""
     ball: tuple[float, float]  # radius (m) and inertia factor
@@ -31,7 +33,7 @@ class Numbers:
     def value(self, name: str) -> float:
         """Present value of a coefficient."""
         owner, key = self.scalars[name]
-        return float(owner[key].item())
+        return owner[key].item()
 
     def tables(self) -> list[Tensor]:
         """Present arrays."""
@@ -40,8 +42,15 @@ class Numbers:
     def stamp(self) -> Hashable:
         """A number that changes with any value, as long as the `tables` of an earlier stamp are kept alive."""
         values = tuple(self.value(name) for name in self.scalars)
-        tables = tuple((id(table), table._version, table.data_ptr()) for table in self.tables())
-        return self.ball, tuple(self.scalars), values, tables
+        return self.ball, tuple(self.scalars), values, stamp_of(self.tables())
+
+
+_VERSION: Final = attrgetter("_version")
+
+
+def stamp_of(tables: Sequence[Tensor]) -> Hashable:
+    """A number that changes with any of the tables, as long as those of an earlier stamp are kept alive."""
+    return tuple(map(id, tables)), tuple(map(_VERSION, tables)), tuple(map(Tensor.data_ptr, tables))
 
 
 _numbers: weakref.WeakKeyDictionary[BallModel, Numbers] = weakref.WeakKeyDictionary()
@@ -57,7 +66,8 @@ def numbers_of(model: BallModel) -> Numbers:
             path, _, key = name.rpartition(".")
             part = model.get_submodule(path)
             places[name] = (part._parameters if name in parameters else part._buffers, key)
-        scalars = {name: places[name] for name, p in parameters.items() if not p.dim()}
+        tabled = {f"{path}.{name}" for path, part in model.named_modules() for name in getattr(part, "tabled", ())}
+        scalars = {name: places[name] for name, p in parameters.items() if not p.dim() and name not in tabled}
         arrays = {name: place for name, place in places.items() if name not in scalars}
         held = [(part._modules, tuple(part._modules.values())) for part in model.modules()]
         known = _numbers[model] = Numbers(scalars, arrays, held, (model.radius, model.inertia_factor))

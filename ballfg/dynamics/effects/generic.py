@@ -60,6 +60,9 @@ LIMIT: Final = 10.0  # Largest weight: drag or lift eleven times as large
 
 WEIGHTS: Final = tuple(f"{force}_{term}" for force in FORCES for term in FUNCTIONS)
 """Names of all weights, those of drag first."""
+DIRECTIONS: Final = tuple(f"{name}_{k}" for k in range(1, len(FUNCTIONS) + 1) for name in WEIGHTS)
+"""Names of the numbers of all directions."""
+BAND: Final = frozenset(DIRECTIONS[DOUBTS * len(WEIGHTS) :])  # Those of directions without a doubt
 
 Terms = Mapping[str, tuple[float, str]]
 
@@ -201,11 +204,7 @@ def _numbers() -> tuple[Coefficient, ...]:
         for prefix in DOUBT.values()
         for k in range(1, DOUBTS + 1)
     )
-    directions = tuple(
-        Coefficient(f"{name}_{k}", 0.0, 0.0, "1", -LIMIT, LIMIT, absent=None)
-        for k in range(1, len(FUNCTIONS) + 1)
-        for name in WEIGHTS
-    )
+    directions = tuple(Coefficient(name, 0.0, 0.0, "1", -LIMIT, LIMIT, absent=None) for name in DIRECTIONS)
     return (*weights, *doubts, *directions)
 
 
@@ -231,6 +230,22 @@ class AirCorrection(FlightEffect):
     needs = ("drag", "magnus")
     learned = True
     coefficients = (*_shape(), *_numbers())
+
+    def __init__(self, /, **values: float) -> None:
+        """A doubt without a direction moves nothing: estimates do not carry it."""
+        super().__init__(**values)
+        idle = (
+            f"{DOUBT[force]}_{k}"
+            for force in FORCES
+            for k in range(1, DOUBTS + 1)
+            if not any(values.get(f"{force}_{term}_{k}") for term in FUNCTIONS)
+        )
+        self.set_sigmas(**dict.fromkeys(idle, 0.0))
+
+    @property
+    def tabled(self) -> frozenset[str]:
+        """What is known and moves a ball: not the doubts, and not the weights while they are learned."""
+        return frozenset(c.name for c in self.coefficients if not c.sigma and c.name not in BAND)
 
     def adjust(self, flight: Flight) -> Flight:
         """The flight with the gains that other effects gave it times one plus the correction."""

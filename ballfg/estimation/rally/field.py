@@ -57,7 +57,8 @@ class Field:
     @classmethod
     def of(cls, seen: Detections, scale: float, ball: float = SEEN) -> Field:
         """The field of detections of a fixed camera that hold the ball with a probability `ball`."""
-        count, size = len(seen.frames), np.ptp(seen.pixels, axis=0)
+        count, pixels = len(seen.frames), seen.pixels
+        size = pixels.max(axis=0, initial=-np.inf) - pixels.min(axis=0, initial=np.inf)
         better = len(seen) - np.searchsorted(np.sort(seen.scores), seen.scores)
         first = np.searchsorted(seen.frame, np.arange(count + 1))
         step, bars = float(np.median(np.diff(seen.frames))), np.nan_to_num(seen.streaks[:, 1] - seen.streaks[:, 0])

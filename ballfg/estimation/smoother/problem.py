@@ -62,8 +62,7 @@ def trackwise_model(model: BallModel, settings: Settings) -> BallModel:
 
 def coefficient_means(model: BallModel, settings: Settings) -> Array:
     """(p,) the model's own values of the estimated coefficients."""
-    parameters = dict(model.named_parameters())
-    return np.array([float(parameters[name].detach()) for name in settings.coefficients])
+    return np.array([float(model.get_parameter(name).detach()) for name in settings.coefficients])
 
 
 def effective_sigmas(track: Track, segmentation: Segmentation, settings: Settings) -> Array:

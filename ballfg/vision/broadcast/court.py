@@ -27,12 +27,14 @@ class Court:
 
     Attributes:
         corners: (4, 3) m, around the court; of its longest rectangle, to the outer edges of its lines.
-        lines: (l, 2, 3) m, ends of the middles of its lines.  net: m, height of the net at x = 0; 0 for none.
-        net_reach: m, half its width.  floor: m, z of a floor below a table; None: there is none.
+        lines: (l, 2, 3) m, ends of the middles of its lines.  across: (l, 3) m, from one edge of each to the other.
+        net: m, height of the net at x = 0; 0 for none.  net_reach: m, half its width.
+        floor: m, z of a floor below a table; None: there is none.
     """
 
     corners: Array
     lines: Array
+    across: Array
     net: float
     net_reach: float
     floor: float | None
@@ -101,9 +103,12 @@ def _court(
     for axis in (0, 1):
         border = np.isclose(np.abs(ends[:, :, axis]), half[axis]).all(axis=1)
         ends[border, :, axis] -= 0.5 * width * np.sign(ends[border, :, axis])
+    along = ends[:, 1] - ends[:, 0]
+    across = width * np.cross((0.0, 0.0, 1.0), along / np.linalg.norm(along, axis=1, keepdims=True))
     if net is not None:
         ends = np.concatenate((ends, [[[0.0, -net[1], net[0]], [0.0, net[1], net[0]]]]))
-    return Court(corners, ends, *((0.0, 0.0) if net is None else net), floor)
+        across = np.concatenate((across, [[0.0, 0.0, width]]))
+    return Court(corners, ends, across, *((0.0, 0.0) if net is None else net), floor)
 
 
 def _named(where: str, names: Any, count: int, known: dict[str, Array]) -> list[Array]:

@@ -22,12 +22,16 @@ SAMPLES: Final = 24
 """Along a line of the court."""
 STEP: Final = 0.5
 """px between values along a normal."""
-FLANK: Final = 3.0
+FLANK: Final = 4.0
 """px from the middle of a line to the ground beside it."""
 CROSSING: Final = 2.0 * FLANK
 """px from another line within which it is in the way."""
 RIDGE: Final = 12.0
 """Grey levels by which a line is brighter than the ground, at least."""
+LEANING, SHARP = 0.1305, 2.4
+"""Of the step between the grounds, by which the halfway places of a line that is far narrower than its blur differ from
+where they should be (Phi(sqrt(2 log 2)) - 3/4); the power of the share of the width that is not blur with which this
+vanishes, as of a bar blurred by a Gaussian to a tenth."""
 SIGMA: Final = 0.7
 """px, standard deviation of a ridge about the camera of one picture alone: more than that of its place."""
 ROBUST: Final = 2.0
@@ -79,7 +83,10 @@ def ridges(image: Array32, camera: Pinhole, court: Court, reach: float) -> Ridge
     inside = ((pixels > FLANK) & (pixels < limit - FLANK)).all(axis=2) & (length > 2 * SAMPLES)[:, None]
     inside &= ~_crossed(pixels, camera.project(court.lines))
     line = np.broadcast_to(np.arange(len(court.lines))[:, None], inside.shape)[inside]
-    offset, good = _brightest(image, pixels[inside], normals[inside], reach)
+    across = np.broadcast_to(0.5 * court.across[:, None], points.shape)[inside]
+    edges = camera.project(points[inside] + across) - camera.project(points[inside] - across)
+    width = np.abs((edges * normals[inside]).sum(axis=1))
+    offset, good = _brightest(image, pixels[inside], normals[inside], reach, width)
     asked = inside.sum(axis=1)
     return Ridges(points[inside][good], offset[good], normals[inside][good], line[good], asked)
 
@@ -94,11 +101,12 @@ def _crossed(pixels: Array, ends: Array) -> Mask:
     return np.asarray(close.any(axis=-1))
 
 
-def _brightest(image: Array32, pixels: Array, normal: Array, reach: float) -> tuple[Array, Mask]:
+def _brightest(image: Array32, pixels: Array, normal: Array, reach: float, width: Array) -> tuple[Array, Mask]:
     """(n,) px, the middle of the strongest ridge along each normal, and whether there is one (n,).
 
     The middle lies between the places on both sides where the brightness is halfway down to the ground there: the
-    brightest place itself lies towards the brighter ground.
+    brightest place itself lies towards the brighter ground. Where blur is as wide as the line, of `width` (n,) px, the
+    places lie there too, by what is known of the ridge: the step between the grounds, and how steep it is.
     """
     steps = np.arange(-reach - FLANK, reach + FLANK + STEP / 2, STEP)
     if not len(pixels):
@@ -110,18 +118,25 @@ def _brightest(image: Array32, pixels: Array, normal: Array, reach: float) -> tu
     top = np.argmax(rise, axis=1)
     good = (rise[rows, top] > RIDGE) & (top > 0) & (top < rise.shape[1] - 1)
     near = values[rows[:, None], top[:, None] + np.arange(2 * flank + 1)]
-    shift = STEP * 0.5 * (_halfway(near[:, flank:]) - _halfway(near[:, flank::-1]))
+    after, steep = _halfway(near[:, flank:])
+    before, steeper = _halfway(near[:, flank::-1])
+    share = np.minimum(width / np.maximum(STEP * (after + before), STEP), 1.0)
+    step = (near[:, -1] - near[:, 0]) / np.maximum(0.5 * (steep + steeper), 1.0)
+    shift = STEP * (0.5 * (after - before) - LEANING * (1.0 - share**SHARP) * step)
     return -reach + STEP * top + np.where(good, shift, 0.0), good
 
 
-def _halfway(falling: Array) -> Array:
-    """(n,) number of the step, with its fraction, where values (n, k) are last halfway from the first to the last."""
+def _halfway(falling: Array) -> tuple[Array, Array]:
+    """Where values (n, k) are last halfway from the first to the last, and how much they fall in a step there.
+
+    Returns: (n,) numbers of steps, with their fractions. (n,).
+    """
     level = 0.5 * (falling[:, 0] + falling[:, -1])
     above = falling[:, :-1] >= level[:, None]
     last = above.shape[1] - 1 - np.argmax(above[:, ::-1], axis=1)
     rows = np.arange(len(falling))
     here, after = falling[rows, last], falling[rows, last + 1]
-    return np.asarray(last + np.clip((here - level) / np.maximum(here - after, 1e-6), 0.0, 1.0))
+    return last + np.clip((here - level) / np.maximum(here - after, 1e-6), 0.0, 1.0), here - after
 
 
 def slopes(camera: Pinhole, points: Array) -> tuple[Array, Array]:

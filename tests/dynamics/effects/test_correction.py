@@ -9,9 +9,13 @@ import pytest
 import torch
 
 from ballfg.dynamics import AnalyticModel, load_model, nominal_model, save_model
+from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.compiled.functions import compiled
 from ballfg.dynamics.effects import generic, registry
 from ballfg.dynamics.effects.flight import Drag, Gravity, Magnus
 from ballfg.dynamics.effects.generic import DOUBT, DOUBTS, FUNCTIONS, WEIGHTS, AirCorrection, correction_terms
+from ballfg.dynamics.motion.integrate import fly, fly_jacobian
 from ballfg.state import STANDARD_GRAVITY
 
 LOW, HIGH = -4.0, 4.0
@@ -123,6 +127,57 @@ def test_a_model_file_keeps_it(tmp_path: Path) -> None:
     assert {name for name, c in found.declared_coefficients().items() if "doubt" in name and c.varies} == {
         f"flight.air_correction.{prefix}_{k}" for prefix in DOUBT.values() for k in range(1, DOUBTS + 1)
     }
+
+
+def test_an_estimate_carries_only_doubts_that_move_something() -> None:
+    drag = [f"drag_{term}_{k}" for term in FUNCTIONS for k in range(1, DOUBTS)]
+    model = model_with(AirCorrection(**dict.fromkeys(drag, 0.1)))
+    assert set(coefficient_sigmas(model)) == {"flight.drag.k", *(f"flight.air_correction.doubt_{k}" for k in (1, 2, 3))}
+
+
+def test_machine_code_has_derivatives_by_the_doubts_and_by_no_known_number() -> None:
+    effect = random_correction()
+    model, section = model_with(effect), "flight.air_correction"
+    rates = compiled(model)
+    assert rates is not None
+    doubts = {f"{section}.{prefix}_{k}" for prefix in DOUBT.values() for k in range(1, DOUBTS + 1)}
+    assert {name for name in rates.rates.names if name.startswith(section)} == doubts
+    learned = model_with(random_correction())
+    learned.flight["air_correction"].set_sigmas(**dict.fromkeys(WEIGHTS, 0.1))
+    rates = compiled(learned)
+    assert rates is not None
+    assert {f"{section}.{name}" for name in WEIGHTS} | doubts <= set(rates.rates.names)
+
+
+@pytest.mark.parametrize("name", ["doubt_2", "lift_vs", "drag_one_1"])
+def test_derivatives_by_any_of_its_numbers_are_central_differences(name: str) -> None:
+    """By doubts in machine code, by numbers that it takes as known in torch."""
+    model = AugmentedModel(model_with(random_correction()), (f"flight.air_correction.{name}",))
+    start = torch.cat((states(6), model.means().detach().expand(6, 1)), dim=1)
+    dt, step = torch.full((6,), 0.02, dtype=torch.float64), 1e-5
+    _, jacobian = fly_jacobian(model, start, dt)
+    moved = torch.zeros(10, dtype=torch.float64)
+    moved[9] = step
+    slope = (fly(model, start + moved, dt) - fly(model, start - moved, dt))[:, :9] / (2.0 * step)
+    assert slope.abs().max() > 1e-5
+    torch.testing.assert_close(jacobian[:, :9, 9], slope.detach(), rtol=1e-6, atol=1e-8)
+
+
+def test_other_weights_move_the_machine_code() -> None:
+    model, dt = model_with(random_correction()), torch.full((6,), 0.02, dtype=torch.float64)
+    before = fly(model, states(6), dt)
+    with torch.no_grad():
+        dict(model.named_parameters())["flight.air_correction.drag_one_1"].add_(0.3)
+    after = fly(model, states(6), dt)
+    assert (after - before).abs().max() > 1e-4
+    torch.testing.assert_close(after, fly(model_like(model), states(6), dt), rtol=0.0, atol=1e-12)
+
+
+def model_like(model: AnalyticModel) -> AnalyticModel:
+    """Another model with the same numbers."""
+    effect = model.flight["air_correction"]
+    assert isinstance(effect, AirCorrection)
+    return model_with(AirCorrection(**effect.values()))
 
 
 def test_a_diagnosis_does_not_look_for_it() -> None:

@@ -4,7 +4,8 @@
 shot, predicts 0.3 s, and prints median errors and the share of coordinates in their 90 % intervals: calibrated, with
 groups, with groups and a correction of drag and lift, and what `kind: auto` chooses of them. With `--tracks 5 10 20`
 and `--draws 30`, so many of the training shots are drawn so often, and the mean log score of `auto` is compared with
-that of `calibrate`.
+that of `calibrate`. Where a correction could be calibrated, the processor time of an estimate with it is compared with
+that of the groups alone.
 """
 
 from __future__ import annotations
@@ -15,17 +16,21 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import torch
 
 from ballfg.arrays import Array
 from ballfg.benchmarks.dynamics.measured import measured_task
-from ballfg.dynamics import AnalyticModel, nominal_model
+from ballfg.dynamics import AnalyticModel, BallModel, load_model, nominal_model, save_model
+from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import Settings, Status, predict_tracks
 from ballfg.estimation.registry import make_estimator
 from ballfg.learning.calibration.auto import (
     CALIBRATED,
+    CORRECTED,
+    GROUPED,
     NOMINAL,
     Fitted,
     choose_candidate,
@@ -40,8 +45,11 @@ from ballfg.learning.calibration.calibrate import (
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.config_file import AUTO
 from ballfg.learning.evaluation import NINETY, log_density
-from ballfg.tracks import Track, read_dataset, write_dataset
+from ballfg.tracks import Dataset, Track, read_dataset, write_dataset
 from ballfg.tracks.info import DatasetInfo
+
+TURNS: Final = 5  # Repetitions of a measurement of time
+TIMED: Final = 12  # Tracks of it
 
 
 @dataclass(frozen=True)
@@ -65,23 +73,30 @@ class Halves:
 
         Args: chosen: numbers of the training tracks.
         """
-        parts = (("train", [self.train[k] for k in chosen]), ("test", self.judge))
-        tracks = [
-            replace(track, labels={**track.labels, "split": split}, name=f"{number:04}")
-            for number, (split, track) in enumerate((split, track) for split, part in parts for track in part)
-        ]
-        with tempfile.TemporaryDirectory() as written:
-            write_dataset(Path(written) / "data", self.info, tracks)
-            dataset, model = read_dataset(Path(written) / "data"), nominal_model(self.info.ball)
+        with tempfile.TemporaryDirectory() as folder:
+            dataset, model = self.written(Path(folder) / "data", chosen), nominal_model(self.info.ball)
             problem = pose(dataset, model, CalibrationConfig(split="label"))
             begun = time.process_time()
             choice, candidates = choose_candidate(problem)
             print(choice.table(), choice.verdict(), sep="\n")
             print(f"{time.process_time() - begun:.0f} s of processor time", flush=True)
-            found = {name: errors(problem, *finished(problem, one), self.judge) for name, one in candidates.items()}
-            if choice.chosen not in found:
-                found[choice.chosen] = errors(problem, *finished(problem, choice.chosen), self.judge)
+            kinds: dict[str, Fitted | str] = {choice.chosen: choice.chosen} | dict(candidates)
+            ready = {name: finished(problem, one) for name, one in kinds.items()}
+            found = {name: errors(problem.surfaces, *one, self.judge) for name, one in ready.items()}
+            if CORRECTED in ready:
+                without, corrected = times(problem.surfaces, (ready[GROUPED], ready[CORRECTED]), self.judge)
+                print(f"an estimate with a correction takes {corrected / without:.2f} times as long as without")
             return found | {AUTO: found[choice.chosen]}
+
+    def written(self, folder: Path, chosen: Sequence[int]) -> Dataset:
+        """A dataset of some training tracks, and the judging ones, with the label `split`."""
+        parts = (("train", [self.train[k] for k in chosen]), ("test", self.judge))
+        tracks = [
+            replace(track, labels={**track.labels, "split": split}, name=f"{number:04}")
+            for number, (split, track) in enumerate((split, track) for split, part in parts for track in part)
+        ]
+        write_dataset(folder, self.info, tracks)
+        return read_dataset(folder)
 
 
 def finished(problem: Problem, made: Fitted | str) -> tuple[AnalyticModel, Settings]:
@@ -96,9 +111,9 @@ def finished(problem: Problem, made: Fitted | str) -> tuple[AnalyticModel, Setti
     return model, settings if noise is None else noise.settings
 
 
-def errors(problem: Problem, model: AnalyticModel, settings: Settings, judged: Sequence[Track]) -> Array:
+def errors(surfaces: Surfaces, model: BallModel, settings: Settings, judged: Sequence[Track]) -> Array:
     """As `Halves.judged`."""
-    estimator = make_estimator("smoother", model, problem.surfaces, settings)
+    estimator = make_estimator("smoother", model, surfaces, settings)
     rows = []
     for one in predict_tracks(estimator, judged, len(judged), 0.25, horizon=0.3):
         if one.status is Status.OK and len(one.times):
@@ -109,6 +124,30 @@ def errors(problem: Problem, model: AnalyticModel, settings: Settings, judged: S
         else:
             rows.append([np.nan] * 5)
     return np.array(rows)
+
+
+def times(surfaces: Surfaces, models: Sequence[tuple[AnalyticModel, Settings]], judged: Sequence[Track]) -> Array:
+    """(k,) s of processor time of estimates of some tracks by each of k models: the shortest of some turns."""
+    smoothers, tracks = [], judged[:TIMED]
+    for model, settings in models:
+        with tempfile.TemporaryDirectory() as folder:  # as a user has it: with known weights
+            save_model(model, Path(folder) / "model.yaml")
+            smoothers.append(make_estimator("smoother", load_model(Path(folder) / "model.yaml"), surfaces, settings))
+    taken = np.empty((TURNS, len(smoothers), len(tracks)))
+    for turn in taken:
+        for row, smoother in zip(turn, smoothers, strict=True):
+            for k, track in enumerate(tracks):
+                begun = time.process_time()
+                smoother.estimate(track)
+                row[k] = time.process_time() - begun
+    return np.asarray(taken.min(axis=0).sum(axis=1))
+
+
+def numbers_of(rows: Array) -> str:
+    """What a line says of rows of `errors`."""
+    held = np.nanmean(rows[:, 2:], axis=0)
+    numbers = f"median {np.nanmedian(rows[:, 0]):.1f} mm, log score {np.nanmean(rows[:, 1]):.3f}"
+    return f"{numbers}, held {held.mean():.0f} % ({' / '.join(f'{axis:.0f}' for axis in held)})"
 
 
 def few(halves: Halves, size: int, draws: int, seed: int) -> str:
@@ -143,10 +182,7 @@ def main() -> None:
             print(f"{folder.name}, {few(halves, size, given.draws, given.seed)}", flush=True)
         kinds = {} if given.tracks else halves.judged(range(len(halves.train)))
         for kind, rows in kinds.items():
-            held = np.nanmean(rows[:, 2:], axis=0)
-            numbers = f"median {np.nanmedian(rows[:, 0]):.1f} mm, log score {np.nanmean(rows[:, 1]):.3f}"
-            axes = " / ".join(f"{axis:.0f}" for axis in held)
-            print(f"{folder.name}, {kind}: {numbers}, held {held.mean():.0f} % ({axes})", flush=True)
+            print(f"{folder.name}, {kind}: {numbers_of(rows)}", flush=True)
 
 
 if __name__ == "__main__":

@@ -183,7 +183,7 @@ def test_the_time_left_is_that_of_the_steps_left(
     moments = iter(range(1000, 10**6, 10))
     monkeypatch.setattr(run, "time", SimpleNamespace(monotonic=lambda: float(next(moments))))
     problem = posed(few_tracks, max_iterations=4)
-    run._steps(problem, [], tmp_path, unwatched)
+    run.take_steps(problem, [], tmp_path, unwatched)
     lines = capsys.readouterr().out.splitlines()
     assert lines[1].startswith("iteration 1: ")
     assert lines[1].endswith("; at most about 30 s left")
