@@ -112,7 +112,7 @@ class SearchLoop:
         """The search with the named effects only, its predictions and findings."""
         stamps, odds = self.holdout.stamps, found.odds
         final = found.named_at(self.name_at)
-        whole = found.models[final.names - {NAMELESS}].fit
+        whole = found.plain(final).fit
         if final.nameless and final.named:
             whole = with_strengths_of(final, whole)
         self.watch("predicting the other half")
@@ -284,8 +284,8 @@ class _Found:
         tried = {best.names}
         while True:
             scores = self.scores
-            names = max(best.nested, key=lambda names: scores[names], default=best.names)
-            if names in tried or scores[names] <= scores[best.names]:
+            names = max(best.nested, key=lambda names: scores.get(names, -np.inf), default=best.names)
+            if names in tried or scores.get(names, -np.inf) <= scores[best.names]:
                 return best
             tried.add(names)
             gone = [h for h in best.named if h.name not in names]
@@ -308,9 +308,8 @@ class _Found:
             of_some = loop.of_some or loop.catalogue
             _, varying = try_varying(best, self.motion, of_some, ways, tell, loop.jobs, self.patterns)
             winner = self._named_beside(best, varying)
-        if winner is not None and winner.names - {NAMELESS} not in self.models:
-            plain = weighed(winner.fit, winner.named, self.motion, self.halves, winner)
-            self.models[plain.names] = plain
+        if winner is not None:
+            self.plain(winner)
         return winner
 
     def _named_beside(self, best: Weighed, refits: Sequence[Refit]) -> Weighed | None:
@@ -347,6 +346,13 @@ class _Found:
         tasks = [partial(weighed, m.fit, m.named, self.motion, self.halves, m, self.patterns) for m in new.values()]
         self.models |= dict(zip(new, do_all(tasks, self.loop.jobs), strict=True))
         return [self.models[m.names | {NAMELESS}] for m in models]
+
+    def plain(self, model: Weighed) -> Weighed:
+        """The same model without something nameless."""
+        names = model.names - {NAMELESS}
+        if names not in self.models:
+            self.models[names] = weighed(model.fit, model.named, self.motion, self.halves, model)
+        return self.models[names]
 
     def without(self, gone: Sequence[Hypothesis], model: Weighed | None = None) -> Weighed:
         """A model without some of its effects, and without those that need them.

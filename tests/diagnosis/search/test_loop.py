@@ -210,6 +210,8 @@ def test_an_effect_is_found_beside_something_nameless_alone(gusty, make_ball):
     best = max(found.models.values(), key=lambda model: found.scores[model.names])
     assert {"frame_tilt", NAMELESS} <= best.names
     assert best.score > nothing.score + np.log(100.0)
+    known = found.models.pop(best.names - {NAMELESS})
+    assert found.plain(best).evidence == pytest.approx(known.evidence, abs=0.5)  # one that was refitted, but lost
 
 
 def test_the_best_minimum_of_the_same_effects_counts(gusty, make_ball):
