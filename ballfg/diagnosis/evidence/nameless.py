@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from ballfg.arrays import Array, Index
-from ballfg.diagnosis.evidence.rows import Rows, batches_of, roots
+from ballfg.diagnosis.evidence.rows import Motion, Rows, batches_of, roots, rows_of
 from ballfg.diagnosis.fit.patterns import blocks_of
 from ballfg.diagnosis.fit.problem import Fit
 
@@ -46,3 +46,9 @@ class Patterns:
     def beside(self, rows: Sequence[Rows]) -> list[Rows]:
         """Rows with the patterns as further common unknowns, last."""
         return [batch.beside(columns) for batch, columns in zip(rows, self.columns, strict=True)]
+
+
+def rows_beside(fit: Fit, motion: Motion, patterns: Patterns | None) -> list[Rows]:
+    """The rows of a fit as of `rows_of`, with patterns as further common unknowns if there are some."""
+    rows = rows_of(fit, motion)
+    return rows if patterns is None else patterns.beside(rows)

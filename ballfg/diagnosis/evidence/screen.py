@@ -16,11 +16,11 @@ from scipy import special
 
 from ballfg.arrays import Array, Index
 from ballfg.diagnosis.evidence.likelihood import Batches, Posterior, Reduced, held_out, posterior
-from ballfg.diagnosis.evidence.nameless import Patterns
+from ballfg.diagnosis.evidence.nameless import Patterns, rows_beside
 from ballfg.diagnosis.evidence.odds import tempered
 from ballfg.diagnosis.evidence.prior import WIDTHS, centres, choice_odds, log_odds, scales, within
 from ballfg.diagnosis.evidence.priors_of_fit import Priors
-from ballfg.diagnosis.evidence.rows import Motion, batches_of, roots, rows_of
+from ballfg.diagnosis.evidence.rows import Motion, batches_of, roots
 from ballfg.diagnosis.evidence.weighed import Step, Weighed, Weight
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 
@@ -66,9 +66,7 @@ class Screen:
             patterns: without a name, that the model was weighed with.
         """
         stretches, strengths = model.fit.problem.stretches, columns / roots(model.fit)
-        rows = rows_of(model.fit, motion)
-        beside = rows if patterns is None else patterns.beside(rows)
-        batches = zip(beside, batches_of(stretches.used.numpy()), strict=True)
+        batches = zip(rows_beside(model.fit, motion, patterns), batches_of(stretches.used.numpy()), strict=True)
         wide = [rows.beside(batch.of(strengths)) for rows, batch in batches]
         tracks = Batches.of(wide, model.weights).reduced(model.noise)[0].by_track(stretches.track)
         total = tracks.of(np.full(len(model.halves), True))
@@ -181,7 +179,7 @@ class Screen:
         for one in chosen:
             beside = (*beside, (one, self._beside(beside, one).width))
         mean, fit = self._posterior(beside).mean, self.model.fit
-        own = len(fit.problem.free) + fit.unknowns.launcher.size  # those of patterns come after them
+        own = len(fit.problem.common_precision)  # those of patterns come after them
         return Step(mean[:own], 0.0), mean[self._own :]
 
     def _names(self, chosen: Sequence[int]) -> frozenset[str]:

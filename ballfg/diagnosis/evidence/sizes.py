@@ -88,7 +88,8 @@ def _climbed(
     def at(likelihood: Batches, noise: Noise) -> tuple[Posterior, float, list[Local]]:
         reduced, local = likelihood.reduced(noise)
         free = posterior(reduced, precision, away)
-        return free.held(own), free.gain(own), local
+        held = free.held(own)
+        return held, free.evidence - held.evidence, local
 
     found, to_come, local = at(likelihood, noise)
     for _ in range(MOST_STEPS):

@@ -11,10 +11,10 @@ import numpy as np
 from ballfg.arrays import Array, Mask
 from ballfg.diagnosis.evidence.halves import unlike_halves
 from ballfg.diagnosis.evidence.likelihood import Noise, Reduced, Weights, held_out, posterior
-from ballfg.diagnosis.evidence.nameless import NAMELESS, Patterns
+from ballfg.diagnosis.evidence.nameless import NAMELESS, Patterns, rows_beside
 from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, log_odds, within
 from ballfg.diagnosis.evidence.priors_of_fit import Priors
-from ballfg.diagnosis.evidence.rows import Motion, Rows, random_motion, rows_of
+from ballfg.diagnosis.evidence.rows import Motion, Rows, random_motion
 from ballfg.diagnosis.evidence.sizes import Start, settled
 from ballfg.diagnosis.fit.fit import followed, with_guesses
 from ballfg.diagnosis.fit.problem import Fit, Unknowns
@@ -213,7 +213,7 @@ class _Point:
     @property
     def own(self) -> int:
         """Number of the common unknowns that the fit has; those of patterns come after them."""
-        return len(self.fit.problem.free) + self.fit.unknowns.launcher.size
+        return len(self.fit.problem.common_precision)
 
 
 @dataclass(frozen=True)
@@ -233,9 +233,8 @@ class _Question:
     def point(self, fit: Fit) -> _Point:
         """The rows of a fit and the priors at its unknowns."""
         fit = with_guesses(fit)
-        rows, patterns = rows_of(fit, self.motion), self.patterns
-        beside = rows if patterns is None else patterns.beside(rows)
-        return _Point(fit, beside, Priors.of(fit, self.named, patterns))
+        rows = rows_beside(fit, self.motion, self.patterns)
+        return _Point(fit, rows, Priors.of(fit, self.named, self.patterns))
 
     def at(
         self, point: _Point, starts: Sequence[Start | None], widths: Sequence[int] = ()

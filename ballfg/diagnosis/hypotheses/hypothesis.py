@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import cast
 
 import numpy as np
+import torch
 
 from ballfg.diagnosis.fit.free import LOOSE, Deviation, spread
 from ballfg.diagnosis.fit.problem import Fit
@@ -108,6 +109,16 @@ def has_effect(model: AnalyticModel, name: str) -> bool:
 def with_effects(model: AnalyticModel, *effects: Effect) -> AnalyticModel:
     """A copy of a model with further effects; its parameters are fixed (`requires_grad` is off)."""
     return _of_effects(model, [*(copy.deepcopy(effect) for effect in effects_of(model)), *effects])
+
+
+def with_coefficients(model: AnalyticModel, values: Mapping[str, float]) -> AnalyticModel:
+    """A copy as of `with_effects` with other values of its coefficients; names that are none of them do not count."""
+    changed = with_effects(model)
+    with torch.no_grad():
+        for name, parameter in changed.named_parameters():
+            if name in values:
+                parameter.fill_(values[name])
+    return changed
 
 
 def without_effect(model: AnalyticModel, name: str) -> AnalyticModel:

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
 import numpy as np
-import torch
 
 from ballfg.arrays import Mask
 from ballfg.diagnosis.evidence.halves import unlike_halves
@@ -16,11 +15,12 @@ from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.weighed import WORTH_A_STEP, Weighed, weighed
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.holdout import Holdout
-from ballfg.diagnosis.fit.problem import Fit, Problem
-from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, with_effects, without_effect
+from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect
 from ballfg.diagnosis.hypotheses.varying import Grouping, groupings
 from ballfg.diagnosis.result import Candidate, Errors, Finding
-from ballfg.diagnosis.search.candidates import FIRST_STEPS, Refit, Scored, refit
+from ballfg.diagnosis.search.candidates import Refit, Scored, refit
+from ballfg.diagnosis.search.changed_fits import with_strengths_of, without_named
 from ballfg.diagnosis.search.evaluation import on_all, on_others
 from ballfg.diagnosis.search.ranking import finding_of, ranking
 from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_findings, stamp_hypotheses
@@ -181,14 +181,19 @@ class _Found:
         scores = self.scores
         return max(models, key=lambda model: scores[model.names], default=None)
 
-    def is_better(self, model: Weighed | None) -> bool:
-        """Whether a model weighed before is more probable than the best one so far."""
-        return model is not None and self.scores[model.names] > self.scores[self.best.names]
+    def is_better(self, model: Weighed | None, than: Weighed | None = None) -> bool:
+        """Whether a model weighed before is more probable than another one, None: than the best one so far."""
+        scores = self.scores
+        return model is not None and scores[model.names] > scores[(than or self.best).names]
+
+    def telling(self, where: str) -> Callable[[str], None]:
+        """What tells lines of progress at a place of the search."""
+        return lambda line: self.loop.watch(f"{where}: {line}")
 
     def round(self) -> bool:
         """Adds the effects that make the model most probable, and removes those that they make superfluous."""
         loop, best, number = self.loop, self.best, len(self.rounds) + 1
-        tell: Callable[[str], None] = lambda line: loop.watch(f"round {number}: {line}")  # noqa: E731
+        tell = self.telling(f"round {number}")
         most = MOST_EFFECTS - len(best.named)
         scored, refits, screen = try_hypotheses(best, self.motion, loop.catalogue, tell, loop.jobs, most)
         winner = self._weighed(refits)
@@ -198,8 +203,7 @@ class _Found:
                 self.rounds.append(Round(scored, [*refits, exchanged], (exchanged.name,)))
                 return True
         if not self.is_better(winner):
-            ways = loop.ways or partial(groupings, loop.holdout.tracks)
-            more, fitted = try_varying(best, self.motion, loop.of_some or loop.catalogue, ways, tell, loop.jobs)
+            more, fitted = self._varying(best, tell)
             scored, refits = [*scored, *more], [*refits, *fitted]
             winner = self.most_probable(w for w in (winner, self._weighed(fitted)) if w is not None)
         added = self.is_better(winner)
@@ -211,7 +215,7 @@ class _Found:
         gone = [h.name for h in best.named if h not in winner.named]
         tell(" and ".join((*(f"{name} added" for name in names), *(f"{name} removed" for name in gone))))
         self.best = winner
-        if self._better_minimum(best, winner) and self.scores[best.names] > self.scores[winner.names]:
+        if self._better_minimum(best, winner) and self.is_better(best, winner):
             self.best = self.models[best.names]
         self._pruned()
         return True
@@ -271,7 +275,7 @@ class _Found:
             more = self._beyond(best)
             if more is None:
                 return
-            if self._better_minimum(best, more) and self.scores[best.names] > self.scores[more.names]:
+            if self._better_minimum(best, more) and self.is_better(best, more):
                 best = self.models[best.names]
             else:
                 best = self._shortened(more)
@@ -290,7 +294,7 @@ class _Found:
             tried.add(names)
             gone = [h for h in best.named if h.name not in names]
             (shorter,) = self.beside_nameless([self.without(gone, best)])
-            if self.scores[shorter.names] > self.scores[best.names]:
+            if self.is_better(shorter, best):
                 best = shorter
 
     def _beyond(self, best: Weighed) -> Weighed | None:
@@ -299,14 +303,12 @@ class _Found:
         Effects that are the same for all tracks are tried first. What is found is weighed without patterns as well.
         """
         loop, most = self.loop, MOST_EFFECTS - len(best.named)
-        tell: Callable[[str], None] = lambda line: loop.watch(f"beside something nameless: {line}")  # noqa: E731
+        tell = self.telling("beside something nameless")
         winner = self._named_beside(
             best, try_beside(best, self.motion, self.patterns, loop.catalogue, tell, loop.jobs, most)
         )
         if winner is None:
-            ways = loop.ways or partial(groupings, loop.holdout.tracks)
-            of_some = loop.of_some or loop.catalogue
-            _, varying = try_varying(best, self.motion, of_some, ways, tell, loop.jobs, self.patterns)
+            _, varying = self._varying(best, tell)
             winner = self._named_beside(best, varying)
         if winner is not None:
             self.plain(winner)
@@ -314,14 +316,25 @@ class _Found:
 
     def _named_beside(self, best: Weighed, refits: Sequence[Refit]) -> Weighed | None:
         """The most probable of some refits beside something nameless, if it is more probable than the best one."""
+        winner = self.most_probable(self._refitted(best, refits))
+        return winner if self.is_better(winner, best) else None
+
+    def _varying(self, best: Weighed, tell: Callable[[str], None]) -> tuple[list[Scored], list[Refit]]:
+        """Tests and refits of effects that differ between tracks, beside patterns if the model has some."""
+        loop = self.loop
+        ways = loop.ways or partial(groupings, loop.holdout.tracks)
+        patterns = self.patterns if best.nameless else None
+        return try_varying(best, self.motion, loop.of_some or loop.catalogue, ways, tell, loop.jobs, patterns)
+
+    def _refitted(self, best: Weighed, refits: Sequence[Refit]) -> list[Weighed]:
+        """Refits of a model, weighed, beside patterns if it has some."""
+        patterns = self.patterns if best.nameless else None
         tasks = [
-            partial(weighed, r.fit, (*best.named, *r.added), self.motion, self.halves, best, self.patterns)
+            partial(weighed, r.fit, (*best.named, *r.added), self.motion, self.halves, best, patterns)
             for r in refits
             if np.isfinite(r.fit.cost)
         ]
-        winner = self.most_probable(self._known(do_all(tasks, self.loop.jobs)))
-        better = winner is not None and self.scores[winner.names] > self.scores[best.names]
-        return winner if better else None
+        return self._known(do_all(tasks, self.loop.jobs))
 
     def named_at(self, probability: float) -> Weighed:
         """The model with all effects that are at least so probable, or with most of them.
@@ -379,12 +392,7 @@ class _Found:
         One that takes the place of a named effect needs both for a while.
         """
         best = self.best
-        tasks = [
-            partial(weighed, r.fit, (*best.named, *r.added), self.motion, self.halves, best)
-            for r in refits
-            if np.isfinite(r.fit.cost)
-        ]
-        found = self._known(do_all(tasks, self.loop.jobs))
+        found = self._refitted(best, refits)
         scores = self.scores
         for model in list(found):
             names = max(model.nested, key=lambda names: scores[names], default=model.names)
@@ -428,53 +436,3 @@ class _Found:
 
 def _score(model: Weighed) -> float:
     return model.score
-
-
-def with_strengths_of(model: Weighed, fit: Fit) -> Fit:
-    """A fit without patterns, its named effects as strong as in the model beside them.
-
-    Free, they would make up for what no effect describes. Effects that differ between tracks stay free.
-    """
-    known, problem = model.fit.unknowns.values, fit.problem
-    held = {c: known[c] for h in model.named if not h.deviations() for c in h.columns if c in problem.free}
-    changed = with_effects(problem.model)
-    parameters = dict(changed.named_parameters())
-    with torch.no_grad():
-        for name, value in held.items():
-            parameters[name].fill_(value)
-    free = {name: c for name, c in problem.free.items() if name not in held}
-    values = {name: value for name, value in fit.unknowns.values.items() if name in free}
-    problem = replace(problem, model=changed, free=free)
-    fitted = fit_problem(problem, replace(fit.unknowns, values=values), fit.noise)
-    return fitted if np.isfinite(fitted.cost) else fit
-
-
-def without_named(fit: Fit, gone: Sequence[Hypothesis], first: Fit) -> Fit:
-    """A few steps of the fit without some of the effects added to the first one's model, at the same noise.
-
-    They begin at the first one's values where a ball leaves its path without an effect: a large lift that saturates
-    without its saturation, say.
-    """
-    problem = fit.problem
-    for hypothesis in gone:
-        problem = _problem_without(problem, hypothesis, first)
-    known, plain = fit.unknowns, first.unknowns
-    kept = replace(known, values={n: known.values[n] for n in problem.free})
-    begun = fit_problem(problem, kept, fit.noise, settle_noise=False, steps=FIRST_STEPS)
-    if np.isfinite(begun.cost):
-        return begun
-    values = {n: plain.values.get(n, value) for n, value in kept.values.items()}
-    return fit_problem(problem, replace(plain, values=values), fit.noise, settle_noise=False, steps=FIRST_STEPS)
-
-
-def _problem_without(problem: Problem, hypothesis: Hypothesis, first: Fit) -> Problem:
-    """The problem without an effect that the first fit's model lacks, or without its free coefficients."""
-    name, gone = hypothesis.effect.name, set(hypothesis.columns)
-    needed = has_effect(first.problem.model, name)
-    if hypothesis.deviations():  # the effect itself may have been named too, the same for all tracks
-        needed |= any(n.startswith(f"{hypothesis.effect.kind}.{name}.") for n in problem.free if n not in gone)
-    model = problem.model if needed else without_effect(problem.model, name)
-    left = dict(model.named_parameters())
-    deviations = {n: d for n, d in problem.deviations.items() if d.coefficient in left and n not in gone}
-    free = {n: c for n, c in problem.free.items() if (n in left or n in deviations) and n not in gone}
-    return replace(problem, model=model, free=free, deviations=deviations)

@@ -16,7 +16,7 @@ from ballfg.diagnosis.evidence.rows import random_motion, rows_of
 from ballfg.diagnosis.evidence.sizes import settled
 from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.hypotheses.hypothesis import with_effects
+from ballfg.diagnosis.hypotheses.hypothesis import with_coefficients, with_effects
 from ballfg.diagnosis.result import Errors
 from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.dynamics import AnalyticModel, BallModel
@@ -37,13 +37,7 @@ SPREAD = 0.3
 
 def fitted_model(fit: Fit) -> AnalyticModel:
     """A copy of a fit's model with the fitted coefficients, without deviations, noise and launcher."""
-    model = with_effects(fit.problem.model)
-    parameters = dict(model.named_parameters())
-    with torch.no_grad():
-        for name, value in fit.unknowns.values.items():
-            if name in parameters:
-                parameters[name].fill_(value)
-    return model
+    return with_coefficients(fit.problem.model, fit.unknowns.values)
 
 
 def calibrated_model(fit: Fit, embedding: SpinEmbedding) -> AnalyticModel:

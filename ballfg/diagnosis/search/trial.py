@@ -87,11 +87,11 @@ def _refits(before: Fit, leading: Sequence[Scored], tell: Callable[[str], None])
 
 
 def _set_refits(
-    screen: Screen, scored: Sequence[Scored], sets: Sequence[tuple[int, ...]], tell: Callable[[str], None]
+    screen: Screen, scored: Sequence[Scored], most: int, tell: Callable[[str], None]
 ) -> list[Callable[[], Refit]]:
-    """The refits of sets of hypotheses."""
+    """The refits of the leading sets of hypotheses."""
     tested, found = {id(s.hypothesis): s for s in scored}, list[Callable[[], Refit]]()
-    for chosen in sets:
+    for chosen in leading_sets(screen, scored, most):
         members = [tested[id(screen.candidates[one])] for one in chosen]
         tell(f"fitting with {' and '.join(one.hypothesis.name for one in members)}")
         found.append(partial(refit_set, screen.model.fit, members, *screen.step(chosen)))
@@ -141,7 +141,7 @@ def try_beside(
     tell(f"testing {len(testable)} hypotheses")
     scored, screen = screened(model, testable, motion, patterns)
     tasks = _refits(model.fit, shortlist(scored), tell)
-    tasks += _set_refits(screen, scored, leading_sets(screen, scored, most), tell)
+    tasks += _set_refits(screen, scored, most, tell)
     return do_all(tasks, jobs)
 
 
@@ -174,7 +174,7 @@ def try_hypotheses(
     usual = {h.name: h for h in (s.hypothesis for s in scored) if h.usual and h.name not in called}
     usual = {name: h for name, h in usual.items() if not has_effect(model, name)}
     tasks = _refits(before, leading, tell)
-    tasks += [] if screen is None else _set_refits(screen, scored, leading_sets(screen, scored, most), tell)
+    tasks += [] if screen is None else _set_refits(screen, scored, most, tell)
     for name in usual:
         tell(f"fitting with {name}, which balls usually have")
     for hypothesis in driven:
