@@ -17,6 +17,7 @@ from ballfg.estimation.rally.choose import Chosen, rally
 from ballfg.estimation.rally.field import SEEN, SEEN_RANGE, Field
 from ballfg.estimation.rally.joined import joined_estimates
 from ballfg.estimation.rally.moments import Event
+from ballfg.estimation.rally.noise import Noise, left_over
 from ballfg.estimation.rally.strokes import Grower, Stroke
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.physics import physics_of
@@ -33,6 +34,8 @@ from ballfg.vision.detection.detections import Detections
 FRAME_SIGMA: Final = 0.3
 """px, of a picture's camera beside the error that all of a shot share."""
 
+NOISE_ROUNDS, NOISE_SETTLED = 8, 0.2
+"""In which the candidates' noise is found, and the change of its factors' logarithms that ends them."""
 KINK: Final = 2.0
 """px, standard deviation of the middle of a bar in which the ball bounced."""
 
@@ -118,8 +121,12 @@ def reconstruct(
         density = foretold.density(np.concatenate([stroke.rows for stroke in chosen.strokes]))
         if abs(plain.seen - field.seen) < SETTLED and before < THINNER * density:
             break
-    seen = _kinked(seen, chosen, field)
     smoother = Smoother(model, surfaces, Settings.for_measured(model, find_events=False))
+    kinked = _kinked(seen, chosen, field)
+    noise = _noise(smoother, seen, replace(camera, covariance=None), chosen, kinked)
+    covariances = noise.of(seen.covariances)
+    covariances[kinked] += KINK**2 * np.eye(2)
+    seen = replace(seen, covariances=covariances)
     tracks = [_track(stroke, seen, camera, model, surfaces) for stroke in chosen.strokes]
     alone = [smoother.estimate(track) for track in watch(tracks, len(tracks), "strokes estimated")]
     begun, end = _in_play(alone)
@@ -130,13 +137,30 @@ def reconstruct(
     return ShotRally(camera, seen, Chosen(*parts) if named else chosen, tuple(named), tuple(hits), field.exposure)
 
 
-def _kinked(seen: Detections, chosen: Chosen, field: Field) -> Detections:
-    """The candidates, with less certain centres of those bars in which the ball bounced."""
-    covariances, half = seen.covariances.copy(), 0.5 * field.exposure * field.step
+def _kinked(seen: Detections, chosen: Chosen, field: Field) -> Mask:
+    """(n,) True for the chosen candidates in whose bars the ball bounced."""
+    kinked, half = np.zeros(len(seen), dtype=bool), 0.5 * field.exposure * field.step
     for stroke in chosen.strokes:
         apart = np.abs(seen.times[stroke.rows][:, None] - np.array(stroke.bounces))
-        covariances[stroke.rows[(apart < half).any(axis=1)]] += KINK**2 * np.eye(2)
-    return replace(seen, covariances=covariances)
+        kinked[stroke.rows] = (apart < half).any(axis=1)
+    return kinked
+
+
+def _noise(smoother: Smoother, seen: Detections, camera: Camera, chosen: Chosen, kinked: Mask) -> Noise:
+    """The noise of the candidates, from the strokes alone as an exact camera sees them, without kinked bars."""
+    noise = Noise()
+    if not chosen.strokes:
+        return noise
+    rows = np.concatenate([stroke.rows for stroke in chosen.strokes])
+    stated, plain = seen.covariances[rows], ~kinked[rows]
+    for _ in range(NOISE_ROUNDS):
+        now = replace(seen, covariances=noise.of(seen.covariances) + KINK**2 * kinked[:, None, None] * np.eye(2))
+        tracks = [_track(stroke, now, camera, smoother.model, smoother.surfaces) for stroke in chosen.strokes]
+        left = left_over(tracks, [smoother.estimate(track) for track in tracks])
+        before, noise = noise, noise.likelier(stated[plain], left.select(plain), smoother.settings.sighting_loss)
+        if noise.changed(before) < NOISE_SETTLED:
+            break
+    return noise
 
 
 def _track(stroke: Stroke, seen: Detections, camera: Camera, model: BallModel, surfaces: Surfaces) -> Track:
