@@ -211,7 +211,7 @@ class Grower:
         most = max(MISSED, int(np.log(RARE) / np.log(1.0 - self.field.seen)))
         while missed <= most and 0 <= (frame := frame + way) < len(self.field.first) - 1:
             missed, more = missed + 1, self._with(stroke, self.field.rows(frame))
-            if more is None or more.score <= stroke.score + missed * np.log(self.field.seen):
+            if more is None or more.score <= stroke.score + missed * np.log(1.0 - self.field.seen):
                 continue
             doubtful |= more.score <= stroke.score
             missed, stroke = 0, more
