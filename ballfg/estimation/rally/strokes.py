@@ -40,7 +40,7 @@ INSIDE, AHEAD = 3.0, 4.0
 ALIKE: Final = 10.0
 """Misfit above the best guess's, of guesses that are followed."""
 FOLLOWED: Final = 4
-"""Guesses that are followed."""
+"""Guesses that are followed, the best one between two pictures: those beside it meet the same candidates."""
 OTHER_HALF: Final = 5.0
 """The same of a bounce on the half on which it scores for nobody: a stroke bounces on the other player's, a service on
 its own first."""
@@ -262,7 +262,11 @@ class Grower:
         passed = np.floor(np.maximum(way * (guesses - end), 0.0) / self.field.step)  # pictures without a candidate
         misfit = tried.misfit - 2.0 * np.log(1.0 - self.field.seen) * passed
         misfit = np.where(possible(scene, tried), misfit, np.inf)
-        for row in np.argsort(misfit, kind="stable")[:FOLLOWED]:
+        order = np.argsort(misfit, kind="stable")
+        _, best = np.unique(
+            np.floor((guesses[order] - end) / self.field.step), return_index=True
+        )  # between two pictures
+        for row in order[np.sort(best)[:FOLLOWED]]:
             if misfit[row] > misfit.min() + ALIKE or not np.isfinite(misfit[row]):
                 return
             yield from self.grown(self._rated(stroke.rows, tried, int(row)), way)
