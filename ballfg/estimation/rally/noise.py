@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 import torch
 
-from ballfg.arrays import Array, Mask
+from ballfg.arrays import Array
 from ballfg.estimation.observations.sightings import sightings_of
 from ballfg.estimation.result import Estimate
 from ballfg.factors.loss import Loss
@@ -24,19 +24,6 @@ from ballfg.vision.projection import CameraBank
 
 KNOWN: Final = 1.0
 """Degrees of freedom with which the stated covariances count."""
-
-
-@dataclass(frozen=True, eq=False)
-class Left:
-    """What flights leave of n candidates: distances `off` (n, 2) px of candidates from them, and `spread` (n, 2, 2)
-    px^2, the flights' own covariances there."""
-
-    off: Array
-    spread: Array
-
-    def select(self, rows: Mask) -> Left:
-        """That of some candidates."""
-        return Left(self.off[rows], self.spread[rows])
 
 
 @dataclass(frozen=True)
@@ -55,22 +42,24 @@ class Noise:
         """The larger change of a factor's logarithm."""
         return max(abs(np.log(self.around / before.around)), abs(np.log(self.along / before.along)))
 
-    def likelier(self, stated: Array, left: Left, loss: Loss) -> Noise:
-        """The factors with which what flights leave is likelier, if these were found with the factors of today.
+    def likelier(self, stated: Array, off: Array, spread: Array, loss: Loss) -> Noise:
+        """The factors with which the candidates are likelier, if the flights were found with the factors of today.
 
-        The distances have the covariance S - P, with that of the candidates S and of the flights P: a part of S
-        is as large as its share in the squares of the distances is beside its share in S - P.
+        The distances have the covariance S - P, with that of the candidates S and that of the flights P: a part of S
+        grows as much as its share in the squares of the distances exceeds its share in S - P.
 
-        Args: stated: (n, 2, 2) px^2.  loss: of a candidate, which weighs far ones less.
+        Args:
+            stated: (n, 2, 2) px^2.  off: (n, 2) px, from the flights to the candidates.
+            spread: (n, 2, 2) px^2, P.  loss: of a candidate, which weighs far ones less.
         """
         inverse = np.linalg.inv(self.of(stated))
-        white = (inverse @ left.off[..., None])[..., 0]
-        weight = loss.weight(np.sqrt((white * left.off).sum(axis=1)))
-        rest = inverse - inverse @ left.spread @ inverse
+        white = (inverse @ off[..., None])[..., 0]
+        weight = loss.weight(np.sqrt((white * off).sum(axis=1)))
+        left = inverse - inverse @ spread @ inverse
         found = list[float]()
         for factor, part in zip((self.around, self.along), parts(stated), strict=True):
             square = factor**2 * (weight * np.einsum("ni,nij,nj->n", white, part, white)).sum()
-            freedom = factor * np.maximum(np.einsum("nij,nji->n", part, rest), 0.0).sum()
+            freedom = factor * np.maximum(np.einsum("nij,nji->n", part, left), 0.0).sum()
             found.append(float((square + KNOWN) / (freedom + KNOWN)))
         return Noise(*found)
 
@@ -81,8 +70,11 @@ def parts(stated: Array) -> tuple[Array, Array]:
     return least, stated - least
 
 
-def left_over(tracks: Sequence[Track], estimates: Sequence[Estimate]) -> Left:
-    """What the estimates of tracks leave of all their sightings by exact cameras."""
+def left_over(tracks: Sequence[Track], estimates: Sequence[Estimate]) -> tuple[Array, Array]:
+    """Pixels (n, 2) from the estimates of tracks to their sightings by exact cameras, and the estimates' covariances.
+
+    Returns: (n, 2) px, and (n, 2, 2) px^2.
+    """
     off, spread = list[Array](), list[Array]()
     for track, estimate in zip(tracks, estimates, strict=True):
         seen = sightings_of(track)
@@ -91,4 +83,4 @@ def left_over(tracks: Sequence[Track], estimates: Sequence[Estimate]) -> Left:
         pixels, slope = (tensor.numpy() for tensor in CameraBank(seen.cameras).jacobian(points, camera))
         off.append(seen.sightings.pixels - pixels)
         spread.append(slope @ estimate.covariances[seen.state, POSITION, POSITION] @ slope.swapaxes(1, 2))
-    return Left(np.concatenate(off), np.concatenate(spread))
+    return np.concatenate(off), np.concatenate(spread)

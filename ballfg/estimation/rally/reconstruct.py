@@ -147,17 +147,22 @@ def _kinked(seen: Detections, chosen: Chosen, field: Field) -> Mask:
 
 
 def _noise(smoother: Smoother, seen: Detections, camera: Camera, chosen: Chosen, kinked: Mask) -> Noise:
-    """The noise of the candidates, from the strokes alone as an exact camera sees them, without kinked bars."""
+    """The noise of the candidates, from the strokes alone as an exact camera sees them, without kinked bars.
+
+    An error of the camera moves a whole stroke: it hardly shows in what is left of single candidates.
+    """
     noise = Noise()
     if not chosen.strokes:
         return noise
     rows = np.concatenate([stroke.rows for stroke in chosen.strokes])
-    stated, plain = seen.covariances[rows], ~kinked[rows]
+    stated, plain, loss = seen.covariances[rows], ~kinked[rows], smoother.settings.sighting_loss
     for _ in range(NOISE_ROUNDS):
         now = replace(seen, covariances=noise.of(seen.covariances) + KINK**2 * kinked[:, None, None] * np.eye(2))
         tracks = [_track(stroke, now, camera, smoother.model, smoother.surfaces) for stroke in chosen.strokes]
-        left = left_over(tracks, [smoother.estimate(track) for track in tracks])
-        before, noise = noise, noise.likelier(stated[plain], left.select(plain), smoother.settings.sighting_loss)
+        found = [smoother.estimate(track) for track in tracks]
+        used = plain & np.repeat([not one.status.failed for one in found], [len(one) for one in found])
+        off, spread = left_over(tracks, found)
+        before, noise = noise, noise.likelier(stated[used], off[used], spread[used], loss)
         if noise.changed(before) < NOISE_SETTLED:
             break
     return noise

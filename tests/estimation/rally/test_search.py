@@ -48,6 +48,19 @@ def test_the_path_through_a_balls_candidates_is_where_it_flew(made: tuple[Truth,
         assert moved.bounces[0] == pytest.approx(bounce, abs=0.012)
 
 
+@pytest.mark.parametrize("number", range(3))
+def test_a_flight_goes_on_past_a_bounce_after_which_a_picture_lacks_the_ball(number: int) -> None:
+    of, motion, found = planted("behind", 12)
+    stroke, bounce = true_stroke(of, number, grower_of(found, motion.shots[0])[0], motion.shots[0])
+    hidden = stroke.rows[found.times[stroke.rows] > bounce][0]
+    grower, _ = grower_of(found.select(np.arange(len(found)) != hidden), motion.shots[0])
+    rows = true_stroke(of, number, grower, motion.shots[0])[0].rows
+    flight = grower.flown(rows[grower.rays.times[rows] < bounce], ())
+    best = max(grower.bounced(flight, 1), key=lambda one: one.score)
+    assert set(rows.tolist()) <= set(best.rows.tolist())
+    assert best.bounces[0] == pytest.approx(bounce, abs=grower.field.step)
+
+
 def test_most_arcs_of_a_ball_are_found_and_they_are_smooth(made: tuple[Truth, Shot, Grower, list[Any]]) -> None:
     of, shot, grower, seeds = made
     for number in range(3):
