@@ -21,7 +21,7 @@ from ballfg.diagnosis.evidence.odds import tempered
 from ballfg.diagnosis.evidence.prior import WIDTHS, centres, choice_odds, log_odds, scales, within
 from ballfg.diagnosis.evidence.priors_of_fit import Priors
 from ballfg.diagnosis.evidence.rows import Motion, batches_of, roots
-from ballfg.diagnosis.evidence.weighed import Step, Weighed, Weight
+from ballfg.diagnosis.evidence.weighed import Weighed, Weight
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 
 TRIED: Final = tuple(range(0, len(WIDTHS), 2))
@@ -173,14 +173,14 @@ class Screen:
         density = held_out(part, whole, away, self.model.halves)
         return Weight(rest.evidence + more.gain + choice_odds(listed), rest.odds + log_odds(listed), density)
 
-    def step(self, chosen: Sequence[int]) -> tuple[Step, Array]:
-        """The step to the most probable unknowns beside some candidates, and (s,) their strengths in order."""
+    def step(self, chosen: Sequence[int]) -> tuple[Array, Array]:
+        """(c,) the step to the most probable unknowns beside some candidates, and (s,) their strengths in order."""
         beside = tuple[tuple[int, int], ...]()
         for one in chosen:
             beside = (*beside, (one, self._beside(beside, one).width))
         mean, fit = self._posterior(beside).mean, self.model.fit
         own = len(fit.problem.common_precision)  # those of patterns come after them
-        return Step(mean[:own], 0.0), mean[self._own :]
+        return mean[:own], mean[self._own :]
 
     def _names(self, chosen: Sequence[int]) -> frozenset[str]:
         return self.model.names | {self.candidates[one].name for one in chosen}

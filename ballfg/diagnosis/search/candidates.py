@@ -12,7 +12,7 @@ from ballfg.arrays import Array
 from ballfg.diagnosis.evidence.nameless import Patterns
 from ballfg.diagnosis.evidence.rows import Motion, random_motion
 from ballfg.diagnosis.evidence.screen import Screen
-from ballfg.diagnosis.evidence.weighed import Step, Weighed
+from ballfg.diagnosis.evidence.weighed import Weighed
 from ballfg.diagnosis.fit.fit import fit_problem, followed
 from ballfg.diagnosis.fit.problem import Fit, Problem, Unknowns
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, with_effects
@@ -148,7 +148,7 @@ def leading_sets(screen: Screen, scored: Sequence[Scored], most: int) -> list[tu
     return list(dict.fromkeys((*likely[:1], *pairs[:1])))
 
 
-def refit_set(before: Fit, chosen: Sequence[Scored], step: Step, strengths: Array) -> Refit:
+def refit_set(before: Fit, chosen: Sequence[Scored], step: Array, strengths: Array) -> Refit:
     """The fit with several hypotheses at the most probable unknowns of the linearised model.
 
     Args:
@@ -166,7 +166,7 @@ def refit_set(before: Fit, chosen: Sequence[Scored], step: Step, strengths: Arra
         name: float(np.clip(absent[name] + strength, problem.free[name].low, problem.free[name].high))
         for name, strength in zip(names, strengths.tolist(), strict=True)
     }
-    moved, values = step.taken(before), before.unknowns.values
+    moved, values = before.stepped(step), before.unknowns.values
     wider = Fit.at(problem, replace(before.unknowns, values={**values, **absent}), before.noise)
     after = followed(wider, replace(moved, values={**moved.values, **absent, **foretold}))
     if not np.isfinite(after.cost):  # too long a step: a flight missed its contact
