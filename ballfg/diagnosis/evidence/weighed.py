@@ -170,12 +170,14 @@ def _followed(question: _Question, fit: Fit, like: Weighed | None) -> Weighed:
     closest = followed(fit, fit.unknowns)
     point = question.point(closest if np.isfinite(closest.cost) else fit)
     found, ahead, density = question.at(point, (like.start, None) if like else (None,))
-    for number in range(MOST_STEPS):
+    if question.nameless:  # without patterns the path would leave the samples; noise and widths need a second turn
+        return question.at(point, (found.start,), found.widths)[0]
+    for _ in range(MOST_STEPS):
         moved = question.moved(point, found, ahead, density)
-        if moved is None and not (number == 0 and question.nameless):  # noise and widths of patterns need a second turn
+        if moved is None:
             break
-        point, damping = moved or (point, ahead.damping)
-        found, ahead, density = question.at(point, (found.start,), found.widths, damping)
+        point, damping = moved
+        found, ahead, density = question.at(point, (found.start,), damping=damping)
     return found.without(ahead.gain) if ahead.gain > WORTH_A_STEP else found
 
 

@@ -9,7 +9,6 @@ import torch
 from scipy import stats
 
 from ballfg.arrays import Array
-from ballfg.diagnosis.evidence.nameless import Patterns
 from ballfg.diagnosis.evidence.rows import Motion, random_motion
 from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.weighed import Weighed
@@ -89,7 +88,6 @@ def score_all(
     model: Weighed,
     candidates: Sequence[Hypothesis],
     motion: Motion | None = None,
-    patterns: Patterns | None = None,
 ) -> list[Scored]:
     """Score tests of all hypotheses, and their foretold gains.
 
@@ -97,24 +95,21 @@ def score_all(
         model: without any of them, as `weigh` gives it.
         candidates: the hypotheses; those without strengths are left out.
         motion: random columns of the model's fit, if they are known.
-        patterns: without a name, that the model was weighed with.
     Returns: the tests, sorted by explained residual, invisible hypotheses last.
     """
     testable = [h for h in candidates if h.strengths]
     if not testable:
         return []
-    return screened(model, testable, random_motion(model.fit) if motion is None else motion, patterns)[0]
+    return screened(model, testable, random_motion(model.fit) if motion is None else motion)[0]
 
 
-def screened(
-    model: Weighed, testable: Sequence[Hypothesis], motion: Motion, patterns: Patterns | None = None
-) -> tuple[list[Scored], Screen]:
+def screened(model: Weighed, testable: Sequence[Hypothesis], motion: Motion) -> tuple[list[Scored], Screen]:
     """The same of hypotheses with strengths, at least one, and what foretells the gains of sets of them.
 
-    Args: motion: random columns of the model's fit.  patterns: as in `score_all`.
+    Args: motion: random columns of the model's fit.
     """
     columns = columns_of(model.fit, testable)
-    screen = Screen.of(model, motion, testable, columns, patterns)
+    screen = Screen.of(model, motion, testable, columns)
     scores = score_tests(*hypothesis_signatures(model.fit, testable, columns))
     scored = []
     for hypothesis, score, gain in zip(testable, scores, screen.gains, strict=True):
