@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ballfg.arrays import Array, Mask
+from ballfg.arrays import Array, Index, Mask
 from ballfg.diagnosis.evidence.likelihood import LOST, Reduced, triangle
 
 
@@ -50,14 +49,14 @@ class Condensed:
         narrow = np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1) - 0.5 * np.log(precision).sum()
         return cls(constant - narrow, left, halves)
 
-    def evidence(self, columns: Sequence[int], precision: Array) -> Array:
+    def evidence(self, columns: Index, precision: Array) -> Array:
         """(n,) of each part, with some further unknowns, whose priors are about their present values; NaN: none.
 
-        Args: columns: their k numbers.  precision: (k,) of their priors.
+        Args: columns: (k,) their numbers.  precision: (k,) of their priors.
         """
         return self._posteriors(self.gram, self.constant, columns, precision)[0]
 
-    def whole(self, columns: Sequence[int], precision: Array) -> tuple[float, Array, Array]:
+    def whole(self, columns: Index, precision: Array) -> tuple[float, Array, Array]:
         """The evidence of all tracks, minus infinity without one, and mean (k,) and covariance (k, k) there.
 
         Args: as of `evidence`.
@@ -65,21 +64,18 @@ class Condensed:
         evidence, mean, covariance = self._posteriors(self.gram[:1], self.constant[:1], columns, precision)
         return float(evidence[0]) if np.isfinite(evidence[0]) else -np.inf, mean[0], covariance[0]
 
-    def held_out(self, columns: Sequence[int], precision: Array) -> Array:
+    def held_out(self, columns: Index, precision: Array) -> Array:
         """As `likelihood.held_out`, with some further unknowns.  Args: as of `evidence`."""
         evidence = self.evidence(columns, precision)
         found = evidence[3:] - evidence[np.where(self.halves, 1, 2)]
         return found if np.isfinite(found).all() else np.full(len(found), LOST)
 
     @staticmethod
-    def _posteriors(
-        gram: Array, constant: Array, columns: Sequence[int], precision: Array
-    ) -> tuple[Array, Array, Array]:
-        listed = np.asarray(columns, dtype=np.intp)
-        information = gram[:, listed[:, None], listed] + np.diag(precision)
-        slope = gram[:, listed, -1]
+    def _posteriors(gram: Array, constant: Array, columns: Index, precision: Array) -> tuple[Array, Array, Array]:
+        information = gram[:, columns[:, None], columns] + np.diag(precision)
+        slope = gram[:, columns, -1]
         lower = triangle(information)
-        covariance = np.linalg.inv(information)
+        covariance: Array = np.asarray(np.linalg.inv(information), dtype=np.float64)
         mean = (covariance @ slope[..., None])[..., 0]
         narrow = np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1) - 0.5 * np.log(precision).sum()
         return constant - 0.5 * (gram[:, -1, -1] - (slope * mean).sum(axis=1)) - narrow, mean, covariance

@@ -190,10 +190,11 @@ class Likelihood:
         right = total[:, :end, -1] - total[:, :end, end:-1] @ common
         return np.asarray(np.linalg.solve(total[:, :end, :end], right[..., None])[..., 0])
 
-    def reweighted(self, noise: Noise, common: Array) -> Likelihood:
-        """With the robust weights of the residual that remains beside the motion, after a step (c,) of the common."""
+    def reweighted(self, noise: Noise) -> Likelihood:
+        """With the robust weights of the residual that remains beside the motion, all common unknowns as they are."""
+        common = np.zeros(self.rows.by_common.shape[-1])
         motion = self.local_step(noise, common)
-        kept = np.broadcast_to(np.append(-common, 1.0), (len(motion), len(common) + 1))
+        kept = np.broadcast_to(np.append(common, 1.0), (len(motion), len(common) + 1))
         return self.beside(np.concatenate((-motion, kept), axis=1), noise)
 
     def beside(self, along: Array, noise: Noise) -> Likelihood:
@@ -235,9 +236,9 @@ class Batches:
         constant, gram = (np.concatenate([getattr(r, name) for r, _ in found])[order] for name in ("constant", "gram"))
         return Reduced(constant, gram), [local for _, local in found]
 
-    def reweighted(self, noise: Noise, common: Array) -> Batches:
+    def reweighted(self, noise: Noise) -> Batches:
         """As of `Likelihood`."""
-        return Batches(tuple(part.reweighted(noise, common) for part in self.parts))
+        return Batches(tuple(part.reweighted(noise) for part in self.parts))
 
     def beside(self, along: Sequence[Array], noise: Noise) -> Batches:
         """As of `Likelihood`, by the factors of each batch."""

@@ -34,19 +34,14 @@ class Start:
     noise: Noise
     weights: Sequence[Weights] | None = None
 
-    def begun(self, rows: Sequence[Rows], precision: Array, away: Array, own: int | None) -> tuple[Batches, Noise]:
+    def begun(self, rows: Sequence[Rows]) -> tuple[Batches, Noise]:
         """The likelihood of rows with these sizes, and the weights of what they leave.
 
         Labels begin with a weight of one: their loss is not convex, and one that a wrong model contradicts would stay
         out.
-
-        Args: as in `settled`.
         """
         known = self.weights and [(samples, np.ones_like(spins), cost) for samples, spins, cost in self.weights]
-        likelihood, common = Batches.of(rows, known), np.zeros_like(away)
-        if own is not None and own < len(common):
-            common = posterior(likelihood.reduced(self.noise)[0], precision, away).held(own).mean
-        return likelihood.reweighted(self.noise, common), self.noise
+        return Batches.of(rows, known).reweighted(self.noise), self.noise
 
 
 @dataclass(frozen=True)
@@ -79,9 +74,7 @@ def settled(
         starts: of similar models, or None for almost no noise beside that of the samples; the best end counts.
         own: number of the common unknowns, the first ones, in which the rows are not linear; None: all.
     """
-    begun = [
-        (Batches.of(rows), Noise()) if start is None else start.begun(rows, precision, away, own) for start in starts
-    ]
+    begun = [(Batches.of(rows), Noise()) if start is None else start.begun(rows) for start in starts]
     ends = [_climbed(*one, precision, away, own) for one in begun]
     _, likelihood, noise = max(ends, key=lambda end: end[0])
     return likelihood, noise

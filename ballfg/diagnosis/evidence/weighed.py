@@ -209,7 +209,7 @@ class _Ahead:
     def of(cls, fit: Fit, found: Posterior) -> _Ahead:
         """From the posterior about a fit."""
         own = len(fit.problem.common_precision)
-        information = np.linalg.inv(found.covariance[:own, :own])
+        information: Array = np.asarray(np.linalg.inv(found.covariance[:own, :own]), dtype=np.float64)
         return cls(information, information @ found.mean[:own], fit.limits)
 
     def step(self, damping: float) -> tuple[Array, float]:
@@ -325,9 +325,8 @@ class _Question:
 
         The evidence is what it would be at the end of the step from there, if that were linear.
         """
-        precision, away = point.priors.precision(model.widths), point.priors.away
-        likelihood, noise = model.start.begun(point.rows, precision, away, point.own)
-        return posterior(likelihood.reduced(noise)[0], precision, away).held(point.own).evidence
+        likelihood, noise = model.start.begun(point.rows)
+        return point.priors.posterior(likelihood.reduced(noise)[0], model.widths).held().evidence
 
     def _nested(
         self, priors: Priors, tracks: Reduced, widths: Sequence[int], mixed: Sequence[float]

@@ -93,8 +93,8 @@ class System:
 def bounded_step(hessian: Array, gradient: Array, low: Array, high: Array, damping: float = 0.0) -> Array:
     """(q,) the step of a Levenberg-Marquardt method within limits.
 
-    An unknown whose step would pass its limit ends there, and the others are solved again with it fixed: their full
-    step would count on a change that does not happen.
+    The first unknown whose step would pass its limit ends there, and the others are solved again with it fixed, until
+    none passes: their full step would count on a change that does not happen.
 
     Args:
         hessian, gradient: (q, q) and (q,) of the objective, the gradient downhill.
@@ -106,11 +106,12 @@ def bounded_step(hessian: Array, gradient: Array, low: Array, high: Array, dampi
     while free.any():
         left = gradient[free] - damped[np.ix_(free, ~free)] @ step[~free]
         step[free] = np.linalg.solve(damped[np.ix_(free, free)], left)
-        outside = free & ((step < low) | (step > high))
-        if not outside.any():
+        outside = np.flatnonzero(free & ((step < low) | (step > high)))
+        if not len(outside):
             break
-        step[outside] = np.clip(step, low, high)[outside]
-        free &= ~outside
+        ends = np.clip(step, low, high)
+        first = outside[np.argmin(ends[outside] / step[outside])]
+        step[first], free[first] = ends[first], False
     return step
 
 

@@ -255,20 +255,24 @@ class _Found:
         return refitted
 
     def compare(self) -> None:
-        """Weighs something nameless beside the best model, and which effects are there beside it.
+        """Weighs something nameless beside the best model, and if it is there, which effects are there beside it.
 
         Patterns make some effects superfluous. They also show others, which a model that lacks them hides: an effect
         alone takes the values that make up for what no effect describes.
         """
         loop = self.loop
         loop.watch("weighing what has no name")
-        (best,) = self.beside_nameless([self.best])
-        varying = offered_varying(best, loop.of_some or loop.catalogue, self.ways)
+        best = weighed(self.best.fit, self.best.named, self.motion, self.halves, self.best, self.patterns)
+        self.models[best.names] = best
+        scores = self.scores
+        if NAMELESS not in max(scores, key=lambda names: scores[names]):
+            return
         loop.watch("weighing sets of effects beside it")
+        varying = offered_varying(best, loop.of_some or loop.catalogue, self.ways)
         self.sets = sets_beside(best, self.motion, self.patterns, loop.catalogue, varying, MOST_EFFECTS)
         self.models[best.names] = replace(best, neighbours=self.sets.weights)
-        odds = self.odds.models
-        self.best = self._model(max((*self.models, *self.sets.members), key=lambda names: odds[names]))
+        scores = self.scores
+        self.best = self._model(max((*self.models, *self.sets.members), key=lambda names: scores[names]))
 
     def _model(self, names: frozenset[str]) -> Weighed:
         """A model weighed before, or that of a set of effects beside something nameless."""
@@ -291,8 +295,7 @@ class _Found:
     def _varying(self, best: Weighed, tell: Callable[[str], None]) -> tuple[list[Scored], list[Refit]]:
         """Tests and refits of effects that differ between tracks."""
         loop = self.loop
-        ways = loop.ways or partial(groupings, loop.holdout.tracks)
-        return try_varying(best, self.motion, loop.of_some or loop.catalogue, ways, tell, loop.jobs)
+        return try_varying(best, self.motion, loop.of_some or loop.catalogue, self.ways, tell, loop.jobs)
 
     def _refitted(self, best: Weighed, refits: Sequence[Refit]) -> list[Weighed]:
         """Refits of a model, weighed."""
@@ -317,13 +320,6 @@ class _Found:
             odds = self.odds
         able = [model for model in self.models.values() if model.names <= likely]
         return max(able, key=lambda model: (len(model.named), odds.models[model.names]))
-
-    def beside_nameless(self, models: Sequence[Weighed]) -> list[Weighed]:
-        """The same models with something nameless beside their effects."""
-        new = {m.names | {NAMELESS}: m for m in models if m.names | {NAMELESS} not in self.models}
-        tasks = [partial(weighed, m.fit, m.named, self.motion, self.halves, m, self.patterns) for m in new.values()]
-        self.models |= dict(zip(new, do_all(tasks, self.loop.jobs), strict=True))
-        return [self.models[m.names | {NAMELESS}] for m in models]
 
     def plain(self, model: Weighed) -> Weighed:
         """The same model without something nameless."""

@@ -43,7 +43,7 @@ def try_varying(
     model: Weighed,
     motion: Motion,
     catalogue: Sequence[type[Effect]],
-    ways: Callable[[Sequence[str]], list[Grouping]],
+    known: Sequence[Grouping],
     tell: Callable[[str], None],
     jobs: int = 1,
 ) -> tuple[list[Scored], list[Refit]]:
@@ -53,13 +53,12 @@ def try_varying(
         model: without any of them.
         motion: random columns of its fit.
         catalogue: effects that may differ.
-        ways: groupings of the tracks, by their names.
+        known: groupings of the tracks.
         tell: called with progress.
         jobs: processes.
     """
     before, problem = model.fit, model.fit.problem
     searched = sorted(dict.fromkeys(problem.stretches.names), key=place_of)
-    known = ways(searched)
     listed = offered_varying(model, catalogue, known)
     tell(f"testing {len(listed)} ways in which tracks may differ")
     scored = score_all(model, listed, motion)
