@@ -267,7 +267,7 @@ def posterior(reduced: Reduced, precision: Array, away: Array) -> Posterior:
     """
     total = reduced.gram.sum(axis=0)
     information, gradient = total[:-1, :-1] + np.diag(precision), total[:-1, -1] + precision * away
-    lower = _triangle(information)
+    lower = triangle(information)
     if not np.isfinite(lower).all():
         return Posterior(-np.inf, np.inf, np.zeros_like(away), np.diag(1.0 / precision))
     covariance = np.linalg.inv(information)
@@ -284,21 +284,21 @@ def evidences(reduced: Reduced, precision: Array, away: Array) -> Array:
     """
     information = reduced.gram[:, :-1, :-1] + np.diag(precision)
     gradient = reduced.gram[:, :-1, -1] + precision * away
-    lower = _triangle(information)
+    lower = triangle(information)
     solved = np.linalg.solve(lower, gradient[..., None])[..., 0]
     square = reduced.gram[:, -1, -1] - (solved**2).sum(axis=-1) + float((precision * away**2).sum())
     narrow = np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=-1) - 0.5 * np.log(precision).sum()
     return np.asarray(reduced.constant - 0.5 * square - narrow)
 
 
-def _triangle(information: Array) -> Array:
+def triangle(information: Array) -> Array:
     """The triangle of matrices (..., c, c); NaN of those that rounding left indefinite, about a path far off, say."""
     try:
         return np.asarray(np.linalg.cholesky(information))
     except np.linalg.LinAlgError:
         if information.ndim == 2:
             return np.full_like(information, np.nan)
-        return np.stack([_triangle(one) for one in information])
+        return np.stack([triangle(one) for one in information])
 
 
 def held_out(tracks: Reduced, precision: Array, away: Array, halves: Mask) -> Array:

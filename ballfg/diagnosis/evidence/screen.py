@@ -15,19 +15,26 @@ import numpy as np
 from scipy import special
 
 from ballfg.arrays import Array, Index
-from ballfg.diagnosis.evidence.likelihood import Batches, Posterior, Reduced, held_out, posterior
+from ballfg.diagnosis.evidence.condensed import Condensed
+from ballfg.diagnosis.evidence.likelihood import Batches, Posterior, Reduced, posterior
 from ballfg.diagnosis.evidence.nameless import Patterns, rows_beside
 from ballfg.diagnosis.evidence.odds import tempered
 from ballfg.diagnosis.evidence.prior import WIDTHS, centres, choice_odds, log_odds, scales, within
 from ballfg.diagnosis.evidence.priors_of_fit import Priors
 from ballfg.diagnosis.evidence.rows import Motion, batches_of, roots
-from ballfg.diagnosis.evidence.weighed import Step, Weighed, Weight
+from ballfg.diagnosis.evidence.weighed import Strengths, Weighed, Weight
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 
 TRIED: Final = tuple(range(0, len(WIDTHS), 2))
 """Numbers of the widths that are tried: a screen needs no finer ones."""
 KEPT: Final = 6
 """Number of the most probable sets of each size that are enlarged."""
+
+
+Beside = tuple[tuple[int, int], ...]
+"""Numbers of candidates, each with that of its width."""
+Gone = tuple[int, ...]
+"""Places of the model's own effects with strengths that are left out."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +54,8 @@ class Screen:
     tracks: Reduced
     total: Reduced
     priors: Priors
-    _known: dict[tuple[tuple[tuple[int, int], ...], int], _Gain] = field(default_factory=dict)
+    _known: dict[tuple[Beside, int, Gone], _Gain] = field(default_factory=dict)
+    _condensed: dict[Gone, Condensed] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -82,7 +90,7 @@ class Screen:
     @cached_property
     def _singles(self) -> list[Weight]:
         """The weight of the model with each candidate."""
-        return [self._with(one, self.model.weight) for one in range(len(self.candidates))]
+        return [self.with_one(one, self.model.weight)[0] for one in range(len(self.candidates))]
 
     @property
     def _alone(self) -> dict[frozenset[str], Weight]:
@@ -94,9 +102,9 @@ class Screen:
         listed = [self.candidates[one] for one in chosen]
         return gain + choice_odds(listed) + log_odds(listed)
 
-    def _together(self, chosen: Sequence[int]) -> tuple[float, tuple[tuple[int, int], ...]]:
+    def _together(self, chosen: Sequence[int]) -> tuple[float, Beside]:
         """What candidates that are added in turn gain, and with which widths."""
-        gain, beside = 0.0, tuple[tuple[int, int], ...]()
+        gain, beside = 0.0, Beside()
         for one in chosen:
             more = self._beside(beside, one)
             gain, beside = gain + more.gain, (*beside, (one, more.width))
@@ -136,7 +144,7 @@ class Screen:
         for chosen in leading:
             gain, beside = self._together(chosen)
             listed, names = [self.candidates[one] for one in chosen], self._names(chosen)
-            density = held_out(*self._part(self.tracks, beside, None), self.model.halves)
+            density = self._held_out(beside)
             weight = Weight(self.model.evidence + gain + choice_odds(listed), log_odds(listed), density)
             found[chosen] = tempered(names, weight, others) - self.model.evidence + weight.odds
             others[names] = weight
@@ -146,13 +154,11 @@ class Screen:
     def exchanges(self) -> dict[tuple[str, int], Weight]:
         """The weight of the model with a candidate in place of an effect, by the effect's name and the candidate."""
         found: dict[tuple[str, int], Weight] = {}
-        widths, effects = list(self.model.widths), [h for h in self.model.named if h.strengths]
-        for place, effect in enumerate(effects):
+        for place, effect in enumerate(self.effects):
             rest = self.model.nested.get(self.model.names - {effect.name})
             if rest is not None:
-                held = self.priors.held([place], widths)
                 for one in range(len(self.candidates)):
-                    found[effect.name, one] = self._with(one, rest, held)
+                    found[effect.name, one], _ = self.with_one(one, rest, gone=(place,))
         return found
 
     @cached_property
@@ -166,21 +172,44 @@ class Screen:
                 found[names] = weight
         return found
 
-    def _with(self, one: int, rest: Weight, precision: Array | None = None) -> Weight:
-        """The weight with a candidate beside the rest; precision: of the rest, if not as in the model."""
-        more, listed = self._beside((), one, precision), [self.candidates[one]]
-        part, whole, away = self._part(self.tracks, [(one, more.width)], precision)
-        density = held_out(part, whole, away, self.model.halves)
-        return Weight(rest.evidence + more.gain + choice_odds(listed), rest.odds + log_odds(listed), density)
+    @property
+    def effects(self) -> list[Hypothesis]:
+        """The model's own effects with strengths."""
+        return [h for h in self.model.named if h.strengths]
 
-    def step(self, chosen: Sequence[int]) -> tuple[Step, Array]:
-        """The step to the most probable unknowns beside some candidates, and (s,) their strengths in order."""
-        beside = tuple[tuple[int, int], ...]()
-        for one in chosen:
-            beside = (*beside, (one, self._beside(beside, one).width))
-        mean, fit = self._posterior(beside).mean, self.model.fit
+    def with_one(self, one: int, rest: Weight, beside: Beside = (), gone: Gone = ()) -> tuple[Weight, Beside]:
+        """The weight of the rest with one more candidate, and the candidates with their widths.
+
+        Args: rest: the weight of the model beside some candidates, without what is gone.
+        """
+        more, listed = self._beside(beside, one, gone), [self.candidates[one]]
+        beside = (*beside, (one, more.width))
+        evidence = rest.evidence + more.gain + choice_odds(listed)
+        return Weight(evidence, rest.odds + log_odds(listed), self._held_out(beside, gone)), beside
+
+    def strengths(self, beside: Beside, gone: Gone = ()) -> dict[str, Strengths]:
+        """The strengths of all effects and candidates, by name."""
+        found, fit = self._posterior(beside, gone), self.model.fit
+        values = np.array([fit.unknowns.values[name] for name in fit.problem.free])
+        places = {h.name: place for h, place in zip(self.effects, self.priors.places, strict=False)}
+        starts = {name: values[place] for name, place in places.items()}
+        end = self._own
+        for one, _ in beside:
+            name, size = self.candidates[one].name, len(self.candidates[one].strengths)
+            places[name], starts[name] = np.arange(end, end + size), self._centres[one]
+            end += size
+        for place in gone:
+            del places[self.effects[place].name]
+        return {
+            name: Strengths(starts[name] + found.mean[place], found.covariance[np.ix_(place, place)])
+            for name, place in places.items()
+        }
+
+    def step(self, chosen: Sequence[int]) -> tuple[Array, Array]:
+        """(c,) the step to the most probable unknowns beside some candidates, and (s,) their strengths in order."""
+        mean, fit = self._posterior(self._together(chosen)[1]).mean, self.model.fit
         own = len(fit.problem.common_precision)  # those of patterns come after them
-        return Step(mean[:own], 0.0), mean[self._own :]
+        return mean[:own], mean[self._own :]
 
     def _names(self, chosen: Sequence[int]) -> frozenset[str]:
         return self.model.names | {self.candidates[one].name for one in chosen}
@@ -196,23 +225,39 @@ class Screen:
     def _own(self) -> int:
         return len(self.priors.base)
 
-    def _beside(self, beside: tuple[tuple[int, int], ...], one: int, precision: Array | None = None) -> _Gain:
-        """What one more candidate gains beside others of given widths; precision: of the model's own unknowns."""
-        key = (beside, one)
-        if precision is None and key in self._known:
+    def _beside(self, beside: Beside, one: int, gone: Gone = ()) -> _Gain:
+        """What one more candidate gains beside others of given widths, without some of the model's effects."""
+        key = (beside, one, gone)
+        if key in self._known:
             return self._known[key]
-        candidate, least = self.candidates[one], self._posterior(beside, precision).evidence
-        found = [self._posterior((*beside, (one, width)), precision) for width in TRIED]
-        evidence = np.array([after.evidence for after in found])
+        candidate, condensed = self.candidates[one], self._without(gone)
+        least, *_ = condensed.whole(*self._further(beside))
+        found = [condensed.whole(*self._further((*beside, (one, width)))) for width in TRIED]
+        evidence = np.array([after for after, *_ in found])
         best, size = int(evidence.argmax()), len(candidate.strengths)
-        mean, sigmas = found[best].mean[-size:], np.sqrt(np.diagonal(found[best].covariance)[-size:])
-        centre = self._centres[one]
-        inside = within(candidate, centre, centre + mean, sigmas, WIDTHS[TRIED[best]])
+        _, mean, covariance = found[best]
+        centre, sigmas = self._centres[one], np.sqrt(np.diagonal(covariance)[-size:])
+        inside = within(candidate, centre, centre + mean[-size:], sigmas, WIDTHS[TRIED[best]])
         gain = float(special.logsumexp(evidence)) - np.log(len(TRIED)) - least + inside
-        more = _Gain(float(gain), TRIED[best])
-        if precision is None:
-            self._known[key] = more
-        return more
+        self._known[key] = _Gain(float(gain), TRIED[best])
+        return self._known[key]
+
+    def _held_out(self, beside: Beside, gone: Gone = ()) -> Array:
+        """(t,) as of `Weight`."""
+        return self._without(gone).held_out(*self._further(beside))
+
+    def _without(self, gone: Gone) -> Condensed:
+        """The candidates' columns, with the model's own unknowns integrated out."""
+        if gone not in self._condensed:
+            precision = self.priors.held(gone, self.model.widths)
+            self._condensed[gone] = Condensed.of(self.tracks, precision, self.priors.away, self.model.halves)
+        return self._condensed[gone]
+
+    def _further(self, beside: Beside) -> tuple[Index, Array]:
+        """Numbers of some candidates' columns among all candidates', and the precision of their priors."""
+        columns = [np.arange(self._ends[one], self._ends[one + 1]) - self._own for one, _ in beside]
+        sizes = [WIDTHS[width] * self._scales[one] for one, width in beside]
+        return np.concatenate([np.zeros(0, dtype=np.intp), *columns]), np.concatenate([np.zeros(0), *sizes]) ** -2
 
     @cached_property
     def _centres(self) -> list[Array]:
@@ -226,26 +271,13 @@ class Screen:
     def _ends(self) -> Index:
         return self._own + np.cumsum([0, *(len(candidate.strengths) for candidate in self.candidates)])
 
-    def _columns(self, chosen: Sequence[int]) -> Index:
-        """Numbers of the model's own columns and of those of some candidates."""
-        strengths = [np.arange(self._ends[one], self._ends[one + 1]) for one in chosen]
-        return np.concatenate((np.arange(self._own), *strengths))
-
-    def _posterior(self, chosen: Sequence[tuple[int, int]], precision: Array | None = None) -> Posterior:
-        """With some candidates, each in a width; precision: of the model's own unknowns, if not as in the model."""
-        return posterior(*self._part(self.total, chosen, precision))
-
-    def _part(
-        self, whole: Reduced, chosen: Sequence[tuple[int, int]], precision: Array | None
-    ) -> tuple[Reduced, Array, Array]:
-        """The part of all columns that some candidates need, the precision of their priors and how far these are."""
-        columns = self._columns([one for one, _ in chosen])
-        listed = np.append(columns, whole.gram.shape[-1] - 1)
-        part = Reduced(whole.constant, whole.gram[:, listed[:, None], listed])
-        sizes = [WIDTHS[width] * self._scales[one] for one, width in chosen]
-        own = self.priors.precision(self.model.widths) if precision is None else precision
-        away = np.append(self.priors.away, np.zeros(len(columns) - self._own))
-        return part, np.concatenate((own, *(size**-2 for size in sizes))), away
+    def _posterior(self, beside: Beside, gone: Gone = ()) -> Posterior:
+        """Of the model's own unknowns, then of some candidates' strengths."""
+        columns, precision = self._further(beside)
+        listed = np.concatenate((np.arange(self._own), self._own + columns, [self.total.gram.shape[-1] - 1]))
+        part = Reduced(self.total.constant, self.total.gram[:, listed[:, None], listed])
+        whole = np.append(self.priors.held(gone, self.model.widths), precision)
+        return posterior(part, whole, np.append(self.priors.away, np.zeros(len(columns))))
 
 
 @dataclass(frozen=True)

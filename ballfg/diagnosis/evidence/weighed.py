@@ -10,22 +10,23 @@ import numpy as np
 
 from ballfg.arrays import Array, Mask
 from ballfg.diagnosis.evidence.halves import unlike_halves
-from ballfg.diagnosis.evidence.likelihood import Noise, Reduced, Weights, held_out, posterior
+from ballfg.diagnosis.evidence.likelihood import Noise, Posterior, Reduced, Weights, held_out, posterior
 from ballfg.diagnosis.evidence.nameless import NAMELESS, Patterns, rows_beside
 from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, log_odds, within
 from ballfg.diagnosis.evidence.priors_of_fit import Priors
 from ballfg.diagnosis.evidence.rows import Motion, Rows, random_motion
 from ballfg.diagnosis.evidence.sizes import Start, settled
 from ballfg.diagnosis.fit.fit import followed, with_guesses
-from ballfg.diagnosis.fit.problem import Fit, Unknowns
+from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.fit.system import bounded_step
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 
-MOST_STEPS = 8
+MOST_STEPS = 12
 """Largest number of steps from a deterministic fit to the most probable unknowns."""
-SHARES = (1.0, 0.5, 0.25)
-"""Of a step, tried in turn."""
-MOSTLY = 0.5
-"""Share of a step's expected gain from which no shorter step is tried."""
+FIRST_DAMPING, DAMPED, LESS = 0.1, 10.0, 4.0
+"""Damping of a step after a whole one that failed, its factor after a further failure, its divisor after a success."""
+HARDLY, MOSTLY = 0.25, 0.75
+"""Shares of a step's expected gain: with less it fails, with more the next one is damped less."""
 WORTH_A_STEP = 0.5
 """Least expected gain of a step, natural units."""
 
@@ -168,38 +169,58 @@ def _followed(question: _Question, fit: Fit, like: Weighed | None) -> Weighed:
     """The model at the most probable unknowns near a fit."""
     closest = followed(fit, fit.unknowns)
     point = question.point(closest if np.isfinite(closest.cost) else fit)
-    found, step, density = question.at(point, (like.start, None) if like else (None,))
-    for number in range(MOST_STEPS):
-        second = number == 0 and question.nameless  # noise and widths of patterns need a second turn
-        if step.gain < WORTH_A_STEP and not second:
-            break
-        moved = question.moved(point, found, step, density)
+    found, ahead, density = question.at(point, (like.start, None) if like else (None,))
+    if question.nameless:  # without patterns the path would leave the samples; noise and widths need a second turn
+        return question.at(point, (found.start,), found.widths)[0]
+    for _ in range(MOST_STEPS):
+        moved = question.moved(point, found, ahead, density)
         if moved is None:
             break
-        point = moved
-        found, step, density = question.at(point, (found.start,), found.widths)
-    return found.without(step.gain) if step.gain > WORTH_A_STEP else found
+        point, damping = moved
+        found, ahead, density = question.at(point, (found.start,), damping=damping)
+    return found.without(ahead.gain) if ahead.gain > WORTH_A_STEP else found
+
+
+def _damped(damping: float, share: float) -> float:
+    """The damping of the step after one that gained a share of what it promised."""
+    if share < MOSTLY:
+        return damping
+    return damping / LESS if damping > FIRST_DAMPING / LESS else 0.0
 
 
 @dataclass(frozen=True)
-class Step:
-    """A step of the common unknowns (c,) with the logarithm of the density that it should gain.
+class _Ahead:
+    """The density of the tracks about the common unknowns of a fit, as far as it is quadratic.
 
     Patterns are no unknowns of the fit: at its new values they are as free as before.
+
+    Attributes:
+        information, slope: (c, c) and (c,) of its logarithm.
+        limits: smallest and largest step (c,).
+        damping: of the next step, as in `bounded_step`.
     """
 
-    common: Array
-    gain: float
+    information: Array
+    slope: Array
+    limits: tuple[Array, Array]
+    damping: float = 0.0
 
-    def taken(self, fit: Fit, share: float = 1.0) -> Unknowns:
-        """The unknowns of a fit after a share of the step; coefficients stay within their bounds, first states stay."""
-        unknowns, free, common = fit.unknowns, fit.problem.free, share * self.common
-        values = {
-            name: float(np.clip(unknowns.values[name] + step, c.low, c.high))
-            for (name, c), step in zip(free.items(), common[: len(free)].tolist(), strict=True)
-        }
-        launcher = unknowns.launcher + common[len(free) :].reshape(-1, 3)
-        return Unknowns(unknowns.starts, values, launcher)
+    @classmethod
+    def of(cls, fit: Fit, found: Posterior) -> _Ahead:
+        """From the posterior about a fit."""
+        own = len(fit.problem.common_precision)
+        information: Array = np.asarray(np.linalg.inv(found.covariance[:own, :own]), dtype=np.float64)
+        return cls(information, information @ found.mean[:own], fit.limits)
+
+    def step(self, damping: float) -> tuple[Array, float]:
+        """(c,) a step within the limits, and the logarithm of the density that it should gain."""
+        step = bounded_step(self.information, self.slope, *self.limits, damping)
+        return step, float(step @ (self.slope - 0.5 * self.information @ step))
+
+    @property
+    def gain(self) -> float:
+        """What the whole step should gain."""
+        return self.step(0.0)[1]
 
 
 @dataclass(frozen=True)
@@ -237,13 +258,14 @@ class _Question:
         return _Point(fit, rows, Priors.of(fit, self.named, self.patterns))
 
     def at(
-        self, point: _Point, starts: Sequence[Start | None], widths: Sequence[int] = ()
-    ) -> tuple[Weighed, Step, float]:
-        """The model at the unknowns of a point, the step to more probable ones, and the density as in `_density`.
+        self, point: _Point, starts: Sequence[Start | None], widths: Sequence[int] = (), damping: float = 0.0
+    ) -> tuple[Weighed, _Ahead, float]:
+        """The model at the unknowns of a point, the way to more probable ones, and the density as in `_density`.
 
         Args:
             starts: as in `settled`.
             widths: of the effects, then of the patterns, of a similar model.
+            damping: of the next step.
         """
         fit, rows, priors = point.fit, point.rows, point.priors
         own, effects = point.own, [h for h in self.named if h.strengths]
@@ -261,7 +283,7 @@ class _Question:
             centre = values[place] + priors.away[place]
             mixed[number] += within(hypothesis, centre, found.mean, sigmas, WIDTHS[best[number]])
             strengths[hypothesis.name] = found
-        evidence, gain = result.evidence + sum(mixed) + choice_odds(self.named), result.gain(own)
+        evidence = result.evidence + sum(mixed) + choice_odds(self.named)
         weighed = Weighed(
             tuple(self.named),
             replace(fit),  # without what can be computed again: a search keeps dozens of models
@@ -276,26 +298,27 @@ class _Question:
             self.nameless,
             self._nested(priors, total, best, mixed),
         )
-        return weighed, Step(result.mean[:own], gain), result.evidence - gain
+        return weighed, replace(_Ahead.of(fit, result), damping=damping), result.held(own).evidence
 
-    def moved(self, point: _Point, model: Weighed, step: Step, before: float) -> _Point | None:
-        """The point after the share of a step that leads to the most probable unknowns; None if all are less probable.
+    def moved(self, point: _Point, model: Weighed, ahead: _Ahead, before: float) -> tuple[_Point, float] | None:
+        """The point after a step to more probable unknowns, and the damping of the next; None if none is worth it.
 
         A step may leave the linear range: where samples cannot tell a clock from gravity, say, or hardly show spins.
+        Damped, it stays among what they show well.
 
         Args: before: the density at the point.
         """
-        best, most = None, before
-        for share in SHARES:
-            fit = followed(point.fit, step.taken(point.fit, share))
+        damping = ahead.damping
+        while True:
+            step, promised = ahead.step(damping)
+            if promised < WORTH_A_STEP:
+                return None
+            fit = followed(point.fit, point.fit.stepped(step))
             density = self._density(after := self.point(fit), model) if np.isfinite(fit.cost) else -np.inf
-            if density > most:
-                best, most = after, density
-            elif best is not None:
-                break
-            if most > before + MOSTLY * step.gain:
-                break
-        return best
+            share = (density - before) / promised
+            if share > HARDLY:
+                return after, _damped(damping, share)
+            damping = max(FIRST_DAMPING, DAMPED * damping)
 
     def _density(self, point: _Point, model: Weighed) -> float:
         """Logarithm of the density at the unknowns of a point, up to a constant, with noise and widths of a model.
@@ -303,9 +326,7 @@ class _Question:
         The evidence is what it would be at the end of the step from there, if that were linear.
         """
         likelihood, noise = model.start.begun(point.rows)
-        reduced, _ = likelihood.reduced(noise)
-        found, own = point.priors.posterior(reduced, model.widths), point.own
-        return found.evidence - found.gain(own)
+        return point.priors.posterior(likelihood.reduced(noise)[0], model.widths).held().evidence
 
     def _nested(
         self, priors: Priors, tracks: Reduced, widths: Sequence[int], mixed: Sequence[float]

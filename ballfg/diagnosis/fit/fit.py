@@ -187,19 +187,13 @@ def _step(now: Fit, damping: float) -> tuple[Fit | None, float]:
 def _moved(now: Fit, system: System, damping: float) -> Fit:
     """The fit after a damped Gauss-Newton step; coefficients stay within their bounds."""
     problem, unknowns = now.problem, now.unknowns
-    q, precision = len(problem.free), problem.common_precision
+    precision = problem.common_precision
     values = np.array([unknowns.values[name] for name in problem.free])
     pull = precision * np.concatenate((problem.centres - values, -unknowns.launcher.ravel()))
-    low, high = (np.array([getattr(c, end) for c in problem.free.values()]) for end in ("low", "high"))
-    endless = np.full(unknowns.launcher.size, np.inf)
-    limits = np.concatenate((low - values, -endless)), np.concatenate((high - values, endless))
     eliminated = system.eliminated(damping)
-    step = eliminated.common_step(precision, pull, *limits, damping) if problem.shared else np.zeros_like(pull)
-    moved = np.clip(values + step[:q], low, high)  # rounding
+    step = eliminated.common_step(precision, pull, *now.limits, damping) if problem.shared else np.zeros_like(pull)
     starts = unknowns.starts + eliminated.start_step(step)
-    launcher = unknowns.launcher + step[q:].reshape(-1, 3)
-    named = dict(zip(problem.free, moved.tolist(), strict=True))
-    return Fit.at(problem, Unknowns(starts, named, launcher), now.noise, now.steps)
+    return Fit.at(problem, replace(now.stepped(step), starts=starts), now.noise, now.steps)
 
 
 def _followed_up(moved: Fit, system: System, weights: Robust) -> Fit:

@@ -149,6 +149,23 @@ class Fit:
         """Fitted coefficients, as `Problem.by_stretch`."""
         return self.problem.by_stretch(self.unknowns.values)
 
+    @property
+    def limits(self) -> tuple[Array, Array]:
+        """(q + 3 s,) the smallest and the largest step of the common unknowns, by the bounds of coefficients."""
+        values = np.array([self.unknowns.values[name] for name in self.problem.free])
+        low, high = (np.array([getattr(c, end) for c in self.problem.free.values()]) for end in ("low", "high"))
+        endless = np.full(self.unknowns.launcher.size, np.inf)
+        return np.concatenate((low - values, -endless)), np.concatenate((high - values, endless))
+
+    def stepped(self, step: Array) -> Unknowns:
+        """The unknowns after a step (q + 3 s,) of the common ones, coefficients within their bounds; starts stay."""
+        unknowns, free = self.unknowns, self.problem.free
+        values = {
+            name: float(np.clip(unknowns.values[name] + change, c.low, c.high))
+            for (name, c), change in zip(free.items(), step[: len(free)].tolist(), strict=True)
+        }
+        return Unknowns(unknowns.starts, values, unknowns.launcher + step[len(free) :].reshape(-1, 3))
+
     def variations(self) -> dict[str, Variation]:
         """Coefficients that differ between tracks, as fitted, by parameter name."""
         parameters, found = dict(self.problem.model.named_parameters()), dict[str, Variation]()

@@ -29,28 +29,13 @@ class Eliminated:
     def common_step(self, precision: Array, pull: Array, low: Array, high: Array, damping: float = 0.0) -> Array:
         """(q,) best step of the common unknowns within limits.
 
-        An unknown whose step would pass its limit ends there, and the others are solved again with it fixed: their full
-        step would count on a change that does not happen.
-
         Args:
             precision: (q,) of the priors.
             pull: (q,) prior mean minus present value, times the precision.
-            low, high: (q,) limits of the step.
-            damping: as in `System.eliminated`.
+            low, high, damping: as in `bounded_step`.
         """
         total = self.gram.sum(axis=0)
-        hessian, gradient = total[:-1, :-1] + np.diag(precision), total[:-1, -1] + pull
-        hessian[np.diag_indices_from(hessian)] *= 1.0 + damping
-        free, step = np.ones(len(gradient), dtype=np.bool_), np.zeros(len(gradient))
-        while free.any():
-            left = gradient[free] - hessian[np.ix_(free, ~free)] @ step[~free]
-            step[free] = np.linalg.solve(hessian[np.ix_(free, free)], left)
-            outside = free & ((step < low) | (step > high))
-            if not outside.any():
-                break
-            step[outside] = np.clip(step, low, high)[outside]
-            free &= ~outside
-        return step
+        return bounded_step(total[:-1, :-1] + np.diag(precision), total[:-1, -1] + pull, low, high, damping)
 
     def start_step(self, common: Array) -> Array:
         """(n, 9) step of the first states that follows a step (q,) of the common unknowns."""
@@ -103,6 +88,31 @@ class System:
     def projected(self) -> Array:
         """(n, m, q + 1) columns and residual with the part that first states absorb taken away."""
         return np.asarray(self.columns - self.by_start @ self.eliminated().solved)
+
+
+def bounded_step(hessian: Array, gradient: Array, low: Array, high: Array, damping: float = 0.0) -> Array:
+    """(q,) the step of a Levenberg-Marquardt method within limits.
+
+    The first unknown whose step would pass its limit ends there, and the others are solved again with it fixed, until
+    none passes: their full step would count on a change that does not happen.
+
+    Args:
+        hessian, gradient: (q, q) and (q,) of the objective, the gradient downhill.
+        low, high: (q,) limits of the step.
+        damping: share of the hessian's diagonal that is added to it.
+    """
+    damped = hessian + damping * np.diag(np.diagonal(hessian))
+    free, step = np.ones(len(gradient), dtype=np.bool_), np.zeros(len(gradient))
+    while free.any():
+        left = gradient[free] - damped[np.ix_(free, ~free)] @ step[~free]
+        step[free] = np.linalg.solve(damped[np.ix_(free, free)], left)
+        outside = np.flatnonzero(free & ((step < low) | (step > high)))
+        if not len(outside):
+            break
+        ends = np.clip(step, low, high)
+        first = outside[np.argmin(ends[outside] / step[outside])]
+        step[first], free[first] = ends[first], False
+    return step
 
 
 def by_track(gram: Array, track: Index) -> Array:

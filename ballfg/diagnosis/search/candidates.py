@@ -9,10 +9,9 @@ import torch
 from scipy import stats
 
 from ballfg.arrays import Array
-from ballfg.diagnosis.evidence.nameless import Patterns
 from ballfg.diagnosis.evidence.rows import Motion, random_motion
 from ballfg.diagnosis.evidence.screen import Screen
-from ballfg.diagnosis.evidence.weighed import Step, Weighed
+from ballfg.diagnosis.evidence.weighed import Weighed
 from ballfg.diagnosis.fit.fit import fit_problem, followed
 from ballfg.diagnosis.fit.problem import Fit, Problem, Unknowns
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, with_effects
@@ -89,7 +88,6 @@ def score_all(
     model: Weighed,
     candidates: Sequence[Hypothesis],
     motion: Motion | None = None,
-    patterns: Patterns | None = None,
 ) -> list[Scored]:
     """Score tests of all hypotheses, and their foretold gains.
 
@@ -97,24 +95,21 @@ def score_all(
         model: without any of them, as `weigh` gives it.
         candidates: the hypotheses; those without strengths are left out.
         motion: random columns of the model's fit, if they are known.
-        patterns: without a name, that the model was weighed with.
     Returns: the tests, sorted by explained residual, invisible hypotheses last.
     """
     testable = [h for h in candidates if h.strengths]
     if not testable:
         return []
-    return screened(model, testable, random_motion(model.fit) if motion is None else motion, patterns)[0]
+    return screened(model, testable, random_motion(model.fit) if motion is None else motion)[0]
 
 
-def screened(
-    model: Weighed, testable: Sequence[Hypothesis], motion: Motion, patterns: Patterns | None = None
-) -> tuple[list[Scored], Screen]:
+def screened(model: Weighed, testable: Sequence[Hypothesis], motion: Motion) -> tuple[list[Scored], Screen]:
     """The same of hypotheses with strengths, at least one, and what foretells the gains of sets of them.
 
-    Args: motion: random columns of the model's fit.  patterns: as in `score_all`.
+    Args: motion: random columns of the model's fit.
     """
     columns = columns_of(model.fit, testable)
-    screen = Screen.of(model, motion, testable, columns, patterns)
+    screen = Screen.of(model, motion, testable, columns)
     scores = score_tests(*hypothesis_signatures(model.fit, testable, columns))
     scored = []
     for hypothesis, score, gain in zip(testable, scores, screen.gains, strict=True):
@@ -148,7 +143,7 @@ def leading_sets(screen: Screen, scored: Sequence[Scored], most: int) -> list[tu
     return list(dict.fromkeys((*likely[:1], *pairs[:1])))
 
 
-def refit_set(before: Fit, chosen: Sequence[Scored], step: Step, strengths: Array) -> Refit:
+def refit_set(before: Fit, chosen: Sequence[Scored], step: Array, strengths: Array) -> Refit:
     """The fit with several hypotheses at the most probable unknowns of the linearised model.
 
     Args:
@@ -166,7 +161,7 @@ def refit_set(before: Fit, chosen: Sequence[Scored], step: Step, strengths: Arra
         name: float(np.clip(absent[name] + strength, problem.free[name].low, problem.free[name].high))
         for name, strength in zip(names, strengths.tolist(), strict=True)
     }
-    moved, values = step.taken(before), before.unknowns.values
+    moved, values = before.stepped(step), before.unknowns.values
     wider = Fit.at(problem, replace(before.unknowns, values={**values, **absent}), before.noise)
     after = followed(wider, replace(moved, values={**moved.values, **absent, **foretold}))
     if not np.isfinite(after.cost):  # too long a step: a flight missed its contact

@@ -5,11 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from ballfg.diagnosis.evidence.prior import centres
+from ballfg.diagnosis.evidence.sets import Sets
 from ballfg.diagnosis.evidence.weighed import Weighed
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.problem import Fit, Problem
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, with_coefficients, without_effect
-from ballfg.diagnosis.search.candidates import FIRST_STEPS
+from ballfg.diagnosis.search.candidates import FIRST_STEPS, Scored, refit_set
 
 
 def with_strengths_of(model: Weighed, fit: Fit) -> Fit:
@@ -17,13 +19,45 @@ def with_strengths_of(model: Weighed, fit: Fit) -> Fit:
 
     Free, they would make up for what no effect describes. Effects that differ between tracks stay free.
     """
-    known, problem = model.fit.unknowns.values, fit.problem
-    held = {c: known[c] for h in model.named if not h.deviations() for c in h.columns if c in problem.free}
+    problem, fixed = fit.problem, [h for h in model.named if not h.deviations()]
+    known = {c: float(v) for h in fixed for c, v in zip(h.columns, model.strengths[h.name].mean, strict=True)}
+    bounds = problem.free
+    held = {c: float(np.clip(v, bounds[c].low, bounds[c].high)) for c, v in known.items() if c in bounds}
     free = {name: c for name, c in problem.free.items() if name not in held}
     values = {name: value for name, value in fit.unknowns.values.items() if name in free}
     problem = replace(problem, model=with_coefficients(problem.model, held), free=free)
     fitted = fit_problem(problem, replace(fit.unknowns, values=values), fit.noise)
     return fitted if np.isfinite(fitted.cost) else fit
+
+
+def model_of(sets: Sets, names: frozenset[str], first: Fit) -> Weighed:
+    """The model of a set of effects beside patterns: strengths as the set has them, and a fit without patterns.
+
+    Args: first: as of `without_named`.
+    """
+    member, model = sets.members[names], sets.screen.model
+    gone, added = sets.listed(names)
+    strengths = sets.screen.strengths(member.beside, member.gone)
+    fit = without_named(model.fit, gone, first) if gone else model.fit
+    if added:
+        away = [strengths[h.name].mean - centres(h, model.fit.problem.model) for h in added]
+        still = np.zeros(len(fit.problem.common_precision))
+        fit = refit_set(fit, [Scored(h, None, 1.0) for h in added], still, np.concatenate(away)).fit
+    effects = len(sets.screen.effects)
+    widths = [width for place, width in enumerate(model.widths[:effects]) if place not in member.gone]
+    return Weighed(
+        (*(h for h in model.named if h not in gone), *added),
+        fit,
+        model.noise,
+        model.weights,
+        (*widths, *(width for _, width in member.beside), *model.widths[effects:]),
+        member.weight.evidence,
+        member.weight.odds,
+        strengths,
+        member.weight.held_out,
+        model.halves,
+        nameless=True,
+    )
 
 
 def without_named(fit: Fit, gone: Sequence[Hypothesis], first: Fit) -> Fit:

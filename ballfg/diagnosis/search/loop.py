@@ -12,6 +12,7 @@ from ballfg.diagnosis.evidence.nameless import NAMELESS, Patterns
 from ballfg.diagnosis.evidence.odds import ALIKE, Odds, odds_of, scores_of
 from ballfg.diagnosis.evidence.rows import random_motion
 from ballfg.diagnosis.evidence.screen import Screen
+from ballfg.diagnosis.evidence.sets import Sets
 from ballfg.diagnosis.evidence.weighed import WORTH_A_STEP, Weighed, weighed
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.holdout import Holdout
@@ -20,13 +21,14 @@ from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect
 from ballfg.diagnosis.hypotheses.varying import Grouping, groupings
 from ballfg.diagnosis.result import Candidate, Errors, Finding
 from ballfg.diagnosis.search.candidates import Refit, Scored, refit
-from ballfg.diagnosis.search.changed_fits import with_strengths_of, without_named
+from ballfg.diagnosis.search.changed_fits import model_of, with_strengths_of, without_named
 from ballfg.diagnosis.search.evaluation import on_all, on_others
 from ballfg.diagnosis.search.ranking import finding_of, ranking
 from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_findings, stamp_hypotheses
-from ballfg.diagnosis.search.trial import try_beside, try_hypotheses, try_varying
+from ballfg.diagnosis.search.trial import offered_varying, sets_beside, try_hypotheses, try_varying
 from ballfg.dynamics import AnalyticModel, BallModel
 from ballfg.dynamics.effect import Effect
+from ballfg.dynamics.variation import place_of
 from ballfg.estimation.batch import do_all
 
 MOST_EFFECTS = 5
@@ -127,8 +129,7 @@ class SearchLoop:
             predictive = self.predictive(fit)
             judged = self.judge(predictive)
         rounds = {name: r for r in found.rounds for name in r.added}
-        rests = [found.without([h], final) for h in final.named]
-        rests = found.beside_nameless(rests) if final.nameless else rests
+        rests = [found.rest([h], final) for h in final.named]
         findings = []
         for h, rest in zip(final.named, rests, strict=True):
             own = rounds.get(h.name, found.rounds[-1])
@@ -160,6 +161,7 @@ class _Found:
         self.models = {self.best.names: self.best}
         self.rounds: list[Round] = []
         self.tried: set[tuple[frozenset[str], frozenset[str]]] = set()
+        self.sets: Sets | None = None  # beside something nameless, once that was weighed
 
     @cached_property
     def patterns(self) -> Patterns:
@@ -253,84 +255,52 @@ class _Found:
         return refitted
 
     def compare(self) -> None:
-        """Weighs something nameless beside the best model, and which effects are there beside it.
+        """Weighs something nameless beside the best model, and if it is there, which effects are there beside it.
 
         Patterns make some effects superfluous. They also show others, which a model that lacks them hides: an effect
         alone takes the values that make up for what no effect describes.
         """
-        self.loop.watch("weighing what has no name")
-        (nothing,) = self.beside_nameless([self.models[frozenset()]])
-        (best,) = self.beside_nameless([self.best])
-        for start in (self._shortened(best), nothing):  # effects found alone may stand for others
-            self._grow(start)
-        odds = self.odds.models
-        self.best = max(self.models.values(), key=lambda model: odds[model.names])
+        loop = self.loop
+        loop.watch("weighing what has no name")
+        best = weighed(self.best.fit, self.best.named, self.motion, self.halves, self.best, self.patterns)
+        self.models[best.names] = best
+        scores = self.scores
+        if NAMELESS not in max(scores, key=lambda names: scores[names]):
+            return
+        loop.watch("weighing sets of effects beside it")
+        varying = offered_varying(best, loop.of_some or loop.catalogue, self.ways)
+        self.sets = sets_beside(best, self.motion, self.patterns, loop.catalogue, varying, MOST_EFFECTS)
+        self.models[best.names] = replace(best, neighbours=self.sets.weights)
+        scores = self.scores
+        self.best = self._model(max((*self.models, *self.sets.members), key=lambda names: scores[names]))
 
-    def _grow(self, best: Weighed) -> None:
-        """Adds effects to a model with something nameless, if that is more probable than none."""
-        for _ in range(MOST_ROUNDS):
-            leading = self.most_probable(self.models.values())
-            if len(best.named) == MOST_EFFECTS or leading is None or not leading.nameless:
-                return
-            more = self._beyond(best)
-            if more is None:
-                return
-            if self._better_minimum(best, more) and self.is_better(best, more):
-                best = self.models[best.names]
-            else:
-                best = self._shortened(more)
+    def _model(self, names: frozenset[str]) -> Weighed:
+        """A model weighed before, or that of a set of effects beside something nameless."""
+        if names not in self.models and self.sets is not None:
+            self.models[names] = model_of(self.sets, names, self.first)
+        return self.models[names]
 
-    def _shortened(self, best: Weighed) -> Weighed:
-        """A model with something nameless, without effects that this makes superfluous.
+    def rest(self, gone: Sequence[Hypothesis], model: Weighed) -> Weighed:
+        """A model without some of its effects, and without those that need them."""
+        if model.nameless and self.sets is not None:
+            return self._model(self.sets.without(model.names, [h.name for h in gone]))
+        return self.without(gone, model)
 
-        The linearised model says which effects are, and a refit confirms it.
-        """
-        tried = {best.names}
-        while True:
-            scores = self.scores
-            names = max(best.nested, key=lambda names: scores.get(names, -np.inf), default=best.names)
-            if names in tried or scores.get(names, -np.inf) <= scores[best.names]:
-                return best
-            tried.add(names)
-            gone = [h for h in best.named if h.name not in names]
-            (shorter,) = self.beside_nameless([self.without(gone, best)])
-            if self.is_better(shorter, best):
-                best = shorter
-
-    def _beyond(self, best: Weighed) -> Weighed | None:
-        """A more probable model with further effects beside something nameless; None if there is none.
-
-        Effects that are the same for all tracks are tried first. What is found is weighed without patterns as well.
-        """
-        loop, most = self.loop, MOST_EFFECTS - len(best.named)
-        tell = self.telling("beside something nameless")
-        winner = self._named_beside(
-            best, try_beside(best, self.motion, self.patterns, loop.catalogue, tell, loop.jobs, most)
-        )
-        if winner is None:
-            _, varying = self._varying(best, tell)
-            winner = self._named_beside(best, varying)
-        if winner is not None:
-            self.plain(winner)
-        return winner
-
-    def _named_beside(self, best: Weighed, refits: Sequence[Refit]) -> Weighed | None:
-        """The most probable of some refits beside something nameless, if it is more probable than the best one."""
-        winner = self.most_probable(self._refitted(best, refits))
-        return winner if self.is_better(winner, best) else None
+    @cached_property
+    def ways(self) -> list[Grouping]:
+        """Ways in which tracks may differ."""
+        listed = sorted(dict.fromkeys(self.first.problem.stretches.names), key=place_of)
+        return (self.loop.ways or partial(groupings, self.loop.holdout.tracks))(listed)
 
     def _varying(self, best: Weighed, tell: Callable[[str], None]) -> tuple[list[Scored], list[Refit]]:
-        """Tests and refits of effects that differ between tracks, beside patterns if the model has some."""
+        """Tests and refits of effects that differ between tracks."""
         loop = self.loop
-        ways = loop.ways or partial(groupings, loop.holdout.tracks)
-        patterns = self.patterns if best.nameless else None
-        return try_varying(best, self.motion, loop.of_some or loop.catalogue, ways, tell, loop.jobs, patterns)
+        return try_varying(best, self.motion, loop.of_some or loop.catalogue, self.ways, tell, loop.jobs)
 
     def _refitted(self, best: Weighed, refits: Sequence[Refit]) -> list[Weighed]:
-        """Refits of a model, weighed, beside patterns if it has some."""
-        patterns = self.patterns if best.nameless else None
+        """Refits of a model, weighed."""
         tasks = [
-            partial(weighed, r.fit, (*best.named, *r.added), self.motion, self.halves, best, patterns)
+            partial(weighed, r.fit, (*best.named, *r.added), self.motion, self.halves, best)
             for r in refits
             if np.isfinite(r.fit.cost)
         ]
@@ -346,19 +316,10 @@ class _Found:
         if best in odds.models:
             likely |= {h.name for h in self.best.named if odds.together(h.name, best) >= probability}
         if gone := [h for h in self.best.named if h.name not in likely]:
-            rest = self.without(gone)
-            if self.best.nameless:
-                self.beside_nameless([rest])
+            self.rest(gone, self.best)
             odds = self.odds
         able = [model for model in self.models.values() if model.names <= likely]
         return max(able, key=lambda model: (len(model.named), odds.models[model.names]))
-
-    def beside_nameless(self, models: Sequence[Weighed]) -> list[Weighed]:
-        """The same models with something nameless beside their effects."""
-        new = {m.names | {NAMELESS}: m for m in models if m.names | {NAMELESS} not in self.models}
-        tasks = [partial(weighed, m.fit, m.named, self.motion, self.halves, m, self.patterns) for m in new.values()]
-        self.models |= dict(zip(new, do_all(tasks, self.loop.jobs), strict=True))
-        return [self.models[m.names | {NAMELESS}] for m in models]
 
     def plain(self, model: Weighed) -> Weighed:
         """The same model without something nameless."""
@@ -419,8 +380,7 @@ class _Found:
         if before.names not in after.nested or after.nested[before.names].score <= before.score:
             return False
         fit = without_named(after.fit, [h for h in after.named if h.name not in before.names], self.first)
-        patterns = self.patterns if before.nameless else None
-        again = weighed(fit, before.named, self.motion, self.halves, before, patterns)
+        again = weighed(fit, before.named, self.motion, self.halves, before)
         if again.score > before.score:
             self.models[before.names] = again
         return again.score > before.score

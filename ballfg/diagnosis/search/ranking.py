@@ -31,8 +31,10 @@ def finding_of(
     """
     values = fitted_values(model.fit, hypothesis)
     if hypothesis.name in model.strengths and not hypothesis.deviations():
-        sigmas = np.sqrt(np.diagonal(model.strengths[hypothesis.name].covariance)).tolist()
-        values |= {n: replace(values[n], sigma=s) for n, s in zip(hypothesis.strengths, sigmas, strict=True)}
+        found = model.strengths[hypothesis.name]
+        sigmas = np.sqrt(np.diagonal(found.covariance)).tolist()
+        listed = zip(hypothesis.strengths, found.mean.tolist(), sigmas, strict=True)
+        values |= {name: replace(values[name], value=value, sigma=sigma) for name, value, sigma in listed}
     gains = model.held_out - without.held_out
     error = gains.std(ddof=1) / np.sqrt(len(gains))
     alike = odds.alike(hypothesis.name, model.names)

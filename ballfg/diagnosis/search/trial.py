@@ -8,9 +8,11 @@ from typing import cast
 from ballfg.diagnosis.evidence.nameless import Patterns
 from ballfg.diagnosis.evidence.rows import Motion
 from ballfg.diagnosis.evidence.screen import Screen
+from ballfg.diagnosis.evidence.sets import Sets
 from ballfg.diagnosis.evidence.weighed import Weighed
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, hypotheses, scene_of
+from ballfg.diagnosis.hypotheses.signatures import columns_of
 from ballfg.diagnosis.hypotheses.varying import Grouping, Varying, near, varying_hypotheses
 from ballfg.diagnosis.search.candidates import (
     ALARM,
@@ -41,10 +43,9 @@ def try_varying(
     model: Weighed,
     motion: Motion,
     catalogue: Sequence[type[Effect]],
-    ways: Callable[[Sequence[str]], list[Grouping]],
+    known: Sequence[Grouping],
     tell: Callable[[str], None],
     jobs: int = 1,
-    patterns: Patterns | None = None,
 ) -> tuple[list[Scored], list[Refit]]:
     """Tries every hypothesis of an effect that differs between tracks; refits of the leading ones, the best first.
 
@@ -52,23 +53,21 @@ def try_varying(
         model: without any of them.
         motion: random columns of its fit.
         catalogue: effects that may differ.
-        ways: groupings of the tracks, by their names.
+        known: groupings of the tracks.
         tell: called with progress.
         jobs: processes.
-        patterns: without a name, that the model was weighed with.
     """
     before, problem = model.fit, model.fit.problem
     searched = sorted(dict.fromkeys(problem.stretches.names), key=place_of)
-    known = ways(searched)
-    listed = varying_hypotheses(problem.model, scene_of(before), catalogue, problem.free, known)
+    listed = offered_varying(model, catalogue, known)
     tell(f"testing {len(listed)} ways in which tracks may differ")
-    scored = score_all(model, listed, motion, patterns)
+    scored = score_all(model, listed, motion)
     names = sorted({name for way in known for level in way.weights.values() for name in level}, key=place_of)
     refits = []
     for candidate in shortlist(scored):
         tell(f"fitting with {candidate.hypothesis.name}")
         closer = near(cast(Varying, candidate.hypothesis), searched, names)
-        best = _placed(model, motion, closer, patterns) if len(closer) > 1 else candidate
+        best = _placed(model, motion, closer) if len(closer) > 1 else candidate
         refits.append(refit(before, replace(best, p_value=candidate.p_value)))
     return scored, sorted(refits, key=lambda r: r.delta_bic)
 
@@ -98,14 +97,14 @@ def _set_refits(
     return found
 
 
-def _placed(model: Weighed, motion: Motion, closer: Sequence[Varying], patterns: Patterns | None) -> Scored:
+def _placed(model: Weighed, motion: Motion, closer: Sequence[Varying]) -> Scored:
     """The change along the recording at its best place.
 
     Several places explain about the same if tracks between them do not show the coefficient. Then an earlier change's
     place is chosen, since one new table changes several coefficients; else the middle of them.
     """
     known = {deviation.level for deviation in model.fit.problem.deviations.values()}
-    scored = {id(s.hypothesis): s for s in score_all(model, closer, motion, patterns)}
+    scored = {id(s.hypothesis): s for s in score_all(model, closer, motion)}
     most = max(s.explained for s in scored.values())
     good = [scored[id(h)] for h in closer if scored[id(h)].explained >= AS_GOOD * most]
     named = [s for h, s in ((cast(Varying, s.hypothesis), s) for s in good) if known & set(h.grouping.weights)]
@@ -122,27 +121,27 @@ def _offered(model: Weighed, catalogue: Sequence[type[Effect]]) -> tuple[list[Hy
     return [h for h in lacking if h not in driven and h.strengths], driven
 
 
-def try_beside(
+def sets_beside(
     model: Weighed,
     motion: Motion,
     patterns: Patterns,
     catalogue: Sequence[type[Effect]],
-    tell: Callable[[str], None],
-    jobs: int = 1,
-    most: int = 1,
-) -> list[Refit]:
-    """Refits of the hypotheses, and sets of them, that a model most probably lacks beside its patterns without a name.
+    varying: Sequence[Varying],
+    most: int,
+) -> Sets:
+    """The sets of up to `most` effects that a model's linearisation foretells beside its patterns without a name.
 
-    Args: as in `try_hypotheses`.  patterns: that the model was weighed with.
+    Args: as in `try_hypotheses`.  patterns: that the model was weighed with.  varying: effects that differ by tracks.
     """
-    testable, _ = _offered(model, catalogue)
-    if not testable:
-        return []
-    tell(f"testing {len(testable)} hypotheses")
-    scored, screen = screened(model, testable, motion, patterns)
-    tasks = _refits(model.fit, shortlist(scored), tell)
-    tasks += _set_refits(screen, scored, most, tell)
-    return do_all(tasks, jobs)
+    listed = [*_offered(model, catalogue)[0], *varying]
+    columns = columns_of(model.fit, listed)
+    return Sets.near(Screen.of(model, motion, listed, columns, patterns), most)
+
+
+def offered_varying(model: Weighed, catalogue: Sequence[type[Effect]], known: Sequence[Grouping]) -> list[Varying]:
+    """The hypotheses of effects that differ between tracks."""
+    problem = model.fit.problem
+    return varying_hypotheses(problem.model, scene_of(model.fit), catalogue, problem.free, known)
 
 
 def try_hypotheses(

@@ -47,9 +47,23 @@ def test_a_step_gains_what_it_promises(make_ball, moved_shots, make_fit):
     fit = make_fit(make_ball(), moved_shots)
     question = weighing._Question((), random_motion(fit), unlike_halves(fit), None)
     point = question.point(followed(fit, at_drag(fit, 0.02)))
-    found, step, density = question.at(point, (None,))
-    after = question.moved(point, found, step, density)
+    found, ahead, density = question.at(point, (None,))
+    after, damping = question.moved(point, found, ahead, density)
     assert density == pytest.approx(question._density(point, found), abs=0.5)
     gained = question._density(after, found) - question._density(point, found)
-    assert step.gain > 10.0
-    assert gained == pytest.approx(step.gain, rel=0.4)
+    assert ahead.gain > 10.0
+    assert damping == 0.0
+    assert gained == pytest.approx(ahead.gain, rel=0.4)
+
+
+def test_damped_steps_stay_within_limits_and_promise_less():
+    """Of a quadratic density, against its values on a fine grid within the limits."""
+    information, slope = np.array([[4.0, 1.5], [1.5, 1.0]]), np.array([2.0, 3.0])
+    ahead = weighing._Ahead(information, slope, (np.array([-1.0, -1.0]), np.array([1.0, 2.0])))
+    grid = np.stack(np.meshgrid(np.linspace(-1.0, 1.0, 401), np.linspace(-1.0, 2.0, 601)), axis=-1).reshape(-1, 2)
+    gains = grid @ slope - 0.5 * np.einsum("ni,ij,nj->n", grid, information, grid)
+    step, gain = ahead.step(0.0)
+    assert step == pytest.approx(grid[gains.argmax()], abs=0.01)
+    assert gain == pytest.approx(gains.max(), abs=1e-3)
+    promised = [ahead.step(damping)[1] for damping in (0.0, 0.1, 1.0, 10.0)]
+    assert promised == sorted(promised, reverse=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -69,9 +68,8 @@ def before(two_balls, make_ball, make_fit) -> Fit:
 @pytest.fixture(scope="module")
 def found(before, holdout):
     catalogue = [EFFECTS[name] for name in ("drag", "restitution", "wind", "table_tilt")]
-    return try_varying(
-        weigh(before), random_motion(before), catalogue, partial(groupings, holdout.tracks), lambda line: None
-    )
+    ways = groupings(holdout.tracks, before.problem.stretches.names)
+    return try_varying(weigh(before), random_motion(before), catalogue, ways, lambda line: None)
 
 
 def test_another_ball_is_found_with_both_values_and_the_track_from_which_on_it_flew(found):
@@ -91,7 +89,7 @@ def test_nothing_differs_where_one_ball_flew_all_the_time(make_ball, make_launch
     stretches = make_shots(make_ball(), make_launches(COUNT, 90), 90).stretches
     names = tuple(f"{2 * i:03d}" for i in range(COUNT))
     alike = replace(stretches, names=names)
-    fit, ways = make_fit(make_ball(), alike), partial(groupings, holdout.tracks)
+    fit, ways = make_fit(make_ball(), alike), groupings(holdout.tracks, names)
     scored, refits = try_varying(weigh(fit), random_motion(fit), list(EFFECTS.values()), ways, lambda line: None)
     assert len(scored) > 20
     assert refits == []

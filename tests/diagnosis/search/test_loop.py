@@ -202,16 +202,20 @@ def test_what_is_named_beside_something_nameless_is_as_strong_in_the_model(gusty
     assert float(written["measurement.frame_tilt.x"]) == pytest.approx(tilt.value)
 
 
-def test_an_effect_is_found_beside_something_nameless_alone(gusty, make_ball):
-    """Patterns first: no search without them leads there."""
+def test_beside_something_nameless_effects_are_found_from_one_linearisation(gusty, make_ball):
+    """Its evidence, strengths, what is left without each, and a fit without patterns."""
     found = _Found(gusty, first_fit(make_ball(), gusty.holdout))
-    (nothing,) = found.beside_nameless([found.models[frozenset()]])
-    found._grow(nothing)
-    best = max(found.models.values(), key=lambda model: found.scores[model.names])
+    nothing = found.best
+    while found.round():
+        pass
+    found.compare()
+    best, weights = found.best, found.sets.weights
     assert {"frame_tilt", NAMELESS} <= best.names
-    assert best.score > nothing.score + np.log(100.0)
-    known = found.models.pop(best.names - {NAMELESS})
-    assert found.plain(best).evidence == pytest.approx(known.evidence, abs=0.5)  # one that was refitted, but lost
+    assert best.score > weights[frozenset([NAMELESS])].score + np.log(100.0)
+    assert found.rest(best.named, best).weight.evidence == weights[frozenset([NAMELESS])].evidence
+    tilt = best.strengths["frame_tilt"]
+    assert (np.abs(tilt.mean - [0.02, 0.0]) < 3 * np.sqrt(np.diagonal(tilt.covariance))).all()
+    assert found.plain(best).score > nothing.score  # its fit without patterns holds the effect too
 
 
 def test_the_best_minimum_of_the_same_effects_counts(gusty, make_ball):
