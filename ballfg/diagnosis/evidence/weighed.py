@@ -9,8 +9,9 @@ from itertools import combinations
 import numpy as np
 
 from ballfg.arrays import Array, Mask
+from ballfg.diagnosis.evidence.ahead import DAMPED, FIRST_DAMPING, HARDLY, Ahead, next_damping
 from ballfg.diagnosis.evidence.halves import unlike_halves
-from ballfg.diagnosis.evidence.likelihood import Noise, Posterior, Reduced, Weights, held_out, posterior
+from ballfg.diagnosis.evidence.likelihood import Noise, Reduced, Weights, held_out, posterior
 from ballfg.diagnosis.evidence.nameless import NAMELESS, Patterns, rows_beside
 from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, log_odds, within
 from ballfg.diagnosis.evidence.priors_of_fit import Priors
@@ -18,15 +19,10 @@ from ballfg.diagnosis.evidence.rows import Motion, Rows, random_motion
 from ballfg.diagnosis.evidence.sizes import Start, settled
 from ballfg.diagnosis.fit.fit import followed, with_guesses
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.fit.system import bounded_step
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 
 MOST_STEPS = 12
 """Largest number of steps from a deterministic fit to the most probable unknowns."""
-FIRST_DAMPING, DAMPED, LESS = 0.1, 10.0, 4.0
-"""Damping of a step after a whole one that failed, its factor after a further failure, its divisor after a success."""
-HARDLY, MOSTLY = 0.25, 0.75
-"""Shares of a step's expected gain: with less it fails, with more the next one is damped less."""
 WORTH_A_STEP = 0.5
 """Least expected gain of a step, natural units."""
 
@@ -181,48 +177,6 @@ def _followed(question: _Question, fit: Fit, like: Weighed | None) -> Weighed:
     return found.without(ahead.gain) if ahead.gain > WORTH_A_STEP else found
 
 
-def _damped(damping: float, share: float) -> float:
-    """The damping of the step after one that gained a share of what it promised."""
-    if share < MOSTLY:
-        return damping
-    return damping / LESS if damping > FIRST_DAMPING / LESS else 0.0
-
-
-@dataclass(frozen=True)
-class _Ahead:
-    """The density of the tracks about the common unknowns of a fit, as far as it is quadratic.
-
-    Patterns are no unknowns of the fit: at its new values they are as free as before.
-
-    Attributes:
-        information, slope: (c, c) and (c,) of its logarithm.
-        limits: smallest and largest step (c,).
-        damping: of the next step, as in `bounded_step`.
-    """
-
-    information: Array
-    slope: Array
-    limits: tuple[Array, Array]
-    damping: float = 0.0
-
-    @classmethod
-    def of(cls, fit: Fit, found: Posterior) -> _Ahead:
-        """From the posterior about a fit."""
-        own = len(fit.problem.common_precision)
-        information: Array = np.asarray(np.linalg.inv(found.covariance[:own, :own]), dtype=np.float64)
-        return cls(information, information @ found.mean[:own], fit.limits)
-
-    def step(self, damping: float) -> tuple[Array, float]:
-        """(c,) a step within the limits, and the logarithm of the density that it should gain."""
-        step = bounded_step(self.information, self.slope, *self.limits, damping)
-        return step, float(step @ (self.slope - 0.5 * self.information @ step))
-
-    @property
-    def gain(self) -> float:
-        """What the whole step should gain."""
-        return self.step(0.0)[1]
-
-
 @dataclass(frozen=True)
 class _Point:
     """A fit with its rows, beside patterns without a name if the question has them, and the priors there."""
@@ -259,7 +213,7 @@ class _Question:
 
     def at(
         self, point: _Point, starts: Sequence[Start | None], widths: Sequence[int] = (), damping: float = 0.0
-    ) -> tuple[Weighed, _Ahead, float]:
+    ) -> tuple[Weighed, Ahead, float]:
         """The model at the unknowns of a point, the way to more probable ones, and the density as in `_density`.
 
         Args:
@@ -298,9 +252,9 @@ class _Question:
             self.nameless,
             self._nested(priors, total, best, mixed),
         )
-        return weighed, replace(_Ahead.of(fit, result), damping=damping), result.held(own).evidence
+        return weighed, replace(Ahead.of(fit, result), damping=damping), result.held(own).evidence
 
-    def moved(self, point: _Point, model: Weighed, ahead: _Ahead, before: float) -> tuple[_Point, float] | None:
+    def moved(self, point: _Point, model: Weighed, ahead: Ahead, before: float) -> tuple[_Point, float] | None:
         """The point after a step to more probable unknowns, and the damping of the next; None if none is worth it.
 
         A step may leave the linear range: where samples cannot tell a clock from gravity, say, or hardly show spins.
@@ -317,7 +271,7 @@ class _Question:
             density = self._density(after := self.point(fit), model) if np.isfinite(fit.cost) else -np.inf
             share = (density - before) / promised
             if share > HARDLY:
-                return after, _damped(damping, share)
+                return after, next_damping(damping, share)
             damping = max(FIRST_DAMPING, DAMPED * damping)
 
     def _density(self, point: _Point, model: Weighed) -> float:

@@ -1,42 +1,22 @@
 """The search adds, removes and exchanges effects as long as that makes the model more probable."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
 
-import numpy as np
-
-from ballfg.arrays import Mask
-from ballfg.diagnosis.evidence.halves import unlike_halves
-from ballfg.diagnosis.evidence.nameless import NAMELESS, Patterns
-from ballfg.diagnosis.evidence.odds import ALIKE, Odds, odds_of, scores_of
-from ballfg.diagnosis.evidence.rows import random_motion
-from ballfg.diagnosis.evidence.screen import Screen
-from ballfg.diagnosis.evidence.sets import Sets
-from ballfg.diagnosis.evidence.weighed import WORTH_A_STEP, Weighed, weighed
+from ballfg.diagnosis.evidence.odds import Odds
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect
-from ballfg.diagnosis.hypotheses.varying import Grouping, groupings
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
+from ballfg.diagnosis.hypotheses.varying import Grouping
 from ballfg.diagnosis.result import Candidate, Errors, Finding
-from ballfg.diagnosis.search.candidates import Refit, Scored, refit
-from ballfg.diagnosis.search.changed_fits import model_of, with_strengths_of, without_named
-from ballfg.diagnosis.search.evaluation import on_all, on_others
+from ballfg.diagnosis.search.changed_fits import with_strengths_of
+from ballfg.diagnosis.search.found import MOST_EFFECTS, MOST_ROUNDS, Found
 from ballfg.diagnosis.search.ranking import finding_of, ranking
 from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_findings, stamp_hypotheses
-from ballfg.diagnosis.search.trial import offered_varying, sets_beside, try_hypotheses, try_varying
 from ballfg.dynamics import AnalyticModel, BallModel
 from ballfg.dynamics.effect import Effect
-from ballfg.dynamics.variation import place_of
-from ballfg.estimation.batch import do_all
 
-MOST_EFFECTS = 5
-"""Largest number of added effects."""
-MOST_ROUNDS = 8
-"""Largest number of rounds: one adds several effects, or exchanges one."""
-MOST_EXCHANGES = 3
-"""Largest number of exchanges that a round refits."""
 NAMED = 0.9
 """Probability above which an effect is named."""
 
@@ -69,15 +49,6 @@ class Search:
 
 
 @dataclass(frozen=True)
-class Round:
-    """Tests and refits of one round, and the names that it added."""
-
-    scored: Sequence[Scored]
-    refits: Sequence[Refit]
-    added: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
 class SearchLoop:
     """The inputs of a search, the same in every round.
 
@@ -104,13 +75,13 @@ class SearchLoop:
         """
         self.watch(f"fitting the declared model to {len(self.holdout.search)} flights")
         first = first_fit(model, self.holdout) if first is None else first
-        found = _Found(self, first)
+        found = Found(self, first)
         while len(found.best.named) < MOST_EFFECTS and len(found.rounds) < MOST_ROUNDS and found.round():
             pass
         found.compare()
         return self._told(found, first)
 
-    def _told(self, found: "_Found", first: Fit) -> Search:
+    def _told(self, found: Found, first: Fit) -> Search:
         """The search with the named effects only, its predictions and findings."""
         stamps, odds = self.holdout.stamps, found.odds
         final = found.named_at(self.name_at)
@@ -147,252 +118,3 @@ class SearchLoop:
             tuple(ranking(r.scored, r.refits, r.added, odds) for r in found.rounds),
             odds,
         )
-
-
-class _Found:
-    """Everything weighed so far, by the names of the effects, and the best of it."""
-
-    def __init__(self, loop: SearchLoop, first: Fit) -> None:
-        self.loop = loop
-        self.first = whole = on_all(first, on_others(first, loop.holdout.held_out))
-        self.halves: Mask = unlike_halves(whole)
-        self.motion = random_motion(whole)  # the same for all models: with another one they cannot be compared
-        self.best = weighed(whole, (), self.motion, self.halves)
-        self.models = {self.best.names: self.best}
-        self.rounds: list[Round] = []
-        self.tried: set[tuple[frozenset[str], frozenset[str]]] = set()
-        self.sets: Sets | None = None  # beside something nameless, once that was weighed
-
-    @cached_property
-    def patterns(self) -> Patterns:
-        """Patterns without a name about the declared model's fit, the same for all models."""
-        return Patterns.of(self.models[frozenset()].fit)
-
-    @property
-    def odds(self) -> Odds:
-        """Probabilities over all models weighed so far."""
-        return odds_of(list(self.models.values()))
-
-    @property
-    def scores(self) -> dict[frozenset[str], float]:
-        """Logarithm of the odds of all models weighed or foretold so far."""
-        return scores_of(list(self.models.values()))
-
-    def most_probable(self, models: Iterable[Weighed]) -> Weighed | None:
-        """The best of some models weighed before; None without any."""
-        scores = self.scores
-        return max(models, key=lambda model: scores[model.names], default=None)
-
-    def is_better(self, model: Weighed | None, than: Weighed | None = None) -> bool:
-        """Whether a model weighed before is more probable than another one, None: than the best one so far."""
-        scores = self.scores
-        return model is not None and scores[model.names] > scores[(than or self.best).names]
-
-    def telling(self, where: str) -> Callable[[str], None]:
-        """What tells lines of progress at a place of the search."""
-        return lambda line: self.loop.watch(f"{where}: {line}")
-
-    def round(self) -> bool:
-        """Adds the effects that make the model most probable, and removes those that they make superfluous."""
-        loop, best, number = self.loop, self.best, len(self.rounds) + 1
-        tell = self.telling(f"round {number}")
-        most = MOST_EFFECTS - len(best.named)
-        scored, refits, screen = try_hypotheses(best, self.motion, loop.catalogue, tell, loop.jobs, most)
-        winner = self._weighed(refits)
-        if screen is not None and not self.is_better(winner):
-            self.best = self.models[best.names] = replace(best, neighbours=screen.neighbours)
-            if (exchanged := self._exchanged(screen, scored, tell)) is not None:
-                self.rounds.append(Round(scored, [*refits, exchanged], (exchanged.name,)))
-                return True
-        if not self.is_better(winner):
-            more, fitted = self._varying(best, tell)
-            scored, refits = [*scored, *more], [*refits, *fitted]
-            winner = self.most_probable(w for w in (winner, self._weighed(fitted)) if w is not None)
-        added = self.is_better(winner)
-        names = tuple(h.name for h in winner.named if h not in best.named) if winner is not None and added else ()
-        self.rounds.append(Round(scored, refits, names))
-        if winner is None or not added:
-            tell("nothing makes the model more probable")
-            return False
-        gone = [h.name for h in best.named if h not in winner.named]
-        tell(" and ".join((*(f"{name} added" for name in names), *(f"{name} removed" for name in gone))))
-        self.best = winner
-        if self._better_minimum(best, winner) and self.is_better(best, winner):
-            self.best = self.models[best.names]
-        self._pruned()
-        return True
-
-    def _exchanged(self, screen: Screen, scored: Sequence[Scored], tell: Callable[[str], None]) -> Refit | None:
-        """The refit with another effect in the place of one that makes the model more probable; None if none does.
-
-        Those that are foretold to come close are refitted: they are what cannot be told apart. An absence that is many
-        standard deviations away lies beyond the linear range, so that close is a share of what the effect explains.
-        """
-        best, tried, scores = self.best, list[tuple[Weighed, Refit]](), self.scores
-
-        def exchanged(gone: str, one: int) -> frozenset[str]:
-            return best.names - {gone} | {screen.candidates[one].name}
-
-        for gone, one in sorted(screen.exchanges, key=lambda exchange: -scores[exchanged(*exchange)]):
-            other, own = screen.candidates[one], next(h for h in best.named if h.name == gone)
-            explains = best.score - best.nested[best.names - {gone}].score
-            close = scores[exchanged(gone, one)] > scores[best.names] - max(-np.log(ALIKE), ALIKE * explains)
-            if len(tried) == MOST_EXCHANGES or not close or exchanged(gone, one) in self.models:
-                continue
-            tell(f"fitting with {other.name} in place of {gone}")
-            candidate = next(s for s in scored if s.hypothesis is other)
-            refitted = refit(without_named(best.fit, [own], self.first), candidate)
-            named = (*(h for h in best.named if h is not own), other)
-            found = weighed(refitted.fit, named, self.motion, self.halves, best)
-            self.models[found.names] = found
-            tried.append((found, refitted))
-        winner = self.most_probable(found for found, _ in tried)
-        if winner is None or not self.is_better(winner):
-            return None
-        found, refitted = next(one for one in tried if one[0] is winner)
-        tell(f"{refitted.name} exchanged for another")
-        self.best = found
-        return refitted
-
-    def compare(self) -> None:
-        """Weighs something nameless beside the best model, and if it is there, which effects are there beside it.
-
-        Patterns make some effects superfluous. They also show others, which a model that lacks them hides: an effect
-        alone takes the values that make up for what no effect describes.
-        """
-        loop = self.loop
-        loop.watch("weighing what has no name")
-        best = weighed(self.best.fit, self.best.named, self.motion, self.halves, self.best, self.patterns)
-        self.models[best.names] = best
-        scores = self.scores
-        if NAMELESS not in max(scores, key=lambda names: scores[names]):
-            return
-        loop.watch("weighing sets of effects beside it")
-        varying = offered_varying(best, loop.of_some or loop.catalogue, self.ways)
-        self.sets = sets_beside(best, self.motion, self.patterns, loop.catalogue, varying, MOST_EFFECTS)
-        self.models[best.names] = replace(best, neighbours=self.sets.weights)
-        scores = self.scores
-        self.best = self._model(max((*self.models, *self.sets.members), key=lambda names: scores[names]))
-
-    def _model(self, names: frozenset[str]) -> Weighed:
-        """A model weighed before, or that of a set of effects beside something nameless."""
-        if names not in self.models and self.sets is not None:
-            self.models[names] = model_of(self.sets, names, self.first)
-        return self.models[names]
-
-    def rest(self, gone: Sequence[Hypothesis], model: Weighed) -> Weighed:
-        """A model without some of its effects, and without those that need them."""
-        if model.nameless and self.sets is not None:
-            return self._model(self.sets.without(model.names, [h.name for h in gone]))
-        return self.without(gone, model)
-
-    @cached_property
-    def ways(self) -> list[Grouping]:
-        """Ways in which tracks may differ."""
-        listed = sorted(dict.fromkeys(self.first.problem.stretches.names), key=place_of)
-        return (self.loop.ways or partial(groupings, self.loop.holdout.tracks))(listed)
-
-    def _varying(self, best: Weighed, tell: Callable[[str], None]) -> tuple[list[Scored], list[Refit]]:
-        """Tests and refits of effects that differ between tracks."""
-        loop = self.loop
-        return try_varying(best, self.motion, loop.of_some or loop.catalogue, self.ways, tell, loop.jobs)
-
-    def _refitted(self, best: Weighed, refits: Sequence[Refit]) -> list[Weighed]:
-        """Refits of a model, weighed."""
-        tasks = [
-            partial(weighed, r.fit, (*best.named, *r.added), self.motion, self.halves, best)
-            for r in refits
-            if np.isfinite(r.fit.cost)
-        ]
-        return self._known(do_all(tasks, self.loop.jobs))
-
-    def named_at(self, probability: float) -> Weighed:
-        """The model with all effects that are at least so probable, or with most of them.
-
-        Of several that can hardly be told apart, the most probable one stands for all.
-        """
-        odds, best = self.odds, self.best.names
-        likely = {name for name in odds.effects() if odds.of(name) >= probability} | {NAMELESS}
-        if best in odds.models:
-            likely |= {h.name for h in self.best.named if odds.together(h.name, best) >= probability}
-        if gone := [h for h in self.best.named if h.name not in likely]:
-            self.rest(gone, self.best)
-            odds = self.odds
-        able = [model for model in self.models.values() if model.names <= likely]
-        return max(able, key=lambda model: (len(model.named), odds.models[model.names]))
-
-    def plain(self, model: Weighed) -> Weighed:
-        """The same model without something nameless."""
-        names = model.names - {NAMELESS}
-        if names not in self.models:
-            self.models[names] = weighed(model.fit, model.named, self.motion, self.halves, model)
-        return self.models[names]
-
-    def without(self, gone: Sequence[Hypothesis], model: Weighed | None = None) -> Weighed:
-        """A model without some of its effects, and without those that need them.
-
-        It is weighed again from there if the linearisation says that it was found in a poorer minimum before.
-        """
-        model = model or self.best
-        lost = {h.effect.name for h in gone if not has_effect(self.first.problem.model, h.effect.name)}
-        gone = [h for h in model.named if h in gone or lost & set(h.effect.needs)]
-        kept = tuple(h for h in model.named if h not in gone)
-        names = frozenset(h.name for h in kept)
-        known = self.models.get(names)
-        poor = known is not None and names in model.nested and known.score < model.nested[names].score - WORTH_A_STEP
-        if known is None or (poor and (model.names, names) not in self.tried):
-            self.tried.add((model.names, names))
-            fit = without_named(model.fit, gone, self.first)
-            found = weighed(fit, kept, self.motion, self.halves, model)
-            self.models[names] = found if known is None else max(known, found, key=_score)
-        return self.models[names]
-
-    def _weighed(self, refits: Sequence[Refit]) -> Weighed | None:
-        """The most probable of some refits, and of them without an effect that they make superfluous; None without any.
-
-        One that takes the place of a named effect needs both for a while.
-        """
-        best = self.best
-        found = self._refitted(best, refits)
-        scores = self.scores
-        for model in list(found):
-            names = max(model.nested, key=lambda names: scores[names], default=model.names)
-            if scores[names] > max(scores[model.names], scores[best.names]):
-                found.append(self.without([h for h in model.named if h.name not in names], model))
-        return self.most_probable(self.models[model.names] for model in found)  # a smaller one may replace its refit
-
-    def _known(self, found: Sequence[Weighed]) -> list[Weighed]:
-        """Models with their effects in the best minimum of all that were found, each once; they count from now on."""
-        for model in found:
-            self.models[model.names] = max(self.models.get(model.names, model), model, key=_score)
-        return [self.models[names] for names in dict.fromkeys(model.names for model in found)]
-
-    def _superfluous(self, model: Weighed) -> list[Hypothesis]:
-        """Effects without which a model is more probable, as far as is known."""
-        scores = self.scores
-        return [h for h in model.named if scores.get(model.names - {h.name}, -np.inf) > scores[model.names]]
-
-    def _better_minimum(self, before: Weighed, after: Weighed) -> bool:
-        """Weighs the earlier model again from the later one's fit: effects may have led out of a poor minimum.
-
-        Only if the later one's linearisation says that they have. True if the earlier one is more probable then.
-        """
-        if before.names not in after.nested or after.nested[before.names].score <= before.score:
-            return False
-        fit = without_named(after.fit, [h for h in after.named if h.name not in before.names], self.first)
-        again = weighed(fit, before.named, self.motion, self.halves, before)
-        if again.score > before.score:
-            self.models[before.names] = again
-        return again.score > before.score
-
-    def _pruned(self) -> None:
-        """Removes effects that later ones made superfluous, as the linearisation says and a refit confirms."""
-        while gone := self._superfluous(self.best):
-            least = self.most_probable(self.without([h]) for h in gone)
-            if least is None or not self.is_better(least):
-                break
-            self.best = least
-
-
-def _score(model: Weighed) -> float:
-    return model.score

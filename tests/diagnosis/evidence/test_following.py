@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import ballfg.diagnosis.evidence.weighed as weighing
+from ballfg.diagnosis.evidence.ahead import Ahead
 from ballfg.diagnosis.evidence.halves import unlike_halves
 from ballfg.diagnosis.evidence.rows import random_motion
 from ballfg.diagnosis.fit.fit import fit_problem, followed
@@ -59,7 +60,7 @@ def test_a_step_gains_what_it_promises(make_ball, moved_shots, make_fit):
 def test_damped_steps_stay_within_limits_and_promise_less():
     """Of a quadratic density, against its values on a fine grid within the limits."""
     information, slope = np.array([[4.0, 1.5], [1.5, 1.0]]), np.array([2.0, 3.0])
-    ahead = weighing._Ahead(information, slope, (np.array([-1.0, -1.0]), np.array([1.0, 2.0])))
+    ahead = Ahead(information, slope, (np.array([-1.0, -1.0]), np.array([1.0, 2.0])))
     grid = np.stack(np.meshgrid(np.linspace(-1.0, 1.0, 401), np.linspace(-1.0, 2.0, 601)), axis=-1).reshape(-1, 2)
     gains = grid @ slope - 0.5 * np.einsum("ni,ij,nj->n", grid, information, grid)
     step, gain = ahead.step(0.0)

@@ -8,11 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from ballfg.diagnosis.evidence.nameless import NAMELESS
 from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.stamps import Stamps
 from ballfg.diagnosis.hypotheses.hypothesis import has_effect, without_effect
 from ballfg.diagnosis.result import Errors, Outcome
-from ballfg.diagnosis.search.loop import NAMELESS, SearchLoop, _Found
+from ballfg.diagnosis.search.found import Found
+from ballfg.diagnosis.search.loop import SearchLoop
 from ballfg.diagnosis.search.stamp_effects import first_fit
 from ballfg.dynamics import EFFECTS
 from ballfg.estimation.settings import Settings
@@ -204,7 +206,7 @@ def test_what_is_named_beside_something_nameless_is_as_strong_in_the_model(gusty
 
 def test_beside_something_nameless_effects_are_found_from_one_linearisation(gusty, make_ball):
     """Its evidence, strengths, what is left without each, and a fit without patterns."""
-    found = _Found(gusty, first_fit(make_ball(), gusty.holdout))
+    found = Found(gusty, first_fit(make_ball(), gusty.holdout))
     nothing = found.best
     while found.round():
         pass
@@ -220,7 +222,7 @@ def test_beside_something_nameless_effects_are_found_from_one_linearisation(gust
 
 def test_the_best_minimum_of_the_same_effects_counts(gusty, make_ball):
     """A set that was refitted, and the same set that is left of a larger one."""
-    found = _Found(gusty, first_fit(make_ball(), gusty.holdout))
+    found = Found(gusty, first_fit(make_ball(), gusty.holdout))
     (better,) = found.models.values()
     poorer = replace(better, evidence=better.evidence - 100.0)
     for models in ([poorer, better], [better, poorer]):
