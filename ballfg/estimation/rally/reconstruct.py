@@ -35,7 +35,7 @@ FRAME_SIGMA: Final = 0.3
 """px, of a picture's camera beside the error that all of a shot share."""
 
 NOISE_ROUNDS, NOISE_SETTLED = 8, 0.2
-"""In which the candidates' noise is found, and the change of its factors' logarithms that ends them."""
+"""Rounds in which the candidates' noise is found, and the change of its factors' logarithms that ends them."""
 KINK: Final = 2.0
 """px, standard deviation of the middle of a bar in which the ball bounced."""
 
