@@ -160,8 +160,9 @@ class Found:
         """
         loop = self.loop
         loop.watch("weighing what has no name")
-        best = weighed(self.best.fit, self.best.named, self.motion, self.halves, self.best, self.patterns)
-        self.models[best.names] = best
+        for model in (self.models[frozenset()], self.best):  # without effects too: a name has to beat that at its best
+            best = weighed(model.fit, model.named, self.motion, self.halves, model, self.patterns)
+            self.models[best.names] = best
         scores = self.scores
         if NAMELESS not in max(scores, key=lambda names: scores[names]):
             return
