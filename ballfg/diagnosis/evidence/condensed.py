@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ballfg.arrays import Array, Index, Mask
-from ballfg.diagnosis.evidence.likelihood import LOST, Reduced, triangle
+from ballfg.diagnosis.evidence.likelihood import LOST, Posterior, Reduced, evidences, posterior, triangle
 
 
 @dataclass(frozen=True)
@@ -54,15 +54,12 @@ class Condensed:
 
         Args: columns: (k,) their numbers.  precision: (k,) of their priors.
         """
-        return self._posteriors(self.gram, self.constant, columns, precision)[0]
+        return evidences(self._part(columns), precision, np.zeros(len(columns)))
 
-    def whole(self, columns: Index, precision: Array) -> tuple[float, Array, Array]:
-        """The evidence of all tracks, minus infinity without one, and mean (k,) and covariance (k, k) there.
-
-        Args: as of `evidence`.
-        """
-        evidence, mean, covariance = self._posteriors(self.gram[:1], self.constant[:1], columns, precision)
-        return float(evidence[0]) if np.isfinite(evidence[0]) else -np.inf, mean[0], covariance[0]
+    def whole(self, columns: Index, precision: Array) -> Posterior:
+        """The posterior of some further unknowns from all tracks.  Args: as of `evidence`."""
+        part = self._part(columns)
+        return posterior(Reduced(part.constant[:1], part.gram[:1]), precision, np.zeros(len(columns)))
 
     def held_out(self, columns: Index, precision: Array) -> Array:
         """As `likelihood.held_out`, with some further unknowns.  Args: as of `evidence`."""
@@ -70,12 +67,6 @@ class Condensed:
         found = evidence[3:] - evidence[np.where(self.halves, 1, 2)]
         return found if np.isfinite(found).all() else np.full(len(found), LOST)
 
-    @staticmethod
-    def _posteriors(gram: Array, constant: Array, columns: Index, precision: Array) -> tuple[Array, Array, Array]:
-        information = gram[:, columns[:, None], columns] + np.diag(precision)
-        slope = gram[:, columns, -1]
-        lower = triangle(information)
-        covariance: Array = np.asarray(np.linalg.inv(information), dtype=np.float64)
-        mean = (covariance @ slope[..., None])[..., 0]
-        narrow = np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1) - 0.5 * np.log(precision).sum()
-        return constant - 0.5 * (gram[:, -1, -1] - (slope * mean).sum(axis=1)) - narrow, mean, covariance
+    def _part(self, columns: Index) -> Reduced:
+        listed = np.append(columns, self.gram.shape[-1] - 1)
+        return Reduced(self.constant, self.gram[:, listed[:, None], listed])

@@ -231,13 +231,13 @@ class Screen:
         if key in self._known:
             return self._known[key]
         candidate, condensed = self.candidates[one], self._without(gone)
-        least, *_ = condensed.whole(*self._further(beside))
+        least = condensed.whole(*self._further(beside)).evidence
         found = [condensed.whole(*self._further((*beside, (one, width)))) for width in TRIED]
-        evidence = np.array([after for after, *_ in found])
+        evidence = np.array([after.evidence for after in found])
         best, size = int(evidence.argmax()), len(candidate.strengths)
-        _, mean, covariance = found[best]
-        centre, sigmas = self._centres[one], np.sqrt(np.diagonal(covariance)[-size:])
-        inside = within(candidate, centre, centre + mean[-size:], sigmas, WIDTHS[TRIED[best]])
+        mean, sigmas = found[best].mean[-size:], np.sqrt(np.diagonal(found[best].covariance)[-size:])
+        centre = self._centres[one]
+        inside = within(candidate, centre, centre + mean, sigmas, WIDTHS[TRIED[best]])
         gain = float(special.logsumexp(evidence)) - np.log(len(TRIED)) - least + inside
         self._known[key] = _Gain(float(gain), TRIED[best])
         return self._known[key]

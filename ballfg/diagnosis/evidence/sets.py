@@ -96,7 +96,7 @@ class Sets:
         return best
 
     def _smaller(self, names: frozenset[str]) -> list[frozenset[str]]:
-        """The sets with one effect less; those of which the candidates alone were added in another order are new."""
+        """The sets with one effect less; those that no larger one led to are weighed."""
         member, screen = self.members[names], self.screen
         found = []
         for place, one in enumerate(member.beside):

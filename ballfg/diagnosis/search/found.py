@@ -160,7 +160,8 @@ class Found:
         """
         loop = self.loop
         loop.watch("weighing what has no name")
-        for model in (self.models[frozenset()], self.best):  # without effects too: a name has to beat that at its best
+        nothing = self.models[frozenset()]  # a name has to beat that at its best
+        for model in {m.names: m for m in (nothing, self.best)}.values():
             best = weighed(model.fit, model.named, self.motion, self.halves, model, self.patterns)
             self.models[best.names] = best
         scores = self.scores

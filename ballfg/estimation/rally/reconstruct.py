@@ -124,9 +124,7 @@ def reconstruct(
     smoother = Smoother(model, surfaces, Settings.for_measured(model, find_events=False))
     kinked = _kinked(seen, chosen, field)
     noise = _noise(smoother, seen, replace(camera, covariance=None), chosen, kinked)
-    covariances = noise.of(seen.covariances)
-    covariances[kinked] += KINK**2 * np.eye(2)
-    seen = replace(seen, covariances=covariances)
+    seen = _with_noise(seen, noise, kinked)
     tracks = [_track(stroke, seen, camera, model, surfaces) for stroke in chosen.strokes]
     alone = [smoother.estimate(track) for track in watch(tracks, len(tracks), "strokes estimated")]
     begun, end = _in_play(alone)
@@ -146,6 +144,11 @@ def _kinked(seen: Detections, chosen: Chosen, field: Field) -> Mask:
     return kinked
 
 
+def _with_noise(seen: Detections, noise: Noise, kinked: Mask) -> Detections:
+    """The candidates with a noise, and less certain centres of those bars in which the ball bounced."""
+    return replace(seen, covariances=noise.of(seen.covariances) + KINK**2 * kinked[:, None, None] * np.eye(2))
+
+
 def _noise(smoother: Smoother, seen: Detections, camera: Camera, chosen: Chosen, kinked: Mask) -> Noise:
     """The noise of the candidates, from the strokes alone as an exact camera sees them, without kinked bars.
 
@@ -157,7 +160,7 @@ def _noise(smoother: Smoother, seen: Detections, camera: Camera, chosen: Chosen,
     rows = np.concatenate([stroke.rows for stroke in chosen.strokes])
     stated, plain, loss = seen.covariances[rows], ~kinked[rows], smoother.settings.sighting_loss
     for _ in range(NOISE_ROUNDS):
-        now = replace(seen, covariances=noise.of(seen.covariances) + KINK**2 * kinked[:, None, None] * np.eye(2))
+        now = _with_noise(seen, noise, kinked)
         tracks = [_track(stroke, now, camera, smoother.model, smoother.surfaces) for stroke in chosen.strokes]
         found = [smoother.estimate(track) for track in tracks]
         used = plain & np.repeat([not one.status.failed for one in found], [len(one) for one in found])

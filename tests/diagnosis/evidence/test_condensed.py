@@ -35,10 +35,10 @@ def test_it_is_the_evidence_of_all_columns_at_once(tracks, priors, columns):
     whole, far = np.append(precision, own), np.append(away, np.zeros(len(columns)))
     expected = posterior(part.of(np.full(len(HALVES), True)), whole, far)
     found = Condensed.of(tracks, precision, away, HALVES)
-    evidence, mean, covariance = found.whole(columns, own)
-    assert evidence == pytest.approx(expected.evidence, rel=1e-12)
-    assert mean == pytest.approx(expected.mean[OWN:], rel=1e-9)
-    assert covariance == pytest.approx(expected.covariance[OWN:, OWN:], rel=1e-9)
+    one = found.whole(columns, own)
+    assert one.evidence == pytest.approx(expected.evidence, rel=1e-12)
+    assert one.mean == pytest.approx(expected.mean[OWN:], rel=1e-9)
+    assert one.covariance == pytest.approx(expected.covariance[OWN:, OWN:], rel=1e-9)
     assert found.held_out(columns, own) == pytest.approx(held_out(part, whole, far, HALVES), rel=1e-9)
 
 
@@ -46,6 +46,6 @@ def test_rounding_that_leaves_nothing_has_no_evidence(tracks, priors):
     gram = tracks.gram.copy()
     gram[:, OWN, OWN] = -1e6
     found = Condensed.of(Reduced(tracks.constant, gram), *priors, HALVES)
-    assert found.whole(np.array([0]), np.ones(1))[0] == -np.inf
+    assert found.whole(np.array([0]), np.ones(1)).evidence == -np.inf
     assert (found.held_out(np.array([0]), np.ones(1)) == LOST).all()
-    assert np.isfinite(found.whole(np.array([1]), np.ones(1))[0])
+    assert np.isfinite(found.whole(np.array([1]), np.ones(1)).evidence)
