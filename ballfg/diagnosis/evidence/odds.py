@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,9 +15,6 @@ ALIKE = 0.05
 """Odds of another effect in an effect's place above which the two cannot be told apart."""
 SURELY = 2.0
 """Standard errors by which the gain on the other half must fall short of the evidence to take its place."""
-
-ABSENT = 4.5
-"""Largest loss of evidence, natural units, with which an effect is still about absent: three standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -74,26 +71,35 @@ def scores_of(models: Sequence[Weighed]) -> dict[frozenset[str], float]:
     there as in evidence. Where their gain over a smaller model is less by more than chance, it takes the place of that
     evidence.
 
-    A refit without an effect may end in a poorer minimum than the model with it. Where strengths are known to be about
-    absent, the linearisation with them holds the model without (J. M. Dickey, 1971), and the better of both counts.
-    Models that no refit weighed count as foretold, and lose what those lose whose linearisations foretell them.
+    Models that no refit weighed count as foretold, and lose what those lose whose linearisations foretell them. Beside
+    patterns each weight is of a linearisation, and the best counts.
     """
     lost = {model.names: -np.inf for model in models if not np.isfinite(model.evidence)}
     models = [model for model in models if np.isfinite(model.evidence)]
     weighed = {model.names: model.weight for model in models}
-    for model in models:
-        for names, weight in model.nested.items():
-            if names in weighed and weight.evidence > model.evidence - ABSENT:
-                weighed[names] = max(weighed[names], weight, key=_score)
     scores = {names: tempered(names, weight, weighed) + weight.odds for names, weight in weighed.items()}
-    foretold: dict[frozenset[str], float] = {}
+    found: dict[frozenset[str], float] = {}
     for model in models:
-        for names, weight in (*model.nested.items(), *model.neighbours.items()):
-            if names not in scores:
-                less = scores[model.names] + weight.score - model.score
-                score = min(less, tempered(names, weight, weighed) + weight.odds)
-                foretold[names] = max(score, foretold.get(names, -np.inf))
-    return lost | scores | foretold
+        for names, score in foretold(
+            model, (*model.nested.items(), *model.neighbours.items()), scores, weighed
+        ).items():
+            found[names] = max(score, found.get(names, -np.inf))
+    beside = {n: max(scores[n], found[n]) for n in scores.keys() & found.keys() if NAMELESS in n}
+    return lost | found | scores | beside
+
+
+def foretold(
+    model: Weighed,
+    others: Iterable[tuple[frozenset[str], Weight]],
+    scores: Mapping[frozenset[str], float],
+    weighed: Mapping[frozenset[str], Weight],
+) -> dict[frozenset[str], float]:
+    """Logarithm of the odds of others by their names, as the linearisation of a model foretells them.
+
+    Args: scores, weighed: of the models that were weighed.
+    """
+    lost = scores[model.names] - model.score
+    return {n: min(lost + w.score, tempered(n, w, weighed) + w.odds) for n, w in others}
 
 
 def tempered(names: frozenset[str], weight: Weight, others: Mapping[frozenset[str], Weight]) -> float:
@@ -110,7 +116,3 @@ def tempered(names: frozenset[str], weight: Weight, others: Mapping[frozenset[st
     gains = weight.held_out - np.stack([other.held_out for other in smaller])
     most = gains.sum(axis=1) + SURELY * gains.std(axis=1, ddof=1) * np.sqrt(gains.shape[1])
     return float((evidence + np.clip(most, 0.0, weight.evidence - evidence)).min())
-
-
-def _score(weight: Weight) -> float:
-    return weight.score

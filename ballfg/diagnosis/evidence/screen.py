@@ -110,8 +110,10 @@ class Screen:
             gain, beside = gain + more.gain, (*beside, (one, more.width))
         return gain, beside
 
-    def sets(self, offered: Sequence[int], most: int) -> list[tuple[int, ...]]:
+    def sets(self, offered: Sequence[int], most: int) -> dict[tuple[int, ...], float]:
         """Sets of up to `most` of the candidates offered, each more probable than all its parts; the best first.
+
+        The values are the logarithms of their posterior odds to the model itself.
 
         The most probable sets of each size are enlarged by one candidate after the other. What a set gains counts as
         far as the other half bears it out.
@@ -134,7 +136,7 @@ class Screen:
             more = self._borne_out(best, others)
             best = [c for c in best if more[c] > max(known_scores.get(part, -np.inf) for part in _parts(c))]
             scores |= {chosen: more[chosen] for chosen in best}
-        return sorted(scores, key=lambda chosen: -scores[chosen])
+        return dict(sorted(scores.items(), key=lambda item: -item[1]))
 
     def _borne_out(
         self, leading: Sequence[tuple[int, ...]], others: dict[frozenset[str], Weight]

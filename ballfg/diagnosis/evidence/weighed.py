@@ -56,6 +56,17 @@ class Weight:
 
 
 @dataclass(frozen=True)
+class Smaller(Weight):
+    """What decides about a model without some effects of another, whose linearisation foretells it.
+
+    Attributes:
+        step: (c,) of the other one's common unknowns to the most probable ones where those effects are absent.
+    """
+
+    step: Array
+
+
+@dataclass(frozen=True)
 class Weighed:
     """A model with its evidence.
 
@@ -86,7 +97,7 @@ class Weighed:
     held_out: Array
     halves: Mask
     nameless: bool = False
-    nested: Mapping[frozenset[str], Weight] = field(default_factory=dict)
+    nested: Mapping[frozenset[str], Smaller] = field(default_factory=dict)
     neighbours: Mapping[frozenset[str], Weight] = field(default_factory=dict)
 
     @property
@@ -284,7 +295,7 @@ class _Question:
 
     def _nested(
         self, priors: Priors, tracks: Reduced, widths: Sequence[int], mixed: Sequence[float]
-    ) -> dict[frozenset[str], Weight]:
+    ) -> dict[frozenset[str], Smaller]:
         """Weights of all models with some of the effects; strengths of the others are held where they are absent."""
         found, effects = {}, [h for h in self.named if h.strengths]
         whole = tracks.of(np.full(len(self.halves), True))
@@ -294,9 +305,9 @@ class _Question:
                 if any(effects[place].effect.name in h.effect.needs for place in gone for h in rest):
                     continue
                 precision = priors.held(gone, widths)
-                evidence = posterior(whole, precision, priors.away).evidence
-                evidence += sum(mixed) - sum(mixed[place] for place in gone) + choice_odds(rest)
+                held = posterior(whole, precision, priors.away)
+                evidence = held.evidence + sum(mixed) - sum(mixed[place] for place in gone) + choice_odds(rest)
                 names = frozenset(h.name for h in rest) | frozenset([NAMELESS] * self.nameless)
                 density = held_out(tracks, precision, priors.away, self.halves)
-                found[names] = Weight(evidence, log_odds(rest, self.nameless), density)
+                found[names] = Smaller(evidence, log_odds(rest, self.nameless), density, held.mean)
         return found

@@ -1,6 +1,6 @@
 """Scores every hypothesis of a search round, refits the leading ones and compares the refits."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
 
@@ -9,6 +9,7 @@ import torch
 from scipy import stats
 
 from ballfg.arrays import Array
+from ballfg.diagnosis.evidence.prior import log_odds
 from ballfg.diagnosis.evidence.rows import Motion, random_motion
 from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.weighed import Weighed
@@ -60,18 +61,25 @@ class Scored:
         """Squared whitened residual that the hypothesis would explain; negative if it is not visible."""
         return -1.0 if self.score is None else self.score.explained
 
+    @property
+    def odds(self) -> float:
+        """Foretold logarithm of the posterior odds of the model with it to that without."""
+        return self.gain + log_odds([self.hypothesis])
+
 
 @dataclass(frozen=True)
 class Refit:
     """The refit of a model with a hypothesis at the noise of the previous fit, and the difference of BIC to that.
 
-    A negative difference is better. Hypotheses `beside` it were added too.
+    A negative difference is better. Hypotheses `beside` it were added too. `tests` says that its score is its own, by
+    the ratio of likelihoods.
     """
 
     scored: Scored
     fit: Fit
     delta_bic: float
     beside: tuple[Hypothesis, ...] = ()
+    tests: bool = False
 
     @property
     def added(self) -> tuple[Hypothesis, ...]:
@@ -82,6 +90,21 @@ class Refit:
     def name(self) -> str:
         """Name of the effect."""
         return self.scored.hypothesis.name
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """Refits that may be worth making.
+
+    Attributes:
+        words: names of what they add.
+        gain: foretold logarithm of the odds to the model; infinite if no linearisation can foretell it.
+        refits: what makes them, each with another shape.
+    """
+
+    words: str
+    gain: float
+    refits: Sequence[Callable[[], Refit]]
 
 
 def score_all(
@@ -118,6 +141,15 @@ def screened(model: Weighed, testable: Sequence[Hypothesis], motion: Motion) -> 
     return sorted(scored, key=lambda s: s.explained, reverse=True), screen
 
 
+def retested(scored: Sequence[Scored], refits: Sequence[Refit]) -> list[Scored]:
+    """Score tests, and the refits' own tests of what no score test sees, sorted as in `score_all`."""
+    own = {r.name: r.scored for r in refits if r.tests}
+    telling = {name: test for name, test in own.items() if test.p_value < ALARM}
+    found = [telling.get(s.hypothesis.name, s) for s in scored]
+    found += [test for name, test in own.items() if name not in {s.hypothesis.name for s in scored}]
+    return sorted(found, key=lambda s: s.explained, reverse=True)
+
+
 def shortlist(scored: Sequence[Scored]) -> list[Scored]:
     """The hypotheses to refit: the best shapes of each effect that may gain.
 
@@ -131,16 +163,17 @@ def shortlist(scored: Sequence[Scored]) -> list[Scored]:
     return [replace(best, shapes=tuple(s.hypothesis for s in others[: MOST_SHAPES - 1])) for best, *others in leading]
 
 
-def leading_sets(screen: Screen, scored: Sequence[Scored], most: int) -> list[tuple[int, ...]]:
-    """The most probable set of up to `most` visible hypotheses, and the most probable pair.
+def leading_sets(screen: Screen, scored: Sequence[Scored], most: int) -> dict[tuple[int, ...], float]:
+    """The most probable set of up to `most` visible hypotheses, and the most probable pair, with their log odds.
 
     None that is foretold to be less probable than one hypothesis alone.
     """
     seen = {id(s.hypothesis) for s in scored if s.score is not None}
     visible = [one for one, candidate in enumerate(screen.candidates) if id(candidate) in seen]
-    likely = list(takewhile(lambda chosen: len(chosen) >= PAIR, screen.sets(visible, most)))
+    sets = screen.sets(visible, most)
+    likely = list(takewhile(lambda chosen: len(chosen) >= PAIR, sets))
     pairs = [chosen for chosen in likely if len(chosen) == PAIR]
-    return list(dict.fromkeys((*likely[:1], *pairs[:1])))
+    return {chosen: sets[chosen] for chosen in (*likely[:1], *pairs[:1])}
 
 
 def refit_set(before: Fit, chosen: Sequence[Scored], step: Array, strengths: Array) -> Refit:
@@ -268,7 +301,7 @@ def _by_likelihood(before: Fit, after: Fit, hypothesis: Hypothesis, taken: float
     p_value = float(stats.chi2.sf(max(gain, 0.0), freedom))
     tracks = len(np.unique(after.problem.stretches.track))
     score = Score(estimate, np.full(len(estimate), np.nan), gain, p_value, freedom, tracks)
-    return Refit(Scored(hypothesis, score, score.p_value), after, delta_bic(before, after) + taken)
+    return Refit(Scored(hypothesis, score, score.p_value), after, delta_bic(before, after) + taken, tests=True)
 
 
 def _narrowness(fitted: Fit) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 from ballfg.diagnosis.evidence.prior import centres
 from ballfg.diagnosis.evidence.sets import Sets
 from ballfg.diagnosis.evidence.weighed import Weighed
-from ballfg.diagnosis.fit.fit import fit_problem
+from ballfg.diagnosis.fit.fit import fit_problem, followed
 from ballfg.diagnosis.fit.problem import Fit, Problem
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, with_coefficients, without_effect
 from ballfg.diagnosis.search.candidates import FIRST_STEPS, Scored, refit_set
@@ -60,15 +60,31 @@ def model_of(sets: Sets, names: frozenset[str], first: Fit) -> Weighed:
     )
 
 
+def smaller_fit(model: Weighed, gone: Sequence[Hypothesis], first: Fit) -> Fit:
+    """The fit without some of a model's effects, where its linearisation says that the other unknowns then go.
+
+    Steps of the deterministic fit would lead away from where random motion makes the unknowns most probable.
+
+    Args: first: as of `without_named`.
+    """
+    fit, smaller = model.fit, model.nested.get(model.names - {h.name for h in gone})
+    if smaller is not None:  # its step goes on to patterns, which are no unknowns of the fit
+        known = followed(fit, fit.stepped(smaller.step[: len(fit.problem.common_precision)])).unknowns
+        problem = _problem_without(fit.problem, gone, first)
+        kept = replace(known, values={name: known.values[name] for name in problem.free})
+        found = Fit.at(problem, kept, fit.noise)
+        if np.isfinite(found.cost):
+            return found
+    return without_named(fit, gone, first)
+
+
 def without_named(fit: Fit, gone: Sequence[Hypothesis], first: Fit) -> Fit:
     """A few steps of the fit without some of the effects added to the first one's model, at the same noise.
 
     They begin at the first one's values where a ball leaves its path without an effect: a large lift that saturates
     without its saturation, say.
     """
-    problem = fit.problem
-    for hypothesis in gone:
-        problem = _problem_without(problem, hypothesis, first)
+    problem = _problem_without(fit.problem, gone, first)
     known, plain = fit.unknowns, first.unknowns
     kept = replace(known, values={n: known.values[n] for n in problem.free})
     begun = fit_problem(problem, kept, fit.noise, settle_noise=False, steps=FIRST_STEPS)
@@ -78,8 +94,15 @@ def without_named(fit: Fit, gone: Sequence[Hypothesis], first: Fit) -> Fit:
     return fit_problem(problem, replace(plain, values=values), fit.noise, settle_noise=False, steps=FIRST_STEPS)
 
 
-def _problem_without(problem: Problem, hypothesis: Hypothesis, first: Fit) -> Problem:
-    """The problem without an effect that the first fit's model lacks, or without its free coefficients."""
+def _problem_without(problem: Problem, gone: Sequence[Hypothesis], first: Fit) -> Problem:
+    """The problem without effects that the first fit's model lacks, or without their free coefficients."""
+    for hypothesis in gone:
+        problem = _without_one(problem, hypothesis, first)
+    return problem
+
+
+def _without_one(problem: Problem, hypothesis: Hypothesis, first: Fit) -> Problem:
+    """The problem without one of them."""
     name, gone = hypothesis.effect.name, set(hypothesis.columns)
     needed = has_effect(first.problem.model, name)
     if hypothesis.deviations():  # the effect itself may have been named too, the same for all tracks

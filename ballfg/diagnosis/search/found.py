@@ -12,7 +12,7 @@ import numpy as np
 from ballfg.arrays import Mask
 from ballfg.diagnosis.evidence.halves import unlike_halves
 from ballfg.diagnosis.evidence.nameless import NAMELESS, Patterns
-from ballfg.diagnosis.evidence.odds import ALIKE, Odds, odds_of, scores_of
+from ballfg.diagnosis.evidence.odds import ALIKE, Odds, foretold, odds_of, scores_of
 from ballfg.diagnosis.evidence.rows import random_motion
 from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.sets import Sets
@@ -20,8 +20,8 @@ from ballfg.diagnosis.evidence.weighed import WORTH_A_STEP, Weighed, weighed
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect
 from ballfg.diagnosis.hypotheses.varying import Grouping, groupings
-from ballfg.diagnosis.search.candidates import Refit, Scored, refit
-from ballfg.diagnosis.search.changed_fits import model_of, without_named
+from ballfg.diagnosis.search.candidates import Attempt, Refit, Scored, refit, retested
+from ballfg.diagnosis.search.changed_fits import model_of, smaller_fit
 from ballfg.diagnosis.search.evaluation import on_all, on_others
 from ballfg.diagnosis.search.trial import offered_varying, sets_beside, try_hypotheses, try_varying
 from ballfg.dynamics.variation import place_of
@@ -34,6 +34,8 @@ MOST_EFFECTS = 5
 """Largest number of added effects."""
 MOST_ROUNDS = 8
 """Largest number of rounds: one adds several effects, or exchanges one."""
+AT_ONCE = 2
+"""Number of attempts that are made side by side, whatever the number of processes: results do not depend on it."""
 MOST_EXCHANGES = 3
 """Largest number of exchanges that a round refits."""
 
@@ -95,17 +97,19 @@ class Found:
         loop, best, number = self.loop, self.best, len(self.rounds) + 1
         tell = self.telling(f"round {number}")
         most = MOST_EFFECTS - len(best.named)
-        scored, refits, screen = try_hypotheses(best, self.motion, loop.catalogue, tell, loop.jobs, most)
-        winner = self._weighed(refits)
+        scored, attempts, screen = try_hypotheses(best, self.motion, loop.catalogue, tell, most)
+        refits, winner = self._attempted(best, attempts, tell)
+        scored = retested(scored, refits)
         if screen is not None and not self.is_better(winner):
             self.best = self.models[best.names] = replace(best, neighbours=screen.neighbours)
             if (exchanged := self._exchanged(screen, scored, tell)) is not None:
                 self.rounds.append(Round(scored, [*refits, exchanged], (exchanged.name,)))
                 return True
         if not self.is_better(winner):
-            more, fitted = self._varying(best, tell)
+            more, attempts = try_varying(best, self.motion, loop.of_some or loop.catalogue, self.ways, tell)
+            fitted, other = self._attempted(best, attempts, tell)
             scored, refits = [*scored, *more], [*refits, *fitted]
-            winner = self.most_probable(w for w in (winner, self._weighed(fitted)) if w is not None)
+            winner = self.most_probable(w for w in (winner, other) if w is not None)
         added = self.is_better(winner)
         names = tuple(h.name for h in winner.named if h not in best.named) if winner is not None and added else ()
         self.rounds.append(Round(scored, refits, names))
@@ -115,8 +119,9 @@ class Found:
         gone = [h.name for h in best.named if h not in winner.named]
         tell(" and ".join((*(f"{name} added" for name in names), *(f"{name} removed" for name in gone))))
         self.best = winner
-        if self._better_minimum(best, winner) and self.is_better(best, winner):
-            self.best = self.models[best.names]
+        if best.names < winner.names:  # effects may have led out of a poor minimum of the model without them
+            again = self.without([h for h in winner.named if h.name in names], winner)
+            self.best = again if self.is_better(again, winner) else winner
         self._pruned()
         return True
 
@@ -139,7 +144,7 @@ class Found:
                 continue
             tell(f"fitting with {other.name} in place of {gone}")
             candidate = next(s for s in scored if s.hypothesis is other)
-            refitted = refit(without_named(best.fit, [own], self.first), candidate)
+            refitted = refit(smaller_fit(best, [own], self.first), candidate)
             named = (*(h for h in best.named if h is not own), other)
             found = weighed(refitted.fit, named, self.motion, self.halves, best)
             self.models[found.names] = found
@@ -192,10 +197,28 @@ class Found:
         listed = sorted(dict.fromkeys(self.first.problem.stretches.names), key=place_of)
         return (self.loop.ways or partial(groupings, self.loop.holdout.tracks))(listed)
 
-    def _varying(self, best: Weighed, tell: Callable[[str], None]) -> tuple[list[Scored], list[Refit]]:
-        """Tests and refits of effects that differ between tracks."""
-        loop = self.loop
-        return try_varying(best, self.motion, loop.of_some or loop.catalogue, self.ways, tell, loop.jobs)
+    def _attempted(
+        self, best: Weighed, attempts: Sequence[Attempt], tell: Callable[[str], None]
+    ) -> tuple[list[Refit], Weighed | None]:
+        """The refits of the most promising attempts, and the most probable model that they lead to; None without any.
+
+        What promises less than was gained already can wait for the next round.
+        """
+        refits, winner = list[Refit](), None
+        waiting = sorted(attempts, key=lambda attempt: -attempt.gain)
+        while waiting and not (winner is not None and self._gain(winner, best) > max(waiting[0].gain, 0.0)):
+            now, waiting = waiting[:AT_ONCE], waiting[AT_ONCE:]
+            for attempt in now:
+                tell(f"fitting with {attempt.words}")
+            made = do_all([task for attempt in now for task in attempt.refits], self.loop.jobs)
+            refits += made
+            winner = self.most_probable(w for w in (winner, self._weighed(made)) if w is not None)
+        return sorted(refits, key=lambda r: r.delta_bic), winner
+
+    def _gain(self, model: Weighed, best: Weighed) -> float:
+        """Logarithm of the odds of a model to another one, both weighed before."""
+        scores = self.scores
+        return scores[model.names] - scores[best.names]
 
     def _refitted(self, best: Weighed, refits: Sequence[Refit]) -> list[Weighed]:
         """Refits of a model, weighed."""
@@ -242,7 +265,7 @@ class Found:
         poor = known is not None and names in model.nested and known.score < model.nested[names].score - WORTH_A_STEP
         if known is None or (poor and (model.names, names) not in self.tried):
             self.tried.add((model.names, names))
-            fit = without_named(model.fit, gone, self.first)
+            fit = smaller_fit(model, gone, self.first)
             found = weighed(fit, kept, self.motion, self.halves, model)
             self.models[names] = found if known is None else max(known, found, key=_score)
         return self.models[names]
@@ -256,8 +279,9 @@ class Found:
         found = self._refitted(best, refits)
         scores = self.scores
         for model in list(found):
-            names = max(model.nested, key=lambda names: scores[names], default=model.names)
-            if scores[names] > max(scores[model.names], scores[best.names]):
+            smaller = self._smaller(model)
+            names = max(smaller, key=lambda names: smaller[names], default=model.names)
+            if names in smaller and smaller[names] > max(scores[model.names], scores[best.names]):
                 found.append(self.without([h for h in model.named if h.name not in names], model))
         return self.most_probable(self.models[model.names] for model in found)  # a smaller one may replace its refit
 
@@ -267,23 +291,22 @@ class Found:
             self.models[model.names] = max(self.models.get(model.names, model), model, key=_score)
         return [self.models[names] for names in dict.fromkeys(model.names for model in found)]
 
+    def _smaller(self, model: Weighed) -> dict[frozenset[str], float]:
+        """Logarithm of the odds of the models that a model holds, by their names.
+
+        Those that were weighed from there count so, the others at least as the linearisation foretells them: a refit
+        from elsewhere may have ended in a poorer minimum.
+        """
+        if not np.isfinite(model.evidence):
+            return {}
+        scores, weights = self.scores, {names: known.weight for names, known in self.models.items()}
+        found = foretold(model, model.nested.items(), scores, weights)
+        return {n: scores[n] if (model.names, n) in self.tried else max(scores[n], score) for n, score in found.items()}
+
     def _superfluous(self, model: Weighed) -> list[Hypothesis]:
         """Effects without which a model is more probable, as far as is known."""
-        scores = self.scores
-        return [h for h in model.named if scores.get(model.names - {h.name}, -np.inf) > scores[model.names]]
-
-    def _better_minimum(self, before: Weighed, after: Weighed) -> bool:
-        """Weighs the earlier model again from the later one's fit: effects may have led out of a poor minimum.
-
-        Only if the later one's linearisation says that they have. True if the earlier one is more probable then.
-        """
-        if before.names not in after.nested or after.nested[before.names].score <= before.score:
-            return False
-        fit = without_named(after.fit, [h for h in after.named if h.name not in before.names], self.first)
-        again = weighed(fit, before.named, self.motion, self.halves, before)
-        if again.score > before.score:
-            self.models[before.names] = again
-        return again.score > before.score
+        least, smaller = self.scores[model.names], self._smaller(model)
+        return [h for h in model.named if smaller.get(model.names - {h.name}, -np.inf) > least]
 
     def _pruned(self) -> None:
         """Removes effects that later ones made superfluous, as the linearisation says and a refit confirms."""

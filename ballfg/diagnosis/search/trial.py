@@ -1,9 +1,11 @@
-"""Tries every hypothesis of a round: score tests of all of them, and refits of the best."""
+"""Scores every hypothesis of a round, and lists the refits that may be worth making."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import cast
+
+import numpy as np
 
 from ballfg.diagnosis.evidence.nameless import Patterns
 from ballfg.diagnosis.evidence.rows import Motion
@@ -15,7 +17,7 @@ from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, hypot
 from ballfg.diagnosis.hypotheses.signatures import columns_of
 from ballfg.diagnosis.hypotheses.varying import Grouping, Varying, near, varying_hypotheses
 from ballfg.diagnosis.search.candidates import (
-    ALARM,
+    Attempt,
     Refit,
     Scored,
     leading_sets,
@@ -31,7 +33,6 @@ from ballfg.diagnosis.search.label_frames import frame_hypotheses
 from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.effects.measurement import SpinLabelFrame
 from ballfg.dynamics.variation import place_of
-from ballfg.estimation.batch import do_all
 
 AS_GOOD = 0.97
 """Share of the best place's explained residual from which another place of a change is as good."""
@@ -45,9 +46,8 @@ def try_varying(
     catalogue: Sequence[type[Effect]],
     known: Sequence[Grouping],
     tell: Callable[[str], None],
-    jobs: int = 1,
-) -> tuple[list[Scored], list[Refit]]:
-    """Tries every hypothesis of an effect that differs between tracks; refits of the leading ones, the best first.
+) -> tuple[list[Scored], list[Attempt]]:
+    """Scores every hypothesis of an effect that differs between tracks, and lists the refits of the leading ones.
 
     Args:
         model: without any of them.
@@ -55,45 +55,47 @@ def try_varying(
         catalogue: effects that may differ.
         known: groupings of the tracks.
         tell: called with progress.
-        jobs: processes.
     """
-    before, problem = model.fit, model.fit.problem
-    searched = sorted(dict.fromkeys(problem.stretches.names), key=place_of)
+    searched = sorted(dict.fromkeys(model.fit.problem.stretches.names), key=place_of)
     listed = offered_varying(model, catalogue, known)
     tell(f"testing {len(listed)} ways in which tracks may differ")
     scored = score_all(model, listed, motion)
     names = sorted({name for way in known for level in way.weights.values() for name in level}, key=place_of)
-    refits = []
+    attempts = []
     for candidate in shortlist(scored):
-        tell(f"fitting with {candidate.hypothesis.name}")
         closer = near(cast(Varying, candidate.hypothesis), searched, names)
-        best = _placed(model, motion, closer) if len(closer) > 1 else candidate
-        refits.append(refit(before, replace(best, p_value=candidate.p_value)))
-    return scored, sorted(refits, key=lambda r: r.delta_bic)
+        task = partial(_refit_placed, model, motion, candidate, closer)
+        attempts.append(Attempt(candidate.hypothesis.name, candidate.odds, [task]))
+    return scored, attempts
 
 
-def _refits(before: Fit, leading: Sequence[Scored], tell: Callable[[str], None]) -> list[Callable[[], Refit]]:
+def _refit_placed(model: Weighed, motion: Motion, candidate: Scored, closer: Sequence[Varying]) -> Refit:
+    """The refit with a change along the recording at its best place."""
+    best = _placed(model, motion, closer) if len(closer) > 1 else candidate
+    return refit(model.fit, replace(best, p_value=candidate.p_value))
+
+
+def _alone(before: Fit, leading: Sequence[Scored]) -> list[Attempt]:
     """The refits of every shape of the leading hypotheses."""
-    shaped: list[Scored] = []
+    found = []
     for candidate in leading:
-        tell(f"fitting with {candidate.hypothesis.name}")
+        shaped = [candidate]
         if candidate.hypothesis.effect is SpinLabelFrame:
             frames = frame_hypotheses(before, candidate.hypothesis)
-            shaped += [Scored(frame, None, candidate.p_value) for frame in frames]
-        else:
-            shaped.append(candidate)
-    return [partial(refit, before, one) for one in shaped]
+            shaped = [Scored(frame, None, candidate.p_value) for frame in frames]
+        found.append(
+            Attempt(candidate.hypothesis.name, candidate.odds, [partial(refit, before, one) for one in shaped])
+        )
+    return found
 
 
-def _set_refits(
-    screen: Screen, scored: Sequence[Scored], most: int, tell: Callable[[str], None]
-) -> list[Callable[[], Refit]]:
+def _together(screen: Screen, scored: Sequence[Scored], most: int) -> list[Attempt]:
     """The refits of the leading sets of hypotheses."""
-    tested, found = {id(s.hypothesis): s for s in scored}, list[Callable[[], Refit]]()
-    for chosen in leading_sets(screen, scored, most):
+    tested, found = {id(s.hypothesis): s for s in scored}, []
+    for chosen, odds in leading_sets(screen, scored, most).items():
         members = [tested[id(screen.candidates[one])] for one in chosen]
-        tell(f"fitting with {' and '.join(one.hypothesis.name for one in members)}")
-        found.append(partial(refit_set, screen.model.fit, members, *screen.step(chosen)))
+        task = partial(refit_set, screen.model.fit, members, *screen.step(chosen))
+        found.append(Attempt(" and ".join(one.hypothesis.name for one in members), odds, [task]))
     return found
 
 
@@ -149,19 +151,17 @@ def try_hypotheses(
     motion: Motion,
     catalogue: Sequence[type[Effect]],
     tell: Callable[[str], None],
-    jobs: int = 1,
     most: int = 1,
-) -> tuple[list[Scored], list[Refit], Screen | None]:
-    """Scores all hypotheses, sorted by explained residual, and refits the best, and the best sets of several.
+) -> tuple[list[Scored], list[Attempt], Screen | None]:
+    """Scores all hypotheses, sorted by explained residual, and lists the refits of the best, alone and together.
 
-    The screen foretells what it did not refit; None without hypotheses.
+    The screen foretells what no refit weighs; None without hypotheses.
 
     Args:
         weighed: the model without any of them.
         motion: random columns of its fit.
         catalogue: candidate effects.
         tell: called with progress.
-        jobs: processes.
         most: largest number of effects in a set.
     """
     before, model = weighed.fit, weighed.fit.problem.model
@@ -170,19 +170,18 @@ def try_hypotheses(
     scored, screen = screened(weighed, testable, motion) if testable else ([], None)
     leading = shortlist(scored)
     called = {candidate.hypothesis.name for candidate in leading}
-    usual = {h.name: h for h in (s.hypothesis for s in scored) if h.usual and h.name not in called}
-    usual = {name: h for name, h in usual.items() if not has_effect(model, name)}
-    tasks = _refits(before, leading, tell)
-    tasks += [] if screen is None else _set_refits(screen, scored, most, tell)
-    for name in usual:
-        tell(f"fitting with {name}, which balls usually have")
+    attempts = _alone(before, leading)
+    attempts += [] if screen is None else _together(screen, scored, most)
+    for one in scored:
+        hypothesis = one.hypothesis
+        if hypothesis.usual and not {hypothesis.name} & called and not has_effect(model, hypothesis.name):
+            called.add(hypothesis.name)
+            gain = (
+                one.odds if weighed.named else np.inf
+            )  # another effect may be in its place only after the first round
+            words = f"{hypothesis.name}, which balls usually have"
+            attempts.append(Attempt(words, gain, [partial(refit_usual, before, hypothesis)]))
     for hypothesis in driven:
-        tell(f"fitting with {hypothesis.name} and spins that nobody labelled")
-    tasks += [partial(refit_usual, before, h) for h in usual.values()]
-    tasks += [partial(refit_driven, before, h) for h in driven]
-    refits = do_all(tasks, jobs)
-    telling = {r.name: r.scored for r in refits if r.name in usual and r.scored.p_value < ALARM}
-    scored = [telling.get(s.hypothesis.name, s) for s in scored]
-    scored += [r.scored for r in refits if r.name in {h.name for h in driven}]
-    ranked = sorted(scored, key=lambda s: s.explained, reverse=True)
-    return ranked, sorted(refits, key=lambda r: r.delta_bic), screen
+        words = f"{hypothesis.name} and spins that nobody labelled"
+        attempts.append(Attempt(words, np.inf, [partial(refit_driven, before, hypothesis)]))
+    return scored, attempts, screen

@@ -13,9 +13,11 @@ from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.stamps import Stamps
 from ballfg.diagnosis.hypotheses.hypothesis import has_effect, without_effect
 from ballfg.diagnosis.result import Errors, Outcome
+from ballfg.diagnosis.search.candidates import Attempt
 from ballfg.diagnosis.search.found import Found
 from ballfg.diagnosis.search.loop import SearchLoop
 from ballfg.diagnosis.search.stamp_effects import first_fit
+from ballfg.diagnosis.search.trial import try_hypotheses
 from ballfg.dynamics import EFFECTS
 from ballfg.estimation.settings import Settings
 
@@ -230,3 +232,31 @@ def test_the_best_minimum_of_the_same_effects_counts(gusty, make_ball):
     for models in ([poorer, better], [better, poorer]):
         assert found._known(models) == [better]
     assert found.models == {frozenset(): better}
+
+
+def test_a_poorer_minimum_of_a_smaller_model_is_left_once_from_a_larger_one(gusty, make_ball):
+    """A refit from there starts where the larger one's linearisation leads, and counts from then on."""
+    found = Found(gusty, first_fit(make_ball(), gusty.holdout))
+    nothing = found.best
+    assert found.round()
+    larger = found.best
+    poorer = replace(nothing, evidence=nothing.evidence - 1e4)
+    found.models[frozenset()] = poorer
+    assert found._smaller(larger)[frozenset()] > found.scores[frozenset()]
+    again = found.without(larger.named)
+    assert again.names == frozenset()
+    assert again.score > nothing.score - 1.0  # the same minimum from another side, or a better one
+    assert found._smaller(larger)[frozenset()] == found.scores[frozenset()]
+
+
+def test_what_promises_less_than_was_gained_waits(gusty, make_ball):
+    """Whatever cannot be foretold comes first, and the order of the rest is that of their promises."""
+    found = Found(gusty, first_fit(make_ball(), gusty.holdout))
+    best, told = found.best, []
+    _, attempts, _ = try_hypotheses(best, found.motion, gusty.catalogue, unwatched, 3)
+    refits = max(attempts, key=lambda attempt: attempt.gain).refits
+    gains = (np.inf, 1e6, 0.5, -1.0)
+    made, winner = found._attempted(best, [Attempt(str(gain), gain, refits) for gain in gains[::-1]], told.append)
+    assert told == ["fitting with inf", "fitting with 1000000.0"]
+    assert len(made) == 2 * len(refits)
+    assert found.is_better(winner, best)
