@@ -11,7 +11,7 @@ from ballfg.arrays import Array, Index, Mask
 from ballfg.diagnosis.design.goal import Goal
 from ballfg.diagnosis.fit.problem import Fit, Unknowns
 from ballfg.diagnosis.fit.stretches import LEAST_SAMPLES, MOST_CONTACTS, Stretches
-from ballfg.diagnosis.search.candidates import with_hypothesis
+from ballfg.diagnosis.search.refits import with_hypothesis
 from ballfg.dynamics import BallModel, Surfaces, rollout
 from ballfg.state import SPIN, VZ
 

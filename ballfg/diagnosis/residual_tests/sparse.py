@@ -15,7 +15,7 @@ from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect
 from ballfg.diagnosis.hypotheses.signatures import hypothesis_signatures
-from ballfg.diagnosis.search.candidates import with_hypothesis
+from ballfg.diagnosis.search.refits import with_hypothesis
 from ballfg.dynamics.effects.registry import GENERIC
 
 MOST_TERMS = 12

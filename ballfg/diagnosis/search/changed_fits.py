@@ -11,7 +11,8 @@ from ballfg.diagnosis.evidence.weighed import Weighed
 from ballfg.diagnosis.fit.fit import fit_problem, followed
 from ballfg.diagnosis.fit.problem import Fit, Problem
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, with_coefficients, without_effect
-from ballfg.diagnosis.search.candidates import FIRST_STEPS, Scored, refit_set
+from ballfg.diagnosis.search.candidates import Scored
+from ballfg.diagnosis.search.refits import FIRST_STEPS, refit_set
 
 
 def with_strengths_of(model: Weighed, fit: Fit) -> Fit:

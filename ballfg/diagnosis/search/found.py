@@ -20,9 +20,10 @@ from ballfg.diagnosis.evidence.weighed import WORTH_A_STEP, Weighed, weighed
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect
 from ballfg.diagnosis.hypotheses.varying import Grouping, groupings
-from ballfg.diagnosis.search.candidates import Attempt, Refit, Scored, refit, retested
+from ballfg.diagnosis.search.candidates import Scored
 from ballfg.diagnosis.search.changed_fits import model_of, smaller_fit
 from ballfg.diagnosis.search.evaluation import on_all, on_others
+from ballfg.diagnosis.search.refits import Attempt, Refit, refit, retested
 from ballfg.diagnosis.search.trial import offered_varying, sets_beside, try_hypotheses, try_varying
 from ballfg.dynamics.variation import place_of
 from ballfg.estimation.batch import do_all
@@ -83,10 +84,13 @@ class Found:
         scores = self.scores
         return max(models, key=lambda model: scores[model.names], default=None)
 
-    def is_better(self, model: Weighed | None, than: Weighed | None = None) -> bool:
-        """Whether a model weighed before is more probable than another one, None: than the best one so far."""
+    def is_better(self, model: Weighed | None, than: Weighed | None = None, by: float = 0.0) -> bool:
+        """Whether a model weighed before is more probable than another one, None: than the best one so far.
+
+        Args: by: least logarithm of their odds.
+        """
         scores = self.scores
-        return model is not None and scores[model.names] > scores[(than or self.best).names]
+        return model is not None and scores[model.names] > scores[(than or self.best).names] + by
 
     def telling(self, where: str) -> Callable[[str], None]:
         """What tells lines of progress at a place of the search."""
@@ -98,7 +102,7 @@ class Found:
         tell = self.telling(f"round {number}")
         most = MOST_EFFECTS - len(best.named)
         scored, attempts, screen = try_hypotheses(best, self.motion, loop.catalogue, tell, most)
-        refits, winner = self._attempted(best, attempts, tell)
+        refits, winner = self._attempted(attempts, tell)
         scored = retested(scored, refits)
         if screen is not None and not self.is_better(winner):
             self.best = self.models[best.names] = replace(best, neighbours=screen.neighbours)
@@ -107,7 +111,7 @@ class Found:
                 return True
         if not self.is_better(winner):
             more, attempts = try_varying(best, self.motion, loop.of_some or loop.catalogue, self.ways, tell)
-            fitted, other = self._attempted(best, attempts, tell)
+            fitted, other = self._attempted(attempts, tell)
             scored, refits = [*scored, *more], [*refits, *fitted]
             winner = self.most_probable(w for w in (winner, other) if w is not None)
         added = self.is_better(winner)
@@ -198,7 +202,7 @@ class Found:
         return (self.loop.ways or partial(groupings, self.loop.holdout.tracks))(listed)
 
     def _attempted(
-        self, best: Weighed, attempts: Sequence[Attempt], tell: Callable[[str], None]
+        self, attempts: Sequence[Attempt], tell: Callable[[str], None]
     ) -> tuple[list[Refit], Weighed | None]:
         """The refits of the most promising attempts, and the most probable model that they lead to; None without any.
 
@@ -206,7 +210,7 @@ class Found:
         """
         refits, winner = list[Refit](), None
         waiting = sorted(attempts, key=lambda attempt: -attempt.gain)
-        while waiting and not (winner is not None and self._gain(winner, best) > max(waiting[0].gain, 0.0)):
+        while waiting and not self.is_better(winner, by=max(waiting[0].gain, 0.0)):
             now, waiting = waiting[:AT_ONCE], waiting[AT_ONCE:]
             for attempt in now:
                 tell(f"fitting with {attempt.words}")
@@ -214,20 +218,6 @@ class Found:
             refits += made
             winner = self.most_probable(w for w in (winner, self._weighed(made)) if w is not None)
         return sorted(refits, key=lambda r: r.delta_bic), winner
-
-    def _gain(self, model: Weighed, best: Weighed) -> float:
-        """Logarithm of the odds of a model to another one, both weighed before."""
-        scores = self.scores
-        return scores[model.names] - scores[best.names]
-
-    def _refitted(self, best: Weighed, refits: Sequence[Refit]) -> list[Weighed]:
-        """Refits of a model, weighed."""
-        tasks = [
-            partial(weighed, r.fit, (*best.named, *r.added), self.motion, self.halves, best)
-            for r in refits
-            if np.isfinite(r.fit.cost)
-        ]
-        return self._known(do_all(tasks, self.loop.jobs))
 
     def named_at(self, probability: float) -> Weighed:
         """The model with all effects that are at least so probable, or with most of them.
@@ -276,7 +266,12 @@ class Found:
         One that takes the place of a named effect needs both for a while.
         """
         best = self.best
-        found = self._refitted(best, refits)
+        tasks = [
+            partial(weighed, r.fit, (*best.named, *r.added), self.motion, self.halves, best)
+            for r in refits
+            if np.isfinite(r.fit.cost)
+        ]
+        found = self._known(do_all(tasks, self.loop.jobs))
         scores = self.scores
         for model in list(found):
             smaller = self._smaller(model)

@@ -16,20 +16,9 @@ from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, hypotheses, scene_of
 from ballfg.diagnosis.hypotheses.signatures import columns_of
 from ballfg.diagnosis.hypotheses.varying import Grouping, Varying, near, varying_hypotheses
-from ballfg.diagnosis.search.candidates import (
-    Attempt,
-    Refit,
-    Scored,
-    leading_sets,
-    refit,
-    refit_driven,
-    refit_set,
-    refit_usual,
-    score_all,
-    screened,
-    shortlist,
-)
+from ballfg.diagnosis.search.candidates import Scored, leading_sets, score_all, screened, shortlist
 from ballfg.diagnosis.search.label_frames import frame_hypotheses
+from ballfg.diagnosis.search.refits import Attempt, Refit, refit, refit_driven, refit_set, refit_usual
 from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.effects.measurement import SpinLabelFrame
 from ballfg.dynamics.variation import place_of

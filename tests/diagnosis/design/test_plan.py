@@ -15,7 +15,7 @@ from ballfg.diagnosis.design.levels import combinations, parse_levels
 from ballfg.diagnosis.design.plan import ShotPlan, _fit_of_all
 from ballfg.diagnosis.fit.fit import covariance_of, fit_problem
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.search.candidates import with_hypothesis
+from ballfg.diagnosis.search.refits import with_hypothesis
 from ballfg.dynamics import nominal_model
 from ballfg.simulation import parse_effects
 from ballfg.tracks import Dataset, Track

@@ -17,7 +17,8 @@ from ballfg.diagnosis.evidence.sets import Sets
 from ballfg.diagnosis.evidence.weighed import weigh
 from ballfg.diagnosis.hypotheses.hypothesis import hypotheses, scene_of
 from ballfg.diagnosis.hypotheses.signatures import columns_of
-from ballfg.diagnosis.search.candidates import Scored, refit
+from ballfg.diagnosis.search.candidates import Scored
+from ballfg.diagnosis.search.refits import refit
 from ballfg.dynamics import EFFECTS
 
 

@@ -11,16 +11,8 @@ import torch
 from ballfg.diagnosis.evidence.weighed import weigh
 from ballfg.diagnosis.fit.fit import values_of
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, without_effect
-from ballfg.diagnosis.search.candidates import (
-    ALARM,
-    LEAST_GAIN,
-    MOST_REFITS,
-    Scored,
-    refit,
-    refit_driven,
-    score_all,
-    shortlist,
-)
+from ballfg.diagnosis.search.candidates import ALARM, LEAST_GAIN, MOST_REFITS, Scored, score_all, shortlist
+from ballfg.diagnosis.search.refits import refit, refit_driven
 from ballfg.diagnosis.search.score import Score
 from ballfg.dynamics import EFFECTS
 

@@ -13,9 +13,9 @@ from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.stamps import Stamps
 from ballfg.diagnosis.hypotheses.hypothesis import has_effect, without_effect
 from ballfg.diagnosis.result import Errors, Outcome
-from ballfg.diagnosis.search.candidates import Attempt
 from ballfg.diagnosis.search.found import Found
 from ballfg.diagnosis.search.loop import SearchLoop
+from ballfg.diagnosis.search.refits import Attempt
 from ballfg.diagnosis.search.stamp_effects import first_fit
 from ballfg.diagnosis.search.trial import try_hypotheses
 from ballfg.dynamics import EFFECTS
@@ -256,7 +256,7 @@ def test_what_promises_less_than_was_gained_waits(gusty, make_ball):
     _, attempts, _ = try_hypotheses(best, found.motion, gusty.catalogue, unwatched, 3)
     refits = max(attempts, key=lambda attempt: attempt.gain).refits
     gains = (np.inf, 1e6, 0.5, -1.0)
-    made, winner = found._attempted(best, [Attempt(str(gain), gain, refits) for gain in gains[::-1]], told.append)
+    made, winner = found._attempted([Attempt(str(gain), gain, refits) for gain in gains[::-1]], told.append)
     assert told == ["fitting with inf", "fitting with 1000000.0"]
     assert len(made) == 2 * len(refits)
     assert found.is_better(winner, best)
