@@ -53,7 +53,7 @@ class Weights:
         return self._known[node]
 
     def recipe(self, graph: GraphModule, vectors: int) -> Recipe | None:
-        """The recipe of the weights from the tables, which are placeholders after `vectors` vectors; None: no weights."""
+        """The recipe of the weights from tables, which are placeholders after `vectors` vectors; None: no weights."""
         if not self.taken:
             return None
         needed, own, copies = self._needed(), Graph(), dict[Node, Node]()
