@@ -179,18 +179,18 @@ class Kept:
         stamp = source_stamp(str(source)) if there else _digest(marshal.dumps(code)).hex()  # of a notebook
         place, named = _digest(str(source.parent).encode()).hex()[:12], re.sub(r"\W+", "_", function.__qualname__)
         version = f"py{sys.version_info.major}{sys.version_info.minor}"
-        self.name = f"{source.stem}-{place}.{named}-{code.co_firstlineno}.{version}.nbc"
-        self._about = f"{self.name}, {stamp}, {VERSIONS}"
+        name = f"{source.stem}.{named}-{code.co_firstlineno}.{version}.nbc"
+        self._about = f"{name}, {stamp}, {VERSIONS}"
         wanted = [told] if told is not None else [beside] if there else []
-        self._folder = next(filter(_is_usable, wanted), None) or cache_folder()
-        self._folders = [self._folder]
-        if told is None and there and beside != self._folder and (beside / self.name).exists() and _is_trusted(beside):
-            self._folders.append(beside)
+        folder = next(filter(_is_usable, wanted), None) or cache_folder()
+        self._paths = [folder / (name if folder == beside else f"{place}-{name}")]
+        if told is None and folder != beside and (beside / name).exists() and _is_trusted(beside):
+            self._paths.append(beside / name)
 
     @property
     def cache_path(self) -> str:
         """The folder that is written to."""
-        return str(self._folder)
+        return str(self._paths[0].parent)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The kept code; None if there is none.
@@ -200,9 +200,9 @@ class Kept:
         """
         rtsys.initialize(target_context)
         about = self._about_code(sig, target_context.codegen())
-        for folder in self._folders:
+        for path in self._paths:
             try:
-                content = own_bytes(folder / self.name)
+                content = own_bytes(path)
                 if content[:DIGEST_SIZE] == _digest(content[DIGEST_SIZE:]):
                     known, payload = pickle.loads(content[DIGEST_SIZE:])
                     if known == about:
@@ -216,7 +216,7 @@ class Kept:
         if data.lifted or data.library.has_dynamic_globals:
             return
         content = dumps((self._about_code(sig, data.codegen), data._reduce()))
-        with suppress(OSError), _replaced(self._folder / self.name) as file:
+        with suppress(OSError), _replaced(self._paths[0]) as file:
             file.write(_digest(content) + content)
 
     def _about_code(self, sig: Any, codegen: Any) -> str:
