@@ -114,7 +114,7 @@ def estimate_noise(
     for name, flag in (("position_known", position_known), ("tracker_known", tracker_known), ("errors", errors)):
         check_flag(name, flag)
     measured = check_each("tracks", tracks, Track, "Make one with Track(times, positions).")
-    parts = [part for track in measured if len(part := _first_part(track)) >= LEAST_SAMPLES]
+    parts = [part for track in measured if len(part := track.opening(LONGEST_PART)) >= LEAST_SAMPLES]
     own_sigmas = any(part.sigmas is not None for part in parts)
     linear = linearised(model, surfaces, settings, parts, watch, jobs=jobs)
     if linear is None:
@@ -210,10 +210,6 @@ def spread_over(tracks: Iterable[T], count: int, most: int = MOST_TRACKS) -> lis
         if number + 1 >= count:
             break
     return found
-
-
-def _first_part(track: Track) -> Track:
-    return track.opening(LONGEST_PART)
 
 
 def _forecaster(linear: LinearTracks, parts: Sequence[Track], settings: Settings, biased: bool) -> Forecaster:
