@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import IO, Any, Final, cast
 
 import llvmlite
 import llvmlite.binding as llvm
@@ -172,10 +172,11 @@ class Kept:
     """
 
     def __init__(self, function: Any) -> None:
-        code = function.__code__
+        code, settings = function.__code__, cast(Any, numba.config)
+        assert function.__closure__ is None, "what a function takes from around it would be compiled in"
         source = Path(code.co_filename)
         there, beside = source.exists(), source.with_name("__pycache__")
-        told = Path(numba.config.CACHE_DIR) if numba.config.CACHE_DIR else None
+        told = Path(settings.CACHE_DIR) if settings.CACHE_DIR else None
         stamp = source_stamp(str(source)) if there else _digest(marshal.dumps(code)).hex()  # of a notebook
         place, named = _digest(str(source.parent).encode()).hex()[:12], re.sub(r"\W+", "_", function.__qualname__)
         version = f"py{sys.version_info.major}{sys.version_info.minor}"
