@@ -25,10 +25,14 @@ WIDER: Final = 10.0  # Width of their density, in standard deviations: one misse
 JUDGED: Final = (Status.OK, Status.DEPTH_UNCERTAIN)  # Statuses of estimates whose predictions count
 
 
-class TrackScore(BaseModel):
-    """Prediction errors of one track, within bounds that only numbers from a damaged checkpoint pass."""
+class Plain(BaseModel):
+    """Plain numbers and texts, for files: strict types, no unknown keys, immutable, finite."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class TrackScore(Plain):
+    """Prediction errors of one track, within bounds that only numbers from a damaged checkpoint pass."""
 
     name: str
     samples: int = Field(ge=1)  # Number of predicted samples

@@ -73,8 +73,6 @@ def make_estimator(name: str, model: BallModel, surfaces: Surfaces | float, sett
     make = partial(_estimator, ESTIMATORS[name], surfaces, settings)
     if not model.variations:
         return make(model)
-    from ballfg.estimation.registry import EachItsModel
-
     return EachItsModel(make, model, surfaces, settings)
 
 

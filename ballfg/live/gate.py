@@ -118,43 +118,13 @@ def assign(costs: Array, limit: float) -> list[tuple[int, int]]:
     """
     if costs.size == 0:
         return []
-    turned = costs.shape[0] > costs.shape[1]
     allowed = np.where(costs <= limit, costs, FAR)
-    pairs = sorted((j, i) if turned else (i, j) for i, j in enumerate(_columns(allowed.T if turned else allowed)))
+    if 1 in costs.shape:  # one ball or one position: scipy takes half a second to import
+        nearest = np.unravel_index(int(allowed.argmin()), costs.shape)
+        pairs = [(int(nearest[0]), int(nearest[1]))]
+    else:
+        from scipy.optimize import linear_sum_assignment
+
+        rows, columns = linear_sum_assignment(allowed)
+        pairs = list(zip(rows.tolist(), columns.tolist(), strict=True))
     return [(i, j) for i, j in pairs if costs[i, j] <= limit]
-
-
-def _columns(costs: Array) -> list[int]:
-    """The column of each row (n, m), n <= m, in the assignment with the smallest sum.
-
-    Rows come in one after the other, each by the shortest path of exchanges to a free column. Scipy has it too, and
-    takes half a second to import.
-
-    Source: D. F. Crouse, "On implementing 2D rectangular assignment algorithms", IEEE Transactions on Aerospace and
-        Electronic Systems 52(4), 2016, section II.
-    """
-    n, m = costs.shape
-    rows, columns = np.full(m, -1), np.full(n, -1)  # the partner of each, so far
-    of_row, of_column = np.zeros(n), np.zeros(m)  # prices: no cost lies below the sum of both
-    for new in range(n):
-        length, before, done = np.full(m, np.inf), np.full(m, -1), np.zeros(m, dtype=bool)
-        row, so_far, end = new, 0.0, -1
-        passed: list[int] = []
-        while row >= 0:
-            passed.append(row)
-            through = so_far + costs[row] - of_row[row] - of_column
-            shorter = ~done & (through < length)
-            length[shorter], before[shorter] = through[shorter], row
-            end = int(np.where(done, np.inf, length).argmin())
-            so_far, done[end], row = float(length[end]), True, int(rows[end])
-        of_row[new] += so_far
-        for row in passed[1:]:
-            of_row[row] += so_far - length[columns[row]]
-        of_column[done] -= so_far - length[done]
-        while True:
-            row = int(before[end])
-            rows[end] = row
-            end, columns[row] = int(columns[row]), end
-            if row == new:
-                break
-    return [int(column) for column in columns]

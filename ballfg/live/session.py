@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from ballfg.estimation.online.warm_up import warmed_up
+from ballfg.live.gate import assign
 from ballfg.live.outlook import Outlook, Plane, answer, encoded, look_out, refusal
 from ballfg.live.sources.source import Arrival, Inbox
 from ballfg.live.tracker import BallUpdate, Tracker
@@ -170,5 +171,6 @@ def warm_up(tracker: Tracker, wanted: Wanted) -> None:
     for state in warmed_up(tracker.estimator):
         update = BallUpdate("state", state.time, 1, state.position, state)
         encoded(answer(update, look_out(state, wanted.horizon, wanted.plane), ()), 0.0)
+    assign(np.zeros((2, 2)), 1.0)  # scipy's, which a second ball would wait for
     gc.collect()
     gc.freeze()  # permanent objects are not scanned again

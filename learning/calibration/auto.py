@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
 from ballfg.checks import aligned
 from ballfg.estimation.noise.estimate import NoiseEstimate
@@ -33,7 +32,7 @@ from ballfg.learning.calibration.calibrate import (
 )
 from ballfg.learning.calibration.groups import OWN, Groups
 from ballfg.learning.config.calibration import CalibrationConfig
-from ballfg.learning.evaluation import TrackScore, summary
+from ballfg.learning.evaluation import Plain, TrackScore, summary
 from ballfg.progress import Watch, unwatched
 
 NOMINAL: Final = "nominal"
@@ -63,10 +62,8 @@ class Fitted:
     steps: tuple[Step, ...]
 
 
-class Candidate(BaseModel):
+class Candidate(Plain):
     """One candidate's predictions of the tracks that did not calibrate it."""
-
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     name: str
     tracks: int
@@ -77,10 +74,8 @@ class Candidate(BaseModel):
     gain_error: float  # Standard error of the gain over tracks
 
 
-class Choice(BaseModel):
+class Choice(Plain):
     """The comparison of all candidates, and the name of the chosen one."""
-
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     chosen: str
     candidates: tuple[Candidate, ...]

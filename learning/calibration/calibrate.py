@@ -11,7 +11,7 @@ from functools import partial
 from typing import Final, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import Field
 
 from ballfg.arrays import Array
 from ballfg.dynamics import AnalyticModel
@@ -38,7 +38,7 @@ from ballfg.learning.calibration.population import Evidence, agreeing, evidence,
 from ballfg.learning.calibration.volume import estimate_with_slopes
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.config_file import AUTO
-from ballfg.learning.evaluation import JUDGED, TrackScore, judge_track
+from ballfg.learning.evaluation import JUDGED, Plain, TrackScore, judge_track
 from ballfg.learning.split import Split, split_tracks, tracks_of
 from ballfg.progress import Watch, unwatched
 from ballfg.tracks import Dataset
@@ -84,20 +84,16 @@ class Problem:
         return Smoother(with_values(self.model, self.chosen.names, values), self.surfaces, settings)
 
 
-class TrackFit(BaseModel):
+class TrackFit(Plain):
     """Posterior of one track's p coefficients, the model's prior included."""
-
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     name: str
     values: tuple[float, ...]
     sigmas: tuple[float, ...]
 
 
-class Step(BaseModel):
+class Step(Plain):
     """One step in plain numbers, which a checkpoint keeps to the last bit. Step 0 only judges the first model."""
-
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     number: int
     mean: tuple[float, ...]  # (p,) the population's mean: the coefficients of the next model
@@ -105,7 +101,7 @@ class Step(BaseModel):
     spread: tuple[float, ...] = ()  # (p,) standard deviations between tracks
     next_track: tuple[float, ...] = ()  # (p,) standard deviations of a new track's coefficients about the mean
     spins: tuple[GroupSpin, ...] = ()  # The spins of each group, in the order of `Groups.names`; none without groups
-    by_group: dict[str, tuple[float, ...]] = {}
+    by_group: dict[str, tuple[float, ...]] = Field(default_factory=dict)
     """Means by group, in the same order, of the coefficients that differ between groups."""
     doubts: tuple[tuple[float, ...], ...] = ()
     """Directions of the uncertainty of a correction's weights; none without a correction."""

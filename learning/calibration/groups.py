@@ -13,7 +13,6 @@ from itertools import product
 from typing import Final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
 from ballfg.arrays import Array, Index
 from ballfg.checks import listed, shown
@@ -25,6 +24,7 @@ from ballfg.estimation.observations.sighted_dataset import SightedDataset
 from ballfg.factors.loss import Loss
 from ballfg.learning.calibration.coefficients import Chosen
 from ballfg.learning.calibration.population import Evidence, Population, evidence, fit_population
+from ballfg.learning.evaluation import Plain
 from ballfg.state import SPIN, VELOCITY
 from ballfg.tracks import Dataset
 
@@ -39,10 +39,8 @@ Columns = tuple[Array, Array, Array, Array]
 Three = tuple[float, float, float]
 
 
-class GroupSpin(BaseModel):
+class GroupSpin(Plain):
     """The spins of one group, (3,) rad/s forward, across and up; all zero before the first step."""
-
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     mean: Three = (0.0, 0.0, 0.0)
     sigma: Three = (0.0, 0.0, 0.0)  # Standard errors of the mean

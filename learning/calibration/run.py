@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 
 from ballfg.checks import shown
 from ballfg.dynamics import save_model
@@ -44,7 +44,7 @@ from ballfg.learning.calibration.picture import draw
 from ballfg.learning.calibration.report import compare, outcome, report, table
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.config_file import AUTO
-from ballfg.learning.evaluation import TrackScore, summary
+from ballfg.learning.evaluation import Plain, TrackScore, summary
 from ballfg.learning.run import run_folder as files
 from ballfg.learning.run.record import NOT_BETTER
 from ballfg.learning.start import describe
@@ -53,10 +53,8 @@ from ballfg.progress import Watch
 from ballfg.tracks.noise import TrackNoise
 
 
-class Checkpoint(BaseModel):
+class Checkpoint(Plain):
     """The checkpoint of a calibration, from which it continues to the same numbers."""
-
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     data: str  # Digest of the dataset's content
     model: dict[str, Any]  # Content of the model file that the run started from

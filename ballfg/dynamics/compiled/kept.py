@@ -5,6 +5,7 @@ file states its function, its sources, their versions and the processor.
 """
 
 import hashlib
+import marshal
 import os
 import pickle
 import re
@@ -14,16 +15,16 @@ import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache, lru_cache
-from io import BytesIO
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import IO, Any, Final, cast
 
 import llvmlite
 import llvmlite.binding as llvm
 import numba
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import CompileResult
 from numba.core.runtime import rtsys
+from numba.core.serialize import dumps
 
 from ballfg.files.own_folder import is_own, own_bytes, temporary_folder
 
@@ -32,11 +33,8 @@ FOR_OTHERS_TO_READ: Final = 0o644
 DIGEST_SIZE: Final = hashlib.sha256().digest_size
 NOTED: Final = "BALLFG_CACHE_NOTED"
 """Environment variable: this process, or one that started it, has printed the note on folders that are not used."""
+VERSIONS: Final = f"numba {numba.__version__}, llvmlite {llvmlite.__version__}"
 _IMPORTS: Final = re.compile(rb"^(?:from|import) (ballfg[\w.]*)", re.MULTILINE)
-_LOCATORS: Final[dict[str, Any]] = {
-    locator.__name__.lstrip("_"): locator for locator in CompileResultCacheImpl._locator_classes
-}  # some versions of numba begin these names with a line
-_InTree: Any = _LOCATORS["InTreeCacheLocator"]
 
 
 def configured_folder() -> Path:
@@ -48,13 +46,21 @@ def configured_folder() -> Path:
 @lru_cache(maxsize=1)
 def cache_folder() -> Path:
     """The folder that compiled functions are written to: the configured one, or one for temporary files."""
-    with suppress(OSError, RuntimeError):
+    with suppress(RuntimeError):
         folder = configured_folder()
+        if _is_usable(folder):
+            return folder
+    return temporary_folder("cache")
+
+
+@cache
+def _is_usable(folder: Path) -> bool:
+    """True if machine code can be written to a folder, which is made if missing, and may be run from there."""
+    with suppress(OSError):
         folder.mkdir(READABLE, parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
-            if _is_trusted(folder):
-                return folder
-    return temporary_folder("cache")
+            return _is_trusted(folder)
+    return False
 
 
 @cache
@@ -100,37 +106,6 @@ def _replaced(path: Path) -> Iterator[IO[bytes]]:
         part.unlink(missing_ok=True)  # of a disk that is full, or after an interrupt
 
 
-class _Temporary(_InTree):
-    """A place in `cache_folder`, for code whose own folder and whose user's cache cannot be written to."""
-
-    def __init__(self, function: Any, file: str) -> None:
-        super().__init__(function, file)
-        self._cache_path = str(cache_folder() / self.get_suitable_cache_subpath(file))
-
-
-class _Beside(_InTree):
-    """The folder beside the source, which need not be one that can be written to."""
-
-    def ensure_cache_path(self) -> None:
-        """Nothing is needed to read."""
-
-
-class _Trusted:
-    """A locator of numba's that ignores folders in which somebody else could change the code."""
-
-    def __init__(self, locator: Any) -> None:
-        self._locator = locator
-
-    def from_function(self, function: Any, file: str) -> Any:
-        """As numba asks for it; None where there is no such folder."""
-        found = self._locator.from_function(function, file)
-        return found if found is not None and _is_trusted(Path(found.get_cache_path())) else None
-
-
-WRITTEN: Final[list[Any]] = [_Trusted(locator) for locator in (*CompileResultCacheImpl._locator_classes, _Temporary)]
-READ: Final[list[Any]] = [_Beside]
-
-
 class _Library(JITCodeLibrary):
     """A loaded function, whose code for building it into others is read when one of them is compiled.
 
@@ -146,76 +121,21 @@ class _Library(JITCodeLibrary):
         return super()._get_module_for_linking()
 
 
-class _Kept(CompileResultCacheImpl):
-    def rebuild(self, target_context: Any, payload: Any) -> Any:
-        """The function of kept code, as numba asks for it."""
-        (name, kind, (code, shared)), about, *others = payload
-        codegen = target_context.codegen()
-        codegen._engine._defined_symbols |= {about.llvm_cpython_wrapper_name, about.llvm_cfunc_wrapper_name}
-        found = super().rebuild(target_context, ((name, kind, (code, _no_code())), about, *others))
-        found.library.__class__, found.library._waiting = _Library, shared
-        return found
-
-
 @cache
 def _no_code() -> bytes:
     return bytes(llvm.parse_assembly("").as_bitcode())
 
 
-class _Written(_Kept):
-    _locator_classes = WRITTEN
-
-
-class _Read(_Kept):
-    _locator_classes = READ
-
-
-class _Checked(IndexDataCacheFile):
-    """Files of machine code, each with its key and with a digest of the rest.
-
-    Damaged code, or another function's, would end the process or compute nonsense.
-    """
-
-    def __init__(self, folder: str, base: str, stamp: str) -> None:
-        super().__init__(folder, base, stamp)
-        self._version = f"numba {numba.__version__}, llvmlite {llvmlite.__version__}"
-        self._about = f"{base}, {stamp}, {self._version}"
-
-    def save(self, key: Any, data: Any) -> None:
-        """Keeps code. Args: key: signature, processor and its features, bytecode."""
-        super().save(key, (f"{self._about}, {key}", data))
-
-    def load(self, key: Any) -> Any:
-        """The code of a key; None if there is none. Raises: ValueError: the file holds other code."""
-        about, data = super().load(key) or ("", None)
-        if data is not None and about != f"{self._about}, {key}":
-            raise ValueError(f"{self._index_name} must lead to its own code. It is compiled again.")
-        return data
-
-    def _load_index(self) -> Any:
-        try:
-            file = BytesIO(own_bytes(Path(self._index_path)))
-        except FileNotFoundError:
-            return {}
-        if pickle.load(file) != self._version:
-            return {}
-        stamp, overloads = pickle.load(file)
-        return overloads if stamp == self._source_stamp else {}
-
-    def _save_data(self, name: str, data: Any) -> None:
-        content = self._dump(data)
-        with self._open_for_write(self._data_path(name)) as file:
-            file.write(_digest(content) + content)
-
-    def _load_data(self, name: str) -> Any:
-        content = own_bytes(Path(self._data_path(name)))
-        digest, code = content[:DIGEST_SIZE], content[DIGEST_SIZE:]
-        if digest != _digest(code):
-            raise ValueError(f"{name} must hold what was written; its digest is another. It is compiled again.")
-        return pickle.loads(code)
-
-    def _open_for_write(self, path: str) -> Any:
-        return _replaced(Path(path))
+def _rebuilt(target_context: Any, payload: Any) -> Any:
+    """The function of kept code."""
+    (name, kind, (code, shared)), about, *others = payload
+    target_context.codegen()._engine._defined_symbols |= {
+        about.llvm_cpython_wrapper_name,
+        about.llvm_cfunc_wrapper_name,
+    }
+    found = CompileResult._rebuild(target_context, (name, kind, (code, _no_code())), about, *others)
+    found.library.__class__, found.library._waiting = _Library, shared
+    return found
 
 
 def _digest(content: bytes) -> bytes:
@@ -242,63 +162,64 @@ def _read(path: str) -> tuple[bytes, tuple[str, ...]]:
     return _digest(content), tuple(name.decode() for name in _IMPORTS.findall(content))
 
 
-class _Cache(FunctionCache):
+class Kept:
+    """Machine code of a function on disk, in the form that numba asks for it.
+
+    It is written to the folder that numba is told by `NUMBA_CACHE_DIR`; else beside its source, or if that folder
+    cannot be written to, or others than this user may change it, to `cache_folder`. It is also read from beside the
+    source, where an administrator may have compiled it. Unreadable, damaged or foreign code is compiled again; a full
+    disk only costs time.
+    """
+
     def __init__(self, function: Any) -> None:
-        super().__init__(function)
-        file = function.__code__.co_filename
-        cell = not os.path.exists(file)  # of a notebook
-        stamp = str(self._impl.locator.get_source_stamp()) if cell else source_stamp(file)
-        self._cache_file = _Checked(self.cache_path, self._impl.filename_base, stamp)
+        code, settings = function.__code__, cast(Any, numba.config)
+        assert function.__closure__ is None, "what a function takes from around it would be compiled in"
+        source = Path(code.co_filename)
+        there, beside = source.exists(), source.with_name("__pycache__")
+        told = Path(settings.CACHE_DIR) if settings.CACHE_DIR else None
+        stamp = source_stamp(str(source)) if there else _digest(marshal.dumps(code)).hex()  # of a notebook
+        place, named = _digest(str(source.parent).encode()).hex()[:12], re.sub(r"\W+", "_", function.__qualname__)
+        version = f"py{sys.version_info.major}{sys.version_info.minor}"
+        name = f"{source.stem}.{named}-{code.co_firstlineno}.{version}.nbc"
+        self._about = f"{name}, {stamp}, {VERSIONS}"
+        wanted = [told] if told is not None else [beside] if there else []
+        folder = next(filter(_is_usable, wanted), None) or cache_folder()
+        self._paths = [folder / (name if folder == beside else f"{place}-{name}")]
+        if told is None and folder != beside and (beside / name).exists() and _is_trusted(beside):
+            self._paths.append(beside / name)
+
+    @property
+    def cache_path(self) -> str:
+        """The folder that is written to."""
+        return str(self._paths[0].parent)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The kept code; None if there is none.
 
-        numba's own method first loads all that a compilation needs, which takes a fifth of a second. Code that is
+        numba's own cache first loads all that a compilation needs, which takes a fifth of a second. Code that is
         compiled already needs the memory of its arrays alone; a compilation loads the rest itself.
         """
         rtsys.initialize(target_context)
-        with self._guard_against_spurious_io_errors():
-            return self._load_overload(sig, target_context)
-
-
-class _KeptBeside(_Cache):
-    _impl_class: Any = _Read
-
-
-class Kept(_Cache):
-    """Machine code of a function on disk.
-
-    It is written to the first folder that numba can write to and nobody else can change. It is also read from beside
-    the source, where an administrator may have compiled it; if `NUMBA_CACHE_DIR` is set, only from there. Unreadable,
-    damaged or foreign code is compiled again; a full disk only costs time.
-    """
-
-    _impl_class: Any = _Written
-
-    def __init__(self, function: Any) -> None:
-        super().__init__(function)
-        told = isinstance(self._impl.locator, _LOCATORS["UserProvidedCacheLocator"])
-        beside = Path(function.__code__.co_filename).with_name("__pycache__")
-        self._beside: Any = None
-        if not told and str(beside) != self.cache_path and any(beside.glob("*.nbi")) and _is_trusted(beside):
-            self._beside = _KeptBeside(function)
-
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The kept code; None if there is none."""
-        found = self._loaded(super(), sig, target_context)
-        if found is None and self._beside is not None:
-            found = self._loaded(self._beside, sig, target_context)
-        return found
-
-    def _loaded(self, cache: Any, sig: Any, target_context: Any) -> Any:
-        try:
-            return cache.load_overload(sig, target_context)
-        except Exception:  # pickle's, of any class, at an index that is empty or cut; that of the digest
-            with suppress(OSError):
-                cache.flush()
-            return None
+        about = self._about_code(sig, target_context.codegen())
+        for path in self._paths:
+            try:
+                content = own_bytes(path)
+                if content[:DIGEST_SIZE] == _digest(content[DIGEST_SIZE:]):
+                    known, payload = pickle.loads(content[DIGEST_SIZE:])
+                    if known == about:
+                        return _rebuilt(target_context, payload)
+            except Exception:  # pickle's, of any class
+                continue
+        return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keeps code for other processes."""
-        with suppress(OSError):
-            super().save_overload(sig, data)
+        """Keeps code for other processes, unless it refers to places in the memory of this one."""
+        if data.lifted or data.library.has_dynamic_globals:
+            return
+        content = dumps((self._about_code(sig, data.codegen), data._reduce()))
+        with suppress(OSError), _replaced(self._paths[0]) as file:
+            file.write(_digest(content) + content)
+
+    def _about_code(self, sig: Any, codegen: Any) -> str:
+        """The function, its sources, their versions, its signature and the processor."""
+        return f"{self._about}, {sig}, {codegen.magic_tuple()}"

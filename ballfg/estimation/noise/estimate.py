@@ -114,7 +114,7 @@ def estimate_noise(
     for name, flag in (("position_known", position_known), ("tracker_known", tracker_known), ("errors", errors)):
         check_flag(name, flag)
     measured = check_each("tracks", tracks, Track, "Make one with Track(times, positions).")
-    parts = [part for track in measured if len(part := _first_part(track)) >= LEAST_SAMPLES]
+    parts = [part for track in measured if len(part := track.opening(LONGEST_PART)) >= LEAST_SAMPLES]
     own_sigmas = any(part.sigmas is not None for part in parts)
     linear = linearised(model, surfaces, settings, parts, watch, jobs=jobs)
     if linear is None:
@@ -133,7 +133,11 @@ def _searched(
     linear: LinearTracks,
 ) -> NoiseEstimate | None:
     """The noise of linearised parts of tracks; known: its white part, and what the tracker adds."""
-    forecaster = _forecaster(linear, parts, settings, settings.has_memory or not known[1])
+    # from the origins that a robot would use, or earlier ones in tracks that are too short
+    typical = float(np.median([part.duration for part in parts]))
+    earliest, every = min(EARLIEST_START, EARLIEST_SHARE * typical), min(START_EVERY, EVERY_SHARE * typical)
+    biased = settings.has_memory or not known[1]
+    forecaster = Forecaster(linear, settings.velocity_prior, earliest, every, biased=biased)
     if not len(forecaster.starts):
         return None
     parameters = parameters_of(settings, linear, *known)
@@ -161,15 +165,9 @@ def _searched(
 
 def _intervals(logs: Array, sides: Array, wide: Array) -> list[tuple[float, float]]:
     """Limits at distances (k, 2) below and above logarithms (k,); open where a distance is beyond `wide` (k,)."""
-    limits = []
-    for log, (below, above), most in zip(logs, sides, wide, strict=False):
-        limits.append(
-            (
-                float(np.exp(log - below)) if below < most else 0.0,
-                float(np.exp(log + above)) if above < most else np.inf,
-            )
-        )
-    return limits
+    ends = np.exp(logs[: len(sides), None] + sides * (-1.0, 1.0))
+    low, high = np.where(sides < wide[: len(sides), None], ends, (0.0, np.inf)).T.tolist()
+    return list(zip(low, high, strict=True))
 
 
 def linearised(
@@ -210,22 +208,6 @@ def spread_over(tracks: Iterable[T], count: int, most: int = MOST_TRACKS) -> lis
         if number + 1 >= count:
             break
     return found
-
-
-def _first_part(track: Track) -> Track:
-    return track.opening(LONGEST_PART)
-
-
-def _forecaster(linear: LinearTracks, parts: Sequence[Track], settings: Settings, biased: bool) -> Forecaster:
-    """Forecasts from the origins that a robot would use, or earlier ones in tracks that are too short."""
-    typical = float(np.median([part.duration for part in parts]))
-    return Forecaster(
-        linear,
-        settings.velocity_prior,
-        earliest=min(EARLIEST_START, EARLIEST_SHARE * typical),
-        every=min(START_EVERY, EVERY_SHARE * typical),
-        biased=biased,
-    )
 
 
 class _Search:

@@ -7,9 +7,10 @@ contacts with their saltation included. A Kalman filter over deviations then giv
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Final
 
 import numpy as np
 import torch
@@ -102,7 +103,7 @@ class _Piece:
     transitions: Array
     offsets: Array
     kicks: Array
-    start: Array
+    starts: Array
     labelled: bool
     group_sigmas: Array
 
@@ -193,29 +194,22 @@ def _longest_stretch(times: Array, breaks: NDArray[np.int64]) -> tuple[int, int]
     return int(firsts[longest]), int(ends[longest])
 
 
+PADDED: Final = {
+    **dict.fromkeys(("times", "white", "velocities", "transitions"), "edge"),
+    **dict.fromkeys(("errors", "used", "offsets", "kicks"), "zero"),
+}
+"""Fields with a row for each sample or interval, and what fills those of shorter tracks."""
+
+
 def _side_by_side(pieces: Sequence[_Piece], numbers: Array, coefficient_sigmas: Tensor) -> LinearTracks:
     longest = max(len(piece.times) for piece in pieces)
 
-    def stacked(arrays: Iterable[Array], length: int, mode: str) -> Tensor:
-        rows = []
-        for array in arrays:
-            missing = length - len(array)
-            filling = array[-1:] if mode == "edge" else np.zeros((1, *array.shape[1:]), dtype=array.dtype)
-            rows.append(np.concatenate((array, np.repeat(filling, missing, axis=0))))
-        return torch.from_numpy(np.stack(rows))
+    def padded(piece: _Piece, name: str) -> Array:
+        array = getattr(piece, name)
+        filling = array[-1:] if PADDED[name] == "edge" else np.zeros_like(array[:1])
+        return np.concatenate((array, np.repeat(filling, longest - len(piece.times), axis=0)))
 
-    return LinearTracks(
-        numbers=numbers,
-        times=stacked((p.times for p in pieces), longest, "edge"),
-        errors=stacked((p.errors for p in pieces), longest, "zero"),
-        white=stacked((p.white for p in pieces), longest, "edge"),
-        velocities=stacked((p.velocities for p in pieces), longest, "edge"),
-        used=stacked((p.used for p in pieces), longest, "zero"),
-        transitions=stacked((p.transitions for p in pieces), longest - 1, "edge"),
-        offsets=stacked((p.offsets for p in pieces), longest - 1, "zero"),
-        kicks=stacked((p.kicks for p in pieces), longest - 1, "zero"),
-        starts=torch.from_numpy(np.stack([p.start for p in pieces])),
-        labelled=torch.tensor([p.labelled for p in pieces]),
-        group_sigmas=torch.from_numpy(np.stack([p.group_sigmas for p in pieces])),
-        coefficient_sigmas=coefficient_sigmas,
-    )
+    fields = {name: np.stack([padded(piece, name) for piece in pieces]) for name in PADDED}
+    fields |= {n: np.stack([getattr(piece, n) for piece in pieces]) for n in ("starts", "labelled", "group_sigmas")}
+    tensors = {name: torch.from_numpy(array) for name, array in fields.items()}
+    return LinearTracks(numbers=numbers, coefficient_sigmas=coefficient_sigmas, **tensors)

@@ -141,15 +141,9 @@ def _parameters(settings: Settings, tracks: LinearTracks, parts: Iterable[Eviden
     """The numbers that act from sample to sample, with those of some parts."""
     times = {part.name: part.time for part in parts}
     names = [*ALWAYS, *(number for name in times for number in NUMBERS[name])]
+    starts = {"memory_time": times.get(MEMORY, 0.0), "stamp_jitter": JITTER_UNIT}
     found = [p for p in parameters_of(settings, tracks, position_known=False) if p.name in names]
-    return [
-        replace(p, start=times[MEMORY])
-        if p.name == "memory_time"
-        else replace(p, start=JITTER_UNIT)
-        if p.name == "stamp_jitter"
-        else p
-        for p in found
-    ]
+    return [replace(p, start=starts.get(p.name, p.start)) for p in found]
 
 
 def _evidence(full: LinearFilter, fit: MarginalFit, name: str, held_out: Mask) -> list[Evidence]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import ClassVar, Final, cast
 
@@ -53,6 +53,7 @@ class TooFewSightingsError(ValueError):
     """The ball was seen too rarely for a path."""
 
 
+@dataclass(eq=False, repr=False)
 class CameraSightings(Observation):
     """Pixels of the ball in the images of cameras.
 
@@ -75,27 +76,15 @@ class CameraSightings(Observation):
     name: ClassVar[str] = "sighting"
     locates: ClassVar[bool] = True
 
-    def __init__(
-        self,
-        sightings: Sightings,
-        cameras: tuple[Camera, ...],
-        state: Index,
-        delay: Array,
-        moved: Array,
-        one_view: bool = False,
-        bounces: tuple[Contact, ...] = (),
-        place: tuple[Array, float] | None = None,
-        known: Segmentation | None = None,
-    ) -> None:
-        self.sightings = sightings
-        self.cameras = cameras
-        self.state = state
-        self.delay = delay
-        self.moved = moved
-        self.one_view = one_view
-        self.bounces = bounces
-        self.place = place
-        self.known = known
+    sightings: Sightings
+    cameras: tuple[Camera, ...]
+    state: Index
+    delay: Array
+    moved: Array
+    one_view: bool = False
+    bounces: tuple[Contact, ...] = ()
+    place: tuple[Array, float] | None = None
+    known: Segmentation | None = None
 
     @property
     def time_offsets(self) -> Array:
@@ -199,8 +188,7 @@ class CameraSightings(Observation):
         if np.median(spread) < np.median(np.trace(seen.covariances, axis1=1, axis2=2)) / 2.0:
             return None
         noisy = replace(seen, covariances=seen.covariances + spread[:, :, None] * np.eye(2))
-        loose = CameraSightings(noisy, self.cameras, self.state, self.delay, self.moved, True, self.bounces, self.place)
-        return self._in_place(track, loose)
+        return self._in_place(track, replace(self, sightings=noisy))
 
     def across(self, first: int, positions: Array, covariances: Array) -> tuple[Array, Array]:
         """Errors of positions across the rays of the sightings, with their standard deviations.

@@ -51,35 +51,29 @@ class GaussianMixture:
         """A part of the Gaussians, by a mask (n,)."""
         return GaussianMixture(self.log_weights[rows], self.means[rows], self.covariances[rows])
 
-    def updated_by_position(self, position: Array, noise: Array, H: Array) -> tuple[GaussianMixture, Array]:
-        """The Kalman update with a position, and squared whitened innovations (n,); weights gain its likelihood.
+    def updated(self, innovation: Array, noise: Array, H: Array) -> tuple[GaussianMixture, Array]:
+        """The Kalman update, and squared whitened innovations (n,); weights gain the likelihood.
 
-        Args: position: (3,) m.  noise: (n, 3, 3) m^2, for each Gaussian.  H: (3, d) of a measured position.
+        Args:
+            innovation: (n, r) measured less predicted, for each Gaussian.
+            noise: (n, r, r) in the squares of their unit.
+            H: (r, d) or (n, r, d) of what is measured.
         """
-        innovation = position - self.means @ H.T
         rows = H @ self.covariances
-        spread = rows @ H.T + noise
+        spread = rows @ H.swapaxes(-1, -2) + noise
         gain = np.linalg.solve(spread, rows).swapaxes(1, 2)
         squares = (innovation * np.linalg.solve(spread, innovation[..., None])[..., 0]).sum(axis=1)
         log_weights = self.log_weights - 0.5 * (squares + np.linalg.slogdet(spread)[1])
-        rest = np.eye(H.shape[1]) - gain @ H
+        rest = np.eye(H.shape[-1]) - gain @ H
         covariances = rest @ self.covariances @ rest.swapaxes(1, 2) + gain @ noise @ gain.swapaxes(1, 2)
         means = self.means + (gain @ innovation[..., None])[..., 0]
         return GaussianMixture(log_weights, means, covariances), squares
 
     def updated_by_factor(self, factor: FactorBatch, biases: int) -> GaussianMixture:
         """The same update with a batch of one factor, which does not see the `biases` at the state's end."""
-        log_weights, means, covariances = self.log_weights.copy(), self.means.copy(), self.covariances.copy()
-        for i, (mean, covariance) in enumerate(zip(self.means, self.covariances, strict=True)):
-            found = FilterInnovation.of(factor, mean, covariance, biases)
-            spread = found.spread + found.R
-            gain = np.linalg.solve(spread, found.H @ covariance).T
-            square = float(found.residual @ np.linalg.solve(spread, found.residual))
-            log_weights[i] -= 0.5 * (square + np.linalg.slogdet(spread)[1])
-            means[i] = mean - gain @ found.residual
-            rest = np.eye(len(mean)) - gain @ found.H
-            covariances[i] = rest @ covariance @ rest.T + gain @ found.R @ gain.T
-        return GaussianMixture(log_weights, means, covariances)
+        found = [FilterInnovation.of(factor, *one, biases) for one in zip(self.means, self.covariances, strict=True)]
+        residuals, noise, H = (np.stack([getattr(one, name) for one in found]) for name in ("residual", "R", "H"))
+        return self.updated(-residuals, noise, H)[0]
 
     def truncated(self, gaps: Array, gradients: Array) -> GaussianMixture:
         """The part above a surface, from gaps (n,) m and gradients (n, d); weighted by the remaining shares."""

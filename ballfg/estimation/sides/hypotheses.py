@@ -155,7 +155,7 @@ class HypothesisModel:
             H = np.zeros((3, balls.means.shape[1]))
             H[:, POSITION], H[:, self.width :] = np.eye(3), np.eye(3)[:, : self.biases]
             noise = np.diag(measured.sigma**2) + stamp_covariance(self.settings, balls.means[:, VELOCITY])
-            balls, squares = balls.updated_by_position(measured.position, noise, H)
+            balls, squares = balls.updated(measured.position - balls.means @ H.T, noise, H)
             nearest = float(squares.min())
         for factor in measured.factors:
             balls = balls.updated_by_factor(factor, self.biases)

@@ -203,10 +203,6 @@ def _of_read(p: Program, number: Number, operation: Operation, place: int) -> Nu
     return p.place(Operation("slope", (number, *by, *moved), where=(block, entry, through, place)))
 
 
-def _still(p: Program, *_: object) -> Number:
-    return p.constant(0.0)
-
-
 PARTIALS: Final[dict[str, Partial]] = {
     "add": lambda p, n, o, k: p.constant(1.0),
     "sub": lambda p, n, o, k: p.constant(1.0 if k == 0 else -1.0),
@@ -226,6 +222,6 @@ PARTIALS: Final[dict[str, Partial]] = {
     "where": _of_where,
     "pow": _of_pow,
     "read": _of_read,
-    **dict.fromkeys(("le", "ge", "lt", "gt", "sign"), _still),
+    **dict.fromkeys(("le", "ge", "lt", "gt", "sign"), lambda p, *_: p.constant(0.0)),
 }
 """Derivatives by operation."""

@@ -6,14 +6,15 @@ from math import prod
 from typing import Any, Final
 
 import torch
-from torch.fx import GraphModule, Node
+from torch.fx import Graph, GraphModule, Node
 
 from ballfg.dynamics.compiled.translation.arrays import View
 from ballfg.dynamics.compiled.translation.recipe import Recipe
-from ballfg.dynamics.compiled.translation.rules import UnknownOperationError
 
 IDLE: Final = frozenset({"memory_format", "pin_memory", "device", "layout"})
 """Arguments without influence on numbers in the memory of a computer."""
+VIEWS: Final = (torch.ops.aten.view.default, torch.ops.aten._unsafe_view.default)
+"""Operations that need contiguous numbers; `reshape` does the same without that."""
 
 
 @dataclass(frozen=True)
@@ -52,25 +53,22 @@ class Weights:
         return self._known[node]
 
     def recipe(self, graph: GraphModule, vectors: int) -> Recipe | None:
-        """The recipe of the weights from the tables, which are placeholders after `vectors` vectors; None: no weights.
-
-        Raises: UnknownOperationError: for an argument that cannot be written down.
-        """
+        """The recipe of the weights from tables, which are placeholders after `vectors` vectors; None: no weights."""
         if not self.taken:
             return None
-        needed = self._needed()
+        needed, own, copies = self._needed(), Graph(), dict[Node, Node]()
         tables = [node for node in graph.graph.nodes if node.op == "placeholder"][vectors:]
         constants = [node for node in graph.graph.nodes if node.op == "get_attr" and node in needed]
-        places = {node: k for k, node in enumerate([*tables, *constants])}
-        steps = []
+        copies |= {node: own.placeholder(f"given_{k}") for k, node in enumerate([*tables, *constants])}
         for node in graph.graph.nodes:
             if node in needed and node.op == "call_function":
-                kwargs = {name: value for name, value in node.kwargs.items() if name not in IDLE}
-                steps.append((_name(node.target), *(_written(a, places) for a in (node.args, kwargs))))
-                places[node] = len(tables) + len(constants) + len(steps) - 1
+                copies[node] = made = own.node_copy(node, copies.__getitem__)
+                made.kwargs = {name: value for name, value in made.kwargs.items() if name not in IDLE}
+                made.target = torch.ops.aten.reshape.default if node.target in VIEWS else node.target
+        own.output([copies[node] for node in self.taken])
         held = [getattr(graph, str(node.target)).detach() for node in constants]
         plain = [(tensor.tolist(), str(tensor.dtype).removeprefix("torch.")) for tensor in held]
-        return Recipe(plain, steps, [places[node] for node in self.taken])
+        return Recipe(own.python_code("self").src, plain)
 
     def _needed(self) -> set[Node]:
         needed, wanted = set[Node](), list(self.taken)
@@ -80,22 +78,3 @@ class Weights:
                 needed.add(node)
                 wanted += node.all_input_nodes
         return needed
-
-
-def _name(target: Any) -> str:
-    """Of an operation of torch, as `_operation` finds it; `getitem` of Python's."""
-    return "getitem" if getattr(target, "__name__", "") == "getitem" else str(target).removeprefix("aten.")
-
-
-def _written(argument: Any, places: dict[Node, int]) -> Any:
-    if isinstance(argument, Node):
-        return {"value": places[argument]}
-    if isinstance(argument, (list, tuple)):
-        return [_written(part, places) for part in argument]
-    if isinstance(argument, dict):
-        return {name: _written(part, places) for name, part in argument.items()}
-    if isinstance(argument, torch.dtype):
-        return {"dtype": str(argument).removeprefix("torch.")}
-    if argument is None or isinstance(argument, (bool, int, float)):
-        return argument
-    raise UnknownOperationError(f"{argument!r} cannot be written down")
