@@ -11,10 +11,13 @@ from typing import ClassVar, Self
 
 import numpy as np
 import torch
+from numba import types
 from torch import Tensor
 
-from ballfg.arrays import Array, Index
+from ballfg.arrays import Array, Index, plain
 from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.signatures import THREE, TWO
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import fly_through, fly_through_jacobian
 from ballfg.dynamics.motion.flight_step import flight_step
@@ -24,6 +27,28 @@ from ballfg.dynamics.motion.rollout import roll
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Noise, Values
 from ballfg.factors.noise import Kicks, ProcessNoise, along_all_axes, whitening, whitening_tensor
 from ballfg.state import STATE_DIM
+
+
+@machine_code(types.Tuple((TWO, THREE))(THREE, TWO, TWO, THREE))
+def whiten(root: Array, target: Array, after: Array, moved: Array) -> tuple[Array, Array]:
+    """W (x - F) (m, 9) and -W dF (m, 9, d), whitened, with W lower triangular.
+
+    Args:
+        root: (m, 9, 9) W, one over the units of the state.  target: (m, 9) x.
+        after: (m, 9 + p) F and what travels with it.  moved: (m, 9 + p, d) its derivatives.
+    """
+    m, w = target.shape
+    d = moved.shape[2]
+    residual, slopes = np.zeros((m, w)), np.zeros((m, w, d))
+    for r in range(m):
+        for i in range(w):
+            for k in range(i + 1):
+                weight = root[r, i, k]
+                if weight != 0.0:
+                    residual[r, i] += weight * (target[r, k] - after[r, k])
+                    for q in range(d):
+                        slopes[r, i, q] -= weight * moved[r, k, q]
+    return residual, slopes
 
 
 def model_width(model: BallModel) -> int:
@@ -108,10 +133,9 @@ class DynamicsFactors(FactorBatch):
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         """Whitened residuals (k, 9) and Jacobians (k, 9, 9), (k, 9, 9) and, with coefficients, (k, 9, p)."""
         start = inputs[0] if len(inputs) == 2 else np.concatenate((inputs[0], inputs[2][:, : self.width]), axis=-1)
-        after, jacobian = (tensor.cpu().numpy() for tensor in self.propagate(self._tensor(start), rows))
+        after, jacobian = (plain(tensor.cpu().numpy()) for tensor in self.propagate(self._tensor(start), rows))
         root = self.whitening[rows]
-        residual = np.einsum("nij,nj->ni", root, inputs[1] - after[:, :STATE_DIM])
-        by_start = -(root @ jacobian[:, :STATE_DIM])
+        residual, by_start = whiten(root, plain(inputs[1]), after, jacobian)
         if len(inputs) == 2:
             return residual, (by_start, root)
         by_coefficients = by_start[..., STATE_DIM:]
