@@ -46,7 +46,7 @@ class Moving:
         """
         levels = np.empty((len(self.start), len(heights)))
         for k, height in enumerate(heights):
-            levels[:, k] = height
+            levels[:, k] = height.numpy() if isinstance(height, Tensor) else height
         after, moved = np.empty_like(self.start), np.empty((*self.start.shape, self.width))
         times = np.empty_like(levels)
         given = (*self.addresses, *self._own, *self._places, *self.weights, self.start, _plain(dt), levels)
@@ -141,6 +141,8 @@ def functions_of(model: BallModel) -> CompiledModel | None:
 
 def fly(model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor) -> Tensor:
     """As `integrate.fly`, without derivatives."""
+    if state.dim() == 2 and dt.shape == state.shape[:1]:
+        return torch.from_numpy(Moving(model, functions, state, 0).travel(dt)[0])
     shape = np.broadcast_shapes(state.shape[:-1], dt.shape)  # torch's own imports sympy, which takes a second
     rows = state.detach().expand(*shape, -1).reshape(-1, state.shape[-1])
     after, _, _ = Moving(model, functions, rows, 0).travel(dt.detach().expand(shape).reshape(-1))

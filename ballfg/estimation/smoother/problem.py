@@ -6,6 +6,7 @@ Every observation of the track gives its factors; the first state of each linked
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -69,7 +70,9 @@ def effective_sigmas(track: Track, segmentation: Segmentation, settings: Setting
     """(n, 3) m: standard deviations of the samples' white errors, larger for wide or shifted samples and outliers."""
     settings = settings.for_track(track)
     sigma = sample_sigmas(settings, len(track), track.sigmas)
-    whole = total_sigmas(settings, sigma, window_velocities(track.times, track.positions))
+    if (segmentation.quality == Quality.GOOD).all():
+        return sigma
+    whole = total_sigmas(settings, sigma, partial(window_velocities, track.times, track.positions))
     for quality, factor in QUALITY_SIGMA.items():
         bad = segmentation.quality == quality
         sigma[bad] = factor * whole[bad]

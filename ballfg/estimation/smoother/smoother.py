@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -146,7 +147,7 @@ class Smoother(Estimator):
                 return shown, ()
         settings = self.settings.for_track(track)
         white = sample_sigmas(settings, len(track), track.sigmas)
-        sigma = total_sigmas(settings, white, window_velocities(track.times, track.positions))
+        sigma = total_sigmas(settings, white, partial(window_velocities, track.times, track.positions))
         physics = physics_of(self.model)
         found = segment(track.times, track.positions, sigma, surfaces=self.surfaces, physics=physics)
         found = found if self.settings.find_events else found.only_contacts()
