@@ -80,8 +80,8 @@ class Moving:
         """(n, m) of a function at the start, and its derivatives (n, m, d)."""
         n, d, function = len(self.start), self.width, self.functions.parts[part]
         states, moved = np.ascontiguousarray(self.start[:, :STATE_DIM]), np.zeros((n, STATE_DIM, d))
-        own = range(min(STATE_DIM, d))
-        moved[:, own, own] = 1.0
+        if d:
+            moved[:, range(STATE_DIM), range(STATE_DIM)] = 1.0
         value, slopes = np.zeros((n, function.size)), np.zeros((n, function.size, d))
         c, ct = self.coefficients(part)
         function.compute(states, c, self.weights[part], moved, ct, value, slopes)
