@@ -93,10 +93,10 @@ class Rows:
 
     def error(self) -> float:
         """Sum of the losses; infinite if a residual overflows when squared, as after a wild trial step."""
+        if self.loss.name == "squared":
+            flat = self.residual.ravel()
+            return 0.5 * float(np.vdot(flat, flat))
         with np.errstate(over="ignore"):
-            if self.loss.name == "squared":
-                flat = self.residual.ravel()
-                return 0.5 * float(flat @ flat)
             return float(self.loss.value(np.linalg.norm(self.residual, axis=-1)).sum())
 
 

@@ -217,8 +217,10 @@ class ContactFactors(SurfaceFactors):
 
     def contact_times(self, values: Values) -> Array:
         """(m, c) s since the start of each interval; NaN if the ball never reaches the surface."""
-        own = np.broadcast_to(values.coefficients[: self.width], (len(self), self.width))
-        start = np.concatenate((values.states[self.variables[:, 0]], own), axis=-1)
+        start = values.states[self.variables[:, 0]]
+        if self.width:
+            own = np.broadcast_to(values.coefficients[: self.width], (len(self), self.width))
+            start = np.concatenate((start, own), axis=-1)
         heights = self._surfaces(slice(None))
         with torch.no_grad():
             return fly_through(self.model, torch.from_numpy(start), torch.from_numpy(self.dt), heights)[1].numpy()

@@ -8,6 +8,7 @@ search then ends in another minimum, or on a slope. In that case convex losses l
 search starts again; the lower minimum is the result.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -171,9 +172,9 @@ def refined_contacts(times: Array, solution: Solution) -> tuple[Contact, ...]:
     for contact in timed_contacts(times, solution):
         if not times[0] <= contact.time <= times[-1]:
             continue
-        interval = int(np.clip(np.searchsorted(times, contact.time, side="right") - 1, 0, len(times) - 2))
-        step = np.clip(interval - contact.interval, -1, 1)  # one interval at a time: the estimate moves along
-        refined.append(Contact(contact.interval + int(step), contact.time, contact.height))
+        interval = min(max(int(np.searchsorted(times, contact.time, side="right")) - 1, 0), len(times) - 2)
+        step = min(max(interval - contact.interval, -1), 1)  # one interval at a time: the estimate moves along
+        refined.append(Contact(contact.interval + step, contact.time, contact.height))
     return tuple(refined)
 
 
@@ -215,7 +216,7 @@ def timed_contacts(times: Array, solution: Solution) -> tuple[Contact, ...]:
         elapsed_of = batch.contact_times(solution.minimum.values)
         for interval, elapsed in zip(batch.variables[:, 0].tolist(), elapsed_of, strict=True):
             for contact, tau in zip(grouped[interval], elapsed.tolist(), strict=True):
-                time = float(times[interval] + tau) if np.isfinite(tau) else contact.time
+                time = float(times[interval]) + tau if math.isfinite(tau) else contact.time
                 timed.append(Contact(interval, time, contact.height))
     return tuple(sorted(timed, key=lambda c: c.time))
 
