@@ -70,6 +70,10 @@ class Moving:
         by_state[:, Z : Z + 1] += 1.0 if self.width else 0.0
         return self.start[:, Z] - height - offset[:, 0] - self.functions.radius, by_state
 
+    def rates(self) -> Array:
+        """(n, 6) m/s^2 and rad/s^2 in flight at the start."""
+        return self._value(RATES)[0]
+
     def after_bounce(self) -> Array:
         """(n, 9 + p) states right after an impact."""
         after = self.start.copy()

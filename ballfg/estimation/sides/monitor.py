@@ -116,7 +116,7 @@ def _gap_sigmas(
     whole = _with_coefficients(states, shared.mean)
     _, slopes = gap_jacobian(model, whole, torch.tensor(heights, dtype=torch.float64))
     own, rest = slopes.numpy()[:, :STATE_DIM], slopes.numpy()[:, STATE_DIM:]
-    variance = np.einsum("mi,mij,mj->m", own, covariances, own)
+    variance = (own[:, None] @ covariances @ own[:, :, None])[:, 0, 0]
     if len(shared.mean):
         variance += np.einsum("mi,ij,mj->m", rest, shared.covariance, rest)
         variance += 2.0 * np.einsum("mi,mij,mj->m", own, shared.cross[stamps], rest)

@@ -264,7 +264,8 @@ class Smoother(Estimator):
         segmentation = solution.events.segmentation
         hops = problem.hops if segmentation is problem.segmentation else None
         hops = self.low_hops(problem.track, segmentation) if hops is None else hops
-        estimate = replace(estimate, notes=estimate.notes + uncounted_note(hops, problem.track.times))
+        uncounted = uncounted_note(hops, problem.track.times)
+        estimate = replace(estimate, notes=estimate.notes + uncounted) if uncounted else estimate
         return with_low_hops(estimate, hops, self.model)
 
     def at_minimum(self, problem: TrackProblem, solution: Solution, known: Covariances | None) -> Estimate:
@@ -310,7 +311,8 @@ class Smoother(Estimator):
         estimate = plausible(estimate, track, problem.sigma, self.settings)
         for observation in problem.observations:
             estimate = observation.judged(estimate)
-        estimate = replace(estimate, notes=estimate.notes + rival_note(solution, estimate.covariances[0]))
+        rival = rival_note(solution, estimate.covariances[0])
+        estimate = replace(estimate, notes=estimate.notes + rival) if rival else estimate
         return widened_near_contacts(estimate, problem.ball)
 
 

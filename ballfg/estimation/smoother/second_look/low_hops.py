@@ -19,7 +19,7 @@ from torch import Tensor
 from ballfg.arrays import Array, median
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.contact import gaps
+from ballfg.dynamics.motion.contact import acceleration, gaps
 from ballfg.dynamics.motion.limits import REST_SPEED
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.result import Estimate
@@ -213,8 +213,7 @@ class _Ball:
 
     def gravity(self, position: Array) -> float:
         """m/s^2, downwards, of a ball that hangs still at a position (3,) m."""
-        with torch.no_grad():
-            return -float(self.model.rates(self._still(position[None], self.means))[0][0, Z])
+        return -float(acceleration(self.model, self._still(position[None], self.means))[0, Z])
 
     def law(self, position: Array, most: float, gravity: float) -> HopLaw:
         """Parameters of hops up to a height `most` m above a surface, at a position (3,) m."""
