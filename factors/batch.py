@@ -197,6 +197,10 @@ class FactorBatch(ABC):
             setattr(part, name, getattr(self, name)[rows])
         return part
 
+    def prepared(self) -> Self:
+        """The same factors for a minimisation, during which their model and its coefficients stay as they are."""
+        return self
+
     def inputs(self, values: Values) -> tuple[Array, ...]:
         """For each variable of a factor the values (m, d) for `compute`, in the variable's own units."""
         return tuple(values.gather(column, self.sees_biases) for column in self.variables.T)

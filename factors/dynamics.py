@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ballfg.arrays import Array, Index, plain
 from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.compiled import motion
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import THREE, TWO
 from ballfg.dynamics.model import BallModel
@@ -71,6 +72,7 @@ class DynamicsFactors(FactorBatch):
     """
 
     row_arrays: ClassVar[tuple[str, ...]] = ("variables", "dt", "whitening", "kick_times", "hit")
+    _moving: motion.Moving | None = None
 
     def __init__(
         self, model: BallModel, states: Index, dt: Array, covariance: Array, kicks: Kicks | None = None
@@ -130,10 +132,25 @@ class DynamicsFactors(FactorBatch):
         """Half the log determinants of all covariances."""
         return -float(np.log(np.diagonal(self.whitening, axis1=1, axis2=2)).sum())
 
+    def prepared(self) -> Self:
+        """The same factors with what machine code needs of their model, if they move by machine code."""
+        functions, other = motion.functions_of(self.model), copy.copy(self)
+        if functions is not None:
+            width = STATE_DIM + self.width
+            other._moving = motion.Moving(self.model, functions, np.empty((0, width)), width)
+        return other
+
+    def _levels(self, rows: Index | slice) -> Array:
+        """(k, c) m, the surfaces of c contacts in some of the intervals."""
+        return np.empty((len(self.dt[rows]), 0))
+
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         """Whitened residuals (k, 9) and Jacobians (k, 9, 9), (k, 9, 9) and, with coefficients, (k, 9, p)."""
         start = inputs[0] if len(inputs) == 2 else np.concatenate((inputs[0], inputs[2][:, : self.width]), axis=-1)
-        after, jacobian = (plain(tensor.cpu().numpy()) for tensor in self.propagate(self._tensor(start), rows))
+        if self._moving is None:
+            after, jacobian = (plain(tensor.cpu().numpy()) for tensor in self.propagate(self._tensor(start), rows))
+        else:
+            after, jacobian, _ = self._moving.at(plain(start)).travel(plain(self.dt[rows]), self._levels(rows))
         root = self.whitening[rows]
         residual, by_start = whiten(root, plain(inputs[1]), after, jacobian)
         if len(inputs) == 2:
@@ -211,6 +228,10 @@ class ContactFactors(SurfaceFactors):
         """Flight, impact, flight."""
         return fly_through(self.model, state, torch.from_numpy(self.dt), self._surfaces(slice(None)))[0]
 
+    def _levels(self, rows: Index | slice) -> Array:
+        """(k, c) m, the surfaces in some of the intervals."""
+        return plain(self.heights[rows])
+
     def _surfaces(self, rows: Index | slice) -> tuple[Tensor, ...]:
         """The heights (k,) of some rows, one tensor for each of the c contacts."""
         return tuple(self._tensor(column) for column in self.heights[rows].T)
@@ -231,6 +252,10 @@ class RestFactors(SurfaceFactors):
 
     Args: heights: (m,) m of the surfaces.
     """
+
+    def prepared(self) -> Self:
+        """The same factors: torch rolls the ball."""
+        return self
 
     def propagate(self, state: Tensor, rows: Index | slice) -> tuple[Tensor, Tensor]:
         """Rolling over dt; the surface holds the ball's height and stops its vertical motion."""

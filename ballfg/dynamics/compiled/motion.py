@@ -1,8 +1,10 @@
 """Moves batches of balls through flight and contacts in machine code, with Jacobians."""
 
+import copy
 import weakref
 from collections.abc import Sequence
 from functools import cache
+from typing import Self
 
 import numpy as np
 import torch
@@ -29,7 +31,7 @@ class Moving:
         start: (n, 9 + p), not changed.  width: d, 9 + p, or 0 for no derivatives.
     """
 
-    def __init__(self, model: BallModel, functions: CompiledModel, start: Tensor, width: int) -> None:
+    def __init__(self, model: BallModel, functions: CompiledModel, start: Tensor | Array, width: int) -> None:
         inner = model.model if isinstance(model, AugmentedModel) else model
         self.functions, self.start, self.width = functions, _plain(start), width
         self.addresses, self.weights = functions.addresses, functions.weights(inner)
@@ -37,19 +39,22 @@ class Moving:
         names = model.names if isinstance(model, AugmentedModel) else ()
         self._places = tuple(_places(part.names, names) for part in functions.parts)
 
-    def travel(self, dt: Tensor, heights: Sequence[Tensor | float] = ()) -> tuple[Array, Array, Array]:
-        """Where the balls are after dt (n,) s, with a contact at each surface, of a height in m or (n,), on the way.
+    def at(self, start: Array) -> Self:
+        """Other balls of the model, (m, 9 + p), with the coefficients that it had when these were made."""
+        others = copy.copy(self)
+        others.start = start
+        return others
+
+    def travel(self, dt: Array, levels: Array) -> tuple[Array, Array, Array]:
+        """Where the balls are after dt (n,) s, with a contact at each surface on the way; their heights are (n, k) m.
 
         Returns: states (n, 9 + p), their derivatives (n, 9 + p, d) and the contact times (n, k) s; NaN after a contact
             that never comes.
         Raises: ValueError: if a duration is infinite.
         """
-        levels = np.empty((len(self.start), len(heights)))
-        for k, height in enumerate(heights):
-            levels[:, k] = height.numpy() if isinstance(height, Tensor) else height
         after, moved = np.empty_like(self.start), np.empty((*self.start.shape, self.width))
         times = np.empty_like(levels)
-        given = (*self.addresses, *self._own, *self._places, *self.weights, self.start, _plain(dt), levels)
+        given = (*self.addresses, *self._own, *self._places, *self.weights, self.start, dt, levels)
         if not travel(*given, self.functions.radius, after, moved, times):
             raise ValueError("dt must be finite; got inf. Check the times.")
         return after, moved, times
@@ -126,9 +131,17 @@ def _places(names: tuple[str, ...], travelling: tuple[str, ...]) -> Index:
     return np.array([STATE_DIM + travelling.index(n) if n in travelling else -1 for n in names], dtype=np.int64)
 
 
-def _plain(given: Tensor) -> Array:
-    """A tensor's numbers for machine code: contiguous, in double precision."""
-    return np.ascontiguousarray(given.detach().numpy(), dtype=np.float64)
+def _plain(given: Tensor | Array) -> Array:
+    """Numbers for machine code: contiguous, in double precision."""
+    return np.ascontiguousarray(given.detach().numpy() if isinstance(given, Tensor) else given, dtype=np.float64)
+
+
+def _levels(state: Tensor, heights: Sequence[Tensor | float] = ()) -> Array:
+    """(n, k) m from k heights of surfaces, each in m or (n,), for n states."""
+    levels = np.empty((len(state), len(heights)))
+    for k, height in enumerate(heights):
+        levels[:, k] = height.numpy() if isinstance(height, Tensor) else height
+    return levels
 
 
 def functions_of(model: BallModel) -> CompiledModel | None:
@@ -146,10 +159,11 @@ def functions_of(model: BallModel) -> CompiledModel | None:
 def fly(model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor) -> Tensor:
     """As `integrate.fly`, without derivatives."""
     if state.dim() == 2 and dt.shape == state.shape[:1]:
-        return torch.from_numpy(Moving(model, functions, state, 0).travel(dt)[0])
+        return torch.from_numpy(Moving(model, functions, state, 0).travel(_plain(dt), _levels(state))[0])
     shape = np.broadcast_shapes(state.shape[:-1], dt.shape)  # torch's own imports sympy, which takes a second
     rows = state.detach().expand(*shape, -1).reshape(-1, state.shape[-1])
-    after, _, _ = Moving(model, functions, rows, 0).travel(dt.detach().expand(shape).reshape(-1))
+    durations = _plain(dt.detach().expand(shape).reshape(-1))
+    after, _, _ = Moving(model, functions, rows, 0).travel(durations, _levels(rows))
     return torch.from_numpy(after).reshape(*shape, state.shape[-1])
 
 
@@ -197,7 +211,7 @@ def fly_jacobian(model: BallModel, functions: CompiledModel, state: Tensor, dt: 
     """As `integrate.fly_jacobian`."""
     shape, width = state.shape, state.shape[-1]
     rows, durations = (state, dt) if dt.dim() == 1 else (state.reshape(-1, width), dt.reshape(-1))
-    after, jacobian, _ = Moving(model, functions, rows, width).travel(durations)
+    after, jacobian, _ = Moving(model, functions, rows, width).travel(_plain(durations), _levels(rows))
     return torch.from_numpy(after.reshape(shape)), torch.from_numpy(jacobian.reshape(*shape, width))
 
 
@@ -205,7 +219,7 @@ def fly_through(
     model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor, heights: Sequence[Tensor | float]
 ) -> tuple[Tensor, Tensor]:
     """As `contact.fly_through`, without derivatives."""
-    after, _, times = Moving(model, functions, state, 0).travel(dt, heights)
+    after, _, times = Moving(model, functions, state, 0).travel(_plain(dt), _levels(state, heights))
     return torch.from_numpy(after), torch.from_numpy(times)
 
 
@@ -213,5 +227,6 @@ def fly_through_jacobian(
     model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor, heights: Sequence[Tensor | float]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """As `contact.fly_through_jacobian`."""
-    after, jacobian, times = Moving(model, functions, state, state.shape[-1]).travel(dt, heights)
+    moving = Moving(model, functions, state, state.shape[-1])
+    after, jacobian, times = moving.travel(_plain(dt), _levels(state, heights))
     return torch.from_numpy(after), torch.from_numpy(times), torch.from_numpy(jacobian)
