@@ -203,7 +203,7 @@ class FactorBatch(ABC):
 
     def inputs(self, values: Values) -> tuple[Array, ...]:
         """For each variable of a factor the values (m, d) for `compute`, in the variable's own units."""
-        return tuple(values.gather(column, self.sees_biases) for column in self.variables.T)
+        return tuple([values.gather(column, self.sees_biases) for column in self.variables.T])
 
     def linearize(self, values: Values) -> Rows:
         """All factors at a point."""

@@ -150,7 +150,7 @@ class DynamicsFactors(FactorBatch):
         if self._moving is None:
             after, jacobian = (plain(tensor.cpu().numpy()) for tensor in self.propagate(self._tensor(start), rows))
         else:
-            after, jacobian, _ = self._moving.at(plain(start)).travel(plain(self.dt[rows]), self._levels(rows))
+            after, jacobian, _ = self._moving.travel(plain(self.dt[rows]), self._levels(rows), plain(start))
         root = self.whitening[rows]
         residual, by_start = whiten(root, plain(inputs[1]), after, jacobian)
         if len(inputs) == 2:

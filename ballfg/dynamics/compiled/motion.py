@@ -1,10 +1,7 @@
 """Moves batches of balls through flight and contacts in machine code, with Jacobians."""
 
-import copy
 import weakref
 from collections.abc import Sequence
-from functools import cache
-from typing import Self
 
 import numpy as np
 import torch
@@ -32,29 +29,22 @@ class Moving:
     """
 
     def __init__(self, model: BallModel, functions: CompiledModel, start: Tensor | Array, width: int) -> None:
-        inner = model.model if isinstance(model, AugmentedModel) else model
+        inner, names = (model.model, model.names) if isinstance(model, AugmentedModel) else (model, ())
         self.functions, self.start, self.width = functions, _plain(start), width
         self.addresses, self.weights = functions.addresses, functions.weights(inner)
-        self._own = _present(inner, functions)
-        names = model.names if isinstance(model, AugmentedModel) else ()
-        self._places = tuple(_places(part.names, names) for part in functions.parts)
+        self._own, self._places = _present(inner, functions, names)
 
-    def at(self, start: Array) -> Self:
-        """Other balls of the model, (m, 9 + p), with the coefficients that it had when these were made."""
-        others = copy.copy(self)
-        others.start = start
-        return others
-
-    def travel(self, dt: Array, levels: Array) -> tuple[Array, Array, Array]:
+    def travel(self, dt: Array, levels: Array, start: Array | None = None) -> tuple[Array, Array, Array]:
         """Where the balls are after dt (n,) s, with a contact at each surface on the way; their heights are (n, k) m.
 
+        Args: start: (n, 9 + p) other balls of the model, with the coefficients that it had when these were made.
         Returns: states (n, 9 + p), their derivatives (n, 9 + p, d) and the contact times (n, k) s; NaN after a contact
             that never comes.
         Raises: ValueError: if a duration is infinite.
         """
-        after, moved = np.empty_like(self.start), np.empty((*self.start.shape, self.width))
-        times = np.empty_like(levels)
-        given = (*self.addresses, *self._own, *self._places, *self.weights, self.start, dt, levels)
+        start = self.start if start is None else start
+        after, moved, times = np.empty_like(start), np.empty((*start.shape, self.width)), np.empty_like(levels)
+        given = (*self.addresses, *self._own, *self._places, *self.weights, start, dt, levels)
         if not travel(*given, self.functions.radius, after, moved, times):
             raise ValueError("dt must be finite; got inf. Check the times.")
         return after, moved, times
@@ -106,26 +96,32 @@ class Moving:
         return c, ct
 
 
-_Present = tuple[CompiledModel, Numbers, list[float], tuple[Array, ...]]
-"""Functions of a model; its numbers, and their values; these as `_present` gives them."""
+_Places = dict[tuple[str, ...], tuple[Index, ...]]
+_Present = tuple[CompiledModel, Numbers, list[float], tuple[Array, ...], _Places]
+"""Functions of a model; its numbers, and their values; these as `_present` gives them, and their places by the names
+of the coefficients that travel."""
 _known: weakref.WeakKeyDictionary[BallModel, _Present] = weakref.WeakKeyDictionary()
 
 
-def _present(model: BallModel, functions: CompiledModel) -> tuple[Array, ...]:
-    """(p,) the present coefficients of each function of a model, as machine code takes them; made anew if one changed.
+def _present(
+    model: BallModel, functions: CompiledModel, travelling: tuple[str, ...]
+) -> tuple[tuple[Array, ...], tuple[Index, ...]]:
+    """(p,) the present coefficients of each function of a model, and (p,) where they travel, as machine code takes them.
 
-    Args: model: without substituted parameters.
+    Args: model: without substituted parameters.  functions: of it.  travelling: names behind the states.
     """
     numbers = numbers_of(model)
     values, known = numbers.values(), _known.get(model)
     if known is None or known[0] is not functions or known[1] is not numbers or known[2] != values:
         named = dict(zip(numbers.scalars, values, strict=True))
         own = tuple(np.array([named[name] for name in part.names]) for part in functions.parts)
-        known = _known[model] = (functions, numbers, values, own)
-    return known[3]
+        known = _known[model] = (functions, numbers, values, own, {})
+    places = known[4].get(travelling)
+    if places is None:
+        places = known[4][travelling] = tuple(_places(part.names, travelling) for part in functions.parts)
+    return known[3], places
 
 
-@cache
 def _places(names: tuple[str, ...], travelling: tuple[str, ...]) -> Index:
     """(p,) the columns behind the states in which coefficients travel; -1 for the others."""
     return np.array([STATE_DIM + travelling.index(n) if n in travelling else -1 for n in names], dtype=np.int64)
