@@ -1,4 +1,4 @@
-"""Defines the types of arrays that all rooms share, their form for machine code, and their median; docstrings state shapes and units."""
+"""Defines the types of arrays that all rooms share, and their median and form; docstrings state shapes and units."""
 
 from typing import TypeAlias, TypeVar
 

@@ -106,7 +106,7 @@ _known: weakref.WeakKeyDictionary[BallModel, _Present] = weakref.WeakKeyDictiona
 def _present(
     model: BallModel, functions: CompiledModel, travelling: tuple[str, ...]
 ) -> tuple[tuple[Array, ...], tuple[Index, ...]]:
-    """(p,) the present coefficients of each function of a model, and (p,) where they travel, as machine code takes them.
+    """(p,) the present coefficients of each function of a model, and (p,) where they travel, for machine code.
 
     Args: model: without substituted parameters.  functions: of it.  travelling: names behind the states.
     """
