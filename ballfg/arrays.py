@@ -1,6 +1,6 @@
-"""Defines the types of arrays that all rooms share, and their median; docstrings state shapes and units."""
+"""Defines the types of arrays that all rooms share, and their median and form; docstrings state shapes and units."""
 
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +8,13 @@ from numpy.typing import NDArray
 Array: TypeAlias = NDArray[np.float64]  # Numbers
 Index: TypeAlias = NDArray[np.int64]  # Indices and counts
 Mask: TypeAlias = NDArray[np.bool_]  # Selects some of several things
+
+N = TypeVar("N", bound=np.generic)
+
+
+def plain(array: NDArray[N]) -> NDArray[N]:
+    """An array for machine code: contiguous and writable."""
+    return array if array.flags.c_contiguous and array.flags.writeable else np.array(array, order="C")
 
 
 def median(values: Array) -> Array:

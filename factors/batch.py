@@ -93,10 +93,10 @@ class Rows:
 
     def error(self) -> float:
         """Sum of the losses; infinite if a residual overflows when squared, as after a wild trial step."""
+        if self.loss.name == "squared":
+            flat = self.residual.ravel()
+            return 0.5 * float(np.vdot(flat, flat))
         with np.errstate(over="ignore"):
-            if self.loss.name == "squared":
-                flat = self.residual.ravel()
-                return 0.5 * float(flat @ flat)
             return float(self.loss.value(np.linalg.norm(self.residual, axis=-1)).sum())
 
 
@@ -197,9 +197,13 @@ class FactorBatch(ABC):
             setattr(part, name, getattr(self, name)[rows])
         return part
 
+    def prepared(self) -> Self:
+        """The same factors for a minimisation, during which their model and its coefficients stay as they are."""
+        return self
+
     def inputs(self, values: Values) -> tuple[Array, ...]:
         """For each variable of a factor the values (m, d) for `compute`, in the variable's own units."""
-        return tuple(values.gather(column, self.sees_biases) for column in self.variables.T)
+        return tuple([values.gather(column, self.sees_biases) for column in self.variables.T])
 
     def linearize(self, values: Values) -> Rows:
         """All factors at a point."""

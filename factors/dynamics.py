@@ -11,10 +11,14 @@ from typing import ClassVar, Self
 
 import numpy as np
 import torch
+from numba import types
 from torch import Tensor
 
-from ballfg.arrays import Array, Index
+from ballfg.arrays import Array, Index, plain
 from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.compiled import motion
+from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.signatures import THREE, TWO
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import fly_through, fly_through_jacobian
 from ballfg.dynamics.motion.flight_step import flight_step
@@ -24,6 +28,28 @@ from ballfg.dynamics.motion.rollout import roll
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Noise, Values
 from ballfg.factors.noise import Kicks, ProcessNoise, along_all_axes, whitening, whitening_tensor
 from ballfg.state import STATE_DIM
+
+
+@machine_code(types.Tuple((TWO, THREE))(THREE, TWO, TWO, THREE))
+def whiten(root: Array, target: Array, after: Array, moved: Array) -> tuple[Array, Array]:
+    """W (x - F) (m, 9) and -W dF (m, 9, d), whitened, with W lower triangular.
+
+    Args:
+        root: (m, 9, 9) W, one over the units of the state.  target: (m, 9) x.
+        after: (m, 9 + p) F and what travels with it.  moved: (m, 9 + p, d) its derivatives.
+    """
+    m, w = target.shape
+    d = moved.shape[2]
+    residual, slopes = np.zeros((m, w)), np.zeros((m, w, d))
+    for r in range(m):
+        for i in range(w):
+            for k in range(i + 1):
+                weight = root[r, i, k]
+                if weight != 0.0:
+                    residual[r, i] += weight * (target[r, k] - after[r, k])
+                    for q in range(d):
+                        slopes[r, i, q] -= weight * moved[r, k, q]
+    return residual, slopes
 
 
 def model_width(model: BallModel) -> int:
@@ -46,6 +72,7 @@ class DynamicsFactors(FactorBatch):
     """
 
     row_arrays: ClassVar[tuple[str, ...]] = ("variables", "dt", "whitening", "kick_times", "hit")
+    _moving: motion.Moving | None = None
 
     def __init__(
         self, model: BallModel, states: Index, dt: Array, covariance: Array, kicks: Kicks | None = None
@@ -105,13 +132,27 @@ class DynamicsFactors(FactorBatch):
         """Half the log determinants of all covariances."""
         return -float(np.log(np.diagonal(self.whitening, axis1=1, axis2=2)).sum())
 
+    def prepared(self) -> Self:
+        """The same factors with what machine code needs of their model, if they move by machine code."""
+        functions, other = motion.functions_of(self.model), copy.copy(self)
+        if functions is not None:
+            width = STATE_DIM + self.width
+            other._moving = motion.Moving(self.model, functions, np.empty((0, width)), width)
+        return other
+
+    def _levels(self, rows: Index | slice) -> Array:
+        """(k, c) m, the surfaces of c contacts in some of the intervals."""
+        return np.empty((len(self.dt[rows]), 0))
+
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         """Whitened residuals (k, 9) and Jacobians (k, 9, 9), (k, 9, 9) and, with coefficients, (k, 9, p)."""
         start = inputs[0] if len(inputs) == 2 else np.concatenate((inputs[0], inputs[2][:, : self.width]), axis=-1)
-        after, jacobian = (tensor.cpu().numpy() for tensor in self.propagate(self._tensor(start), rows))
+        if self._moving is None:
+            after, jacobian = (plain(tensor.cpu().numpy()) for tensor in self.propagate(self._tensor(start), rows))
+        else:
+            after, jacobian, _ = self._moving.travel(plain(self.dt[rows]), self._levels(rows), plain(start))
         root = self.whitening[rows]
-        residual = np.einsum("nij,nj->ni", root, inputs[1] - after[:, :STATE_DIM])
-        by_start = -(root @ jacobian[:, :STATE_DIM])
+        residual, by_start = whiten(root, plain(inputs[1]), after, jacobian)
         if len(inputs) == 2:
             return residual, (by_start, root)
         by_coefficients = by_start[..., STATE_DIM:]
@@ -187,14 +228,20 @@ class ContactFactors(SurfaceFactors):
         """Flight, impact, flight."""
         return fly_through(self.model, state, torch.from_numpy(self.dt), self._surfaces(slice(None)))[0]
 
+    def _levels(self, rows: Index | slice) -> Array:
+        """(k, c) m, the surfaces in some of the intervals."""
+        return plain(self.heights[rows])
+
     def _surfaces(self, rows: Index | slice) -> tuple[Tensor, ...]:
         """The heights (k,) of some rows, one tensor for each of the c contacts."""
         return tuple(self._tensor(column) for column in self.heights[rows].T)
 
     def contact_times(self, values: Values) -> Array:
         """(m, c) s since the start of each interval; NaN if the ball never reaches the surface."""
-        own = np.broadcast_to(values.coefficients[: self.width], (len(self), self.width))
-        start = np.concatenate((values.states[self.variables[:, 0]], own), axis=-1)
+        start = values.states[self.variables[:, 0]]
+        if self.width:
+            own = np.broadcast_to(values.coefficients[: self.width], (len(self), self.width))
+            start = np.concatenate((start, own), axis=-1)
         heights = self._surfaces(slice(None))
         with torch.no_grad():
             return fly_through(self.model, torch.from_numpy(start), torch.from_numpy(self.dt), heights)[1].numpy()
@@ -205,6 +252,10 @@ class RestFactors(SurfaceFactors):
 
     Args: heights: (m,) m of the surfaces.
     """
+
+    def prepared(self) -> Self:
+        """The same factors: torch rolls the ball."""
+        return self
 
     def propagate(self, state: Tensor, rows: Index | slice) -> tuple[Tensor, Tensor]:
         """Rolling over dt; the surface holds the ball's height and stops its vertical motion."""

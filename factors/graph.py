@@ -34,7 +34,7 @@ class BallGraph:
 
 def objective(linearized: Sequence[Rows]) -> float:
     """Sum of all losses; infinite if a residual is not a number."""
-    total = sum(rows.error() for rows in linearized)
+    total = sum([rows.error() for rows in linearized])
     return total if np.isfinite(total) else np.inf
 
 
@@ -132,6 +132,7 @@ class LevenbergMarquardt:
         found = (
             Minimum(start, np.inf, None, Convergence.CONVERGED, 0, beyond=True) if isinstance(start, Values) else start
         )
+        graph = BallGraph(tuple([batch.prepared() for batch in graph.batches]))
         known = None if found.beyond else found.linearized
         point = _Point(found.values, graph.linearize(found.values) if known is None else known)
         if not np.isfinite(point.error):

@@ -33,7 +33,7 @@ class PriorFactors(FactorBatch):
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         """Whitened residuals (k, r) and Jacobians (k, r, d)."""
         root = self.information_root[rows]
-        return np.einsum("nij,nj->ni", root, inputs[0] - self.mean[rows]), (root,)
+        return (root @ (inputs[0] - self.mean[rows])[..., None])[..., 0], (root,)
 
     def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
         """(m, r) whitened residuals in torch."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal, get_args
 
@@ -267,13 +267,17 @@ def stamp_covariance(settings: Settings, velocity: Array) -> Array:
     return np.asarray(way[..., :, None] * way[..., None, :])
 
 
-def total_sigmas(settings: Settings, white: Array, velocities: Array) -> Array:
+def total_sigmas(settings: Settings, white: Array, velocities: Callable[[], Array]) -> Array:
     """Standard deviations of whole position errors: the white part, the lasting part, and that of the stamps.
 
-    Args: settings: with memory and jitter.  white: (n, 3) m, of the white part.  velocities: (n, 3) m/s, of the ball.
+    Args:
+        settings: with memory and jitter.  white: (n, 3) m, of the white part.
+        velocities: gives (n, 3) m/s, of the ball; asked for only where stamps jitter.
     Returns: (n, 3) m.
     """
     if not settings.has_memory and settings.stamp_jitter == 0.0:
         return white
-    variance = white**2 + np.square(settings.memory) + (settings.stamp_jitter * velocities) ** 2
+    variance = white**2 + np.square(settings.memory)
+    if settings.stamp_jitter:
+        variance += (settings.stamp_jitter * velocities()) ** 2
     return np.asarray(np.sqrt(variance))

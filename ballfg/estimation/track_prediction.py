@@ -212,7 +212,8 @@ def _predict_alike(
     for i, (track, result, (later, measured, white)) in enumerate(zip(tracks, estimates, parts, strict=True)):
         k = len(later)
         variances = np.diagonal(covariances[i, :k], axis1=1, axis2=2)
-        sigmas = np.sqrt(variances + total_sigmas(settings, white, velocities[i, :k]) ** 2)
+        stated = total_sigmas(settings, white, partial(np.asarray, velocities[i, :k]))
+        sigmas = np.sqrt(variances + stated**2)
         left = None if outside is None else outside[i, :k]
         ahead = later, positions[i, :k], sigmas, measured
         yield TrackPrediction(track.name, *ahead, result, outside=left, covariances=covariances[i, :k])

@@ -6,10 +6,14 @@ times 1 - a, standard deviations as they are, with the smallest a that makes the
 definite covariance stays as it is.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
+from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.signatures import FLAG, NOTHING, REAL, THREE, TWO
 
 MARGIN = 1e-13
 """Smallest eigenvalue of an unchanged correlation matrix: of smaller ones rounding decides the sign."""
@@ -23,7 +27,7 @@ def definite(covariance: Array) -> Array:
     Args: covariance: (..., d, d) in the products of any units, with finite numbers and positive variances.
     """
     symmetric = 0.5 * (covariance + covariance.swapaxes(-1, -2))
-    if _all_definite(_correlation(symmetric)[0]):
+    if _all_definite(symmetric):
         return np.asarray(symmetric)
     flat = symmetric.reshape(-1, *symmetric.shape[-2:])
     return np.stack([_shrunk(one) for one in flat]).reshape(symmetric.shape)
@@ -52,10 +56,12 @@ def raised(covariance: Array, least: Array) -> Array:
 
 def whitened(vectors: Array, covariance: Array) -> Array:
     """(..., d) vectors divided by the lower triangular root of their covariances (..., d, d)."""
-    covariance = definite(covariance)
-    sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
-    root = np.linalg.cholesky(covariance / sigma[..., :, None] / sigma[..., None, :])
-    return np.asarray(np.linalg.solve(root, (vectors / sigma)[..., None])[..., 0])
+    shape, size = vectors.shape, vectors.shape[-1]
+    roots, own = np.array(definite(covariance).reshape(-1, size, size)), vectors.reshape(-1, size).copy()
+    if not _roots(roots, 0.0):
+        raise np.linalg.LinAlgError("Matrix is not positive definite")
+    _divide(roots, own)
+    return own.reshape(shape)
 
 
 def compatible(cross: Array, own: Array, shared: Array) -> Array:
@@ -63,12 +69,12 @@ def compatible(cross: Array, own: Array, shared: Array) -> Array:
 
     Args: cross: (n, d, p).  own: (n, d, d), positive definite.  shared: (p, p), positive definite.
     """
-    if not shared.size or _all_definite(_correlation(_joint(cross, own, shared))[0]):
+    if not shared.size or _all_definite(_joint(cross, own, shared)):
         return cross
     cross = cross.copy()
     for one, mine in zip(cross, own, strict=True):
         share = FIRST_SHRINKAGE
-        while not _all_definite(_correlation(_joint(one, mine, shared))[0]):
+        while not _all_definite(_joint(one, mine, shared)):
             one *= 1.0 - min(share, 1.0)
             share *= 10.0
     return cross
@@ -79,21 +85,52 @@ def _joint(cross: Array, own: Array, shared: Array) -> Array:
     return np.block([[own, cross], [cross.swapaxes(-1, -2), both]])
 
 
-def _correlation(symmetric: Array) -> tuple[Array, Array]:
-    sigma = np.sqrt(np.diagonal(symmetric, axis1=-2, axis2=-1))
-    return symmetric / sigma[..., :, None] / sigma[..., None, :], sigma
+def _all_definite(symmetric: Array) -> bool:
+    """True if the correlations of all covariances (..., d, d) are positive definite with a margin."""
+    return bool(_roots(np.array(symmetric, order="C").reshape(-1, *symmetric.shape[-2:]), MARGIN))
 
 
-def _all_definite(correlation: Array) -> bool:
-    try:
-        np.linalg.cholesky(correlation - MARGIN * np.eye(correlation.shape[-1]))
-    except np.linalg.LinAlgError:
-        return False
+@machine_code(FLAG(THREE, REAL))
+def _roots(covariances: Array, margin: float) -> bool:
+    """Replaces covariances (n, d, d) by lower triangles: S L with S the sigmas, L L^T the correlations less a margin.
+
+    Returns: False if there is no such triangle for one of them.
+    """
+    d = covariances.shape[1]
+    sigma = np.empty(d)
+    for c in covariances:
+        for i in range(d):
+            sigma[i] = math.sqrt(c[i, i])
+        for i in range(d):
+            for j in range(i + 1):
+                left = c[i, j] / sigma[i] / sigma[j] - (margin if i == j else 0.0)
+                for k in range(j):
+                    left -= c[i, k] * c[j, k]
+                if i > j:
+                    c[i, j] = left / c[j, j]
+                elif left > 0.0:
+                    c[i, i] = math.sqrt(left)
+                else:
+                    return False
+        for i in range(d):
+            for j in range(i + 1):
+                c[i, j] *= sigma[i]
     return True
 
 
+@machine_code(NOTHING(THREE, TWO))
+def _divide(roots: Array, vectors: Array) -> None:
+    """Divides vectors (n, d) by lower triangles (n, d, d)."""
+    for r in range(len(vectors)):
+        for i in range(vectors.shape[1]):
+            for k in range(i):
+                vectors[r, i] -= roots[r, i, k] * vectors[r, k]
+            vectors[r, i] /= roots[r, i, i]
+
+
 def _shrunk(symmetric: Array) -> Array:
-    correlation, sigma = _correlation(symmetric)
+    sigma = np.sqrt(np.diagonal(symmetric))
+    correlation = symmetric / sigma[:, None] / sigma[None, :]
     shrinkage, whole = 0.0, np.eye(len(sigma))
     shrunk = correlation
     while not _all_definite(shrunk):

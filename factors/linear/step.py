@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ballfg.arrays import Array, Index
+from ballfg.arrays import Array, Index, plain
 from ballfg.factors.batch import Rows, Values
 from ballfg.factors.linear import elimination, placement
 from ballfg.factors.linear.elimination import Root
 from ballfg.factors.linear.substitution import solution_of
-
-N = TypeVar("N", bound=np.generic)
 
 Piece = tuple[Index, Array, tuple[Array, ...]]
 """Variables (m, a), weighted residuals (m, r) and weighted Jacobians of some factors."""
@@ -119,7 +115,7 @@ def _system(
     """
     counts = np.zeros(n + 1, dtype=np.int64)
     for variables, residual, _ in pieces:
-        wrong = placement.count_rows(counts, _plain(variables), residual.shape[1])
+        wrong = placement.count_rows(counts, plain(variables), residual.shape[1])
         if wrong >= 0:
             linked = sorted({int(v) for v in variables[wrong] if v >= 0})
             raise ValueError(
@@ -132,12 +128,7 @@ def _system(
     free, system = start[:-1].copy(), np.zeros((start[-1], elimination.padded(2 * width + p + 1)))
     for variables, residual, jacobians in pieces:
         rows, firsts = np.empty(len(variables), dtype=np.int64), np.empty(len(variables), dtype=np.int64)
-        placement.place_residuals(system, free, _plain(variables), _plain(residual), rows, firsts)
+        placement.place_residuals(system, free, plain(variables), plain(residual), rows, firsts)
         for which, block in enumerate(jacobians):
-            placement.place_block(system, width, own, rows, firsts, _plain(variables), which, _plain(block))
+            placement.place_block(system, width, own, rows, firsts, plain(variables), which, plain(block))
     return system, start, free
-
-
-def _plain(array: NDArray[N]) -> NDArray[N]:
-    """An array for machine code: contiguous and writable."""
-    return array if array.flags.c_contiguous and array.flags.writeable else np.array(array, order="C")

@@ -6,7 +6,7 @@ import warnings
 import weakref
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import asdict, dataclass
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Final
 
@@ -55,16 +55,30 @@ class CompiledModel:
     surface: Function  # offset of surfaces above their declared heights in m, and their slopes along x and y, (3,)
     radius: float  # m, of the ball
 
+    @cached_property
+    def parts(self) -> tuple[Function, Function, Function]:
+        """Rates, impact and surface."""
+        return self.rates, self.impact, self.surface
+
+    @cached_property
+    def addresses(self) -> tuple[int, int, int]:
+        """By which machine code takes them."""
+        return self.rates.compute.address, self.impact.compute.address, self.surface.compute.address
+
+    @cached_property
+    def _weighed(self) -> bool:
+        """True if any of them has weights."""
+        return any(part.weigh is not None for part in self.parts)
+
     def weights(self, model: BallModel) -> tuple[Array, Array, Array]:
         """Weights of rates, impact and surface from a model's present tables."""
-        parts = (self.rates, self.impact, self.surface)
-        if all(part.weigh is None for part in parts):
+        if not self._weighed:
             return NONE, NONE, NONE
         tables = numbers_of(model).tables()
         now, known = stamp_of(tables), _weights.get(model)
         if known is None or known[0] != now:
             plain = [table.detach() for table in tables]
-            rates, impact, surface = (NONE if p.weigh is None else p.weigh(*plain).numpy() for p in parts)
+            rates, impact, surface = (NONE if p.weigh is None else p.weigh(*plain).numpy() for p in self.parts)
             known = _weights[model] = (now, tables, (rates, impact, surface))
         return known[2]
 

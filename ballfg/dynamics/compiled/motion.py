@@ -1,7 +1,7 @@
 """Moves batches of balls through flight and contacts in machine code, with Jacobians."""
 
+import weakref
 from collections.abc import Sequence
-from functools import cache
 
 import numpy as np
 import torch
@@ -10,12 +10,14 @@ from torch import Tensor
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.compiled.contacts import coefficients_of, contact_times, travel
-from ballfg.dynamics.compiled.functions import CompiledModel, Function, compiled
-from ballfg.dynamics.compiled.places import numbers_of
+from ballfg.dynamics.compiled.functions import CompiledModel, compiled
+from ballfg.dynamics.compiled.places import Numbers, numbers_of
 from ballfg.dynamics.compiled.roll_out import roll_out as roll_out_rows
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import STATE_DIM, Z
+
+RATES, IMPACT, SURFACE = range(3)  # The places of a model's functions in `CompiledModel.parts`
 
 
 class Moving:
@@ -26,89 +28,116 @@ class Moving:
         start: (n, 9 + p), not changed.  width: d, 9 + p, or 0 for no derivatives.
     """
 
-    def __init__(self, model: BallModel, functions: CompiledModel, start: Tensor, width: int) -> None:
-        inner = model.model if isinstance(model, AugmentedModel) else model
+    def __init__(self, model: BallModel, functions: CompiledModel, start: Tensor | Array, width: int) -> None:
+        inner, names = (model.model, model.names) if isinstance(model, AugmentedModel) else (model, ())
         self.functions, self.start, self.width = functions, _plain(start), width
-        self.weights = functions.weights(inner)
-        self.parts = (functions.rates, functions.impact, functions.surface)
-        self.addresses = tuple(part.compute.address for part in self.parts)
-        self._names = model.names if isinstance(model, AugmentedModel) else ()
-        self._numbers = numbers_of(inner)
+        self.addresses, self.weights = functions.addresses, functions.weights(inner)
+        self._own, self._places = _present(inner, functions, names)
 
-    def travel(self, dt: Tensor, heights: Sequence[Tensor | float] = ()) -> tuple[Array, Array, Array]:
-        """Where the balls are after dt (n,) s, with a contact at each surface, of a height in m or (n,), on the way.
+    def travel(self, dt: Array, levels: Array, start: Array | None = None) -> tuple[Array, Array, Array]:
+        """Where the balls are after dt (n,) s, with a contact at each surface on the way; their heights are (n, k) m.
 
+        Args: start: (n, 9 + p) other balls of the model, with the coefficients that it had when these were made.
         Returns: states (n, 9 + p), their derivatives (n, 9 + p, d) and the contact times (n, k) s; NaN after a contact
             that never comes.
         Raises: ValueError: if a duration is infinite.
         """
-        levels = np.empty((len(self.start), len(heights)))
-        for k, height in enumerate(heights):
-            levels[:, k] = height
-        after, moved, times = np.empty_like(self.start), np.empty((*self.start.shape, self.width)), levels.copy()
-        own, places = zip(*map(self._given, self.parts), strict=True)
-        given = (*self.addresses, *own, *places, *self.weights, self.start, _plain(dt), levels, self.functions.radius)
-        if not travel(*given, after, moved, times):
+        start = self.start if start is None else start
+        after, moved, times = np.empty_like(start), np.empty((*start.shape, self.width)), np.empty_like(levels)
+        given = (*self.addresses, *self._own, *self._places, *self.weights, start, dt, levels)
+        if not travel(*given, self.functions.radius, after, moved, times):
             raise ValueError("dt must be finite; got inf. Check the times.")
         return after, moved, times
 
     def meets(self, height: Array, longest: Array) -> Array:
         """(n,) s until the next contact with surfaces at some heights (n,) m; NaN if there is none."""
-        rates, _, surface = self.parts
-        c, s = (self.coefficients(function)[0] for function in (rates, surface))
+        rates, _, surface = self.addresses
+        c, s = (self.coefficients(part)[0] for part in (RATES, SURFACE))
         w, _, ws = self.weights
         states, tau = np.ascontiguousarray(self.start[:, :STATE_DIM]), np.empty(len(self.start))
-        places = (rates.compute.address, surface.compute.address)
-        contact_times(*places, states, c, s, w, ws, height, longest, self.functions.radius, tau)
+        contact_times(rates, surface, states, c, s, w, ws, height, longest, self.functions.radius, tau)
         return tau
 
     def gaps(self, height: Array | float) -> tuple[Array, Array]:
         """(n,) m from surfaces up to the balls' lowest points, and the derivatives (n, d). Args: height: m or (n,)."""
-        offset, slopes = self._value(self.functions.surface, self.weights[2])
+        offset, slopes = self._value(SURFACE)
         by_state = -slopes[:, 0]
         by_state[:, Z : Z + 1] += 1.0 if self.width else 0.0
         return self.start[:, Z] - height - offset[:, 0] - self.functions.radius, by_state
 
+    def rates(self) -> Array:
+        """(n, 6) m/s^2 and rad/s^2 in flight at the start."""
+        return self._value(RATES)[0]
+
     def after_bounce(self) -> Array:
         """(n, 9 + p) states right after an impact."""
         after = self.start.copy()
-        after[:, :STATE_DIM] = self._value(self.functions.impact, self.weights[1])[0]
+        after[:, :STATE_DIM] = self._value(IMPACT)[0]
         return after
 
-    def _value(self, function: Function, weights: Array) -> tuple[Array, Array]:
+    def _value(self, part: int) -> tuple[Array, Array]:
         """(n, m) of a function at the start, and its derivatives (n, m, d)."""
-        n, d = len(self.start), self.width
+        n, d, function = len(self.start), self.width, self.functions.parts[part]
         states, moved = np.ascontiguousarray(self.start[:, :STATE_DIM]), np.zeros((n, STATE_DIM, d))
-        own = range(min(STATE_DIM, d))
-        moved[:, own, own] = 1.0
+        if d:
+            moved[:, range(STATE_DIM), range(STATE_DIM)] = 1.0
         value, slopes = np.zeros((n, function.size)), np.zeros((n, function.size, d))
-        c, ct = self.coefficients(function)
-        function.compute(states, c, weights, moved, ct, value, slopes)
+        c, ct = self.coefficients(part)
+        function.compute(states, c, self.weights[part], moved, ct, value, slopes)
         return value, slopes
 
     def all_coefficients(self) -> list[Array]:
         """`coefficients` of rates, impact and surface, one behind another."""
-        return [array for part in self.parts for array in self.coefficients(part)]
+        return [array for part in (RATES, IMPACT, SURFACE) for array in self.coefficients(part)]
 
-    def coefficients(self, function: Function) -> tuple[Array, Array]:
+    def coefficients(self, part: int) -> tuple[Array, Array]:
         """(n, p) coefficients of a function for each ball, and their tangents (n, p, d)."""
-        c, ct = coefficients_of(*self._given(function), self.start, self.width)
+        c, ct = coefficients_of(self._own[part], self._places[part], self.start, self.width)
         return c, ct
 
-    def _given(self, function: Function) -> tuple[Array, Index]:
-        """(p,) the model's own coefficients of a function, and (p,) where they travel, as machine code takes them."""
-        return np.array([self._numbers.value(name) for name in function.names]), _places(function.names, self._names)
+
+_Places = dict[tuple[str, ...], tuple[Index, ...]]
+_Present = tuple[CompiledModel, Numbers, list[float], tuple[Array, ...], _Places]
+"""Functions of a model; its numbers, and their values; these as `_present` gives them, and their places by the names
+of the coefficients that travel."""
+_known: weakref.WeakKeyDictionary[BallModel, _Present] = weakref.WeakKeyDictionary()
 
 
-@cache
+def _present(
+    model: BallModel, functions: CompiledModel, travelling: tuple[str, ...]
+) -> tuple[tuple[Array, ...], tuple[Index, ...]]:
+    """(p,) the present coefficients of each function of a model, and (p,) where they travel, for machine code.
+
+    Args: model: without substituted parameters.  functions: of it.  travelling: names behind the states.
+    """
+    numbers = numbers_of(model)
+    values, known = numbers.values(), _known.get(model)
+    if known is None or known[0] is not functions or known[1] is not numbers or known[2] != values:
+        named = dict(zip(numbers.scalars, values, strict=True))
+        own = tuple(np.array([named[name] for name in part.names]) for part in functions.parts)
+        known = _known[model] = (functions, numbers, values, own, {})
+    places = known[4].get(travelling)
+    if places is None:
+        places = known[4][travelling] = tuple(_places(part.names, travelling) for part in functions.parts)
+    return known[3], places
+
+
 def _places(names: tuple[str, ...], travelling: tuple[str, ...]) -> Index:
     """(p,) the columns behind the states in which coefficients travel; -1 for the others."""
     return np.array([STATE_DIM + travelling.index(n) if n in travelling else -1 for n in names], dtype=np.int64)
 
 
-def _plain(given: Tensor) -> Array:
-    """A tensor's numbers for machine code: contiguous, in double precision."""
-    return np.ascontiguousarray(given.detach().numpy(), dtype=np.float64)
+def _plain(given: Tensor | Array) -> Array:
+    """Numbers for machine code: contiguous, in double precision."""
+    return np.ascontiguousarray(given.detach().numpy() if isinstance(given, Tensor) else given, dtype=np.float64)
+
+
+def _levels(state: Tensor, heights: Sequence[Tensor | float] = ()) -> Array:
+    """(n, k) m from k heights of surfaces, each in m or (n,), for n states."""
+    levels = np.empty((len(state), len(heights)))
+    for k, height in enumerate(heights):
+        levels[:, k] = height.numpy() if isinstance(height, Tensor) else height
+    return levels
 
 
 def functions_of(model: BallModel) -> CompiledModel | None:
@@ -125,9 +154,12 @@ def functions_of(model: BallModel) -> CompiledModel | None:
 
 def fly(model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor) -> Tensor:
     """As `integrate.fly`, without derivatives."""
+    if state.dim() == 2 and dt.shape == state.shape[:1]:
+        return torch.from_numpy(Moving(model, functions, state, 0).travel(_plain(dt), _levels(state))[0])
     shape = np.broadcast_shapes(state.shape[:-1], dt.shape)  # torch's own imports sympy, which takes a second
     rows = state.detach().expand(*shape, -1).reshape(-1, state.shape[-1])
-    after, _, _ = Moving(model, functions, rows, 0).travel(dt.detach().expand(shape).reshape(-1))
+    durations = _plain(dt.detach().expand(shape).reshape(-1))
+    after, _, _ = Moving(model, functions, rows, 0).travel(durations, _levels(rows))
     return torch.from_numpy(after).reshape(*shape, state.shape[-1])
 
 
@@ -173,16 +205,17 @@ def _numbers(given: Tensor | float, shape: torch.Size) -> Array:
 
 def fly_jacobian(model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor) -> tuple[Tensor, Tensor]:
     """As `integrate.fly_jacobian`."""
-    width = state.shape[-1]
-    after, jacobian, _ = Moving(model, functions, state.reshape(-1, width), width).travel(dt.reshape(-1))
-    return torch.from_numpy(after).reshape(state.shape), torch.from_numpy(jacobian).reshape(*state.shape, width)
+    shape, width = state.shape, state.shape[-1]
+    rows, durations = (state, dt) if dt.dim() == 1 else (state.reshape(-1, width), dt.reshape(-1))
+    after, jacobian, _ = Moving(model, functions, rows, width).travel(_plain(durations), _levels(rows))
+    return torch.from_numpy(after.reshape(shape)), torch.from_numpy(jacobian.reshape(*shape, width))
 
 
 def fly_through(
     model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor, heights: Sequence[Tensor | float]
 ) -> tuple[Tensor, Tensor]:
     """As `contact.fly_through`, without derivatives."""
-    after, _, times = Moving(model, functions, state, 0).travel(dt, heights)
+    after, _, times = Moving(model, functions, state, 0).travel(_plain(dt), _levels(state, heights))
     return torch.from_numpy(after), torch.from_numpy(times)
 
 
@@ -190,5 +223,6 @@ def fly_through_jacobian(
     model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor, heights: Sequence[Tensor | float]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """As `contact.fly_through_jacobian`."""
-    after, jacobian, times = Moving(model, functions, state, state.shape[-1]).travel(dt, heights)
+    moving = Moving(model, functions, state, state.shape[-1])
+    after, jacobian, times = moving.travel(_plain(dt), _levels(state, heights))
     return torch.from_numpy(after), torch.from_numpy(times), torch.from_numpy(jacobian)

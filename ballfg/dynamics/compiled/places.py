@@ -19,21 +19,26 @@ class Numbers:
     arrays: Mapping[str, tuple[dict[str, Any], str]]
     """The same for parameters that are no scalars, `Effect.tabled` ones, and buffers: derivatives by them are left to
     torch."""
-    parts: Sequence[tuple[dict[str, Any], tuple[Any, ...]]]
-    """Of each module of the model, the dictionary of its sub-modules and what that held."""
+    held: Sequence[dict[str, Any]]
+    """Of each module of the model, the dictionary of its sub-modules."""
+    parts: Sequence[tuple[Any, ...]]  # What each of these dictionaries held
     ball: tuple[float, float]  # radius (m) and inertia factor
 
     def are_of(self, model: BallModel) -> bool:
         """True if a model still consists of the same modules, none of them exchanged."""
-        for held, parts in self.parts:
-            if tuple(held.values()) != parts:
-                return False
-        return self.ball == (model.radius, model.inertia_factor)
+        return [*map(tuple, map(dict.values, self.held))] == self.parts and self.ball == (
+            model.radius,
+            model.inertia_factor,
+        )
 
     def value(self, name: str) -> float:
         """Present value of a coefficient."""
         owner, key = self.scalars[name]
         return owner[key].item()
+
+    def values(self) -> list[float]:
+        """Present values of all coefficients, in the order of `scalars`."""
+        return [owner[key].item() for owner, key in self.scalars.values()]
 
     def tables(self) -> list[Tensor]:
         """Present arrays."""
@@ -41,8 +46,7 @@ class Numbers:
 
     def stamp(self) -> Hashable:
         """A number that changes with any value, as long as the `tables` of an earlier stamp are kept alive."""
-        values = tuple(self.value(name) for name in self.scalars)
-        return self.ball, tuple(self.scalars), values, stamp_of(self.tables())
+        return self.ball, tuple(self.scalars), tuple(self.values()), stamp_of(self.tables())
 
 
 _VERSION: Final = attrgetter("_version")
@@ -69,6 +73,7 @@ def numbers_of(model: BallModel) -> Numbers:
         tabled = {f"{path}.{name}" for path, part in model.named_modules() for name in getattr(part, "tabled", ())}
         scalars = {name: places[name] for name, p in parameters.items() if not p.dim() and name not in tabled}
         arrays = {name: place for name, place in places.items() if name not in scalars}
-        held = [(part._modules, tuple(part._modules.values())) for part in model.modules()]
-        known = _numbers[model] = Numbers(scalars, arrays, held, (model.radius, model.inertia_factor))
+        held = [part._modules for part in model.modules()]
+        parts = [tuple(modules.values()) for modules in held]
+        known = _numbers[model] = Numbers(scalars, arrays, held, parts, (model.radius, model.inertia_factor))
     return known

@@ -212,6 +212,22 @@ def gap_jacobian(model: BallModel, state: Tensor, height: Tensor | float) -> tup
     return gap.detach(), gradient
 
 
+def acceleration(model: BallModel, state: Tensor) -> Tensor:
+    """(n, 3) m/s^2 of balls in flight, in states (n, 9), without derivatives."""
+    if is_plain(state) and (functions := motion.functions_of(model)) is not None:
+        return torch.from_numpy(motion.Moving(model, functions, state, 0).rates()[:, :3])
+    with torch.no_grad():
+        return model.rates(state)[0]
+
+
+def gaps(model: BallModel, state: Tensor, height: Tensor | float) -> Tensor:
+    """`model.gap` of states (n, 9), without derivatives."""
+    if is_plain(state) and (functions := motion.functions_of(model)) is not None:
+        return torch.from_numpy(motion.Moving(model, functions, state, 0).gaps(_numbers(height))[0])
+    with torch.no_grad():
+        return model.gap(state, height)
+
+
 def bounced(model: BallModel, state: Tensor) -> Tensor:
     """`model.after_bounce` of states (n, 9), without derivatives."""
     if is_plain(state) and (functions := motion.functions_of(model)) is not None:

@@ -273,7 +273,7 @@ class _Run:
             return first, first + 1
         z = self.track.positions[:, Z, None] - self.owner.model.radius
         near = np.abs(z - np.array(self.owner.surfaces.heights())).min(axis=-1, initial=np.inf) < NEAR_SURFACE
-        sigma = total_sigmas(self.settings, self.sigma, self.velocities)
+        sigma = total_sigmas(self.settings, self.sigma, lambda: self.velocities)
         return first_pair(self.track.times, self.track.positions, sigma, near, first)
 
     def _predict(self, ball: BallFilter, k: int) -> None:

@@ -5,6 +5,7 @@ Roto-Translational Invariant Representations", section IV: the average velocity 
 """
 
 from collections.abc import Sequence
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -56,7 +57,7 @@ class SlidingWindow(Estimator):
         track = written.since_first()
         n, settings = len(track), self.settings.for_track(track)
         white = sample_sigmas(settings, n, track.sigmas)
-        sigma = total_sigmas(settings, white, window_velocities(track.times, track.positions))
+        sigma = total_sigmas(settings, white, partial(window_velocities, track.times, track.positions))
         first = np.maximum(np.arange(n) - WINDOW + 1, 0)
         span = track.times - track.times[first]
         span[0] = 1.0  # the first sample's difference is zero; its velocity is the prior's

@@ -1,6 +1,7 @@
 """Estimates a tracker's position noise from the distance of samples to smooth paths through their neighbours."""
 
 from collections.abc import Iterable
+from functools import partial
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -66,7 +67,7 @@ def noise_doubts(track: Track, settings: Settings) -> tuple[str, ...]:
     if len(residuals) < LEAST_WINDOWS:
         return ()
     white = sample_sigmas(settings, len(times), None if track.sigmas is None else track.sigmas[first])
-    stated = total_sigmas(settings, white, np.gradient(positions, times, axis=0))
+    stated = total_sigmas(settings, white, partial(np.gradient, positions, times, axis=0))
     seen, said = (float(np.sqrt(np.square(s).mean())) for s in (_robust_sigma(residuals), median(stated)))
     if seen <= MOST_SCATTER * said:
         return ()

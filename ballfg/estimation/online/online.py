@@ -268,7 +268,7 @@ class Online(Estimator):
         in_order = len(last) > 1 and sample.time > last[-2].time and np.isfinite(sample.position).all()
         if self.settings.stamp_jitter > 0.0 and in_order:
             sample.velocity = window_velocities(*path_of(last))[-1]
-        sample.whole = total_sigmas(self.settings, sample.stated, sample.velocity)
+        sample.whole = total_sigmas(self.settings, sample.stated, lambda: sample.velocity)
 
     @np.errstate(over="ignore", invalid="ignore")
     def _join(self, sighting: Measurement) -> OnlineState:

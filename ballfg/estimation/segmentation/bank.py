@@ -149,7 +149,7 @@ class Scene:
         shares = np.log([1.0 - s.wide_share - s.outlier_share, s.wide_share, s.outlier_share])
         extent = np.array((-np.inf, np.inf, -np.inf, np.inf) if surfaces.extent is None else surfaces.extent)
         extent += s.extent_margin * np.array((-1.0, 1.0, -1.0, 1.0))
-        own = (getattr(part, one.name) for part in (physics, s) for one in fields(part))
+        own = (*vars(physics).values(), *vars(s).values())  # in the order of `fields`
         self.numbers: Record = np.array([(*own, shares, drift, extent)], dtype=NUMBERS)[0]
         heights = np.array(surfaces.heights())
         self.rows: Records = np.zeros(len(heights), dtype=SURFACE)

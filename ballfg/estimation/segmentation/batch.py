@@ -1,17 +1,21 @@
 """Segments a whole track by a forward pass over all samples, and assembles the events of a chain."""
 
+import math
 from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Index, plain
+from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.signatures import COUNTS, NOTHING, ONE, REAL, TWO
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.estimation.segmentation.result import Contact, Event, EventKind, Quality, Rest, Segmentation
 from ballfg.estimation.segmentation.segmenter import Segmenter
 from ballfg.estimation.segmentation.settings import SegmentationSettings
+from ballfg.state import Z
 
 BREAKS = (EventKind.HIT, EventKind.RESTART)
 """Events after which nothing is known of the past."""
@@ -128,12 +132,32 @@ def _velocity(
     rows = first + np.flatnonzero(usable[first : last + 1])
     if len(rows) < LEAST_SIDE:
         return None
-    since = times[rows] - at
-    chord = (positions[rows[-1]] - positions[rows[0]]) / (times[rows[-1]] - times[rows[0]])
-    pull = -physics.drag * np.linalg.norm(chord) * chord - np.array([0.0, 0.0, physics.gravity])
-    straight = positions[rows] - 0.5 * pull * since[:, None] ** 2
-    centred = since - since.mean()
-    return np.asarray(centred @ (straight - straight.mean(axis=0)) / (centred @ centred))
+    velocity = np.empty(3)
+    _fit_velocity(plain(times), plain(positions), rows, at, physics.drag, physics.gravity, velocity)
+    return velocity
+
+
+@machine_code(NOTHING(ONE, TWO, COUNTS, REAL, REAL, REAL, ONE))
+def _fit_velocity(
+    times: Array, positions: Array, rows: Index, at: float, drag: float, gravity: float, velocity: Array
+) -> None:
+    """Writes the velocity (3,) of `_velocity` through the samples `rows` (m,). Args: drag: 1/m.  gravity: m/s^2."""
+    first, last, m = rows[0], rows[-1], len(rows)
+    speed, mean, scatter = 0.0, 0.0, 0.0
+    for axis in range(3):
+        velocity[axis] = (positions[last, axis] - positions[first, axis]) / (times[last] - times[first])
+        speed += velocity[axis] ** 2
+    for row in rows:
+        mean += (times[row] - at) / m
+    for row in rows:
+        scatter += (times[row] - at - mean) ** 2
+    for axis in range(3):
+        pull = -drag * math.sqrt(speed) * velocity[axis] - (gravity if axis == Z else 0.0)
+        moved = 0.0
+        for row in rows:  # less the first position: a difference of large numbers would be rounded
+            since = times[row] - at
+            moved += (since - mean) * (positions[row, axis] - positions[first, axis] - 0.5 * pull * since**2)
+        velocity[axis] = moved / scatter
 
 
 def segment(

@@ -67,10 +67,11 @@ def physics_of(model: BallModel) -> SegmentationPhysics:
 
     Args: model: any `BallModel`; it is neither changed nor differentiated.
     """
-    if is_substituted(model):
+    known = _known.get(model)
+    if known is None and is_substituted(model):
         return _asked(model)
     numbers = numbers_of(model)
-    stamp, known = numbers.stamp(), _known.get(model)
+    stamp = numbers.stamp()
     if known is None or known[0] != stamp:
         known = _known[model] = stamp, numbers.tables(), _asked(model)
     return known[2]

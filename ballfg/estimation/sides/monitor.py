@@ -116,9 +116,10 @@ def _gap_sigmas(
     whole = _with_coefficients(states, shared.mean)
     _, slopes = gap_jacobian(model, whole, torch.tensor(heights, dtype=torch.float64))
     own, rest = slopes.numpy()[:, :STATE_DIM], slopes.numpy()[:, STATE_DIM:]
-    variance = np.einsum("mi,mij,mj->m", own, covariances, own)
-    variance += np.einsum("mi,ij,mj->m", rest, shared.covariance, rest)
-    variance += 2.0 * np.einsum("mi,mij,mj->m", own, shared.cross[stamps], rest)
+    variance = (own[:, None] @ covariances @ own[:, :, None])[:, 0, 0]
+    if len(shared.mean):
+        variance += np.einsum("mi,ij,mj->m", rest, shared.covariance, rest)
+        variance += 2.0 * np.einsum("mi,mij,mj->m", own, shared.cross[stamps], rest)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
@@ -133,6 +134,8 @@ def _carried(model: BallModel, states: Array, coefficients: Array, dt: Array) ->
 
 
 def _with_coefficients(states: Array, coefficients: Array) -> torch.Tensor:
+    if not len(coefficients):
+        return torch.from_numpy(states)
     return torch.from_numpy(np.column_stack((states, np.tile(coefficients, (len(states), 1)))))
 
 

@@ -6,6 +6,7 @@ Every observation of the track gives its factors; the first state of each linked
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -69,7 +70,9 @@ def effective_sigmas(track: Track, segmentation: Segmentation, settings: Setting
     """(n, 3) m: standard deviations of the samples' white errors, larger for wide or shifted samples and outliers."""
     settings = settings.for_track(track)
     sigma = sample_sigmas(settings, len(track), track.sigmas)
-    whole = total_sigmas(settings, sigma, window_velocities(track.times, track.positions))
+    if (segmentation.quality == Quality.GOOD).all():
+        return sigma
+    whole = total_sigmas(settings, sigma, partial(window_velocities, track.times, track.positions))
     for quality, factor in QUALITY_SIGMA.items():
         bad = segmentation.quality == quality
         sigma[bad] = factor * whole[bad]
@@ -124,6 +127,11 @@ class TrackProblem:
         self.added: list[FactorBatch] = []
         self._dynamics = TrackDynamics(track.times, self.ball, settings.process)
 
+    @cached_property
+    def _launch(self) -> list[FactorBatch]:
+        """The priors on the first state, the same for all arrangements of events."""
+        return _first_priors(self.track, self.settings)
+
     @property
     def coefficient_sigmas(self) -> Array:
         """(p + q,) prior standard deviations of the ball's coefficients and of the unknowns, in their own units."""
@@ -133,7 +141,7 @@ class TrackProblem:
         """The factor graph for some events."""
         batches: list[FactorBatch] = [*self.observed.values(), *self.added]
         batches += self._dynamics.factors(replace(events.segmentation, contacts=events.contacts))
-        batches += _priors(self.track, events.segmentation, self.settings)
+        batches += (*self._launch, *_priors_after_hits(self.track, events.segmentation, self.settings))
         for observation in self.observations:
             batches += observation.priors()
         if self.biased:
@@ -180,21 +188,24 @@ def bridged_positions(track: Track, segmentation: Segmentation) -> Array:
     return np.stack([np.interp(track.times, track.times[trusted], p[trusted]) for p in track.positions.T], axis=-1)
 
 
-def _priors(track: Track, segmentation: Segmentation, settings: Settings) -> list[FactorBatch]:
-    """Wide priors on each piece's first state, and on its spin by the label, the launcher or the settings."""
-    batches: list[FactorBatch] = []
+def _first_priors(track: Track, settings: Settings) -> list[FactorBatch]:
+    """A wide prior on the first state, and one on its spin by the label, the launcher or the settings."""
     launcher = settings.launcher
     launch = None if launcher is None else launcher.settings(track)
-    if launcher is not None and launch is not None:
-        spread, loss = np.full((1, 3), launcher.sigma), settings.label_loss
-        batches.append(LauncherSpinFactors(np.array([0]), launch[None], launcher.embedding, spread, loss))
-        batches.append(_wide_prior(0, track.positions[0], settings))
-    else:
-        batches += start_priors(0, track.positions[0], settings.spin_label(track), settings)
+    if launcher is None or launch is None:
+        return start_priors(0, track.positions[0], settings.spin_label(track), settings)
+    spread, loss = np.full((1, 3), launcher.sigma), settings.label_loss
+    about = LauncherSpinFactors(np.array([0]), launch[None], launcher.embedding, spread, loss)
+    return [about, _wide_prior(0, track.positions[0], settings)]
+
+
+def _priors_after_hits(track: Track, segmentation: Segmentation, settings: Settings) -> list[FactorBatch]:
+    """Wide priors on the first state of each further piece, and on its spin, which is not that of the launcher."""
+    if not len(segmentation.restarts):
+        return []
     anew = replace(settings, spin_prior=max(settings.spin_prior, LEAST_SPIN_PRIOR))
-    for interval in segmentation.restarts:  # spin after a hit is not that of the group
-        batches += start_priors(int(interval) + 1, track.positions[int(interval) + 1], None, anew)
-    return batches
+    begins = (segmentation.restarts + 1).tolist()
+    return [prior for k in begins for prior in start_priors(k, track.positions[k], None, anew)]
 
 
 def start_priors(state: int, position: Array, label: SpinLabel | None, settings: Settings) -> list[FactorBatch]:

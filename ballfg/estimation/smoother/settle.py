@@ -8,6 +8,7 @@ search then ends in another minimum, or on a slope. In that case convex losses l
 search starts again; the lower minimum is the result.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -16,7 +17,7 @@ import torch
 
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.contact import bounced, fly_through, gap_jacobian
+from ballfg.dynamics.motion.contact import bounced, fly_through, gaps
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.launcher import SpinLabel
@@ -93,12 +94,12 @@ def initial_states(
         states[:, SPIN] = label.spin
     for contact in sorted(contacts, key=lambda c: c.time):  # the state before it can reach it
         before = torch.from_numpy(states[[contact.interval]])
-        states[contact.interval, Z] -= min(0.0, float(gap_jacobian(model, before, contact.height)[0]))
+        states[contact.interval, Z] -= min(0.0, float(gaps(model, before, contact.height)))
         states[contact.interval, VZ] = before[0, VZ] = min(float(before[0, VZ]), -LEAST_FALL)
         states[contact.interval + 1 :, SPIN] = bounced(model, before)[0, SPIN].numpy()
     for rest in segmentation.rests:  # rolling: saturated friction does not determine the direction of the spin
         down = states[rest.first : rest.last + 2]
-        down[:, Z] -= gap_jacobian(model, torch.from_numpy(down), rest.height)[0].numpy()
+        down[:, Z] -= gaps(model, torch.from_numpy(down), rest.height).numpy()
         down[:, VZ] = 0.0
         down[:, SPIN.start] = -down[:, VELOCITY.start + 1] / model.radius
         down[:, SPIN.start + 1] = down[:, VELOCITY.start] / model.radius
@@ -157,7 +158,7 @@ def contacts_at_ends(times: Array, solution: Solution, model: BallModel, surface
             continue
         pair = torch.from_numpy(np.concatenate((values.states[[inside, beyond]], coefficients), axis=1))
         height = surfaces.level_below(pair)[0]
-        above, below = gap_jacobian(model, pair, float(height))[0].tolist()
+        above, below = gaps(model, pair, float(height)).tolist()
         if above >= 0.0 > below and bool(surfaces.over_table(pair)[1]):
             time = times[beyond] - below / speed
             found.append(Contact(interval, float(np.clip(time, times[interval], times[interval + 1])), float(height)))
@@ -171,9 +172,9 @@ def refined_contacts(times: Array, solution: Solution) -> tuple[Contact, ...]:
     for contact in timed_contacts(times, solution):
         if not times[0] <= contact.time <= times[-1]:
             continue
-        interval = int(np.clip(np.searchsorted(times, contact.time, side="right") - 1, 0, len(times) - 2))
-        step = np.clip(interval - contact.interval, -1, 1)  # one interval at a time: the estimate moves along
-        refined.append(Contact(contact.interval + int(step), contact.time, contact.height))
+        interval = min(max(int(np.searchsorted(times, contact.time, side="right")) - 1, 0), len(times) - 2)
+        step = min(max(interval - contact.interval, -1), 1)  # one interval at a time: the estimate moves along
+        refined.append(Contact(contact.interval + step, contact.time, contact.height))
     return tuple(refined)
 
 
@@ -191,7 +192,7 @@ def move_contacts(
             continue  # the contact entered or left this interval; the state after both is right already
         heights = tuple(height for i, height in new if i == interval)
         start = torch.from_numpy(np.concatenate((states[interval], values.coefficients[: model_width(model)]))[None])
-        gap = float(gap_jacobian(model, start, heights[0])[0]) if heights else 0.0
+        gap = float(gaps(model, start, heights[0])) if heights else 0.0
         if gap < 0.0 < states[interval, VZ]:  # it was on the way up, from below: before the contact it mirrors that
             states[interval, [Z, VZ]] -= (2.0 * gap, 2.0 * states[interval, VZ])
             start[0, :STATE_DIM] = torch.from_numpy(states[interval])
@@ -215,7 +216,7 @@ def timed_contacts(times: Array, solution: Solution) -> tuple[Contact, ...]:
         elapsed_of = batch.contact_times(solution.minimum.values)
         for interval, elapsed in zip(batch.variables[:, 0].tolist(), elapsed_of, strict=True):
             for contact, tau in zip(grouped[interval], elapsed.tolist(), strict=True):
-                time = float(times[interval] + tau) if np.isfinite(tau) else contact.time
+                time = float(times[interval]) + tau if math.isfinite(tau) else contact.time
                 timed.append(Contact(interval, time, contact.height))
     return tuple(sorted(timed, key=lambda c: c.time))
 

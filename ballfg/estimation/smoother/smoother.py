@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -146,7 +147,7 @@ class Smoother(Estimator):
                 return shown, ()
         settings = self.settings.for_track(track)
         white = sample_sigmas(settings, len(track), track.sigmas)
-        sigma = total_sigmas(settings, white, window_velocities(track.times, track.positions))
+        sigma = total_sigmas(settings, white, partial(window_velocities, track.times, track.positions))
         physics = physics_of(self.model)
         found = segment(track.times, track.positions, sigma, surfaces=self.surfaces, physics=physics)
         found = found if self.settings.find_events else found.only_contacts()
@@ -263,7 +264,8 @@ class Smoother(Estimator):
         segmentation = solution.events.segmentation
         hops = problem.hops if segmentation is problem.segmentation else None
         hops = self.low_hops(problem.track, segmentation) if hops is None else hops
-        estimate = replace(estimate, notes=estimate.notes + uncounted_note(hops, problem.track.times))
+        uncounted = uncounted_note(hops, problem.track.times)
+        estimate = replace(estimate, notes=estimate.notes + uncounted) if uncounted else estimate
         return with_low_hops(estimate, hops, self.model)
 
     def at_minimum(self, problem: TrackProblem, solution: Solution, known: Covariances | None) -> Estimate:
@@ -309,7 +311,8 @@ class Smoother(Estimator):
         estimate = plausible(estimate, track, problem.sigma, self.settings)
         for observation in problem.observations:
             estimate = observation.judged(estimate)
-        estimate = replace(estimate, notes=estimate.notes + rival_note(solution, estimate.covariances[0]))
+        rival = rival_note(solution, estimate.covariances[0])
+        estimate = replace(estimate, notes=estimate.notes + rival) if rival else estimate
         return widened_near_contacts(estimate, problem.ball)
 
 

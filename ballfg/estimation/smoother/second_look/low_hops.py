@@ -19,6 +19,7 @@ from torch import Tensor
 from ballfg.arrays import Array, median
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.motion.contact import acceleration, gaps
 from ballfg.dynamics.motion.limits import REST_SPEED
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.result import Estimate
@@ -114,6 +115,8 @@ def low_hops(
         if number == 0:
             low &= surfaces.over_table(torch.from_numpy(track.positions)).numpy()
         for first, last in _runs(low, events):
+            if first == last:
+                continue
             position, inside = track.positions[first], slice(first, last + 1)
             gravity = ball.gravity(position)
             if gravity <= 0.0 or track.times[last] - track.times[first] <= 2.0 * np.sqrt(2.0 * most / gravity):
@@ -201,19 +204,16 @@ class _Ball:
 
     def gap(self, positions: Array, height: float) -> Array:
         """(n,) m, from the surface up to the ball, at positions (n, 3) m."""
-        with torch.no_grad():
-            return np.asarray(self.model.gap(self._still(positions, self.means), height).numpy())
+        return np.asarray(gaps(self.model, self._still(positions, self.means), height).numpy())
 
     def level_sigma(self, position: Array, height: float) -> float:
         """m, standard deviation of the surface's height. Args: position: (3,) m.  height: m, as declared."""
-        with torch.no_grad():
-            gaps = self.model.gap(self._varied(position), height).numpy()
-        return float(np.linalg.norm(gaps[1:] - gaps[0]))
+        varied = gaps(self.model, self._varied(position), height).numpy()
+        return float(np.linalg.norm(varied[1:] - varied[0]))
 
     def gravity(self, position: Array) -> float:
         """m/s^2, downwards, of a ball that hangs still at a position (3,) m."""
-        with torch.no_grad():
-            return -float(self.model.rates(self._still(position[None], self.means))[0][0, Z])
+        return -float(acceleration(self.model, self._still(position[None], self.means))[0, Z])
 
     def law(self, position: Array, most: float, gravity: float) -> HopLaw:
         """Parameters of hops up to a height `most` m above a surface, at a position (3,) m."""
