@@ -11,6 +11,7 @@ import math
 import torch
 from torch import Tensor
 
+from ballfg.arrays import Array
 from ballfg.dynamics.compiled import motion
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.flight_step import rk4_step
@@ -202,9 +203,8 @@ def _flow_rate(model: BallModel, state: Tensor, dt: Tensor) -> Tensor:
 def gap_jacobian(model: BallModel, state: Tensor, height: Tensor | float) -> tuple[Tensor, Tensor]:
     """Gaps (n,) m between balls in states (n, 9) and surfaces at heights in m or (n,), and their derivatives (n, 9)."""
     if is_plain(state) and (functions := motion.functions_of(model)) is not None:
-        level = height.numpy() if isinstance(height, Tensor) else height
-        gaps, slopes = motion.Moving(model, functions, state, state.shape[-1]).gaps(level)
-        return torch.from_numpy(gaps), torch.from_numpy(slopes)
+        found = motion.Moving(model, functions, state, state.shape[-1]).gaps(_numbers(height))
+        return torch.from_numpy(found[0]), torch.from_numpy(found[1])
     leaf = state.detach().requires_grad_(True)
     with torch.enable_grad():
         gap = model.gap(leaf, height)
@@ -234,3 +234,7 @@ def bounced(model: BallModel, state: Tensor) -> Tensor:
         return torch.from_numpy(motion.Moving(model, functions, state, 0).after_bounce())
     with torch.no_grad():
         return model.after_bounce(state)
+
+
+def _numbers(height: Tensor | float) -> Array | float:
+    return height.numpy() if isinstance(height, Tensor) else height
