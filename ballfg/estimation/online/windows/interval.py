@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, plain
 from ballfg.dynamics.compiled.flight import white_acceleration
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.limits import steps_over
@@ -17,7 +17,7 @@ from ballfg.estimation.smoother.motion import FLIGHT, Motion
 from ballfg.factors.batch import merge
 from ballfg.factors.bridge import Bridge, checked
 from ballfg.factors.correlated_noise import BIAS_DIM, bias_step
-from ballfg.factors.dynamics import ContactFactors, DynamicsFactors, FlightFactors, RestFactors
+from ballfg.factors.dynamics import ContactFactors, DynamicsFactors, FlightFactors, RestFactors, whiten
 from ballfg.factors.linear.definite import whitened as whitened_by
 from ballfg.factors.noise import ProcessNoise
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
@@ -125,8 +125,7 @@ def _keep(
 ) -> None:
     """Stores the inputs (k, d), residuals (k, 9) and Jacobians (k, 9, d) of intervals."""
     start, after = start[:, :STATE_DIM], after[:, :STATE_DIM]
-    residual = (root @ (after - pieces[:, :, 0])[..., None])[..., 0]
-    by_start = -(root @ pieces[:, :, 1:])
+    residual, by_start = whiten(plain(root), plain(after), plain(pieces[:, :, 0]), plain(pieces[:, :, 1:]))
     inputs: tuple[Array, ...] = (start, after)
     blocks: tuple[Array, ...] = (by_start[..., :STATE_DIM], root)
     if len(coefficients):
