@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -80,9 +80,7 @@ def scores_of(models: Sequence[Weighed]) -> dict[frozenset[str], float]:
     scores = {names: tempered(names, weight, weighed) + weight.odds for names, weight in weighed.items()}
     found: dict[frozenset[str], float] = {}
     for model in models:
-        for names, score in foretold(
-            model, (*model.nested.items(), *model.neighbours.items()), scores, weighed
-        ).items():
+        for names, score in foretold(model, {**model.nested, **model.neighbours}, scores, weighed).items():
             found[names] = max(score, found.get(names, -np.inf))
     beside = {n: max(scores[n], found[n]) for n in scores.keys() & found.keys() if NAMELESS in n}
     return lost | found | scores | beside
@@ -90,16 +88,16 @@ def scores_of(models: Sequence[Weighed]) -> dict[frozenset[str], float]:
 
 def foretold(
     model: Weighed,
-    others: Iterable[tuple[frozenset[str], Weight]],
+    others: Mapping[frozenset[str], Weight],
     scores: Mapping[frozenset[str], float],
     weighed: Mapping[frozenset[str], Weight],
 ) -> dict[frozenset[str], float]:
     """Logarithm of the odds of others by their names, as the linearisation of a model foretells them.
 
-    Args: scores, weighed: of the models that were weighed.
+    Args: scores, weighed: of the models that were weighed and have an evidence.
     """
     lost = scores[model.names] - model.score
-    return {n: min(lost + w.score, tempered(n, w, weighed) + w.odds) for n, w in others}
+    return {n: min(lost + w.score, tempered(n, w, weighed) + w.odds) for n, w in others.items()}
 
 
 def tempered(names: frozenset[str], weight: Weight, others: Mapping[frozenset[str], Weight]) -> float:

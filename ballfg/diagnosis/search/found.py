@@ -276,7 +276,7 @@ class Found:
         for model in list(found):
             smaller = self._smaller(model)
             names = max(smaller, key=lambda names: smaller[names], default=model.names)
-            if names in smaller and smaller[names] > max(scores[model.names], scores[best.names]):
+            if smaller.get(names, -np.inf) > max(scores[model.names], scores[best.names]):
                 found.append(self.without([h for h in model.named if h.name not in names], model))
         return self.most_probable(self.models[model.names] for model in found)  # a smaller one may replace its refit
 
@@ -294,8 +294,9 @@ class Found:
         """
         if not np.isfinite(model.evidence):
             return {}
-        scores, weights = self.scores, {names: known.weight for names, known in self.models.items()}
-        found = foretold(model, model.nested.items(), scores, weights)
+        weights = {names: known.weight for names, known in self.models.items() if np.isfinite(known.evidence)}
+        scores = self.scores
+        found = foretold(model, model.nested, scores, weights)
         return {n: scores[n] if (model.names, n) in self.tried else max(scores[n], score) for n, score in found.items()}
 
     def _superfluous(self, model: Weighed) -> list[Hypothesis]:

@@ -9,7 +9,7 @@ from scipy import stats
 
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.fit import fit_problem, followed
-from ballfg.diagnosis.fit.problem import Fit, Problem, Unknowns
+from ballfg.diagnosis.fit.problem import Fit, Problem
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, with_effects
 from ballfg.diagnosis.search.candidates import ALARM, Scored
 from ballfg.diagnosis.search.label_frames import FRAMES
@@ -128,19 +128,14 @@ def _refit(before: Fit, scored: Scored) -> Refit:
     return Refit(scored, after, delta_bic(before, after) + chosen)
 
 
-def _from(before: Fit, problem: Problem, unknowns: Unknowns, steps: int = FIRST_STEPS) -> Fit:
-    """A few steps of a fit at the noise of the previous one."""
-    return fit_problem(problem, unknowns, before.noise, settle_noise=False, steps=steps)
-
-
 def _started_at(
     before: Fit, hypothesis: Hypothesis, problem: Problem, values: Mapping[str, float], steps: int = FIRST_STEPS
 ) -> Fit:
-    """The fit of a problem with a hypothesis, started from the previous fit and some values of the hypothesis."""
+    """A few steps from the previous fit and some values of the hypothesis, at the noise of that fit."""
     unknowns = replace(before.unknowns, values={**before.unknowns.values, **values})
     if hypothesis.shape and not hypothesis.strengths:
         unknowns = replace(unknowns, starts=_starts_with_labels(problem, unknowns.starts))
-    return _from(before, problem, unknowns, steps)
+    return fit_problem(problem, unknowns, before.noise, settle_noise=False, steps=steps)
 
 
 def with_hypothesis(problem: Problem, hypothesis: Hypothesis) -> Problem:

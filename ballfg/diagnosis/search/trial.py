@@ -163,11 +163,10 @@ def try_hypotheses(
     attempts += [] if screen is None else _together(screen, scored, most)
     for one in scored:
         hypothesis = one.hypothesis
-        if hypothesis.usual and not {hypothesis.name} & called and not has_effect(model, hypothesis.name):
+        if hypothesis.usual and hypothesis.name not in called and not has_effect(model, hypothesis.name):
             called.add(hypothesis.name)
-            gain = (
-                one.odds if weighed.named else np.inf
-            )  # another effect may be in its place only after the first round
+            # beside other effects its absence misleads less, and the linearisation may foretell it
+            gain = one.odds if weighed.named else np.inf
             words = f"{hypothesis.name}, which balls usually have"
             attempts.append(Attempt(words, gain, [partial(refit_usual, before, hypothesis)]))
     for hypothesis in driven:
