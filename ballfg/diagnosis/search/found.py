@@ -24,7 +24,7 @@ from ballfg.diagnosis.search.candidates import Scored
 from ballfg.diagnosis.search.changed_fits import model_of, smaller_fit
 from ballfg.diagnosis.search.evaluation import on_all, on_others
 from ballfg.diagnosis.search.refits import Attempt, Refit, refit, retested
-from ballfg.diagnosis.search.trial import offered_varying, sets_beside, try_hypotheses, try_varying
+from ballfg.diagnosis.search.trial import offered_varying, screen_of, try_hypotheses, try_varying
 from ballfg.dynamics.variation import place_of
 from ballfg.estimation.batch import do_all
 
@@ -167,7 +167,13 @@ class Found:
         Patterns make some effects superfluous. They also show others, which a model that lacks them hides: an effect
         alone takes the values that make up for what no effect describes.
         """
-        loop = self.loop
+        loop, best = self.loop, self.best
+        if (
+            not best.neighbours
+        ):  # no round looked beyond it: it has as many effects as may be, or the last round made it
+            loop.watch("weighing what could stand in place of its effects")
+            neighbours = screen_of(best, self.motion, loop.catalogue).neighbours
+            self.best = self.models[best.names] = replace(best, neighbours=neighbours)
         loop.watch("weighing what has no name")
         nothing = self.models[frozenset()]  # a name has to beat that at its best
         for model in {m.names: m for m in (nothing, self.best)}.values():
@@ -178,7 +184,8 @@ class Found:
             return
         loop.watch("weighing sets of effects beside it")
         varying = offered_varying(best, loop.of_some or loop.catalogue, self.ways)
-        self.sets = sets_beside(best, self.motion, self.patterns, loop.catalogue, varying, MOST_EFFECTS)
+        screen = screen_of(best, self.motion, loop.catalogue, varying, self.patterns)
+        self.sets = Sets.near(screen, MOST_EFFECTS)
         self.models[best.names] = replace(best, neighbours=self.sets.weights)
         scores = self.scores
         self.best = self._model(max((*self.models, *self.sets.members), key=lambda names: scores[names]))

@@ -5,6 +5,7 @@ little of it makes them overconfident, too much makes them ignore the observed p
 forecasts within the tracks of the search half.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -95,7 +96,8 @@ def noise_about(
         stamp_jitter=tracker.stamp_jitter or settings.stamp_jitter,
     )
     some, surfaces = spread_over((p.track for p in tracks), len(tracks), MOST_FOR_NOISE), dataset_surfaces(dataset)
-    found = estimate_noise(model, surfaces, settings, some, tracker_known=True, errors=False, jobs=jobs)
+    whole = math.inf  # the model is judged by predictions that go on to the end of a track
+    found = estimate_noise(model, surfaces, settings, some, tracker_known=True, longest=whole, errors=False, jobs=jobs)
     if found is None:
         return None
     noise = replace(found.noise, stamp_jitter=settings.stamp_jitter or None)

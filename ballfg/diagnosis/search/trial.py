@@ -10,7 +10,6 @@ import numpy as np
 from ballfg.diagnosis.evidence.nameless import Patterns
 from ballfg.diagnosis.evidence.rows import Motion
 from ballfg.diagnosis.evidence.screen import Screen
-from ballfg.diagnosis.evidence.sets import Sets
 from ballfg.diagnosis.evidence.weighed import Weighed
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, hypotheses, scene_of
@@ -112,21 +111,19 @@ def _offered(model: Weighed, catalogue: Sequence[type[Effect]]) -> tuple[list[Hy
     return [h for h in lacking if h not in driven and h.strengths], driven
 
 
-def sets_beside(
+def screen_of(
     model: Weighed,
     motion: Motion,
-    patterns: Patterns,
     catalogue: Sequence[type[Effect]],
-    varying: Sequence[Varying],
-    most: int,
-) -> Sets:
-    """The sets of up to `most` effects that a model's linearisation foretells beside its patterns without a name.
+    varying: Sequence[Varying] = (),
+    patterns: Patterns | None = None,
+) -> Screen:
+    """What foretells a model with further effects, or with others in place of its own; without any, nothing but itself.
 
-    Args: as in `try_hypotheses`.  patterns: that the model was weighed with.  varying: effects that differ by tracks.
+    Args: as in `try_hypotheses`.  varying: effects that differ by tracks.  patterns: that the model was weighed with.
     """
     listed = [*_offered(model, catalogue)[0], *varying]
-    columns = columns_of(model.fit, listed)
-    return Sets.near(Screen.of(model, motion, listed, columns, patterns), most)
+    return Screen.of(model, motion, listed, columns_of(model.fit, listed), patterns)
 
 
 def offered_varying(model: Weighed, catalogue: Sequence[type[Effect]], known: Sequence[Grouping]) -> list[Varying]:

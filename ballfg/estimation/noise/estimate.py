@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -12,7 +13,7 @@ import numpy as np
 import torch
 
 from ballfg.arrays import Array
-from ballfg.checks import check_each, check_flag, check_instance
+from ballfg.checks import check_each, check_flag, check_instance, check_range
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.batch import map_tracks
@@ -39,7 +40,7 @@ from ballfg.tracks.noise import TrackNoise
 T = TypeVar("T")
 
 LONGEST_PART: Final = 0.75
-"""s, used part of a track: a start at 0.2 s or later, and 0.3 s of forecast after it."""
+"""s, usually used part of a track: forecasts of 0.3 s that start 0.2 s after the first sample or somewhat later."""
 MOST_TRACKS: Final = 20
 """Number of used tracks; twice as many move no number by more than its error bar, and take twice as long."""
 MOST_ITERATIONS: Final = 25
@@ -88,6 +89,7 @@ def estimate_noise(
     *,
     position_known: bool = False,
     tracker_known: bool = False,
+    longest: float = LONGEST_PART,
     errors: bool = True,
     watch: Watch = unwatched,
     jobs: int = 1,
@@ -101,9 +103,11 @@ def estimate_noise(
         model: the ball, and how it is measured.
         surfaces: table and floor.
         settings: prior medians of all numbers.
-        tracks: measured positions; the first part of each is used (`LONGEST_PART`).
+        tracks: measured positions.
         position_known: True if the settings' white noise of positions is fixed.
         tracker_known: True if the settings' memory of the tracker and jitter of the stamps are fixed.
+        longest: s, used part of each track, from its first sample on. Errors of the model late in a track, after
+            bounces, count as noise too.
         errors: True to compute error bars, which doubles the time.
         watch: called for each track and each step of the search.
         jobs: processes.
@@ -113,8 +117,9 @@ def estimate_noise(
     check_instance("settings", settings, Settings, "Make them with Settings.for_measured(model).")
     for name, flag in (("position_known", position_known), ("tracker_known", tracker_known), ("errors", errors)):
         check_flag(name, flag)
+    check_range("longest", longest, 0.0, math.inf)
     measured = check_each("tracks", tracks, Track, "Make one with Track(times, positions).")
-    parts = [part for track in measured if len(part := track.opening(LONGEST_PART)) >= LEAST_SAMPLES]
+    parts = [part for track in measured if len(part := track.opening(longest)) >= LEAST_SAMPLES]
     own_sigmas = any(part.sigmas is not None for part in parts)
     linear = linearised(model, surfaces, settings, parts, watch, jobs=jobs)
     if linear is None:

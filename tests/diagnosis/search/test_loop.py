@@ -224,6 +224,19 @@ def test_beside_something_nameless_effects_are_found_from_one_linearisation(gust
     assert found.plain(best).score > nothing.score  # its fit without patterns holds the effect too
 
 
+def test_a_model_that_the_last_round_made_shares_its_probability_with_its_neighbours(gusty, make_ball):
+    """A search that ends with as many effects as may be has not looked beyond them."""
+    found = Found(gusty, first_fit(make_ball(), gusty.holdout))
+    assert found.round()
+    last = found.best
+    assert last.names == {"frame_tilt"}
+    assert not last.neighbours
+    found.compare()
+    neighbours = {frozenset(["wind"]), frozenset(["frame_tilt", "wind"])}
+    assert neighbours <= set(found.models[last.names].neighbours)
+    assert neighbours <= set(found.odds.models)
+
+
 def test_the_best_minimum_of_the_same_effects_counts(gusty, make_ball):
     """A set that was refitted, and the same set that is left of a larger one."""
     found = Found(gusty, first_fit(make_ball(), gusty.holdout))

@@ -1,5 +1,7 @@
 """The noise that tracks show: planted numbers come back, and intervals with them hold what they promise."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -72,6 +74,11 @@ def test_planted_acceleration_comes_back(recorded):
     model, surfaces, settings, tracks = recorded(MeasurementNoise(position=0.002), process, tracks=20)
     found = estimate_noise(model, surfaces, settings, tracks, position_known=True, errors=False)
     assert found.noise.acceleration == pytest.approx(0.5, rel=0.25)
+    whole = estimate_noise(model, surfaces, settings, tracks, position_known=True, errors=False, longest=math.inf)
+    assert whole.starts > 1.3 * found.starts
+    assert whole.noise.acceleration == pytest.approx(0.5, rel=0.2)
+    with pytest.raises(ValueError, match=r"longest must be at least 0; got -1\. Correct it"):
+        estimate_noise(model, surfaces, settings, tracks, longest=-1.0)
 
 
 def test_nothing_to_tell(recorded):
