@@ -7,11 +7,11 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.signatures import COUNT, NOTHING, ONE, TWO
+from ballfg.dynamics.compiled.signatures import COUNT, FLAG, NOTHING, ONE
 
-FEW: Final = 12
-"""Rows up to which loops are quicker than BLAS, which copies the other matrix first: four times so for three rows."""
-LEAST_FOR_BLAS: Final = 256  # Multiplications below which loops are quicker too
+FEW, NARROW = 12, 16
+"""Rows up to which loops are quicker than BLAS, which copies the other matrix first: four times so for three rows; and
+the length of that matrix's shorter side."""
 
 ROUNDING: Final = 1.5 * 2.0**52  # Added to a float64, it leaves the nearest whole number in the lowest bits
 PER_LN2: Final = 1.4426950408889634
@@ -42,7 +42,7 @@ def _add_rows(sums: Array, rows: Array, matrix: Array, m: int, k: int, n: int) -
 
 @machine_code(NOTHING(ONE, ONE, ONE, COUNT, COUNT, COUNT), may=("contract", "reassoc"))
 def _add_turned(sums: Array, rows: Array, turned: Array, m: int, k: int, n: int) -> None:
-    """`_add_rows` of a matrix whose columns are rows of `turned` (n, k): quicker than the other where k is not small."""
+    """`_add_rows` of a matrix whose columns are rows of `turned` (n, k): quicker than the other unless k is small."""
     fours = n - n % 4  # four columns at a time, which stay in the cache
     for j in range(0, fours, 4):
         one, two = turned[j * k : (j + 1) * k], turned[(j + 1) * k : (j + 2) * k]
@@ -67,12 +67,34 @@ def _add_turned(sums: Array, rows: Array, turned: Array, m: int, k: int, n: int)
             sums[i * n + j] += a
 
 
-@machine_code(NOTHING(ONE, COUNT, COUNT, *(ONE, *[COUNT] * 4) * 2, *[COUNT] * 4))
+@machine_code(NOTHING(ONE, ONE, ONE, COUNT, COUNT, COUNT, FLAG, FLAG))
+def _by_blas(sums: Array, rows: Array, matrix: Array, m: int, k: int, n: int, upright: bool, anew: bool) -> None:
+    """`_add_rows`, or `_add_turned` unless `upright`; `anew`: without what `sums` held."""
+    into = sums.reshape(m, n) if anew else np.empty((m, n))
+    if upright:
+        np.dot(rows.reshape(m, k), matrix.reshape(k, n), into)
+    else:
+        np.dot(rows.reshape(m, k), matrix.reshape(n, k).T, into)
+    if not anew:
+        for i, product in enumerate(into.flat):
+            sums[i] += product
+
+
+@machine_code(NOTHING(ONE, COUNT, COUNT, COUNT, COUNT))
+def _clear(whole: Array, at: int, step: int, count: int, size: int) -> None:
+    """Write zeros to so many matrices of a size."""
+    for q in range(count):
+        one = whole[at + q * step : at + q * step + size]
+        for i in range(size):
+            one[i] = 0.0
+
+
+@machine_code(NOTHING(ONE, COUNT, COUNT, *(ONE, *[COUNT] * 4) * 2, *[COUNT] * 5))
 def add_product(
     whole: Array, whole_at: int, whole_step: int,
     left: Array, left_at: int, left_step: int, left_row: int, left_column: int,
     right: Array, right_at: int, right_step: int, right_row: int, right_column: int,
-    count: int, m: int, k: int, n: int,
+    count: int, m: int, k: int, n: int, anew: int,
 ) -> None:  # fmt: skip
     """Add matrix products (m, k) (k, n) to `whole`, whose rows lie one behind another.
 
@@ -81,10 +103,15 @@ def add_product(
         whole_at, left_at, right_at: place of the first entry.
         whole_step, left_step, right_step: from a matrix to the same one of the next product; 0 if it is the same.
         left_row, left_column, right_row, right_column: from an entry to that of the next row or column.
-        count: number of products.
+        count: number of products.  anew: 1 if `whole` holds nothing yet.
     """
     in_rows = left_column == 1 and (m == 1 or left_row == k)
     upright, turned = right_column == 1 and right_row == n, right_row == 1 and right_column == k
+    joined = right_step == 0 and left_step == m * k and whole_step == m * n
+    rows, times = (count * m, 1) if joined else (m, count)
+    by_blas = in_rows and (upright or turned) and rows > FEW and min(k, n) > NARROW
+    if anew and not by_blas:
+        _clear(whole, whole_at, whole_step, count, m * n)
     if not (in_rows and (upright or turned)):
         for q in range(count):
             for i in range(m):
@@ -95,21 +122,15 @@ def add_product(
                     for j in range(n):
                         whole[into + j] += factor * right[place + j * right_column]
         return
-    joined = right_step == 0 and left_step == m * k and whole_step == m * n
-    rows, times = (count * m, 1) if joined else (m, count)
-    by_loops = rows <= FEW or rows * k * n < LEAST_FOR_BLAS
     for q in range(times):
-        at, there, into = left_at + q * left_step, right_at + q * right_step, whole_at + q * whole_step
-        one, other, sums = left[at : at + rows * k], right[there : there + k * n], whole[into : into + rows * n]
-        if by_loops and upright:
+        at, there, here = left_at + q * left_step, right_at + q * right_step, whole_at + q * whole_step
+        one, other, sums = left[at : at + rows * k], right[there : there + k * n], whole[here : here + rows * n]
+        if by_blas:
+            _by_blas(sums, one, other, rows, k, n, upright, anew)
+        elif upright:
             _add_rows(sums, one, other, rows, k, n)
-        elif by_loops:
-            _add_turned(sums, one, other, rows, k, n)
         else:
-            ordered = one.reshape(rows, k)
-            both = np.dot(ordered, other.reshape(k, n)) if upright else np.dot(ordered, other.reshape(n, k).T)
-            for i, product in enumerate(both.flat):
-                sums[i] += product
+            _add_turned(sums, one, other, rows, k, n)
 
 
 @machine_code(NOTHING(ONE, ONE), may=("contract",))
