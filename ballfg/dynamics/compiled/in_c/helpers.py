@@ -12,14 +12,23 @@ static inline void NAME(double *whole, int whole_at, int whole_step,
     for (int i = 0; i < m; ++i) {
       double *into = whole + whole_at + q * whole_step + i * n;
       for (int j = 0; anew && j < n; ++j) into[j] = 0.0;
-      for (int r = 0; r < k; ++r) {
-        const double factor = left[left_at + q * left_step + i * left_row + r * left_column];
-        const double *from = right + right_at + q * right_step + r * right_row;
-        if (right_column == 1)
+      if (right_column == 1)
+        for (int r = 0; r < k; ++r) {
+          const double factor = left[left_at + q * left_step + i * left_row + r * left_column];
+          const double *from = right + right_at + q * right_step + r * right_row;
           for (int j = 0; j < n; ++j) into[j] += factor * from[j];
-        else
-          for (int j = 0; j < n; ++j) into[j] += factor * from[j * right_column];
-      }
+        }
+      else
+        for (int j = 0; j < n; ++j) {
+          const double *row = left + left_at + q * left_step + i * left_row;
+          const double *column = right + right_at + q * right_step + j * right_column;
+          double sums[4] = {0.0, 0.0, 0.0, 0.0};
+          int r = 0;
+          for (; r + 3 < k; r += 4)
+            for (int l = 0; l < 4; ++l) sums[l] += row[(r + l) * left_column] * column[(r + l) * right_row];
+          for (; r < k; ++r) sums[0] += row[r * left_column] * column[r * right_row];
+          into[j] += (sums[0] + sums[1]) + (sums[2] + sums[3]);
+        }
     }
 }"""
 """`layers.add_product`."""
