@@ -3,7 +3,7 @@
 import hashlib
 import json
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -37,15 +37,19 @@ ONE, TWO, THREE = (types.Array(types.float64, dimensions, "C") for dimensions in
 HELPERS: Final = ("add_product", "tanh_all")  # Functions of `layers.py` that generated ones may call
 
 
-def machine_code(signature: Any) -> Callable[[Callable[..., Any]], Any]:
+def machine_code(signature: Any, may: Collection[str] = ()) -> Callable[[Callable[..., Any]], Any]:
     """Numba's compiler for one signature; kept on disk for other processes.
 
     A function is compiled, or loaded, when it is first called or built into another one: a process pays for what it
     uses.
+
+    Args: may: what LLVM may do to rounding: "contract", a product and a sum rounded once; "reassoc", sums in any order.
     """
 
     def declared(function: Callable[..., Any]) -> Any:
-        dispatcher: Any = njit(error_model="numpy")(function)  # numba's own would look for a zero in every division
+        dispatcher: Any = njit(error_model="numpy", fastmath=set(may))(
+            function
+        )  # numba's own would look for a zero in every division
         dispatcher._cache = Kept(function)
 
         def for_call(*_: Any, **__: Any) -> Any:

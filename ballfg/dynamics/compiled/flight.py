@@ -88,39 +88,50 @@ def value_of(law, x, y):
 @machine_code(NOTHING(LAW, TWO, THREE, TWO, THREE, TWO, THREE))
 def slopes_at(rates, x, xt, k, kt, a, at):
     """The derivatives k (n, 9) of states by time, with tangents; a (n, 6) and at (n, 6, d) are working memory."""
+    d = xt.shape[2]
     rates.compute(x, rates.c, rates.w, xt, rates.ct, a, at)
     for r in range(len(x)):
         for i in range(3):
             k[r, i], k[r, 3 + i], k[r, 6 + i] = x[r, 3 + i], a[r, i], a[r, 3 + i]
-            for q in range(xt.shape[2]):
-                kt[r, i, q], kt[r, 3 + i, q], kt[r, 6 + i, q] = xt[r, 3 + i, q], at[r, i, q], at[r, 3 + i, q]
-
-
-@machine_code(NOTHING(LAW, TWO, THREE, ONE, TWO, TWO, THREE))
-def step_on(rates, x, xt, h, ht, k, kt):
-    """`flight_step.runge_kutta` of n states, in place: h (n,) s, ht (n, d); k, kt: the slopes at x, then used up."""
-    n, d = len(x), xt.shape[2]
-    a, at = np.empty((n, 6)), np.empty((n, 6, d))
-    stage, staget, total, totalt = np.empty((n, 9)), np.empty((n, 9, d)), np.empty((n, 9)), np.empty((n, 9, d))
-    put_all(total, k)
-    put_all(totalt.reshape(n * 9, d), kt.reshape(n * 9, d))
-    for reach, weight in STAGES:
-        for r in range(n):
-            for i in range(9):
-                stage[r, i] = x[r, i] + reach * h[r] * k[r, i]
+            if d:  # else a look at three empty rows takes longer than all the rest
                 for q in range(d):
-                    staget[r, i, q] = xt[r, i, q] + reach * (h[r] * kt[r, i, q] + ht[r, q] * k[r, i])
+                    kt[r, i, q], kt[r, 3 + i, q], kt[r, 6 + i, q] = xt[r, 3 + i, q], at[r, i, q], at[r, 3 + i, q]
+
+
+@machine_code(NOTHING(TWO, THREE, TWO, THREE, REAL, ONE, TWO, TWO, THREE))
+def _carry_on(after, aftert, x, xt, share, h, ht, k, kt):
+    """Write the states after a share of h (n,) s by slopes k (n, 9), with tangents."""
+    n, d = len(x), xt.shape[2]
+    for r in range(n):
+        for i in range(9):
+            after[r, i] = x[r, i] + share * h[r] * k[r, i]
+            if d:
+                for q in range(d):
+                    aftert[r, i, q] = xt[r, i, q] + share * (h[r] * kt[r, i, q] + ht[r, q] * k[r, i])
+
+
+@machine_code(NOTHING(LAW, TWO, THREE, ONE, TWO, TWO, THREE, TWO, THREE))
+def step_on(rates, x, xt, h, ht, k, kt, a, at):
+    """`flight_step.runge_kutta` of n states, in place: h (n,) s, ht (n, d); a, at: as in `slopes_at`.
+
+    Args: k, kt: the slopes at x, then used up.
+    """
+    n, d = len(x), xt.shape[2]
+    values, moved = np.empty((2, n, 9)), np.empty((2, n, 9, d))
+    stage, total, staget, totalt = values[0], values[1], moved[0], moved[1]
+    put_all(total, k)
+    if d:
+        put_all(totalt.reshape(n * 9, d), kt.reshape(n * 9, d))
+    for reach, weight in STAGES:
+        _carry_on(stage, staget, x, xt, reach, h, ht, k, kt)
         slopes_at(rates, stage, staget, k, kt, a, at)
         for r in range(n):
             for i in range(9):
                 total[r, i] += weight * k[r, i]
-                for q in range(d):
-                    totalt[r, i, q] += weight * kt[r, i, q]
-    for r in range(n):
-        for i in range(9):
-            x[r, i] += h[r] / 6.0 * total[r, i]
-            for q in range(d):
-                xt[r, i, q] += (h[r] * totalt[r, i, q] + ht[r, q] * total[r, i]) / 6.0
+                if d:
+                    for q in range(d):
+                        totalt[r, i, q] += weight * kt[r, i, q]
+    _carry_on(x, xt, x, xt, 1.0 / 6.0, h, ht, total, totalt)
 
 
 @machine_code(NOTHING(ADDRESS, TWO, THREE, TWO, THREE, ONE, ONE, COUNT, THREE, FOUR, THREE, FOUR))
@@ -139,7 +150,7 @@ def fly_arcs(rates, start, startt, c, ct, w, step, count, nodes, nodest, slopes,
         put_all(xt[0], startt[r])
         for s in range(count + 1):
             if s:
-                step_on(own, x, xt, step[r : r + 1], fixed, k, kt)
+                step_on(own, x, xt, step[r : r + 1], fixed, k, kt, a, at)
             slopes_at(own, x, xt, k, kt, a, at)
             put(nodes[r, s], x[0])
             put_all(nodest[r, s], xt[0])
@@ -161,7 +172,7 @@ def fly_together(rates, state, statet, c, ct, w, dt, dtt, steps):
         k, kt, a, at = np.empty((n, 9)), np.empty((n, 9, d)), np.empty((n, 6)), np.empty((n, 6, d))
         for _ in range(steps):
             slopes_at(own, x, xt, k, kt, a, at)
-            step_on(own, x, xt, h, ht, k, kt)
+            step_on(own, x, xt, h, ht, k, kt, a, at)
 
 
 @machine_code(NOTHING(LAW, ONE, TWO, REAL, ONE, COUNT))
@@ -176,7 +187,7 @@ def fly_one(rates, x, xt, duration, durationt, steps):
         ht[0, q] = durationt[q] / steps
     for _ in range(steps):
         slopes_at(rates, one, moved, k, kt, a, at)
-        step_on(rates, one, moved, h, ht, k, kt)
+        step_on(rates, one, moved, h, ht, k, kt, a, at)
 
 
 @machine_code(NOTHING(LAW, ONE, REAL, COUNT))

@@ -184,10 +184,11 @@ def roll_out(
     states, reached = np.empty((n, steps.shape[1], STATE_DIM)), np.empty(n, dtype=np.int64)
     durations, world = np.ascontiguousarray(steps.detach().numpy()), world_of(surfaces, functions.radius)
     given = (*moving.addresses, *moving.all_coefficients(), *moving.weights)
-    begin, travelling = np.split(moving.start, [STATE_DIM], axis=1)
-    roll_out_rows(*given, np.ascontiguousarray(begin), durations, world, states, reached)
-    travelling = np.broadcast_to(travelling[:, None], (n, steps.shape[1], width - STATE_DIM))
-    return torch.from_numpy(np.concatenate((states, travelling), axis=2)), torch.from_numpy(reached)
+    roll_out_rows(*given, np.ascontiguousarray(moving.start[:, :STATE_DIM]), durations, world, states, reached)
+    if width > STATE_DIM:
+        travelling = np.broadcast_to(moving.start[:, None, STATE_DIM:], (n, steps.shape[1], width - STATE_DIM))
+        states = np.concatenate((states, travelling), axis=2)
+    return torch.from_numpy(states), torch.from_numpy(reached)
 
 
 def world_of(surfaces: Surfaces, radius: float) -> Array:

@@ -73,10 +73,9 @@ def _advance(model: BallModel, state: Tensor, dt: Tensor, surfaces: Surfaces) ->
 
 
 def _check_durations(dt: Tensor) -> None:
-    if not bool(((dt >= 0) & (dt < math.inf)).all()):
-        raise ValueError(
-            f"dt must be finite and not negative; got {float(dt.min()):g} to {float(dt.max()):g} s. Sort the times."
-        )
+    low, high = (float(dt.min()), float(dt.max())) if dt.numel() else (0.0, 0.0)
+    if not (low >= 0 and high < math.inf):
+        raise ValueError(f"dt must be finite and not negative; got {low:g} to {high:g} s. Sort the times.")
 
 
 def _advance_step(model: BallModel, state: Tensor, h: Tensor, surfaces: Surfaces) -> Tensor:
@@ -152,7 +151,7 @@ def rollout(model: BallModel, state: Tensor, times: Tensor, surfaces: Surfaces) 
     """
     times = times.expand(state.shape[0], -1) if times.dim() == 1 else times
     steps = torch.diff(times, dim=-1, prepend=torch.zeros_like(times[:, :1]))
-    if not bool((steps >= 0).all()):
+    if steps.numel() and not float(steps.min()) >= 0:
         raise ValueError("times must start at 0 or later and must not decrease. Sort them.")
     _check_durations(steps)
     moved = _by_machine_code(model, state, steps, surfaces)

@@ -19,17 +19,22 @@ def test_tanh_of_many_numbers() -> None:
     assert np.isnan(y[-3])
 
 
-@pytest.mark.parametrize(("m", "k", "n", "count"), [(1, 6, 5, 3), (1, 40, 30, 7), (4, 20, 30, 2), (3, 2, 1, 1)])
+@pytest.mark.parametrize(
+    ("m", "k", "n", "count"),
+    [(1, 6, 5, 3), (1, 40, 30, 7), (4, 20, 30, 2), (5, 23, 30, 3), (14, 21, 18, 1), (3, 2, 1, 1)],
+)
 @pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize("shared", [False, True])
-def test_products_of_matrices(m, k, n, count, turned, shared) -> None:
+@pytest.mark.parametrize("anew", [False, True])
+def test_products_of_matrices(m, k, n, count, turned, shared, anew) -> None:
     rng = np.random.default_rng(m * k)
     left, start = rng.normal(size=(count, m, k)), rng.normal(size=(count, m, n))
     right = rng.normal(size=(1 if shared else count, *((n, k) if turned else (k, n))))
     whole, at = np.concatenate((np.zeros(2), start.ravel())), (1, k) if turned else (n, 1)
     step = 0 if shared else k * n
-    add_product(whole, 2, m * n, left.ravel(), 0, m * k, k, 1, right.ravel(), 0, step, *at, count, m, k, n)
-    wanted = start + left @ (right.mT if turned else right)
+    given = (left.ravel(), 0, m * k, k, 1, right.ravel(), 0, step, *at, count, m, k, n)
+    add_product(whole, 2, m * n, *given, int(anew))
+    wanted = (0.0 if anew else start) + left @ (right.mT if turned else right)
     np.testing.assert_allclose(whole[2:].reshape(wanted.shape), wanted, rtol=1e-12, atol=1e-13)
     assert (whole[:2] == 0.0).all()
 

@@ -34,10 +34,16 @@ def over_table(x, world):
     return within(x[0], x[1], world[3:7])
 
 
+@machine_code(FLAG(ONE))
+def is_slow(x):
+    """Whether a state (9,) may be at rest: nearly none is, and their gaps take longer than this look."""
+    return abs(x[5]) <= REST_SPEED / 2
+
+
 @machine_code(FLAG(LAW, ONE, REAL, ONE))
 def at_rest(surface, x, level, world):
     """True if a state (9,) rests on the surface at a level (m)."""
-    if abs(x[5]) > REST_SPEED / 2:  # nearly all do not rest, and their gap takes half a microsecond
+    if not is_slow(x):
         return False
     beside = level == world[0] and not over_table(x, world)
     return abs(gap_of(surface, x, level, world[2])) <= REST_GAP and not beside

@@ -59,7 +59,7 @@ class Entries:
 def filled(arrays: Arrays, block: int) -> list[str]:
     """Lines that fill a block from weights `w` and other blocks; the caller of a `Load` fills it with its numbers."""
     making, values = arrays.makings[block], Entries(arrays)
-    lines = [values.empty(block, "zeros" if isinstance(making, Product | Total) else "empty")]
+    lines = [values.empty(block, "zeros" if isinstance(making, Total) else "empty")]
     match making:
         case Load():
             return lines
@@ -70,11 +70,11 @@ def filled(arrays: Arrays, block: int) -> list[str]:
             body, called = computed(making.program, [making.result], given_names(making, values))
             body.append(f"{values.at(whole)} = {called[making.result]}")
         case Product(left, right, plus):
-            if plus is not None:
-                whole = View.whole(block, plus.shape)
-                lines += [EACH_STATE, *indented(loops(plus.shape, [f"{values.at(whole)} = {values.at(plus)}"]))]
             whole = View.whole(block, (left.shape[0], right.shape[1]))
-            return [*lines, *product((whole, values), (left, values), (right, values))]
+            lines += product((whole, values), (left, values), (right, values), anew=True)
+            if plus is None:
+                return lines
+            body = [f"{values.at(whole)} += {values.at(plus)}"]
         case Total(of, summed):
             whole = View.whole(block, of.shape[summed:])
             body = [f"{values.at(whole, summed)} += {values.at(of)}"]
@@ -84,37 +84,36 @@ def filled(arrays: Arrays, block: int) -> list[str]:
 def moved(arrays: Arrays, block: int, moving: Entries) -> list[str]:
     """Lines that fill a block's derivatives, forward from those of its operand blocks."""
     making, values = arrays.makings[block], Entries(arrays)
-    each_one = f"for q in range({moving.count}):"
-    lines = [moving.empty(block, "zeros")]
+    lines = [moving.empty(block, "empty" if isinstance(making, Each | Product) else "zeros")]
     match making:
         case Load():
             return lines
         case Each():
             whole, (body, called, blocks) = View.whole(block, making.operands[0].shape), slopes(making, block, values)
             terms = [f"{called[slope]} * {moving.at(view)}" for view, slope in blocks]
-            if not terms:
-                return lines
-            body.append(f"{moving.at(whole)} = {' + '.join(terms)}")
+            body.append(f"{moving.at(whole)} = {' + '.join(terms) or '0.0'}")
         case Product(left, right, plus):
             whole = View.whole(block, (left.shape[0], right.shape[1]))
-            if plus is not None and plus.block is not None:
-                body = loops(plus.shape, [f"{moving.at(View.whole(block, plus.shape))} = {moving.at(plus)}"])
-                lines += [EACH_STATE, f"    {each_one}", *indented(body, 2)]
             if left.block is not None:
-                lines += product((whole, moving), (left, moving), (right, values))
+                lines += product((whole, moving), (left, moving), (right, values), anew=True)
             if right.block is not None:
-                lines += product((whole, moving), (left, values), (right, moving))
-            return lines
+                lines += product((whole, moving), (left, values), (right, moving), anew=left.block is None)
+            if plus is None or plus.block is None:
+                return lines
+            body = [f"{moving.at(whole)} += {moving.at(plus)}"]
         case Total(of, summed):
             whole = View.whole(block, of.shape[summed:])
             body = [f"{moving.at(whole, summed)} += {moving.at(of)}"]
-    return [*lines, EACH_STATE, f"    {each_one}", *indented(loops(_shape(making), body), 2)]
+    return [*lines, EACH_STATE, f"    for q in range({moving.count}):", *indented(loops(_shape(making), body), 2)]
 
 
-def product(whole: tuple[View, Entries], left: tuple[View, Entries], right: tuple[View, Entries]) -> list[str]:
+def product(
+    whole: tuple[View, Entries], left: tuple[View, Entries], right: tuple[View, Entries], *, anew: bool
+) -> list[str]:
     """Lines that add products of matrices (m, k) (k, n) to a block's own (m, n), whose rows lie one behind another.
 
-    There is one for every state, or as many as it has derivatives if these are those of `whole`.
+    There is one for every state, or as many as it has derivatives if these are those of `whole`. Args: anew: the block
+    holds nothing yet.
     """
     (target, into), parts = whole, (left, right)
     counts = {entries.count for view, entries in parts if view.block is not None}
@@ -127,7 +126,7 @@ def product(whole: tuple[View, Entries], left: tuple[View, Entries], right: tupl
         given += [entries.name(view.block), _first(view, entries, together), str(step), *map(str, view.strides)]
     number = (f"n * {many}" if many > 1 else "n") if together else str(many)
     sizes = (left[0].shape[0], left[0].shape[1], right[0].shape[1])
-    call = f"add_product({', '.join(given)}, {number}, {', '.join(map(str, sizes))})"
+    call = f"add_product({', '.join(given)}, {number}, {', '.join(map(str, sizes))}, {int(anew)})"
     return [call] if together else [EACH_STATE, f"    {call}"]
 
 
@@ -179,7 +178,9 @@ def indented(lines: Sequence[str], depth: int = 1) -> list[str]:
 
 
 def _shape(making: Making) -> tuple[int, ...]:
-    """Shape of the loops of an elementwise operation, or of a sum."""
+    """Shape of the loops of an elementwise operation, of a sum, or of what is added to a product."""
+    if isinstance(making, Product):
+        return making.left.shape[0], making.right.shape[1]
     assert isinstance(making, Each | Total)
     return making.of.shape if isinstance(making, Total) else making.operands[0].shape
 
@@ -187,9 +188,14 @@ def _shape(making: Making) -> tuple[int, ...]:
 def _is_tanh(arrays: Arrays, making: Each) -> bool:
     """True if an operation is the hyperbolic tangent of a whole block."""
     operation, operand = making.program.operations[making.result], making.operands[0]
-    if operation.name != "tanh" or operation.operands != making.inputs or operand.block is None:
-        return False
-    return operand == View.whole(operand.block, operand.shape) and operand.size == arrays.sizes[operand.block]
+    return operation.name == "tanh" and operation.operands == making.inputs and is_all(arrays, operand)
+
+
+def is_all(arrays: Arrays, view: View) -> bool:
+    """True if a view has all numbers of a block in their order."""
+    return (
+        view.block is not None and view == View.whole(view.block, view.shape) and view.size == arrays.sizes[view.block]
+    )
 
 
 def expression(program: Program, number: Number, names: Mapping[Number, str], inputs: Mapping[Number, str]) -> str:

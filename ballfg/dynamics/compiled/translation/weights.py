@@ -30,19 +30,25 @@ class Known:
 class Weights:
     """The known tensors that a program takes, one behind another."""
 
-    taken: dict[Node, int] = field(default_factory=dict)
+    taken: dict[Node, View] = field(default_factory=dict)
     length: int = 0
     _first: dict[Hashable, Node] = field(default_factory=dict)
     _known: dict[Node, Node] = field(default_factory=dict)
 
     def take(self, known: Known) -> View:
-        """Places of the numbers of a tensor among the weights; one that is computed twice lies there once."""
+        """Places of the numbers of a tensor among the weights; one that is computed twice lies there once.
+
+        A matrix lies there transposed if that makes its rows longer, as quick products need it, or leaves them as long:
+        torch's layers take transposed tables.
+        """
         shape = tuple(known.example.shape)
         node = self._same(known.node)
         if node not in self.taken:
-            self.taken[node] = self.length
+            tall = len(shape) == 2 and shape[0] >= shape[1]
+            view = View.whole(None, shape[::-1] if tall else shape, self.length)
+            self.taken[node] = view.permuted((1, 0)) if tall else view
             self.length += prod(shape)
-        return View.whole(None, shape, self.taken[node])
+        return self.taken[node]
 
     def _same(self, node: Node) -> Node:
         """The first node with the same operation on the same operands."""
@@ -65,6 +71,9 @@ class Weights:
                 copies[node] = made = own.node_copy(node, copies.__getitem__)
                 made.kwargs = {name: value for name, value in made.kwargs.items() if name not in IDLE}
                 made.target = torch.ops.aten.reshape.default if node.target in VIEWS else node.target
+        for node, view in self.taken.items():
+            if view.strides != View.whole(None, view.shape).strides:
+                copies[node] = own.call_function(torch.ops.aten.t.default, (copies[node],))
         own.output([copies[node] for node in self.taken])
         held = [getattr(graph, str(node.target)).detach() for node in constants]
         plain = [(tensor.tolist(), str(tensor.dtype).removeprefix("torch.")) for tensor in held]
