@@ -11,7 +11,7 @@ from numba import types
 
 from ballfg.arrays import Array, Index, Mask, plain
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.signatures import FLAG, NOTHING, ONE, REAL, TWO, several
+from ballfg.dynamics.compiled.signatures import COUNTS, FLAG, NOTHING, ONE, REAL, TWO, several
 from ballfg.vision.detection.detections import Detections
 
 SEEN, UNKNOWN = 0.9, 0.5
@@ -75,6 +75,18 @@ def _bars_off(bars, motion, off):
     for n in range(len(bars)):
         square, variance = bar_error(bars[n, 0], bars[n, 1], motion[n, 0], motion[n, 1])
         off[n] = math.sqrt(square / variance)
+
+
+@machine_code(NOTHING(COUNTS, TWO, TWO))
+def _moved(frames, pixels, motion):
+    """Writes the slopes (n, 2) of pixels: at the ends those to the next, else of a parabola through three of them."""
+    last = len(frames) - 1
+    for n in range(last + 1):
+        before, after = float(frames[n] - frames[max(n - 1, 0)]), float(frames[min(n + 1, last)] - frames[n])
+        for axis in range(2):
+            to = (pixels[n, axis] - pixels[n - 1, axis]) / before if n else 0.0
+            on = (pixels[n + 1, axis] - pixels[n, axis]) / after if n < last else 0.0
+            motion[n, axis] = (after * to + before * on) / (before + after) if 0 < n < last else to + on
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,5 +168,7 @@ class Field:
         return bool((self.bar_off(rows, self.motion(rows)) < most).all())
 
     def motion(self, rows: Index) -> Array:
-        """(n, 2) px a picture, of an arc."""
-        return np.asarray(np.gradient(self.pixels[rows], self.frame[rows].astype(np.float64), axis=0))
+        """(n, 2) px a picture, of an arc: the slope of a parabola through each candidate and those beside it."""
+        motion = np.empty((len(rows), 2))
+        _moved(self.frame[rows], self.pixels[rows], motion)
+        return motion
