@@ -98,16 +98,16 @@ class Grower:
         """The stroke through some candidates with bounces at some times."""
         one = rated(*self._seen, rows, np.array(bounces))
         path = one.path
-        numbers = (np.array([number]) for number in (path.misfit, path.narrowed))
+        misfit, narrowed = np.array([path.misfit]), np.array([path.narrowed])
         own = (path.vectors[None], path.drag[None], path.covariance[None])
-        return Stroke(rows, bounces, Paths(one.times[None], len(bounces), *numbers, *own), one.score)
+        return Stroke(rows, bounces, Paths(one.times[None], len(bounces), misfit, narrowed, *own), one.score)
 
     def flights(self, seeds: Sequence[Index]) -> list[Stroke]:
         """The flights without a bounce through the candidates of each seed; those of equal length at once."""
         found, length = dict[int, Stroke](), np.array([len(rows) for rows in seeds])
         for count in np.unique(length):
             some = np.flatnonzero(length == count)
-            rows, k = np.stack([seeds[number] for number in some]), len(some)
+            rows, k = np.stack([seeds[number] for number in some.tolist()]), len(some)
             numbers, paths = np.empty((k, 4)), (np.empty((k, 3, 3)), np.empty((k, 1)), np.empty((k, 9, 9)))
             all_rated(*self._seen, rows, numbers, *paths)
             for number, row in zip(some.tolist(), range(k), strict=True):

@@ -130,9 +130,10 @@ def _regions(rise: Image, size: Array) -> Candidates:
     weight, mine = rise[y, x].astype(np.float64), labels[y, x]
     peak = np.zeros(count)
     np.maximum.at(peak, mine, weight)
-    centre, width, half = _bars(np.stack((x, y), axis=1).astype(np.float64), weight, mine, stats[:, :2])
+    corner: Array = stats[:, :2].astype(np.float64)
+    centre, width, half = _bars(np.stack((x, y), axis=1).astype(np.float64), weight, mine, corner)
     kept = np.flatnonzero((peak >= PEAK) & (width > THIN * size[0]) & (width < THICK * size[1]))
-    centre, width, half, peak, area = (one[kept] for one in (centre, width, half, peak, areas))
+    centre, width, half, peak, area = centre[kept], width[kept], half[kept], peak[kept], areas[kept]
     length = 2.0 * np.hypot(*half.T)
     filled = np.minimum(1.0, area / np.maximum(width * (length + width), 1.0))
     scores = np.clip(peak / (peak + 60.0) * filled, 0.0, 1.0)
@@ -144,7 +145,7 @@ def _regions(rise: Image, size: Array) -> Candidates:
     return Candidates(centre[order], spread[order], scores[order], streaks[order])
 
 
-def _bars(pixels: Array, weight: Array, mine: Index, corner: Index) -> tuple[Array, Array, Array]:
+def _bars(pixels: Array, weight: Array, mine: Index, corner: Array) -> tuple[Array, Array, Array]:
     """Centres (k, 2) px, widths (k,) px and halves of the lengths (k, 2) px of bars; of width zero without pixels.
 
     A swept disc of diameter w and length l has the variances w^2 / 16 across it and w^2 / 16 + l^2 / 12 along it.
