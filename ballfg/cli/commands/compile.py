@@ -59,7 +59,30 @@ def _parts(model: BallModel) -> list[Callable[[], object]]:
     streams = [Online(model, table, replace(settings, solver=solver)) for solver in SOLVERS]
     track = Track(*falling_ball(streams[0]), name="falling")
     noise = partial(estimate_noise, model, table, settings, [track], errors=False)
-    return [partial(smoother.estimate, track), noise, *(online.warm_up for online in streams)]
+    return [partial(smoother.estimate, track), noise, *(online.warm_up for online in streams), partial(_search, model)]
+
+
+def _search(model: BallModel) -> None:
+    """Looks for strokes in pictures with one candidate each, so that all functions of the search are there."""
+    import numpy as np
+
+    from ballfg.dynamics import Surfaces
+    from ballfg.estimation.rally.arcs import arcs
+    from ballfg.estimation.rally.field import Field
+    from ballfg.estimation.rally.strokes import Grower
+    from ballfg.estimation.segmentation.physics import physics_of
+    from ballfg.vision.camera import Camera
+    from ballfg.vision.detection.detections import Candidates, Detections
+
+    one = np.zeros((1, 2)), np.eye(2)[None], np.ones(1), np.full((1, 2, 2), np.nan)
+    found = Detections.of_frames("main", [(0.04 * k, Candidates(one[0] + 20.0 * k, *one[1:])) for k in range(5)])
+    matrix = np.array([[1000.0, 0.0, 640.0], [0.0, 1000.0, 360.0], [0.0, 0.0, 1.0]])
+    camera = Camera("main", (1280, 720), matrix, np.zeros(4), np.array([2.0, 0.0, 0.0]), np.array([0.0, 0.0, 9.0]))
+    seeds, field, _ = arcs(Field.of(found, 100.0))
+    grower = Grower.of(field, found.times, camera, physics_of(model), Surfaces.table_tennis(0.0))
+    for flight in grower.flights(seeds)[:1]:
+        grower.whole(flight)
+        list(grower.bounced(flight, 1))
 
 
 def export(

@@ -6,31 +6,25 @@ g s^2 / 2 by 1 + k v s / 3. Spin, where a scene has it, accelerates each flight 
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Final
+from functools import cached_property, lru_cache
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Index, plain
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.observations.ray_path import NEAREST, ROBUST, ROUNDS, SPREAD, Rays
+from ballfg.estimation.observations.bounced_code import NUMBERS, RAY, STRETCH_LIMIT, all_flown, shares_at
+from ballfg.estimation.observations.ray_path import SPREAD, Rays
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.state import Z
 
-SPEED: Final = 15.0  # m/s, prior standard deviation of each component of a velocity
 PLAY: Final = 1.0
 """Half diagonals of a table, prior standard deviation along each axis of the ball's place about its centre."""
-KEPT: Final = 0.8  # Share of the horizontal velocity that a bounce leaves; friction takes or adds some
-FRICTION_SIGMA: Final = 1.0  # m/s, standard deviation about it: the spin is unknown
-RESTITUTION_SIGMA: Final = 0.15  # m/s, of the vertical velocity after a bounce
-PLANE_SIGMA: Final = 1e-3  # m, of the height at which a ball bounces
-LAWS: Final = 5e-3  # m, standard deviation of the ball's place about a path of these laws, which leave out spin
 LIFT: Final = (2.0, 6.0, 6.0)
 """m/s^2, prior standard deviation of the acceleration by spin: 12 m/s and 170 rad/s; it stands across the flight, which
 goes along x."""
 ASIDE: Final = 0.1  # m beside the table where a bounce may seem to be
-STRETCH_LIMIT: Final = -0.8  # Least k v s: before that the ball would have come from infinity
 
 
 @dataclass(frozen=True)
@@ -49,6 +43,23 @@ class Scene:
         """m, of the ball's centre at a bounce."""
         return self.height + self.physics.radius + self.physics.surface_offset
 
+    @cached_property
+    def numbers(self) -> Any:
+        """The ball and its place for machine code, of `NUMBERS`."""
+        ball, place = self.physics, place_prior(self.surfaces)
+        own = (ball.gravity, ball.drag, ball.restitution, self.plane, *place, self.lift or (0.0, 0.0, 0.0))
+        return np.array([own], dtype=NUMBERS)[0]
+
+    @cached_property
+    def sightings(self) -> NDArray[np.void]:
+        """(m,) the rays for machine code, of `RAY`."""
+        found, rays = np.zeros(len(self.rays.times), dtype=RAY), self.rays
+        for name, values in zip(
+            RAY.names or (), (rays.times, rays.matrix, rays.target, rays.root, rays.depth_row), strict=True
+        ):
+            found[name] = values
+        return found
+
 
 @dataclass(frozen=True)
 class Paths:
@@ -63,67 +74,33 @@ class Paths:
     times: Array  # (k, max(b, 1)) s
     bounces: int
     misfit: Array  # (k,)
+    narrowed: Array  # (k,), logarithm of the share of its prior volume that a path has left: Occam's factor
     vectors: Array  # (k, c, 3), c = b + 2, or 2 b + 3 with lift
     drag: Array  # (k, b + 1) 1/s, k |v| of each flight
     covariance: Array  # (k, 3 c, 3 c)
 
 
-def solved(scene: Scene, times: Array, bounces: int) -> Paths:
+def solved(scene: Scene, times: Array, bounces: int, rows: Index | None = None) -> Paths:
     """The paths with bounces at guessed times (k, b) s, or of one flight about an anchor (k, 1) s.
 
-    Args: scene: with rays (m,) of all guesses, or (k, m) of each.
+    Args: rows: numbers (1 or k, m) of the scene's rays through which they go; None: all.
     """
-    rays, physics = scene.rays, scene.physics
-    k, m, size = len(times), rays.times.shape[-1], 3 * columns_of(scene, bounces)
-    drag, depth, weight = np.zeros((k, bounces + 1)), np.ones((k, m)), np.ones((k, m))
-    precision = LAWS**2 * np.linalg.det(rays.root)  # of a sighting, at 1 m, beside that of the laws
-    for _ in range(ROUNDS):
-        prior, target = _priors(scene, times, bounces, drag)
-        share, drop = shares_of(
-            np.atleast_2d(rays.times), times, bounces, drag, physics.gravity, lift=scene.lift is not None
-        )
-        root = rays.root / np.sqrt(depth**2 + precision)[..., None, None]
-        seen = (root @ rays.matrix)[:, :, :, None, :] * share[:, :, None, :, None]
-        seen = seen.reshape(k, 2 * m, size)
-        wanted = (root @ (rays.target + rays.matrix[..., Z] * drop[..., None])[..., None]).reshape(k, 2 * m)
-        pulled = seen.swapaxes(1, 2) * np.repeat(weight, 2, axis=1)[:, None]
-        turned = prior.swapaxes(1, 2)
-        information = pulled @ seen + turned @ prior
-        side = pulled @ wanted[..., None] + turned @ target[..., None]
-        unknown: Array = np.asarray(np.linalg.solve(information, side), dtype=np.float64)
-        square = (((seen @ unknown)[..., 0] - wanted).reshape(k, m, 2) ** 2).sum(axis=-1)
-        weight = 1.0 / (1.0 + square / ROBUST**2)
-        vectors = unknown.reshape(k, -1, 3)
-        drag = physics.drag * np.minimum(np.linalg.norm(vectors[:, 1 : bounces + 2], axis=-1), 2.0 * SPEED)
-        point = share @ vectors
-        point[..., Z] -= drop
-        depth = np.maximum((rays.depth_row[..., :3] * point).sum(axis=-1) + rays.depth_row[..., 3], NEAREST)
-    loss = ROBUST**2 * np.log1p(square / ROBUST**2).sum(axis=1)
-    misfit = loss + (((prior @ unknown)[..., 0] - target) ** 2).sum(axis=1)
-    return Paths(times, bounces, misfit, vectors, drag, np.asarray(np.linalg.inv(information), dtype=np.float64))
-
-
-def columns_of(scene: Scene, bounces: int) -> int:
-    """Number of vectors of a path."""
-    return bounces + 2 + (0 if scene.lift is None else bounces + 1)
+    k, count = len(times), bounces + 2 + (0 if scene.lift is None else bounces + 1)
+    rows = np.arange(len(scene.sightings))[None] if rows is None else rows
+    numbers, vectors, drag = np.empty((k, 2)), np.empty((k, count, 3)), np.empty((k, bounces + 1))
+    covariance, times = np.empty((k, 3 * count, 3 * count)), plain(times)
+    all_flown(scene.sightings, rows, scene.numbers, times, bounces, numbers, vectors, drag, covariance)
+    return Paths(times, bounces, numbers[:, 0], numbers[:, 1], vectors, drag, covariance)
 
 
 def shares_of(
     moments: Array, times: Array, bounces: int, drag: Array, gravity: float, *, lift: bool = False
 ) -> tuple[Array, Array]:
     """Positions at moments (1 or k, n) s as sums: shares (k, n, c) of the vectors, drops (k, n) m by gravity."""
-    later = (moments[..., None] > times[:, None, :]).sum(axis=2)[..., None] * (bounces > 0)
-    flight = np.arange(bounces + 1)
-    begin = times[:, None, np.maximum(flight - 1, 0)]
-    since = moments[..., None] - begin
-    for whole in range(1, bounces):  # a whole flight for all later moments
-        since[..., whole] = np.minimum(since[..., whole], times[:, whole, None] - times[:, whole - 1, None])
-    flown = np.where(flight > 0, later >= flight, later == 0)
-    square, slower = np.where(flown, 0.5 * since**2, 0.0), np.maximum(drag[:, None] * since, STRETCH_LIMIT)
-    # the time in which a ball without drag covers the same way
-    stretched = np.where(drag[:, None] > 0.0, np.log1p(slower) / np.where(drag > 0.0, drag, 1.0)[:, None], since)
-    parts = (np.ones_like(since[..., :1]), np.where(flown, stretched, 0.0), *((square,) if lift else ()))
-    return np.concatenate(parts, axis=2), gravity * (square / (1.0 + slower / 3.0)).sum(axis=2)
+    k, n = len(times), moments.shape[1]
+    share, drop = np.empty((k, n, bounces + 2 + lift * (bounces + 1))), np.empty((k, n))
+    shares_at(plain(moments), plain(times), bounces, plain(drag), gravity, share, drop)
+    return share, drop
 
 
 @lru_cache(maxsize=8)
@@ -133,36 +110,6 @@ def place_prior(surfaces: Surfaces) -> tuple[Array, float]:
         return np.array([0.0, 0.0, surfaces.table_height]), SPREAD
     low, high = np.array(surfaces.extent).reshape(2, 2).T
     return np.append((low + high) / 2, surfaces.table_height), PLAY * float(np.linalg.norm(high - low)) / 2
-
-
-def _priors(scene: Scene, times: Array, bounces: int, drag: Array) -> tuple[Array, Array]:
-    """Whitened rows (k, r, 3 (b + 2)) and their targets (k, r): wide priors, and the plane and laws of each bounce."""
-    (centre, spread), g, k = place_prior(scene.surfaces), scene.physics.gravity, len(times)
-    size, straight = 3 * columns_of(scene, bounces), 3 * (bounces + 2)
-    rows, targets = np.zeros((k, size + 4 * bounces, size)), np.zeros((k, size + 4 * bounces))
-    sigmas = np.concatenate((np.repeat((spread, SPEED), (3, straight - 3)), (scene.lift or ()) * (bounces + 1)))
-    rows[:, range(size), range(size)] = 1.0 / sigmas
-    targets[:, :3] = centre / spread
-    for bounce in range(bounces):
-        law, before, after = size + 4 * bounce, 3 + 3 * bounce, 6 + 3 * bounce
-        flown = times[:, bounce] - times[:, max(bounce - 1, 0)]
-        slowed = 1.0 / (1.0 + drag[:, bounce] * flown)
-        for axis in range(2):
-            rows[:, law + axis, after + axis] = 1.0 / FRICTION_SIGMA
-            rows[:, law + axis, before + axis] = -KEPT * slowed / FRICTION_SIGMA
-        rows[:, law + 2, after + Z] = 1.0 / RESTITUTION_SIGMA
-        rows[:, law + 2, before + Z] = scene.physics.restitution * slowed / RESTITUTION_SIGMA
-        fallen = g * flown / (1.0 + drag[:, bounce] * flown / 2.0)
-        targets[:, law + 2] = scene.physics.restitution * fallen / RESTITUTION_SIGMA
-        if bounce and scene.lift is not None:
-            turned = straight + 3 * bounce
-            rows[:, law, turned], rows[:, law + 1, turned + 1] = (-KEPT * flown / FRICTION_SIGMA,) * 2
-            rows[:, law + 2, turned + Z] = scene.physics.restitution * flown / RESTITUTION_SIGMA
-    if bounces:
-        share, drop = shares_of(times, times, bounces, drag, g, lift=scene.lift is not None)
-        rows[:, size + 3 :: 4, Z::3] = share / PLANE_SIGMA
-        targets[:, size + 3 :: 4] = (scene.plane + drop) / PLANE_SIGMA
-    return rows, targets
 
 
 def possible(scene: Scene, tried: Paths) -> NDArray[np.bool_]:
@@ -178,13 +125,6 @@ def possible(scene: Scene, tried: Paths) -> NDArray[np.bool_]:
         x, y, _ = (share @ tried.vectors)[:, 0].T
         fine &= (x >= ends[0] - ASIDE) & (x <= ends[1] + ASIDE) & (y >= ends[2] - ASIDE) & (y <= ends[3] + ASIDE)
     return np.asarray(fine)
-
-
-def narrowed(scene: Scene, tried: Paths) -> Array:
-    """(k,) logarithm of the share of its prior volume that a path has left: the factor of Occam in its evidence."""
-    rows, _ = _priors(scene, tried.times, tried.bounces, tried.drag)
-    before = np.linalg.slogdet(rows.swapaxes(1, 2) @ rows)[1]
-    return np.asarray(0.5 * (before + np.linalg.slogdet(tried.covariance)[1]))
 
 
 def velocities_of(tried: Paths, row: int, moments: Array, gravity: float) -> Array:

@@ -16,7 +16,8 @@ from ballfg.checks import listed, shown
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.nominal import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.observations.bounced_path import LAWS, place_prior
+from ballfg.estimation.observations.bounced_code import LAWS
+from ballfg.estimation.observations.bounced_path import place_prior
 from ballfg.estimation.observations.observation import Context, Observation, Unknowns
 from ballfg.estimation.observations.one_view import OneView, bounced_at, one_view
 from ballfg.estimation.observations.ray_path import Rays, determined, filled, rough_path

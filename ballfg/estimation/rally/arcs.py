@@ -7,16 +7,19 @@ bars must agree with the motion.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from itertools import pairwise, product
-from typing import Final
+from itertools import product
+from typing import Any, Final
 
 import numpy as np
+from numba import types
 
-from ballfg.arrays import Array, Index
-from ballfg.estimation.rally.field import Field
+from ballfg.arrays import Index, Mask
+from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, INDEX, NOTHING, ONE, REAL, TWO, several
+from ballfg.estimation.rally.field import Field, along
 
 FASTEST: Final = 40.0
 """m/s, of a ball."""
@@ -40,6 +43,7 @@ AGREE: Final = 3.0
 """Standard deviations of a bar about its motion."""
 EXPOSURES: Final = np.linspace(0.0, 1.0, 41)
 """Of the step, that are tried."""
+FLAGS: Final[Any] = types.Array(types.boolean, 2, "C")
 
 
 @dataclass
@@ -83,7 +87,9 @@ def arcs(field: Field) -> tuple[list[Index], Field, Foretold]:
 
     Returns: the arcs, the field with the exposure that they show, and how often they foretell candidates.
     """
-    used, tally = set[tuple[int, int]](), Foretold([], [], [])
+    tally, frames = Foretold([], [], []), len(field.first) - 1
+    widest = max((field.first[min(k + 1 + APART, frames)] - field.first[k + 1] for k in range(frames)), default=0)
+    used = np.zeros((len(field.frame), int(widest)), dtype=bool)
     every = [field.rows(frame) for frame in range(len(field.first) - 1)]
     found = _begun(field, every, (1,), used, tally)
     long = sorted((rows for rows in found if len(rows) >= LEAST), key=lambda rows: -len(rows))
@@ -95,37 +101,28 @@ def arcs(field: Field) -> tuple[list[Index], Field, Foretold]:
     return sorted(found, key=lambda rows: -len(rows)), field, tally
 
 
-def _begun(
-    field: Field, rows_of: Sequence[Index], gaps: Sequence[int], used: set[tuple[int, int]], tally: Foretold
-) -> list[Index]:
-    """Arcs that begin with three of the rows of pictures, so many pictures apart, and were not used before."""
+def _begun(field: Field, rows_of: Sequence[Index], gaps: Sequence[int], used: Mask, tally: Foretold) -> list[Index]:
+    """Arcs that begin with three of the rows of pictures, so many pictures apart, and were not used before.
+
+    Args: used: (n, k) of each candidate and those of the next pictures whether an arc holds both; is overwritten.
+    """
     found, bend = list[Index](), TURNING * field.step**2 * field.scale
     for frame in range(1, len(rows_of) - 1):
         for before, after in product(gaps, gaps):
             if not before <= frame < len(rows_of) - after:
                 continue
-            for triple in _triples(field, [rows_of[frame + k] for k in (-before, 0, after)], before, after, bend):
-                if (triple[0], triple[1]) in used and (triple[1], triple[2]) in used:
-                    continue
-                rows = list(triple)
-                _extend(field, rows, 1, bend, tally)
-                rows.reverse()
-                _extend(field, rows, -1, bend, tally)
-                rows.reverse()
-                used.update(pairwise(rows))
-                found.append(np.array(rows))
-                if len(rows) > len(triple):  # beyond pictures without the ball an arc may go on through a bounce
-                    found.append(np.array(triple))
+            three = _triples(field, [rows_of[frame + k] for k in (-before, 0, after)], before, after, bend)
+            flat, ends, asked, met = _followed(field.frame, field.pixels, field.bars, field.first, three, bend, used)
+            found += np.split(flat, ends)[:-1]
+            tally.rows += three[asked].tolist()
+            tally.met += (met > 0).tolist()
+            tally.area += [np.pi * _reach(bend, 0) ** 2] * len(asked)
     return found
 
 
-def _triples(
-    field: Field, rows: Sequence[Index], before: int, after: int, bend: float
-) -> Iterator[tuple[int, int, int]]:
-    """Rows of three pictures that may be one ball, smoothest first: of one `before` and one `after` the middle one."""
+def _triples(field: Field, rows: Sequence[Index], before: int, after: int, bend: float) -> Index:
+    """Rows (k, 3) of three pictures that may be one ball, smoothest first: `before` and `after` the middle one."""
     a, b, c = rows
-    if not (len(a) and len(b) and len(c)):
-        return
     step = (field.pixels[b][None] - field.pixels[a][:, None]) / before
     length = np.linalg.norm(step, axis=2)
     i, j = np.nonzero((length < FASTEST * field.step * field.scale) & (length > SLOWEST * field.step * field.scale))
@@ -137,33 +134,93 @@ def _triples(
     good = np.all([field.along(three[:, n], motion) for n in range(3)], axis=0)
     if max(before, after) > 1:
         good &= np.all([field.bar_off(three[:, n], motion) < AGREE for n in range(3)], axis=0)
-    yield from three[good][np.argsort(off[pair, k][good], kind="stable")].tolist()
+    return three[good][np.argsort(off[pair, k][good], kind="stable")]
 
 
-def _extend(field: Field, rows: list[int], way: int, bend: float, tally: Foretold) -> None:
-    """Goes on with rows in the order of `way`, 1 or -1, as long as candidates continue them."""
-    missed, frame = 0, int(field.frame[rows[-1]])
+@machine_code(REAL(REAL, COUNT))
+def _reach(bend, missed):
+    """Distance, px, from where it is foretold, within which a candidate continues an arc that just missed some."""
+    return NOISE + 0.35 * (bend + NOISE) * (1 + missed) ** 2
+
+
+@machine_code(NOTHING(COUNTS, TWO, COUNTS, COUNT, ONE, ONE))
+def _ahead(frames, pixels, rows, frame, place, motion):
+    """Writes place (2,) px and motion (2,) px a picture in a picture, by a parabola through points (n,)."""
+    s = np.zeros(5)
+    for row in rows:
+        for power in range(5):
+            s[power] += float(frames[row] - frame) ** power
+    # rows of the inverse of the normal equations' matrix, times its determinant
+    own = (s[2] * s[4] - s[3] * s[3], s[2] * s[3] - s[1] * s[4], s[1] * s[3] - s[2] * s[2])
+    way = (own[1], s[0] * s[4] - s[2] * s[2], s[1] * s[2] - s[0] * s[3])
+    size = s[0] * own[0] + s[1] * own[1] + s[2] * own[2]
+    place[:], motion[:] = 0.0, 0.0
+    for row in rows:
+        t = float(frames[row] - frame)
+        for axis in range(2):
+            place[axis] += (own[0] + own[1] * t + own[2] * t * t) / size * pixels[row, axis]
+            motion[axis] += (way[0] + way[1] * t + way[2] * t * t) / size * pixels[row, axis]
+
+
+@machine_code(COUNT(COUNTS, TWO, TWO, COUNTS, COUNTS, COUNTS, COUNT, REAL))
+def _extend(frames, pixels, bars, begins, arc, span, way, bend):
+    """Goes on with an arc, rows span[0] to span[1] of `arc`, after it (way 1) or before it, as candidates continue it.
+
+    Overwrites: arc, span. Returns: 1 if the next picture has a candidate that continues it, 0 if not, -1 if none is.
+    """
+    missed, first, place, motion = 0, -1, np.empty(2), np.empty(2)
+    frame = frames[arc[span[1] - 1 if way > 0 else span[0]]]
     while missed <= MISSED:
         frame += way
-        if not 0 <= frame < len(field.first) - 1:
-            return
-        last = np.array(rows[-MEMORY:])
-        place = _ahead(tuple((field.frame[last] - frame).tolist())) @ field.pixels[last]
-        here, reach = field.rows(frame), NOISE + 0.35 * (bend + NOISE) * (1 + missed) ** 2
-        off = np.linalg.norm(field.pixels[here] - place[0], axis=1)
-        off[~field.along(here, np.tile(place[1], (len(here), 1)))] = np.inf
-        near = len(here) > 0 and bool(off.min() < reach)
-        if len(rows) == 3 and not missed:
-            tally.rows.append(rows[:])
-            tally.met.append(near)
-            tally.area.append(np.pi * reach**2)
-        if near:
-            rows.append(int(here[np.argmin(off)]))
-        missed = 0 if near else missed + 1
+        if not 0 <= frame < len(begins) - 1:
+            break
+        begin = max(span[1] - MEMORY, span[0]) if way > 0 else span[0]
+        _ahead(frames, pixels, arc[begin : min(begin + MEMORY, span[1])], frame, place, motion)
+        nearest, best = _reach(bend, missed), -1
+        for row in range(begins[frame], begins[frame + 1]):
+            off = math.hypot(pixels[row, 0] - place[0], pixels[row, 1] - place[1])
+            if off < nearest and along(bars[row, 0], bars[row, 1], motion[0], motion[1]):
+                nearest, best = off, row
+        if first < 0:
+            first = int(best >= 0)
+        missed = 0 if best >= 0 else missed + 1
+        if best >= 0 and way > 0:
+            arc[span[1]] = best
+            span[1] += 1
+        elif best >= 0:
+            span[0] -= 1
+            arc[span[0]] = best
+    return first
 
 
-@lru_cache(maxsize=1024)
-def _ahead(since: tuple[int, ...]) -> Array:
-    """(2, n) weights of points so many pictures away, in their place and motion now: those of a parabola's fit."""
-    design = np.stack([np.array(since, dtype=np.float64) ** n for n in range(min(len(since), 3))], axis=1)
-    return np.asarray(np.linalg.pinv(design)[:2])
+@machine_code(several(COUNTS, 4)(COUNTS, TWO, TWO, COUNTS, INDEX, REAL, FLAGS))
+def _followed(frames, pixels, bars, begins, triples, bend, used):
+    """The arcs that triples (k, 3) begin, and these themselves, but for those whose pairs are used; overwrites used.
+
+    Returns: rows of all arcs; where each one ends among them; the triples that foretold a fourth candidate, ahead or
+    behind, and 1 where it was there.
+    """
+    flat, ends, asked, met = [0][:0], [0][:0], [0][:0], [0][:0]
+    arc, span = np.empty(2 * len(begins) + 3, dtype=np.int64), np.empty(2, dtype=np.int64)
+    for k in range(len(triples)):
+        a, b, c = triples[k, 0], triples[k, 1], triples[k, 2]
+        if used[a, b - begins[frames[a] + 1]] and used[b, c - begins[frames[b] + 1]]:
+            continue
+        span[0], span[1] = len(begins), len(begins) + 3
+        arc[span[0]], arc[span[0] + 1], arc[span[0] + 2] = a, b, c
+        for way in (1, -1):
+            three = span[1] - span[0] == 3
+            there = _extend(frames, pixels, bars, begins, arc, span, way, bend)
+            if three and there >= 0:
+                asked.append(k)
+                met.append(there)
+        for place in range(span[0], span[1]):
+            flat.append(arc[place])
+            if place > span[0]:
+                used[arc[place - 1], arc[place] - begins[frames[arc[place - 1]] + 1]] = True
+        ends.append(len(flat))
+        if span[1] - span[0] > 3:  # beyond pictures without the ball an arc may go on through a bounce
+            for row in triples[k]:
+                flat.append(row)
+            ends.append(len(flat))
+    return np.array(flat), np.array(ends), np.array(asked), np.array(met)

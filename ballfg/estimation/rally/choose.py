@@ -13,7 +13,6 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from scipy.special import logsumexp
 
 from ballfg.arrays import Array, Index
 from ballfg.estimation.rally.hits import Hits
@@ -203,10 +202,10 @@ def best_sequence(grower: Grower, hits: Hits, strokes: Sequence[Stroke]) -> Chos
         if j and ways.max() > begins[j]:
             before[j] = int(np.argmax(ways))
             best[j] = ways.max() + score[j]
-        forward[j] = score[j] + logsumexp(np.append(forward[:j] + link[:j, j], begins[j]))
+        forward[j] = score[j] + np.logaddexp.reduce(np.append(forward[:j] + link[:j, j], begins[j]))
     for i in range(count - 1, -1, -1):
-        backward[i] = logsumexp(np.append(link[i] + score + backward, 0.0))
-    total = logsumexp(np.append(forward, 0.0))
+        backward[i] = np.logaddexp.reduce(np.append(link[i] + score + backward, 0.0))
+    total = np.logaddexp.reduce(np.append(forward, 0.0))
     chain, at = list[int](), int(np.argmax(best))
     while best.max() > 0.0 and at >= 0:
         chain.append(at)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from numba import types
 
-from ballfg.arrays import Array, Index, Mask
+from ballfg.arrays import Array, Index, Mask, plain
+from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.signatures import COUNTS, FLAG, NOTHING, ONE, REAL, TWO, several
 from ballfg.vision.detection.detections import Detections
 
 SEEN, UNKNOWN = 0.9, 0.5
@@ -27,6 +31,64 @@ LONG: Final = 8.0
 """px of a bar and of a motion whose directions are compared."""
 
 
+@machine_code(several(REAL, 2)(REAL, REAL, REAL, REAL))
+def bar_error(x, y, to_x, to_y):
+    """px^2, squared distance of a bar from a motion while the shutter is open, either way around; its variance."""
+    off = min((x - to_x) ** 2 + (y - to_y) ** 2, (x + to_x) ** 2 + (y + to_y) ** 2)
+    return off, BAR_SIGMA**2 + BAR_SHARE**2 * (to_x**2 + to_y**2)
+
+
+@machine_code(REAL(REAL, REAL, REAL, REAL, REAL))
+def bar_gain(x, y, to_x, to_y, usual):
+    """Logarithm of how much likelier a bar is a ball's, which moved so while the shutter was open, than clutter's."""
+    if not usual:
+        return 0.0
+    off, variance = bar_error(x, y, to_x, to_y)
+    ratio = math.exp(-0.5 * off / variance) / (2.0 * math.pi * variance) / usual
+    return math.log(STRAY + (1.0 - STRAY) * ratio)
+
+
+@machine_code(FLAG(REAL, REAL, REAL, REAL))
+def along(x, y, to_x, to_y):
+    """True if a bar lies along a motion, or one of both is short."""
+    long, far = math.hypot(x, y), math.hypot(to_x, to_y)
+    return not (long > LONG and far > LONG and abs(x * to_y - y * to_x) > math.sin(ASKEW) * long * far)
+
+
+@machine_code(NOTHING(TWO, TWO, types.Array(types.boolean, 1, "C")))
+def _all_along(bars, motion, good):
+    """Writes `along` of bars (n, 2)."""
+    for n in range(len(bars)):
+        good[n] = along(bars[n, 0], bars[n, 1], motion[n, 0], motion[n, 1])
+
+
+@machine_code(NOTHING(TWO, TWO, ONE, ONE))
+def _bar_gains(bars, motion, usual, gain):
+    """Writes `bar_gain` of bars (n, 2)."""
+    for n in range(len(bars)):
+        gain[n] = bar_gain(bars[n, 0], bars[n, 1], motion[n, 0], motion[n, 1], usual[n])
+
+
+@machine_code(NOTHING(TWO, TWO, ONE))
+def _bars_off(bars, motion, off):
+    """Writes the standard deviations (n,) between bars (n, 2) and motions."""
+    for n in range(len(bars)):
+        square, variance = bar_error(bars[n, 0], bars[n, 1], motion[n, 0], motion[n, 1])
+        off[n] = math.sqrt(square / variance)
+
+
+@machine_code(NOTHING(COUNTS, TWO, TWO))
+def _moved(frames, pixels, motion):
+    """Writes the slopes (n, 2) of pixels: at the ends those to the next, else of a parabola through three of them."""
+    last = len(frames) - 1
+    for n in range(last + 1):
+        before, after = float(frames[n] - frames[max(n - 1, 0)]), float(frames[min(n + 1, last)] - frames[n])
+        for axis in range(2):
+            to = (pixels[n, axis] - pixels[n - 1, axis]) / before if n else 0.0
+            on = (pixels[n + 1, axis] - pixels[n, axis]) / after if n < last else 0.0
+            motion[n, axis] = (after * to + before * on) / (before + after) if 0 < n < last else to + on
+
+
 @dataclass(frozen=True, eq=False)
 class Field:
     """The candidates of a recording as one fixed camera would see them, sorted by picture.
@@ -35,7 +97,7 @@ class Field:
         frame: (n,) numbers of their pictures.  pixels: (n, 2).  covariances: (n, 2, 2) px^2.
         bars: (n, 2) px from end to end, zero where not blurred.
         density: (n,) 1/px^2, of clutter that looks as much like a ball.
-        usual: (n,) 1/px^2, density of a bar like each one's among all candidates.
+        usual: (n,) 1/px^2, density of a bar like each one's among all candidates; 0 of a detector that gives none.
         first: (f + 1,) where each picture's begin.  stamps: (f,) s, of the pictures.  step: s between them, the median.
         scale: px for a m at the court.  exposure: of the step, during which the shutter is open.
         seen: probability that the ball is among the candidates of a picture.
@@ -66,7 +128,7 @@ class Field:
         number = (np.linalg.norm(bars, axis=1) // RING).astype(np.int64)
         share = (np.bincount(number) + 1.0) / (len(bars) + number.max(initial=0) + 1.0)
         usual = share[number] / (np.pi * RING**2 * (2.0 * number + 1.0))  # of rings about a bar of no length
-        rows = seen.frame, seen.pixels, seen.covariances, bars, density, usual
+        rows = plain(seen.frame), plain(pixels), plain(seen.covariances), bars, density, usual * bars.any()
         return cls(*rows, first, seen.frames, step, scale, seen=ball)
 
     def smooth(self, density: float) -> Field:
@@ -80,42 +142,33 @@ class Field:
 
     def along(self, rows: Index, motion: Array) -> Mask:
         """(n,) bool: the bars of rows (n,) lie along motions (n, 2) px, or one of both is short."""
-        bars = self.bars[rows]
-        cross = np.abs(bars[:, 0] * motion[:, 1] - bars[:, 1] * motion[:, 0])
-        long, far = np.linalg.norm(bars, axis=1), np.linalg.norm(motion, axis=1)
-        return np.asarray(~((long > LONG) & (far > LONG) & (cross > np.sin(ASKEW) * long * far)))
+        good: Mask = np.empty(len(rows), dtype=bool)
+        _all_along(self.bars[rows], motion, good)
+        return good
 
-    def gain(self, rows: Index, motion: Array) -> Array:
-        """(k,) logarithm of how much likelier candidates (k, n) are a ball than clutter, by their number and bars.
-
-        Their distances from a path count elsewhere. Args: motion: (k, n, 2) px a picture, of the ball.
-        """
-        spot = self.density[rows] * 2.0 * np.pi * np.sqrt(np.linalg.det(self.covariances[rows]))
-        return np.asarray((self.bar_gain(rows, motion, self.exposure) + np.log(self.seen / spot)).sum(axis=-1))
+    @property
+    def spot(self) -> Array:
+        """(n,) logarithm of how much likelier candidates are a ball than clutter, by their number alone."""
+        return np.asarray(np.log(self.seen / self.density / (2.0 * np.pi * np.sqrt(np.linalg.det(self.covariances)))))
 
     def bar_gain(self, rows: Index, motion: Array, exposure: float) -> Array:
-        """(..., n) of bars alone: a ball's is as long as its motion while the shutter is open, either way around."""
-        if not self.bars.any():  # a detector that gives centres only
-            return np.zeros(rows.shape)
-        off, variance = self._bar_errors(rows, motion, exposure)
-        ratio = np.exp(-0.5 * off / variance) / (2.0 * np.pi * variance) / self.usual[rows]
-        return np.asarray(np.log(STRAY + (1.0 - STRAY) * ratio))
+        """(n,) the same of bars alone, for motions (n, 2) px a picture and an exposure of the step."""
+        gain = np.empty(len(rows))
+        _bar_gains(self.bars[rows], exposure * motion, self.usual[rows], gain)
+        return gain
 
     def bar_off(self, rows: Index, motion: Array) -> Array:
         """(n,) standard deviations between bars and motions (n, 2) px a picture."""
-        off, variance = self._bar_errors(rows, motion, self.exposure)
-        return np.asarray(np.sqrt(off / variance))
+        off = np.empty(len(rows))
+        _bars_off(self.bars[rows], self.exposure * motion, off)
+        return off
 
     def agree(self, rows: Index, most: float) -> bool:
         """True if all bars of an arc lie within so many standard deviations of its motion."""
         return bool((self.bar_off(rows, self.motion(rows)) < most).all())
 
-    def _bar_errors(self, rows: Index, motion: Array, exposure: float) -> tuple[Array, Array]:
-        """(n,) px^2, squared distances of bars from motions while the shutter is open, and their variances."""
-        bars, true = self.bars[rows], exposure * motion
-        off = np.minimum(((bars - true) ** 2).sum(axis=-1), ((bars + true) ** 2).sum(axis=-1))
-        return off, BAR_SIGMA**2 + BAR_SHARE**2 * (true**2).sum(axis=-1)
-
     def motion(self, rows: Index) -> Array:
-        """(n, 2) px a picture, of an arc."""
-        return np.asarray(np.gradient(self.pixels[rows], self.frame[rows].astype(np.float64), axis=0))
+        """(n, 2) px a picture, of an arc: the slope of a parabola through each candidate and those beside it."""
+        motion = np.empty((len(rows), 2))
+        _moved(self.frame[rows], self.pixels[rows], motion)
+        return motion

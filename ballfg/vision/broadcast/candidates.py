@@ -13,7 +13,7 @@ from typing import Final
 import cv2
 import numpy as np
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Index
 from ballfg.progress import Watch, unwatched
 from ballfg.vision.arrays import Image
 from ballfg.vision.broadcast.court import Court
@@ -119,43 +119,51 @@ def _warped(image: Image, camera: Pinhole, onto: Pinhole) -> Image:
 def _regions(rise: Image, size: Array) -> Candidates:
     """Connected regions of a ball's width, as bars."""
     bright = cv2.threshold(rise, BRIGHTER, 1.0, cv2.THRESH_BINARY)[1]
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(bright, connectivity=8)
-    pixels, covariances, scores, streaks = [], [], [], []
-    sides, areas = stats[1:, 2:4], stats[1:, 4]
-    fine = (areas >= LEAST) & (sides.max(axis=1) < LONGEST + THICK * size[1]) & (sides.max(axis=1) >= THIN * size[0])
-    for k in np.flatnonzero(fine) + 1:
-        x, y, w, h, area = stats[k]
-        patch = np.where(labels[y : y + h, x : x + w] == k, rise[y : y + h, x : x + w], 0.0).astype(np.float64)
-        if patch.max() < PEAK:
-            continue
-        centre, width, half = _bar(patch)
-        if not THIN * size[0] < width < THICK * size[1]:
-            continue
-        centre += (x, y)
-        length = 2.0 * np.hypot(*half)
-        unit = half / max(np.hypot(*half), 1e-9)
-        spread = SIGMA**2 * np.eye(2) + (ALONG * length) ** 2 * np.outer(unit, unit)
-        pixels.append(centre)
-        covariances.append(spread)
-        streaks.append(np.stack((centre - half, centre + half)) if length > VISIBLE else np.full((2, 2), np.nan))
-        filled = min(1.0, area / max(width * (length + width), 1.0))
-        scores.append(float(np.clip(patch.max() / (patch.max() + 60.0) * filled, 0.0, 1.0)))
-    order = np.argsort(-np.array(scores), kind="stable")[:MOST]
-    if not len(order):
-        return Candidates.none()
-    return Candidates(*(np.array(one)[order] for one in (pixels, covariances, scores, streaks)))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(bright, connectivity=8)
+    sides, areas = stats[:, 2:4].max(axis=1), stats[:, 4]
+    fine = (areas >= LEAST) & (sides < LONGEST + THICK * size[1]) & (sides >= THIN * size[0])
+    fine[0] = False  # the ground
+    places = cv2.findNonZero(bright)
+    x, y = (np.zeros((0, 2), dtype=np.int64) if places is None else places.reshape(-1, 2)).T
+    used = fine[labels[y, x]]
+    x, y = x[used], y[used]
+    weight, mine = rise[y, x].astype(np.float64), labels[y, x]
+    peak = np.zeros(count)
+    np.maximum.at(peak, mine, weight)
+    corner: Array = stats[:, :2].astype(np.float64)
+    centre, width, half = _bars(np.stack((x, y), axis=1).astype(np.float64), weight, mine, corner)
+    kept = np.flatnonzero((peak >= PEAK) & (width > THIN * size[0]) & (width < THICK * size[1]))
+    centre, width, half, peak, area = centre[kept], width[kept], half[kept], peak[kept], areas[kept]
+    length = 2.0 * np.hypot(*half.T)
+    filled = np.minimum(1.0, area / np.maximum(width * (length + width), 1.0))
+    scores = np.clip(peak / (peak + 60.0) * filled, 0.0, 1.0)
+    unit = half / np.maximum(0.5 * length, 1e-9)[:, None]
+    spread = SIGMA**2 * np.eye(2) + ((ALONG * length) ** 2)[:, None, None] * unit[:, :, None] * unit[:, None]
+    streaks = np.stack((centre - half, centre + half), axis=1)
+    streaks[length <= VISIBLE] = np.nan
+    order = np.argsort(-scores, kind="stable")[:MOST]
+    return Candidates(centre[order], spread[order], scores[order], streaks[order])
 
 
-def _bar(patch: Array) -> tuple[Array, float, Array]:
-    """Centre (2,) px, width px and half of the length (2,) px of a bar with weights (h, w).
+def _bars(pixels: Array, weight: Array, mine: Index, corner: Array) -> tuple[Array, Array, Array]:
+    """Centres (k, 2) px, widths (k,) px and halves of the lengths (k, 2) px of bars; of width zero without pixels.
 
     A swept disc of diameter w and length l has the variances w^2 / 16 across it and w^2 / 16 + l^2 / 12 along it.
+
+    Args: pixels: (n, 2), with weights (n,) and numbers (n,) of their bars.  corner: (k, 2) px, near each bar.
     """
-    y, x = np.mgrid[: patch.shape[0], : patch.shape[1]]
-    total = patch.sum()
-    centre = np.array([(patch * x).sum(), (patch * y).sum()]) / total
-    dx, dy = x - centre[0], y - centre[1]
-    xx, xy, yy = (patch * dx * dx).sum() / total, (patch * dx * dy).sum() / total, (patch * dy * dy).sum() / total
-    (small, large), axes = np.linalg.eigh(np.array([[xx, xy], [xy, yy]]))
-    half = 0.5 * np.sqrt(12.0 * max(large - small, 0.0)) * axes[:, 1]
-    return centre, float(4.0 * np.sqrt(max(small, 0.0) + 1.0 / 24.0)), half
+    count = len(corner)
+
+    def mean(values: Array) -> Array:
+        return np.bincount(mine, weight * values, minlength=count) / total
+
+    total = np.maximum(np.bincount(mine, weight, minlength=count), 1e-9)
+    near = pixels - corner[mine]
+    centre = np.stack((mean(near[:, 0]), mean(near[:, 1])), axis=1)
+    x, y = (near - centre[mine]).T
+    xx, xy, yy = mean(x * x), mean(x * y), mean(y * y)
+    value, axes = np.linalg.eigh(np.stack((xx, xy, xy, yy), axis=1).reshape(-1, 2, 2))
+    small, large = np.maximum(value[:, 0], 0.0), value[:, 1]
+    half = 0.5 * np.sqrt(12.0 * np.maximum(large - value[:, 0], 0.0))[:, None] * axes[..., 1]
+    width = np.where(np.bincount(mine, minlength=count) > 0, 4.0 * np.sqrt(small + 1.0 / 24.0), 0.0)
+    return centre + corner, width, half

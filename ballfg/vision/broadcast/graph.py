@@ -136,7 +136,11 @@ def _noise(
     solved = [_camera(one, found, k) for k, one in enumerate(cameras)]
     pairs = [(like, one, lines) for like, one, lines in zip(cameras, solved, seen, strict=True) if lines is not None]
     line = np.concatenate([np.zeros(0, dtype=np.int64), *(lines.line for *_, lines in pairs)])
-    left = np.concatenate([np.zeros(0), *(_across(like, one, lines, off) for like, one, lines in pairs)])
+    parts = [
+        _across(one.project(lines.points) - like.project(lines.points), lines) + off[lines.line] - lines.offset
+        for like, one, lines in pairs
+    ]
+    left = np.concatenate([np.zeros(0), *parts])
     square = _weighed(left, noise.ridges[line])
     ridges = np.bincount(line, square, minlength=count) / np.maximum(np.bincount(line, minlength=count), 1)
     apart = [
@@ -157,10 +161,9 @@ def _weighed(left: Array, sigma: Array | float) -> Array:
     return np.asarray(left**2 / (1.0 + (left / sigma / ROBUST) ** 2))
 
 
-def _across(like: Pinhole, camera: Pinhole, lines: Ridges, off: Array) -> Array:
-    """(n,) px, across the lines, from the ridges seen to where a camera sees them, with lines that are off (l,)."""
-    apart = camera.project(lines.points) - like.project(lines.points)
-    return np.asarray((lines.normal * apart).sum(axis=1) + off[lines.line] - lines.offset)
+def _across(pixels: Array, lines: Ridges) -> Array:
+    """(n,) px, of pixels (n, 2) across the lines."""
+    return np.asarray((lines.normal * pixels).sum(axis=1))
 
 
 def _turn(k: int) -> int:
@@ -181,10 +184,12 @@ def _court_factor(k: int, like: Pinhole, lines: Ridges, noise: Array) -> gtsam.C
     """The ridges of picture k, whose cameras differ from `like` little. Args: noise: (l,) px, of each line's."""
     sigma = noise[lines.line]
     own_line = np.eye(len(lines.asked))[lines.line]
+    seen = _across(like.project(lines.points), lines) + lines.offset
 
     def error(_: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
         one = _camera(like, values, k)
-        left, scale = _robust(_across(like, one, lines, values.atVector(LINES)) / sigma)
+        off = values.atVector(LINES)[lines.line]
+        left, scale = _robust((_across(one.project(lines.points), lines) + off - seen) / sigma)
         if H is not None:
             scale = scale / sigma
             rows = scale[:, None] * np.einsum("na,nab->nb", lines.normal, slopes(one, lines.points)[1])
@@ -204,9 +209,10 @@ def _match_factor(k: int, like: Pinhole, match: Match, sigma: float) -> gtsam.Cu
     def error(_: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
         first, second = _camera(like, values, k - 1), _camera(like, values, k)
         own = first.directions(match.before)
-        pixels, slope = slopes(second, second.place + own @ first.turn)
-        left, scale = _robust(((pixels - match.now) / sigma).ravel())
+        points = second.place + own @ first.turn
+        left, scale = _robust(((second.project(points) - match.now) / sigma).ravel())
         if H is not None:
+            slope = slopes(second, points)[1]
             by_own = -slope[..., 3:6] @ first.turn.T  # a place that moves with the point leaves the picture as it is
             none, (a, b, c) = np.zeros(len(own)), own.T
             cross = np.stack((none, -c, b, c, none, -a, -b, a, none), axis=1).reshape(-1, 3, 3)

@@ -17,6 +17,7 @@ from ballfg.benchmarks.cameras.rallies import Truth
 from ballfg.estimation.rally import hits as hits_of
 from ballfg.estimation.rally.arcs import Foretold
 from ballfg.estimation.rally.choose import BEGINS, MOST_BOUNCES, PAUSE, SERVED, best_sequence
+from ballfg.estimation.rally.growth import halves, rated
 from ballfg.estimation.rally.hits import Hits
 from ballfg.estimation.rally.strokes import LEAST, Grower, Stroke
 from ballfg.state import POSITION
@@ -34,7 +35,7 @@ def test_the_path_through_a_balls_candidates_is_where_it_flew(made: tuple[Truth,
     of, shot, grower, _ = made
     for number in range(3):
         stroke, bounce = true_stroke(of, number, grower, shot)
-        times = grower.rays.times[stroke.rows]
+        times = grower.scene.rays.times[stroke.rows]
         assert len(times) >= 8
         true = np.array([state[POSITION] for state in map(of.at, times.tolist()) if state is not None])
         places, spread = grower.places_of(stroke.path, times)
@@ -55,7 +56,7 @@ def test_a_flight_goes_on_past_a_bounce_after_which_a_picture_lacks_the_ball(num
     hidden = stroke.rows[found.times[stroke.rows] > bounce][0]
     grower, _ = grower_of(found.select(np.arange(len(found)) != hidden), motion.shots[0])
     rows = true_stroke(of, number, grower, motion.shots[0])[0].rows
-    flight = grower.flown(rows[grower.rays.times[rows] < bounce], ())
+    flight = grower.flown(rows[grower.scene.rays.times[rows] < bounce], ())
     best = max(grower.bounced(flight, 1), key=lambda one: one.score)
     assert set(rows.tolist()) <= set(best.rows.tolist())
     assert best.bounces[0] == pytest.approx(bounce, abs=grower.field.step)
@@ -73,11 +74,13 @@ def test_a_stroke_that_flies_past_the_wrong_half_costs_as_much_as_it_says(
     made: tuple[Truth, Shot, Grower, list[Any]],
 ) -> None:
     of, shot, grower, _ = made
-    stroke, _ = true_stroke(of, 0, grower, shot)
-    back = replace(stroke.path, vectors=stroke.path.vectors * np.array([-1.0, 1.0, 1.0]))  # as far on the other half
-    back.vectors[0, 1:] *= np.array([-1.0, 1.0, 1.0])
-    assert grower._halves(stroke.path) == pytest.approx(0.0, abs=0.05)
-    assert grower._halves(back) == pytest.approx(5.0, abs=0.2)
+    stroke, bounce = true_stroke(of, 0, grower, shot)
+    *_, scene, view = grower._seen
+    path = rated(*grower._seen, stroke.rows, np.array([bounce])).path
+    vectors = path.vectors * np.array([-1.0, 1.0, 1.0])  # as far on the other half
+    vectors[1:] *= np.array([-1.0, 1.0, 1.0])
+    assert halves(scene, view, np.array([bounce]), 1, path) == pytest.approx(0.0, abs=0.05)
+    assert halves(scene, view, np.array([bounce]), 1, path._replace(vectors=vectors)) == pytest.approx(5.0, abs=0.2)
 
 
 def test_a_stroke_grows_from_three_of_its_candidates_and_has_those_between(
@@ -85,7 +88,7 @@ def test_a_stroke_grows_from_three_of_its_candidates_and_has_those_between(
 ) -> None:
     of, shot, grower, _ = made
     whole, bounce = true_stroke(of, 0, grower, shot)
-    rows = whole.rows[grower.rays.times[whole.rows] < bounce]
+    rows = whole.rows[grower.scene.rays.times[whole.rows] < bounce]
     known = {tuple(one.rows.tolist()) for one in grower.whole(grower.flown(rows[[0, 2, 4]], ()))}
     assert any(set(rows.tolist()) <= set(one) for one in known)
     (together, *_) = grower.flights([rows[[0, 2, 4]], rows[:4], rows[[1, 3, 4]]])
@@ -114,7 +117,8 @@ def test_a_hit_is_as_likely_as_the_normal_density_of_what_parts_the_paths(
     assert np.isneginf(found[np.tril_indices(3)]).all()
     for i in range(2):
         one, other = strokes[i], strokes[i + 1]
-        moments = np.linspace(grower.rays.times[one.rows[-1]], grower.rays.times[other.rows[0]], hits_of.MOMENTS)
+        ends = grower.scene.rays.times[[one.rows[-1], other.rows[0]]]
+        moments = np.linspace(*ends, hits_of.MOMENTS)
         pairs = [grower.places_of(stroke.path, moments) for stroke in (one, other)]
         density = [
             multivariate_normal(place, first + second + hits_of.HIT_SIGMA**2 * np.eye(3)).logpdf(other_place)
