@@ -47,9 +47,8 @@ def machine_code(signature: Any, may: Collection[str] = ()) -> Callable[[Callabl
     """
 
     def declared(function: Callable[..., Any]) -> Any:
-        dispatcher: Any = njit(error_model="numpy", fastmath=set(may))(
-            function
-        )  # numba's own would look for a zero in every division
+        compiler = njit(error_model="numpy", fastmath=set(may))  # numba's own would look for a zero in every division
+        dispatcher: Any = compiler(function)
         dispatcher._cache = Kept(function)
 
         def for_call(*_: Any, **__: Any) -> Any:
