@@ -101,15 +101,18 @@ def hypothesis_signatures(
 
 
 def columns_of(fit: Fit, candidates: Sequence[Hypothesis]) -> Array:
-    """Columns of all candidates, in their order; measurement effects by themselves: their further states are costly."""
-    parts: dict[int, Array] = {}
+    """(n, m, p) columns of all candidates, in their order; none without candidates.
+
+    Measurement effects are computed by themselves: their further states are costly.
+    """
+    none, parts = np.zeros((*fit.weighted_residual(fit.robust).shape, 0)), dict[int, Array]()
     for late in (False, True):
         group = [i for i, h in enumerate(candidates) if (h.effect.kind == "measurement") is late]
         if group:
             ends = np.cumsum([len(candidates[i].strengths) for i in group])[:-1]
             own = np.split(hypothesis_columns(fit, [candidates[i] for i in group]), ends, axis=-1)
             parts |= dict(zip(group, own, strict=True))
-    return np.concatenate([parts[i] for i in range(len(candidates))], axis=-1)
+    return np.concatenate([none, *(parts[i] for i in range(len(candidates)))], axis=-1)
 
 
 def hypothesis_columns(fit: Fit, group: Sequence[Hypothesis]) -> Array:

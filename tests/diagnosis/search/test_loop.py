@@ -206,6 +206,15 @@ def test_what_is_named_beside_something_nameless_is_as_strong_in_the_model(gusty
     assert float(written["measurement.frame_tilt.x"]) == pytest.approx(tilt.value)
 
 
+def test_something_nameless_is_weighed_where_no_further_effect_is_left_to_try(gusty, make_ball):
+    """A catalogue of one effect, which is named: its model has no neighbours, but may lack something nameless."""
+    search = replace(gusty, catalogue=[EFFECTS["frame_tilt"]], of_some=[]).run(make_ball())
+    assert search.odds.nameless > 0.99
+    assert [finding.name for finding in search.findings] == ["frame_tilt"]
+    (tilt,) = search.findings
+    assert abs(tilt.parameters["x"].value - 0.02) < 3 * tilt.parameters["x"].sigma
+
+
 def test_beside_something_nameless_effects_are_found_from_one_linearisation(gusty, make_ball):
     """Its evidence, strengths, what is left without each, and a fit without patterns."""
     found = Found(gusty, first_fit(make_ball(), gusty.holdout))
