@@ -40,6 +40,7 @@ def compile_ahead(
     models: dict[str, BallModel] = {name: nominal_model(name) for name in KNOWN_BALLS}
     models |= {str(path): load_model(path) for path in model or ()}
     parts = [part for one in models.values() for part in _parts(one)]
+    parts.append(partial(_search, models["table_tennis"]))  # its code is the same for all balls
     for part in progress(parts, len(parts), "parts compiled"):
         part()
     print(f"{', '.join(models)}: compiled, and kept in {cache_folder()}")
@@ -59,7 +60,7 @@ def _parts(model: BallModel) -> list[Callable[[], object]]:
     streams = [Online(model, table, replace(settings, solver=solver)) for solver in SOLVERS]
     track = Track(*falling_ball(streams[0]), name="falling")
     noise = partial(estimate_noise, model, table, settings, [track], errors=False)
-    return [partial(smoother.estimate, track), noise, *(online.warm_up for online in streams), partial(_search, model)]
+    return [partial(smoother.estimate, track), noise, *(online.warm_up for online in streams)]
 
 
 def _search(model: BallModel) -> None:

@@ -168,9 +168,7 @@ class Found:
         alone takes the values that make up for what no effect describes.
         """
         loop, best = self.loop, self.best
-        if (
-            not best.neighbours
-        ):  # no round looked beyond it: it has as many effects as may be, or the last round made it
+        if not best.neighbours:  # no round looked beyond it: it was the last, or as many effects as may be are there
             loop.watch("weighing what could stand in place of its effects")
             neighbours = screen_of(best, self.motion, loop.catalogue).neighbours
             self.best = self.models[best.names] = replace(best, neighbours=neighbours)

@@ -41,8 +41,6 @@ CUT: Final = 12
 goes on smoothly for some pictures after a hit."""
 SPEEDS: Final = (2.0, 40.0)
 """m/s, of a stroke, along the court at least and in all at most."""
-TOGETHER: Final = 2000
-"""Flights that are solved at once: more take more memory, and no less time."""
 ROOM: Final = (3.6, 3.6, 5.0)
 """Half lengths and half widths of the court, and half widths above it, in which a ball is in play."""
 
@@ -116,36 +114,14 @@ class Grower:
                 found[number] = Stroke(rows[row], (), Paths(numbers[one, 1:2], 0, *own), float(numbers[row, 0]))
         return [found[number] for number in range(len(seeds))]
 
-    def places(self, path: Paths, moments: Array) -> tuple[Array, Array]:
-        """Positions (k, n, 3) m of paths at moments (n,) or (k, n) s, and shares (k, n, c) of their vectors."""
-        share, drop = shares_of(
-            np.atleast_2d(moments), path.times, path.bounces, path.drag, self.scene.physics.gravity, lift=True
-        )
-        positions = share @ path.vectors
-        positions[..., Z] -= drop
-        return positions, share
-
-    def foretold(self, path: Paths, moments: Array) -> tuple[Array, Array]:
-        """Pixels (k, n, 2) of paths at moments (n,) or (k, n) s, and their covariances (k, n, 2, 2)."""
-        positions, share = self.places(path, moments)
-        spread = self._spread(path, share)
-        at = positions @ self.camera.rotation.T + self.camera.tvec
-        depth = np.maximum(at[..., 2:], 0.1)
-        seen = at[..., :2] / depth
-        slope = (self.camera.rotation[:2] - seen[..., None] * self.camera.rotation[2]) / depth[..., None]
-        slope *= self.camera.matrix[0, 0]
-        pixels = self.camera.matrix[0, 0] * seen + self.camera.matrix[:2, 2]
-        return pixels, slope @ spread @ slope.swapaxes(-1, -2)
-
-    def _spread(self, path: Paths, share: Array) -> Array:
-        """(k, n, 3, 3) m^2, covariances of positions that are shares (k, n, c) of a path's vectors."""
-        joint = path.covariance.reshape(len(share), share.shape[2], 3, share.shape[2], 3)
-        return np.asarray(np.einsum("kna,kaibj,knb->knij", share, joint, share))
-
     def places_of(self, path: Paths, moments: Array) -> tuple[Array, Array]:
-        """Positions (n, 3) m of a single path and their covariances (n, 3, 3)."""
-        positions, share = self.places(path, moments)
-        return positions[0], self._spread(path, share)[0]
+        """Positions (n, 3) m of a single path at moments (n,) s, and their covariances (n, 3, 3) m^2."""
+        gravity = self.scene.physics.gravity
+        (share,), (drop,) = shares_of(moments[None], path.times, path.bounces, path.drag, gravity, lift=True)
+        positions = share @ path.vectors[0]
+        positions[:, Z] -= drop
+        joint = path.covariance.reshape(share.shape[1], 3, share.shape[1], 3)
+        return positions, np.asarray(np.einsum("na,aibj,nb->nij", share, joint, share))
 
     def plausible(self, stroke: Stroke) -> bool:
         """True for a ball in play: its speed, its place, and its bounces on the court, seen on both sides."""
