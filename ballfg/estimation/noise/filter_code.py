@@ -11,8 +11,6 @@ from ballfg.state import STATE_DIM
 
 NEXT_FROM = 3
 """Number of samples that determine a state; the marginal likelihood counts the later ones."""
-GATE = 30.0
-"""Squared whitened innovation of three coordinates; beyond it, one in a million, a sample does not update."""
 NEXT_TAIL = 4.0
 """Standard deviations, of the norm of three coordinates, beyond which the score of a next sample grows linearly; a
 missed hit must not dominate the noise."""
@@ -156,7 +154,7 @@ def filter_tracks(
                 tail = NEXT_TAIL * math.sqrt(square) - 0.5 * NEXT_TAIL * NEXT_TAIL
                 nll[t] += 0.5 * square if square < NEXT_TAIL * NEXT_TAIL else tail
                 nll[t] -= math.log(root[0, 0] * root[1, 1] * root[2, 2])
-            if used[t, k] and square < GATE:
+            if used[t, k]:
                 prior = covariances[t, k]
                 prior[:] = p
                 _update(seen, root, new, m, p, gain)

@@ -13,7 +13,7 @@ import numpy as np
 
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNT, FIVE, FLAG, FOUR, INDEX, NOTHING, ONE, REAL, THREE, TWO
-from ballfg.estimation.noise.filter_code import GATE, NEXT_FROM, NEXT_TAIL
+from ballfg.estimation.noise.filter_code import NEXT_FROM, NEXT_TAIL
 from ballfg.estimation.noise.transition_code import is_something, pull, transpose
 from ballfg.state import STATE_DIM
 
@@ -138,8 +138,7 @@ def pull_back(
                         p[i, j] += 0.5 * (by_covariance[t, k, i, j] + by_covariance[t, k, j, i])
             seen, square = used[t, k] != 0, nis[t, k]
             share = by_following[t] if seen and k >= NEXT_FROM else 0.0
-            updated = seen and square < GATE
-            _before_update(d, gains[t, k], roots[t, k], weighted[t, k], square, updated, share, m, p, to_measured[t, k])
+            _before_update(d, gains[t, k], roots[t, k], weighted[t, k], square, seen, share, m, p, to_measured[t, k])
             if k:
                 to_decays[t, k - 1] = _before_prediction(
                     transitions[t, k - 1], decays[t, k - 1], kicks[t, k - 1], memory[t], means[t, k - 1],

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from ballfg.estimation.noise.filter_code import GATE, NEXT_FROM, NEXT_TAIL
+from ballfg.estimation.noise.filter_code import NEXT_FROM, NEXT_TAIL
 from ballfg.estimation.noise.linear_filter import LinearFilter, Noise
 from ballfg.state import POSITION, STATE_DIM
 
@@ -54,9 +54,7 @@ def run(tracks: LinearFilter, noise: Noise) -> tuple[Tensor, Tensor, Tensor, Ten
         if k >= NEXT_FROM:
             loss = torch.where(square < NEXT_TAIL**2, square / 2, NEXT_TAIL * square.sqrt() - NEXT_TAIL**2 / 2)
             nll = nll + linear.used[:, k] * (loss + torch.logdet(spread) / 2)
-        gain = (
-            torch.linalg.solve(spread, observe @ covariance).mT * (linear.used[:, k] & (square < GATE))[:, None, None]
-        )
+        gain = torch.linalg.solve(spread, observe @ covariance).mT * linear.used[:, k][:, None, None]
         mean = mean + (gain @ innovation)[..., 0]
         kept = torch.eye(tracks.width, dtype=torch.float64) - gain @ observe
         covariance = kept @ covariance @ kept.mT + gain @ measured[:, k] @ gain.mT

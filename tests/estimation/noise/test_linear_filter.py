@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ballfg.estimation import Settings, Smoother
-from ballfg.estimation.noise.filter_code import GATE, NEXT_TAIL
+from ballfg.estimation.noise.filter_code import NEXT_TAIL
 from ballfg.estimation.noise.linear_filter import LinearFilter, Noise
 from ballfg.estimation.noise.linear_tracks import linearise
 from ballfg.estimation.noise.marginal import MarginalFit
@@ -35,7 +35,7 @@ def linear(recorded):
     found = linearise(Smoother(model, surfaces, settings), parts)
     errors, used = found.errors.clone(), found.used.clone()
     errors[0, 20] += 0.010  # its loss grows linearly
-    errors[1, 25] += 0.4  # it does not update
+    errors[1, 25] += 0.4  # as the smoother would have left it out
     used[2, 10:13] = False
     assert not found.used.all()
     assert len(found.coefficient_sigmas)
@@ -75,11 +75,23 @@ def test_values_and_derivatives_are_those_of_torch(linear, biased, rows):
 
 
 def test_the_case_has_all_that_can_happen_to_a_sample(linear):
-    """Updates, a sample beyond the tail, and one beyond the gate; `linear` has some that are not used."""
+    """Samples within the tail, beyond it and far beyond it; `linear` has some that are not used."""
     tracks, noise = LinearFilter(linear, 10.0), noise_of(1)
     squares = in_torch.run(tracks, noise)[-1].detach()
-    assert NEXT_TAIL**2 < squares[0, 20] < GATE < squares[1, 25]
+    assert NEXT_TAIL**2 < squares[0, 20] < 100 * NEXT_TAIL**2 < squares[1, 25]
     assert (squares[linear.used] < NEXT_TAIL**2).sum() > 100
+
+
+def test_losses_change_by_the_integral_of_their_derivative(linear):
+    """From much noise to far too little: a sample that stops to count on the way would make them jump."""
+    tracks, parameters = LinearFilter(linear, 10.0), parameters_of(Settings(), linear, position_known=False)
+    fit = MarginalFit(tracks, Settings(), parameters, most=1)
+    scales = np.linspace(1.0, -4.0, 401)
+    losses, gradients = zip(*(fit.at(fit.start + scale) for scale in scales), strict=True)
+    slopes, total = np.sum(gradients, axis=2), np.array(losses)
+    step = scales[1] - scales[0]
+    simpson = step / 3.0 * (slopes[:-2:2] + 4.0 * slopes[1:-1:2] + slopes[2::2])
+    np.testing.assert_allclose(simpson, np.diff(total[::2], axis=0), rtol=1e-3, atol=1e-3)
 
 
 def test_a_covariance_that_is_none_is_refused(linear):
