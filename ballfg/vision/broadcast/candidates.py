@@ -118,20 +118,20 @@ def _warped(image: Image, camera: Pinhole, onto: Pinhole) -> Image:
 
 def _regions(rise: Image, size: Array) -> Candidates:
     """Connected regions of a ball's width, as bars."""
-    bright = cv2.threshold(rise, BRIGHTER, 1.0, cv2.THRESH_BINARY)[1]
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(bright, connectivity=8)
-    sides, areas = stats[:, 2:4].max(axis=1), stats[:, 4]
+    bright = rise > BRIGHTER
+    count, labels = cv2.connectedComponents(bright.view(np.uint8), connectivity=8)
+    y, x = np.divmod(np.flatnonzero(bright), bright.shape[1])
+    mine, pixels = labels[y, x], np.stack((x, y), axis=1).astype(np.float64)
+    corner, far = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+    np.minimum.at(corner, mine, pixels)
+    np.maximum.at(far, mine, pixels)
+    sides, areas = (far - corner).max(axis=1) + 1.0, np.bincount(mine, minlength=count)
     fine = (areas >= LEAST) & (sides < LONGEST + THICK * size[1]) & (sides >= THIN * size[0])
-    fine[0] = False  # the ground
-    places = cv2.findNonZero(bright)
-    x, y = (np.zeros((0, 2), dtype=np.int64) if places is None else places.reshape(-1, 2)).T
-    used = fine[labels[y, x]]
-    x, y = x[used], y[used]
-    weight, mine = rise[y, x].astype(np.float64), labels[y, x]
+    used = fine[mine]
+    pixels, mine, weight = pixels[used], mine[used], rise[y[used], x[used]].astype(np.float64)
     peak = np.zeros(count)
     np.maximum.at(peak, mine, weight)
-    corner: Array = stats[:, :2].astype(np.float64)
-    centre, width, half = _bars(np.stack((x, y), axis=1).astype(np.float64), weight, mine, corner)
+    centre, width, half = _bars(pixels, weight, mine, corner)
     kept = np.flatnonzero((peak >= PEAK) & (width > THIN * size[0]) & (width < THICK * size[1]))
     centre, width, half, peak, area = centre[kept], width[kept], half[kept], peak[kept], areas[kept]
     length = 2.0 * np.hypot(*half.T)
