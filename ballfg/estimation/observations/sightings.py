@@ -8,7 +8,6 @@ from functools import lru_cache
 from typing import ClassVar, Final, cast
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array, Index

@@ -169,12 +169,12 @@ def _best_in_each(
         first, last = grower.field.frame[stroke.rows[[0, -1]]]
         if taken[first : last + 1].min() >= most:
             continue
-        lacking = [(1 << len(kept)) - 1] * (alike + 1)  # those kept, as bits, that lack none of the rows, one at most, ...
-        for row in stroke.rows.tolist() if lacking else ():
-            for most_lacking in range(alike, 0, -1):
-                lacking[most_lacking] = lacking[most_lacking] & holders[row] | lacking[most_lacking - 1]
-            lacking[0] &= holders[row]
-        if not any(lacking) and admitted(stroke):
+        near = [(1 << len(kept)) - 1] * (alike + 1)  # those kept, as bits, that lack none of its rows, at most one
+        for row in stroke.rows.tolist() if near else ():
+            for lacking in range(alike, 0, -1):
+                near[lacking] = near[lacking] & holders[row] | near[lacking - 1]
+            near[0] &= holders[row]
+        if not any(near) and admitted(stroke):
             for row in stroke.rows.tolist():
                 holders[row] |= 1 << len(kept)
             kept.append(stroke)
