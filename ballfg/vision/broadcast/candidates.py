@@ -64,7 +64,7 @@ def find_candidates(
     for k, (_, image) in enumerate(watch(frames(), len(stamps), "pictures searched for the ball")):
         if not shot.first <= k < last:
             continue
-        window.append(image)
+        window.append(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2BGRA), dtype=np.uint8))  # warped twice as quickly
         if len(window) > 2 * FAR + 1:
             window.popleft()
         if len(window) > FAR and k - shot.first >= FAR:
@@ -95,7 +95,7 @@ def aligned_candidates(window: list[Image], index: int, cameras: tuple[Pinhole, 
             continue
         others = [_warped(window[i], cameras[i], cameras[index]) for i in beside]
         most = others[0] if len(others) == 1 else cv2.max(*others)
-        blue, green, red = cv2.split(cv2.subtract(here, most))
+        blue, green, red, *_ = cv2.split(cv2.subtract(here, most))
         change = np.minimum(np.minimum(blue, green), red).astype(np.uint8)
         rise = change if rise is None else np.maximum(rise, change)
     if rise is None:
@@ -111,8 +111,7 @@ def _warped(image: Image, camera: Pinhole, onto: Pinhole) -> Image:
     if np.abs(there - grid).max() < 0.05:
         return image
     homography = cv2.findHomography(grid, there, 0)[0]
-    white = (255.0, 255.0, 255.0)
-    seen = cv2.warpPerspective(image, homography, (width, height), flags=cv2.INTER_LINEAR, borderValue=white)
+    seen = cv2.warpPerspective(image, homography, (width, height), flags=cv2.INTER_LINEAR, borderValue=(255.0,) * 4)
     return np.asarray(seen, dtype=np.uint8)
 
 
