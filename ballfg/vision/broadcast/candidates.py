@@ -8,12 +8,15 @@ place is a candidate; a ball that moves while the shutter is open is a bar, whos
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
+from itertools import islice
 from typing import Final
 
 import cv2
 import numpy as np
 
 from ballfg.arrays import Array, Index
+from ballfg.parallel.parts import in_threads
 from ballfg.progress import Watch, unwatched
 from ballfg.vision.arrays import Image
 from ballfg.vision.broadcast.court import Court
@@ -52,26 +55,22 @@ def find_candidates(
     Args: frames: opens the video.  radius: m, of the ball.  stamps: (f,) s, of all pictures.
     Returns: pixels as in the pictures, with camera `main`; frames are those of the shot.
     """
-    window, found = deque[Image](), list[tuple[float, Candidates]]()
-    size = _diameters(shot, court, radius)
-    last = shot.first + len(shot)
+    size, count = _diameters(shot, court, radius), len(shot)
 
-    def centre(index: int) -> None:
-        number = len(found)
-        here = aligned_candidates(list(window), index, shot.cameras[number - index :][: len(window)], size[number])
-        found.append((float(stamps[shot.first + number]), here))
+    def windows() -> Iterator[tuple[list[Image], int, tuple[Pinhole, ...], Array]]:
+        every = enumerate(watch(frames(), len(stamps), "pictures searched for the ball"))
+        mine = (image for k, (_, image) in every if shot.first <= k < shot.first + count)
+        window = deque[Image](maxlen=2 * FAR + 1)
+        for number in range(-FAR, count):
+            for image in islice(mine, 1):  # OpenCV warps four channels twice as quickly as three
+                window.append(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2BGRA), dtype=np.uint8))
+            if number >= 0:
+                begin = min(number + FAR + 1, count) - len(window)
+                yield list(window), number - begin, shot.cameras[begin : begin + len(window)], size[number]
 
-    for k, (_, image) in enumerate(watch(frames(), len(stamps), "pictures searched for the ball")):
-        if not shot.first <= k < last:
-            continue
-        window.append(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2BGRA), dtype=np.uint8))  # warped twice as quickly
-        if len(window) > 2 * FAR + 1:
-            window.popleft()
-        if len(window) > FAR and k - shot.first >= FAR:
-            centre(len(window) - 1 - FAR)
-    while len(found) < len(shot):
-        centre(len(window) - (len(shot) - len(found)))
-    return Detections.of_frames("main", found)
+    found = in_threads(lambda one: aligned_candidates(*one), windows())
+    times = stamps[shot.first : shot.first + count].tolist()
+    return Detections.of_frames("main", zip(times, found, strict=True))
 
 
 def _diameters(shot: Shot, court: Court, radius: float) -> Array:
