@@ -172,17 +172,17 @@ def _root(information):
     return size
 
 
-@machine_code(NOTHING(TWO, ONE))
-def _solve(root, side):
-    """Overwrites a side (n,) by the solution with the matrix whose Cholesky root (n, n) is given."""
-    for i in range(len(side)):
-        for j in range(i):
+@machine_code(NOTHING(TWO, ONE, COUNT))
+def _solve(root, side, first):
+    """Overwrites a side (n,), zero before `first`, by the solution with the matrix whose root (n, n) is given."""
+    for i in range(first, len(side)):
+        for j in range(first, i):
             side[i] -= root[i, j] * side[j]
         side[i] /= root[i, i]
     for i in range(len(side) - 1, -1, -1):
-        for j in range(i + 1, len(side)):
-            side[i] -= root[j, i] * side[j]
         side[i] /= root[i, i]
+        for j in range(i):
+            side[j] -= root[i, j] * side[i]
 
 
 @machine_code(NOTHING(ONE_RAY, REAL, REAL, TWO, ONE))
@@ -204,7 +204,7 @@ def _whitened(ray, depth, drop, seen, wanted):
 @machine_code(NOTHING(RAYS, COUNTS, ONE, ONE, TWO, TWO, ONE))
 def _see(rays, rows, depth, weight, shares, information, side):
     """Adds the equations of rays (m,) at depths (m,) m, with weights, to an information (3 c, 3 c) and its pull."""
-    count, seen, wanted = shares.shape[1] - 1, np.empty((2, 3)), np.empty(2)
+    count, seen, wanted, both = shares.shape[1] - 1, np.empty((2, 3)), np.empty(2), np.empty((3, 3))
     for n in range(len(rows)):
         _whitened(rays[rows[n]], depth[n], shares[n, count], seen, wanted)
         for c in range(count):
@@ -212,9 +212,11 @@ def _see(rays, rows, depth, weight, shares, information, side):
             for a in range(3):
                 side[3 * c + a] += share * (seen[0, a] * wanted[0] + seen[1, a] * wanted[1])
                 for b in range(3):
-                    both = share * (seen[0, a] * seen[0, b] + seen[1, a] * seen[1, b])
-                    for d in range(c + 1):
-                        information[3 * c + a, 3 * d + b] += both * shares[n, d]
+                    both[a, b] = share * (seen[0, a] * seen[0, b] + seen[1, a] * seen[1, b])
+            for d in range(c + 1):
+                for a in range(3):
+                    for b in range(3):
+                        information[3 * c + a, 3 * d + b] += both[a, b] * shares[n, d]
 
 
 @machine_code(REAL(RAYS, COUNTS, TWO, TWO, ONE, ONE))
@@ -251,7 +253,7 @@ def flown(rays, rows, scene, times, bounces):
         _prior(scene, times, bounces, drag, information, unknown)
         _see(rays, rows, depth, weight, shares, information, unknown)
         known = _root(information)
-        _solve(information, unknown)
+        _solve(information, unknown, 0)
         vectors[:] = unknown.reshape(count, 3)
         misfit = _miss(rays, rows, shares, vectors, depth, weight)
         if turn == ROUNDS - 1:
@@ -263,7 +265,7 @@ def flown(rays, rows, scene, times, bounces):
     for i in range(size):
         covariance[i] = 0.0
         covariance[i, i] = 1.0
-        _solve(information, covariance[i])
+        _solve(information, covariance[i], i)
     _prior(scene, times, bounces, drag, information, unknown)
     return Flown(misfit, 0.5 * (_root(information) - known), vectors, drag, covariance)
 
