@@ -8,7 +8,7 @@ from numba import from_dtype, types
 
 from ballfg.arrays import Array
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, INDEX, NOTHING, ONE, REAL, THREE, TWO
+from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, FLAG, INDEX, NOTHING, ONE, REAL, THREE, TWO
 from ballfg.estimation.observations.ray_path import NEAREST, ROBUST, ROUNDS
 
 SPEED: Final = 15.0  # m/s, prior standard deviation of each component of a velocity
@@ -240,9 +240,12 @@ def _miss(rays, rows, shares, vectors, depth, weight):
     return loss
 
 
-@machine_code(FLOWN(RAYS, COUNTS, SCENE, ONE, COUNT))
-def flown(rays, rows, scene, times, bounces):
-    """The path through some rays (m,) with bounces at times (b,) s; without bounces `times` is an anchor (1,) s."""
+@machine_code(FLOWN(RAYS, COUNTS, SCENE, ONE, COUNT, FLAG))
+def flown(rays, rows, scene, times, bounces, wide):
+    """The path through some rays (m,) with bounces at times (b,) s; without bounces `times` is an anchor (1,) s.
+
+    Args: wide: False leaves out the covariance, which takes a third of the time, and the narrowing.
+    """
     m, count = len(rows), bounces + 2 + (bounces + 1 if scene.lift[0] > 0.0 else 0)
     size, drag, vectors, shares = 3 * count, np.zeros(bounces + 1), np.empty((count, 3)), np.empty((m, count + 1))
     information, covariance, unknown = np.empty((size, size)), np.empty((size, size)), np.empty(size)
@@ -262,6 +265,8 @@ def flown(rays, rows, scene, times, bounces):
             v = vectors[1 + flight]
             speed = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
             drag[flight] = scene.drag * min(speed, 2.0 * SPEED)
+    if not wide:
+        return Flown(misfit, 0.0, vectors, drag, covariance)
     for i in range(size):
         covariance[i] = 0.0
         covariance[i, i] = 1.0
@@ -272,8 +277,14 @@ def flown(rays, rows, scene, times, bounces):
 
 @machine_code(NOTHING(RAYS, INDEX, SCENE, TWO, COUNT, TWO, THREE, TWO, THREE))
 def all_flown(rays, rows, scene, times, bounces, numbers, vectors, drag, covariance):
-    """`flown` for times (k, b) s and rays (1 or k, m). Writes: numbers (k, 2), misfit and narrowed, and the others."""
+    """`flown` for times (k, b) s and rays (1 or k, m). Writes: numbers (k, 2), misfit and narrowed, and the others.
+
+    Args: covariance: (k, 3 c, 3 c); (0, 3 c, 3 c) to leave them out.
+    """
+    wide = len(covariance) > 0
     for k in range(len(times)):
-        one = flown(rays, rows[k if len(rows) > 1 else 0], scene, times[k], bounces)
+        one = flown(rays, rows[k if len(rows) > 1 else 0], scene, times[k], bounces, wide)
         numbers[k, 0], numbers[k, 1] = one.misfit, one.narrowed
-        vectors[k], drag[k], covariance[k] = one.vectors, one.drag, one.covariance
+        vectors[k], drag[k] = one.vectors, one.drag
+        if wide:
+            covariance[k] = one.covariance
