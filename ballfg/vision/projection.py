@@ -45,8 +45,8 @@ class CameraBank:
         local = (self._rotation[camera] @ points.unsqueeze(-1)).squeeze(-1) + self._tvec[camera]
         depth = local[:, 2:]
         seen = (depth > 0.0) & (local[:, :2].detach().norm(dim=-1, keepdim=True) <= self._widest[camera, None] * depth)
-        plane = local[:, :2] / torch.where(seen, depth, torch.nan)
-        bent = torch.stack(_distorted(*plane.unbind(-1), self._distortion[camera].unbind(-1)), dim=-1)
+        x, y = (local[:, :2] / torch.where(seen, depth, torch.nan)).unbind(-1)
+        bent = torch.stack(_distorted(x, y, self._distortion[camera].unbind(-1)), dim=-1)
         if self._tilt is not None:
             tilted = (self._tilt[camera] @ torch.cat((bent, torch.ones_like(depth)), dim=-1).unsqueeze(-1)).squeeze(-1)
             bent = tilted[:, :2] / tilted[:, 2:]
@@ -107,9 +107,9 @@ def _bent(x: Array, y: Array, d: Array) -> tuple[Array, Array]:
     grows = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / below
     by_u, by_v = x * grows + 2 * (s1 + 2 * r2 * s2), y * grows + 2 * (s3 + 2 * r2 * s4)
     mixed = 2 * (p1 * x + p2 * y)
-    slope = (radial + x * by_u + 2 * p1 * y + 6 * p2 * x, y * by_u + mixed)
-    slope += (x * by_v + mixed, radial + y * by_v + 6 * p1 * y + 2 * p2 * x)
-    return np.stack(_distorted(x, y, d), axis=1), np.stack(slope, axis=1).reshape(-1, 2, 2)
+    along = radial + x * by_u + 2 * p1 * y + 6 * p2 * x, y * by_u + mixed
+    across = x * by_v + mixed, radial + y * by_v + 6 * p1 * y + 2 * p2 * x
+    return np.stack(_distorted(x, y, list(d)), axis=1), np.stack(along + across, axis=1).reshape(-1, 2, 2)
 
 
 def _tilt(tau_x: float, tau_y: float) -> Tensor:

@@ -119,7 +119,7 @@ def _regions(rise: Image, size: Array) -> Candidates:
     bright = rise > BRIGHTER
     count, labels = cv2.connectedComponents(bright.view(np.uint8), connectivity=8)
     y, x = np.divmod(np.flatnonzero(bright), bright.shape[1])
-    mine, pixels = labels[y, x], np.stack((x, y), axis=1).astype(np.float64)
+    mine, pixels = labels[y, x].astype(np.int64), np.stack((x, y), axis=1).astype(np.float64)
     corner, far = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
     np.minimum.at(corner, mine, pixels)
     np.maximum.at(far, mine, pixels)
