@@ -87,7 +87,7 @@ class CameraFactors(FactorBatch):
         state, root, column = inputs[0], self.root[rows], self.column[rows]
         tau = self.delay[rows] - _own(inputs[1:], column)
         velocity = state[:, VELOCITY]
-        points = torch.from_numpy(state[:, POSITION] + tau[:, None] * velocity)
+        points = state[:, POSITION] + tau[:, None] * velocity
         numbers, by_point, by_change = self._seen(points, rows, inputs[1:])
         residual = (root @ (numbers[:, :2] - self.pixels[rows])[..., None])[..., 0]
         slope, change = root @ by_point[:, :2], root @ by_change[:, :2]
@@ -106,12 +106,13 @@ class CameraFactors(FactorBatch):
         self._add(by_coefficient, rows, change)
         return residual, (by_state, by_coefficient)
 
-    def _seen(self, points: Tensor, rows: Index | slice, coefficients: tuple[Array, ...]) -> tuple[Array, Array, Array]:
+    def _seen(self, points: Array, rows: Index | slice, coefficients: tuple[Array, ...]) -> tuple[Array, Array, Array]:
         """Pixels and radius (k, r) of points (k, 3) m, derivatives (k, r, 3), and those by changes of the camera."""
-        camera = torch.from_numpy(self.camera[rows])
-        numbers, slope = (t.numpy() for t in self.bank.jacobian(points, camera))
+        camera = self.camera[rows]
+        numbers, slope = self.bank.jacobian(points, camera)
         if self.dim == 3:
-            seen, by_place = (t.numpy() for t in self.bank.radius(points, camera, self.ball))
+            both = torch.from_numpy(points), torch.from_numpy(camera)
+            seen, by_place = (t.numpy() for t in self.bank.radius(*both, self.ball))
             numbers = np.concatenate((numbers, seen[:, None]), axis=1)
             slope = np.concatenate((slope, by_place[:, None]), axis=1)
         return numbers, slope, np.zeros((len(points), self.dim, 0))

@@ -43,19 +43,15 @@ class UncertainCameraFactors(CameraFactors):
         """(k, 7) index of each row's coefficients; of an exact camera any."""
         return np.asarray(np.maximum(self.place[rows], 0)[:, None] + np.arange(CHANGES))
 
-    def _change(self, rows: Index | slice, coefficients: Tensor) -> Tensor:
-        """(k, 7) changes of the rows' cameras."""
-        own = coefficients.gather(1, torch.from_numpy(self._columns(rows)))
-        return (torch.from_numpy(self.spread[self.camera[rows]]) @ own[..., None])[..., 0]
-
-    def _seen(self, points: Tensor, rows: Index | slice, coefficients: tuple[Array, ...]) -> tuple[Array, Array, Array]:
+    def _seen(self, points: Array, rows: Index | slice, coefficients: tuple[Array, ...]) -> tuple[Array, Array, Array]:
         """As for exact cameras, for the point that they would see; derivatives by the changes (k, r, 7)."""
         camera = self.camera[rows]
-        change = self._change(rows, torch.from_numpy(np.ascontiguousarray(coefficients[0])))
-        numbers, slope, _ = super()._seen(seen_at(points, self.centres[camera], change), rows, coefficients)
-        by_point, by_place = (t.numpy() for t in slopes_of(points, self.centres[camera], change))
-        zoom = np.exp(change[:, ZOOM].numpy())[:, None]
-        middle = np.pad(self.middles[camera].numpy(), ((0, 0), (0, self.dim - 2)))
+        own = np.take_along_axis(coefficients[0], self._columns(rows), axis=1)
+        change = (self.spread[camera] @ own[..., None])[..., 0]
+        seen, by_point, by_place = slopes_of(points, self.centres.numpy()[camera], change)
+        numbers, slope, _ = super()._seen(seen, rows, coefficients)
+        zoom = np.exp(change[:, ZOOM])[:, None]
+        middle = np.pad(self.middles.numpy()[camera], ((0, 0), (0, self.dim - 2)))
         grown, slope = zoom * (numbers - middle), zoom[..., None] * slope
         by_change = np.concatenate((slope @ by_place, grown[..., None]), axis=2)
         return middle + grown, slope @ by_point, by_change
@@ -68,7 +64,8 @@ class UncertainCameraFactors(CameraFactors):
 
     def _projected(self, points: Tensor, coefficients: tuple[Tensor, ...]) -> Tensor:
         """As for exact cameras, for the point that they would see."""
-        change = self._change(slice(None), coefficients[0])
+        own = coefficients[0].gather(1, torch.from_numpy(self._columns(slice(None))))
+        change = (torch.from_numpy(self.spread[self.camera]) @ own[..., None])[..., 0]
         numbers = super()._projected(seen_at(points, self.centres[self.camera], change), coefficients)
         middle = torch.nn.functional.pad(self.middles[self.camera], (0, self.dim - 2))
         return middle + change[:, ZOOM, None].exp() * (numbers - middle)

@@ -1,6 +1,8 @@
 """Computes the parts of one large piece of work wherever the work around it may run."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import ContextVar
 from functools import partial
 from itertools import islice
@@ -40,3 +42,23 @@ def in_parts(function: Callable[[T], R], parts: Sequence[T], together: int) -> I
     stream = iter(parts)
     chunks = iter(lambda: list(islice(stream, together)), [])
     yield from in_order(partial(each, function), chunks, others)
+
+
+def in_threads(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """A function of each item of a stream, in order, a few ahead: on as many threads as `with_jobs` has processes.
+
+    For large items and functions of libraries that let other threads run meanwhile, such as OpenCV's of pictures.
+
+    Raises: the function's exceptions.
+    """
+    jobs, pending = _JOBS.get(), deque[Future[R]]()
+    if jobs < 2:
+        yield from map(function, items)
+        return
+    with ThreadPoolExecutor(jobs) as threads:
+        for item in items:
+            pending.append(threads.submit(function, item))
+            if len(pending) > 2 * jobs:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()

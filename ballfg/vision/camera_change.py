@@ -38,14 +38,17 @@ def seen_at(points: Tensor, centre: Tensor, change: Tensor) -> Tensor:
     return centre + away + torch.linalg.cross(away, change[:, TURN])
 
 
-def slopes_of(points: Tensor, centre: Tensor, change: Tensor) -> tuple[Tensor, Tensor]:
-    """Derivatives of X' by the points (n, 3, 3), and by turn and move (n, 3, 6)."""
-    by_point = torch.eye(3, dtype=points.dtype) - skew(change[:, TURN])
-    return by_point, torch.cat((skew(points - centre - change[:, MOVE]), -by_point), dim=-1)
+def slopes_of(points: Array, centre: Array, change: Array) -> tuple[Array, Array, Array]:
+    """`seen_at` (n, 3) m, and its derivatives by the points (n, 3, 3), and by turn and move (n, 3, 6)."""
+    by_point, away = np.eye(3) - skew(change[:, TURN]), points - centre - change[:, MOVE]
+    moved = centre + (by_point @ away[..., None])[..., 0]
+    return moved, by_point, np.concatenate((skew(away), -by_point), axis=2)
 
 
-def skew(vectors: Tensor) -> Tensor:
+def skew(vectors: Array) -> Array:
     """(n, 3, 3) whose products with b are the cross products of vectors (n, 3) and b."""
-    x, y, z = vectors.unbind(-1)
-    zero = torch.zeros_like(x)
-    return torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), dim=-1).reshape(*vectors.shape, 3)
+    found = np.zeros((*vectors.shape, 3))
+    x, y, z = vectors.T
+    found[:, 0, 1], found[:, 0, 2], found[:, 1, 2] = -z, y, -x
+    found[:, 1, 0], found[:, 2, 0], found[:, 2, 1] = z, -y, x
+    return found

@@ -44,7 +44,7 @@ def of_corners(first: Pinhole, court: Court, seen: Array, sigma: float) -> Pinho
     camera, known = first, np.isfinite(seen).all(axis=1)
     for _ in range(10):
         pixels, slope = slopes(camera, court.corners[known])
-        rows, left = slope[..., :7].reshape(-1, 7) / sigma, (seen[known] - pixels).ravel() / sigma
+        rows, left = slope.reshape(-1, 7) / sigma, (seen[known] - pixels).ravel() / sigma
         information, pull = rows.T @ rows, rows.T @ left
         information[3:6, 3:6] += np.eye(3) / PLACE[1] ** 2
         pull[3:6] += (np.array(PLACE[0]) - camera.place) / PLACE[1] ** 2

@@ -15,6 +15,7 @@ import pytest
 from ballfg.arrays import Array
 from ballfg.dynamics import nominal_model
 from ballfg.estimation import ExtendedKalmanFilter, Online, Settings, Smoother
+from ballfg.parallel.parts import in_threads, with_jobs
 from ballfg.simulation import SimulationConfig, simulate
 from ballfg.simulation.balls import table_tennis
 from ballfg.tracks import Track
@@ -115,3 +116,34 @@ def test_the_first_estimates_of_a_process_may_begin_together_and_then_a_fork_mak
         check=False,
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "1\n0\n", "")
+
+
+@pytest.mark.parametrize("jobs", [1, 3])
+def test_a_stream_in_threads_keeps_its_order_and_a_few_items_only(jobs: int) -> None:
+    """The first of each three waits for the other two: on fewer threads it would wait in vain."""
+    begun, together, most = list[int](), Barrier(jobs), list[int]()
+
+    def stream() -> Iterator[int]:
+        for number in range(9 * jobs):
+            begun.append(number)
+            yield number
+
+    def squared(number: int) -> int:
+        together.wait(timeout=30.0)
+        return number**2
+
+    def consumed(_: None) -> list[int]:
+        found = []
+        for one in in_threads(squared, stream()):
+            most.append(len(begun) - len(found))
+            found.append(one)
+        return found
+
+    assert with_jobs(jobs, consumed, None) == [number**2 for number in range(9 * jobs)]
+    assert max(most) <= 2 * jobs + 1
+
+    def wrong(number: int) -> int:
+        return 1 // (number - 2)
+
+    with pytest.raises(ZeroDivisionError):
+        with_jobs(jobs, lambda _: list(in_threads(wrong, range(9))), None)

@@ -56,16 +56,22 @@ def test_rays_lead_to_what_was_projected(count: int) -> None:
     np.testing.assert_allclose(rays, towards, atol=1e-9)
 
 
-def test_jacobian_agrees_with_differences() -> None:
-    bent = camera(14)
-    bank = CameraBank([bent])
-    world = points(bent, 20)
-    number = torch.zeros(len(world), dtype=torch.int64)
-    _, jacobian = bank.jacobian(torch.from_numpy(world), number)
+@pytest.mark.parametrize("count", list(DISTORTIONS))
+def test_jacobian_agrees_with_autograd_and_differences_of_opencv(count: int) -> None:
+    bent = camera(count)
+    bank = CameraBank([camera(0, name="other", tvec=[0, 0, 5.0]), bent])
+    world, number = points(bent, 20), np.ones(20, dtype=np.int64)
+    pixels, jacobian = bank.jacobian(world, number)
+    place = torch.from_numpy(world).requires_grad_()
+    seen = bank.project(place, torch.from_numpy(number))
+    np.testing.assert_allclose(pixels, seen.detach().numpy(), rtol=1e-12)
+    for axis in range(2):
+        (slope,) = torch.autograd.grad(seen[:, axis].sum(), place, retain_graph=True)
+        np.testing.assert_allclose(jacobian[:, axis], slope.numpy(), rtol=1e-9, atol=1e-9)
     for axis in range(3):
         step = np.eye(3)[axis] * 1e-5
         slope = (bent.project(world + step) - bent.project(world - step)) / 2e-5
-        np.testing.assert_allclose(jacobian[..., axis].numpy(), slope, rtol=1e-6, atol=1e-5)
+        np.testing.assert_allclose(jacobian[..., axis], slope, rtol=1e-6, atol=1e-5)
 
 
 def test_what_is_behind_the_camera_is_not_seen() -> None:
@@ -75,6 +81,7 @@ def test_what_is_behind_the_camera_is_not_seen() -> None:
     assert not bent.in_view(behind)
     bank = CameraBank([bent])
     assert bank.project(torch.from_numpy(behind)[None], torch.zeros(1, dtype=torch.int64)).isnan().all()
+    assert all(np.isnan(found).all() for found in bank.jacobian(behind[None], np.zeros(1, dtype=np.int64)))
 
 
 def test_view_ends_at_the_image() -> None:

@@ -8,7 +8,7 @@ from numba import from_dtype, types
 
 from ballfg.arrays import Array
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, INDEX, NOTHING, ONE, REAL, THREE, TWO
+from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, FLAG, INDEX, NOTHING, ONE, REAL, THREE, TWO
 from ballfg.estimation.observations.ray_path import NEAREST, ROBUST, ROUNDS
 
 SPEED: Final = 15.0  # m/s, prior standard deviation of each component of a velocity
@@ -172,17 +172,17 @@ def _root(information):
     return size
 
 
-@machine_code(NOTHING(TWO, ONE))
-def _solve(root, side):
-    """Overwrites a side (n,) by the solution with the matrix whose Cholesky root (n, n) is given."""
-    for i in range(len(side)):
-        for j in range(i):
+@machine_code(NOTHING(TWO, ONE, COUNT))
+def _solve(root, side, first):
+    """Overwrites a side (n,), zero before `first`, by the solution with the matrix whose root (n, n) is given."""
+    for i in range(first, len(side)):
+        for j in range(first, i):
             side[i] -= root[i, j] * side[j]
         side[i] /= root[i, i]
     for i in range(len(side) - 1, -1, -1):
-        for j in range(i + 1, len(side)):
-            side[i] -= root[j, i] * side[j]
         side[i] /= root[i, i]
+        for j in range(i):
+            side[j] -= root[i, j] * side[i]
 
 
 @machine_code(NOTHING(ONE_RAY, REAL, REAL, TWO, ONE))
@@ -204,7 +204,7 @@ def _whitened(ray, depth, drop, seen, wanted):
 @machine_code(NOTHING(RAYS, COUNTS, ONE, ONE, TWO, TWO, ONE))
 def _see(rays, rows, depth, weight, shares, information, side):
     """Adds the equations of rays (m,) at depths (m,) m, with weights, to an information (3 c, 3 c) and its pull."""
-    count, seen, wanted = shares.shape[1] - 1, np.empty((2, 3)), np.empty(2)
+    count, seen, wanted, both = shares.shape[1] - 1, np.empty((2, 3)), np.empty(2), np.empty((3, 3))
     for n in range(len(rows)):
         _whitened(rays[rows[n]], depth[n], shares[n, count], seen, wanted)
         for c in range(count):
@@ -212,9 +212,11 @@ def _see(rays, rows, depth, weight, shares, information, side):
             for a in range(3):
                 side[3 * c + a] += share * (seen[0, a] * wanted[0] + seen[1, a] * wanted[1])
                 for b in range(3):
-                    both = share * (seen[0, a] * seen[0, b] + seen[1, a] * seen[1, b])
-                    for d in range(c + 1):
-                        information[3 * c + a, 3 * d + b] += both * shares[n, d]
+                    both[a, b] = share * (seen[0, a] * seen[0, b] + seen[1, a] * seen[1, b])
+            for d in range(c + 1):
+                for a in range(3):
+                    for b in range(3):
+                        information[3 * c + a, 3 * d + b] += both[a, b] * shares[n, d]
 
 
 @machine_code(REAL(RAYS, COUNTS, TWO, TWO, ONE, ONE))
@@ -238,9 +240,12 @@ def _miss(rays, rows, shares, vectors, depth, weight):
     return loss
 
 
-@machine_code(FLOWN(RAYS, COUNTS, SCENE, ONE, COUNT))
-def flown(rays, rows, scene, times, bounces):
-    """The path through some rays (m,) with bounces at times (b,) s; without bounces `times` is an anchor (1,) s."""
+@machine_code(FLOWN(RAYS, COUNTS, SCENE, ONE, COUNT, FLAG))
+def flown(rays, rows, scene, times, bounces, wide):
+    """The path through some rays (m,) with bounces at times (b,) s; without bounces `times` is an anchor (1,) s.
+
+    Args: wide: False leaves out the covariance, which takes a third of the time, and the narrowing.
+    """
     m, count = len(rows), bounces + 2 + (bounces + 1 if scene.lift[0] > 0.0 else 0)
     size, drag, vectors, shares = 3 * count, np.zeros(bounces + 1), np.empty((count, 3)), np.empty((m, count + 1))
     information, covariance, unknown = np.empty((size, size)), np.empty((size, size)), np.empty(size)
@@ -251,7 +256,7 @@ def flown(rays, rows, scene, times, bounces):
         _prior(scene, times, bounces, drag, information, unknown)
         _see(rays, rows, depth, weight, shares, information, unknown)
         known = _root(information)
-        _solve(information, unknown)
+        _solve(information, unknown, 0)
         vectors[:] = unknown.reshape(count, 3)
         misfit = _miss(rays, rows, shares, vectors, depth, weight)
         if turn == ROUNDS - 1:
@@ -260,18 +265,26 @@ def flown(rays, rows, scene, times, bounces):
             v = vectors[1 + flight]
             speed = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
             drag[flight] = scene.drag * min(speed, 2.0 * SPEED)
+    if not wide:
+        return Flown(misfit, 0.0, vectors, drag, covariance)
     for i in range(size):
         covariance[i] = 0.0
         covariance[i, i] = 1.0
-        _solve(information, covariance[i])
+        _solve(information, covariance[i], i)
     _prior(scene, times, bounces, drag, information, unknown)
     return Flown(misfit, 0.5 * (_root(information) - known), vectors, drag, covariance)
 
 
 @machine_code(NOTHING(RAYS, INDEX, SCENE, TWO, COUNT, TWO, THREE, TWO, THREE))
 def all_flown(rays, rows, scene, times, bounces, numbers, vectors, drag, covariance):
-    """`flown` for times (k, b) s and rays (1 or k, m). Writes: numbers (k, 2), misfit and narrowed, and the others."""
+    """`flown` for times (k, b) s and rays (1 or k, m). Writes: numbers (k, 2), misfit and narrowed, and the others.
+
+    Args: covariance: (k, 3 c, 3 c); (0, 3 c, 3 c) to leave them out.
+    """
+    wide = len(covariance) > 0
     for k in range(len(times)):
-        one = flown(rays, rows[k if len(rows) > 1 else 0], scene, times[k], bounces)
+        one = flown(rays, rows[k if len(rows) > 1 else 0], scene, times[k], bounces, wide)
         numbers[k, 0], numbers[k, 1] = one.misfit, one.narrowed
-        vectors[k], drag[k], covariance[k] = one.vectors, one.drag, one.covariance
+        vectors[k], drag[k] = one.vectors, one.drag
+        if wide:
+            covariance[k] = one.covariance

@@ -80,15 +80,17 @@ class Paths:
     covariance: Array  # (k, 3 c, 3 c)
 
 
-def solved(scene: Scene, times: Array, bounces: int, rows: Index | None = None) -> Paths:
+def solved(scene: Scene, times: Array, bounces: int, rows: Index | None = None, *, wide: bool = True) -> Paths:
     """The paths with bounces at guessed times (k, b) s, or of one flight about an anchor (k, 1) s.
 
-    Args: rows: numbers (1 or k, m) of the scene's rays through which they go; None: all.
+    Args:
+        rows: numbers (1 or k, m) of the scene's rays through which they go; None: all.
+        wide: False leaves out covariances and `narrowed`, for guesses of which one is solved again.
     """
     k, count = len(times), bounces + 2 + (0 if scene.lift is None else bounces + 1)
     rows = np.arange(len(scene.sightings))[None] if rows is None else rows
     numbers, vectors, drag = np.empty((k, 2)), np.empty((k, count, 3)), np.empty((k, bounces + 1))
-    covariance, times = np.empty((k, 3 * count, 3 * count)), plain(times)
+    covariance, times = np.empty((k * wide, 3 * count, 3 * count)), plain(times)
     all_flown(scene.sightings, rows, scene.numbers, times, bounces, numbers, vectors, drag, covariance)
     return Paths(times, bounces, numbers[:, 0], numbers[:, 1], vectors, drag, covariance)
 

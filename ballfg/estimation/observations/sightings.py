@@ -8,7 +8,6 @@ from functools import lru_cache
 from typing import ClassVar, Final, cast
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array, Index
@@ -202,8 +201,7 @@ class CameraSightings(Observation):
         """
         rows = (self.state >= first) & (self.state < first + len(positions))
         state, seen = self.state[rows] - first, self.sightings.select(rows)
-        points, camera = torch.from_numpy(positions[state]), torch.from_numpy(seen.camera)
-        pixels, slope = (tensor.numpy() for tensor in _bank(self.cameras).jacobian(points, camera))
+        pixels, slope = _bank(self.cameras).jacobian(positions[state], seen.camera)
         spread = slope @ covariances[state] @ slope.swapaxes(1, 2) + seen.covariances
         scale = np.sqrt(2.0) / np.linalg.norm(slope, axis=(1, 2))[:, None]  # m for a pixel
         return scale * (pixels - seen.pixels), scale * np.sqrt(np.diagonal(spread, axis1=1, axis2=2))

@@ -73,13 +73,19 @@ def with_exposure(field: Field, found: Sequence[Index]) -> Field:
     sums = list[float]()
     for exposure in EXPOSURES:
         gain = np.add.reduceat(spot + field.bar_gain(rows, motion, exposure), begin)
-        best, done = np.zeros(len(field.first) + 1), 0  # of arcs that end before a picture
-        for arc in order:
-            best[done + 1 : last[arc] + 2] = best[done]
-            done = int(last[arc]) + 1
-            best[done] = max(best[done], best[first[arc]] + gain[arc])
-        sums.append(float(best.max()))
+        sums.append(_likeliest(gain, first, last, order, len(field.first)))
     return replace(field, exposure=float(EXPOSURES[int(np.argmax(sums))]))
+
+
+@machine_code(REAL(ONE, COUNTS, COUNTS, COUNTS, COUNT))
+def _likeliest(gain, first, last, order, frames):
+    """The largest sum of gains (k,) of arcs that follow each other; order (k,) is that of their ends."""
+    best, done = np.zeros(frames + 1), 0  # of arcs that end before a picture
+    for arc in order:
+        best[done + 1 : last[arc] + 2] = best[done]
+        done = last[arc] + 1
+        best[done] = max(best[done], best[first[arc]] + gain[arc])
+    return best.max()
 
 
 def arcs(field: Field) -> tuple[list[Index], Field, Foretold]:
@@ -122,19 +128,33 @@ def _begun(field: Field, rows_of: Sequence[Index], gaps: Sequence[int], used: Ma
 
 def _triples(field: Field, rows: Sequence[Index], before: int, after: int, bend: float) -> Index:
     """Rows (k, 3) of three pictures that may be one ball, smoothest first: `before` and `after` the middle one."""
-    a, b, c = rows
-    step = (field.pixels[b][None] - field.pixels[a][:, None]) / before
-    length = np.linalg.norm(step, axis=2)
-    i, j = np.nonzero((length < FASTEST * field.step * field.scale) & (length > SLOWEST * field.step * field.scale))
-    bent = field.pixels[c][None] - field.pixels[b[j]][:, None] - after * step[i, j][:, None]
-    off = np.linalg.norm(bent, axis=2)
-    pair, k = np.nonzero(off < 0.5 * bend * after * (before + after) + NOISE)
-    three = np.stack((a[i[pair]], b[j[pair]], c[k]), axis=1)
+    flat, off = _smooth(field.pixels, *rows, before, after, field.step * field.scale, bend)
+    three = flat.reshape(-1, 3)
     motion = (field.pixels[three[:, 2]] - field.pixels[three[:, 0]]) / (before + after)
     good = np.all([field.along(three[:, n], motion) for n in range(3)], axis=0)
     if max(before, after) > 1:
         good &= np.all([field.bar_off(three[:, n], motion) < AGREE for n in range(3)], axis=0)
-    return three[good][np.argsort(off[pair, k][good], kind="stable")]
+    return three[good][np.argsort(off[good], kind="stable")]
+
+
+@machine_code(types.Tuple((COUNTS, ONE))(TWO, COUNTS, COUNTS, COUNTS, COUNT, COUNT, REAL, REAL))
+def _smooth(pixels, first, middle, last, before, after, unit, bend):
+    """Rows (3 k,) of candidates of three pictures, and px (k,) of their second differences, if a ball may have them.
+
+    Args: first, middle, last: rows of the pictures.  unit: px, of 1 m/s in a picture.
+    """
+    flat, off = [0][:0], [0.0][:0]
+    for i in first:
+        for j in middle:
+            x, y = (pixels[j, 0] - pixels[i, 0]) / before, (pixels[j, 1] - pixels[i, 1]) / before
+            if SLOWEST * unit < math.sqrt(x * x + y * y) < FASTEST * unit:
+                for k in last:
+                    u, v = pixels[k, 0] - pixels[j, 0] - after * x, pixels[k, 1] - pixels[j, 1] - after * y
+                    bent = math.sqrt(u * u + v * v)
+                    if bent < 0.5 * bend * after * (before + after) + NOISE:
+                        flat += [i, j, k]
+                        off.append(bent)
+    return np.array(flat), np.array(off)
 
 
 @machine_code(REAL(REAL, COUNT))

@@ -6,6 +6,7 @@ backward, as for a hidden Markov model) give the probability of each stroke.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -163,16 +164,20 @@ def _best_in_each(
         alike: number of candidates, at most, by which a stroke differs from a better one that it repeats.
         admitted: says whether a stroke may take a place; asked of those alone that would take one.
     """
-    taken, kept, sets = np.zeros(len(grower.field.first), dtype=np.int64), list[Stroke](), list[int]()
+    taken, kept, holders = np.zeros(len(grower.field.first), dtype=np.int64), list[Stroke](), defaultdict[int, int](int)
     for stroke in sorted(strokes, key=lambda one: -one.score):
         first, last = grower.field.frame[stroke.rows[[0, -1]]]
         if taken[first : last + 1].min() >= most:
             continue
-        mine = sum(1 << row for row in stroke.rows.tolist())  # a set as bits: there are thousands of pairs
-        repeats = any((mine & ~used).bit_count() <= alike for used in sets)
-        if not repeats and admitted(stroke):
+        near = [(1 << len(kept)) - 1] * (alike + 1)  # those kept, as bits, that lack none of its rows, at most one
+        for row in stroke.rows.tolist() if near else ():
+            for lacking in range(alike, 0, -1):
+                near[lacking] = near[lacking] & holders[row] | near[lacking - 1]
+            near[0] &= holders[row]
+        if not any(near) and admitted(stroke):
+            for row in stroke.rows.tolist():
+                holders[row] |= 1 << len(kept)
             kept.append(stroke)
-            sets.append(mine)
             taken[first : last + 1] += 1
     return kept
 

@@ -146,7 +146,7 @@ def rated(rays, candidates, scene, view, rows, bounces):
     middle, count = len(rows) // 2, len(bounces)
     anchor = 0.5 * (rays[rows[middle]].time + rays[rows[len(rows) - 1 - middle]].time)
     times = bounces if count else np.full(1, anchor)
-    path = flown(rays, rows, scene, times, count)
+    path = flown(rays, rows, scene, times, count, True)
     price = BOUNCE * count + (UNBOUNCED if count != 1 else 0.0) - path.narrowed
     gain = _gain(rays, candidates, scene, view, rows, times, count, path)
     return Rated(gain - 0.5 * path.misfit - price - halves(scene, view, times, count, path), times, path)

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Index
 from ballfg.estimation.rally.strokes import Grower, Stroke
 
 HIT: Final = 3.0
@@ -58,14 +58,9 @@ class Hits:
         ways += [np.array([one.path.vectors[0, 1, 0] for one in later])[after]]
         onward = ways[0] * ways[1] > 0.0
         pair = gap[before, after] - 1
-        beyond = {number: self._ahead(strokes[number], 1) for number in np.unique(before).tolist()}
-        toward = {number: self._ahead(later[number], -1) for number in np.unique(after).tolist()}
-        here, there = [beyond[number] for number in before.tolist()], [toward[number] for number in after.tolist()]
-        ends = np.stack([one.places[k] for one, k in zip(there, pair, strict=True)])
-        starts = np.stack([one.places[k] for one, k in zip(here, pair, strict=True)])
-        spread = np.stack([one.covariances[k] for one, k in zip(here, pair, strict=True)])
-        spread += np.stack([one.covariances[k] for one, k in zip(there, pair, strict=True)])
-        near = _log_normal(ends - starts, spread + HIT_SIGMA**2 * np.eye(3)).max(axis=1)
+        starts, spread = self._all_ahead(strokes, 1, before, pair)
+        ends, wider = self._all_ahead(later, -1, after, pair)
+        near = _log_normal(ends - starts, spread + wider + HIT_SIGMA**2 * np.eye(3)).max(axis=1)
         seen, step = self.grower.field.seen, self.grower.field.step
         missed = -np.log(1.0 - seen * -np.expm1(-step / HIDDEN)) * pair  # hidden still, or not among the candidates
         found[before, after] = near + np.log(ROOM) - HIT - SAME_WAY * onward - missed
@@ -74,6 +69,13 @@ class Hits:
     def _widest(self) -> int:
         """Pictures between two strokes that a hit joins."""
         return max(1, int(np.ceil(LONGEST_HIT / self.grower.field.step)) - 1)
+
+    def _all_ahead(self, strokes: Sequence[Stroke], way: int, numbers: Index, pair: Index) -> tuple[Array, Array]:
+        """Places (k, m, 3) m and covariances (k, m, 3, 3) of the strokes of some numbers (k,), for their gaps."""
+        used, place = np.unique(numbers, return_inverse=True)
+        every = [self._ahead(strokes[number], way) for number in used.tolist()]
+        places, covariances = (np.stack([getattr(one, name) for one in every]) for name in ("places", "covariances"))
+        return places[place, pair], covariances[place, pair]
 
     def _ahead(self, stroke: Stroke, way: int) -> Ahead:
         """The path after (way 1) or before (-1) a stroke, for each gap that a hit may fill, in order of time."""

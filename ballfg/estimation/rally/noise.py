@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import torch
 
 from ballfg.arrays import Array
 from ballfg.estimation.observations.sightings import sightings_of
@@ -78,9 +77,8 @@ def left_over(tracks: Sequence[Track], estimates: Sequence[Estimate]) -> tuple[A
     off, spread = list[Array](), list[Array]()
     for track, estimate in zip(tracks, estimates, strict=True):
         seen = sightings_of(track)
-        points = torch.from_numpy(estimate.states[seen.state, POSITION])
-        camera = torch.from_numpy(seen.sightings.camera)
-        pixels, slope = (tensor.numpy() for tensor in CameraBank(seen.cameras).jacobian(points, camera))
+        points = estimate.states[seen.state, POSITION]
+        pixels, slope = CameraBank(seen.cameras).jacobian(points, seen.sightings.camera)
         off.append(seen.sightings.pixels - pixels)
         spread.append(slope @ estimate.covariances[seen.state, POSITION, POSITION] @ slope.swapaxes(1, 2))
     return np.concatenate(off), np.concatenate(spread)

@@ -169,7 +169,7 @@ class Grower:
         if not len(guesses):
             return
         together = np.sort(np.concatenate((np.tile(known, (len(guesses), 1)), guesses[:, None]), axis=1), axis=1)
-        tried = solved(self.scene, together, together.shape[1], stroke.rows[None])
+        tried = solved(self.scene, together, together.shape[1], stroke.rows[None], wide=False)
         passed = np.floor(np.maximum(way * (guesses - end), 0.0) / self.field.step)  # pictures without a candidate
         misfit = tried.misfit - 2.0 * np.log(1.0 - self.field.seen) * passed
         misfit = np.where(possible(self.scene, tried), misfit, np.inf)
@@ -197,7 +197,7 @@ class Grower:
             shifts = np.arange(-1.0, 1.01, 0.1) * self.field.step
             times = np.tile(stroke.bounces, (len(shifts), 1))
             times[:, number] += shifts
-            tried = solved(self.scene, times, len(stroke.bounces), stroke.rows[None])
+            tried = solved(self.scene, times, len(stroke.bounces), stroke.rows[None], wide=False)
             misfit = np.where(possible(self.scene, tried), tried.misfit, np.inf)
             if misfit.min() < stroke.path.misfit[0]:
                 stroke = self.flown(stroke.rows, tuple(times[int(np.argmin(misfit))].tolist()))

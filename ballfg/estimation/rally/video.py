@@ -22,6 +22,7 @@ from ballfg.vision.broadcast.court import Court
 from ballfg.vision.broadcast.doubled import without_doubled
 from ballfg.vision.broadcast.motion import Frames, Motion, Shot, find_motion
 from ballfg.vision.detection.detections import Detections
+from ballfg.vision.one_thread import one_thread
 
 OwnCandidates = Callable[[Shot, Array], Detections]
 """Gives the candidates of a user's detector in the pictures of a shot, from the stamps (f,) s of all pictures."""
@@ -59,6 +60,7 @@ def surfaces_of(court: Court) -> Surfaces:
     return Surfaces(0.0, court.floor, (-x, x, -y, y))
 
 
+@one_thread()  # pictures are shared out among threads of our own
 def track_moving_camera(
     frames: Frames,
     court: Court,

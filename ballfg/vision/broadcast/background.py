@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -37,14 +36,12 @@ class Match:
     homography: Array
 
 
-def matches(images: Iterable[Image]) -> Iterator[Match | None]:
-    """For each picture but the first its match with the one before; None for a cut."""
-    last: Image | None = None
-    for image in images:
-        grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
-        if last is not None:
-            yield matched(last, grey)
-        last = grey
+def linked(pair: tuple[Image | None, Image]) -> tuple[Image, Match | None]:
+    """The second of two pictures with its match with the one before; None for a cut, or where none is before."""
+    before, now = (
+        None if image is None else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8) for image in pair
+    )
+    return pair[1], None if before is None or now is None else matched(before, now)
 
 
 def matched(before: Image, now: Image) -> Match | None:

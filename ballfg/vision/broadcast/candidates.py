@@ -8,12 +8,15 @@ place is a candidate; a ball that moves while the shutter is open is a bar, whos
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
+from itertools import islice
 from typing import Final
 
 import cv2
 import numpy as np
 
 from ballfg.arrays import Array, Index
+from ballfg.parallel.parts import in_threads
 from ballfg.progress import Watch, unwatched
 from ballfg.vision.arrays import Image
 from ballfg.vision.broadcast.court import Court
@@ -52,26 +55,22 @@ def find_candidates(
     Args: frames: opens the video.  radius: m, of the ball.  stamps: (f,) s, of all pictures.
     Returns: pixels as in the pictures, with camera `main`; frames are those of the shot.
     """
-    window, found = deque[Image](), list[tuple[float, Candidates]]()
-    size = _diameters(shot, court, radius)
-    last = shot.first + len(shot)
+    size, count = _diameters(shot, court, radius), len(shot)
 
-    def centre(index: int) -> None:
-        number = len(found)
-        here = aligned_candidates(list(window), index, shot.cameras[number - index :][: len(window)], size[number])
-        found.append((float(stamps[shot.first + number]), here))
+    def windows() -> Iterator[tuple[list[Image], int, tuple[Pinhole, ...], Array]]:
+        every = enumerate(watch(frames(), len(stamps), "pictures searched for the ball"))
+        mine = (image for k, (_, image) in every if shot.first <= k < shot.first + count)
+        window = deque[Image](maxlen=2 * FAR + 1)
+        for number in range(-FAR, count):
+            for image in islice(mine, 1):  # OpenCV warps four channels twice as quickly as three
+                window.append(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2BGRA), dtype=np.uint8))
+            if number >= 0:
+                begin = min(number + FAR + 1, count) - len(window)
+                yield list(window), number - begin, shot.cameras[begin : begin + len(window)], size[number]
 
-    for k, (_, image) in enumerate(watch(frames(), len(stamps), "pictures searched for the ball")):
-        if not shot.first <= k < last:
-            continue
-        window.append(image)
-        if len(window) > 2 * FAR + 1:
-            window.popleft()
-        if len(window) > FAR and k - shot.first >= FAR:
-            centre(len(window) - 1 - FAR)
-    while len(found) < len(shot):
-        centre(len(window) - (len(shot) - len(found)))
-    return Detections.of_frames("main", found)
+    found = in_threads(lambda one: aligned_candidates(*one), windows())
+    times = stamps[shot.first : shot.first + count].tolist()
+    return Detections.of_frames("main", zip(times, found, strict=True))
 
 
 def _diameters(shot: Shot, court: Court, radius: float) -> Array:
@@ -95,7 +94,7 @@ def aligned_candidates(window: list[Image], index: int, cameras: tuple[Pinhole, 
             continue
         others = [_warped(window[i], cameras[i], cameras[index]) for i in beside]
         most = others[0] if len(others) == 1 else cv2.max(*others)
-        blue, green, red = cv2.split(cv2.subtract(here, most))
+        blue, green, red, *_ = cv2.split(cv2.subtract(here, most))
         change = np.minimum(np.minimum(blue, green), red).astype(np.uint8)
         rise = change if rise is None else np.maximum(rise, change)
     if rise is None:
@@ -111,27 +110,26 @@ def _warped(image: Image, camera: Pinhole, onto: Pinhole) -> Image:
     if np.abs(there - grid).max() < 0.05:
         return image
     homography = cv2.findHomography(grid, there, 0)[0]
-    white = (255.0, 255.0, 255.0)
-    seen = cv2.warpPerspective(image, homography, (width, height), flags=cv2.INTER_LINEAR, borderValue=white)
+    seen = cv2.warpPerspective(image, homography, (width, height), flags=cv2.INTER_LINEAR, borderValue=(255.0,) * 4)
     return np.asarray(seen, dtype=np.uint8)
 
 
 def _regions(rise: Image, size: Array) -> Candidates:
     """Connected regions of a ball's width, as bars."""
-    bright = cv2.threshold(rise, BRIGHTER, 1.0, cv2.THRESH_BINARY)[1]
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(bright, connectivity=8)
-    sides, areas = stats[:, 2:4].max(axis=1), stats[:, 4]
+    bright = rise > BRIGHTER
+    count, labels = cv2.connectedComponents(bright.view(np.uint8), connectivity=8)
+    y, x = np.divmod(np.flatnonzero(bright), bright.shape[1])
+    mine, pixels = labels[y, x].astype(np.int64), np.stack((x, y), axis=1).astype(np.float64)
+    corner, far = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+    np.minimum.at(corner, mine, pixels)
+    np.maximum.at(far, mine, pixels)
+    sides, areas = (far - corner).max(axis=1) + 1.0, np.bincount(mine, minlength=count)
     fine = (areas >= LEAST) & (sides < LONGEST + THICK * size[1]) & (sides >= THIN * size[0])
-    fine[0] = False  # the ground
-    places = cv2.findNonZero(bright)
-    x, y = (np.zeros((0, 2), dtype=np.int64) if places is None else places.reshape(-1, 2)).T
-    used = fine[labels[y, x]]
-    x, y = x[used], y[used]
-    weight, mine = rise[y, x].astype(np.float64), labels[y, x]
+    used = fine[mine]
+    pixels, mine, weight = pixels[used], mine[used], rise[y[used], x[used]].astype(np.float64)
     peak = np.zeros(count)
     np.maximum.at(peak, mine, weight)
-    corner: Array = stats[:, :2].astype(np.float64)
-    centre, width, half = _bars(np.stack((x, y), axis=1).astype(np.float64), weight, mine, corner)
+    centre, width, half = _bars(pixels, weight, mine, corner)
     kept = np.flatnonzero((peak >= PEAK) & (width > THIN * size[0]) & (width < THICK * size[1]))
     centre, width, half, peak, area = centre[kept], width[kept], half[kept], peak[kept], areas[kept]
     length = 2.0 * np.hypot(*half.T)

@@ -70,14 +70,11 @@ def joined_segments(image: Image) -> Array:
     length = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
     segments = segments[length > 0.25 * SHORTEST * np.hypot(*image.shape[:2])]
     segments = segments[np.argsort(-np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1), kind="stable")]
-    joined, free = list[Array](), np.ones(len(segments), dtype=bool)
-    for i in range(len(segments)):
-        if not free[i]:
-            continue
-        line, free[i] = segments[i], False
-        while (more := np.flatnonzero(free & _continues(line, segments))).size:
-            free[more] = False
-            line = _hull(line, segments[more])
+    joined = list[Array]()
+    while len(segments):
+        line, segments = segments[0], segments[1:]
+        while (more := _continues(line, segments)).any():
+            line, segments = _hull(line, segments[more]), segments[~more]
         joined.append(line)
     lines = np.array(joined).reshape(-1, 2, 2)
     length = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)
@@ -85,17 +82,18 @@ def joined_segments(image: Image) -> Array:
     return np.asarray(lines[order][length[order] > SHORTEST * np.hypot(*image.shape[:2])])
 
 
-def _continues(line: Array, others: Array) -> Array:
-    """(n,) bool: which others (n, 2, 2) lie on a line (2, 2) and near its ends."""
+def _continues(line: Array, others: Array) -> Mask:
+    """(n,) which others (n, 2, 2) lie on a line (2, 2) and near its ends."""
     along = line[1] - line[0]
     length = np.linalg.norm(along)
     along = along / length
     normal = np.array([-along[1], along[0]])
-    aside = np.abs((others - line[0]) @ normal).max(axis=1)
-    places = (others - line[0]) @ along
-    gap = np.maximum(places.min(axis=1) - length, -places.max(axis=1))
-    extent = np.abs(places[:, 1] - places[:, 0])
-    turned = np.abs((others[:, 1] - others[:, 0]) @ normal) / np.maximum(extent, 1e-9)
+    away = others.reshape(-1, 2) - line[0]
+    first, last = (away @ normal).reshape(-1, 2).T
+    begin, end = (away @ along).reshape(-1, 2).T
+    gap = np.maximum(np.minimum(begin, end) - length, -np.maximum(begin, end))
+    extent = np.abs(end - begin)
+    aside, turned = np.maximum(np.abs(first), np.abs(last)), np.abs(last - first) / np.maximum(extent, 1e-9)
     return np.asarray((turned < PARALLEL) & (aside < ASIDE) & (gap < GAP * np.maximum(length, extent)))
 
 

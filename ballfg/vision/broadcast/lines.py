@@ -140,28 +140,19 @@ def _halfway(falling: Array) -> tuple[Array, Array]:
 
 
 def slopes(camera: Pinhole, points: Array) -> tuple[Array, Array]:
-    """Pixels (n, 2) of points (n, 3) m, and derivatives (n, 2, 8) by turn, place, log focal length and distortion.
+    """Pixels (n, 2) of points (n, 3) m, and derivatives (n, 2, 7) by turn, place and log focal length.
 
     A turn w changes the camera's rotation to the world into R exp(w).
     """
     at = (points - camera.place) @ camera.turn.T
     x, y, z = at.T
     none, plane = np.zeros_like(z), at[:, :2] / z[:, None]
-    square = (plane**2).sum(axis=1)
-    by_plane = camera.focal * bending(plane, camera.bend)
+    straight = (1.0 + camera.bend * (plane**2).sum(axis=1))[:, None]
+    by_plane = straight[:, None] * np.eye(2) + 2.0 * camera.bend * plane[:, :, None] * plane[:, None, :]
     by_at = np.stack((none + 1.0, none, -x / z, none, none + 1.0, -y / z), axis=1).reshape(-1, 2, 3) / z[:, None, None]
     cross = np.stack((none, -z, y, z, none, -x, -y, x, none), axis=1).reshape(-1, 3, 3)
-    grown = camera.focal * plane * (1.0 + camera.bend * square)[:, None]
-    bent = camera.focal * plane * square[:, None]
-    by_at = by_plane @ by_at
-    slope = np.concatenate((by_at @ cross, -by_at @ camera.turn, grown[..., None], bent[..., None]), axis=2)
-    return grown + camera.middle, slope
-
-
-def bending(plane: Array, bend: float) -> Array:
-    """(n, 2, 2), derivative of distorted x/z and y/z by the undistorted ones (n, 2)."""
-    straight = (1.0 + bend * (plane**2).sum(axis=1))[:, None, None] * np.eye(2)
-    return np.asarray(straight + 2.0 * bend * plane[:, :, None] * plane[:, None, :])
+    grown, by_at = camera.focal * straight * plane, camera.focal * by_plane @ by_at
+    return grown + camera.middle, np.concatenate((by_at @ cross, -by_at @ camera.turn, grown[..., None]), axis=2)
 
 
 def moved(camera: Pinhole, step: Array) -> Pinhole:
@@ -181,7 +172,7 @@ def corrected(image: Array32, camera: Pinhole, court: Court, free: slice = slice
         seen = ridges(image, camera, court, reach)
         if len(seen.offset) < 2 * len(unknown):
             return camera, 0.0
-        row = np.einsum("na,nab->nb", seen.normal, slopes(camera, seen.points)[1][..., :7]) / SIGMA
+        row = np.einsum("na,nab->nb", seen.normal, slopes(camera, seen.points)[1]) / SIGMA
         weight = 1.0 / (1.0 + (seen.offset / SIGMA / ROBUST) ** 2)
         information = (row * weight[:, None]).T @ row + 1e-6 * np.eye(7)
         pull = row.T @ (weight * seen.offset / SIGMA)

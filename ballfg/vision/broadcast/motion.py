@@ -10,9 +10,10 @@ from typing import Final
 import numpy as np
 
 from ballfg.arrays import Array, Index
+from ballfg.parallel.parts import in_threads
 from ballfg.progress import Watch, unwatched
 from ballfg.vision.arrays import Image
-from ballfg.vision.broadcast.background import ALIKE, Match, matches
+from ballfg.vision.broadcast.background import ALIKE, Match, linked
 from ballfg.vision.broadcast.court import Court
 from ballfg.vision.broadcast.find import cameras_of, find_court
 from ballfg.vision.broadcast.graph import Solved, solve
@@ -21,6 +22,8 @@ from ballfg.vision.broadcast.pinhole import Pinhole
 
 Frames = Callable[[], Iterator[tuple[float, Image]]]
 """Opens a video and gives stamps (s) and images (h, w, 3), BGR."""
+Pair = tuple[Image | None, Image]
+"""The picture before, if there is one, and a picture."""
 EVERY: Final = 0.5
 """s between the pictures in which the court is looked for."""
 SEEDS: Final = 4
@@ -105,35 +108,33 @@ def _first_pass(
     frames: Frames,
     court: Court,
     corners: dict[int, Array] | None,
-    watched: Callable[[Iterator[Image]], Iterable[Image]],
+    watched: Callable[[Iterator[Pair]], Iterable[Pair]],
 ) -> tuple[Array, list[Match | None], dict[int, list[tuple[Pinhole, float]]]]:
     """Stamps, matches of neighbours, and the cameras in the pictures in which the court was found."""
     times, seeds = list[float](), dict[int, list[tuple[Pinhole, float]]]()
     found, looked = 0, -np.inf
 
-    def images() -> Iterator[Image]:
+    def pairs() -> Iterator[Pair]:
+        last: Image | None = None
         for stamp, image in frames():
             times.append(stamp)
-            yield image
+            yield last, image
+            last = image
 
     links = list[Match | None]()
-    last: Image | None = None
-    for k, image in enumerate(watched(images())):
-        if k:
-            assert last is not None
-            links.append(next(matches((last, image))))
-            if links[-1] is None:
-                found, looked = 0, -np.inf
-        last = image
+    for k, (image, link) in enumerate(in_threads(linked, watched(pairs()))):
+        links.append(link)
+        if link is None:
+            found, looked = 0, -np.inf
         if corners is not None:
             here = _of_corners(image, court, corners[k]) if k in corners else []
             seeds |= {k: here} if here else {}
-        elif found < SEEDS and times[-1] - looked >= EVERY:
-            looked = times[-1]
+        elif found < SEEDS and times[k] - looked >= EVERY:
+            looked = times[k]
             here = likely(image, find_court(image, court)[:TRIED], court)
             if here:
                 found, seeds[k] = found + 1, here
-    return np.array(times), links, seeds
+    return np.array(times), links[1:], seeds
 
 
 def _of_corners(image: Image, court: Court, corners: Array) -> list[tuple[Pinhole, float]]:

@@ -4,7 +4,6 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-import torch
 
 from ballfg.arrays import Array
 from ballfg.checks import check_range
@@ -57,8 +56,7 @@ def _first(lens: Camera, marked: Marked, focal_sigma: float) -> Camera:
 
 def _slopes(camera: Camera, points: Array) -> Array:
     """(2 n, 7) px of the pixels of points (n, 3) m by the camera's changes."""
-    here, centre = torch.from_numpy(points), torch.from_numpy(np.tile(camera.centre, (len(points), 1)))
-    pixels, by_point = CameraBank([camera]).jacobian(here, torch.zeros(len(points), dtype=torch.int64))
-    _, by_place = slopes_of(here, centre, torch.zeros(len(points), CHANGES, dtype=torch.float64))
-    grown = pixels - torch.tensor(camera.matrix[:2, 2])
-    return np.asarray(torch.cat((by_point @ by_place, grown[..., None]), dim=-1).numpy().reshape(-1, CHANGES))
+    pixels, by_point = CameraBank([camera]).jacobian(points, np.zeros(len(points), dtype=np.int64))
+    *_, by_place = slopes_of(points, camera.centre, np.zeros((len(points), CHANGES)))
+    grown = pixels - camera.matrix[:2, 2]
+    return np.concatenate((by_point @ by_place, grown[..., None]), axis=2).reshape(-1, CHANGES)

@@ -11,6 +11,7 @@ from ballfg.arrays import Array
 from ballfg.checks import shown
 from ballfg.vision.calibration.boards import View
 from ballfg.vision.camera import DISTORTIONS, Camera
+from ballfg.vision.one_thread import one_thread
 
 MIN_VIEWS: Final = 3  # a view tells two numbers about the lens (Zhang 2000, section 2.3)
 USUAL_VIEWS: Final = 8  # with fewer, a bent board or a wrong corner looks like the lens
@@ -152,20 +153,17 @@ def _fit(name: str, views: Sequence[View], distortion: int) -> Intrinsics:
     points = [np.ascontiguousarray(view.points, dtype=np.float32) for view in views]
     pixels = [np.ascontiguousarray(view.pixels, dtype=np.float32) for view in views]
     size = views[0].size
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)  # on several it adds in another order each time, and the last digits differ
     try:
-        _, matrix, coefficients, rvecs, tvecs = cv2.calibrateCamera(
-            points, pixels, size, np.eye(3), np.zeros(0), flags=_FLAGS[distortion], criteria=_CRITERIA
-        )
+        with one_thread():
+            _, matrix, coefficients, rvecs, tvecs = cv2.calibrateCamera(
+                points, pixels, size, np.eye(3), np.zeros(0), flags=_FLAGS[distortion], criteria=_CRITERIA
+            )
         bent = np.array(np.ravel(coefficients)[:distortion], dtype=np.float64)
         camera = Camera(name, size, np.array(matrix, dtype=np.float64), bent, np.zeros(3), np.zeros(3))
     except (cv2.error, ValueError):
         problem = f"camera {shown(name)}: views must tell the lens; no lens explains them"
         remedy = "Turn the board to different sides, up to 45 degrees, and check that it is flat."
         raise ValueError(f"{problem}. {remedy}") from None
-    finally:
-        cv2.setNumThreads(threads)
     posed = zip(views, rvecs, tvecs, strict=True)
     fitted = tuple(_fitted(camera, view, np.ravel(rvec), np.ravel(tvec)) for view, rvec, tvec in posed)
     share = coverage(size, np.concatenate([view.pixels for view in views]))

@@ -66,12 +66,15 @@ def test_the_noise_is_that_with_which_the_residuals_are_most_probable(seen):
         values.insert(graph._zoom(k), np.array([np.log(CAMERA.focal)]))
     start = graph.Noise(np.full(6, 0.1), 0.03, 0.15)
     first = gtsam.Values(values)
-    marginals = gtsam.Marginals(
-        graph._graph([CAMERA] * len(drawn), drawn, [STILL] * (len(drawn) - 1), first, start), values
-    )
-    noise = start
+    cameras, still = [CAMERA] * len(drawn), [STILL] * (len(drawn) - 1)
+
+    def batches(noise):
+        return graph.CourtLines(cameras, drawn, noise), graph.Background(cameras, still, noise)
+
+    marginals = gtsam.Marginals(graph._graph(*batches(start), first, start), values)
+    noise, at = start, graph.Unknowns.of(values, len(drawn))
     for _ in range(60):
-        noise = graph._noise([CAMERA] * len(drawn), drawn, [STILL] * (len(drawn) - 1), values, marginals, noise)
+        noise = graph._noise(*batches(noise), at, marginals, noise)
     tried = np.geomspace(0.02, 1.0, 2000)
     for line in range(6):
         left = np.concatenate([one.offset[one.line == line] for one in drawn])
@@ -95,26 +98,31 @@ def test_no_ridge_is_sought_where_another_line_is_in_the_way(seen):
     assert 0 < len(middle) < 8 * 24
 
 
-def test_derivatives_of_the_factor_are_those_of_differences(seen):
-    """Of a picture's ridges by turn, place, focal length, lens and the shift of each line."""
-    like, lines = looking((0.5, -7.02, 3.0), (0.02, 0.0, 0.0), 1003.0), seen[0]
-    factor = graph._court_factor(0, like, lines, np.linspace(0.05, 0.2, len(COURT.lines)))
-    turn, place, zoom, lens, shift = keys = factor.keys()
-    values = gtsam.Values()
-    values.insert(turn, gtsam.Rot3(like.turn.T))
-    values.insert(place, gtsam.Point3(like.place))
-    values.insert(zoom, np.array([np.log(like.focal)]))
-    values.insert(lens, np.array([-0.02]))
-    values.insert(shift, np.linspace(-0.3, 0.3, len(COURT.lines)))
-    found = factor.linearize(values).jacobian()[0] * np.sqrt(graph.SHARED)
-    widths, column = (3, 3, 1, 1, len(COURT.lines)), 0
-    for key, width in zip(keys, widths, strict=True):
-        for number in range(width):
-            ends = []
-            for way in (1e-6, -1e-6):
-                step = gtsam.VectorValues()
-                for other, count in zip(keys, widths, strict=True):
-                    step.insert(other, way * np.eye(count)[number] if other == key else np.zeros(count))
-                ends.append(factor.unwhitenedError(values.retract(step)))
-            np.testing.assert_allclose(found[:, column], (ends[0] - ends[1]) / 2e-6, atol=1e-4, rtol=1e-5)
-            column += 1
+def test_derivatives_of_the_factors_are_those_of_differences(seen):
+    """Of the ridges and of the background of two pictures, by each of their variables, and at new values anew."""
+    likes = [looking((0.5, -7.02, 3.0), (0.02 * k, 0.0, 0.0), 1003.0 + 9.0 * k) for k in range(2)]
+    noise = graph.Noise(np.linspace(0.05, 0.2, len(COURT.lines)), 0.03, 0.15)
+    values, widths = gtsam.Values(), {graph.PLACE: 3, graph.LENS: 1, graph.LINES: len(COURT.lines)}
+    values.insert(graph.PLACE, gtsam.Point3(likes[0].place))
+    values.insert(graph.LENS, np.array([-0.02]))
+    values.insert(graph.LINES, np.linspace(-0.3, 0.3, len(COURT.lines)))
+    for k, like in enumerate(likes):
+        values.insert(graph._turn(k), gtsam.Rot3(like.turn.T))
+        values.insert(graph._zoom(k), np.array([np.log(like.focal)]))
+        widths |= {graph._turn(k): 3, graph._zoom(k): 1}
+    far = Match(PLACES, likes[0].onto(PLACES, likes[1]) + 0.2, np.eye(3))
+    court, background = graph.CourtLines(likes, seen[:2], noise), graph.Background(likes, [far], noise)
+    for factor in (court.factor(0), court.factor(1), background.factor(0)):
+        keys, column = factor.keys(), 0
+        found = factor.linearize(values).jacobian()[0] * factor.noiseModel().sigma()
+        for key in keys:
+            for number in range(widths[key]):
+                ends = []
+                for way in (1e-6, -1e-6):
+                    step = gtsam.VectorValues()
+                    for other, count in widths.items():
+                        step.insert(other, way * np.eye(count)[number] if other == key else np.zeros(count))
+                    ends.append(factor.unwhitenedError(values.retract(step)))
+                np.testing.assert_allclose(found[:, column], (ends[0] - ends[1]) / 2e-6, atol=1e-4, rtol=1e-5)
+                column += 1
+        assert column == found.shape[1]
