@@ -68,7 +68,8 @@ def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list
     if lacking:
         raise ValueError(f"{table.where} must have the columns of the other tables; {listed(lacking)} missing. Add it.")
     stamps = _stamps(table, roles, choices, counts)
-    positions, sigmas = roles.coordinates(table), None
+    columns = [numbers(table.columns[one]) if one != UNMEASURED else np.zeros(len(table)) for one in roles.places]
+    positions, sigmas = np.stack(columns, axis=1), None
     held = ~missing(stamps) & (np.abs(positions) <= _LARGEST).all(axis=1)
     if roles.sigmas is not None:
         sigmas = np.stack([numbers(table.columns[name]) for name in roles.sigmas], axis=1)

@@ -60,12 +60,6 @@ def kicks_of(motions: Sequence[Motion], dt: Array) -> Kicks:
     return Kicks(np.array(times), np.array([motion.hit for motion in motions]))
 
 
-def motions_of(segmentation: Segmentation, times: Array) -> list[Motion]:
-    """The motion of every interval of a track or window of samples at times (n,) s."""
-    found = eventful_motions(segmentation, times)
-    return [found.get(i, FLIGHT) for i in range(len(times) - 1)]
-
-
 def eventful_motions(segmentation: Segmentation, times: Array) -> dict[int, Motion]:
     """The motion of every interval with an event, in their order, of samples at times (n,) s."""
     count = len(times) - 1
