@@ -76,7 +76,7 @@ def scores_of(models: Sequence[Weighed]) -> dict[frozenset[str], float]:
     """
     lost = {model.names: -np.inf for model in models if not np.isfinite(model.evidence)}
     models = [model for model in models if np.isfinite(model.evidence)]
-    weighed = {model.names: model.weight for model in models}
+    weighed = {model.names: model for model in models}
     scores = {names: tempered(names, weight, weighed) + weight.odds for names, weight in weighed.items()}
     found: dict[frozenset[str], float] = {}
     for model in models:

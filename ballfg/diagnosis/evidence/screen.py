@@ -83,18 +83,14 @@ class Screen:
     @cached_property
     def gains(self) -> list[float]:
         """What each candidate adds to the evidence, at the model's noise, as far as the other half bears it out."""
-        alone = self._alone
+        alone = {self.model.names: self.model}
         found = (tempered(self._names((one,)), weight, alone) for one, weight in enumerate(self._singles))
         return [evidence - self.model.evidence for evidence in found]
 
     @cached_property
     def _singles(self) -> list[Weight]:
         """The weight of the model with each candidate."""
-        return [self.with_one(one, self.model.weight)[0] for one in range(len(self.candidates))]
-
-    @property
-    def _alone(self) -> dict[frozenset[str], Weight]:
-        return {self.model.names: self.model.weight}
+        return [self.with_one(one, self.model)[0] for one in range(len(self.candidates))]
 
     def odds(self, chosen: Sequence[int]) -> float:
         """Logarithm of the posterior odds of the model with some candidates, added in turn, to the model itself."""
@@ -119,7 +115,7 @@ class Screen:
         far as the other half bears it out.
         """
         found: dict[tuple[int, ...], float] = {(one,): self.odds((one,)) for one in offered}
-        best, others = self._leading(found), self._alone
+        best, others = self._leading(found), dict[frozenset[str], Weight]({self.model.names: self.model})
         scores = self._borne_out(best, others)
         for _ in range(most - 1):
             larger: dict[tuple[int, ...], float] = {}

@@ -38,7 +38,7 @@ class Sets:
         """The most probable set that single effects lead to, from all of the model's and from none, and its kin."""
         found = cls(screen, most)
         model = screen.model
-        found.members[model.names] = Member(model.weight, (), ())
+        found.members[model.names] = Member(model, (), ())
         for names, weight in model.nested.items():
             gone = tuple(place for place, h in enumerate(screen.effects) if h.name not in names)
             found.members[names] = Member(weight, (), gone)
