@@ -14,7 +14,6 @@ from ballfg.dynamics.domain import Domain
 from ballfg.dynamics.effect import Effect, Kind
 from ballfg.dynamics.effects.registry import effect_class
 from ballfg.dynamics.model import BASE, THIN_SHELL, BallModel
-from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.dynamics.population import SpinPopulation
 from ballfg.dynamics.variation import Variation
 from ballfg.files.strict_yaml import read_yaml
@@ -218,14 +217,14 @@ def save_model(model: BallModel, path: str | Path) -> None:
 
     Raises: TypeError: if the model is neither analytic nor learned, or corrects one that is not analytic.
     """
-    from ballfg.dynamics.networks.learned_file import write_learned
+    from ballfg.dynamics.networks.learned_file import has_learned_part, write_learned
 
     path = check_path("path", path)
     content = model_to_dict(_analytic_part(model)) | _listed(model.variations)
     if model.noise is not None:
         listed = {name.removeprefix(BASE): sigma for name, sigma in model.noise.coefficients.items()}
         content["measurement"][NOISE] = replace(model.noise, coefficients=listed).to_mapping()
-    if isinstance(model, LearnedModel) or model.trained is not None:
+    if has_learned_part(model):
         content["learned"] = write_learned(model, path.parent, path.stem)
     write_text(path, yaml.safe_dump(content, sort_keys=False))
 

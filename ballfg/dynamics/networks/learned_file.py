@@ -68,6 +68,11 @@ class _Config(_Section):
     fading: _FadingConfig | None = None
 
 
+def has_learned_part(model: BallModel) -> bool:
+    """True if this model needs a folder beside its model file."""
+    return isinstance(model, LearnedModel) or model.trained is not None
+
+
 def write_learned(model: BallModel, parent: Path, stem: str) -> str:
     """Writes the folder of a model's learned part.
 
