@@ -1,7 +1,5 @@
 """Solves the linear subproblem by QR, state by state along the track, for the step of a minimisation."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -38,7 +36,7 @@ class Step:
     decrease: float
 
     @classmethod
-    def of(cls, root: Root, states: Array, coefficients: Array, damping: float, diagonal: Array) -> Step | None:
+    def of(cls, root: Root, states: Array, coefficients: Array, damping: float, diagonal: Array) -> "Step | None":
         """The step R d = y with its predicted decrease; None if it is not finite.
 
         Args:

@@ -1,7 +1,5 @@
 """Probabilities of effects from the evidence of all models that were weighed."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 

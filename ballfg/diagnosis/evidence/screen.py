@@ -4,8 +4,6 @@ One pass over the tracks gives the inner products of all candidates. Every set o
 solution, so that effects which only help together are found together.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -54,7 +52,7 @@ class Screen:
     tracks: Reduced
     total: Reduced
     priors: Priors
-    _known: dict[tuple[Beside, int, Gone], _Gain] = field(default_factory=dict)
+    _known: "dict[tuple[Beside, int, Gone], _Gain]" = field(default_factory=dict)
     _condensed: dict[Gone, Condensed] = field(default_factory=dict)
 
     @classmethod
@@ -65,7 +63,7 @@ class Screen:
         candidates: Sequence[Hypothesis],
         columns: Array,
         patterns: Patterns | None = None,
-    ) -> Screen:
+    ) -> "Screen":
         """The screen of a model.
 
         Args:
@@ -223,7 +221,7 @@ class Screen:
     def _own(self) -> int:
         return len(self.priors.base)
 
-    def _beside(self, beside: Beside, one: int, gone: Gone = ()) -> _Gain:
+    def _beside(self, beside: Beside, one: int, gone: Gone = ()) -> "_Gain":
         """What one more candidate gains beside others of given widths, without some of the model's effects."""
         key = (beside, one, gone)
         if key in self._known:

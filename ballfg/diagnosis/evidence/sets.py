@@ -5,8 +5,6 @@ apart and the evidence of each hold the error of its own linearisation. About th
 samples, the linear model of all sets is the same.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -34,7 +32,7 @@ class Sets:
     members: dict[frozenset[str], Member] = field(default_factory=dict)
 
     @classmethod
-    def near(cls, screen: Screen, most: int) -> Sets:
+    def near(cls, screen: Screen, most: int) -> "Sets":
         """The most probable set that single effects lead to, from all of the model's and from none, and its kin."""
         found = cls(screen, most)
         model = screen.model

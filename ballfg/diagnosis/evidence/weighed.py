@@ -1,7 +1,5 @@
 """Weighs a fitted model: its noise, its evidence, and its density of tracks whose half it was not fitted to."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
@@ -104,7 +102,7 @@ class Weighed(Weight):
         """Where the noise of a similar model starts."""
         return Start(self.noise, self.weights)
 
-    def without(self, gain: float) -> Weighed:
+    def without(self, gain: float) -> "Weighed":
         """With strengths where its fit has them, and less evidence, also of the models that it holds.
 
         Args: gain: what a step promises that leads nowhere.

@@ -1,7 +1,5 @@
 """Positions are the usual observation of a track."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import numpy as np
@@ -38,7 +36,7 @@ class Positions(Observation):
             self.state, self.positions, context.sigma, stamps, settings.loss, settings.has_memory
         )
 
-    def select(self, samples: NDArray[np.bool_]) -> Positions:
+    def select(self, samples: NDArray[np.bool_]) -> "Positions":
         """The positions of some samples."""
         return Positions(self.positions[samples])
 

@@ -1,7 +1,5 @@
 """Keeps the segmenter's current events on a stream and applies them to the samples of the window."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Sequence
@@ -54,7 +52,7 @@ class EventTracker:
         self._pending: tuple[Event, ...] = ()
         self._moves: dict[tuple[int, float], list[int]] = {}  # steps of each contact, by the place it was found at
 
-    def copy(self) -> EventTracker:
+    def copy(self) -> "EventTracker":
         """An event tracker with the same samples, independent of this one."""
         other = copy.copy(self)
         other.segmenter = self.segmenter.copy()
