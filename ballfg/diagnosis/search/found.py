@@ -105,7 +105,7 @@ class Found:
         scored, attempts, screen = try_hypotheses(best, self.motion, loop.catalogue, tell, most)
         refits, winner = self._attempted(attempts, tell)
         scored = retested(scored, refits)
-        if screen is not None and not self.is_better(winner):
+        if not self.is_better(winner):
             self.best = self.models[best.names] = replace(best, neighbours=screen.neighbours)
             if (exchanged := self._exchanged(screen, scored, tell)) is not None:
                 self.rounds.append(Round(scored, [*refits, exchanged], (exchanged.name,)))
