@@ -194,7 +194,6 @@ class _Question:
         return self.patterns is not None
 
     def point(self, fit: Fit) -> _Point:
-        """The rows of a fit and the priors at its unknowns."""
         fit = with_guesses(fit)
         rows = rows_beside(fit, self.motion, self.patterns)
         return _Point(fit, rows, Priors.of(fit, self.named, self.patterns))
