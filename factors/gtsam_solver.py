@@ -1,7 +1,5 @@
 """Minimises the graphs of this package by GTSAM's Levenberg-Marquardt, with GTSAM's marginals."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Over an interval the acceleration adds what `white_acceleration` says; spin is a
 same model.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -69,7 +67,7 @@ class ProcessNoise:
         tangential = np.hypot(self.contact_velocity, self.contact_tangential)
         return self.kick(dt, time, (tangential, tangential, self.contact_velocity), self.contact_spin)
 
-    def kicks(self, dt: Array, kicks: Kicks) -> Array:
+    def kicks(self, dt: Array, kicks: "Kicks") -> Array:
         """(m, 9, 9) covariance at the end of intervals dt (m,) s of the contacts and hits in them."""
         covariance = np.zeros((len(dt), STATE_DIM, STATE_DIM))
         for time in kicks.times.T:
@@ -114,11 +112,11 @@ class Kicks:
     hit: NDArray[np.bool_]
 
     @staticmethod
-    def none(count: int) -> Kicks:
+    def none(count: int) -> "Kicks":
         """Free flight in all intervals."""
         return Kicks(np.zeros((count, 0)), np.zeros(count, dtype=bool))
 
-    def __getitem__(self, rows: NDArray[np.int64] | slice) -> Kicks:
+    def __getitem__(self, rows: NDArray[np.int64] | slice) -> "Kicks":
         return Kicks(self.times[rows], self.hit[rows])
 
     def basis(self, dt: Array) -> Array:

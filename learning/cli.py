@@ -72,7 +72,6 @@ def train(
 
 
 def _typed(config: Path, overrides: Sequence[str], data: Sequence[str], out: str | None, resume: str | None) -> str:
-    """The command line."""
     words = ["ballfg-train", str(config), *overrides, *(word for folder in data for word in ("--data", folder))]
     words += [word for option, folder in (("--out", out), ("--resume", resume)) if folder for word in (option, folder)]
     return shlex.join(words)

@@ -77,15 +77,6 @@ def _refused(error: Exception) -> int:
     return _bad_input(message().replace(": Value error, ", ": "), getattr(error, "ctx", None))
 
 
-def check_words(words: Sequence[str]) -> None:
-    """Refuses arguments that text cannot represent, such as odd file names, before any work.
-
-    Raises: UnicodeEncodeError.
-    """
-    for word in words:
-        word.encode()
-
-
 def _in_words(error: Exception) -> str:
     if isinstance(error, MemoryError):
         why = f" ({error})" if str(error) else ""
@@ -124,7 +115,8 @@ def start(app: typer.Typer, name: str, arguments: Sequence[str] | None) -> NoRet
     given = sys.argv[1:] if arguments is None else list(arguments)
 
     def work() -> object:
-        check_words(given)
+        for word in given:
+            word.encode()  # text cannot represent odd file names: refused before any work
         with alive(" ".join([name, *given[:1]])):
             return command.main(given, prog_name=name, standalone_mode=False)
 

@@ -1,7 +1,5 @@
 """Holds an error budget: the prediction error of a dataset in parts that add up in squares."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -57,7 +55,7 @@ class ErrorBudget:
     tracks: int
 
     @classmethod
-    def of(cls, expected: Mapping[str, float], tracks: int, before_mm: float, after_mm: float) -> ErrorBudget:
+    def of(cls, expected: Mapping[str, float], tracks: int, before_mm: float, after_mm: float) -> "ErrorBudget":
         """The budget of measured errors.
 
         Args:

@@ -1,7 +1,5 @@
 """Computes error budgets: the squared error that a model expects on held-out tracks, by its sources."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 

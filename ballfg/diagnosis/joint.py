@@ -220,7 +220,6 @@ class _Predicting:
         self._judged: WeakKeyDictionary[BallModel, dict[str, Errors]] = WeakKeyDictionary()
 
     def __call__(self, fit: Fit) -> AnalyticModel:
-        """The model with its rooms' models attached."""
         models = {room.name: self._model(fit, room) for room in self.rooms}
         model = with_effects(fit.problem.model)
         self._models[model] = models

@@ -89,7 +89,10 @@ class ConformalScales:
         for prediction in predictions:
             statuses[prediction.status.value] += 1
             if len(prediction.times):
-                longer.append((_bins(prediction), _scores(prediction)))
+                with np.errstate(invalid="ignore", divide="ignore"):
+                    scores = np.abs(prediction.measured - prediction.positions) / prediction.sigmas
+                # a prediction that is not finite counts as a miss
+                longer.append((_bins(prediction), np.where(np.isfinite(scores), scores, np.inf)))
         found = list(_by_bin(longer))
         most = max((one.count for one in found), default=0)
         if most < FEWEST:
@@ -285,10 +288,3 @@ def _bins(prediction: TrackPrediction) -> Index:
     """(k,) bin of the horizon of each stamp; a stamp at the end of a bin belongs to it."""
     ahead = elapsed(prediction.times, float(prediction.estimate.times[-1])) / BIN
     return np.maximum(np.ceil(ahead - EDGE).astype(np.int64) - 1, 0)
-
-
-def _scores(prediction: TrackPrediction) -> Array:
-    """(k, 3) errors in sigmas; infinite where a prediction is not finite, so that it counts as a miss."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        scores = np.abs(prediction.measured - prediction.positions) / prediction.sigmas
-    return np.where(np.isfinite(scores), scores, np.inf)

@@ -1,7 +1,5 @@
 """Holds the noise of measurements and motion and the priors, which all estimators share."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal, get_args
@@ -160,7 +158,7 @@ class Settings:
             raise TypeError(f"launcher must be a Launcher or None; got {got}. Read one from its file.")
 
     @classmethod
-    def for_measured(cls, model: BallModel, **changes: Any) -> Settings:
+    def for_measured(cls, model: BallModel, **changes: Any) -> "Settings":
         """Settings for measured tracks: the model's coefficients are estimated with each track within their priors.
 
         Args: model: gives the coefficients and their prior standard deviations.  changes: other fields.
@@ -178,7 +176,7 @@ class Settings:
         """(3,) m, standard deviations of the lasting errors; a tiny one for an axis without any."""
         return np.maximum(self.memory, LEAST_BIAS)
 
-    def for_track(self, track: Track) -> Settings:
+    def for_track(self, track: Track) -> "Settings":
         """The settings of a track: positions computed from other observations have no tracker's errors.
 
         A track that one camera saw has an acceleration noise and a spin prior of its own.
@@ -199,7 +197,7 @@ class Settings:
             return track
         return replace(track, labels={**track.labels, self.spins.by: self.group})
 
-    def renamed(self, model: BallModel) -> Settings:
+    def renamed(self, model: BallModel) -> "Settings":
         """These settings with today's names of the model's coefficients."""
         earlier = [name for name in self.coefficients if todays_name(name) != name]
         if not earlier:

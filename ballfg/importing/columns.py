@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ballfg.checks import did_you_mean, listed, short_text, shown
 from ballfg.importing.choices import Choices, UndecidedError
@@ -38,11 +37,6 @@ class Roles:
     by_name: bool = True
     others: tuple[str, ...] = ()
     identities: tuple[str, ...] = ()  # columns that tell several balls of a trajectory apart
-
-    def coordinates(self, table: RawTable) -> NDArray[np.float64]:
-        """(n, 3) positions in the source's unit; zeros along an axis that is not measured."""
-        columns = [numbers(table.columns[one]) if one != UNMEASURED else np.zeros(len(table)) for one in self.places]
-        return np.stack(columns, axis=1)
 
 
 def roles_of(table: RawTable, choices: Choices) -> Roles | None:

@@ -55,10 +55,6 @@ class Frame:
         signs = np.array([-1.0 if axis == self.flip else 1.0 for axis in "xyz"])
         return (positions * signs) @ np.array(TURNS[self.up], dtype=np.float64).T + 0.0
 
-    def turned_sizes(self, sigmas: Array) -> Array:
-        """(n, 3) standard deviations, along the axes of the frame with z up."""
-        return sigmas @ np.abs(np.array(TURNS[self.up], dtype=np.float64)).T
-
     @property
     def rotation(self) -> str:
         """The turn in words."""

@@ -17,7 +17,7 @@ from ballfg.importing.choices import AllUndecidedError, Choices, Guess, Undecide
 from ballfg.importing.columns import UNMEASURED, Roles
 from ballfg.importing.formats.raw import RawTable
 from ballfg.importing.formats.sources import tables_of
-from ballfg.importing.frame import Frame, find_frame
+from ballfg.importing.frame import TURNS, Frame, find_frame
 from ballfg.importing.gathering import MOST_SHOTS, relative, shots_of, split, understood, with_labels
 from ballfg.importing.several_balls import balls_of
 from ballfg.importing.shots import Counts, SourceShot
@@ -218,7 +218,7 @@ def _tracks(shots: Sequence[SourceShot], frame: Frame) -> tuple[list[Track], lis
         times = in_seconds(shot.stamps, frame.time, origin)
         parts = [times[:, None], frame.turned(frame.metres(shot.positions))]
         if shot.sigmas is not None:
-            parts.append(frame.turned_sizes(frame.metres(shot.sigmas)))
+            parts.append(frame.metres(shot.sigmas) @ np.abs(np.array(TURNS[frame.up], dtype=np.float64)).T)
 
         def where(*rows: int, table: RawTable = shot.table) -> str:
             return f"{table.where}, rows {' and '.join(str(row + 1) for row in rows)}"

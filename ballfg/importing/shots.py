@@ -13,7 +13,7 @@ from ballfg.checks import MAX_TEXT, NAME_RULE, is_name, listed, short_text, show
 from ballfg.importing.choices import Choices, UndecidedError
 from ballfg.importing.columns import UNMEASURED, Roles
 from ballfg.importing.formats.raw import Column, RawTable, is_number, numbers
-from ballfg.importing.stamps import Stamps, as_stamps, is_date, joined, missing
+from ballfg.importing.stamps import Stamps, as_stamps, joined, missing
 from ballfg.tracks.track import Label
 
 _DISORDER: Final = 3.0  # median steps: an earlier stamp within this came late; beyond it a new shot begins
@@ -68,7 +68,8 @@ def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list
     if lacking:
         raise ValueError(f"{table.where} must have the columns of the other tables; {listed(lacking)} missing. Add it.")
     stamps = _stamps(table, roles, choices, counts)
-    positions, sigmas = roles.coordinates(table), None
+    columns = [numbers(table.columns[one]) if one != UNMEASURED else np.zeros(len(table)) for one in roles.places]
+    positions, sigmas = np.stack(columns, axis=1), None
     held = ~missing(stamps) & (np.abs(positions) <= _LARGEST).all(axis=1)
     if roles.sigmas is not None:
         sigmas = np.stack([numbers(table.columns[name]) for name in roles.sigmas], axis=1)
@@ -147,7 +148,7 @@ def _stamps(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> 
     if stamps is None:
         what = f"{table.where}: the column of times, {shown(roles.time[0])}, must hold numbers or dates"
         raise UndecidedError(f"{what}; it holds {shown(str(column[0])[:30])}", "columns", (), "t=NAME")
-    counts.dates |= is_date(column)
+    counts.dates |= column.dtype.kind == "O"
     return stamps
 
 

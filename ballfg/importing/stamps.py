@@ -31,11 +31,6 @@ def as_stamps(column: Column) -> Stamps | None:
     return np.array([NO_STAMP if one is None else one for one in parsed], dtype=np.int64)
 
 
-def is_date(column: Column) -> bool:
-    """True if the stamps of the column are dates or times of day, and so in ns."""
-    return column.dtype.kind == "O"
-
-
 def joined(seconds: Column, nanoseconds: Column) -> Stamps:
     """Stamps in ns from their two parts."""
     return seconds.astype(np.int64) * 1_000_000_000 + nanoseconds.astype(np.int64)

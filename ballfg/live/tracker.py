@@ -100,7 +100,6 @@ class _Frame:
         return Kept(self.time, self.positions[k], self.sigmas[k], by_hit)
 
     def refuse(self, k: int, reason: str) -> None:
-        """Refuses a position."""
         self.updates[k] = BallUpdate("refused", self.time, position=self.positions[k], reason=reason)
 
 

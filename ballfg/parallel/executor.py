@@ -1,7 +1,5 @@
 """Chooses where work runs, by `--jobs` or `--cluster`, for all code that distributes work."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -12,7 +10,7 @@ from ballfg.machine import MOST_JOBS
 from ballfg.parallel.work import is_inside
 
 CLUSTERS = ("dask", "ray")  # kinds of clusters, by ballfg's extra for their library
-_CLUSTER: ContextVar[Executor | None] = ContextVar("cluster", default=None)
+_CLUSTER: "ContextVar[Executor | None]" = ContextVar("cluster", default=None)
 
 
 class Pending(Protocol):

@@ -266,7 +266,6 @@ def _rates(propagator: Propagator, belief: Belief) -> RateFunction:
 
 
 def _at_event(there: Belief, event: EventFunction, rates: RateFunction) -> Crossing:
-    """The crossing of a belief with mean `there`."""
     _, gradient = batch_jacobian(event, there.mean, outputs=1)
     with torch.no_grad():
         rate = derivative(rates, there.mean)

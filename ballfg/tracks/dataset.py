@@ -1,7 +1,5 @@
 """A dataset is a folder of tracks that is checked once and then streamed as often as needed."""
 
-from __future__ import annotations
-
 import copy
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -79,7 +77,7 @@ class Dataset(TrackFolder):
         """One track by its name, as `track` gives it."""
         return self.track(name)
 
-    def with_readings(self, attached: Callable[[Track], Track], notes: Sequence[str] = ()) -> Dataset:
+    def with_readings(self, attached: Callable[[Track], Track], notes: Sequence[str] = ()) -> "Dataset":
         """The dataset with further observations in its tracks.
 
         Args: attached: adds them to a track.  notes: on ignored entries of their files, one sentence each.

@@ -1,7 +1,5 @@
 """Sightings are the pixels of one ball in several cameras, each with its own camera's stamp."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -83,7 +81,7 @@ class Sightings:
     def __len__(self) -> int:
         return len(self.times)
 
-    def select(self, rows: ArrayLike) -> Sightings:
+    def select(self, rows: ArrayLike) -> "Sightings":
         """The rows of the numbers (k,), ascending, or of the mask (m,) bool. Raises: ValueError: if none remains."""
         kept = np.asarray(rows)
         radii = None if self.radii is None else self.radii[kept]

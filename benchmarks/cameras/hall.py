@@ -1,7 +1,5 @@
 """Draws pictures of a table in a hall from a camera that pans and zooms: projected polygons."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final
 

@@ -1,7 +1,7 @@
 """Judges strokes that one camera saw: depth, intervals and bounces against the measured tracks of the same strokes."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
@@ -10,18 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
-from ballfg.benchmarks.cameras.rough_camera import roughly_known
 from ballfg.benchmarks.metrics import bootstrap, inside, median_and_quartiles, share
 from ballfg.benchmarks.results import Results
 from ballfg.dynamics import nominal_model
-from ballfg.estimation import Estimate, Estimator
+from ballfg.estimation import Estimate, Estimator, sighted_track
 from ballfg.estimation.observations.sighted_dataset import SightedDataset
+from ballfg.estimation.observations.sightings import sightings_of
 from ballfg.estimation.registry import make_estimator
 from ballfg.front import estimator_for
 from ballfg.learning.calibration.calibrate import calibrate, population_model, population_settings, pose
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.progress import progress
 from ballfg.tracks import Dataset, Track
+from ballfg.vision.calibration.focal import pose_and_focal
+from ballfg.vision.calibration.table_points import Marked
+from ballfg.vision.camera_change import changed
 
 METHOD: Final = "smoother, one camera"
 CALIBRATED: Final = "smoother, one camera, calibrated by the view's other strokes"
@@ -30,6 +33,12 @@ CLICKED: Final = 8
 """Cameras whose errors and clicks are drawn, for the same strokes."""
 FAILED: Final = 1.0
 """m, error of a stroke from which it counts as a failure, as one without states does."""
+FOCAL: Final = 0.05
+"""Relative error of the focal length of a camera that is known roughly, up or down."""
+TURN, MOVE = np.deg2rad(2.0), 0.1
+"""rad and m, errors of the pose, in any direction."""
+CLICK: Final = 3.0
+"""px, noise of each coordinate of a corner."""
 LEVEL: Final = 0.9
 LEAST: Final = 8
 """Strokes of a view of which one half can calibrate for the other."""
@@ -140,3 +149,31 @@ def _add(results: Results, case: str, method: str, found: Sequence[Stroke]) -> N
     add("bounce_time_median", "ms", 1e3 * float(np.nanmedian(late)), int(np.isfinite(late).sum()))
     add("bounce_place_median", "mm", 1e3 * float(np.nanmedian(apart)), int(np.isfinite(apart).sum()))
     add("time", "s", median_and_quartiles([stroke.duration for stroke in found]), n)
+
+
+def roughly_known(view: SightedDataset, tracks: list[Track], seed: int) -> Iterator[Track]:
+    """The tracks of a view as a camera sees them that corners of the table gave back.
+
+    Args: view: of one camera, with the ends of its table.  seed: of the camera's errors and of the clicks.
+    Raises: ValueError: a view without the table's ends.
+    """
+    if view.info.table_extent is None:
+        raise ValueError(f"{view.path} must state the table's ends, frame.table; it does not. Add them.")
+    low_x, high_x, low_y, high_y = view.info.table_extent
+    height, (camera,), rng = view.info.table_height, view.cameras, np.random.default_rng(seed)
+    corners = np.array([(x, y, height) for x in (low_x, high_x) for y in (low_y, high_y)])
+    clicks = camera.project(corners) + CLICK * rng.standard_normal((4, 2))
+    zoom = np.log1p(rng.choice((-FOCAL, FOCAL)))
+    wrong = changed(camera, np.concatenate((TURN * _direction(rng), MOVE * _direction(rng), [zoom])))
+    found = pose_and_focal(wrong, Marked(("a", "b", "c", "d"), corners, clicks, CLICK), FOCAL).camera
+    model = nominal_model(view.ball)
+    for track in tracks:
+        sightings = sightings_of(track).sightings
+        again = sighted_track(track.name, sightings, [found], track.labels, model=model)
+        yield replace(again, dataset=view)
+
+
+def _direction(rng: np.random.Generator) -> Array:
+    """(3,) a unit vector."""
+    drawn = rng.standard_normal(3)
+    return np.asarray(drawn / np.linalg.norm(drawn))

@@ -6,8 +6,6 @@ near behind a player who hides part of the table), the light, the focal length (
 and how much the camera shakes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial

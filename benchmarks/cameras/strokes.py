@@ -4,8 +4,6 @@ Coefficients have the spreads that the model declares, spins those of strokes; f
 process noise of such a track. A nominal ball, which nothing scatters, would be inside of all intervals.
 """
 
-from __future__ import annotations
-
 import copy
 from dataclasses import dataclass, replace
 from typing import Final

@@ -3,8 +3,6 @@
 ballfg track ../shared/data/broadcast/rally.mp4 --out rally && python docs/pictures/rally.py rally
 """
 
-from __future__ import annotations
-
 import json
 import re
 import sys

@@ -4,8 +4,6 @@ Each `*.yaml` is a section: its tables hold entries (measure, required, measured
 rows of `ballfg-bench` from a `*.json` here. `--take RESULTS.json ...` first puts new values into those rows.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections.abc import Iterator

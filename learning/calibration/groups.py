@@ -5,8 +5,6 @@ correlation; the prior's information is removed from both. The spins of a group'
 mean, with the group's spread along each axis (`fit_population`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -48,7 +46,7 @@ class GroupSpin(Plain):
     next_track: Three = (0.0, 0.0, 0.0)  # Standard deviations of a new track's spin about the mean
 
     @classmethod
-    def rows(cls, mean: Array, sigma: Array, spread: Array, next_track: Array, first: int) -> tuple[GroupSpin, ...]:
+    def rows(cls, mean: Array, sigma: Array, spread: Array, next_track: Array, first: int) -> "tuple[GroupSpin, ...]":
         """Of each group. Args: mean, sigma, spread, next_track: (first + 3 groups,) the coefficients come first."""
         parts = [values[first:].reshape(-1, 3).tolist() for values in (mean, sigma, spread, next_track)]
         names = ("mean", "sigma", "spread", "next_track")
@@ -68,7 +66,7 @@ class Groups:
     own: str  # the group of tracks without the label
 
     @classmethod
-    def of(cls, dataset: Dataset | SightedDataset, by: str, fit: Sequence[str]) -> Groups:
+    def of(cls, dataset: Dataset | SightedDataset, by: str, fit: Sequence[str]) -> "Groups":
         """The groups of a dataset's fitted tracks. Raises: ValueError: if no track has the label."""
         if by not in dataset.label_names and by != OWN:
             known = listed(dataset.label_names) if dataset.label_names else "none"

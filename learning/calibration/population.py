@@ -13,8 +13,6 @@ for variance components models", J. Comput. Graph. Stat. 28, 2019, which never l
 no step size.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -160,7 +158,7 @@ class _Fit:
         log_likelihood: marginal, without its constants, with the priors of means and spreads.
     """
 
-    def __init__(self, information: Array, moved: Array, about: _Means, variance: Array) -> None:
+    def __init__(self, information: Array, moved: Array, about: "_Means", variance: Array) -> None:
         self.information, self.moved, self.about, self.variance = information, moved, about, variance
         own = variance[about.numbers]
         varies = own.any(axis=0)
@@ -180,7 +178,7 @@ class _Fit:
         prior = 0.5 * float((np.log(own) - own).sum())
         self.log_likelihood = prior - 0.5 * float(np.linalg.slogdet(inner)[1].sum() + quadratic)
 
-    def at(self, variance: Array) -> _Fit:
+    def at(self, variance: Array) -> "_Fit":
         """The same tracks with other variances (p,)."""
         return _Fit(self.information, self.moved, self.about, variance)
 

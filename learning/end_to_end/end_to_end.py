@@ -4,8 +4,6 @@ The estimate is a function of the model, the launcher's embedding and the noise.
 implicit function theorem (`ballfg.learning.gradient.implicit`). Source: Q. Xiao, Z. Wu, M. Gombolay 2024, section III.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -102,7 +100,7 @@ class EndToEnd(Trainee):
         noise_step: float = NOISE_STEP,
         fades: Sequence[int] = (),
         held_out: Sequence[int] = (),
-        untrained: EndToEnd | None = None,
+        untrained: "EndToEnd | None" = None,
     ) -> None:
         self.module = self.learnables = learnables
         self.shots, self.settings, self.seed, self.augment = shots, loss, seed, augment

@@ -94,6 +94,5 @@ def read_checkpoint(folder: Path) -> Checkpoint | None:
 
 
 def _digests(folder: Path) -> dict[str, str]:
-    """The digest of every file of tensors in a folder."""
     files = {name: folder / f"{name}.safetensors" for name in TENSORS}
     return {name: hashlib.sha256(file.read_bytes()).hexdigest() for name, file in files.items()}

@@ -6,7 +6,7 @@ checkpoint takes the same steps, bit for bit.
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -235,7 +235,10 @@ class Training:
             )
         try:
             self.module.load_state_dict(checkpoint.weights)
-            restore_moments(self.optimizer, self.module, checkpoint.optimizer)
+            parameters = dict(self.module.named_parameters())
+            for name, tensor in checkpoint.optimizer.items():
+                parameter, _, moment = name.rpartition("/")
+                self.optimizer.state[parameters[parameter]][moment] = tensor.clone()
         except (RuntimeError, KeyError) as error:  # torch raises these for names and shapes that differ
             raise ValueError(f"the checkpoint must be of the same model; {error}. Start a new run.") from None
         task.trainee.remember(checkpoint.memory)
@@ -282,11 +285,3 @@ def moments(optimizer: torch.optim.Optimizer, module: nn.Module) -> dict[str, Te
         if parameter in optimizer.state
         for key, tensor in optimizer.state[parameter].items()
     }
-
-
-def restore_moments(optimizer: torch.optim.Optimizer, module: nn.Module, state: Mapping[str, Tensor]) -> None:
-    """Restore the state that `moments` gave. Raises: KeyError: for a parameter that the module does not have."""
-    parameters = dict(module.named_parameters())
-    for name, tensor in state.items():
-        parameter, _, moment = name.rpartition("/")
-        optimizer.state[parameters[parameter]][moment] = tensor.clone()

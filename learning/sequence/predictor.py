@@ -188,7 +188,6 @@ class SequencePredictor:
 
 @of_one_state
 def _read(folder: Path) -> tuple[FolderConfig, dict[str, Tensor]]:
-    """Config and weights of a folder."""
     for name in (CONFIG, WEIGHTS):
         if not (folder / name).is_file():
             raise FileNotFoundError(f"{folder} must hold {CONFIG} and {WEIGHTS}; {name} is missing. Save it again.")

@@ -1,7 +1,5 @@
 """Damped steps to more probable common unknowns, within their bounds, of a density that is about quadratic."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,7 +33,7 @@ class Ahead:
     damping: float = 0.0
 
     @classmethod
-    def of(cls, fit: Fit, found: Posterior) -> Ahead:
+    def of(cls, fit: Fit, found: Posterior) -> "Ahead":
         """From the posterior about a fit."""
         own = len(fit.problem.common_precision)
         information: Array = np.asarray(np.linalg.inv(found.covariance[:own, :own]), dtype=np.float64)

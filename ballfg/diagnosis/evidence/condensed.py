@@ -1,7 +1,5 @@
 """Evidence of many sets of further common unknowns beside the same ones, which are integrated out once."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +23,7 @@ class Condensed:
     halves: Mask
 
     @classmethod
-    def of(cls, tracks: Reduced, precision: Array, away: Array, halves: Mask) -> Condensed:
+    def of(cls, tracks: Reduced, precision: Array, away: Array, halves: Mask) -> "Condensed":
         """With the first unknowns integrated out.
 
         Args:

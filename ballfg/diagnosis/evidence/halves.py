@@ -5,8 +5,6 @@ the other. An effect that is there acts on other shots as well, and gains there 
 for missing physics at these speeds and spins does not.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

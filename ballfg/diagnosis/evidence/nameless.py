@@ -4,8 +4,6 @@ Under wrong physics the nearest effect explains a part, on both halves of the tr
 more than smooth patterns of place, velocity, spin and time would, whose sizes are as free as its own.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -35,7 +33,7 @@ class Patterns:
     blocks: tuple[Index, ...]
 
     @classmethod
-    def of(cls, fit: Fit) -> Patterns:
+    def of(cls, fit: Fit) -> "Patterns":
         """The patterns that a fit's flights, contacts and positions may have."""
         blocks = blocks_of(fit)
         ends = np.cumsum([block.columns.shape[-1] for block in blocks])

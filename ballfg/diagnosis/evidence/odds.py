@@ -1,7 +1,5 @@
 """Probabilities of effects from the evidence of all models that were weighed."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -76,7 +74,7 @@ def scores_of(models: Sequence[Weighed]) -> dict[frozenset[str], float]:
     """
     lost = {model.names: -np.inf for model in models if not np.isfinite(model.evidence)}
     models = [model for model in models if np.isfinite(model.evidence)]
-    weighed = {model.names: model.weight for model in models}
+    weighed = {model.names: model for model in models}
     scores = {names: tempered(names, weight, weighed) + weight.odds for names, weight in weighed.items()}
     found: dict[frozenset[str], float] = {}
     for model in models:

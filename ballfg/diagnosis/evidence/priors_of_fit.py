@@ -1,7 +1,5 @@
 """The normal priors of all common unknowns of a fit, with the most probable width for each effect's strengths."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -39,7 +37,7 @@ class Priors:
     sizes: tuple[Array, ...]
 
     @classmethod
-    def of(cls, fit: Fit, named: Sequence[Hypothesis], patterns: Patterns | None = None) -> Priors:
+    def of(cls, fit: Fit, named: Sequence[Hypothesis], patterns: Patterns | None = None) -> "Priors":
         """The priors at a fit, beside patterns."""
         problem, listed = fit.problem, list(fit.problem.free)
         with_strengths = [h for h in named if h.strengths]

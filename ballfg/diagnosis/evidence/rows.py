@@ -5,8 +5,6 @@ beside the first states: white acceleration in short bins of flight, kicks of ve
 coefficients that scatter from track to track. Their sizes are the noise of the model.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Collection
 from dataclasses import dataclass, replace
@@ -138,7 +136,7 @@ class Rows:
             found[stretches] = rows.swapaxes(1, 2) @ rows
         return found
 
-    def beside(self, columns: Array) -> Rows:
+    def beside(self, columns: Array) -> "Rows":
         """The rows with further common unknowns, last; columns: (b, m, p)."""
         return replace(self, by_common=np.concatenate((self.by_common, columns), axis=-1))
 

@@ -4,8 +4,6 @@ One pass over the tracks gives the inner products of all candidates. Every set o
 solution, so that effects which only help together are found together.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -54,7 +52,7 @@ class Screen:
     tracks: Reduced
     total: Reduced
     priors: Priors
-    _known: dict[tuple[Beside, int, Gone], _Gain] = field(default_factory=dict)
+    _known: "dict[tuple[Beside, int, Gone], _Gain]" = field(default_factory=dict)
     _condensed: dict[Gone, Condensed] = field(default_factory=dict)
 
     @classmethod
@@ -65,7 +63,7 @@ class Screen:
         candidates: Sequence[Hypothesis],
         columns: Array,
         patterns: Patterns | None = None,
-    ) -> Screen:
+    ) -> "Screen":
         """The screen of a model.
 
         Args:
@@ -83,18 +81,14 @@ class Screen:
     @cached_property
     def gains(self) -> list[float]:
         """What each candidate adds to the evidence, at the model's noise, as far as the other half bears it out."""
-        alone = self._alone
+        alone = {self.model.names: self.model}
         found = (tempered(self._names((one,)), weight, alone) for one, weight in enumerate(self._singles))
         return [evidence - self.model.evidence for evidence in found]
 
     @cached_property
     def _singles(self) -> list[Weight]:
         """The weight of the model with each candidate."""
-        return [self.with_one(one, self.model.weight)[0] for one in range(len(self.candidates))]
-
-    @property
-    def _alone(self) -> dict[frozenset[str], Weight]:
-        return {self.model.names: self.model.weight}
+        return [self.with_one(one, self.model)[0] for one in range(len(self.candidates))]
 
     def odds(self, chosen: Sequence[int]) -> float:
         """Logarithm of the posterior odds of the model with some candidates, added in turn, to the model itself."""
@@ -119,7 +113,7 @@ class Screen:
         far as the other half bears it out.
         """
         found: dict[tuple[int, ...], float] = {(one,): self.odds((one,)) for one in offered}
-        best, others = self._leading(found), self._alone
+        best, others = self._leading(found), dict[frozenset[str], Weight]({self.model.names: self.model})
         scores = self._borne_out(best, others)
         for _ in range(most - 1):
             larger: dict[tuple[int, ...], float] = {}
@@ -227,7 +221,7 @@ class Screen:
     def _own(self) -> int:
         return len(self.priors.base)
 
-    def _beside(self, beside: Beside, one: int, gone: Gone = ()) -> _Gain:
+    def _beside(self, beside: Beside, one: int, gone: Gone = ()) -> "_Gain":
         """What one more candidate gains beside others of given widths, without some of the model's effects."""
         key = (beside, one, gone)
         if key in self._known:

@@ -5,8 +5,6 @@ apart and the evidence of each hold the error of its own linearisation. About th
 samples, the linear model of all sets is the same.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -34,11 +32,11 @@ class Sets:
     members: dict[frozenset[str], Member] = field(default_factory=dict)
 
     @classmethod
-    def near(cls, screen: Screen, most: int) -> Sets:
+    def near(cls, screen: Screen, most: int) -> "Sets":
         """The most probable set that single effects lead to, from all of the model's and from none, and its kin."""
         found = cls(screen, most)
         model = screen.model
-        found.members[model.names] = Member(model.weight, (), ())
+        found.members[model.names] = Member(model, (), ())
         for names, weight in model.nested.items():
             gone = tuple(place for place, h in enumerate(screen.effects) if h.name not in names)
             found.members[names] = Member(weight, (), gone)
@@ -63,15 +61,11 @@ class Sets:
 
     def without(self, names: frozenset[str], gone: Iterable[str]) -> frozenset[str]:
         """A set without some of its effects and those that need them, which is weighed if it was not yet."""
-        member, screen = self.members[names], self.screen
         lost = set(gone) & names
-        listed = {h.name: h for h in (*screen.effects, *screen.candidates) if h.name in names}
+        listed = {h.name: h for h in (*self.screen.effects, *self.screen.candidates) if h.name in names}
         kinds = {listed[name].effect.name for name in lost}
         lost |= {name for name, h in listed.items() if kinds & set(h.effect.needs)}
-        places = {place for place, h in enumerate(screen.effects) if h.name in lost}
-        chosen = tuple(one for one, _ in member.beside if screen.candidates[one].name not in lost)
-        self._add(names - lost, tuple(sorted({*member.gone, *places})), chosen)
-        return names - lost
+        return self._rest(names, lost)
 
     def _climb(self, names: frozenset[str]) -> None:
         """Adds and removes single effects as long as that makes a set more probable; if none does, exchanges one."""
@@ -98,17 +92,8 @@ class Sets:
     def _smaller(self, names: frozenset[str]) -> list[frozenset[str]]:
         """The sets with one effect less; those that no larger one led to are weighed."""
         member, screen = self.members[names], self.screen
-        found = []
-        for place, one in enumerate(member.beside):
-            rest = names - {screen.candidates[one[0]].name}
-            self._add(rest, member.gone, tuple(c for c, _ in (*member.beside[:place], *member.beside[place + 1 :])))
-            found.append(rest)
-        for place, effect in enumerate(screen.effects):
-            if place not in member.gone:
-                gone = tuple(sorted((*member.gone, place)))
-                self._add(names - {effect.name}, gone, tuple(one for one, _ in member.beside))
-                found.append(names - {effect.name})
-        return found
+        kept = [h for place, h in enumerate(screen.effects) if place not in member.gone]
+        return [self._rest(names, {h.name}) for h in (*(screen.candidates[one] for one, _ in member.beside), *kept)]
 
     def _larger(self, names: frozenset[str]) -> list[frozenset[str]]:
         """The sets with one candidate more, each in its best shape."""
@@ -124,15 +109,19 @@ class Sets:
                 found.add(larger)
         return list(found)
 
-    def _add(self, names: frozenset[str], gone: Gone, chosen: tuple[int, ...]) -> None:
-        """Weighs a set if it was not yet, and if none of its effects needs one that is gone."""
-        if names in self.members or not self._stands(gone, chosen):
-            return
-        plain = self.screen.model.names - {self.screen.effects[place].name for place in gone}
-        weight, beside = self.members[plain].weight, Beside()
-        for one in chosen:
-            weight, beside = self.screen.with_one(one, weight, beside, gone)
-        self.members[names] = Member(weight, beside, gone)
+    def _rest(self, names: frozenset[str], lost: set[str]) -> frozenset[str]:
+        """A set without some effects, which is weighed if it was not yet, and if none of the others needs them."""
+        member, screen, rest = self.members[names], self.screen, names - lost
+        places = {place for place, h in enumerate(screen.effects) if h.name in lost}
+        gone = tuple(sorted({*member.gone, *places}))
+        chosen = [one for one, _ in member.beside if screen.candidates[one].name not in lost]
+        if rest not in self.members and self._stands(gone, chosen):
+            plain = screen.model.names - {screen.effects[place].name for place in gone}
+            weight, beside = self.members[plain].weight, Beside()
+            for one in chosen:
+                weight, beside = screen.with_one(one, weight, beside, gone)
+            self.members[rest] = Member(weight, beside, gone)
+        return rest
 
     def _stands(self, gone: Gone, chosen: Iterable[int]) -> bool:
         """True if no effect of a set needs one that is gone."""

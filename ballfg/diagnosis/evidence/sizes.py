@@ -163,7 +163,7 @@ class _Shown:
 def _shown(likelihood: Likelihood, noise: Noise, local: Local, found: Posterior) -> _Shown:
     kinds = likelihood.rows.kinds
     end = STATE_DIM + kinds.shape[1]
-    upper = inverses(local.lower)
+    upper = np.stack([linalg.lapack.dtrtri(one.T)[0] for one in local.lower])
     solved = upper @ local.solved.swapaxes(1, 2)  # (n, l, c + 1), what local unknowns absorb of each column
     step, root = np.append(-found.mean, 1.0), np.linalg.cholesky(found.covariance)
     mean, moved = solved @ step, solved[..., :-1] @ root
@@ -202,8 +202,3 @@ def _products(likelihood: Likelihood, noise: Noise, upper: Array, solved: Array,
     local = upper.swapaxes(1, 2) @ rows[:, :end]
     common = (rows[:, end:-1] - solved[:, :-1] @ local).sum(axis=0)
     return products - np.einsum("nla,nlb->ab", local, local), common
-
-
-def inverses(lower: Array) -> Array:
-    """(n, l, l) transposed inverses of triangles (n, l, l)."""
-    return np.stack([linalg.lapack.dtrtri(one.T)[0] for one in lower])

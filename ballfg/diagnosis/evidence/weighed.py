@@ -1,7 +1,5 @@
 """Weighs a fitted model: its noise, its evidence, and its density of tracks whose half it was not fitted to."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
@@ -67,7 +65,7 @@ class Smaller(Weight):
 
 
 @dataclass(frozen=True)
-class Weighed:
+class Weighed(Weight):
     """A model with its evidence.
 
     Attributes:
@@ -76,10 +74,7 @@ class Weighed:
         noise: sizes of its noise.
         weights: robust weights, batch by batch.
         widths: number of each effect's most probable prior width.
-        evidence: logarithm, natural units, up to a constant that all models of the same tracks share.
-        odds: logarithm of the prior odds.
         strengths: by name of the effect.
-        held_out: (t,) logarithm of the density of each track, with coefficients of the other half.
         halves: (t,) which half each track belongs to.
         nameless: whether it holds patterns without a name as well.
         nested: the weight of each smaller model, by its names, the rest linearised where it is.
@@ -91,10 +86,7 @@ class Weighed:
     noise: Noise
     weights: tuple[Weights, ...]
     widths: tuple[int, ...]
-    evidence: float
-    odds: float
     strengths: Mapping[str, Strengths]
-    held_out: Array
     halves: Mask
     nameless: bool = False
     nested: Mapping[frozenset[str], Smaller] = field(default_factory=dict)
@@ -110,17 +102,7 @@ class Weighed:
         """Where the noise of a similar model starts."""
         return Start(self.noise, self.weights)
 
-    @property
-    def weight(self) -> Weight:
-        """What decides about it."""
-        return Weight(self.evidence, self.odds, self.held_out)
-
-    @property
-    def score(self) -> float:
-        """As of its weight."""
-        return self.weight.score
-
-    def without(self, gain: float) -> Weighed:
+    def without(self, gain: float) -> "Weighed":
         """With strengths where its fit has them, and less evidence, also of the models that it holds.
 
         Args: gain: what a step promises that leads nowhere.
@@ -169,23 +151,18 @@ def weighed(
         patterns: without a name, beside the effects; of this or a similar model.
     """
     with np.errstate(invalid="ignore"):  # differences of models without a density: they lose to all others
-        return _followed(_Question(named, motion, halves, patterns), fit, like)
-
-
-def _followed(question: _Question, fit: Fit, like: Weighed | None) -> Weighed:
-    """The model at the most probable unknowns near a fit."""
-    closest = followed(fit, fit.unknowns)
-    point = question.point(closest if np.isfinite(closest.cost) else fit)
-    found, ahead, density = question.at(point, (like.start, None) if like else (None,))
-    if question.nameless:  # without patterns the path would leave the samples; noise and widths need a second turn
-        return question.at(point, (found.start,), found.widths)[0]
-    for _ in range(MOST_STEPS):
-        moved = question.moved(point, found, ahead, density)
-        if moved is None:
-            break
-        point, damping = moved
-        found, ahead, density = question.at(point, (found.start,), damping=damping)
-    return found.without(ahead.gain) if ahead.gain > WORTH_A_STEP else found
+        question, closest = _Question(named, motion, halves, patterns), followed(fit, fit.unknowns)
+        point = question.point(closest if np.isfinite(closest.cost) else fit)
+        found, ahead, density = question.at(point, (like.start, None) if like else (None,))
+        if question.nameless:  # without patterns the path would leave the samples; noise and widths need a second turn
+            return question.at(point, (found.start,), found.widths)[0]
+        for _ in range(MOST_STEPS):
+            moved = question.moved(point, found, ahead, density)
+            if moved is None:
+                break
+            point, damping = moved
+            found, ahead, density = question.at(point, (found.start,), damping=damping)
+        return found.without(ahead.gain) if ahead.gain > WORTH_A_STEP else found
 
 
 @dataclass(frozen=True)
@@ -217,7 +194,6 @@ class _Question:
         return self.patterns is not None
 
     def point(self, fit: Fit) -> _Point:
-        """The rows of a fit and the priors at its unknowns."""
         fit = with_guesses(fit)
         rows = rows_beside(fit, self.motion, self.patterns)
         return _Point(fit, rows, Priors.of(fit, self.named, self.patterns))
@@ -250,15 +226,15 @@ class _Question:
             strengths[hypothesis.name] = found
         evidence = result.evidence + sum(mixed) + choice_odds(self.named)
         weighed = Weighed(
+            evidence if np.isfinite(evidence) else -np.inf,
+            log_odds(self.named, self.nameless),
+            held_out(total, priors.precision(best), priors.away, self.halves),
             tuple(self.named),
             replace(fit),  # without what can be computed again: a search keeps dozens of models
             noise,
             likelihood.weights,
             tuple(best),
-            evidence if np.isfinite(evidence) else -np.inf,
-            log_odds(self.named, self.nameless),
             strengths,
-            held_out(total, priors.precision(best), priors.away, self.halves),
             self.halves,
             self.nameless,
             self._nested(priors, total, best, mixed),

@@ -107,7 +107,8 @@ def fit_problem(
     for _ in range(SCALE_ROUNDS if settle_noise else 0):
         before, noise = result.noise, _settled(result)
         result = _minimise(Fit.at(result.problem, result.unknowns, noise, result.steps))
-        if _near(before, noise):
+        ratios = np.append(noise.position / before.position, noise.spin / before.spin)
+        if bool(np.abs(np.log(ratios)).max() < SETTLED):
             break
     return result
 
@@ -126,12 +127,6 @@ def followed(fit: Fit, unknowns: Unknowns) -> Fit:
     for _ in range(CORRECTIONS):
         moved = _followed_up(moved, system, fit.robust)
     return moved
-
-
-def _near(before: Noise, after: Noise) -> bool:
-    """True if the noise has converged."""
-    ratios = np.append(after.position / before.position, after.spin / before.spin)
-    return bool(np.abs(np.log(ratios)).max() < SETTLED)
 
 
 def values_of(fit: Fit, names: Iterable[str], declared: Mapping[str, float]) -> dict[str, Value]:

@@ -5,8 +5,6 @@ response of the samples to such a pattern. Quantities and axes are named in word
 coefficients that change over a recording.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -156,7 +154,7 @@ class _Scale:
     scatter: Array
 
     @staticmethod
-    def of(group: Names, values: Array) -> _Scale:
+    def of(group: Names, values: Array) -> "_Scale":
         flat = values.reshape(-1, values.shape[-1])
         same = np.array([name == EVERYWHERE for name in group])
         scatter = np.where(same, 1.0, flat.std(axis=0))

@@ -4,8 +4,6 @@ Between two nodes a state is a sum of the nodes' states and slopes, with weights
 its derivatives, which need no dual arithmetic at the samples.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Self
@@ -32,7 +30,7 @@ class RepeatedMotion:
         parts: 3; or 1 for positions alone, with states (n, k, 3).
     """
 
-    def __init__(self, arcs: Sequence[MovedArc], balls: int, directions: int, parts: int) -> None:
+    def __init__(self, arcs: "Sequence[MovedArc]", balls: int, directions: int, parts: int) -> None:
         self.arcs, self.balls, self.directions, self.parts = arcs, balls, directions, parts
 
     def states(self, times: Tensor) -> tuple[Tensor, Tensor]:

@@ -43,16 +43,6 @@ class Hypothesis:
         """Name of the effect."""
         return self.effect.name
 
-    @property
-    def sentence(self) -> str:
-        """Its meaning in words."""
-        return self.effect.sentence
-
-    @property
-    def decide(self) -> str:
-        """The measurement that would decide."""
-        return self.effect.decide
-
     def deviations(self) -> dict[str, Deviation]:
         """Its unknowns that act on some tracks more than on others; none if the effect is the same for all."""
         return {}

@@ -3,8 +3,6 @@
 Tests of candidate effects need only the inner products of these columns, track by track.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -37,7 +35,7 @@ class Signatures:
         """Number of tracks."""
         return len(self.gram)
 
-    def efficient(self) -> Efficient:
+    def efficient(self) -> "Efficient":
         """Scores and information of the candidates, with the common columns projected out too."""
         q, g = self.common, self.gram
         total = g.sum(axis=0)

@@ -4,12 +4,12 @@ import math
 from collections.abc import Iterator, Sequence
 
 from ballfg.diagnosis.report import pictures
-from ballfg.diagnosis.report.glossary import outcome_badge, term
+from ballfg.diagnosis.report.glossary import OUTCOMES, term
 from ballfg.diagnosis.report.headline import not_shown
 from ballfg.diagnosis.report.wording import NONE, capital, listed, number, plain_name, probability, sized
 from ballfg.diagnosis.result import Candidate, Diagnosis, Outcome
 from ballfg.dynamics import EFFECTS
-from ballfg.pages.html import Html, bar, picture, section, table, tag
+from ballfg.pages.html import Html, bar, explained, picture, section, table, tag
 
 COLOURS = {Outcome.ADDED: "added", Outcome.ALIKE: "alike"}  # CSS classes for the outcome of a candidate
 SHOWN = 8  # Number of visible rows of a ranking; the others unfold
@@ -56,7 +56,7 @@ def _lines(row: Sequence[Candidate], most: float) -> Iterator[tuple[str, ...]]:
             NONE if unseen else probability(c.p_value),
             NONE if c.delta_bic is None else f"{c.delta_bic:+.0f}",
             NONE if unseen else listed(c.estimate),
-            outcome_badge(c.outcome, colour),
+            explained(c.outcome.value, OUTCOMES[c.outcome], f"badge {colour}"),
         )
 
 

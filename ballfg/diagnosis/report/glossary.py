@@ -55,11 +55,6 @@ def term(name: str, shown: str = "") -> Html:
     return explained(shown or name, TERMS[name])
 
 
-def outcome_badge(outcome: Outcome, colour: str) -> Html:
-    """The outcome of a candidate, with its explanation on hover; colour: a class of the page."""
-    return explained(outcome.value, OUTCOMES[outcome], f"badge {colour}")
-
-
 def glossary() -> Html:
     """All words with their explanations."""
     return meanings(TERMS | {f"“{outcome.value}”": meaning for outcome, meaning in OUTCOMES.items()})

@@ -7,17 +7,25 @@ each label has a probability of being wrong, and a single doubtful one among man
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.diagnosis.fit.holdout import Holdout
+from ballfg.diagnosis.fit.free import declared_free
+from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout
 from ballfg.diagnosis.generic_test import GenericTest
+from ballfg.diagnosis.hypotheses.hypothesis import with_effects
 from ballfg.diagnosis.label_verdicts import LabelCheck, LabelVerdict
 from ballfg.diagnosis.residual_tests.label_flights import LabelledFlight, labelled_flights
-from ballfg.diagnosis.residual_tests.label_model import scattering_model
+from ballfg.diagnosis.search.process_noise import noise_about
 from ballfg.dynamics import AnalyticModel
+from ballfg.estimation import Settings, Status, dataset_settings
+from ballfg.estimation.batch import estimate_tracks
+from ballfg.estimation.registry import make_estimator
+from ballfg.learning.calibration.coefficients import choose, values_of, with_values
+from ballfg.learning.calibration.population import evidence, fit_population
 from ballfg.tracks.noise import TrackNoise
 
 LABEL: Final = "label"
@@ -32,6 +40,11 @@ RIGHT_SPREAD: Final = 0.7
 """Standard deviation of the logarithm of such a multiple: stated noise is known to a factor of two."""
 WRONG: Final = np.exp(np.linspace(-1.1, 1.1, 9))
 """Errors of wrong labels, as multiples of `wrong_error`: a third to three times."""
+
+MOST_ROUNDS = 5
+"""Largest number of fits of the population; usual are three, from coefficients far off."""
+SETTLED = 0.1
+"""Change of the population's mean, in standard errors, below which it has converged."""
 
 
 def check_labels(
@@ -60,6 +73,65 @@ def label_evidence(
         return []
     ball, settings = scattering_model(model, declared, tracks, holdout, tracker, jobs=jobs)
     return labelled_flights(ball, holdout.surfaces, settings, tracks, jobs)
+
+
+def scattering_model(
+    model: AnalyticModel,
+    declared: AnalyticModel,
+    tracks: Sequence[EvaluationTrack],
+    holdout: Holdout,
+    tracker: TrackNoise | None = None,
+    *,
+    jobs: int = 1,
+) -> tuple[AnalyticModel, Settings]:
+    """A corrected model with refitted coefficients, and the settings for predictions with it.
+
+    The diagnosis' own fit flies deterministically. If real bounces scatter, it adapts coefficients and spins to them,
+    and right labels then seem wrong. Here each track is smoothed with process noise, and the coefficients are the mean
+    of a population of tracks. The noise about that model comes from forecasts, as for predictions.
+
+    The declared coefficients of flight and bounce are refitted to tracks with spin labels, about their declared values;
+    added effects and values that differ between tracks stay. The tracker's memory and jitter are used if found.
+    """
+    plain = with_effects(model)
+    plain.variations = model.variations
+    usual = dataset_settings(holdout.dataset, plain)  # no noise is stated in this model
+    names = [n for n in declared_free(declared) if not n.startswith("measurement.") and n not in model.variations]
+    if names:
+        plain = _of_population(plain, declared, names, tracks, holdout, usual, jobs)
+    plain.noise = noise_about(plain, tracks, holdout.dataset, tracker, jobs=jobs)
+    settings = dataset_settings(holdout.dataset, plain)
+    # the labels' estimated error includes wrong labels: right ones have the dataset's error
+    return plain, replace(settings, spin_label_noise=usual.spin_label_noise)
+
+
+def _of_population(
+    model: AnalyticModel,
+    declared: AnalyticModel,
+    names: Sequence[str],
+    tracks: Sequence[EvaluationTrack],
+    holdout: Holdout,
+    settings: Settings,
+    jobs: int,
+) -> AnalyticModel:
+    chosen, mean = choose(declared, names), values_of(model, names)
+    priors = {**settings.coefficients, **dict(zip(names, chosen.sigma.tolist(), strict=True))}
+    for _ in range(MOST_ROUNDS):
+        moving = with_values(model, names, mean)
+        smoother = make_estimator("smoother", moving, holdout.surfaces, replace(settings, coefficients=priors))
+        estimates = estimate_tracks(smoother, (part.track for part in tracks), len(tracks), jobs)
+        found = []
+        for estimate in (e for e in estimates if e.status is Status.OK):
+            columns = [estimate.coefficient_names.index(name) for name in names]
+            covariance = estimate.coefficient_covariance[np.ix_(columns, columns)]
+            found.append(evidence(estimate.coefficients[columns], covariance, mean, chosen.sigma))
+        if not found:
+            return model
+        population = fit_population(found, chosen.start, chosen.sigma, chosen.low, chosen.high)
+        before, mean = mean, population.mean
+        if np.abs((mean - before) / population.sigma).max() < SETTLED:
+            break
+    return with_values(model, names, mean)
 
 
 def judged(flights: Sequence[LabelledFlight]) -> LabelCheck | None:

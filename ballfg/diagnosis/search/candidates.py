@@ -67,13 +67,11 @@ def score_all(
     Returns: the tests, sorted by explained residual, invisible hypotheses last.
     """
     testable = [h for h in candidates if h.strengths]
-    if not testable:
-        return []
     return screened(model, testable, random_motion(model.fit) if motion is None else motion)[0]
 
 
 def screened(model: Weighed, testable: Sequence[Hypothesis], motion: Motion) -> tuple[list[Scored], Screen]:
-    """The same of hypotheses with strengths, at least one, and what foretells the gains of sets of them.
+    """The same of hypotheses with strengths, and what foretells the gains of sets of them.
 
     Args: motion: random columns of the model's fit.
     """

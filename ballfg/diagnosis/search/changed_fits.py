@@ -47,15 +47,15 @@ def model_of(sets: Sets, names: frozenset[str], first: Fit) -> Weighed:
     effects = len(sets.screen.effects)
     widths = [width for place, width in enumerate(model.widths[:effects]) if place not in member.gone]
     return Weighed(
+        member.weight.evidence,
+        member.weight.odds,
+        member.weight.held_out,
         (*(h for h in model.named if h not in gone), *added),
         fit,
         model.noise,
         model.weights,
         (*widths, *(width for _, width in member.beside), *model.widths[effects:]),
-        member.weight.evidence,
-        member.weight.odds,
         strengths,
-        member.weight.held_out,
         model.halves,
         nameless=True,
     )

@@ -97,7 +97,8 @@ def _apex_distances(evaluated: EvaluationTrack, prediction: TrackPrediction) -> 
 
 def on_others(fitted: Fit, others: Stretches) -> Fit:
     """The fit of first states to stretches of other tracks, with all else as fitted."""
-    return _on(fitted, _reached(fitted, others), fitted.noise)
+    values = fitted.problem.by_stretch(fitted.unknowns.values, others)
+    return _on(fitted, reachable(fitted.problem.model, others, values), fitted.noise)
 
 
 def on_all(fitted: Fit, others: Fit) -> Fit:
@@ -107,11 +108,6 @@ def on_all(fitted: Fit, others: Fit) -> Fit:
     starts = np.concatenate((fitted.unknowns.starts, others.unknowns.starts))
     unknowns = replace(fitted.unknowns, starts=starts)
     return fit_problem(replace(fitted.problem, stretches=stretches), unknowns, fitted.noise, settle_noise=False)
-
-
-def _reached(fitted: Fit, stretches: Stretches) -> Stretches:
-    values = fitted.problem.by_stretch(fitted.unknowns.values, stretches)
-    return reachable(fitted.problem.model, stretches, values)
 
 
 def _on(fitted: Fit, stretches: Stretches, noise: Noise) -> Fit:

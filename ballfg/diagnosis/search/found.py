@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,6 +40,7 @@ AT_ONCE = 2
 """Number of attempts that are made side by side, whatever the number of processes: results do not depend on it."""
 MOST_EXCHANGES = 3
 """Largest number of exchanges that a round refits."""
+SCORE = attrgetter("score")
 
 
 @dataclass(frozen=True)
@@ -92,19 +94,18 @@ class Found:
         scores = self.scores
         return model is not None and scores[model.names] > scores[(than or self.best).names] + by
 
-    def telling(self, where: str) -> Callable[[str], None]:
-        """What tells lines of progress at a place of the search."""
-        return lambda line: self.loop.watch(f"{where}: {line}")
-
     def round(self) -> bool:
         """Adds the effects that make the model most probable, and removes those that they make superfluous."""
         loop, best, number = self.loop, self.best, len(self.rounds) + 1
-        tell = self.telling(f"round {number}")
+
+        def tell(line: str) -> None:
+            loop.watch(f"round {number}: {line}")
+
         most = MOST_EFFECTS - len(best.named)
         scored, attempts, screen = try_hypotheses(best, self.motion, loop.catalogue, tell, most)
         refits, winner = self._attempted(attempts, tell)
         scored = retested(scored, refits)
-        if screen is not None and not self.is_better(winner):
+        if not self.is_better(winner):
             self.best = self.models[best.names] = replace(best, neighbours=screen.neighbours)
             if (exchanged := self._exchanged(screen, scored, tell)) is not None:
                 self.rounds.append(Round(scored, [*refits, exchanged], (exchanged.name,)))
@@ -135,7 +136,7 @@ class Found:
         Those that are foretold to come close are refitted: they are what cannot be told apart. An absence that is many
         standard deviations away lies beyond the linear range, so that close is a share of what the effect explains.
         """
-        best, tried, scores = self.best, list[tuple[Weighed, Refit]](), self.scores
+        best, tried, scores = self.best, dict[frozenset[str], Refit](), self.scores
 
         def exchanged(gone: str, one: int) -> frozenset[str]:
             return best.names - {gone} | {screen.candidates[one].name}
@@ -152,14 +153,13 @@ class Found:
             named = (*(h for h in best.named if h is not own), other)
             found = weighed(refitted.fit, named, self.motion, self.halves, best)
             self.models[found.names] = found
-            tried.append((found, refitted))
-        winner = self.most_probable(found for found, _ in tried)
+            tried[found.names] = refitted
+        winner = self.most_probable(self.models[names] for names in tried)
         if winner is None or not self.is_better(winner):
             return None
-        found, refitted = next(one for one in tried if one[0] is winner)
-        tell(f"{refitted.name} exchanged for another")
-        self.best = found
-        return refitted
+        self.best = winner
+        tell(f"{tried[winner.names].name} exchanged for another")
+        return tried[winner.names]
 
     def compare(self) -> None:
         """Weighs something nameless beside the best model, and if it is there, which effects are there beside it.
@@ -262,7 +262,7 @@ class Found:
             self.tried.add((model.names, names))
             fit = smaller_fit(model, gone, self.first)
             found = weighed(fit, kept, self.motion, self.halves, model)
-            self.models[names] = found if known is None else max(known, found, key=_score)
+            self.models[names] = found if known is None else max(known, found, key=SCORE)
         return self.models[names]
 
     def _weighed(self, refits: Sequence[Refit]) -> Weighed | None:
@@ -288,7 +288,7 @@ class Found:
     def _known(self, found: Sequence[Weighed]) -> list[Weighed]:
         """Models with their effects in the best minimum of all that were found, each once; they count from now on."""
         for model in found:
-            self.models[model.names] = max(self.models.get(model.names, model), model, key=_score)
+            self.models[model.names] = max(self.models.get(model.names, model), model, key=SCORE)
         return [self.models[names] for names in dict.fromkeys(model.names for model in found)]
 
     def _smaller(self, model: Weighed) -> dict[frozenset[str], float]:
@@ -299,24 +299,17 @@ class Found:
         """
         if not np.isfinite(model.evidence):
             return {}
-        weights = {names: known.weight for names, known in self.models.items() if np.isfinite(known.evidence)}
+        weighed = {names: known for names, known in self.models.items() if np.isfinite(known.evidence)}
         scores = self.scores
-        found = foretold(model, model.nested, scores, weights)
+        found = foretold(model, model.nested, scores, weighed)
         return {n: scores[n] if (model.names, n) in self.tried else max(scores[n], score) for n, score in found.items()}
-
-    def _superfluous(self, model: Weighed) -> list[Hypothesis]:
-        """Effects without which a model is more probable, as far as is known."""
-        least, smaller = self.scores[model.names], self._smaller(model)
-        return [h for h in model.named if smaller.get(model.names - {h.name}, -np.inf) > least]
 
     def _pruned(self) -> None:
         """Removes effects that later ones made superfluous, as the linearisation says and a refit confirms."""
-        while gone := self._superfluous(self.best):
+        while True:
+            best, score, smaller = self.best, self.scores[self.best.names], self._smaller(self.best)
+            gone = [h for h in best.named if smaller.get(best.names - {h.name}, -np.inf) > score]
             least = self.most_probable(self.without([h]) for h in gone)
             if least is None or not self.is_better(least):
                 break
             self.best = least
-
-
-def _score(model: Weighed) -> float:
-    return model.score

@@ -42,8 +42,8 @@ def finding_of(
     return Finding(
         name=hypothesis.name,
         kind=hypothesis.effect.kind,
-        sentence=hypothesis.sentence,
-        decide=hypothesis.decide,
+        sentence=hypothesis.effect.sentence,
+        decide=hypothesis.effect.decide,
         parameters=values,
         p_value=_by_chance(hypothesis, model.evidence - without.evidence, scored),
         delta_bic=-2.0 * (model.evidence - without.evidence),

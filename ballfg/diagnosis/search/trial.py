@@ -138,10 +138,10 @@ def try_hypotheses(
     catalogue: Sequence[type[Effect]],
     tell: Callable[[str], None],
     most: int = 1,
-) -> tuple[list[Scored], list[Attempt], Screen | None]:
+) -> tuple[list[Scored], list[Attempt], Screen]:
     """Scores all hypotheses, sorted by explained residual, and lists the refits of the best, alone and together.
 
-    The screen foretells what no refit weighs; None without hypotheses.
+    The screen foretells what no refit weighs.
 
     Args:
         weighed: the model without any of them.
@@ -153,11 +153,10 @@ def try_hypotheses(
     before, model = weighed.fit, weighed.fit.problem.model
     testable, driven = _offered(weighed, catalogue)
     tell(f"testing {len(testable) + len(driven)} hypotheses")
-    scored, screen = screened(weighed, testable, motion) if testable else ([], None)
+    scored, screen = screened(weighed, testable, motion)
     leading = shortlist(scored)
     called = {candidate.hypothesis.name for candidate in leading}
-    attempts = _alone(before, leading)
-    attempts += [] if screen is None else _together(screen, scored, most)
+    attempts = [*_alone(before, leading), *_together(screen, scored, most)]
     for one in scored:
         hypothesis = one.hypothesis
         if hypothesis.usual and hypothesis.name not in called and not has_effect(model, hypothesis.name):

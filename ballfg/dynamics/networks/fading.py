@@ -1,7 +1,5 @@
 """Fades a network's correction away from its training data and keeps an unknown share of it as uncertainty."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final
 
@@ -53,7 +51,7 @@ class FeatureDensity(nn.Module):
         return weight
 
     @classmethod
-    def of(cls, groups: Sequence[Array], features: int) -> FeatureDensity:
+    def of(cls, groups: Sequence[Array], features: int) -> "FeatureDensity":
         """The density of training features, with the kernel width that is most probable for held-out tracks.
 
         Every track counts the same, however many samples it has.
@@ -122,12 +120,12 @@ class Fading(nn.Module):
         self.register_buffer("velocity", torch.zeros((), dtype=torch.float64))
 
     @classmethod
-    def empty(cls, flying: int, bouncing: int, radius: float) -> Fading:
+    def empty(cls, flying: int, bouncing: int, radius: float) -> "Fading":
         """An object with this many kernels of each density, to be filled from a file."""
         return cls(FeatureDensity(flying, FLIGHT_FEATURES), FeatureDensity(bouncing, CONTACT_FEATURES), radius)
 
     @classmethod
-    def of(cls, flights: Sequence[Tensor], contacts: Sequence[Tensor], radius: float) -> Fading:
+    def of(cls, flights: Sequence[Tensor], contacts: Sequence[Tensor], radius: float) -> "Fading":
         """Fits the densities to training tracks.
 
         Args:

@@ -277,7 +277,6 @@ class _Run:
         return first_pair(self.track.times, self.track.positions, sigma, near, first)
 
     def _predict(self, ball: BallFilter, k: int) -> None:
-        """Predicts to the time of sample k."""
         times, record = self.track.times, self.record
         used = next((i for i in range(k, len(times)) if i not in self.skipped), k)
         R = self._measurement_noise(used, self.velocities[used])

@@ -1,7 +1,5 @@
 """Cuts flights out of tracks, and gives those of a dataset as a dataset, with what commands say about the rest."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -38,7 +36,7 @@ LOOKED_AT: Final = 200  # Number of tracks that show whether a filter smoothed t
 class FlightsOf(Dataset):
     """The flights of a dataset as a dataset; tracks that only fly are in it as they are."""
 
-    def __init__(self, whole: Dataset, pieces: dict[str, list[Piece] | None]) -> None:
+    def __init__(self, whole: Dataset, pieces: "dict[str, list[Piece] | None]") -> None:
         self.__dict__.update(whole.__dict__)
         self._whole, self._pieces = whole, pieces
 
@@ -159,13 +157,13 @@ class Contents:
         smoothing, others: as of `InFlight`.
     """
 
-    pieces: dict[str, list[Piece] | None]
+    pieces: "dict[str, list[Piece] | None]"
     share: float
     smoothing: float
     others: str
 
     @classmethod
-    def of(cls, labelled: Iterable[tuple[Track, Labels]], whole: Callable[[Track, Labels], bool]) -> Contents:
+    def of(cls, labelled: Iterable[tuple[Track, Labels]], whole: Callable[[Track, Labels], bool]) -> "Contents":
         """Of labelled tracks. Args: whole: True for a track that is used as a whole."""
         pieces: dict[str, list[Piece] | None] = {}
         ratios, jumps, samples, flying, lost = list[Array](), list[float](), 0, 0, 0

@@ -1,7 +1,5 @@
 """Positions are the usual observation of a track."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import numpy as np
@@ -16,7 +14,6 @@ from ballfg.factors.correlated_noise import BiasedPositionFactors
 from ballfg.factors.linear.covariance import Covariances
 from ballfg.factors.position import PositionFactors
 from ballfg.state import STATE_DIM
-from ballfg.tracks import Track
 
 
 class Positions(Observation):
@@ -39,7 +36,7 @@ class Positions(Observation):
             self.state, self.positions, context.sigma, stamps, settings.loss, settings.has_memory
         )
 
-    def select(self, samples: NDArray[np.bool_]) -> Positions:
+    def select(self, samples: NDArray[np.bool_]) -> "Positions":
         """The positions of some samples."""
         return Positions(self.positions[samples])
 
@@ -49,9 +46,3 @@ class Positions(Observation):
             return leave_one_out(rows, covariances)
         noise = context.sigma[:, :, None] ** 2 * np.eye(3)
         return leave_position_out(values.states, covariances.states, self.positions, noise, rows)
-
-
-def observations_of(track: Track) -> tuple[Observation, ...]:
-    """All observations of a track: its further ones, and its positions unless they were computed from those."""
-    measured = () if track.rough else (Positions(track.positions),)
-    return (*measured, *track.observations)

@@ -1,7 +1,5 @@
 """Holds the sightings of one ball by one or more cameras, and makes a track with rough positions from them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -149,7 +147,7 @@ class CameraSightings(Observation):
         seen.moved = self.moved + offsets - self.time_offsets
         return again.observed(*(other.onto(track, again) for other in track.observations if other is not self))
 
-    def select(self, samples: NDArray[np.bool_]) -> CameraSightings:
+    def select(self, samples: NDArray[np.bool_]) -> "CameraSightings":
         """The sightings of some samples."""
         rows, number = samples[self.state], np.cumsum(samples) - 1
         sightings, state = self.sightings.select(rows), number[self.state[rows]]
@@ -175,7 +173,7 @@ class CameraSightings(Observation):
         own = CameraSightings(*arrays, one_view=True, bounces=found.contacts(track.times), place=place)
         return replace(self._in_place(track, own), positions=found.path.positions, sigmas=found.path.sigmas)
 
-    def _in_place(self, track: Track, other: CameraSightings) -> Track:
+    def _in_place(self, track: Track, other: "CameraSightings") -> Track:
         """The track with other sightings in place of these."""
         return replace(track, observations=tuple(other if one is self else one for one in track.observations))
 

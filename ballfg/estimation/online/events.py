@@ -1,7 +1,5 @@
 """Keeps the segmenter's current events on a stream and applies them to the samples of the window."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Sequence
@@ -19,7 +17,7 @@ from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.estimation.segmentation.result import Event, EventKind, Quality, Segmentation
 from ballfg.estimation.segmentation.segmenter import Segmenter
 from ballfg.estimation.segmentation.settings import SegmentationSettings
-from ballfg.estimation.smoother.motion import FLIGHT, Motion, motions_of
+from ballfg.estimation.smoother.motion import FLIGHT, Motion, eventful_motions
 from ballfg.estimation.smoother.problem import QUALITY_SIGMA
 from ballfg.state import STANDARD_GRAVITY, VZ, Z
 
@@ -54,7 +52,7 @@ class EventTracker:
         self._pending: tuple[Event, ...] = ()
         self._moves: dict[tuple[int, float], list[int]] = {}  # steps of each contact, by the place it was found at
 
-    def copy(self) -> EventTracker:
+    def copy(self) -> "EventTracker":
         """An event tracker with the same samples, independent of this one."""
         other = copy.copy(self)
         other.segmenter = self.segmenter.copy()
@@ -155,7 +153,8 @@ def explain(window: StreamWindow, samples: list[Sample], events: EventTracker) -
     held = len(window)
     times, positions = path_of(samples)
     segmentation = events.segmentation(window.first, times, positions)
-    motions = motions_of(events.with_moved_contacts(segmentation, window.first), times)
+    found = eventful_motions(events.with_moved_contacts(segmentation, window.first), times)
+    motions = [found.get(i, FLIGHT) for i in range(len(times) - 1)]
     measured = np.array([s.measured for s in samples])
     factors = np.where(measured, SIGMA_FACTOR[segmentation.quality], 1.0)  # the loss sets wrong sightings aside
     settled = max(held - LATEST_CHANGE, 0)

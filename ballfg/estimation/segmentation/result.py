@@ -1,7 +1,5 @@
 """Kinds of events; a segmentation holds the contacts, hits, rests and qualities of a track."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum, IntEnum, auto
 
@@ -82,16 +80,16 @@ class Segmentation:
         return list(zip(starts, ends, strict=True))
 
     @classmethod
-    def of_contacts(cls, contacts: tuple[Contact, ...], samples: int) -> Segmentation:
+    def of_contacts(cls, contacts: tuple[Contact, ...], samples: int) -> "Segmentation":
         """Contacts alone, of so many good samples."""
         none = np.zeros(0, dtype=np.int64)
         return cls(contacts, none, none, (), np.full(samples, Quality.GOOD, dtype=np.int8))
 
-    def opening(self, samples: int) -> Segmentation:
+    def opening(self, samples: int) -> "Segmentation":
         """The contacts between the first samples, so many, all of them good."""
         return Segmentation.of_contacts(tuple(one for one in self.contacts if one.interval < samples - 1), samples)
 
-    def only_contacts(self) -> Segmentation:
+    def only_contacts(self) -> "Segmentation":
         """The same contacts and rests, without hits and with every sample good: for undisturbed tracks."""
         none = np.zeros(0, dtype=np.int64)
         return Segmentation(self.contacts, none, none, self.rests, np.zeros_like(self.quality))

@@ -6,8 +6,6 @@ of the contact; it is truncated where the ball would be below the surface. Frict
 sliding and rolling. So a bounce is computed at nine spins.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -191,12 +189,12 @@ class ContactHypotheses:
     nearest: float = 0.0
 
     @classmethod
-    def start(cls, model: HypothesisModel, mean: Array, covariance: Array) -> ContactHypotheses:
+    def start(cls, model: HypothesisModel, mean: Array, covariance: Array) -> "ContactHypotheses":
         """Hypotheses of a ball that has not bounced, with mean (d,) and covariance (d, d)."""
         flying = GaussianMixture.single(mean, covariance)
         return cls(model, flying, flying.selected(np.zeros(1, dtype=bool)), model.level(mean))
 
-    def step(self, dt: float, measured: SampleMeasurement) -> ContactHypotheses:
+    def step(self, dt: float, measured: SampleMeasurement) -> "ContactHypotheses":
         """The hypotheses dt s later, after a measurement."""
         weights = self._above.log_weights  # of the parts above the surface; the Gaussians stay whole
         still = replace(self.flying, log_weights=weights[:1])
@@ -209,7 +207,7 @@ class ContactHypotheses:
         bounced = GaussianMixture.concatenated([bouncing, flown.selected(~first)])
         return replace(self, flying=flown.selected(first), bounced=bounced).updated(measured)
 
-    def updated(self, measured: SampleMeasurement) -> ContactHypotheses:
+    def updated(self, measured: SampleMeasurement) -> "ContactHypotheses":
         """The hypotheses after a further measurement at the same stamp."""
         flying, nearest = self.model.update(self.flying, measured)
         bounced, other = self.model.update(self.bounced, measured)

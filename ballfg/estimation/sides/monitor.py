@@ -1,7 +1,5 @@
 """Finds samples near a contact at which a ball may be on either side, the states to report, and covariances."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -170,7 +168,7 @@ class ContactMonitor:
         self._samples = 0
         self._rejected = 0
 
-    def copy(self) -> ContactMonitor:
+    def copy(self) -> "ContactMonitor":
         """An independent monitor in the same state."""
         return copy.copy(self)
 

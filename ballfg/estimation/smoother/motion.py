@@ -1,7 +1,5 @@
 """Lists the events of a track as motions from one sample to the next, and makes the dynamics factors of these."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,7 +33,7 @@ class Motion:
     hit: bool = False
     linked: bool = True
 
-    def same(self, other: Motion) -> bool:
+    def same(self, other: "Motion") -> bool:
         """True if both have the same events, at any times."""
         mine = (self.heights, self.rest, self.hit, self.linked)
         return mine == (other.heights, other.rest, other.hit, other.linked)
@@ -58,12 +56,6 @@ def kicks_of(motions: Sequence[Motion], dt: Array) -> Kicks:
         for motion, duration in zip(motions, dt.tolist(), strict=True)
     ]
     return Kicks(np.array(times), np.array([motion.hit for motion in motions]))
-
-
-def motions_of(segmentation: Segmentation, times: Array) -> list[Motion]:
-    """The motion of every interval of a track or window of samples at times (n,) s."""
-    found = eventful_motions(segmentation, times)
-    return [found.get(i, FLIGHT) for i in range(len(times) - 1)]
 
 
 def eventful_motions(segmentation: Segmentation, times: Array) -> dict[int, Motion]:

@@ -16,7 +16,7 @@ from ballfg.dynamics.model import BallModel
 from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.launcher import SpinLabel
 from ballfg.estimation.observations.observation import Context, Observation, Unknowns, unknowns_of
-from ballfg.estimation.observations.positions import observations_of
+from ballfg.estimation.observations.positions import Positions
 from ballfg.estimation.segmentation.result import Contact, Quality, Segmentation
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, total_sigmas
 from ballfg.estimation.smoother.motion import TrackDynamics
@@ -116,7 +116,8 @@ class TrackProblem:
         self.segmentation = segmentation
         self.sigma = effective_sigmas(track, segmentation, settings) if sigma is None else sigma
         self.ball = trackwise_model(model, settings)
-        self.observations: tuple[Observation, ...] = observations_of(track)
+        measured = () if track.rough else (Positions(track.positions),)
+        self.observations: tuple[Observation, ...] = (*measured, *track.observations)
         self.one_view = track.one_view
         self.unknowns: Unknowns = unknowns_of(self.observations, settings)
         self.width = model_width(self.ball)

@@ -1,7 +1,5 @@
 """The smoother finds the most probable states of a whole track by Levenberg-Marquardt on its factor graph."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -126,7 +124,7 @@ class Smoother(Estimator):
         """
         return None
 
-    def first_look(self) -> Smoother:
+    def first_look(self) -> "Smoother":
         """The smoother for stamps with errors of milliseconds.
 
         A flight then seems to be full of hits, which would absorb the offsets; and with wrong contacts no step reduces

@@ -1,7 +1,5 @@
 """Gives the factor graph of a track as GTSAM's objects, for further factors and for GTSAM's solvers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -54,7 +52,7 @@ class TrackGraph:
     _solution: Solution
 
     @classmethod
-    def of(cls, smoother: Smoother, track: Track) -> TrackGraph:
+    def of(cls, smoother: Smoother, track: Track) -> "TrackGraph":
         """The graph of a track with the events of the smoother.
 
         Args: smoother: with model, surfaces and settings.  track: stamps, positions, observations.

@@ -13,7 +13,7 @@ from ballfg.importing.formats.matlab import read_matlab
 from ballfg.importing.formats.nested import nested_tables
 from ballfg.importing.formats.raw import RawTable
 from ballfg.importing.formats.registry import FORMATS, Format
-from ballfg.importing.formats.text_files import decoded, read_text_table
+from ballfg.importing.formats.text_files import decoded, text_table
 
 TEXT: Final = (".csv", ".tsv", ".txt", ".dat", ".tab", ".asc", "")
 JSON: Final = (".json", ".jsonl", ".ndjson")
@@ -99,7 +99,7 @@ def _of_file(path: Path, topic: str | None) -> list[RawTable]:
             arrays = any(name.endswith(".npy") for name in archive.namelist())
         return read_npz(path) if arrays else read_excel(path)
     text = decoded(path) if ending in JSON or head.lstrip(b"\xef\xbb\xbf \r\n\t")[:1] in (b"{", b"[") else None
-    return read_text_table(path) if text is None else _json(path, text)
+    return [text_table(decoded(path), path.stem, str(path))] if text is None else _json(path, text)
 
 
 def _json(path: Path, text: str) -> list[RawTable]:

@@ -24,11 +24,6 @@ _HEAD: Final = 4096  # number of bytes at the beginning for recognising text
 _CONTROL: Final = 0.02  # share of control characters from which a file is not text
 
 
-def read_text_table(path: Path) -> list[RawTable]:
-    """The one table of a text file. Raises: ValueError: not text, empty, or without rows of numbers."""
-    return [text_table(decoded(path), path.stem, str(path))]
-
-
 def decoded(path: Path) -> str:
     """The text of a file, whatever its encoding. Raises: ValueError: empty, or not text."""
     with path.open("rb") as file:

@@ -98,7 +98,6 @@ def _count(path: Path, stream: Any, size: int) -> int:
 
 
 def _unpacked(file: IO[bytes], compression: str) -> Any:
-    """The content of a compressed file, as a stream."""
     if compression == "lz4":
         return importlib.import_module("lz4.frame").open(file)
     for name in ("compression.zstd", "backports.zstd"):

@@ -1,7 +1,5 @@
 """Reads lines as samples, CSV `t,x,y,z` or JSON: bytes become lines, lines wait, those of one stamp become samples."""
 
-from __future__ import annotations
-
 import json
 import threading
 from collections import deque
@@ -199,7 +197,7 @@ class Sender:
         while self.full and not stop.wait(PAUSE):
             pass
 
-    def cut(self, chunk: bytes, *, last: bool = False) -> Iterator[Line]:
+    def cut(self, chunk: bytes, *, last: bool = False) -> "Iterator[Line]":
         """The lines completed by a chunk that was just read. Args: last: True if nothing continues the chunk."""
         now = perf_counter()
         found = self._buffer.feed(chunk)

@@ -79,8 +79,8 @@ def test_a_wrong_effect_is_not_borne_out_by_unlike_shots(make_ball, make_launche
         nothing, model = (weighed(*one, motion, halves) for one in ((declared, ()), (fit, [hypothesis])))
         promised = model.evidence - nothing.evidence
         assert promised > 40.0
-        own = {nothing.names: nothing.weight}
-        return (tempered(model.names, model.weight, own) - nothing.evidence) / promised
+        own = {nothing.names: nothing}
+        return (tempered(model.names, model, own) - nothing.evidence) / promised
 
     assert borne_out("distortion", alternating) == 1.0
     assert borne_out("distortion", unlike_halves(declared)) < 0.5

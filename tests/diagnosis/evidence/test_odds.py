@@ -55,14 +55,12 @@ def model(names, evidence, held_out=None):
     named = [Hypothesis(EFFECTS[name], {}, ("x",)) for name in names]
     gains = np.full(10, evidence / 10.0) if held_out is None else np.asarray(held_out)
     weight = Weight(evidence, log_odds(named), gains)
-    return SimpleNamespace(
-        names=frozenset(names), nested={}, neighbours={}, weight=weight, evidence=evidence, score=weight.score
-    )
+    return SimpleNamespace(names=frozenset(names), nested={}, neighbours={}, score=weight.score, **vars(weight))
 
 
 def borne_out(effect, *smaller):
     """The tempered evidence of a model, beside smaller ones."""
-    return tempered(effect.names, effect.weight, {one.names: one.weight for one in smaller})
+    return tempered(effect.names, effect, {one.names: one for one in smaller})
 
 
 def test_a_strength_of_five_times_the_usual_one_costs_two_nats():
@@ -157,7 +155,7 @@ def test_the_doubt_of_a_smaller_model_decides_between_none_that_look_alike():
 def test_what_is_foretold_loses_what_its_origin_loses():
     """A smaller model that only the linearisation of a wrong one knows is no better than that one."""
     nothing, wrong = model([], 0.0), model(["gust_region", "scale"], 60.0, np.full(10, -5.0))
-    wrong.nested = {frozenset(["scale"]): Weight(50.0, model(["scale"], 0.0).weight.odds, np.full(10, 5.0))}
+    wrong.nested = {frozenset(["scale"]): Weight(50.0, model(["scale"], 0.0).odds, np.full(10, 5.0))}
     odds = odds_of([nothing, wrong])
     assert odds.of("scale") < 0.1
 
@@ -165,7 +163,7 @@ def test_what_is_foretold_loses_what_its_origin_loses():
 def test_a_refit_counts_as_it_was_weighed():
     """Whatever another model's linearisation says of it."""
     nothing, both, wind = model([], 0.0), model(["wind", "scale"], 60.0), model(["wind"], 20.0)
-    both.nested = {one.names: one.weight for one in (model(["scale"], 8.0), model(["wind"], 61.0), model([], 3.0))}
+    both.nested = {one.names: one for one in (model(["scale"], 8.0), model(["wind"], 61.0), model([], 3.0))}
     assert odds_of([nothing, both, wind]).of("scale") > 0.99
     odds = odds_of([nothing, both])
     assert odds.of("scale") < 0.1
@@ -175,7 +173,7 @@ def test_a_refit_counts_as_it_was_weighed():
 def test_neighbours_that_no_refit_weighed_count_as_foretold():
     nothing, wind, tilt = model([], 0.0), model(["wind"], 20.0), model(["frame_tilt"], 5.0)
     alone = odds_of([nothing, wind, tilt])
-    wind.neighbours = {one.names: one.weight for one in (model(["frame_tilt"], 40.0), model(["drag_spin"], 20.0))}
+    wind.neighbours = {one.names: one for one in (model(["frame_tilt"], 40.0), model(["drag_spin"], 20.0))}
     odds = odds_of([nothing, wind, tilt])
     assert alone.of("wind") > 0.99
     assert odds.of("wind") == pytest.approx(0.5, abs=0.01)

@@ -42,7 +42,7 @@ def weight_of(sets, names):
     screen = sets.screen
     gone = tuple(place for place, h in enumerate(screen.effects) if h.name not in names)
     rest = screen.model.names & names
-    weight = screen.model.weight if rest == screen.model.names else screen.model.nested[rest]
+    weight = screen.model if rest == screen.model.names else screen.model.nested[rest]
     beside = ()
     for one, candidate in enumerate(screen.candidates):
         if candidate.name in names:

@@ -8,10 +8,20 @@ import numpy as np
 import pytest
 import torch
 
+from ballfg.diagnosis.evidence.rows import random_motion
 from ballfg.diagnosis.evidence.weighed import weigh
 from ballfg.diagnosis.fit.fit import values_of
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, without_effect
-from ballfg.diagnosis.search.candidates import ALARM, LEAST_GAIN, MOST_REFITS, Scored, score_all, shortlist
+from ballfg.diagnosis.search.candidates import (
+    ALARM,
+    LEAST_GAIN,
+    MOST_REFITS,
+    Scored,
+    leading_sets,
+    score_all,
+    screened,
+    shortlist,
+)
 from ballfg.diagnosis.search.refits import refit, refit_driven
 from ballfg.diagnosis.search.score import Score
 from ballfg.dynamics import EFFECTS
@@ -59,6 +69,13 @@ def test_p_values_are_corrected_for_the_number_of_hypotheses(windy_fit, scored):
     among = next(s for s in scored if s.hypothesis.name == "spin_decay")
     assert among.p_value == pytest.approx(min(1.0, len(CANDIDATES) * among.score.p_value), rel=1e-12)
     assert alone.p_value == alone.score.p_value
+
+
+def test_without_hypotheses_nothing_is_scored_or_foretold(windy_fit):
+    model = weigh(windy_fit)
+    scored, screen = screened(model, [], random_motion(windy_fit))
+    assert scored == [] == score_all(model, [])
+    assert screen.neighbours == {} == leading_sets(screen, scored, 5)
 
 
 def test_one_step_comes_near_the_wind(scored):

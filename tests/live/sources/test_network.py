@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager
 
 import pytest
 
-from ballfg.live.sources import tcp, udp
+from ballfg.live.sources import sockets
 from ballfg.live.sources.listener import SENDERS
 from ballfg.live.sources.sender import WAITING, Arrival
 from ballfg.live.sources.sockets import listen
@@ -152,7 +152,7 @@ def test_idle_connections_are_dropped_and_those_with_lines_are_not(capfd: pytest
 def test_one_udp_sender_too_many_is_told_so_and_the_silent_make_room(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(udp, "SILENT", 3600.0)
+    monkeypatch.setattr(sockets, "SILENT", 3600.0)
     with heard("udp://127.0.0.1:0") as (source, groups), ExitStack() as stack:
         senders = [stack.enter_context(packets()) for _ in range(SENDERS + 1)]
         for k, sender in enumerate(senders[:SENDERS]):
@@ -161,7 +161,7 @@ def test_one_udp_sender_too_many_is_told_so_and_the_silent_make_room(
         senders[SENDERS].sendto(b"99,1,2,3", place_of(source))
         assert told(senders[SENDERS]) == "64 senders are heard; no more are. Come back when one has gone."
         assert "64 senders are heard: the packets of 127.0.0.1:" in capfd.readouterr().err
-        monkeypatch.setattr(udp, "SILENT", 0.0)
+        monkeypatch.setattr(sockets, "SILENT", 0.0)
         senders[SENDERS].sendto(b"100,1,2,3", place_of(source))
         assert stamp(next(groups)) == 100
         senders[0].sendto(b"101,1,2,3", place_of(source))  # who made room comes back
@@ -237,7 +237,7 @@ def test_packets_of_any_size_are_taken() -> None:
 def test_many_connections_in_a_row_leave_nothing_behind() -> None:
     """More than there are places for, some with half a line that waits to be answered. The last one is let in."""
     with heard("tcp://127.0.0.1:0") as (source, groups):
-        assert isinstance(source, tcp.TcpServer)
+        assert isinstance(source, sockets.TcpServer)
         before = len(os.listdir("/dev/fd"))
         for k in range(300):
             with connected(source) as sender:

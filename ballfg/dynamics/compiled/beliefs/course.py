@@ -1,7 +1,5 @@
 """Holds Gaussian beliefs of balls at a sequence of times and carries them on by machine code."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Final
@@ -43,7 +41,7 @@ class Course:
     age: Array
 
     @classmethod
-    def start(cls, mean: Array, covariance: Array) -> Course:
+    def start(cls, mean: Array, covariance: Array) -> "Course":
         """One time, without neighbours: mean (n, d), covariance (n, d, d)."""
         none = np.full((1, len(mean)), np.nan)
         return cls(mean[None], covariance[None], mean[None], covariance[None], none, none)
@@ -51,12 +49,12 @@ class Course:
     def __len__(self) -> int:
         return len(self.mean)
 
-    def at(self, rows: Any) -> Course:
+    def at(self, rows: Any) -> "Course":
         """A part of the times: a slice or indices."""
         return Course(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     @staticmethod
-    def joined(parts: Sequence[Course]) -> Course:
+    def joined(parts: "Sequence[Course]") -> "Course":
         """All times of several courses."""
         if len(parts) == 1:
             return parts[0]

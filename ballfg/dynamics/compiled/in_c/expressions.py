@@ -264,19 +264,14 @@ def _called(body: Body, node: ast.Call) -> Value:
         name, kind = OF_LIBM[function]
         return Scalar(f"{name}({text_of(given[0])})", kind)
     if function in OF_TWO:
-        return _extreme(body, OF_TWO[function], given)
+        a, b = map(body.kept, given)  # of numbers that are not there the first one, as numba has it
+        first, second = text_of(a, PLUS), text_of(b, PLUS)
+        return Scalar(f"{second} {OF_TWO[function]} {first} ? {second} : {first}", common(given), ANY)
     if function is function_at:  # C has the function itself
         return given[0]
     if isinstance(function, type) and issubclass(function, tuple):
         return function(*given)
     return body.call(function, given)
-
-
-def _extreme(body: Body, sign: str, given: Sequence[Value]) -> Value:
-    """Minimum or maximum, of numbers that are not there as numba has it: the first one."""
-    a, b = map(body.kept, given)
-    first, second = text_of(a, PLUS), text_of(b, PLUS)
-    return Scalar(f"{second} {sign} {first} ? {second} : {first}", common(given), ANY)
 
 
 def _method(body: Body, owner: Array, name: str, given: Sequence[Value]) -> Array:

@@ -138,15 +138,11 @@ class Program:
         terms = []
         for place, tangent in enumerate(moved):
             if self.value(tangent) != 0.0:
-                terms.append(self.apply("mul", self._partial(number, operation, place), tangent))
+                rule = PARTIALS.get(operation.name)
+                if rule is None:
+                    raise NotImplementedError(f"'{operation.name}' has no derivative")
+                terms.append(self.apply("mul", rule(self, number, operation, place), tangent))
         return self.total(terms)
-
-    def _partial(self, number: Number, operation: Operation, place: int) -> Number:
-        """The derivative of an operation's result by one of its operands."""
-        rule = PARTIALS.get(operation.name)
-        if rule is None:
-            raise NotImplementedError(f"'{operation.name}' has no derivative")
-        return rule(self, number, operation, place)
 
     def needed(self, outputs: Iterable[Number]) -> list[Number]:
         """The numbers on which outputs depend, in their order."""

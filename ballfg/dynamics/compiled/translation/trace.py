@@ -45,16 +45,12 @@ def each_of(arrays: Arrays, target: Any, args: Sequence[Any], kwargs: Mapping[st
     return arrays.make(Each(program, tuple(inputs), result, operands), shape)
 
 
-def _copied(arrays: Arrays, view: View) -> View:
-    program = Program()
-    number = program.input()
-    return arrays.make(Each(program, (number,), number, (view,)), view.shape)
-
-
 def _reshaped(arrays: Arrays, view: View, shape: Sequence[int]) -> View:
     same = view.reshaped(shape)
     if same is None:
-        same = _copied(arrays, view).reshaped(shape)
+        program = Program()
+        number = program.input()
+        same = arrays.make(Each(program, (number,), number, (view,)), view.shape).reshaped(shape)
     assert same is not None
     return same
 

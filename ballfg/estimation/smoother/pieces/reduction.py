@@ -5,8 +5,6 @@ the coefficients are exactly the section's information for the rest of the track
 inner states follow.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -32,16 +30,16 @@ class Point:
     coefficients: Array
 
     @classmethod
-    def of(cls, values: Values) -> Point:
+    def of(cls, values: Values) -> "Point":
         """The ends of a section's values."""
         whole = values.states if values.biases is None else np.concatenate((values.states, values.biases), axis=1)
         return cls(whole[0], whole[-1], values.coefficients)
 
-    def since(self, other: Point) -> Point:
+    def since(self, other: "Point") -> "Point":
         """The step from another point to this one."""
         return Point(self.first - other.first, self.last - other.last, self.coefficients - other.coefficients)
 
-    def scaled(self, share: float) -> Point:
+    def scaled(self, share: float) -> "Point":
         """A share of the step."""
         return Point(share * self.first, share * self.last, share * self.coefficients)
 

@@ -5,8 +5,6 @@ certain. For such low hops, `HopGrid` follows all arrangements at once. It gives
 intervals, and the distance of the ball from the estimate, which holds one arrangement.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -71,7 +69,7 @@ class LowHops:
         """Its last sample."""
         return self.first + len(self.known.speed) - 1
 
-    def select(self, begin: int, end: int) -> LowHops | None:
+    def select(self, begin: int, end: int) -> "LowHops | None":
         """The part within samples begin to end - 1 of the track, renumbered from 0; None if empty."""
         first, last = max(self.first, begin), min(self.last, end - 1)
         inside = slice(first - self.first, last + 1 - self.first)
