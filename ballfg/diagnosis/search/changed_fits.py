@@ -1,6 +1,6 @@
 """Fits again with fewer effects among the named ones, or with effects as strong as another model says."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,15 +20,27 @@ def with_strengths_of(model: Weighed, fit: Fit) -> Fit:
 
     Free, they would make up for what no effect describes. Effects that differ between tracks stay free.
     """
-    problem, fixed = fit.problem, [h for h in model.named if not h.deviations()]
+    fixed = [h for h in model.named if not h.deviations()]
     known = {c: float(v) for h in fixed for c, v in zip(h.columns, model.strengths[h.name].mean, strict=True)}
-    bounds = problem.free
-    held = {c: float(np.clip(v, bounds[c].low, bounds[c].high)) for c, v in known.items() if c in bounds}
-    free = {name: c for name, c in problem.free.items() if name not in held}
-    values = {name: value for name, value in fit.unknowns.values.items() if name in free}
-    problem = replace(problem, model=with_coefficients(problem.model, held), free=free)
-    fitted = fit_problem(problem, replace(fit.unknowns, values=values), fit.noise)
+    bounds = fit.problem.free
+    known = {c: float(np.clip(v, bounds[c].low, bounds[c].high)) for c, v in known.items() if c in bounds}
+    held = _held(fit, known | {c: v for c, v in _shapes(model.fit, fixed).items() if c in bounds})
+    fitted = fit_problem(held.problem, held.unknowns, fit.noise)
     return fitted if np.isfinite(fitted.cost) else fit
+
+
+def _shapes(fit: Fit, named: Sequence[Hypothesis]) -> dict[str, float]:
+    """The coefficients of the forms of effects (centres, sizes), about which their strengths are linearised."""
+    values = fit.unknowns.values
+    return {c: values[c] for h in named for c in h.free() if c not in h.columns and c in values}
+
+
+def _held(fit: Fit, values: Mapping[str, float]) -> Fit:
+    """The fit with some coefficients at these values, and no longer free."""
+    free = {name: c for name, c in fit.problem.free.items() if name not in values}
+    problem = replace(fit.problem, model=with_coefficients(fit.problem.model, values), free=free)
+    known = {name: value for name, value in fit.unknowns.values.items() if name in free}
+    return Fit.at(problem, replace(fit.unknowns, values=known), fit.noise, fit.steps)
 
 
 def model_of(sets: Sets, names: frozenset[str], first: Fit) -> Weighed:
@@ -39,7 +51,7 @@ def model_of(sets: Sets, names: frozenset[str], first: Fit) -> Weighed:
     member, model = sets.members[names], sets.screen.model
     gone, added = sets.listed(names)
     strengths = sets.screen.strengths(member.beside, member.gone)
-    fit = without_named(model.fit, gone, first) if gone else model.fit
+    fit = without_at_shapes(model, gone, first) if gone else model.fit
     if added:
         away = [strengths[h.name].mean - centres(h, model.fit.problem.model) for h in added]
         still = np.zeros(len(fit.problem.common_precision))
@@ -59,6 +71,20 @@ def model_of(sets: Sets, names: frozenset[str], first: Fit) -> Weighed:
         model.halves,
         nameless=True,
     )
+
+
+def without_at_shapes(model: Weighed, gone: Sequence[Hypothesis], first: Fit) -> Fit:
+    """The fit without some effects; those that stay keep their forms, about which their strengths are known.
+
+    Free, the form of an effect that the fit has at hardly any strength would wander out of the room.
+    """
+    free = model.fit.problem.free
+    shapes = _shapes(model.fit, [h for h in model.named if not h.deviations()])
+    fit = without_named(_held(model.fit, shapes), gone, first)
+    left = dict(fit.problem.model.named_parameters())
+    shapes = {name: value for name, value in shapes.items() if name in left}
+    problem = replace(fit.problem, free={n: c for n, c in free.items() if n in fit.problem.free or n in shapes})
+    return Fit.at(problem, replace(fit.unknowns, values=fit.unknowns.values | shapes), fit.noise, fit.steps)
 
 
 def smaller_fit(model: Weighed, gone: Sequence[Hypothesis], first: Fit) -> Fit:

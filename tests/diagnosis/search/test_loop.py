@@ -13,6 +13,7 @@ from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.stamps import Stamps
 from ballfg.diagnosis.hypotheses.hypothesis import has_effect, without_effect
 from ballfg.diagnosis.result import Errors, Outcome
+from ballfg.diagnosis.search.changed_fits import with_strengths_of, without_at_shapes
 from ballfg.diagnosis.search.found import Found
 from ballfg.diagnosis.search.loop import SearchLoop
 from ballfg.diagnosis.search.refits import Attempt
@@ -231,6 +232,32 @@ def test_beside_something_nameless_effects_are_found_from_one_linearisation(gust
     tilt = best.strengths["frame_tilt"]
     assert (np.abs(tilt.mean - [0.02, 0.0]) < 3 * np.sqrt(np.diagonal(tilt.covariance))).all()
     assert found.plain(best).score > nothing.score  # its fit without patterns holds the effect too
+
+
+def test_an_effect_keeps_the_form_about_which_its_strength_is_known(make_ball, make_launches, make_shots):
+    """Fits without patterns, of all named effects and of one alone, neither move the gust nor change its size."""
+    truth = {"frame_tilt": {"x": 0.03, "y": 0.0}, "gust_region": {"x": 2.0, "y": 4.0, "z": 2.0}}
+    data = (shots(make_ball, make_launches, make_shots, seed, **truth) for seed in (71, 72))
+    catalogue = [EFFECTS[name] for name in ("frame_tilt", "gust_region")]
+    found = Found(
+        loop := SearchLoop(holdout(*data), catalogue, predicts_well, judges_alike, unwatched),
+        first := first_fit(make_ball(), loop.holdout),
+    )
+    while found.round():
+        pass
+    best = found.best
+    gust, tilt = (next(h for h in best.named if h.name == name) for name in ("gust_region", "frame_tilt"))
+    form = {name: best.fit.unknowns.values[name] for name in gust.free() if name not in gust.columns}
+    assert len(form) == 4
+    held = with_strengths_of(best, best.fit).problem
+    written = {name: float(value) for name, value in held.model.named_parameters()}
+    assert not held.free.keys() & (form.keys() | set(gust.columns))
+    assert {name: written[name] for name in form} == form
+    assert [written[name] for name in gust.columns] == best.strengths[gust.name].mean.tolist()
+    alone = without_at_shapes(best, [tilt], first)
+    assert {name: alone.unknowns.values[name] for name in form} == form
+    assert alone.problem.free.keys() == best.fit.problem.free.keys() - set(tilt.columns)
+    assert np.isfinite(alone.cost)
 
 
 def test_a_model_that_the_last_round_made_shares_its_probability_with_its_neighbours(gusty, make_ball):
