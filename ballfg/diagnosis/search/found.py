@@ -299,9 +299,9 @@ class Found:
         """
         if not np.isfinite(model.evidence):
             return {}
-        weighed = {names: known for names, known in self.models.items() if np.isfinite(known.evidence)}
+        others = {names: known for names, known in self.models.items() if np.isfinite(known.evidence)}
         scores = self.scores
-        found = foretold(model, model.nested, scores, weighed)
+        found = foretold(model, model.nested, scores, others)
         return {n: scores[n] if (model.names, n) in self.tried else max(scores[n], score) for n, score in found.items()}
 
     def _pruned(self) -> None:

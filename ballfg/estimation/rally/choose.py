@@ -169,7 +169,7 @@ def _best_in_each(
         first, last = grower.field.frame[stroke.rows[[0, -1]]]
         if taken[first : last + 1].min() >= most:
             continue
-        near = [(1 << len(kept)) - 1] * (alike + 1)  # those kept, as bits, that lack none of its rows, at most one
+        near = [(1 << len(kept)) - 1] * (alike + 1)  # [n]: those kept, as bits, that lack at most n of its rows
         for row in stroke.rows.tolist() if near else ():
             for lacking in range(alike, 0, -1):
                 near[lacking] = near[lacking] & holders[row] | near[lacking - 1]
