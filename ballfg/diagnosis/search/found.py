@@ -94,6 +94,11 @@ class Found:
         scores = self.scores
         return model is not None and scores[model.names] > scores[(than or self.best).names] + by
 
+    def step(self) -> bool:
+        """One round, or where none adds anything, removes effects without which a refit is better; False: neither."""
+        able = len(self.best.named) < MOST_EFFECTS and len(self.rounds) < MOST_ROUNDS
+        return (able and self.round()) or self._pruned(every=True)
+
     def round(self) -> bool:
         """Adds the effects that make the model most probable, and removes those that they make superfluous."""
         loop, best, number = self.loop, self.best, len(self.rounds) + 1
@@ -304,12 +309,17 @@ class Found:
         found = foretold(model, model.nested, scores, others)
         return {n: scores[n] if (model.names, n) in self.tried else max(scores[n], score) for n, score in found.items()}
 
-    def _pruned(self) -> None:
-        """Removes effects that later ones made superfluous, as the linearisation says and a refit confirms."""
+    def _pruned(self, every: bool = False) -> bool:
+        """Removes effects that later ones made superfluous, as the linearisation says and a refit confirms.
+
+        Args: every: refit without each effect. A strong one's absence lies beyond the linear range.
+        Returns: whether the best model lost an effect.
+        """
+        whole = self.best
         while True:
             best, score, smaller = self.best, self.scores[self.best.names], self._smaller(self.best)
-            gone = [h for h in best.named if smaller.get(best.names - {h.name}, -np.inf) > score]
+            gone = [h for h in best.named if every or smaller.get(best.names - {h.name}, -np.inf) > score]
             least = self.most_probable(self.without([h]) for h in gone)
             if least is None or not self.is_better(least):
-                break
+                return self.best is not whole
             self.best = least

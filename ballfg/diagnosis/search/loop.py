@@ -11,7 +11,7 @@ from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.hypotheses.varying import Grouping
 from ballfg.diagnosis.result import Candidate, Errors, Finding
 from ballfg.diagnosis.search.changed_fits import with_strengths_of
-from ballfg.diagnosis.search.found import MOST_EFFECTS, MOST_ROUNDS, Found
+from ballfg.diagnosis.search.found import Found
 from ballfg.diagnosis.search.ranking import finding_of, ranking
 from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_findings, stamp_hypotheses
 from ballfg.dynamics import AnalyticModel, BallModel
@@ -76,7 +76,7 @@ class SearchLoop:
         self.watch(f"fitting the declared model to {len(self.holdout.search)} flights")
         first = first_fit(model, self.holdout) if first is None else first
         found = Found(self, first)
-        while len(found.best.named) < MOST_EFFECTS and len(found.rounds) < MOST_ROUNDS and found.round():
+        while found.step():
             pass
         found.compare()
         return self._told(found, first)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from ballfg.diagnosis.evidence.nameless import NAMELESS
+from ballfg.diagnosis.evidence.weighed import weighed
 from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.stamps import Stamps
 from ballfg.diagnosis.hypotheses.hypothesis import has_effect, without_effect
@@ -16,7 +17,7 @@ from ballfg.diagnosis.result import Errors, Outcome
 from ballfg.diagnosis.search.changed_fits import with_strengths_of, without_at_shapes
 from ballfg.diagnosis.search.found import Found
 from ballfg.diagnosis.search.loop import SearchLoop
-from ballfg.diagnosis.search.refits import Attempt
+from ballfg.diagnosis.search.refits import Attempt, refit
 from ballfg.diagnosis.search.stamp_effects import first_fit
 from ballfg.diagnosis.search.trial import try_hypotheses
 from ballfg.dynamics import EFFECTS
@@ -309,3 +310,24 @@ def test_what_promises_less_than_was_gained_waits(gusty, make_ball):
     assert told == ["fitting with inf", "fitting with 1000000.0"]
     assert len(made) == 2 * len(refits)
     assert found.is_better(winner, best)
+
+
+def test_no_effect_stays_without_which_a_refit_is_better(make_ball, make_launches, make_shots):
+    """The linearisation about two strong effects may foretell far too little of the model without one of them."""
+    data = (shots(make_ball, make_launches, make_shots, seed, table_tilt={"x": 0.02, "y": 0.0}) for seed in (71, 72))
+    loop = SearchLoop(holdout(*data), CATALOGUE, predicts_well, judges_alike, unwatched)
+    found = Found(loop, first_fit(make_ball(), loop.holdout))
+    assert found.round()
+    right = found.models.pop(found.best.names)
+    scored, _, _ = try_hypotheses(right, found.motion, [EFFECTS["wind"]], unwatched)
+    with_wind = refit(right.fit, scored[0]).fit
+    both = weighed(with_wind, (*right.named, scored[0].hypothesis), found.motion, found.halves, right)
+    poor = {names: replace(weight, evidence=weight.evidence - 100.0) for names, weight in both.nested.items()}
+    found.best = found.models[both.names] = replace(both, nested=poor)
+    assert not found._pruned()
+    assert found.best.names == {"table_tilt", "wind"}
+    while found.step():
+        pass
+    assert found.best.names == right.names == {"table_tilt"}
+    assert found.best.score > both.score
+    assert found.best.score == pytest.approx(right.score, abs=1.0)
