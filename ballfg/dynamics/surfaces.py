@@ -85,24 +85,28 @@ class Surfaces:
         over: Tensor = within(state[..., 0], state[..., 1], self.extent)
         return over
 
-    def height_below(self, state: Tensor) -> Tensor:
+    def height_below(self, state: Tensor, raised: Tensor | float = 0.0) -> Tensor:
         """(...) m, height of the surface below a ball in states (..., 9), straight down; -inf where there is none.
 
         A ball whose centre is below the table's surface is beside the table; `level_below` limits its depth.
-        """
-        return torch.where(self.over_table(state), self.level_below(state), self._lower_level(state))
 
-    def level_below(self, state: Tensor) -> Tensor:
+        Args: raised: as of `level_below`.
+        """
+        return torch.where(self.over_table(state), self.level_below(state, raised), self._lower_level(state, raised))
+
+    def level_below(self, state: Tensor, raised: Tensor | float = 0.0) -> Tensor:
         """(...) m, height of the surface that a ball in states (..., 9) falls to, on the table or beside it.
 
         -inf where there is none: below the lowest surface by more than `DEEPEST`.
-        """
-        above = state[..., Z] > self.table_height
-        return torch.where(above, state.new_tensor(self.table_height), self._lower_level(state))
 
-    def _lower_level(self, state: Tensor) -> Tensor:
+        Args: raised: (...) m by which surfaces lie above their declared heights there (`BallModel.surface_offset`).
+        """
+        above = state[..., Z] - raised > self.table_height
+        return torch.where(above, state.new_tensor(self.table_height), self._lower_level(state, raised))
+
+    def _lower_level(self, state: Tensor, raised: Tensor | float) -> Tensor:
         low = self.lowest()
-        return torch.where(state[..., Z] > low - DEEPEST, state.new_tensor(low), state.new_tensor(-math.inf))
+        return torch.where(state[..., Z] - raised > low - DEEPEST, state.new_tensor(low), state.new_tensor(-math.inf))
 
     def lowest(self) -> float:
         """m, height of the lowest surface under a ball beside the table; -inf where there is none."""

@@ -51,7 +51,7 @@ class Gate:
 
     def __init__(self, physics: SegmentationPhysics, heights: Sequence[float], noise: Array, jitter: float) -> None:
         self.physics = physics
-        self.rises = sorted((h + physics.surface_offset + physics.radius for h in heights), reverse=True)
+        self.rises = sorted((h + physics.radius for h in heights), reverse=True)
         self.noise = np.maximum(noise, FLOOR) ** 2
         self.jitter = jitter
 
@@ -99,7 +99,8 @@ class Gate:
         """The same for a ball that met a surface on the way; None if none was within reach."""
         z, vz, g = float(ball.mean[2]), float(ball.mean[5]), self.physics.gravity
         sigma = math.sqrt(covariance[2, 2])
-        for rise in self.rises:
+        lean = self.physics.rise(*flown[:2].tolist())
+        for rise in (height + lean for height in self.rises):
             if z < rise - 3.0 * sigma - 2 * self.physics.radius or flown[2] > rise + 3.0 * sigma:
                 continue
             fall = math.sqrt(max(vz * vz + 2 * g * (z - rise), 0.0))

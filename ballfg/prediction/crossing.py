@@ -258,8 +258,8 @@ def _mean_at(belief: Belief, times: Tensor, surfaces: Surfaces) -> Tensor:
 
 def _rates(propagator: Propagator, belief: Belief) -> RateFunction:
     """Rate of change of the state by air and weight or, at rest, friction."""
-    level = propagator.surfaces.level_below(belief.mean)
     with torch.no_grad():
+        level = propagator.surfaces.level_below(belief.mean, belief.model.surface_offset(belief.mean))
         resting = bool(is_resting(belief.model, belief.mean, level))
     resting = resting and _lies_under(propagator.surfaces, belief.mean, float(level))
     return belief.model.roll if resting else belief.model.rates

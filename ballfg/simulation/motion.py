@@ -151,7 +151,7 @@ def _next_frames(
     for _ in range(steps):
         state = advance(model, state, h, surfaces)
         disturbance = process_noise(len(state), dt / steps, noise, rng)
-        resting = is_resting(model, state, surfaces.height_below(state))
+        resting = is_resting(model, state, surfaces.height_below(state, model.surface_offset(state)))
         disturbance[resting, Z] = 0.0  # the surface absorbs it
         disturbance[resting, VZ] = 0.0
         state = state + disturbance

@@ -71,7 +71,7 @@ def planned_flights(
     times = torch.arange(0.0, view.duration + 0.5 * view.interval, view.interval, dtype=torch.float64)
     with torch.no_grad():
         paths = rollout(model, torch.from_numpy(starts), times, surfaces)
-        heights = surfaces.level_below(paths)
+        heights = surfaces.level_below(paths, model.surface_offset(paths))
         gaps = model.gap(paths, heights).numpy()
     states, n, k = paths.numpy(), len(starts), len(times)
     lengths, contacts, levels = np.zeros(n, dtype=np.int64), *(np.full((n, MOST_CONTACTS), np.nan) for _ in range(2))

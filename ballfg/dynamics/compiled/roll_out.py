@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from ballfg.dynamics.compiled.beliefs.edges import at_rest, gap_of, is_slow, level_below, over_table
+from ballfg.dynamics.compiled.beliefs.edges import at_rest, gap_of, is_slow, level_at, over_table
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.contacts import meet
 from ballfg.dynamics.compiled.flight import fly_together, glide, laws_of, laws_of_one, put, put_all
@@ -54,6 +54,7 @@ def roll_out(rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws, start, dura
     (m, k), all_laws = durations.shape, laws_of(rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws)
     x, after, still = start.copy(), np.empty((m, 9)), np.zeros((m, 0))
     none, step, raised, unmoved = np.empty((m, 9, 0)), np.empty(m), np.empty((m, 3)), np.empty((m, 3, 0))
+    under = raised.copy()
     for r in range(m):
         reached[r] = k
     for j in range(k):
@@ -66,9 +67,10 @@ def roll_out(rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws, start, dura
         for _ in range(steps):
             put_all(after, x)
             fly_together(rates, after, none, c, ct, w, step, still, 1)
+            all_laws.surface.compute(x, s, ws, none, st, under, unmoved)
             all_laws.surface.compute(after, s, ws, none, st, raised, unmoved)
             for r in range(m):
-                level = level_below(x[r, 2], world)
+                level = level_at(x[r, 2] - under[r, 0], world)
                 below = after[r, 5] < 0.0 and after[r, 2] - level - raised[r, 0] - world[2] < 0.0
                 if reached[r] <= j or not (below or is_slow(x[r])):
                     continue

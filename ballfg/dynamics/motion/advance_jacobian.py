@@ -41,7 +41,7 @@ def advance_jacobian(model: BallModel, state: Tensor, dt: float, surfaces: Surfa
 
 def _advance_step(model: BallModel, start: Tensor, h: float, surfaces: Surfaces) -> Advance:
     """One step of at most `integrate.MAX_STEP`, cut at its contacts, by the rules of `rollout`."""
-    state, height = start, surfaces.level_below(start)
+    state, height = start, surfaces.level_below(start, model.surface_offset(start))
     # a check of the vertical speed first: most states need no more
     if abs(float(state[0, VZ])) <= REST_SPEED and bool(stays(model, state, height, surfaces)):
         after, jacobian = batch_jacobian(lambda at: roll(model, at, at.new_tensor([h]), height), state)

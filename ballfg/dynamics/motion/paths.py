@@ -110,15 +110,16 @@ def hermite(theta: Tensor, h: Tensor | float, x0: Tensor, d0: Tensor, x1: Tensor
 
 def _fly_arc(model: BallModel, state: Tensor, left: Tensor, surfaces: Surfaces) -> _Arc:
     """Flight of balls (m, 9) until each has landed or flown for `left` (m,) s."""
-    resting = stays(model, state.detach(), surfaces.level_below(state.detach()), surfaces)
+    first = state.detach()
+    resting = stays(model, first, surfaces.level_below(first, model.surface_offset(first)), surfaces)
     done = resting.clone()
     landed, step, level = torch.zeros_like(done), torch.zeros_like(done, dtype=torch.long), torch.zeros_like(left)
-    start, nodes, still = state, [state.detach()], list[Tensor]()
+    start, nodes, still = state, [first], list[Tensor]()
     with torch.no_grad():
         while not still or not bool(done.all()):
             state = nodes[-1]
             after = fly(model, state, torch.full_like(left, MAX_STEP))
-            height = surfaces.level_below(state)
+            height = surfaces.level_below(state, model.surface_offset(state))
             height, landing = next_surface(model, state, after, height, ~done, surfaces)
             step = torch.where(landing, len(nodes) - 1, step)
             level, landed = torch.where(landing, height, level), landed | landing

@@ -80,7 +80,7 @@ def _check_durations(dt: Tensor) -> None:
 
 def _advance_step(model: BallModel, state: Tensor, h: Tensor, surfaces: Surfaces) -> Tensor:
     """One step of at most `MAX_STEP`."""
-    height = surfaces.level_below(state.detach())
+    height = surfaces.level_below(state.detach(), model.surface_offset(state.detach()))
     remaining = h
     done = state
     active = torch.arange(state.shape[0], device=state.device)

@@ -108,9 +108,9 @@ class EventTracker:
         self._moves[interval, height] = [step]
         return True
 
-    def rise(self, height: float) -> float:
-        """m, z of the ball's centre when it touches a surface declared at `height`."""
-        return height + self.physics.surface_offset + self.physics.radius
+    def rise(self, height: float, state: Array) -> float:
+        """m, z of the ball's centre when it touches a surface declared at `height` below a state (9,)."""
+        return height + self.physics.rise(*state[:2].tolist()) + self.physics.radius
 
 
 _REST_KINDS = (EventKind.REST, EventKind.LEAVE, *BREAKS)
@@ -184,7 +184,7 @@ def move_contacts(window: StreamWindow, samples: Sequence[Sample], events: Event
             continue
         (height,) = motion.heights
         state = window.theta[k - 1] + window.delta[k - 1]
-        step = contact_step(state, events.rise(height), samples[k].time - samples[k - 1].time)
+        step = contact_step(state, events.rise(height, state), samples[k].time - samples[k - 1].time)
         other = k + step
         if step == 0 or not 1 <= other < n or samples[other].motion != FLIGHT:
             continue

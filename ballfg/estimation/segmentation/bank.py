@@ -142,7 +142,7 @@ class Scene:
     """Ball, surfaces and settings for machine code: `numbers`, a row of `NUMBERS`; `rows` of `SURFACE`, table first."""
 
     def __init__(self, physics: SegmentationPhysics, surfaces: Surfaces, settings: SegmentationSettings) -> None:
-        self.surfaces, self.settings = surfaces, settings
+        self.surfaces, self.settings, self.physics = surfaces, settings, physics
         s, drift = settings, np.zeros((3, 3, 3))
         drift[2, 0, 0], drift[1, 0, 1], drift[0, 1, 1] = white_acceleration(1.0, s.velocity_drift**2)
         drift[1, 1, 0], drift[0, 2, 2] = drift[1, 0, 1], s.slack_drift**2

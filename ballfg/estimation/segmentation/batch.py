@@ -196,7 +196,7 @@ def assembled(
     met = (e for e in events if e.kind is EventKind.CONTACT)
     contacts = [Contact(e.index, e.time, e.height) for e in met if e.height is not None]
     hits, quality = intervals_of(events, *BREAKS), quality_of(events, n, settings.shift_level)
-    hits += hits_at_contacts(times, positions, quality <= Quality.WIDE, contacts, hits, ball, settings)
+    hits += hits_at_contacts(times, ball.level(positions), quality <= Quality.WIDE, contacts, hits, ball, settings)
     restarts = np.array(intervals_of(events, EventKind.RESTART), dtype=np.int64)
     hit = np.array(sorted(hits), dtype=np.int64)
     return Segmentation(tuple(contacts), hit, restarts, tuple(rests_of(events, n)), quality)

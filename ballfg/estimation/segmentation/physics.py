@@ -1,16 +1,18 @@
-"""Derives the six numbers of the segmentation's ball from the answers of any ball model."""
+"""Derives the eight numbers of the segmentation's ball from the answers of any ball model."""
 
 import math
 import weakref
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from ballfg.arrays import Array
 from ballfg.dynamics.compiled.places import numbers_of
 from ballfg.dynamics.model import BallModel, is_substituted
-from ballfg.state import STANDARD_GRAVITY, STATE_DIM, VELOCITY, VZ, Z
+from ballfg.state import STANDARD_GRAVITY, STATE_DIM, VELOCITY, Z
 
 PROBE_SPEEDS = (2.0, 4.0, 8.0)
 """m/s, for the drag."""
@@ -26,18 +28,21 @@ BOUNDS = {
     "friction": (0.0, 3.0),
     "radius": (1e-3, 1.0),
     "surface_offset": (-0.2, 0.2),
+    "slope_x": (-0.5, 0.5),
+    "slope_y": (-0.5, 0.5),
 }
 """Lowest and highest value of each number, in its own unit."""
 
 
 @dataclass(frozen=True)
 class SegmentationPhysics:
-    """A ball without spin, in six numbers; the slack of the segmentation covers the rest.
+    """A ball without spin and the plane of its surfaces, in eight numbers; slack covers the rest.
 
     Attributes:
         gravity: m/s^2, downwards.  drag: 1/m, k in a = -k |v| v.  restitution: of the normal velocity.
         friction: Coulomb coefficient of a bounce.  radius: m.
-        surface_offset: m by which surfaces lie above their declared heights.
+        surface_offset: m by which surfaces lie above their declared heights at the origin.
+        slope_x, slope_y: by which they rise along x and y.
 
     Raises: ValueError: if a number is not finite or out of range.
     """
@@ -48,6 +53,8 @@ class SegmentationPhysics:
     friction: float = 0.25
     radius: float = 0.02
     surface_offset: float = 0.0
+    slope_x: float = 0.0
+    slope_y: float = 0.0
 
     def __post_init__(self) -> None:
         for name, (low, high) in BOUNDS.items():
@@ -57,13 +64,25 @@ class SegmentationPhysics:
             if not low <= value <= high:
                 raise ValueError(f"{name} must lie in [{low:g}, {high:g}]; got {value:g}. Check units and model.")
 
+    def rise(self, x: float, y: float) -> float:
+        """M by which surfaces lie above their declared heights at a place (m)."""
+        return self.surface_offset + self.slope_x * x + self.slope_y * y
+
+    def level(self, positions: Array) -> Array:
+        """(n, 3) m, the same positions as over surfaces without a slope: z is reduced by what they rise.
+
+        Flight and bounce look there as they do over a level table, but for the turn of a bounce's tangential velocity.
+        """
+        rise = self.slope_x * positions[:, :1] + self.slope_y * positions[:, 1:2]
+        return np.concatenate((positions[:, :2], positions[:, 2:] - rise), axis=1)
+
 
 def physics_of(model: BallModel) -> SegmentationPhysics:
     """The physics of a model, analytic or learned, from its values at a few states without spin.
 
-    Gravity, and the offset of the surfaces, come from a ball that hangs still; drag is the least-squares k over
-    horizontal flight in four directions; restitution and friction are means over bounces. A value outside `BOUNDS`,
-    which a learned model may give outside of its training data, is replaced by that of a table-tennis ball.
+    Gravity, offset and slope of the surfaces come from a ball that hangs still, here and 1 m away; drag is the
+    least-squares k over horizontal flight in four directions; restitution and friction are means over bounces. A value
+    outside `BOUNDS`, which a learned model may give outside of its training data, is that of a table-tennis ball.
 
     Args: model: any `BallModel`; it is neither changed nor differentiated.
     """
@@ -86,10 +105,10 @@ def _asked(model: BallModel) -> SegmentationPhysics:
     still = torch.zeros(1, STATE_DIM, dtype=torch.float64)
     still[:, Z] = 1.0
     with torch.no_grad():
-        restitution, friction = _bounce_coefficients(model, still)
-        offset = float(torch.as_tensor(model.surface_offset(still)).reshape(-1)[0])
+        offset, *slope = _surface(model, still)
+        restitution, friction = _bounce_coefficients(model, still, slope)
         gravity, drag = -float(model.rates(still)[0][0, 2]), _drag_coefficient(model, still)
-    values = dict(zip(BOUNDS, (gravity, drag, restitution, friction, model.radius, offset), strict=True))
+    values = dict(zip(BOUNDS, (gravity, drag, restitution, friction, model.radius, offset, *slope), strict=True))
     return SegmentationPhysics(**{n: v for n, v in values.items() if BOUNDS[n][0] <= v <= BOUNDS[n][1]})
 
 
@@ -103,12 +122,22 @@ def _drag_coefficient(model: BallModel, still: Tensor) -> float:
     return -float((pull * speeds**3).sum() / speeds.pow(6).sum())
 
 
-def _bounce_coefficients(model: BallModel, still: Tensor) -> tuple[float, float]:
+def _surface(model: BallModel, still: Tensor) -> list[float]:
+    """m, the offset of surfaces at the origin, and by how much it grows over 1 m along x and along y."""
+    places = still.repeat(3, 1)
+    places[1, 0] = places[2, 1] = 1.0
+    here, *there = torch.as_tensor(model.surface_offset(places)).expand(3).tolist()
+    return [here, *(offset - here for offset in there)]
+
+
+def _bounce_coefficients(model: BallModel, still: Tensor, slope: Sequence[float]) -> tuple[float, float]:
     """Restitution and friction: normal and tangential impulse of fast sliding bounces at `PROBE_FALLS`."""
     falls = torch.tensor(PROBE_FALLS, dtype=torch.float64)
+    normal = torch.tensor([-slope[0], -slope[1], 1.0], dtype=torch.float64)
+    along = torch.tensor([1.0, 0.0, slope[0]], dtype=torch.float64)
+    normal, along = normal / normal.norm(), along / along.norm()
     falling = still.repeat(len(falls), 1)
-    falling[:, VZ] = -falls
-    falling[:, VELOCITY.start] = PROBE_SLIDE
-    after = model.after_bounce(falling)
-    normal = after[:, VZ] + falls
-    return float((after[:, VZ] / falls).mean()), float(((PROBE_SLIDE - after[:, VELOCITY.start]) / normal).mean())
+    falling[:, VELOCITY] = PROBE_SLIDE * along - falls[:, None] * normal
+    after = model.after_bounce(falling)[:, VELOCITY]
+    up, slid = (after * normal).sum(-1), PROBE_SLIDE - (after * along).sum(-1)
+    return float((up / falls).mean()), float((slid / (up + falls)).mean())

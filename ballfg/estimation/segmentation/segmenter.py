@@ -72,7 +72,8 @@ class Segmenter:
         if not len(times):
             return Decision((), ())
         scene, noise = self._scene, np.maximum(sigmas, self._scene.settings.sigma_floor)
-        known = (self._bank, self._log, self._time, times, positions, noise, self.count, scene.numbers, scene.rows)
+        level = scene.physics.level(positions)
+        known = (self._bank, self._log, self._time, times, level, noise, self.count, scene.numbers, scene.rows)
         self._bank, self._log, final = follow(*known)
         self._time = float(times[-1])
         self.count += len(times)

@@ -86,7 +86,8 @@ class HypothesisModel:
 
     def level(self, mean: Array) -> float:
         """m, height of the surface below a ball (d,); -inf where there is none."""
-        return float(self.surfaces.height_below(torch.from_numpy(mean[:STATE_DIM])))
+        state = torch.from_numpy(mean[: self.width])
+        return float(self.surfaces.height_below(state, self.ball.surface_offset(state)))
 
     def gaps(self, means: Array, level: float) -> tuple[Array, Array]:
         """(n,) m between balls (n, d) and a surface, and its gradients (n, d)."""

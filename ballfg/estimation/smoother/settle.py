@@ -157,7 +157,7 @@ def contacts_at_ends(times: Array, solution: Solution, model: BallModel, surface
         if interval in taken or (beyond - inside) * speed >= 0.0:  # it does not move away from the other samples
             continue
         pair = torch.from_numpy(np.concatenate((values.states[[inside, beyond]], coefficients), axis=1))
-        height = surfaces.level_below(pair)[0]
+        height = surfaces.level_below(pair, model.surface_offset(pair))[0]
         above, below = gaps(model, pair, float(height)).tolist()
         if above >= 0.0 > below and bool(surfaces.over_table(pair)[1]):
             time = times[beyond] - below / speed

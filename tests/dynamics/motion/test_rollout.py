@@ -387,3 +387,36 @@ def test_machine_code_goes_from_time_to_time_as_torch_does(any_model, states, su
         for k, step in enumerate(torch.diff(times, prepend=torch.zeros(1, dtype=torch.float64))):
             state = advance(any_model, state, step.expand(9), surfaces)
             torch.testing.assert_close(found[:, k], state, rtol=1e-12, atol=1e-12, equal_nan=True)
+
+
+@pytest.mark.parametrize("edges", [None, (-1.0, 9.0, -1.0, 1.0)], ids=["endless", "edged"])
+@pytest.mark.parametrize("differentiated", [False, True])
+def test_a_table_may_lie_far_below_its_declared_height(build, differentiated, edges):
+    """The centre of a ball that touches it is lower than that height, and yet the ball is above the table."""
+    declared = {"gravity": {"g": 9.81}, "drag": {"k": 0.1}, "restitution": {"e": 0.9}, "friction": {"mu": 0.2}}
+    low, usual, surfaces = (
+        build(**declared, table_height={"offset": -0.05}),
+        build(**declared),
+        Surfaces(0.7, 0.0, edges),
+    )
+    times, lower = torch.linspace(0.1, 1.2, 12, dtype=torch.float64), seconds(0, 0, 0.05, 0, 0, 0, 0, 0, 0)
+    start = rows((0, 0, 1.0, 2, 0.1, 0, 0, 50, 0))
+    with torch.set_grad_enabled(differentiated):
+        expected = rollout(usual, start, times, surfaces).detach()
+        found = rollout(low, start - lower, times, surfaces).detach()
+    assert float(found[0, -1, 5]) > -3.0  # it has bounced: a free fall is at 11 m/s
+    torch.testing.assert_close(found, expected - lower, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("differentiated", [False, True])
+def test_a_ball_bounces_where_a_leaning_table_is_low(build, differentiated):
+    """2 m from the origin a table that leans by 2.3 degrees is 80 mm lower. Without losses, energy stays the same."""
+    leaning = build(gravity={"g": 9.81}, restitution={"e": 1.0}, table_tilt={"x": 0.0, "y": 0.04})
+    times, start = torch.linspace(0.02, 0.6, 30, dtype=torch.float64), rows((2.0, 0, 1.0, 1, 0, 0, 0, 0, 0))
+    with torch.set_grad_enabled(differentiated):
+        (path,) = rollout(leaning, start, times, Surfaces(0.7, 0.0, (-1.0, 9.0, -1.0, 1.0))).detach()
+    energy = 9.81 * path[:, 2] + 0.5 * path[:, 3:6].square().sum(-1)
+    torch.testing.assert_close(energy, torch.full_like(energy, 9.81 + 0.5), rtol=0, atol=1e-9)
+    assert bool((leaning.gap(path, 0.7) > -1e-9).all())
+    assert float(path[-1, 5]) < float(path[:, 5].max()) > 2.0
+    assert path[:, 2].min() < 0.7

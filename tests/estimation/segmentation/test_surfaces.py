@@ -43,6 +43,20 @@ def test_off_the_table_onto_the_floor(see, match, known):
     assert len(found.hits) == 0
 
 
+@pytest.mark.parametrize("lean", [{"x": 0.0, "y": 0.06}, {"x": -0.05, "y": 0.03}])
+def test_a_table_that_is_not_level(see, match, lean):
+    """Where the ball bounces it lies some centimetres above or below its height at the origin."""
+    physics = {"flight": {"gravity": {}, "drag": {"k": 0.1}}, "bounce": {"restitution": {"e": 0.9}, "friction": {}}}
+    leaning = model_from_dict({**physics, "bounce": {**physics["bounce"], "table_tilt": lean}})
+    truth, found = see([-0.7, -1.2, 1.2, 1.0, 1.5, 1, 0, 0, 0], EDGED, EDGED, leaning, times=TIMES[:150])
+    assert len(truth.contacts) >= 1
+    check_contacts(match, found, truth)
+    assert len(found.hits) == 0
+    level, asked = physics_of(model_from_dict(physics)), physics_of(leaning)
+    assert asked.restitution == pytest.approx(level.restitution, rel=1e-9)
+    assert asked.friction == pytest.approx(level.friction, rel=1e-9)
+
+
 @pytest.mark.parametrize("known", [EDGED, UNKNOWN])
 def test_beside_the_table(see, match, known):
     truth, found = see([0, 1, 1.1, 0, 3, 1, 0, 0, 0], EDGED, known)

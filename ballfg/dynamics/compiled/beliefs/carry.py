@@ -162,7 +162,7 @@ def carry(
                 level[k + 1, r] = level[k, r]
             else:
                 age[k + 1, r] = np.nan
-            low, after = level_below(x[2], world), mean[k + 1, r]
+            low, after = level_below(laws.surface, x[:9], world), mean[k + 1, r]
             if at_rest(laws.surface, x[:9], low, world):
                 hard[r], stop = 2.0, True
                 continue

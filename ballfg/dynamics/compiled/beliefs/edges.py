@@ -20,9 +20,15 @@ def gap_of(surface, x, level, radius):
     return x[2] - level - offset[0] - radius
 
 
+@machine_code(REAL(LAW, ONE, ONE))
+def level_below(surface, x, world):
+    """Height (m) of the surface that a ball (9,) falls to; -inf if there is none."""
+    return level_at(gap_of(surface, x, 0.0, 0.0), world)
+
+
 @machine_code(REAL(REAL, ONE))
-def level_below(z, world):
-    """Height (m) of the surface that a ball with its centre at z (m) falls to; -inf if there is none."""
+def level_at(z, world):
+    """The same for a centre at z (m), less what surfaces lie above their declared heights there."""
     if z > world[0]:
         return world[0]
     return world[1] if z > world[1] - DEEPEST else -np.inf

@@ -77,7 +77,7 @@ def _contact_within(laws, x, h, world, touch):
     It is unclear if the ball rests there, or falls past the table to the floor within the step. The third number is the
     time at which it falls past the table, else NaN; writes its state there to touch (9,).
     """
-    low, after = level_below(x[2], world), x.copy()
+    low, after = level_below(laws.surface, x, world), x.copy()
     if at_rest(laws.surface, x, low, world):
         return low, np.nan, np.nan
     glide(laws.rates, after, h, 1)

@@ -128,7 +128,7 @@ def mix(
                 low = level[time, r]
                 below[:], belows[:] = beside[time, r], besides[time, r]
                 c0 = _below(laws.surface, below, belows, low, world[2], k)
-            under = level_below(at[2], world)
+            under = level_below(laws.surface, at[:9], world)
             if at[5] < 0.0 and math.isfinite(under) and (under != world[0] or over_table(at, world)):
                 c1 = _below(laws.surface, at, spread, under, world[2], own)
                 if abs(c1) < abs(c0):  # of two contacts of a ball the nearer one
