@@ -30,6 +30,11 @@ def flight_step(model: BallModel, state: Tensor, h: Tensor) -> Tensor:
     return after + _StepByParameters.apply(work, *work.parameters) if work.parameters else after
 
 
+_Curved = tuple[Tensor, list[Tensor | None]]
+"""(4, n, 9) the Hessians of c_k . d_k times the tangents t_k, and the mixed derivatives by each parameter; each stage
+counts for its share."""
+
+
 class _Work:
     """The values that all derivatives of a step share.
 
@@ -46,7 +51,7 @@ class _Work:
         self.shares = h / 6.0 * h.new_tensor([1.0, *(weight for _, weight in STAGES)])[:, None, None]
         self._pushed: tuple[Tensor, Tensor] | None = None
         self._bent: tuple[Tensor, Tensor] | None = None
-        self._curved: tuple[Tensor, tuple[Tensor, Tensor]] | None = None
+        self._curved: tuple[Tensor, _Curved] | None = None
 
     @cached_property
     def maps(self) -> tuple[Tensor, Tensor]:
@@ -95,30 +100,27 @@ class _Work:
             self._bent = upstream, gradient
         return self._bent[1]
 
-    def curved(self, upstream: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        """(4, n, 9) tangents t_k of the stages for one v (n, 9) of the state, and the Hessians of c_k . d_k times t_k.
+    def curved(self, upstream: Tensor, v: Tensor, learn: bool) -> "_Curved":
+        """What bends along one v (n, 9) of the state, with derivatives by the parameters where they `learn`.
 
-        Cached for the last v: two nodes of the graph ask for the same.
+        Cached for the last v: two nodes of the graph ask for the same, that of the parameters first.
         """
         kept = self._curved
         if kept is None or kept[0].data_ptr() != v.data_ptr() or self._bent is None or self._bent[0] is not upstream:
             tangents = _times(self.maps[1], v).view(len(v), len(self.stages), -1).transpose(0, 1).contiguous()
-            self._curved = kept = (v, (tangents, self._bend(upstream, tangents)))
+            bent, *rest = self._derivatives(self.bent(upstream), self.shares * tangents, [self.traced[0]], learn)
+            self._curved = kept = (v, (torch.zeros_like(tangents) if bent is None else bent, rest))
         return kept[1]
 
-    def _bend(self, upstream: Tensor, tangents: Tensor) -> Tensor:
-        gradient = self.bent(upstream)
-        if not gradient.requires_grad:  # rates that are linear in the state, with nothing to learn
-            return torch.zeros_like(gradient)
-        leaf, _ = self.traced
-        (bent,) = torch.autograd.grad(gradient, leaf, tangents, retain_graph=True, allow_unused=True)
-        return torch.zeros_like(gradient) if bent is None else bent
+    def by_parameters(self, cotangents: Tensor) -> list[Tensor | None]:
+        """Derivatives by the parameters of the stages' slopes times their cotangents (4, n, 9)."""
+        return self._derivatives(self.traced[1], self.shares * cotangents, [], learn=True)
 
-    def by_parameters(self, outputs: list[Tensor], weights: list[Tensor]) -> tuple[Tensor | None, ...]:
-        """Derivatives by the parameters of the sum of outputs times weights, each of which counts for its share."""
-        kept = [(output, self.shares * w) for output, w in zip(outputs, weights, strict=True) if output.requires_grad]
-        outputs, weights = (list(each) for each in zip(*kept, strict=True))
-        return torch.autograd.grad(outputs, self.parameters, weights, retain_graph=True, allow_unused=True)
+    def _derivatives(self, output: Tensor, weight: Tensor, leaves: list[Tensor], learn: bool) -> list[Tensor | None]:
+        wanted = [*leaves, *(self.parameters if learn else ())]
+        if not output.requires_grad:  # rates that are linear in the state, with nothing to learn
+            return [None] * len(wanted)
+        return list(torch.autograd.grad(output, wanted, weight, retain_graph=True, allow_unused=True))
 
 
 def _step(model: BallModel, state: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -175,7 +177,7 @@ class _StepByParameters(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         work: _Work = ctx.work
-        return None, *work.by_parameters([work.traced[1]], [work.cotangents(upstream[0])])
+        return None, *work.by_parameters(work.cotangents(upstream[0]))
 
 
 class _Pull(torch.autograd.Function):
@@ -193,8 +195,8 @@ class _Pull(torch.autograd.Function):
         after, stages = work.maps
         gradient = None
         if ctx.needs_input_grad[0]:
-            acting = (work.shares * work.curved(ctx.upstream, v[0])[1]).transpose(0, 1)
-            gradient = _times(stages.mT, acting.reshape(len(v[0]), -1))
+            bent, _ = work.curved(ctx.upstream, v[0], learn=False)
+            gradient = _times(stages.mT, bent.transpose(0, 1).reshape(len(v[0]), -1))
         return gradient, _times(after, v[0]), None, None
 
 
@@ -210,6 +212,6 @@ class _PullByParameters(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *v: Tensor) -> tuple[Tensor | None, ...]:
         work: _Work = ctx.work
-        tangents, bent = work.curved(ctx.upstream, v[0])
-        outputs = [work.traced[1], work.bent(ctx.upstream)]
-        return None, None, *work.by_parameters(outputs, [work.cotangents(torch.zeros_like(v[0]), bent), tangents])
+        bent, direct = work.curved(ctx.upstream, v[0], learn=True)
+        moved = work.by_parameters(work.cotangents(torch.zeros_like(bent[0]), bent / work.shares))
+        return None, None, *(a if b is None else b if a is None else a + b for a, b in zip(direct, moved, strict=True))
