@@ -21,10 +21,10 @@ from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import THREE, TWO
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import fly_through, fly_through_jacobian
-from ballfg.dynamics.motion.flight_step import flight_step
 from ballfg.dynamics.motion.integrate import batch_jacobian, fly_jacobian
 from ballfg.dynamics.motion.limits import step_count, steps_over
 from ballfg.dynamics.motion.rollout import roll
+from ballfg.dynamics.motion.step_twice import flight_step
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Noise, Values
 from ballfg.factors.noise import Kicks, ProcessNoise, along_all_axes, whitening, whitening_tensor
 from ballfg.state import STATE_DIM

@@ -15,7 +15,7 @@ from ballfg.dynamics.compiled.places import Numbers, numbers_of
 from ballfg.dynamics.compiled.roll_out import roll_out as roll_out_rows
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.state import STATE_DIM, Z
+from ballfg.state import POSITION, STATE_DIM, VELOCITY, Z
 
 RATES, IMPACT, SURFACE = range(3)  # The places of a model's functions in `CompiledModel.parts`
 
@@ -69,21 +69,32 @@ class Moving:
         """(n, 6) m/s^2 and rad/s^2 in flight at the start."""
         return self._value(RATES)[0]
 
+    def slopes(self, states: Array) -> tuple[Array, Array]:
+        """(n, 9 + p) derivatives by time in flight, and (n, 9 + p, d) by the states.
+
+        Args: states: (n, 9 + p) other states of the same balls, d = 9 + p, with the coefficients of the start.
+        """
+        rates, by_state = self._value(RATES, states)
+        slopes, jacobians = np.zeros_like(states), np.zeros((*states.shape, self.width))
+        slopes[:, POSITION], slopes[:, VELOCITY.start : STATE_DIM] = states[:, VELOCITY], rates
+        jacobians[:, POSITION, VELOCITY], jacobians[:, VELOCITY.start : STATE_DIM] = np.eye(3), by_state
+        return slopes, jacobians
+
     def after_bounce(self) -> Array:
         """(n, 9 + p) states right after an impact."""
         after = self.start.copy()
         after[:, :STATE_DIM] = self._value(IMPACT)[0]
         return after
 
-    def _value(self, part: int) -> tuple[Array, Array]:
-        """(n, m) of a function at the start, and its derivatives (n, m, d)."""
+    def _value(self, part: int, states: Array | None = None) -> tuple[Array, Array]:
+        """(n, m) of a function at the start, or at other states of the balls, and its derivatives (n, m, d)."""
         n, d, function = len(self.start), self.width, self.functions.parts[part]
-        states, moved = np.ascontiguousarray(self.start[:, :STATE_DIM]), np.zeros((n, STATE_DIM, d))
+        at, moved = self.start if states is None else states, np.zeros((n, STATE_DIM, d))
         if d:
             moved[:, range(STATE_DIM), range(STATE_DIM)] = 1.0
         value, slopes = np.zeros((n, function.size)), np.zeros((n, function.size, d))
         c, ct = self.coefficients(part)
-        function.compute(states, c, self.weights[part], moved, ct, value, slopes)
+        function.compute(np.ascontiguousarray(at[:, :STATE_DIM]), c, self.weights[part], moved, ct, value, slopes)
         return value, slopes
 
     def all_coefficients(self) -> list[Array]:

@@ -8,7 +8,8 @@ import torch
 from ballfg.dynamics import nominal_model
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.flight_step import flight_step, rk4_step
+from ballfg.dynamics.motion.flight_step import rk4_step
+from ballfg.dynamics.motion.step_twice import flight_step
 from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.dynamics.networks.learned import build
 
