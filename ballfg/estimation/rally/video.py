@@ -21,6 +21,7 @@ from ballfg.vision.broadcast.candidates import find_candidates
 from ballfg.vision.broadcast.court import Court
 from ballfg.vision.broadcast.doubled import without_doubled
 from ballfg.vision.broadcast.motion import Frames, Motion, Shot, find_motion
+from ballfg.vision.broadcast.resized import Scale
 from ballfg.vision.detection.detections import Detections
 from ballfg.vision.one_thread import one_thread
 
@@ -80,10 +81,12 @@ def track_moving_camera(
     Raises: ValueError: no picture shows the court.
     """
     kept = without_doubled(frames, count, watch)
+    scale = Scale.of(_size(kept.frames))
     if corners is not None:
         places = np.searchsorted(kept.numbers, list(corners), side="right") - 1
-        corners = {int(place): four for place, four in zip(places, corners.values(), strict=True)}
-    frames = kept.frames
+        fours = [scale.to_searched(four) for four in corners.values()]
+        corners = {int(place): four for place, four in zip(places, fours, strict=True)}
+    frames = scale.frames(kept.frames)
     motion = replace(find_motion(frames, court, len(kept.numbers), corners, watch), numbers=kept.numbers)
     surfaces = surfaces_of(court)
     step = float(np.median(np.diff(motion.times)))
@@ -92,10 +95,19 @@ def track_moving_camera(
         if candidates is None:
             found, share = find_candidates(frames, shot, court, model.radius, motion.times, watch), SEEN
         else:
-            found, share = candidates(shot, motion.times), UNKNOWN
+            found = scale.detections_searched(candidates(scale.shot_of_video(shot), motion.times))
+            share = UNKNOWN
         one = reconstruct(found, shot, model, surfaces, first=len(rows), seen_share=share, watch=watch)
         mine = events_of(one, model, surfaces, step, court.net)
-        shots.append(one)
+        seen = scale.detections_of_video(one.seen)
+        shots.append(replace(one, camera=scale.camera_of_video(one.camera), seen=seen))
         events += mine
         rows += [stroke_row(estimate, mine, model, court.net) for estimate in one.estimates]
-    return Rally(motion, tuple(shots), tuple(events), tuple(rows), kept.doubled)
+    return Rally(scale.motion_of_video(motion), tuple(shots), tuple(events), tuple(rows), kept.doubled)
+
+
+def _size(frames: Frames) -> tuple[int, int]:
+    """(width, height) px of the first picture."""
+    for _, image in frames():
+        return image.shape[1], image.shape[0]
+    raise ValueError("the video must hold at least one picture; it holds none. Check the file.")

@@ -30,6 +30,8 @@ SMALLEST: Final = 0.004
 """Of the image's area."""
 FOCALS: Final = np.geomspace(0.5, 10.0, 22)
 """Focal lengths that are tried, of the image's width."""
+FINER: Final = (FOCALS[1] / FOCALS[0]) ** np.linspace(-1.0, 1.0, 13)
+"""Factors about the best of them that are tried next: one step misses the corners of a large court by too much."""
 MISSED: Final = 0.03
 """Of the quadrilateral's size: the corners' error by which a pinhole camera may miss them."""
 UPRIGHT: Final = 0.35
@@ -151,16 +153,27 @@ def cameras_of(quads: Array, court: Court, size: tuple[int, int]) -> list[Pinhol
         for first in range(4):  # clockwise as seen from above is clockwise in the picture
             seen = np.roll(quad[::-1], first, axis=0) - middle
             plane = cv2.getPerspectiveTransform(flat, seen.astype(np.float32))
-            focal = FOCALS * size[0]
-            turn, place = posed(np.tile(plane, (len(focal), 1, 1)), focal)
-            at = (court.corners - place[:, None]) @ turn.swapaxes(1, 2)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                missed = np.linalg.norm(focal[:, None, None] * at[..., :2] / at[..., 2:] - seen, axis=2).max(axis=1)
-            missed[~_possible(turn, place, at, court)] = np.inf
-            best = int(np.argmin(missed))
-            if missed[best] < MISSED * scale:
-                found.append(Pinhole(turn[best], place[best], float(focal[best]), size))
+            one, missed = _best(plane, seen, court, FOCALS * size[0], size)
+            if np.isfinite(missed):
+                one, missed = _best(plane, seen, court, one.focal * FINER, size)
+            if missed < MISSED * scale:
+                found.append(one)
     return [one for one in found if _in_front(one.place)]
+
+
+def _best(plane: Array, seen: Array, court: Court, focal: Array, size: tuple[int, int]) -> tuple[Pinhole, float]:
+    """The camera of those focal lengths (m,) px that sees a court's corners nearest to where they are seen.
+
+    Args: plane: (3, 3), from the court to `seen` (4, 2) px from the image's middle.
+    Returns: it, and by how much it misses them, px; infinite where none is possible.
+    """
+    turn, place = posed(np.tile(plane, (len(focal), 1, 1)), focal)
+    at = (court.corners - place[:, None]) @ turn.swapaxes(1, 2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        missed = np.linalg.norm(focal[:, None, None] * at[..., :2] / at[..., 2:] - seen, axis=2).max(axis=1)
+    missed[~_possible(turn, place, at, court)] = np.inf
+    best = int(np.argmin(missed))
+    return Pinhole(turn[best], place[best], float(focal[best]), size), float(missed[best])
 
 
 def _in_front(place: Array) -> bool:
