@@ -35,7 +35,7 @@ BARRIERS: Final = (
 
 @dataclass(frozen=True)
 class Look:
-    """The colours of a hall, and half the widths, m, of the table's lines and of the middle one.
+    """The colours of a hall, and half the widths, m, of the table's lines, the middle one, and the net's tape from above.
 
     Attributes: barriers: around the floor; None: there are none.  net: cloth, with its posts and tape in `lines`.
     """
@@ -49,6 +49,7 @@ class Look:
     barriers: Colour | None = None
     half_width: float = 0.01
     half_middle: float = 0.01
+    half_tape: float = 0.0
 
 
 PLAIN: Final = Look()
@@ -139,8 +140,10 @@ def _line(image: Image, camera: Pinhole, ends: Array, look: Look) -> None:
     across = np.array([-along[1], along[0], 0.0]) * (look.half_middle if middle else look.half_width)
     if first[2] > 0.0:
         across = np.array([0.0, 0.0, 0.008])
+        thick = np.array([look.half_tape, 0.0, 0.0])
         low = np.array([0.0, 0.0, first[2]])
         _filled(image, camera, np.array([first, second, second - low, first - low]), look.net)
+        _filled(image, camera, np.array([first - thick, second - thick, second + thick, first + thick]), look.lines)
     _filled(image, camera, np.array([first - across, second - across, second + across, first + across]), look.lines)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,7 +17,7 @@ from ballfg.estimation.rally.moments import Event
 from ballfg.estimation.rally.reconstruct import ShotRally, reconstruct
 from ballfg.estimation.result import Status
 from ballfg.progress import Watch, unwatched
-from ballfg.vision.broadcast.candidates import find_candidates
+from ballfg.vision.broadcast.candidates import BALLS, find_candidates
 from ballfg.vision.broadcast.court import Court
 from ballfg.vision.broadcast.doubled import without_doubled
 from ballfg.vision.broadcast.motion import Frames, Motion, Shot, find_motion
@@ -77,7 +77,7 @@ def track_moving_camera(
     Args:
         frames: opens the video, each time anew.  count: of its pictures, about.  court: in them.  model: the ball.
         corners: number of a picture -> (4, 2) px of the court's corners, in any order; None: the court is found.
-        candidates: of a detector of one's own; None: bright moving spots.
+        candidates: of a detector of one's own; None: bright moving spots, as of a white ball, or else an orange one.
     Raises: ValueError: no picture shows the court.
     """
     kept = without_doubled(frames, count, watch)
@@ -93,17 +93,27 @@ def track_moving_camera(
     shots, events, rows = list[ShotRally](), list[Event](), list[dict[str, Any]]()
     for shot in motion.shots:
         if candidates is None:
-            found, share = find_candidates(frames, shot, court, model.radius, motion.times, watch), SEEN
+            sought = (find_candidates(frames, shot, court, model.radius, motion.times, one, watch) for one in BALLS)
+            share = SEEN
         else:
-            found = scale.detections_searched(candidates(scale.shot_of_video(shot), motion.times))
-            share = UNKNOWN
-        one = reconstruct(found, shot, model, surfaces, first=len(rows), seen_share=share, watch=watch)
+            own = candidates(scale.shot_of_video(shot), motion.times)
+            sought, share = (scale.detections_searched(one) for one in (own,)), UNKNOWN
+        one = _first_with_strokes(
+            reconstruct(found, shot, model, surfaces, first=len(rows), seen_share=share, watch=watch)
+            for found in sought
+        )
         mine = events_of(one, model, surfaces, step, court.net)
         seen = scale.detections_of_video(one.seen)
         shots.append(replace(one, camera=scale.camera_of_video(one.camera), seen=seen))
         events += mine
         rows += [stroke_row(estimate, mine, model, court.net) for estimate in one.estimates]
     return Rally(scale.motion_of_video(motion), tuple(shots), tuple(events), tuple(rows), kept.doubled)
+
+
+def _first_with_strokes(rallies: Iterator[ShotRally]) -> ShotRally:
+    """The first that holds strokes; without any the first of all."""
+    one = next(rallies)
+    return one if one.estimates else next((other for other in rallies if other.estimates), one)
 
 
 def _size(frames: Frames) -> tuple[int, int]:

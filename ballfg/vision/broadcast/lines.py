@@ -26,7 +26,7 @@ FLANK, BESIDE = 4.0, 2.5
 """px from the middle of a line, and from the edge of a wide one, to the ground beside it."""
 CROSSING: Final = 2.0
 """Of the flank, from another line within which it is in the way."""
-RIDGE: Final = 12.0
+RIDGE: Final = 6.0
 """Grey levels by which a line is brighter than the ground, at least."""
 LEANING, SHARP = 0.1305, 2.4
 """Of the step between the grounds, by which the halfway places of a line that is far narrower than its blur differ from
