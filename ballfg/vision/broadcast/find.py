@@ -20,10 +20,11 @@ from ballfg.vision.broadcast.pinhole import Pinhole, posed
 
 SHORTEST: Final = 0.02
 """Of the image's diagonal: a shorter segment is not used."""
-MOST_LINES: Final = 70
+MOST_LINES: Final = 90
 """Longest ones that are combined."""
-PARALLEL, ASIDE, GAP = 0.03, 2.0, 0.6
-"""rad and px by which segments of one line differ; the gap between them, of the longer one."""
+PARALLEL, ASIDE, GAPS = 0.03, 2.0, (0.15, 0.6)
+"""rad and px by which segments of one line differ; the gap between them, of the longer one. A wide gap bridges a player
+before an edge, but continues another edge with what lies in its direction on the floor: lines of both are combined."""
 OPEN: Final = (8.0, 0.12)
 """px, and share of a segment's length, by which it may end before a corner or pass it."""
 SMALLEST: Final = 0.004
@@ -72,20 +73,25 @@ def joined_segments(image: Image) -> Array:
     length = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
     segments = segments[length > 0.25 * SHORTEST * np.hypot(*image.shape[:2])]
     segments = segments[np.argsort(-np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1), kind="stable")]
-    joined = list[Array]()
-    while len(segments):
-        line, segments = segments[0], segments[1:]
-        while (more := _continues(line, segments)).any():
-            line, segments = _hull(line, segments[more]), segments[~more]
-        joined.append(line)
-    lines = np.array(joined).reshape(-1, 2, 2)
+    lines = np.unique(np.concatenate([_joined(segments, gap) for gap in GAPS]), axis=0)
     length = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)
     order = np.argsort(-length, kind="stable")[:MOST_LINES]
     return np.asarray(lines[order][length[order] > SHORTEST * np.hypot(*image.shape[:2])])
 
 
-def _continues(line: Array, others: Array) -> Mask:
-    """(n,) which others (n, 2, 2) lie on a line (2, 2) and near its ends."""
+def _joined(segments: Array, gap: float) -> Array:
+    """(m, 2, 2) px, lines of segments (n, 2, 2), longest first, that a `gap` of the longer one may part."""
+    joined = list[Array]()
+    while len(segments):
+        line, segments = segments[0], segments[1:]
+        while (more := _continues(line, segments, gap)).any():
+            line, segments = _hull(line, segments[more]), segments[~more]
+        joined.append(line)
+    return np.array(joined).reshape(-1, 2, 2)
+
+
+def _continues(line: Array, others: Array, most: float) -> Mask:
+    """(n,) which others (n, 2, 2) lie on a line (2, 2) and at `most` so far from its ends, of the longer one."""
     along = line[1] - line[0]
     length = np.linalg.norm(along)
     along = along / length
@@ -96,7 +102,7 @@ def _continues(line: Array, others: Array) -> Mask:
     gap = np.maximum(np.minimum(begin, end) - length, -np.maximum(begin, end))
     extent = np.abs(end - begin)
     aside, turned = np.maximum(np.abs(first), np.abs(last)), np.abs(last - first) / np.maximum(extent, 1e-9)
-    return np.asarray((turned < PARALLEL) & (aside < ASIDE) & (gap < GAP * np.maximum(length, extent)))
+    return np.asarray((turned < PARALLEL) & (aside < ASIDE) & (gap < most * np.maximum(length, extent)))
 
 
 def _hull(line: Array, others: Array) -> Array:
