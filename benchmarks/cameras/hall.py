@@ -35,7 +35,7 @@ BARRIERS: Final = (
 
 @dataclass(frozen=True)
 class Look:
-    """The colours of a hall, and half the widths, m, of the table's lines, the middle one, and the net's tape from above.
+    """The colours of a hall, and half the widths, m, of table lines, the middle one, and the net's tape from above.
 
     Attributes: barriers: around the floor; None: there are none.  net: cloth, with its posts and tape in `lines`.
     """
@@ -143,7 +143,8 @@ def _line(image: Image, camera: Pinhole, ends: Array, look: Look) -> None:
         thick = np.array([look.half_tape, 0.0, 0.0])
         low = np.array([0.0, 0.0, first[2]])
         _filled(image, camera, np.array([first, second, second - low, first - low]), look.net)
-        _filled(image, camera, np.array([first - thick, second - thick, second + thick, first + thick]), look.lines)
+        if look.half_tape:
+            _filled(image, camera, np.array([first - thick, second - thick, second + thick, first + thick]), look.lines)
     _filled(image, camera, np.array([first - across, second - across, second + across, first + across]), look.lines)
 
 

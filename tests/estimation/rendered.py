@@ -61,7 +61,8 @@ def main() -> None:
             continue
         cameras.append(seen)
         print(
-            f"{seed} {of.view}, light {of.light:.1f}, {of.cameras[0].focal:.0f} of {of.cameras[0].size[0]} px, quality {of.quality}: "
+            f"{seed} {of.view}, light {of.light:.1f}, {of.cameras[0].focal:.0f} of "
+            f"{of.cameras[0].size[0]} px, quality {of.quality}: "
             f"place {100 * seen.place:.2f} %, focal length {100 * seen.focal:.2f} %, "
             f"{one.found} of {one.strokes} strokes, {one.false} false, median "
             f"{1e3 * np.median(one.errors or [np.nan]):.0f} mm, spins {one.spins}, bounces {one.bounces}, "

@@ -86,7 +86,7 @@ def ridges(image: Array32, camera: Pinhole, court: Court, reach: float) -> Ridge
     flank = max(FLANK, STEP * np.ceil((0.5 * width[inside].max(initial=0.0) + BESIDE) / STEP))
     inside &= ~_crossed(pixels, camera.project(court.lines), CROSSING * flank)
     line = np.broadcast_to(np.arange(len(court.lines))[:, None], inside.shape)[inside]
-    offset, good = _brightest(image, pixels[inside], normals[inside], width[inside], (reach, flank))
+    offset, good = _brightest(image, pixels[inside], normals[inside], reach, width[inside], flank)
     asked = inside.sum(axis=1)
     return Ridges(points[inside][good], offset[good], normals[inside][good], line[good], asked)
 
@@ -102,7 +102,7 @@ def _crossed(pixels: Array, ends: Array, near: float) -> Mask:
 
 
 def _brightest(
-    image: Array32, pixels: Array, normal: Array, width: Array, reach_flank: tuple[float, float]
+    image: Array32, pixels: Array, normal: Array, reach: float, width: Array, flank: float = FLANK
 ) -> tuple[Array, Mask]:
     """(n,) px, the middle of the strongest ridge along each normal, and whether there is one (n,).
 
@@ -110,19 +110,18 @@ def _brightest(
     brightest place itself lies towards the brighter ground. Where blur is as wide as the line, of `width` (n,) px, the
     places lie there too, by what is known of the ridge: the step between the grounds, and how steep it is.
     """
-    reach, beside = reach_flank
-    steps = np.arange(-reach - beside, reach + beside + STEP / 2, STEP)
+    steps = np.arange(-reach - flank, reach + flank + STEP / 2, STEP)
     if not len(pixels):
         return np.zeros(0), np.zeros(0, dtype=bool)
     at = (pixels[:, None] + steps[:, None] * normal[:, None]).astype(np.float32)
     values = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR).reshape(len(pixels), len(steps))
-    flank, rows = round(beside / STEP), np.arange(len(pixels))
-    rise = values[:, flank:-flank] - np.maximum(values[:, : -2 * flank], values[:, 2 * flank :])
+    beside, rows = round(flank / STEP), np.arange(len(pixels))
+    rise = values[:, beside:-beside] - np.maximum(values[:, : -2 * beside], values[:, 2 * beside :])
     top = np.argmax(rise, axis=1)
     good = (rise[rows, top] > RIDGE) & (top > 0) & (top < rise.shape[1] - 1)
-    near = values[rows[:, None], top[:, None] + np.arange(2 * flank + 1)]
-    after, steep = _halfway(near[:, flank:])
-    before, steeper = _halfway(near[:, flank::-1])
+    near = values[rows[:, None], top[:, None] + np.arange(2 * beside + 1)]
+    after, steep = _halfway(near[:, beside:])
+    before, steeper = _halfway(near[:, beside::-1])
     share = np.minimum(width / np.maximum(STEP * (after + before), STEP), 1.0)
     step = (near[:, -1] - near[:, 0]) / np.maximum(0.5 * (steep + steeper), 1.0)
     shift = STEP * (0.5 * (after - before) - LEANING * (1.0 - share**SHARP) * step)
