@@ -106,7 +106,7 @@ def aligned_candidates(
             continue
         others = [_warped(window[i], cameras[i], cameras[index]) for i in beside]
         most = others[0] if len(others) == 1 else cv2.max(*others)
-        change = _brighter(here, most, colour)
+        change = _brighter(here, np.asarray(most, dtype=np.uint8), colour)
         rise = change if rise is None else np.maximum(rise, change)
     if rise is None:
         return Candidates.none()

@@ -158,7 +158,7 @@ def cameras_of(quads: Array, court: Court, size: tuple[int, int]) -> list[Pinhol
         scale = np.linalg.norm(quad - quad.mean(axis=0), axis=1).mean()
         for first in range(4):  # clockwise as seen from above is clockwise in the picture
             seen = np.roll(quad[::-1], first, axis=0) - middle
-            plane = cv2.getPerspectiveTransform(flat, seen.astype(np.float32))
+            plane = np.asarray(cv2.getPerspectiveTransform(flat, seen.astype(np.float32)), dtype=np.float64)
             one, missed = _best(plane, seen, court, FOCALS * size[0], size)
             if np.isfinite(missed):
                 one, missed = _best(plane, seen, court, one.focal * FINER, size)
