@@ -1,6 +1,9 @@
 """Draws pictures of a table in a hall from a camera that pans and zooms: projected polygons."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
 from typing import Final
 
 import cv2
@@ -13,21 +16,54 @@ from ballfg.vision.broadcast.lines import moved
 from ballfg.vision.broadcast.pinhole import Pinhole
 
 SIZE: Final = (960, 540)
-"""px, of all pictures."""
+"""px, of pictures."""
+Colour = tuple[float, float, float]
+"""Grey levels of blue, green and red."""
 COURT: Final = table_tennis()
 PARTS: Final = 12
 """Of the side of a polygon, which a lens bends."""
 LARGEST: Final = 1e4
 """px, of a polygon that is drawn."""
+FLOOR: Final = -0.76
+"""m, z of the floor."""
+BARRIERS: Final = (
+    *(((x, y), (0.8, 0.0)) for x in (-4.9, -3.0, -1.0, 1.0, 3.0, 4.9) for y in (-3.5, 3.5)),
+    *(((x, y), (0.0, 0.8)) for x in (-7.0, 7.0) for y in (-2.0, 0.0, 2.0)),
+)
+"""Middles and half lengths of barriers, m."""
 
 
-def looking(place: Sequence[float], at: Sequence[float], focal: float, bend: float = 0.0) -> Pinhole:
+@dataclass(frozen=True)
+class Look:
+    """The colours of a hall, and half the widths, m, of table lines, the middle one, and the net's tape from above.
+
+    Attributes: barriers: around the floor; None: there are none.  net: cloth, with its posts and tape in `lines`.
+    """
+
+    table: Colour = (150, 80, 30)
+    lines: Colour = (240, 240, 240)
+    net: Colour = (70, 60, 40)
+    floor: Colour = (60, 50, 48)
+    wall: Colour = (60, 50, 48)
+    ball: Colour = (235, 240, 240)
+    barriers: Colour | None = None
+    half_width: float = 0.01
+    half_middle: float = 0.01
+    half_tape: float = 0.0
+
+
+PLAIN: Final = Look()
+
+
+def looking(
+    place: Sequence[float], at: Sequence[float], focal: float, bend: float = 0.0, size: tuple[int, int] = SIZE
+) -> Pinhole:
     """A camera at a place (m) that looks at a point (m), upright."""
     forward = np.subtract(at, place)
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
-    return Pinhole(np.stack((right, np.cross(forward, right), forward)), np.array(place), focal, SIZE, bend)
+    return Pinhole(np.stack((right, np.cross(forward, right), forward)), np.array(place), focal, size, bend)
 
 
 def panned(camera: Pinhole, count: int, turn: float, zoom: float) -> list[Pinhole]:
@@ -40,46 +76,79 @@ def picture(
     camera: Pinhole,
     rng: np.random.Generator,
     balls: Sequence[Array] = (),
-    others: Sequence[tuple[Array, float]] = (),
+    others: Sequence[tuple[Array, Colour]] = (),
     court: Court = COURT,
+    look: Look = PLAIN,
 ) -> Image:
-    """A blue table with white lines and a net, on a dark floor with marks; balls (2, 3) m, ends of their bars.
+    """A table with lines and a net, on a floor with marks; balls (2, 3) m, ends of their bars.
 
-    Args: others: polygons (n, 3) m and their grey levels, of what stands before or behind the table.
+    Args: others: polygons (n, 3) m and their colours, of what stands before or behind the table.
     """
-    image = np.full((SIZE[1], SIZE[0], 3), (60, 50, 48), dtype=np.uint8)
-    marks = np.random.default_rng(5)
-    for _ in range(150):
-        x, y = marks.uniform((-9.0, -7.0), (9.0, 12.0))
-        level = marks.uniform(70, 170)
-        corners = np.array([[x, y], [x + 0.5, y], [x + 0.4, y + 0.3], [x, y + 0.3]]) + marks.uniform(-0.1, 0.1, (4, 2))
-        _filled(image, camera, np.column_stack((corners, np.full(4, -0.76))), (level, level, level))
+    width, height = camera.size
+    image = np.full((height, width, 3), look.wall, dtype=np.uint8)
+    _hall(image, camera, look)
     far = float(np.linalg.norm(camera.place))
-    for shown, level in others:
+    for shown, colour in others:
         if np.linalg.norm(shown.mean(axis=0) - camera.place) > far:
-            _filled(image, camera, shown, (level, level, level))
-    _filled(image, camera, court.corners, (150, 80, 30))
+            _filled(image, camera, shown, colour)
+    _filled(image, camera, court.corners, look.table)
     for first, second in court.lines:
-        along = (second - first) / np.linalg.norm(second - first)
-        across = np.array([-along[1], along[0], 0.0]) * 0.01
-        if first[2] > 0.0:
-            across = np.array([0.0, 0.0, 0.008])
-            low = np.array([0.0, 0.0, first[2]])
-            _filled(image, camera, np.array([first, second, second - low, first - low]), (70, 60, 40))
-        ends = np.array([first - across, second - across, second + across, first + across])
-        _filled(image, camera, ends, (240, 240, 240))
+        _line(image, camera, np.stack((first, second)), look)
     for ball in balls:
         ends = camera.project(ball)
         depth = ((ball.mean(axis=0) - camera.place) @ camera.turn.T)[2]
-        _barred(image, ends, 0.02 * camera.focal / depth, (235, 240, 240))
-    for shown, level in others:
+        _barred(image, ends, 0.02 * camera.focal / depth, look.ball)
+    for shown, colour in others:
         if np.linalg.norm(shown.mean(axis=0) - camera.place) <= far:
-            _filled(image, camera, shown, (level, level, level))
+            _filled(image, camera, shown, colour)
     noisy = cv2.GaussianBlur(image, (3, 3), 0.7).astype(np.float32) + rng.normal(0.0, 2.0, image.shape)
     return np.asarray(np.clip(noisy, 0, 255), dtype=np.uint8)
 
 
-def _filled(image: Image, camera: Pinhole, corners: Array, colour: tuple[float, float, float]) -> None:
+def _hall(image: Image, camera: Pinhole, look: Look) -> None:
+    """Draws the floor, with marks as of letters and wear, and barriers with white letters around it."""
+    marks = np.random.default_rng(5)
+    if look.floor != look.wall:
+        for x, y in product(np.arange(-12.0, 12.0, 2.0), np.arange(-12.0, 16.0, 2.0)):  # one may lie behind the camera
+            tile = [(x, y, FLOOR), (x + 2.0, y, FLOOR), (x + 2.0, y + 2.0, FLOOR), (x, y + 2.0, FLOOR)]
+            _filled(image, camera, np.array(tile), look.floor)
+    for _ in range(150):
+        x, y = marks.uniform((-9.0, -7.0), (9.0, 12.0))
+        level = marks.uniform(70, 170)
+        corners = np.array([[x, y], [x + 0.5, y], [x + 0.4, y + 0.3], [x, y + 0.3]]) + marks.uniform(-0.1, 0.1, (4, 2))
+        _filled(image, camera, np.column_stack((corners, np.full(4, FLOOR))), (level, level, level))
+    if look.barriers is None:
+        return
+    for middle, along in BARRIERS:
+        one = partial(_upright, np.array(middle), np.array(along))
+        _filled(image, camera, one(-1.0, 1.0, 0.0, 0.7), look.barriers)
+        for begin in np.arange(-0.8, 0.8, 0.12):
+            _filled(image, camera, one(begin, begin + marks.uniform(0.03, 0.1), 0.25, 0.5), (235, 235, 235))
+
+
+def _upright(middle: Array, along: Array, begin: float, end: float, low: float, high: float) -> Array:
+    """(4, 3) m, a rectangle that stands on the floor, from and to shares of its half length and heights, m."""
+    first, last = middle + begin * along, middle + end * along
+    return np.array([[*first, FLOOR + low], [*last, FLOOR + low], [*last, FLOOR + high], [*first, FLOOR + high]])
+
+
+def _line(image: Image, camera: Pinhole, ends: Array, look: Look) -> None:
+    """Draws a line (2, 3) m of the court, or the net with its tape."""
+    first, second = ends
+    along = (second - first) / np.linalg.norm(second - first)
+    middle = not first[1] and not second[1]
+    across = np.array([-along[1], along[0], 0.0]) * (look.half_middle if middle else look.half_width)
+    if first[2] > 0.0:
+        across = np.array([0.0, 0.0, 0.008])
+        thick = np.array([look.half_tape, 0.0, 0.0])
+        low = np.array([0.0, 0.0, first[2]])
+        _filled(image, camera, np.array([first, second, second - low, first - low]), look.net)
+        if look.half_tape:
+            _filled(image, camera, np.array([first - thick, second - thick, second + thick, first + thick]), look.lines)
+    _filled(image, camera, np.array([first - across, second - across, second + across, first + across]), look.lines)
+
+
+def _filled(image: Image, camera: Pinhole, corners: Array, colour: Colour) -> None:
     """Draws a convex polygon (n, 3) m, each pixel by the share that lies within it.
 
     `cv2.fillPoly` would make a line 1.4 px wider, and a tenth of a pixel off.
@@ -102,7 +171,7 @@ def _filled(image: Image, camera: Pinhole, corners: Array, colour: tuple[float, 
     _blended(image[box], np.clip(share, 0.0, 1.0), colour)
 
 
-def _barred(image: Image, ends: Array, radius: float, colour: tuple[float, float, float]) -> None:
+def _barred(image: Image, ends: Array, radius: float, colour: Colour) -> None:
     """Draws a bar with round ends (2, 2) px, each pixel by the share that lies within it."""
     box = _box(image, np.concatenate((ends - radius, ends + radius)))
     pixels, along = _pixels(box) - ends[0], ends[1] - ends[0]
@@ -124,7 +193,7 @@ def _pixels(box: tuple[slice, slice]) -> Array:
     return np.stack((u, v), axis=2).astype(np.float64)
 
 
-def _blended(part: Image, share: Array, colour: tuple[float, float, float]) -> None:
+def _blended(part: Image, share: Array, colour: Colour) -> None:
     """Paints a share (h, w) of each pixel of a part (h, w, 3) of a picture."""
     part[:] = np.round(part + share[..., None] * (np.array(colour) - part)).astype(np.uint8)
 

@@ -3,11 +3,11 @@
 Strokes are those of `strokes`, for which the intervals are; pictures have bars of motion blur, players as moving shapes
 with white shoes, noise and video compression. Each seed draws its view (from the side, behind a player, a corner, or
 near behind a player who hides part of the table), the light, the focal length (and so the ball's size), the compression
-and how much the camera shakes.
+and how much the camera shakes. Those of varied looks draw colours, the size of the pictures and judges, too.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,7 +17,8 @@ import cv2
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.benchmarks.cameras.hall import COURT, looking, panned, picture
+from ballfg.benchmarks.cameras.hall import COURT, PLAIN, SIZE, Colour, Look, looking, panned, picture
+from ballfg.benchmarks.cameras.looks import SHIRTS, SIZES, drawn_look, judges
 from ballfg.benchmarks.cameras.strokes import MODEL, STEP, TABLE, Scattered, drawn_ball, scattered
 from ballfg.benchmarks.metrics import median_and_quartiles, median_and_range, share
 from ballfg.benchmarks.results import Results, in_processes
@@ -50,13 +51,19 @@ LIGHT, ZOOM, QUALITY, SHAKE = (0.5, 1.0), (0.7, 1.0), (35, 90), 4e-4
 
 @dataclass(frozen=True)
 class Truth:
-    """Strokes with times in the video, s, the cameras of its pictures, the share of light and JPEG's quality."""
+    """Strokes with times in the video, s, the cameras of its pictures, the share of light and JPEG's quality.
+
+    Attributes: judges: polygons and colours of people who sit.  shirts: of both players.
+    """
 
     view: str
     strokes: tuple[Scattered, ...]
     cameras: tuple[Pinhole, ...]
     light: float
     quality: int
+    look: Look = PLAIN
+    judges: tuple[tuple[Array, Colour], ...] = ()
+    shirts: tuple[Colour, Colour] = ((45, 45, 45), (45, 45, 45))
 
     @property
     def bounces(self) -> list[float]:
@@ -93,6 +100,15 @@ def truth(view: str, rate: float, seed: int) -> Truth:
     return Truth(view, tuple(found), tuple(shaken), rng.uniform(*LIGHT), int(rng.integers(*QUALITY)))
 
 
+def varied(of: Truth, seed: int) -> Truth:
+    """The same rally in a hall of another look, in pictures of another size."""
+    rng = np.random.default_rng([seed, 3])
+    size = SIZES[rng.integers(len(SIZES))]
+    cameras = tuple(replace(one, size=size, focal=one.focal * size[0] / SIZE[0]) for one in of.cameras)
+    left, right = (SHIRTS[k] for k in rng.integers(len(SHIRTS), size=2))
+    return replace(of, cameras=cameras, look=drawn_look(rng), judges=tuple(judges(rng)), shirts=(left, right))
+
+
 def pictures(of: Truth, rate: float, seed: int) -> Iterator[Image]:
     """The pictures, with two players who sway behind the ends of the table."""
     rng = np.random.default_rng([seed, 1])
@@ -101,14 +117,14 @@ def pictures(of: Truth, rate: float, seed: int) -> Iterator[Image]:
         t = number / rate
         ends = [of.at(t - half), of.at(t + half)]
         bar = [one[POSITION] for one in ends if one is not None]
-        others = list[tuple[Array, float]]()
-        for end in (-1.0, 1.0):
+        others = list(of.judges)
+        for end, shirt in zip((-1.0, 1.0), of.shirts, strict=True):
             sway = 0.35 * np.sin(2.0 * t + end) + 0.1 * np.sin(7.0 * t) - 0.5 * (of.view == "near")
-            for low, high, wide, level in ((-0.7, 0.75, 0.2, 45), (-0.76, -0.66, 0.14, 235)):
+            for low, high, wide, colour in ((-0.7, 0.75, 0.2, shirt), (-0.76, -0.66, 0.14, (235, 235, 235))):
                 box = [(end * 2.3, sway + y, z) for y, z in ((-wide, low), (wide, low), (wide, high), (-wide, high))]
                 if of.view != "behind" or end > 0.0:  # there he would hide most of the table
-                    others.append((np.array(box), level))
-        image = picture(camera, rng, [np.stack(bar)] if len(bar) == len(ends) else [], others)
+                    others.append((np.array(box), colour))
+        image = picture(camera, rng, [np.stack(bar)] if len(bar) == len(ends) else [], others, look=of.look)
         dark = np.asarray(np.round(of.light * image), dtype=np.uint8)
         packed = cv2.imencode(".jpg", dark, (cv2.IMWRITE_JPEG_QUALITY, of.quality))[1]
         yield np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), dtype=np.uint8)
@@ -189,16 +205,18 @@ def judged(rally: Rally, of: Truth) -> Score:
 
 @dataclass(frozen=True)
 class Filmed:
-    """A rally to film: its seed, Hz, and its view; None: that of its seed."""
+    """A rally to film: its seed, Hz, its view (None: that of its seed), and whether its look is drawn."""
 
     seed: int
     rate: float
     view: str | None = None
+    varied: bool = False
 
     @property
     def truth(self) -> Truth:
         """What happens in it."""
-        return truth(self.view or list(VIEWS)[self.seed % len(VIEWS)], self.rate, self.seed)
+        plain = truth(self.view or list(VIEWS)[self.seed % len(VIEWS)], self.rate, self.seed)
+        return varied(plain, self.seed) if self.varied else plain
 
 
 def rated(filmed: Filmed, candidates: OwnCandidates | None = None) -> tuple[Score, CameraScore | None]:

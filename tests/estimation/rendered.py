@@ -1,6 +1,6 @@
 """Rendered rallies of `ballfg.benchmarks.cameras.rallies`, line by line.
 
-    python -m tests.estimation.rendered --count 6 --seed 0 [--rate 60] [--view behind] [--half]
+    python -m tests.estimation.rendered --count 6 --seed 0 [--rate 60] [--view behind] [--varied] [--half]
 
 prints what is found of each, and the sums. With `--half` the candidates are those of another detector: half of the
 balls, with a noise of a pixel, and twenty false ones in each picture.
@@ -44,11 +44,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--rate", type=float, default=25.0, help="Hz")
     parser.add_argument("--view", choices=VIEWS, help="the same for all")
+    parser.add_argument("--varied", action="store_true", help="halls of varied looks, pictures of varied sizes")
     parser.add_argument("--half", action="store_true", help="candidates of another detector")
     given = parser.parse_args()
     scores, cameras = list[Score](), list[CameraScore]()
     for seed in range(given.seed, given.seed + given.count):
-        filmed, begun = Filmed(seed, given.rate, given.view), time.process_time()
+        filmed, begun = Filmed(seed, given.rate, given.view, given.varied), time.process_time()
         of = filmed.truth
         with tempfile.TemporaryDirectory() as folder:
             table, stamps = Path(folder) / "candidates.csv", np.arange(len(of.cameras)) / given.rate
@@ -56,11 +57,12 @@ def main() -> None:
             one, seen = rated(filmed, partial(read_candidates, table) if given.half else None)
         scores.append(one)
         if seen is None:
-            print(f"{seed} {of.view}: no court", flush=True)
+            print(f"{seed} {of.view}, {of.cameras[0].size[0]} px, {of.look}: no court", flush=True)
             continue
         cameras.append(seen)
         print(
-            f"{seed} {of.view}, light {of.light:.1f}, {of.cameras[0].focal:.0f} px, quality {of.quality}: "
+            f"{seed} {of.view}, light {of.light:.1f}, {of.cameras[0].focal:.0f} of "
+            f"{of.cameras[0].size[0]} px, quality {of.quality}: "
             f"place {100 * seen.place:.2f} %, focal length {100 * seen.focal:.2f} %, "
             f"{one.found} of {one.strokes} strokes, {one.false} false, median "
             f"{1e3 * np.median(one.errors or [np.nan]):.0f} mm, spins {one.spins}, bounces {one.bounces}, "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,10 +17,11 @@ from ballfg.estimation.rally.moments import Event
 from ballfg.estimation.rally.reconstruct import ShotRally, reconstruct
 from ballfg.estimation.result import Status
 from ballfg.progress import Watch, unwatched
-from ballfg.vision.broadcast.candidates import find_candidates
+from ballfg.vision.broadcast.candidates import BALLS, find_candidates
 from ballfg.vision.broadcast.court import Court
 from ballfg.vision.broadcast.doubled import without_doubled
 from ballfg.vision.broadcast.motion import Frames, Motion, Shot, find_motion
+from ballfg.vision.broadcast.resized import Scale
 from ballfg.vision.detection.detections import Detections
 from ballfg.vision.one_thread import one_thread
 
@@ -76,26 +77,47 @@ def track_moving_camera(
     Args:
         frames: opens the video, each time anew.  count: of its pictures, about.  court: in them.  model: the ball.
         corners: number of a picture -> (4, 2) px of the court's corners, in any order; None: the court is found.
-        candidates: of a detector of one's own; None: bright moving spots.
+        candidates: of a detector of one's own; None: bright moving spots, as of a white ball, or else an orange one.
     Raises: ValueError: no picture shows the court.
     """
     kept = without_doubled(frames, count, watch)
+    scale = Scale.of(_size(kept.frames))
     if corners is not None:
         places = np.searchsorted(kept.numbers, list(corners), side="right") - 1
-        corners = {int(place): four for place, four in zip(places, corners.values(), strict=True)}
-    frames = kept.frames
+        fours = [scale.to_searched(four) for four in corners.values()]
+        corners = {int(place): four for place, four in zip(places, fours, strict=True)}
+    frames = scale.frames(kept.frames)
     motion = replace(find_motion(frames, court, len(kept.numbers), corners, watch), numbers=kept.numbers)
     surfaces = surfaces_of(court)
     step = float(np.median(np.diff(motion.times)))
     shots, events, rows = list[ShotRally](), list[Event](), list[dict[str, Any]]()
     for shot in motion.shots:
         if candidates is None:
-            found, share = find_candidates(frames, shot, court, model.radius, motion.times, watch), SEEN
+            sought = (find_candidates(frames, shot, court, model.radius, motion.times, one, watch) for one in BALLS)
+            share = SEEN
         else:
-            found, share = candidates(shot, motion.times), UNKNOWN
-        one = reconstruct(found, shot, model, surfaces, first=len(rows), seen_share=share, watch=watch)
+            own = candidates(scale.shot_of_video(shot), motion.times)
+            sought, share = (scale.detections_searched(one) for one in (own,)), UNKNOWN
+        one = _first_with_strokes(
+            reconstruct(found, shot, model, surfaces, first=len(rows), seen_share=share, watch=watch)
+            for found in sought
+        )
         mine = events_of(one, model, surfaces, step, court.net)
-        shots.append(one)
+        seen = scale.detections_of_video(one.seen)
+        shots.append(replace(one, camera=scale.camera_of_video(one.camera), seen=seen))
         events += mine
         rows += [stroke_row(estimate, mine, model, court.net) for estimate in one.estimates]
-    return Rally(motion, tuple(shots), tuple(events), tuple(rows), kept.doubled)
+    return Rally(scale.motion_of_video(motion), tuple(shots), tuple(events), tuple(rows), kept.doubled)
+
+
+def _first_with_strokes(rallies: Iterator[ShotRally]) -> ShotRally:
+    """The first that holds strokes; without any the first of all."""
+    one = next(rallies)
+    return one if one.estimates else next((other for other in rallies if other.estimates), one)
+
+
+def _size(frames: Frames) -> tuple[int, int]:
+    """(width, height) px of the first picture."""
+    for _, image in frames():
+        return image.shape[1], image.shape[0]
+    raise ValueError("the video must hold at least one picture; it holds none. Check the file.")

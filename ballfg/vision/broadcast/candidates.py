@@ -1,7 +1,8 @@
 """Finds what may be the ball in pictures that the camera's motion aligns.
 
-A moving ball is brighter, in each of the three colours, than the same place in the pictures before and after it; where
-it hardly moves, brighter than in pictures some frames away. What is left in connected regions of a ball's size at that
+A moving white ball is brighter, in each of the three colours, than the same place in the pictures before and after it;
+where it hardly moves, brighter than in pictures some frames away. An orange ball is so in red and on the whole: before
+a blue table it has less blue. What is left in connected regions of a ball's size at that
 place is a candidate; a ball that moves while the shutter is open is a bar, whose second moments give its ends.
 """
 
@@ -23,6 +24,7 @@ from ballfg.vision.broadcast.court import Court
 from ballfg.vision.broadcast.motion import Frames, Shot
 from ballfg.vision.broadcast.pinhole import Pinhole
 from ballfg.vision.detection.detections import Candidates, Detections
+from ballfg.vision.detection.detector import Colour
 
 NEAR, FAR = 1, 4
 """Pictures before and after, with which a picture is compared."""
@@ -43,16 +45,24 @@ ROOM: Final = (3.5, 3.0)
 SIGMA: Final = 0.6
 """px, standard deviation of a candidate's centre across a bar; along it a share of the bar's length is added."""
 ALONG: Final = 0.06
+BALLS: Final[tuple[Colour, ...]] = ("white", "orange")
+"""Colours of balls, in the order in which they are looked for."""
 VISIBLE: Final = 3.0
 """px, of a bar whose direction shows."""
 
 
 def find_candidates(
-    frames: Frames, shot: Shot, court: Court, radius: float, stamps: Array, watch: Watch = unwatched
+    frames: Frames,
+    shot: Shot,
+    court: Court,
+    radius: float,
+    stamps: Array,
+    colour: Colour = "white",
+    watch: Watch = unwatched,
 ) -> Detections:
     """The candidates in the pictures of a shot.
 
-    Args: frames: opens the video.  radius: m, of the ball.  stamps: (f,) s, of all pictures.
+    Args: frames: opens the video.  radius: m, of the ball.  stamps: (f,) s, of all pictures.  colour: of the ball.
     Returns: pixels as in the pictures, with camera `main`; frames are those of the shot.
     """
     size, count = _diameters(shot, court, radius), len(shot)
@@ -68,7 +78,7 @@ def find_candidates(
                 begin = min(number + FAR + 1, count) - len(window)
                 yield list(window), number - begin, shot.cameras[begin : begin + len(window)], size[number]
 
-    found = in_threads(lambda one: aligned_candidates(*one), windows())
+    found = in_threads(lambda one: aligned_candidates(*one, colour), windows())
     times = stamps[shot.first : shot.first + count].tolist()
     return Detections.of_frames("main", zip(times, found, strict=True))
 
@@ -84,7 +94,9 @@ def _diameters(shot: Shot, court: Court, radius: float) -> Array:
     return np.array(sizes)
 
 
-def aligned_candidates(window: list[Image], index: int, cameras: tuple[Pinhole, ...], size: Array) -> Candidates:
+def aligned_candidates(
+    window: list[Image], index: int, cameras: tuple[Pinhole, ...], size: Array, colour: Colour = "white"
+) -> Candidates:
     """The candidates of the picture `index` of a window, with the cameras of all of it and diameters (2,) px."""
     here = window[index]
     rise: Image | None = None
@@ -94,12 +106,20 @@ def aligned_candidates(window: list[Image], index: int, cameras: tuple[Pinhole, 
             continue
         others = [_warped(window[i], cameras[i], cameras[index]) for i in beside]
         most = others[0] if len(others) == 1 else cv2.max(*others)
-        blue, green, red, *_ = cv2.split(cv2.subtract(here, most))
-        change = np.minimum(np.minimum(blue, green), red).astype(np.uint8)
+        change = _brighter(here, np.asarray(most, dtype=np.uint8), colour)
         rise = change if rise is None else np.maximum(rise, change)
     if rise is None:
         return Candidates.none()
     return _regions(np.asarray(cv2.GaussianBlur(rise, (3, 3), 0), dtype=np.uint8), size)
+
+
+def _brighter(here: Image, most: Image, colour: Colour) -> Image:
+    """(h, w) by how much pixels (h, w, 4) of a picture are brighter than others', as a ball of a colour is."""
+    blue, green, red, *_ = cv2.split(cv2.subtract(here, most))
+    if colour == "white":
+        return np.minimum(np.minimum(blue, green), red).astype(np.uint8)
+    grey, others = (cv2.cvtColor(one, cv2.COLOR_BGRA2GRAY) for one in (here, most))
+    return np.minimum(red, cv2.subtract(grey, others)).astype(np.uint8)
 
 
 def _warped(image: Image, camera: Pinhole, onto: Pinhole) -> Image:

@@ -20,16 +20,19 @@ from ballfg.vision.broadcast.pinhole import Pinhole, posed
 
 SHORTEST: Final = 0.02
 """Of the image's diagonal: a shorter segment is not used."""
-MOST_LINES: Final = 70
+MOST_LINES: Final = 90
 """Longest ones that are combined."""
-PARALLEL, ASIDE, GAP = 0.03, 2.0, 0.6
-"""rad and px by which segments of one line differ; the gap between them, of the longer one."""
+PARALLEL, ASIDE, GAPS = 0.03, 2.0, (0.15, 0.6)
+"""rad and px by which segments of one line differ; the gap between them, of the longer one. A wide gap bridges a player
+before an edge, but continues another edge with what lies in its direction on the floor: lines of both are combined."""
 OPEN: Final = (8.0, 0.12)
 """px, and share of a segment's length, by which it may end before a corner or pass it."""
 SMALLEST: Final = 0.004
 """Of the image's area."""
 FOCALS: Final = np.geomspace(0.5, 10.0, 22)
 """Focal lengths that are tried, of the image's width."""
+FINER: Final = (FOCALS[1] / FOCALS[0]) ** np.linspace(-1.0, 1.0, 13)
+"""Factors about the best of them that are tried next: one step misses the corners of a large court by too much."""
 MISSED: Final = 0.03
 """Of the quadrilateral's size: the corners' error by which a pinhole camera may miss them."""
 UPRIGHT: Final = 0.35
@@ -70,20 +73,25 @@ def joined_segments(image: Image) -> Array:
     length = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
     segments = segments[length > 0.25 * SHORTEST * np.hypot(*image.shape[:2])]
     segments = segments[np.argsort(-np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1), kind="stable")]
-    joined = list[Array]()
-    while len(segments):
-        line, segments = segments[0], segments[1:]
-        while (more := _continues(line, segments)).any():
-            line, segments = _hull(line, segments[more]), segments[~more]
-        joined.append(line)
-    lines = np.array(joined).reshape(-1, 2, 2)
+    lines = np.unique(np.concatenate([_joined(segments, gap) for gap in GAPS]), axis=0)
     length = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)
     order = np.argsort(-length, kind="stable")[:MOST_LINES]
     return np.asarray(lines[order][length[order] > SHORTEST * np.hypot(*image.shape[:2])])
 
 
-def _continues(line: Array, others: Array) -> Mask:
-    """(n,) which others (n, 2, 2) lie on a line (2, 2) and near its ends."""
+def _joined(segments: Array, gap: float) -> Array:
+    """(m, 2, 2) px, lines of segments (n, 2, 2), longest first, that a `gap` of the longer one may part."""
+    joined = list[Array]()
+    while len(segments):
+        line, segments = segments[0], segments[1:]
+        while (more := _continues(line, segments, gap)).any():
+            line, segments = _hull(line, segments[more]), segments[~more]
+        joined.append(line)
+    return np.array(joined).reshape(-1, 2, 2)
+
+
+def _continues(line: Array, others: Array, most: float) -> Mask:
+    """(n,) which others (n, 2, 2) lie on a line (2, 2) and at `most` so far from its ends, of the longer one."""
     along = line[1] - line[0]
     length = np.linalg.norm(along)
     along = along / length
@@ -94,7 +102,7 @@ def _continues(line: Array, others: Array) -> Mask:
     gap = np.maximum(np.minimum(begin, end) - length, -np.maximum(begin, end))
     extent = np.abs(end - begin)
     aside, turned = np.maximum(np.abs(first), np.abs(last)), np.abs(last - first) / np.maximum(extent, 1e-9)
-    return np.asarray((turned < PARALLEL) & (aside < ASIDE) & (gap < GAP * np.maximum(length, extent)))
+    return np.asarray((turned < PARALLEL) & (aside < ASIDE) & (gap < most * np.maximum(length, extent)))
 
 
 def _hull(line: Array, others: Array) -> Array:
@@ -150,17 +158,28 @@ def cameras_of(quads: Array, court: Court, size: tuple[int, int]) -> list[Pinhol
         scale = np.linalg.norm(quad - quad.mean(axis=0), axis=1).mean()
         for first in range(4):  # clockwise as seen from above is clockwise in the picture
             seen = np.roll(quad[::-1], first, axis=0) - middle
-            plane = cv2.getPerspectiveTransform(flat, seen.astype(np.float32))
-            focal = FOCALS * size[0]
-            turn, place = posed(np.tile(plane, (len(focal), 1, 1)), focal)
-            at = (court.corners - place[:, None]) @ turn.swapaxes(1, 2)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                missed = np.linalg.norm(focal[:, None, None] * at[..., :2] / at[..., 2:] - seen, axis=2).max(axis=1)
-            missed[~_possible(turn, place, at, court)] = np.inf
-            best = int(np.argmin(missed))
-            if missed[best] < MISSED * scale:
-                found.append(Pinhole(turn[best], place[best], float(focal[best]), size))
+            plane = np.asarray(cv2.getPerspectiveTransform(flat, seen.astype(np.float32)), dtype=np.float64)
+            one, missed = _best(plane, seen, court, FOCALS * size[0], size)
+            if np.isfinite(missed):
+                one, missed = _best(plane, seen, court, one.focal * FINER, size)
+            if missed < MISSED * scale:
+                found.append(one)
     return [one for one in found if _in_front(one.place)]
+
+
+def _best(plane: Array, seen: Array, court: Court, focal: Array, size: tuple[int, int]) -> tuple[Pinhole, float]:
+    """The camera of those focal lengths (m,) px that sees a court's corners nearest to where they are seen.
+
+    Args: plane: (3, 3), from the court to `seen` (4, 2) px from the image's middle.
+    Returns: it, and by how much it misses them, px; infinite where none is possible.
+    """
+    turn, place = posed(np.tile(plane, (len(focal), 1, 1)), focal)
+    at = (court.corners - place[:, None]) @ turn.swapaxes(1, 2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        missed = np.linalg.norm(focal[:, None, None] * at[..., :2] / at[..., 2:] - seen, axis=2).max(axis=1)
+    missed[~_possible(turn, place, at, court)] = np.inf
+    best = int(np.argmin(missed))
+    return Pinhole(turn[best], place[best], float(focal[best]), size), float(missed[best])
 
 
 def _in_front(place: Array) -> bool:

@@ -22,11 +22,11 @@ SAMPLES: Final = 24
 """Along a line of the court."""
 STEP: Final = 0.5
 """px between values along a normal."""
-FLANK: Final = 4.0
-"""px from the middle of a line to the ground beside it."""
-CROSSING: Final = 2.0 * FLANK
-"""px from another line within which it is in the way."""
-RIDGE: Final = 12.0
+FLANK, BESIDE = 4.0, 2.5
+"""px from the middle of a line, and from the edge of a wide one, to the ground beside it."""
+CROSSING: Final = 2.0
+"""Of the flank, from another line within which it is in the way."""
+RIDGE: Final = 6.0
 """Grey levels by which a line is brighter than the ground, at least."""
 LEANING, SHARP = 0.1305, 2.4
 """Of the step between the grounds, by which the halfway places of a line that is far narrower than its blur differ from
@@ -79,47 +79,49 @@ def ridges(image: Array32, camera: Pinhole, court: Court, reach: float) -> Ridge
     length = np.linalg.norm(along, axis=1)
     normal = np.stack((-along[:, 1], along[:, 0]), axis=1) / length[:, None]
     normals = np.broadcast_to(normal[:, None], pixels.shape)
+    half = 0.5 * court.across[:, None]
+    width = np.abs(((camera.project(points + half) - camera.project(points - half)) * normals).sum(axis=2))
     limit = np.array(camera.size) - 1.0
     inside = ((pixels > FLANK) & (pixels < limit - FLANK)).all(axis=2) & (length > 2 * SAMPLES)[:, None]
-    inside &= ~_crossed(pixels, camera.project(court.lines))
+    flank = max(FLANK, STEP * np.ceil((0.5 * width[inside].max(initial=0.0) + BESIDE) / STEP))
+    inside &= ~_crossed(pixels, camera.project(court.lines), CROSSING * flank)
     line = np.broadcast_to(np.arange(len(court.lines))[:, None], inside.shape)[inside]
-    across = np.broadcast_to(0.5 * court.across[:, None], points.shape)[inside]
-    edges = camera.project(points[inside] + across) - camera.project(points[inside] - across)
-    width = np.abs((edges * normals[inside]).sum(axis=1))
-    offset, good = _brightest(image, pixels[inside], normals[inside], reach, width)
+    offset, good = _brightest(image, pixels[inside], normals[inside], reach, width[inside], flank)
     asked = inside.sum(axis=1)
     return Ridges(points[inside][good], offset[good], normals[inside][good], line[good], asked)
 
 
-def _crossed(pixels: Array, ends: Array) -> Mask:
-    """(l, k) whether another line (l, 2, 2) px is so close to places (l, k, 2) px on lines that it hides them."""
+def _crossed(pixels: Array, ends: Array, near: float) -> Mask:
+    """(l, k) whether another line (l, 2, 2) px is so `near`, px, to places (l, k, 2) px on lines that it hides them."""
     along = ends[:, 1] - ends[:, 0]
     away = pixels[:, :, None] - ends[:, 0]
     share = np.clip((away * along).sum(axis=-1) / (along**2).sum(axis=-1), 0.0, 1.0)
-    close = np.linalg.norm(away - share[..., None] * along, axis=-1) < CROSSING
+    close = np.linalg.norm(away - share[..., None] * along, axis=-1) < near
     close[np.arange(len(ends)), :, np.arange(len(ends))] = False
     return np.asarray(close.any(axis=-1))
 
 
-def _brightest(image: Array32, pixels: Array, normal: Array, reach: float, width: Array) -> tuple[Array, Mask]:
+def _brightest(
+    image: Array32, pixels: Array, normal: Array, reach: float, width: Array, flank: float = FLANK
+) -> tuple[Array, Mask]:
     """(n,) px, the middle of the strongest ridge along each normal, and whether there is one (n,).
 
     The middle lies between the places on both sides where the brightness is halfway down to the ground there: the
     brightest place itself lies towards the brighter ground. Where blur is as wide as the line, of `width` (n,) px, the
     places lie there too, by what is known of the ridge: the step between the grounds, and how steep it is.
     """
-    steps = np.arange(-reach - FLANK, reach + FLANK + STEP / 2, STEP)
+    steps = np.arange(-reach - flank, reach + flank + STEP / 2, STEP)
     if not len(pixels):
         return np.zeros(0), np.zeros(0, dtype=bool)
     at = (pixels[:, None] + steps[:, None] * normal[:, None]).astype(np.float32)
     values = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR).reshape(len(pixels), len(steps))
-    flank, rows = round(FLANK / STEP), np.arange(len(pixels))
-    rise = values[:, flank:-flank] - np.maximum(values[:, : -2 * flank], values[:, 2 * flank :])
+    beside, rows = round(flank / STEP), np.arange(len(pixels))
+    rise = values[:, beside:-beside] - np.maximum(values[:, : -2 * beside], values[:, 2 * beside :])
     top = np.argmax(rise, axis=1)
     good = (rise[rows, top] > RIDGE) & (top > 0) & (top < rise.shape[1] - 1)
-    near = values[rows[:, None], top[:, None] + np.arange(2 * flank + 1)]
-    after, steep = _halfway(near[:, flank:])
-    before, steeper = _halfway(near[:, flank::-1])
+    near = values[rows[:, None], top[:, None] + np.arange(2 * beside + 1)]
+    after, steep = _halfway(near[:, beside:])
+    before, steeper = _halfway(near[:, beside::-1])
     share = np.minimum(width / np.maximum(STEP * (after + before), STEP), 1.0)
     step = (near[:, -1] - near[:, 0]) / np.maximum(0.5 * (steep + steeper), 1.0)
     shift = STEP * (0.5 * (after - before) - LEANING * (1.0 - share**SHARP) * step)

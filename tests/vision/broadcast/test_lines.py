@@ -10,7 +10,7 @@ import pytest
 from ballfg.benchmarks.cameras.hall import COURT, looking, picture
 from ballfg.vision.broadcast import graph
 from ballfg.vision.broadcast.background import Match
-from ballfg.vision.broadcast.lines import CROSSING, _brightest, brightness, ridges
+from ballfg.vision.broadcast.lines import CROSSING, FLANK, _brightest, brightness, ridges
 
 PLACES = np.array([[100.0, 80.0], [800.0, 120.0], [500.0, 300.0], [150.0, 450.0]])
 STILL = Match(PLACES, PLACES, np.eye(3))
@@ -93,7 +93,7 @@ def test_no_ridge_is_sought_where_another_line_is_in_the_way(seen):
         others = np.concatenate([one.points[one.line != number] for one in seen])
         pixels, along = CAMERA.project(others), second - first
         share = np.clip((pixels - first) @ along / (along @ along), 0.0, 1.0)
-        assert np.linalg.norm(pixels - first - share[:, None] * along, axis=1).min() > CROSSING - 1e-9
+        assert np.linalg.norm(pixels - first - share[:, None] * along, axis=1).min() > CROSSING * FLANK - 1e-9
     middle = np.concatenate([one.points[one.line == 4, 0] for one in seen])
     assert 0 < len(middle) < 8 * 24
 
