@@ -8,7 +8,7 @@ approximation.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
 
@@ -90,11 +90,13 @@ class Local:
 class Posterior:
     """Evidence of a model, and mean (c,) and covariance (c, c) of its common unknowns, as steps from the fit.
 
-    `square` is that of all rows and priors, over their variances, at the mean.
+    `square` is that of all rows and priors, over their variances, at the mean; `prior` is the logarithm of the priors'
+    density there over that at their own means.
     """
 
     evidence: float
     square: float
+    prior: float
     mean: Array
     covariance: Array
 
@@ -106,7 +108,7 @@ class Posterior:
         """The same with the density of the tracks where the first `own` unknowns are, and the others follow them."""
         gain, follow = self.gain(own), self.covariance[:, :own] @ np.linalg.inv(self.covariance[:own, :own])
         mean = self.mean - follow @ self.mean[:own]
-        return Posterior(self.evidence - gain, self.square + 2.0 * gain, mean, self.covariance)
+        return replace(self, evidence=self.evidence - gain, square=self.square + 2.0 * gain, mean=mean)
 
 
 @dataclass(frozen=True)
@@ -269,12 +271,13 @@ def posterior(reduced: Reduced, precision: Array, away: Array) -> Posterior:
     information, gradient = total[:-1, :-1] + np.diag(precision), total[:-1, -1] + precision * away
     lower = triangle(information)
     if not np.isfinite(lower).all():
-        return Posterior(-np.inf, np.inf, np.zeros_like(away), np.diag(1.0 / precision))
+        return Posterior(-np.inf, np.inf, 0.0, np.zeros_like(away), np.diag(1.0 / precision))
     covariance = np.linalg.inv(information)
     mean = covariance @ gradient
     square = total[-1, -1] - gradient @ mean + float((precision * away**2).sum())
     narrow = np.log(np.diagonal(lower)).sum() - 0.5 * np.log(precision).sum()
-    return Posterior(float(reduced.constant.sum() - 0.5 * square - narrow), float(square), mean, covariance)
+    evidence, prior = reduced.constant.sum() - 0.5 * square - narrow, -0.5 * (precision * (mean - away) ** 2).sum()
+    return Posterior(float(evidence), float(square), float(prior), mean, covariance)
 
 
 def evidences(reduced: Reduced, precision: Array, away: Array) -> Array:

@@ -101,7 +101,8 @@ def foretold(
 def tempered(names: frozenset[str], weight: Weight, others: Mapping[frozenset[str], Weight]) -> float:
     """The evidence of a model as far as the other half bears out what it gains over each smaller one.
 
-    A smaller one that is itself doubtful takes nothing from it: an effect may act only beside another.
+    A smaller one that is itself doubtful takes nothing from it: an effect may act only beside another. What is gained
+    since the coefficients of a smaller one are improbable by their priors, no half can bear out: it counts as it is.
 
     Args: others: the models that were weighed.
     """
@@ -110,5 +111,6 @@ def tempered(names: frozenset[str], weight: Weight, others: Mapping[frozenset[st
         return weight.evidence
     evidence = np.array([other.evidence for other in smaller])
     gains = weight.held_out - np.stack([other.held_out for other in smaller])
-    most = gains.sum(axis=1) + SURELY * gains.std(axis=1, ddof=1) * np.sqrt(gains.shape[1])
+    of_priors = np.maximum(weight.prior - np.array([other.prior for other in smaller]), 0.0)
+    most = of_priors + gains.sum(axis=1) + SURELY * gains.std(axis=1, ddof=1) * np.sqrt(gains.shape[1])
     return float((evidence + np.clip(most, 0.0, weight.evidence - evidence)).min())

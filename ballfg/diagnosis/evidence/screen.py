@@ -141,7 +141,8 @@ class Screen:
             gain, beside = self._together(chosen)
             listed, names = [self.candidates[one] for one in chosen], self._names(chosen)
             density = self._held_out(beside)
-            weight = Weight(self.model.evidence + gain + choice_odds(listed), log_odds(listed), density)
+            evidence, prior = self.model.evidence + gain + choice_odds(listed), self._posterior(beside).prior
+            weight = Weight(evidence, log_odds(listed), density, prior)
             found[chosen] = tempered(names, weight, others) - self.model.evidence + weight.odds
             others[names] = weight
         return found
@@ -181,7 +182,8 @@ class Screen:
         more, listed = self._beside(beside, one, gone), [self.candidates[one]]
         beside = (*beside, (one, more.width))
         evidence = rest.evidence + more.gain + choice_odds(listed)
-        return Weight(evidence, rest.odds + log_odds(listed), self._held_out(beside, gone)), beside
+        prior = self._posterior(beside, gone).prior
+        return Weight(evidence, rest.odds + log_odds(listed), self._held_out(beside, gone), prior), beside
 
     def strengths(self, beside: Beside, gone: Gone = ()) -> dict[str, Strengths]:
         """The strengths of all effects and candidates, by name."""

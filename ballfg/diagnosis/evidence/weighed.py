@@ -41,11 +41,13 @@ class Weight:
         evidence: logarithm, natural units, up to a constant that all models of the same tracks share.
         odds: logarithm of the prior odds.
         held_out: (t,) logarithm of the density of each track, with coefficients of the other half.
+        prior: logarithm of the density of all coefficients by their priors, over that at the priors' means.
     """
 
     evidence: float
     odds: float
     held_out: Array
+    prior: float
 
     @property
     def score(self) -> float:
@@ -229,6 +231,7 @@ class _Question:
             evidence if np.isfinite(evidence) else -np.inf,
             log_odds(self.named, self.nameless),
             held_out(total, priors.precision(best), priors.away, self.halves),
+            result.prior,
             tuple(self.named),
             replace(fit),  # without what can be computed again: a search keeps dozens of models
             noise,
@@ -285,5 +288,5 @@ class _Question:
                 evidence = held.evidence + sum(mixed) - sum(mixed[place] for place in gone) + choice_odds(rest)
                 names = frozenset(h.name for h in rest) | frozenset([NAMELESS] * self.nameless)
                 density = held_out(tracks, precision, priors.away, self.halves)
-                found[names] = Smaller(evidence, log_odds(rest, self.nameless), density, held.mean)
+                found[names] = Smaller(evidence, log_odds(rest, self.nameless), density, held.prior, held.mean)
         return found

@@ -62,6 +62,7 @@ def model_of(sets: Sets, names: frozenset[str], first: Fit) -> Weighed:
         member.weight.evidence,
         member.weight.odds,
         member.weight.held_out,
+        member.weight.prior,
         (*(h for h in model.named if h not in gone), *added),
         fit,
         model.noise,

@@ -51,10 +51,10 @@ def windy_with_wind(refitted):
     return weigh(refitted, [WIND])
 
 
-def model(names, evidence, held_out=None):
+def model(names, evidence, held_out=None, prior=0.0):
     named = [Hypothesis(EFFECTS[name], {}, ("x",)) for name in names]
     gains = np.full(10, evidence / 10.0) if held_out is None else np.asarray(held_out)
-    weight = Weight(evidence, log_odds(named), gains)
+    weight = Weight(evidence, log_odds(named), gains, prior)
     return SimpleNamespace(names=frozenset(names), nested={}, neighbours={}, score=weight.score, **vars(weight))
 
 
@@ -132,6 +132,15 @@ def test_what_the_other_half_does_not_bear_out_is_tempered():
     assert borne_out(model(["wind"], -3.0), nothing) == -3.0
 
 
+def test_what_the_priors_say_needs_no_other_half():
+    """A model without gravity's change that needs a table 27 mm too low, on one half as on the other."""
+    improbable, held = model(["scale"], 1000.0, prior=-28.0), np.tile([100.2, 100.4], 5)
+    both = model(["gravity", "scale"], 1026.0, held, prior=-3.0)
+    assert borne_out(both, improbable) == pytest.approx(1026.0)
+    assert borne_out(both, model(["scale"], 1000.0, prior=-3.0)) == pytest.approx(1003.0, abs=1.0)
+    assert borne_out(model(["gravity", "scale"], 1026.0, held, prior=-50.0), improbable) < 1004.0
+
+
 def test_an_addition_is_believed_as_far_as_it_gains_over_the_smaller_model():
     """With a true effect beside it a wrong one still gains over nothing, but less than the true one alone."""
     nothing, true = model([], 0.0), model(["wind"], 20.0, np.tile([2.5, 3.5], 5))
@@ -155,7 +164,7 @@ def test_the_doubt_of_a_smaller_model_decides_between_none_that_look_alike():
 def test_what_is_foretold_loses_what_its_origin_loses():
     """A smaller model that only the linearisation of a wrong one knows is no better than that one."""
     nothing, wrong = model([], 0.0), model(["gust_region", "scale"], 60.0, np.full(10, -5.0))
-    wrong.nested = {frozenset(["scale"]): Weight(50.0, model(["scale"], 0.0).odds, np.full(10, 5.0))}
+    wrong.nested = {frozenset(["scale"]): Weight(50.0, model(["scale"], 0.0).odds, np.full(10, 5.0), 0.0)}
     odds = odds_of([nothing, wrong])
     assert odds.of("scale") < 0.1
 
