@@ -123,20 +123,19 @@ def without_named(fit: Fit, gone: Sequence[Hypothesis], first: Fit) -> Fit:
 
 
 def _problem_without(problem: Problem, gone: Sequence[Hypothesis], first: Fit) -> Problem:
-    """The problem without effects that the first fit's model lacks, or without their free coefficients."""
-    for hypothesis in gone:
-        problem = _without_one(problem, hypothesis, first)
-    return problem
+    """The problem without the coefficients of some effects, and without effects that then no coefficient moves.
 
-
-def _without_one(problem: Problem, hypothesis: Hypothesis, first: Fit) -> Problem:
-    """The problem without one of them."""
-    name, gone = hypothesis.effect.name, set(hypothesis.columns)
-    needed = has_effect(first.problem.model, name)
-    if hypothesis.deviations():  # the effect itself may have been named too, the same for all tracks
-        needed |= any(n.startswith(f"{hypothesis.effect.kind}.{name}.") for n in problem.free if n not in gone)
-    model = problem.model if needed else without_effect(problem.model, name)
+    An effect of the first fit's model stays, and so does one whose deviations between tracks, or whose value for all of
+    them, was named too.
+    """
+    lost = {column for h in gone for column in h.columns}
+    deviations = {n: d for n, d in problem.deviations.items() if n not in lost}
+    moved, model = {*(problem.free.keys() - lost), *(d.coefficient for d in deviations.values())}, problem.model
+    for effect in dict.fromkeys(h.effect for h in gone):
+        strengths = {f"{effect.kind}.{effect.name}.{c.name}" for c in effect.coefficients if c.absent is not None}
+        if not (strengths & moved or has_effect(first.problem.model, effect.name)):
+            model = without_effect(model, effect.name)
     left = dict(model.named_parameters())
-    deviations = {n: d for n, d in problem.deviations.items() if d.coefficient in left and n not in gone}
-    free = {n: c for n, c in problem.free.items() if (n in left or n in deviations) and n not in gone}
+    deviations = {n: d for n, d in deviations.items() if d.coefficient in left}
+    free = {n: c for n, c in problem.free.items() if (n in left or n in deviations) and n not in lost}
     return replace(problem, model=model, free=free, deviations=deviations)

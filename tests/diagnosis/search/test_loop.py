@@ -12,8 +12,10 @@ from ballfg.diagnosis.evidence.nameless import NAMELESS
 from ballfg.diagnosis.evidence.weighed import weighed
 from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.stamps import Stamps
-from ballfg.diagnosis.hypotheses.hypothesis import has_effect, without_effect
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, without_effect
+from ballfg.diagnosis.hypotheses.varying import Grouping, Varying
 from ballfg.diagnosis.result import Errors, Outcome
+from ballfg.diagnosis.search.candidates import Scored
 from ballfg.diagnosis.search.changed_fits import with_strengths_of, without_at_shapes
 from ballfg.diagnosis.search.found import Found
 from ballfg.diagnosis.search.loop import SearchLoop
@@ -331,3 +333,31 @@ def test_no_effect_stays_without_which_a_refit_is_better(make_ball, make_launche
     assert found.best.names == right.names == {"table_tilt"}
     assert found.best.score > both.score
     assert found.best.score == pytest.approx(right.score, abs=1.0)
+
+
+@pytest.mark.parametrize("from_linearisation", [True, False])
+def test_an_effect_that_differs_between_tracks_stays_without_its_value_for_all(gusty, make_ball, from_linearisation):
+    """Wind for all tracks and its change along the recording are two names: either may go without the other."""
+    found = Found(gusty, first_fit(make_ball(), gusty.holdout))
+    late = {f"{i:03d}": 1.0 for i in range(5, 10)}
+    drift = Varying.of(EFFECTS["wind"], ("x",), Grouping("track", {"005": late}, "000"))
+    wind = Hypothesis(EFFECTS["wind"], {}, ("x",))
+
+    def added(fit, hypothesis, *before):
+        return weighed(
+            refit(fit, Scored(hypothesis, None, 1.0)).fit, (*before, hypothesis), found.motion, found.halves, found.best
+        )
+
+    alone = added(found.first, drift)
+    both = added(added(found.first, wind).fit, drift, wind)
+    if not from_linearisation:
+        both = replace(both, nested={})
+    rest = found.without([wind], both)
+    assert rest.names == {"wind_drift"}
+    assert has_effect(rest.fit.problem.model, "wind")
+    assert set(rest.fit.problem.deviations) == {"flight.wind.x[from 005]"}
+    assert "flight.wind.x" not in rest.fit.problem.free
+    assert rest.score == pytest.approx(alone.score, abs=2.0)  # the last steps are not worth making
+    nothing = found.without([wind, drift], both)
+    assert nothing.names == frozenset()
+    assert not has_effect(without_at_shapes(both, [wind, drift], found.first).problem.model, "wind")
