@@ -34,7 +34,7 @@ DIGEST_SIZE: Final = hashlib.sha256().digest_size
 NOTED: Final = "BALLFG_CACHE_NOTED"
 """Environment variable: this process, or one that started it, has printed the note on folders that are not used."""
 VERSIONS: Final = f"numba {numba.__version__}, llvmlite {llvmlite.__version__}"
-_IMPORTS: Final = re.compile(rb"^(?:from|import) (ballfg[\w.]*)", re.MULTILINE)
+_IMPORTS: Final = re.compile(rb"^(?:from|import) (ballfg[\w.]*)(?: import (\([^)]*\)|.*))?", re.MULTILINE)
 
 
 def configured_folder() -> Path:
@@ -157,9 +157,12 @@ def source_stamp(file: str) -> str:
 
 @cache
 def _read(path: str) -> tuple[bytes, tuple[str, ...]]:
-    """The digest of a source file, and the modules of ballfg that it imports."""
+    """The digest of a source file, and the modules of ballfg that it imports, among other names."""
     content = Path(path).read_bytes()
-    return _digest(content), tuple(name.decode() for name in _IMPORTS.findall(content))
+    modules = list[bytes]()
+    for module, names in _IMPORTS.findall(content):  # a name may be that of a module too
+        modules += [module, *(module + b"." + name for name in re.findall(rb"\w+", names))]
+    return _digest(content), tuple(name.decode() for name in modules)
 
 
 class Kept:

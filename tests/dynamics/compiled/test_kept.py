@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+import ballfg
 from ballfg.dynamics.compiled.build import read_note, write_note
 from ballfg.dynamics.compiled.kept import (
     NOTED,
@@ -304,9 +305,19 @@ def test_files_of_two_functions_exchanged_are_noticed(tmp_path: Path) -> None:
     assert not again.thrice.stats.cache_hits
 
 
-def test_a_change_of_another_file_that_is_built_in_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("line", "name"),
+    [
+        ("from ballfg.made_up import FACTOR", "FACTOR"),
+        ("from ballfg import made_up", "made_up.FACTOR"),
+        ("from ballfg import (\n    arrays,\n    made_up as other,\n)", "other.FACTOR"),
+    ],
+)
+def test_a_change_of_another_file_that_is_built_in_is_noticed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str, name: str
+) -> None:
     """What a function calls, and the constants that it reads; numba looks at the function's own file alone."""
-    text = FUNCTION_FILE.replace("\n@machine", "from ballfg.made_up import FACTOR\n\n@machine").replace("2.0", "FACTOR")
+    text = FUNCTION_FILE.replace("\n@machine", f"{line}\n\n@machine").replace("2.0", name)
     (tmp_path / "some_function.py").write_text(text)
     for factor in (2.0, 3.25):
         other = tmp_path / "made_up.py"
@@ -314,6 +325,7 @@ def test_a_change_of_another_file_that_is_built_in_is_noticed(tmp_path: Path, mo
         module = ModuleType("ballfg.made_up")
         module.__dict__.update(FACTOR=factor, __file__=str(other))
         monkeypatch.setitem(sys.modules, "ballfg.made_up", module)
+        monkeypatch.setattr(ballfg, "made_up", module, raising=False)
         for hits in (False, True):
             for asked in (source_stamp, _read):
                 asked.cache_clear()
