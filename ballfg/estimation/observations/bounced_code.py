@@ -37,13 +37,15 @@ NUMBERS: Final = np.dtype(
         ("drag", np.float64),
         ("restitution", np.float64),
         ("plane", np.float64),
+        ("slope", np.float64, (2,)),
         ("centre", np.float64, (3,)),
         ("spread", np.float64),
         ("lift", np.float64, (3,)),
     ]
 )
-"""Ball and place: m/s^2; 1/m; of the normal velocity; m, of the ball's centre at a bounce; m, mean and standard
-deviation of the ball's place; m/s^2, standard deviations of the acceleration by spin, zero for none."""
+"""Ball and place: m/s^2; 1/m; of the normal velocity; m, of the ball's centre at a bounce, at the origin, and by how
+much it rises along x and y; m, mean and standard deviation of the ball's place; m/s^2, standard deviations of the
+acceleration by spin, zero for none."""
 ONE_RAY: Final[Any] = from_dtype(RAY)
 RAYS: Final[Any] = from_dtype(RAY)[::1]
 SCENE: Final[Any] = from_dtype(NUMBERS)
@@ -94,6 +96,14 @@ def shares_at(moments, times, bounces, drag, gravity, share, drop):
             drop[k, n] = share_at(mine[n], times[k], bounces, drag[k], gravity, share[k, n])
 
 
+@machine_code(NOTHING(ONE, COUNT, COUNT, REAL, SCENE))
+def _set(row, vector, axis, value, scene):
+    """Writes a row's numbers for a vector along x or y, or, as axis 2, along the normal of the surface."""
+    row[3 * vector + axis] = value
+    if axis == 2:
+        row[3 * vector], row[3 * vector + 1] = -scene.slope[0] * value, -scene.slope[1] * value
+
+
 @machine_code(REAL(COUNT, SCENE, ONE, COUNT, ONE, ONE))
 def _rule(number, scene, times, bounces, drag, row):
     """Writes the whitened row (3 c,) of the equation `number` of the bounces; returns its target."""
@@ -103,15 +113,15 @@ def _rule(number, scene, times, bounces, drag, row):
         share = np.empty(count)
         drop = share_at(times[bounce], times, bounces, drag, scene.gravity, share)
         for vector in range(count):
-            row[3 * vector + 2] = share[vector] / PLANE_SIGMA
+            _set(row, vector, 2, share[vector] / PLANE_SIGMA, scene)
         return (scene.plane + drop) / PLANE_SIGMA
     flown = times[bounce] - times[max(bounce - 1, 0)]
     slowed, target = 1.0 + drag[bounce] * flown, 0.0
     kept, sigma = (-KEPT, FRICTION_SIGMA) if axis < 2 else (scene.restitution, RESTITUTION_SIGMA)
-    row[3 * (bounce + 2) + axis] = 1.0 / sigma
-    row[3 * (bounce + 1) + axis] = kept / slowed / sigma
+    _set(row, bounce + 2, axis, 1.0 / sigma, scene)
+    _set(row, bounce + 1, axis, kept / slowed / sigma, scene)
     if bounce and lift:
-        row[3 * (bounces + 2 + bounce) + axis] = kept * flown / sigma
+        _set(row, bounces + 2 + bounce, axis, kept * flown / sigma, scene)
     if axis == 2:
         fallen = scene.gravity * flown / (1.0 + drag[bounce] * flown / 2.0)
         target = scene.restitution * fallen / sigma

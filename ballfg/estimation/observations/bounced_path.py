@@ -40,14 +40,15 @@ class Scene:
 
     @property
     def plane(self) -> float:
-        """m, of the ball's centre at a bounce."""
+        """m, of the ball's centre at a bounce, at the origin."""
         return self.height + self.physics.radius + self.physics.surface_offset
 
     @cached_property
     def numbers(self) -> Any:
         """The ball and its place for machine code, of `NUMBERS`."""
         ball, place = self.physics, place_prior(self.surfaces)
-        own = (ball.gravity, ball.drag, ball.restitution, self.plane, *place, self.lift or (0.0, 0.0, 0.0))
+        slope = ball.slope_x, ball.slope_y
+        own = (ball.gravity, ball.drag, ball.restitution, self.plane, slope, *place, self.lift or (0.0, 0.0, 0.0))
         return np.array([own], dtype=NUMBERS)[0]
 
     @cached_property

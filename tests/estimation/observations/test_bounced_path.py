@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -76,8 +77,10 @@ def laws(scene: Scene, vectors: Array, times: Array, bounces: int, drag: Array) 
             before = before + flown * vectors[bounces + 2 + bounce]
         fallen = before[2] - BALL.gravity * flown / (1.0 + drag[bounce] * flown / 2.0)
         left += [*(after[:2] - KEPT * before[:2]) / FRICTION_SIGMA]
-        left += [(after[2] + BALL.restitution * fallen) / RESTITUTION_SIGMA]
-        left += [(place(vectors, times, bounces, drag, times[bounce])[2] - scene.plane) / PLANE_SIGMA]
+        lean = np.array([scene.physics.slope_x, scene.physics.slope_y])
+        rises = after[2] - lean @ after[:2] + BALL.restitution * (fallen - lean @ before[:2])
+        at = place(vectors, times, bounces, drag, times[bounce])
+        left += [rises / RESTITUTION_SIGMA, (at[2] - lean @ at[:2] - scene.plane) / PLANE_SIGMA]
     return left
 
 
@@ -87,12 +90,15 @@ def linear(residual: Callable[[Array], Array], size: int) -> tuple[Array, Array]
     return np.stack([residual(row) - zero for row in np.eye(size)], axis=1), zero
 
 
+@pytest.mark.parametrize("ball", [BALL, replace(BALL, slope_x=0.03, slope_y=-0.02)], ids=["level", "leaning"])
 @pytest.mark.parametrize("lift", [None, LIFT])
 @pytest.mark.parametrize("bounces", range(4))
-def test_paths_are_those_of_least_squares(bounces: int, lift: tuple[float, float, float] | None) -> None:
+def test_paths_are_those_of_least_squares(
+    bounces: int, lift: tuple[float, float, float] | None, ball: SegmentationPhysics
+) -> None:
     rng = np.random.default_rng([bounces, lift is None])
     seen = rays(rng, 12)
-    scene = Scene(seen, BALL, TABLE, 0.0, lift)
+    scene = Scene(seen, ball, TABLE, 0.0, lift)
     times = np.sort(rng.uniform(0.1, 0.5, (3, max(bounces, 1))), axis=1)
     found = solved(scene, times, bounces)
     for k in range(3):
@@ -101,12 +107,12 @@ def test_paths_are_those_of_least_squares(bounces: int, lift: tuple[float, float
         for _ in range(ROUNDS):
             root = seen.root / np.sqrt(depth**2 + LAWS**2 * np.linalg.det(seen.root))[:, None, None]
 
-            def ball(unknown: Array, k: int = k, drag: Array = drag, count: int = count) -> Array:
+            def path(unknown: Array, k: int = k, drag: Array = drag, count: int = count) -> Array:
                 vectors = unknown.reshape(count, 3)
                 return np.array([place(vectors, times[k], bounces, drag, float(t)) for t in seen.times])
 
-            def rows(unknown: Array, root: Array = root, ball: Callable[[Array], Array] = ball) -> Array:
-                off = np.einsum("nra,na->nr", seen.matrix, ball(unknown)) - seen.target
+            def rows(unknown: Array, root: Array = root, path: Callable[[Array], Array] = path) -> Array:
+                off = np.einsum("nra,na->nr", seen.matrix, path(unknown)) - seen.target
                 return np.einsum("nqr,nr->nq", root, off).ravel()
 
             def rules(unknown: Array, k: int = k, drag: Array = drag, count: int = count) -> Array:
@@ -119,7 +125,7 @@ def test_paths_are_those_of_least_squares(bounces: int, lift: tuple[float, float
             square = ((a @ unknown + zero) ** 2).reshape(-1, 2).sum(axis=1)
             misfit = ROBUST**2 * np.log1p(square / ROBUST**2).sum() + ((b @ unknown + other) ** 2).sum()
             weight, vectors = 1.0 / (1.0 + square / ROBUST**2), unknown.reshape(count, 3)
-            depth = np.maximum(np.einsum("na,na->n", seen.depth_row[:, :3], ball(unknown)) + 9.0, NEAREST)
+            depth = np.maximum(np.einsum("na,na->n", seen.depth_row[:, :3], path(unknown)) + 9.0, NEAREST)
             drag = BALL.drag * np.minimum(np.linalg.norm(vectors[1 : bounces + 2], axis=1), 2.0 * SPEED)
         np.testing.assert_allclose(found.vectors[k], vectors, rtol=1e-6, atol=1e-7)
         np.testing.assert_allclose(found.drag[k], drag, rtol=1e-6)
