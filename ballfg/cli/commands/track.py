@@ -1,7 +1,5 @@
 """Implements `ballfg track`, which turns videos of calibrated cameras into tracks."""
 
-from __future__ import annotations
-
 import enum
 import os
 from collections.abc import Sequence
@@ -159,7 +157,7 @@ def track(
 def _moving_camera(
     recordings: Sequence[str],
     out: Path,
-    kind: BallKind,
+    kind: "BallKind",
     court: str,
     corners: Path | None,
     candidates: Path | None,
@@ -241,13 +239,13 @@ def _refuse(**options: object) -> None:
 
 def _from_videos(
     recordings: Sequence[str],
-    rig: Sequence[Camera],
+    rig: "Sequence[Camera]",
     stamps: Sequence[str],
     colour: Colour | None,
     detector: str | None,
     jobs: int | None,
     without: Sequence[str],
-) -> tuple[list[Detections], Streams]:
+) -> "tuple[list[Detections], Streams]":
     """The detections, and a function that gives each video's frames again."""
     from ballfg.vision.detection.detect import learn_detector, load_detector
     from ballfg.vision.detection.detector import DetectorSettings
@@ -263,7 +261,7 @@ def _from_videos(
     return found, [open_video(path, files.get(name)).frames for name, path in videos.items()]
 
 
-def _on_one_clock(tracking: Tracking, model: AnalyticModel, surfaces: Surfaces) -> Tracking:
+def _on_one_clock(tracking: "Tracking", model: "AnalyticModel", surfaces: "Surfaces") -> "Tracking":
     """The same candidates with time offsets of the cameras estimated from the balls."""
     from ballfg.estimation import Settings, estimate_time_offsets, sighted_track
     from ballfg.vision.tracking.pipeline import disagreement, track_detections

@@ -1,7 +1,5 @@
 """All models that a search has weighed, the best of them, and the steps that lead to better ones."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -55,7 +53,7 @@ class Round:
 class Found:
     """Everything weighed so far, by the names of the effects, and the best of it."""
 
-    def __init__(self, loop: SearchLoop, first: Fit) -> None:
+    def __init__(self, loop: "SearchLoop", first: Fit) -> None:
         self.loop = loop
         self.first = whole = on_all(first, on_others(first, loop.holdout.held_out))
         self.halves: Mask = unlike_halves(whole)

@@ -1,7 +1,5 @@
 """Estimates the noise of a set of tracks by the calibration of forecasts within them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing

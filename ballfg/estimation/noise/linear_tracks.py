@@ -5,8 +5,6 @@ the offset of the estimate itself from the model. F and o come from the dynamics
 contacts with their saltation included. A Kalman filter over deviations then gives forecasts for any noise.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial

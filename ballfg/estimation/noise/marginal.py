@@ -1,7 +1,5 @@
 """Maximises the marginal likelihood of linearised tracks: the density of each sample given those before it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final

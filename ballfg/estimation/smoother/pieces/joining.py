@@ -5,8 +5,6 @@ Gauss-Newton steps of the whole track follow: each piece passes its information 
 and gets their steps back. Memory holds some numbers a sample, and the matrices of the pieces in progress.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -97,7 +95,7 @@ class Joined:
         convergence, rounds: reason for the end of the search, and number of its linear solutions.
     """
 
-    segmentation: Segmentation
+    segmentation: "Segmentation"
     cuts: Sequence[int]
     rival: Array | None
     states: Sequence[State]
@@ -107,7 +105,7 @@ class Joined:
     rounds: int
 
 
-def told_by(smoother: Smoother, state: State) -> Told:
+def told_by(smoother: "Smoother", state: State) -> Told:
     """The information of a section at its present values."""
     own = state.section.own(smoother.problem(state.section.track, state.section.segmentation))
     rows = state.section.linearized(own, state.values)
@@ -115,7 +113,7 @@ def told_by(smoother: Smoother, state: State) -> Told:
     return Told(state.values, objective(rows), found.inner, found.ends, found.response(REACH))
 
 
-def joined_minimum(smoother: Smoother, track: Track, length: int | None = None) -> Joined | None:
+def joined_minimum(smoother: "Smoother", track: Track, length: int | None = None) -> Joined | None:
     """The minimum of a prepared track, by sections of about `length` samples; None if a piece has none."""
     rough = copy.copy(smoother)
     rough.optimizer = replace(smoother.optimizer, tolerance=max(ROUGH, smoother.optimizer.tolerance))
@@ -135,7 +133,7 @@ def joined_minimum(smoother: Smoother, track: Track, length: int | None = None) 
     return None if found is None else Joined(events, cuts, looks[0].rival, *found)
 
 
-def _search(smoother: Smoother, states: list[State]) -> tuple[Sequence[State], Chain, float, Convergence, int] | None:
+def _search(smoother: "Smoother", states: list[State]) -> tuple[Sequence[State], Chain, float, Convergence, int] | None:
     """Gauss-Newton steps of the whole track until those of all sections are shorter than the optimizer's tolerance.
 
     Lengths are distances to the minimum in posterior standard deviations, as in
