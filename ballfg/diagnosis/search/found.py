@@ -315,7 +315,8 @@ class Found:
         """
         whole = self.best
         while True:
-            best, score, smaller = self.best, self.scores[self.best.names], self._smaller(self.best)
+            best, score = self.best, self.scores[self.best.names]
+            smaller = {} if every else self._smaller(best)
             gone = [h for h in best.named if every or smaller.get(best.names - {h.name}, -np.inf) > score]
             least = self.most_probable(self.without([h]) for h in gone)
             if least is None or not self.is_better(least):
