@@ -1,7 +1,5 @@
 """The front door estimates, predicts and diagnoses from arrays, tracks, datasets and folders alike."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from functools import partial
 from os import PathLike
@@ -57,9 +55,9 @@ class PredictOptions(Options, total=False):
 @overload
 def estimate(measured: OneTrack, **options: Unpack[Options]) -> Estimate: ...
 @overload
-def estimate(measured: Tracks | Folder, **options: Unpack[Options]) -> dict[str, Estimate]: ...
+def estimate(measured: "Tracks | Folder", **options: Unpack[Options]) -> dict[str, Estimate]: ...
 def estimate(
-    measured: OneTrack | Tracks | Folder,
+    measured: "OneTrack | Tracks | Folder",
     *,
     method: str = "smoother",
     model: Model = None,
@@ -133,10 +131,10 @@ def predict(
 ) -> Forecast: ...
 @overload
 def predict(
-    known: Tracks | Folder, horizon: float = ..., **options: Unpack[PredictOptions]
-) -> dict[str, TrackPrediction]: ...
+    known: "Tracks | Folder", horizon: float = ..., **options: Unpack[PredictOptions]
+) -> "dict[str, TrackPrediction]": ...
 def predict(
-    known: Estimate | BallState | OneTrack | Tracks | Folder,
+    known: "Estimate | BallState | OneTrack | Tracks | Folder",
     horizon: float = 0.3,
     *,
     observe: float = 0.25,
@@ -146,7 +144,7 @@ def predict(
     settings: Settings | None = None,
     conformal: Conformal = None,
     jobs: int = 1,
-) -> Forecast | dict[str, TrackPrediction]:
+) -> "Forecast | dict[str, TrackPrediction]":
     """The path of the ball ahead, with standard deviations.
 
     Args:
@@ -187,7 +185,7 @@ def predict(
     return {one.name: one if scales is None else scales.scaled(one) for one in found}
 
 
-def _in_flight(data: Dataset) -> InFlight:
+def _in_flight(data: Dataset) -> "InFlight":
     """The flights of a dataset, and how much of it they are."""
     from ballfg.estimation.flights.dataset import in_flight as found_in
 
@@ -205,10 +203,10 @@ def _refuse(conformal: Conformal) -> None:
 def _scales(
     conformal: Conformal,
     data: Tracks,
-    predicted: Callable[[Tracks, int], Iterator[TrackPrediction]],
+    predicted: "Callable[[Tracks, int], Iterator[TrackPrediction]]",
     method: str,
     observe: float,
-) -> ConformalScales | None:
+) -> "ConformalScales | None":
     """The scales of predictions of `data`: the given ones, or from the given calibration tracks."""
     from ballfg.estimation import ConformalScales
     from ballfg.estimation.conformal import check_calibration_tracks, load_conformal
@@ -227,7 +225,7 @@ def _scales(
     return ConformalScales.of(predicted(calibration, len(calibration)), calibration.info.name, observe, method)
 
 
-def diagnose(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) -> Diagnosis:
+def diagnose(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) -> "Diagnosis":
     """The effects that the model of the ball lacks, found in measured tracks.
 
     Args:
@@ -249,7 +247,7 @@ def diagnose(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) 
     return on_one_thread(partial(diagnose_dataset, _in_flight(data).dataset, jobs=jobs), _model(model, data))
 
 
-def error_budget(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) -> ErrorBudget:
+def error_budget(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) -> "ErrorBudget":
     """The parts of the prediction error of a dataset: noise, spins, coefficients, bounces, open motion, the rest.
 
     No effect is searched: the budget is that of the model as it is, with its coefficients and noise fitted to one half
@@ -292,7 +290,7 @@ def graph(
     model: Model = None,
     surfaces: Surfaces | float | None = None,
     settings: Settings | None = None,
-) -> TrackGraph:
+) -> "TrackGraph":
     """The factor graph of a track as GTSAM's objects, for GTSAM's solvers and for further factors.
 
     Args:
@@ -313,7 +311,7 @@ def graph(
 
 
 def estimator_for(
-    data: Track | Tracks,
+    data: "Track | Tracks",
     method: str = "smoother",
     model: Model = None,
     surfaces: Surfaces | float | None = None,
@@ -336,7 +334,7 @@ def estimator_for(
     return make_estimator(method, ball, surfaces, settings)
 
 
-def _model(model: Model, source: Tracks | None) -> BallModel:
+def _model(model: Model, source: "Tracks | None") -> BallModel:
     ball = TABLE_TENNIS if source is None else source.ball
     if model is None or isinstance(model, Ball):
         return nominal_model(ball if model is None else model)
@@ -347,7 +345,7 @@ def _model(model: Model, source: Tracks | None) -> BallModel:
     return load_model(Path(model), radius=ball.radius, inertia_factor=inertia_factor(ball), room=room)
 
 
-def _opened(measured: object) -> Track | Tracks:
+def _opened(measured: object) -> "Track | Tracks":
     if isinstance(measured, str | PathLike):
         from ballfg.estimation import read
 

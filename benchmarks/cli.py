@@ -3,8 +3,6 @@
 Commands import what they need inside: `ballfg-bench --help` must not wait for torch or GTSAM.
 """
 
-from __future__ import annotations
-
 import inspect
 import os
 import sys
@@ -66,7 +64,7 @@ class Run:
     cluster: Cluster = None
     address: Address = None
 
-    def results(self, command: str, data: Sequence[Path] = (), more: Sequence[str] = ()) -> Results:
+    def results(self, command: str, data: Sequence[Path] = (), more: Sequence[str] = ()) -> "Results":
         """Empty results that name the command, with `more` words after the datasets; of paths the folder's name."""
         import torch
 
@@ -97,7 +95,7 @@ class Run:
         """The folder as workers find it: those of a cluster share it, and were started anywhere."""
         return folder if self.cluster is None else folder.resolve()
 
-    def finish(self, results: Results, pictures: Sequence[Path] = ()) -> None:
+    def finish(self, results: "Results", pictures: Sequence[Path] = ()) -> None:
         """Print the table, write `results.json`, say where everything is."""
         from ballfg.benchmarks.conclusions import print_table
 
@@ -380,7 +378,7 @@ def speed(
             raise typer.Exit(1) from None
 
 
-def _open(data: Path) -> Dataset:
+def _open(data: Path) -> "Dataset":
     from ballfg.estimation.reading import with_readings
     from ballfg.tracks import read_dataset
 

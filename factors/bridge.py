@@ -5,8 +5,6 @@ and Jacobians of every row together with the exact bytes of their inputs. A call
 result; any other call is a miss. docs/custom_factors.md is the contract.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
@@ -69,7 +67,7 @@ class Bridge:
         self._inputs: list[tuple[bytes, ...] | None] = [None] * len(batch)
         self._answers: list[tuple[Array, tuple[Array, ...]] | None] = [None] * len(batch)
 
-    def factor(self, row: int, variables: Sequence[int] | None = None) -> gtsam.CustomFactor:
+    def factor(self, row: int, variables: Sequence[int] | None = None) -> "gtsam.CustomFactor":
         """The CustomFactor of one row; its noise model has unit sigmas and the batch's loss.
 
         Args:
@@ -82,7 +80,7 @@ class Bridge:
 
         return gtsam.CustomFactor(self.batch.loss.noise_model(self.batch.dim), keys, _callback(self, row, keys))
 
-    def factors(self) -> list[gtsam.CustomFactor]:
+    def factors(self) -> "list[gtsam.CustomFactor]":
         """One factor a row."""
         return [self.factor(row) for row in range(len(self.batch))]
 
@@ -134,7 +132,7 @@ class Bridge:
         return found
 
     def answer(
-        self, row: int, keys: Sequence[int], values: gtsam.Values, *, trial: bool = False
+        self, row: int, keys: Sequence[int], values: "gtsam.Values", *, trial: bool = False
     ) -> tuple[Array, tuple[Array, ...]]:
         """Residual (r,) and Jacobians (r, d), whitened, of a row at GTSAM's values.
 
@@ -164,7 +162,7 @@ class Bridge:
         """The part of one of GTSAM's vectors that the batch uses."""
         return vector if self.batch.sees_biases or key == COEFFICIENT_KEY else vector[:STATE_DIM]
 
-    def _evaluate(self, row: int, keys: Sequence[int], values: gtsam.Values) -> None:
+    def _evaluate(self, row: int, keys: Sequence[int], values: "gtsam.Values") -> None:
         if self.on_miss == "row":
             self.prepare(np.array([row]), tuple(self._seen(key, values.atVector(key))[None] for key in keys))
             return
@@ -190,7 +188,7 @@ def _widened(block: Array, width: int) -> Array:
     return wide
 
 
-def _vector(values: gtsam.Values, variable: int, known: dict[int, Array]) -> Array | None:
+def _vector(values: "gtsam.Values", variable: int, known: dict[int, Array]) -> Array | None:
     """A variable's vector, read from GTSAM once; None if GTSAM does not have it."""
     if variable not in known:
         key = key_of(variable)
@@ -203,7 +201,7 @@ def _vector(values: gtsam.Values, variable: int, known: dict[int, Array]) -> Arr
 def _callback(bridge: Bridge, row: int, keys: Sequence[int]) -> Callback:
     """The error function of one factor. `values` and `jacobians` are GTSAM's: valid inside the call only."""
 
-    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: gtsam.JacobianVector | None) -> Array:
+    def error(_: "gtsam.CustomFactor", values: "gtsam.Values", jacobians: "gtsam.JacobianVector | None") -> Array:
         residual, blocks = bridge.answer(row, keys, values, trial=jacobians is None)
         if jacobians is not None:
             for i, block in enumerate(blocks):
@@ -266,7 +264,7 @@ def _not_finite(what: str, row: int) -> str:
     )
 
 
-def nonlinear_graph(graph: BallGraph) -> tuple[gtsam.NonlinearFactorGraph, list[Bridge]]:
+def nonlinear_graph(graph: BallGraph) -> "tuple[gtsam.NonlinearFactorGraph, list[Bridge]]":
     """A graph for GTSAM's own optimizers, with the bridges that evaluate it (they count the calls)."""
     import gtsam
 
@@ -278,7 +276,7 @@ def nonlinear_graph(graph: BallGraph) -> tuple[gtsam.NonlinearFactorGraph, list[
     return result, bridges
 
 
-def linear_graph(linearized: Sequence[Rows]) -> gtsam.GaussianFactorGraph:
+def linear_graph(linearized: Sequence[Rows]) -> "gtsam.GaussianFactorGraph":
     """The whitened rows that `ballfg.factors.solve` eliminates, for GTSAM's elimination and marginals.
 
     They include the curvature of robust losses, which GTSAM's own linearisation leaves out.
@@ -295,7 +293,7 @@ def linear_graph(linearized: Sequence[Rows]) -> gtsam.GaussianFactorGraph:
     return result
 
 
-def to_gtsam(values: Values) -> gtsam.Values:
+def to_gtsam(values: Values) -> "gtsam.Values":
     """States as vectors x0, x1, ..., biases behind them; coefficients, if any, as the vector c0."""
     import gtsam
 
@@ -307,7 +305,7 @@ def to_gtsam(values: Values) -> gtsam.Values:
     return result
 
 
-def from_gtsam(values: gtsam.Values) -> Values:
+def from_gtsam(values: "gtsam.Values") -> Values:
     """The values from GTSAM's, as `to_gtsam` wrote them; other variables than x0, x1, ... and c0 are left out."""
     import gtsam
 

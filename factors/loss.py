@@ -1,7 +1,5 @@
 """Robust losses reduce the weight of large whitened residuals; they equal GTSAM's m-estimators."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -38,7 +36,7 @@ class Loss:
         check_number("scale", self.scale, "standard deviations", above=0.0)
 
     @property
-    def convex(self) -> Loss:
+    def convex(self) -> "Loss":
         """The loss itself if it is convex; Huber's in place of Cauchy's."""
         return Loss("huber", self.scale) if self.name == "cauchy" else self
 
@@ -88,7 +86,7 @@ class Loss:
             ratio = np.ones_like(norm)
         return np.maximum(ratio, LEAST_STRETCH)
 
-    def noise_model(self, dim: int) -> gtsam.noiseModel.Base:
+    def noise_model(self, dim: int) -> "gtsam.noiseModel.Base":
         """GTSAM's model of this loss on a whitened residual of `dim` numbers."""
         import gtsam  # it takes a tenth of a second to import, and the own solver needs none of it
 

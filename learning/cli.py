@@ -3,8 +3,6 @@
 Heavy libraries are imported inside functions: `ballfg-train --help` must not wait for torch or GTSAM.
 """
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -77,7 +75,7 @@ def _typed(config: Path, overrides: Sequence[str], data: Sequence[str], out: str
     return shlex.join(words)
 
 
-def _train(config: TrainConfig, folder: Path, resume: bool, typed: str) -> int:
+def _train(config: "TrainConfig", folder: Path, resume: bool, typed: str) -> int:
     """Train in this process if a launcher has started it or one is enough, else in new processes.
 
     Returns: the exit status.
@@ -94,13 +92,13 @@ def _train(config: TrainConfig, folder: Path, resume: bool, typed: str) -> int:
         return launch(jobs, _train_guarded, config, folder, resume, typed)
 
 
-def _train_here(config: TrainConfig, folder: Path, resume: bool, typed: str) -> int:
+def _train_here(config: "TrainConfig", folder: Path, resume: bool, typed: str) -> int:
     from ballfg.learning.run.training import run_training
 
     return run_training(config, folder, resume=resume, watch=progress, command=typed)
 
 
-def _train_guarded(config: TrainConfig, folder: Path, resume: bool, typed: str) -> int:
+def _train_guarded(config: "TrainConfig", folder: Path, resume: bool, typed: str) -> int:
     """The work of each process that this command starts. Returns: its exit status; none where it was interrupted."""
     from ballfg.learning.run.ranks import NO_STATUS
 

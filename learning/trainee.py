@@ -4,8 +4,6 @@ A kind of one's own is a subclass of `TraineeKind` and one call of `register_tra
 `ballfg.trainees`. Those of the package stand beside what they build, and are imported when they are named.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -148,7 +146,7 @@ class TraineeKind(ABC):
 
     @classmethod
     @abstractmethod
-    def build(cls, config: TrainConfig) -> Prepared:
+    def build(cls, config: "TrainConfig") -> Prepared:
         """The model with its data, ready to train.
 
         Args: config: the whole config; the section `options` is the kind's own.

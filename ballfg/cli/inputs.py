@@ -1,7 +1,5 @@
 """Opens the dataset, model and estimator that a command line names, for estimate and predict."""
 
-from __future__ import annotations
-
 import enum
 import math
 import sys
@@ -123,12 +121,12 @@ class Inputs(Generic[D]):
     """A dataset, of positions or of sightings, with model and surfaces."""
 
     dataset: D
-    model: BallModel
-    surfaces: Surfaces
+    model: "BallModel"
+    surfaces: "Surfaces"
     observed: float  # s from the start of each track that a noise estimate may use
     doubts: tuple[str, ...] = ()
 
-    def in_flight(self, anyway: bool) -> Inputs[D]:
+    def in_flight(self, anyway: bool) -> "Inputs[D]":
         """The same of flights alone, after what is said about the rest; sightings stay as they are.
 
         Args: anyway: True for a dataset that hardly holds any flight.
@@ -142,7 +140,7 @@ class Inputs(Generic[D]):
             return self
         return replace(self, dataset=flights_only(data, anyway), doubts=(*self.doubts, *in_flight(data).lines))
 
-    def estimator(self, method: str, solver: Solver | None = None, group: str | None = None) -> Estimator:
+    def estimator(self, method: str, solver: "Solver | None" = None, group: str | None = None) -> "Estimator":
         """The estimator of a name, with the noise of the dataset.
 
         Args:
@@ -162,7 +160,7 @@ class Inputs(Generic[D]):
         return make_estimator(method, self.model, self.surfaces, replace(settings, solver=solver, group=group))
 
 
-def flights_only(data: Dataset, anyway: bool) -> Any:
+def flights_only(data: "Dataset", anyway: bool) -> Any:
     """The flights of a dataset, after what is said about the rest; errors as of `Inputs.in_flight`."""
     from ballfg.estimation.flights.dataset import in_flight
 
@@ -172,7 +170,7 @@ def flights_only(data: Dataset, anyway: bool) -> Any:
     return found.dataset
 
 
-def filtered(data: Dataset | SightedDataset) -> tuple[str, ...]:
+def filtered(data: "Dataset | SightedDataset") -> tuple[str, ...]:
     """Sentences on a filter that smoothed the positions of a dataset, and on samples of other balls."""
     from ballfg.estimation.configure import TRACKS_FOR_TABLE
     from ballfg.estimation.flights.dataset import in_flight
@@ -203,7 +201,7 @@ def open_inputs(
     effects_files: Iterable[Path] | None = None,
     observed: float = math.inf,
     ball: str | None = None,
-) -> Inputs[Dataset]:
+) -> "Inputs[Dataset]":
     """Opens and checks everything before any work; repairs are reported on stderr.
 
     Args:
@@ -222,7 +220,7 @@ def open_inputs(
 
 def open_sighted(
     dataset: Path, model: Path | None, effects_files: Iterable[Path] | None = None, ball: str | None = None
-) -> Inputs[SightedDataset]:
+) -> "Inputs[SightedDataset]":
     """`open_inputs` for sightings."""
     from ballfg.estimation import dataset_surfaces, read_sighted
 
@@ -247,7 +245,7 @@ def open_source(
     return open_sighted(dataset, model, effects_files, ball)
 
 
-def open_model(data: Dataset | SightedDataset, model: Path | None, ball: str | None = None) -> BallModel:
+def open_model(data: "Dataset | SightedDataset", model: Path | None, ball: str | None = None) -> "BallModel":
     """The model of a file, or the nominal one; prints notes on data and model on stderr.
 
     Args: ball: name of the data's known ball, or a ball file, whose model is then the nominal one; None: any ball.
@@ -256,7 +254,9 @@ def open_model(data: Dataset | SightedDataset, model: Path | None, ball: str | N
     return _opened(data, model, ball)[0]
 
 
-def _opened(data: Dataset | SightedDataset, model: Path | None, ball: str | None) -> tuple[BallModel, tuple[str, ...]]:
+def _opened(
+    data: "Dataset | SightedDataset", model: Path | None, ball: str | None
+) -> "tuple[BallModel, tuple[str, ...]]":
     """The same, with the doubts that were printed."""
     import torch
 
@@ -286,7 +286,7 @@ def _opened(data: Dataset | SightedDataset, model: Path | None, ball: str | None
     return found, doubts
 
 
-def _named(ball: str) -> tuple[Ball, AnalyticModel]:
+def _named(ball: str) -> "tuple[Ball, AnalyticModel]":
     """A ball and its model: a known one by its name, or that of a ball file."""
     from ballfg.dynamics import nominal_model
     from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball
@@ -300,7 +300,7 @@ def _named(ball: str) -> tuple[Ball, AnalyticModel]:
     return KNOWN_BALLS[name].ball, nominal_model(name)
 
 
-def _doubts_of(data: Dataset | SightedDataset, model: BallModel, file: Path | None) -> tuple[str, ...]:
+def _doubts_of(data: "Dataset | SightedDataset", model: "BallModel", file: Path | None) -> tuple[str, ...]:
     """What is not sure about a dataset, and how far it lies outside of what a model was fitted on."""
     from ballfg.estimation.flights.dataset import LOOKED_AT
 
@@ -309,7 +309,7 @@ def _doubts_of(data: Dataset | SightedDataset, model: BallModel, file: Path | No
     return (*data.info.doubts, *model.domain.doubts(islice(iter(data), LOOKED_AT), file))
 
 
-def model_alone(model: Path | None, ball: str | None) -> tuple[BallModel, Settings]:
+def model_alone(model: Path | None, ball: str | None) -> "tuple[BallModel, Settings]":
     """A model without a dataset, and its settings: of a file, else the nominal one.
 
     Args: ball: name of the known ball that gives radius and inertia, or a ball file; None: table tennis.

@@ -1,7 +1,5 @@
 """Counts the tracks of a command by their status, and ends it where some could not be estimated."""
 
-from __future__ import annotations
-
 import sys
 from collections import Counter
 from collections.abc import Iterable
@@ -33,7 +31,7 @@ class Outcome:
     far: int = 0
     shares: float = 0.0
 
-    def add(self, name: str, status: Status, notes: Iterable[str], outside: float | None) -> None:
+    def add(self, name: str, status: "Status", notes: Iterable[str], outside: float | None) -> None:
         """Counts a track.
 
         Args:

@@ -14,10 +14,10 @@ from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.generic_test import ALARM, GenericTest
 from ballfg.diagnosis.label_verdicts import LabelCheck
 from ballfg.diagnosis.report.wording import sentence
-from ballfg.diagnosis.residual_tests.fallback import fallback
 from ballfg.diagnosis.residual_tests.generic import generic_tests
 from ballfg.diagnosis.residual_tests.label_check import check_labels, label_test
 from ballfg.diagnosis.residual_tests.residuals import residuals_of
+from ballfg.diagnosis.residual_tests.sparse import fallback
 from ballfg.diagnosis.residual_tests.tracker_errors import look_at_tracker
 from ballfg.diagnosis.result import Diagnosis, Errors, Fallback, Unexplained, Value, Verdict
 from ballfg.diagnosis.search.loop import NAMED, Search, SearchLoop

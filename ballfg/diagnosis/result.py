@@ -1,7 +1,5 @@
 """Holds the result of a diagnosis: verdict, added effects with evidence, errors before and after, the rest."""
 
-from __future__ import annotations
-
 import enum
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -300,7 +298,7 @@ class Diagnosis:
         effects = ", ".join(finding.name for finding in self.findings) or "none"
         return f"Diagnosis({self.dataset!r}, effects added: {effects};\n    {self.sentence})"
 
-    def plot(self) -> Figure:
+    def plot(self) -> "Figure":
         """A picture of the prediction error of each held-out track, before and after the model was corrected.
 
         If nothing was added to the model, it shows the residuals of the fitted model over their normal distribution.

@@ -6,8 +6,6 @@ third kind, `measurement`, is in `ballfg.dynamics.measurement`. A model is a set
 them.
 """
 
-from __future__ import annotations
-
 from abc import ABC
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -147,25 +145,25 @@ class Flight:
         """(..., 1) ratio R |w| / |v|, finite at rest: times the speed it is R |w| to autograd."""
         return self.radius * length(self.spin) / self.speed.clamp_min(TINY_LENGTH)
 
-    def against(self, air: Tensor) -> Flight:
+    def against(self, air: Tensor) -> "Flight":
         """This flight in air that moves at `air`, (3,) or (..., 3) m/s."""
         moved = self._copy()
         moved.velocity, moved._speed = self.velocity - air, None
         return moved
 
-    def more_drag(self, share: Tensor) -> Flight:
+    def more_drag(self, share: Tensor) -> "Flight":
         """This flight with more drag, by a share (..., 1) of the effect `Drag` alone; shares add up."""
         changed = self._copy()
         changed.drag_gain = 1.0 + share if self.drag_gain is None else self.drag_gain + share
         return changed
 
-    def more_lift(self, share: Tensor) -> Flight:
+    def more_lift(self, share: Tensor) -> "Flight":
         """This flight with more Magnus force, by a share (..., 1) of the effect `Magnus` alone; shares add up."""
         changed = self._copy()
         changed.lift_gain = 1.0 + share if self.lift_gain is None else self.lift_gain + share
         return changed
 
-    def _copy(self) -> Flight:
+    def _copy(self) -> "Flight":
         other = object.__new__(Flight)  # a third of the time that copy.copy takes
         for name in Flight.__slots__:
             setattr(other, name, getattr(self, name))
@@ -197,7 +195,7 @@ class Impact:
         """(..., 1) m/s, speed towards the plane, positive for an approaching ball."""
         return -self.velocity[..., 2:]
 
-    def with_(self, **changes: Tensor) -> Impact:
+    def with_(self, **changes: Tensor) -> "Impact":
         """This impact with changes: other values (..., 1), dimensionless, or of the motion; units as in `Impact`."""
         return replace(self, **changes)
 

@@ -85,7 +85,7 @@ class Surfaces:
         over: Tensor = within(state[..., 0], state[..., 1], self.extent)
         return over
 
-    def height_below(self, state: Tensor, raised: Tensor | float = 0.0) -> Tensor:
+    def height_below(self, state: Tensor, raised: Tensor | float) -> Tensor:
         """(...) m, height of the surface below a ball in states (..., 9), straight down; -inf where there is none.
 
         A ball whose centre is below the table's surface is beside the table; `level_below` limits its depth.
@@ -94,7 +94,7 @@ class Surfaces:
         """
         return torch.where(self.over_table(state), self.level_below(state, raised), self._lower_level(state, raised))
 
-    def level_below(self, state: Tensor, raised: Tensor | float = 0.0) -> Tensor:
+    def level_below(self, state: Tensor, raised: Tensor | float) -> Tensor:
         """(...) m, height of the surface that a ball in states (..., 9) falls to, on the table or beside it.
 
         -inf where there is none: below the lowest surface by more than `DEEPEST`.

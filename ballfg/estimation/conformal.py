@@ -4,8 +4,6 @@ Source: Lee, Barber, Willett, "Distribution-free inference with hierarchical dat
 docs/predict.md.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -74,8 +72,8 @@ class ConformalScales:
 
     @classmethod
     def of(
-        cls, predictions: Iterable[TrackPrediction], source: str, observe: float, method: str = "smoother"
-    ) -> ConformalScales:
+        cls, predictions: "Iterable[TrackPrediction]", source: str, observe: float, method: str = "smoother"
+    ) -> "ConformalScales":
         """The scales from predictions of the calibration tracks.
 
         Args:
@@ -127,7 +125,7 @@ class ConformalScales:
         told = self.tracks > FEWEST
         return float(np.average(shares[told].mean(axis=1), weights=self.tracks[told])) if told.any() else float("nan")
 
-    def scaled(self, prediction: TrackPrediction) -> TrackPrediction:
+    def scaled(self, prediction: "TrackPrediction") -> "TrackPrediction":
         """The prediction with conformal sigmas, infinite beyond the last bin with enough calibration tracks."""
         bins = _bins(prediction)
         scales = np.concatenate((self.scales, np.full((1, 3), np.inf)))[np.minimum(bins, len(self.scales))]
@@ -195,7 +193,7 @@ def load_conformal(path: str | Path) -> ConformalScales:
     return ConformalScales(str(content["source"]), observe, str(content["method"]), tracks, **tables, statuses=statuses)
 
 
-def check_calibration_tracks(calibration: Dataset | SightedDataset, dataset: Dataset | SightedDataset) -> None:
+def check_calibration_tracks(calibration: "Dataset | SightedDataset", dataset: "Dataset | SightedDataset") -> None:
     """Refuses calibration tracks that are not exchangeable with the tracks to predict.
 
     Args: calibration: the calibration dataset.  dataset: the one to predict.
@@ -284,7 +282,7 @@ def _by_bin(tracks: list[tuple[Index, Array]]) -> Iterator[_Bin]:
         yield _Bin(scores[here], np.unique(track[here], return_inverse=True)[1])
 
 
-def _bins(prediction: TrackPrediction) -> Index:
+def _bins(prediction: "TrackPrediction") -> Index:
     """(k,) bin of the horizon of each stamp; a stamp at the end of a bin belongs to it."""
     ahead = elapsed(prediction.times, float(prediction.estimate.times[-1])) / BIN
     return np.maximum(np.ceil(ahead - EDGE).astype(np.int64) - 1, 0)

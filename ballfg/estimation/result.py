@@ -1,7 +1,5 @@
 """An estimate holds the states of a track with covariances, and a status that says how far to trust them."""
 
-from __future__ import annotations
-
 import enum
 import operator
 from collections.abc import Mapping
@@ -168,7 +166,7 @@ class Estimate:
         )
 
     @classmethod
-    def from_gtsam(cls, graph: TrackGraph, values: gtsam.Values) -> Estimate:
+    def from_gtsam(cls, graph: "TrackGraph", values: "gtsam.Values") -> "Estimate":
         """The estimate of a track at values from GTSAM, with the marginals of all factors of the graph.
 
         Args: graph: from `bf.graph`, with further factors or without.  values: of all variables of the factors.
@@ -196,7 +194,7 @@ class Estimate:
         """(m,) squared length of `whitened`, dimensionless: chi-square with `dim` degrees of freedom."""
         return np.asarray((self.whitened**2).sum(axis=-1))
 
-    def dated(self, times: Array, origin: float | None = None) -> Estimate:
+    def dated(self, times: Array, origin: float | None = None) -> "Estimate":
         """The estimate with the stamps of the data; estimators count stamps from a track's first.
 
         Args: times: (n,) s, the original stamps.  origin: s, the first stamp of the whole track, if these are a part.
@@ -211,7 +209,7 @@ class Estimate:
         """The path of the ball from the last sample on; arguments and errors as those of `BallState.predict`."""
         return self.last.predict(horizon, step)
 
-    def to_frame(self) -> DataFrame:
+    def to_frame(self) -> "DataFrame":
         """A pandas table with the columns of `ballfg estimate`: t, the state, its standard deviations, the label.
 
         Raises: ImportError: without pandas.
@@ -229,7 +227,7 @@ class Estimate:
         shown = words[self.labels if len(self.labels) else np.zeros(len(self), np.int8)]
         return {"t": self.times, **states, **sigmas, "label": shown}
 
-    def plot(self) -> Figure:
+    def plot(self) -> "Figure":
         """A picture of position, velocity and spin over time, each with a band of two standard deviations."""
         from ballfg.estimation.picture import picture
 

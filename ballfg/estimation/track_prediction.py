@@ -1,7 +1,5 @@
 """Predicts the later positions of whole tracks from their observed first parts."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -58,7 +56,7 @@ class TrackPrediction:
     sigmas: Array
     measured: Array
     estimate: Estimate
-    conformal: ConformalScales | None = None
+    conformal: "ConformalScales | None" = None
     outside: Array | None = None
     covariances: Array | None = None
 
@@ -70,7 +68,7 @@ class TrackPrediction:
         """The status of the observed part's estimate."""
         return self.estimate.status
 
-    def plot(self) -> Figure:
+    def plot(self) -> "Figure":
         """A picture of x, y and z over time: the estimate, the prediction and what was measured, with 90 % bands."""
         from ballfg.estimation.picture import predicted
 

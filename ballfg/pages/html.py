@@ -1,7 +1,5 @@
 """Writes one self-contained HTML file of escaped text, tables, lists, pictures, bars, explained words."""
 
-from __future__ import annotations
-
 import base64
 import html
 import io
@@ -103,7 +101,7 @@ def bar(share: float, colour: str) -> Html:
     return tag("span", tag("span", kind=f"bar {colour}", style=f"width:{100 * share:.1f}%"), kind="track")
 
 
-def picture(figure: Figure, caption: str) -> Html:
+def picture(figure: "Figure", caption: str) -> Html:
     """A figure as a PNG inside the page.
 
     Args: figure: of matplotlib.  caption: below it, and its text for screen readers.

@@ -1,7 +1,5 @@
 """A belief holds Gaussian states at one time, with the model coefficients of their estimate."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -36,7 +34,7 @@ class Belief:
     @classmethod
     def of(
         cls, model: BallModel, states: Sequence[BallState], coefficients: Mapping[str, float] | None = None
-    ) -> Belief:
+    ) -> "Belief":
         """The belief of some states that were estimated with the same model.
 
         A coefficient beyond the bounds of its effect (a restitution above 1, say) is moved to the bound, and the state
@@ -79,12 +77,12 @@ class Belief:
     def __len__(self) -> int:
         return len(self.time)
 
-    def from_zero(self) -> Belief:
+    def from_zero(self) -> "Belief":
         """The belief with time counted from now, against the rounding of large stamps."""
         return replace(self, time=torch.zeros_like(self.time))
 
     @staticmethod
-    def joined(beliefs: Sequence[Belief]) -> Belief:
+    def joined(beliefs: "Sequence[Belief]") -> "Belief":
         """All balls of some beliefs.
 
         Args:
@@ -97,7 +95,7 @@ class Belief:
             torch.cat([belief.covariance for belief in beliefs]),
         )
 
-    def take(self, rows: Tensor | slice) -> Belief:
+    def take(self, rows: Tensor | slice) -> "Belief":
         """A part of the balls.
 
         Args:

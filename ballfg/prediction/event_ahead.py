@@ -5,8 +5,6 @@ plane. Its mean and standard deviation along the path give the probability that 
 later. A ball that may miss a plane has an event with a small probability, or none on its mean path.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeAlias
 
@@ -47,7 +45,7 @@ def asked_event(text: str) -> Plane | str:
     return Plane.parse(text)
 
 
-def event_on(path: Path, asked: Plane | str) -> EventAhead:
+def event_on(path: "Path", asked: Plane | str) -> EventAhead:
     """The first event of a kind on a path; asked: as from `asked_event`."""
     if isinstance(asked, Plane):
         return _crossing(path, asked)
@@ -114,7 +112,7 @@ def falls(value: Array, sigma: Array) -> float:
 class Path:
     """Means (k, 9) and covariances (k, 9, 9) of the state at times (k,) s after the start, and what carries it."""
 
-    start: BallState
+    start: "BallState"
     carried: Carried
     times: Array
     states: Array

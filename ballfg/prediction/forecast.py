@@ -1,7 +1,5 @@
 """Predicts the path of one ball, with standard deviations and the events on the way."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -117,7 +115,7 @@ class Forecast:
         """The path for several events."""
         return Path(self.start, self._carried, self.times, self.states, self.covariances)
 
-    def to_frame(self) -> DataFrame:
+    def to_frame(self) -> "DataFrame":
         """A pandas table: t, x, y, z and sigma_x, sigma_y, sigma_z, s and m, one row a time.
 
         Raises: ImportError: without pandas.
@@ -127,7 +125,7 @@ class Forecast:
         columns = {"t": self.times, **dict(zip(AXES, self.positions.T, strict=True))}
         return pandas.DataFrame(columns | {f"sigma_{a}": s for a, s in zip(AXES, self.sigmas.T, strict=True)})
 
-    def plot(self) -> Figure:
+    def plot(self) -> "Figure":
         """A picture of x, y and z over time, each with the band that holds 90 %; without measurement noise."""
         from ballfg.pages.pictures import by_axis
         from ballfg.pages.shot import ShownShot

@@ -5,8 +5,6 @@ Near a contact of uncertain time the reported mean and covariance include the ba
 (docs/derivations/prediction.md).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -52,7 +50,7 @@ class Prediction:
     states: Array
     covariances: Array
 
-    def plot(self, ball: int = 0) -> Figure:
+    def plot(self, ball: int = 0) -> "Figure":
         """A picture of x, y and z of one ball over time, each with the band that holds 90 %.
 
         Args: ball: index of the ball.

@@ -4,8 +4,6 @@ Repairs: rows out of time order are sorted, exact repeats are dropped. Two diffe
 together count as one measurement with an inaccurate stamp: their mean replaces them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
@@ -73,7 +71,7 @@ def check_step(label: str, stamps: Array) -> None:
         raise ValueError(f"{problem}. The unit is probably ms or us: convert it.")
 
 
-def tidy(group: RowGroup, where: Where, findings: Findings | None = None) -> Array:
+def tidy(group: "RowGroup", where: Where, findings: Findings | None = None) -> Array:
     """The samples of one trajectory, one for each stamp, in time order.
 
     Returns: (n, 4) or (n, 7), columns as in Block; repairs are added to the findings.
@@ -156,7 +154,7 @@ def doubts_about(times: Array, positions: Array, surfaces: Sequence[float], radi
     return (*_other_axis(times, positions, reach), *_other_surface(times, positions, reach, surfaces, radius))
 
 
-def _one_per_stamp(group: RowGroup, where: Where, findings: Findings) -> Array:
+def _one_per_stamp(group: "RowGroup", where: Where, findings: Findings) -> Array:
     values = group.values
     starts = np.flatnonzero(np.concatenate([[True], np.diff(values[:, 0]) != 0]))
     kept = values[starts].copy()

@@ -126,7 +126,7 @@ def true_bounces(times: Array, states: Array, model: BallModel, surfaces: Surfac
     """(b,) s, the contacts of a true motion (n, 9), by flying each state before a bounce on to the surface."""
     rows = np.flatnonzero((states[:-1, VZ] < 0.0) & (states[1:, VZ] > 0.0))
     before = torch.from_numpy(states[rows])
-    tau = contact_time(model, before, surfaces.height_below(before)).numpy()
+    tau = contact_time(model, before, surfaces.height_below(before, model.surface_offset(before))).numpy()
     dt = times[rows + 1] - times[rows]
     touches = (tau >= 0.0) & (tau <= dt)  # a strong lift can turn a fall upwards without any contact
     return np.asarray(times[rows][touches] + tau[touches])

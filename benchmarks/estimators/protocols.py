@@ -162,7 +162,7 @@ def fair_protocol(count: int, seed: int, name: str = "fair") -> Protocol:
 def away_from_bounces(times: Array, states: Array, model: BallModel, surfaces: Surfaces) -> NDArray[np.bool_]:
     """(n,) False for samples within `AT_BOUNCE` of a bounce, by flying each true state (n, 9) on to the next stamp."""
     state, dt = torch.from_numpy(states[:-1]), np.diff(times)
-    tau = contact_time(model, state, surfaces.height_below(state)).numpy()
+    tau = contact_time(model, state, surfaces.height_below(state, model.surface_offset(state))).numpy()
     rises = np.diff(states[:, VZ]) > 0.0
     bounces = rises & (tau > -AT_BOUNCE) & (tau < dt + AT_BOUNCE)
     away = np.ones(len(times), dtype=bool)

@@ -15,21 +15,7 @@ import numpy as np
 from ballfg.checks import aligned
 from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.estimation.noise.parameters import with_noise
-from ballfg.learning.calibration.calibrate import (
-    Linear,
-    Problem,
-    Step,
-    TooManyFailures,
-    advanced,
-    first_step,
-    fitted_noise,
-    has_ended,
-    linearised,
-    population_model,
-    population_settings,
-    pose_correction,
-    score,
-)
+from ballfg.learning.calibration import calibrate
 from ballfg.learning.calibration.groups import OWN, Groups
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import Plain, TrackScore, summary
@@ -58,8 +44,8 @@ FOLDS: Final = 5  # Parts of the fitted tracks; the others calibrate the candida
 class Fitted:
     """A candidate, calibrated on all fitted tracks: its problem, without judging tracks, and all its steps."""
 
-    problem: Problem
-    steps: tuple[Step, ...]
+    problem: calibrate.Problem
+    steps: tuple[calibrate.Step, ...]
 
 
 class Candidate(Plain):
@@ -96,7 +82,7 @@ class Choice(Plain):
         return f"Chosen: {self.chosen}, the simplest model that none surely beats."
 
 
-def choose_candidate(problem: Problem, watch: Watch = unwatched) -> tuple[Choice, dict[str, Fitted]]:
+def choose_candidate(problem: calibrate.Problem, watch: Watch = unwatched) -> tuple[Choice, dict[str, Fitted]]:
     """Compare the candidates within the fitted tracks of a problem.
 
     Returns: the comparison, and the calibrated candidates by name; those whose estimates fail are left out.
@@ -115,54 +101,56 @@ def choose_candidate(problem: Problem, watch: Watch = unwatched) -> tuple[Choice
     scores: dict[str, Sequence[TrackScore | None]] = {}
     known = replace(problem, settings=replace(problem.settings, coefficients={}))
     for name, posed in ((NOMINAL, known), (PER_TRACK, problem)):
-        noise = fitted_noise(posed, problem.model, posed.settings, watch, errors=False)
+        noise = calibrate.fitted_noise(posed, problem.model, posed.settings, watch, errors=False)
         settings = posed.settings if noise is None else noise.settings
-        scores[name] = score(_judging(posed, fitted), problem.model, watch, settings)
+        scores[name] = calibrate.score(_judging(posed, fitted), problem.model, watch, settings)
     shown = None if noise is None else noise.noise
     for name, posed in ((CALIBRATED, plain), (GROUPED, grouped), (CORRECTED, grouped)):
         try:
             if name == CORRECTED:
-                posed = pose_correction(grouped, found[GROUPED].steps[-1], watch, noise)
+                posed = calibrate.pose_correction(grouped, found[GROUPED].steps[-1], watch, noise)
             else:
                 posed = replace(posed, shown=shown)
             found[name], linear = _fitted(posed, watch)
-        except TooManyFailures:  # it, and the richer ones that begin from it, are left out
+        except calibrate.TooManyFailures:  # it, and the richer ones that begin from it, are left out
             break
         last = found[name].steps[-1]
-        model, settings = population_model(posed, last), population_settings(posed, last)
-        noise = fitted_noise(posed, model, settings, watch, errors=False)
+        model, settings = calibrate.population_model(posed, last), calibrate.population_settings(posed, last)
+        noise = calibrate.fitted_noise(posed, model, settings, watch, errors=False)
         scores[name] = _folds(found[name], linear, noise, watch)
     return compared(scores), found
 
 
-def _fitted(problem: Problem, watch: Watch) -> tuple[Fitted, Linear]:
+def _fitted(problem: calibrate.Problem, watch: Watch) -> tuple[Fitted, calibrate.Linear]:
     """A calibration on all fitted tracks, and these tracks as linearised about its last step but one."""
-    steps = [first_step(problem)]
+    steps = [calibrate.first_step(problem)]
     while True:
-        linear = linearised(problem, steps[-1], watch)
-        steps.append(advanced(problem, steps[-1], linear))
-        if has_ended(problem.config, steps[-1]):
+        linear = calibrate.linearised(problem, steps[-1], watch)
+        steps.append(calibrate.advanced(problem, steps[-1], linear))
+        if calibrate.has_ended(problem.config, steps[-1]):
             return Fitted(problem, tuple(steps)), linear
 
 
-def _folds(fitted: Fitted, linear: Linear, noise: NoiseEstimate | None, watch: Watch) -> tuple[TrackScore | None, ...]:
+def _folds(
+    fitted: Fitted, linear: calibrate.Linear, noise: NoiseEstimate | None, watch: Watch
+) -> tuple[TrackScore | None, ...]:
     """Scores of the fitted tracks, each by the population of the other folds, with the noise of all."""
     problem, found = fitted.problem, dict[str, TrackScore | None]()
     names = problem.split.fit
     for k in range(min(FOLDS, len(names))):
         held = names[k::FOLDS]
-        step = advanced(problem, fitted.steps[-2], linear.without(held))
-        settings = population_settings(problem, step)
+        step = calibrate.advanced(problem, fitted.steps[-2], linear.without(held))
+        settings = calibrate.population_settings(problem, step)
         if noise is not None:
             factor, own = noise.coefficient_factor, settings.coefficients
             spreads = {name: factor * own[name] for name in noise.noise.coefficients}
             settings = with_noise(settings, replace(noise.noise, coefficients=spreads))
-        judged = score(_judging(problem, held), population_model(problem, step), watch, settings)
+        judged = calibrate.score(_judging(problem, held), calibrate.population_model(problem, step), watch, settings)
         found |= zip(held, judged, strict=True)
     return tuple(found[name] for name in names)
 
 
-def _judging(problem: Problem, names: Sequence[str]) -> Problem:
+def _judging(problem: calibrate.Problem, names: Sequence[str]) -> calibrate.Problem:
     near = min(NEAR, np.inf if problem.config.horizon is None else problem.config.horizon)
     config = problem.config.model_copy(update={"horizon": near})
     return replace(problem, config=config, split=replace(problem.split, judge=tuple(names)))

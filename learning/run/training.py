@@ -1,7 +1,5 @@
 """Runs a training from config to model, in each process of `ballfg-train`."""
 
-from __future__ import annotations
-
 import io
 from contextlib import ExitStack, redirect_stderr, redirect_stdout
 from functools import partial
@@ -88,7 +86,7 @@ def _built(ranks: Ranks, config: TrainConfig) -> Prepared:
 
 def _record(
     training: Training, folder: Path, checkpoint: Checkpoint | None, command: str, start: Start | None
-) -> Record:
+) -> "Record":
     """Pictures and TensorBoard take half a second to import; processes other than the first do without."""
     from ballfg.learning.run.record import Record
 

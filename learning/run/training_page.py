@@ -8,19 +8,7 @@ from matplotlib.figure import Figure
 from ballfg.arrays import Array
 from ballfg.learning.run.metrics import Epoch
 from ballfg.learning.trainee import Learned, PredictedShot
-from ballfg.pages.html import (
-    Html,
-    doubtful,
-    explained,
-    items,
-    meanings,
-    picture,
-    section,
-    table,
-    tag,
-    typed,
-    whole_page,
-)
+from ballfg.pages import html
 
 MEASURED, PREDICTED = "#8c8c8c", "#0072b2"
 TERMS = {
@@ -100,24 +88,24 @@ def page(
     """
     first = f"{verdict(epochs, best_epoch)} {beside}".strip()
     caption = "Loss (a pure number) and root mean square errors (mm) after each epoch. An axis of powers of ten is "
-    made = [(name, typed(said) if name == "command" else said) for name, said in origin.items()]
+    made = [(name, html.typed(said) if name == "command" else said) for name, said in origin.items()]
     made.append(("config", "config.yaml beside this page, with every default"))
     rows = [(o.name, f"{o.before:.4g}", f"{o.after:.4g}", o.unit or "a pure number", o.meaning) for o in learned]
     head = ("number", "before", "after", "unit", "what it is")
-    return whole_page(
+    return html.whole_page(
         f"training: {title}",
-        tag("header", tag("p", title), tag("h1", first), doubtful(doubts)),
-        section("What to do next", *_next(improved(epochs, best_epoch), next_command)),
+        html.tag("header", html.tag("p", title), html.tag("h1", first), html.doubtful(doubts)),
+        html.section("What to do next", *_next(improved(epochs, best_epoch), next_command)),
         _numbers(epochs, best_epoch),
-        section("The course of the training", picture(curves, f"{caption}logarithmic.")),
+        html.section("The course of the training", html.picture(curves, f"{caption}logarithmic.")),
         _shot(shot),
-        section("What was learned of noise, spin and coefficients", table(head, rows)),
-        section("Where this page comes from", table(("", ""), made)),
-        section("What the words mean", meanings(TERMS)),
+        html.section("What was learned of noise, spin and coefficients", html.table(head, rows)),
+        html.section("Where this page comes from", html.table(("", ""), made)),
+        html.section("What the words mean", html.meanings(TERMS)),
     )
 
 
-def _next(better: bool | None, command: str) -> list[Html]:
+def _next(better: bool | None, command: str) -> list[html.Html]:
     parts = []
     if better is False:
         lines = (
@@ -126,13 +114,13 @@ def _next(better: bool | None, command: str) -> list[Html]:
             "Train longer (optimizer.epochs) if the errors still fell at the end.",
             "Take more tracks if the error of the training tracks falls and that of the validation tracks rises.",
         )
-        parts += [items(lines)]
+        parts += [html.items(lines)]
     if command:
-        parts += [tag("p", "Use the model that was written:"), tag("pre", typed(command))]
+        parts += [html.tag("p", "Use the model that was written:"), html.tag("pre", html.typed(command))]
     return parts
 
 
-def _numbers(epochs: Sequence[Epoch], best_epoch: int) -> Html:
+def _numbers(epochs: Sequence[Epoch], best_epoch: int) -> html.Html:
     chosen = dict.fromkeys((epochs[0].epoch, best_epoch, epochs[-1].epoch))
     names = {epochs[-1].epoch: "last", best_epoch: "best, written", epochs[0].epoch: "before the first step"}
     by_number, rows = {e.epoch: e for e in epochs}, []
@@ -141,17 +129,17 @@ def _numbers(epochs: Sequence[Epoch], best_epoch: int) -> Html:
         errors = ["–" if rmse is None else f"{1e3 * rmse:.1f} mm" for rmse in (one.train_rmse, one.validation_rmse)]
         rows.append((f"{number}: {names[number]}", *errors, "–" if one.loss is None else f"{one.loss:.4g}"))
     head = (
-        explained("epoch", TERMS["epoch"]),
-        explained("RMSE, training tracks", TERMS["RMSE"]),
-        explained("RMSE, validation tracks", TERMS["validation"]),
-        explained("loss", TERMS["loss"]),
+        html.explained("epoch", TERMS["epoch"]),
+        html.explained("RMSE, training tracks", TERMS["RMSE"]),
+        html.explained("RMSE, validation tracks", TERMS["validation"]),
+        html.explained("loss", TERMS["loss"]),
     )
-    return section("How good the model is", table(head, rows))
+    return html.section("How good the model is", html.table(head, rows))
 
 
-def _shot(shot: PredictedShot | None) -> Html:
+def _shot(shot: PredictedShot | None) -> html.Html:
     if shot is None:
-        return Html()
+        return html.Html()
     ahead = shot.times > 0.0
     error = np.linalg.norm(shot.predicted - shot.measured, axis=-1)
     off = 1e3 * float(np.sqrt((error[ahead] ** 2).mean())) if ahead.any() else float("nan")
@@ -166,7 +154,7 @@ def _shot(shot: PredictedShot | None) -> Html:
         f"Validation track {shot.name}, whose error is the median: the prediction is off by {off:.1f} mm (RMSE). "
         f"{observed}"
     )
-    return section("Predicted against measured", picture(_drawn(shot, error), caption))
+    return html.section("Predicted against measured", html.picture(_drawn(shot, error), caption))
 
 
 def _drawn(shot: PredictedShot, error: Array) -> Figure:

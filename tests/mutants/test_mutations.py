@@ -111,7 +111,7 @@ def test_a_constant_is_used_by_those_who_import_it(names: Names) -> None:
     compiled = {"ballfg/dynamics/compiled/beliefs/course.py"}
     assert names.frozen_in_machine_code(file, line, compiled)  # what is compiled holds its value
     text = (ROOT / "ballfg/prediction/forecast.py").read_text(encoding="utf-8").splitlines()
-    line = text.index("    def plot(self) -> Figure:") + 1
+    line = text.index('    def plot(self) -> "Figure":') + 1
     assert text[names.headed("ballfg/prediction/forecast.py", line)[-1] - 1].strip().startswith("return by_axis(")
     assert not names.headed("ballfg/prediction/forecast.py", line + 1)
     assert not names.frozen_in_machine_code("factors/noise.py", 60, compiled)

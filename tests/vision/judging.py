@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ballfg.vision.association.associate import SeenBall
+from ballfg.vision.association.gathering import SeenBall
 from ballfg.vision.association.paths import MAX_GAP
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections

@@ -1,7 +1,5 @@
 """Implements `ballfg calibrate-cameras`: images of a board and points of the table give `cameras.yaml`."""
 
-from __future__ import annotations
-
 import enum
 import json
 import re
@@ -120,7 +118,7 @@ def _grouped(option: str, words: Iterable[str]) -> dict[str, list[str]]:
 
 
 def _check_same(
-    cameras: Iterable[str], where: str, marked: TableFile | None, table: Path | None, shown: Iterable[str]
+    cameras: Iterable[str], where: str, marked: "TableFile | None", table: Path | None, shown: Iterable[str]
 ) -> None:
     """Refuses a camera that is named in only one of the two."""
     cameras = set(cameras)
@@ -134,7 +132,7 @@ def _check_same(
         raise ValueError(f"{here} names camera {name!r}, which {there} does not. Add it there, or leave it out.")
 
 
-def _board(kind: BoardKind, squares: str, square: float, marker: float, dictionary: str, legacy: bool) -> Board:
+def _board(kind: BoardKind, squares: str, square: float, marker: float, dictionary: str, legacy: bool) -> "Board":
     from ballfg.vision.calibration.boards import Charuco, Chessboard
 
     match = re.fullmatch(r"(\d+)x(\d+)", squares)
@@ -146,7 +144,7 @@ def _board(kind: BoardKind, squares: str, square: float, marker: float, dictiona
     return Charuco(columns, rows, square, marker, dictionary.upper().removeprefix("DICT_"), legacy)
 
 
-def _lens(name: str, places: Iterable[str], board: Board, distortion: int) -> Intrinsics:
+def _lens(name: str, places: Iterable[str], board: "Board", distortion: int) -> "Intrinsics":
     from ballfg.vision.calibration.boards import find_views, image_files, suggested
     from ballfg.vision.calibration.intrinsics import calibrate_intrinsics
 
@@ -160,8 +158,8 @@ def _lens(name: str, places: Iterable[str], board: Board, distortion: int) -> In
 
 
 def _placed(
-    camera: Camera, lens: Intrinsics | None, marked: TableFile | None, focal_sigma: float | None
-) -> Calibration:
+    camera: "Camera", lens: "Intrinsics | None", marked: "TableFile | None", focal_sigma: float | None
+) -> "Calibration":
     from ballfg.vision.calibration.extrinsics import calibrate_extrinsics
     from ballfg.vision.calibration.focal import pose_and_focal
     from ballfg.vision.calibration.report import Calibration
@@ -173,7 +171,7 @@ def _placed(
     return Calibration(place.camera, lens, place)
 
 
-def _write(out: Path, found: list[Calibration], shown: Mapping[str, Image], marked: TableFile | None) -> None:
+def _write(out: Path, found: "list[Calibration]", shown: "Mapping[str, Image]", marked: "TableFile | None") -> None:
     from ballfg.files.whole_file import whole_file
     from ballfg.vision.calibration.report import calibration_picture, content, summary
     from ballfg.vision.calibration.table_points import TABLE_HEIGHT

@@ -1,7 +1,5 @@
 """Implements `ballfg compile`, which makes machine code ahead of its first use, and `export`, which makes C of it."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -46,7 +44,7 @@ def compile_ahead(
     print(f"{', '.join(models)}: compiled, and kept in {cache_folder()}")
 
 
-def _parts(model: BallModel) -> list[Callable[[], object]]:
+def _parts(model: "BallModel") -> list[Callable[[], object]]:
     """The functions of an estimate, a stream and their predictions, with the settings of commands."""
     from ballfg.dynamics import Surfaces
     from ballfg.estimation import Online, Settings, Smoother, estimate_noise
@@ -63,7 +61,7 @@ def _parts(model: BallModel) -> list[Callable[[], object]]:
     return [partial(smoother.estimate, track), noise, *(online.warm_up for online in streams)]
 
 
-def _search(model: BallModel) -> None:
+def _search(model: "BallModel") -> None:
     """Looks for strokes in pictures with one candidate each, so that all functions of the search are there."""
     import numpy as np
 

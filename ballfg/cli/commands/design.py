@@ -1,7 +1,5 @@
 """Implements `ballfg design`, which chooses the next shots."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -93,7 +91,7 @@ def _say(line: str) -> None:
 
 
 def _pairs(
-    between: str | None, shrink: str | None, folder: Path | None, data: Dataset, model: AnalyticModel, jobs: int
+    between: str | None, shrink: str | None, folder: Path | None, data: "Dataset", model: "AnalyticModel", jobs: int
 ) -> Sequence[tuple[str, str]]:
     """The pairs of effects to separate: from the options, else those that a diagnosis left open; none with --shrink."""
     from ballfg.diagnosis import diagnose
@@ -115,7 +113,7 @@ def _pairs(
     return pairs_of(diagnose(data, model, jobs=jobs, watch=_say))
 
 
-def _lines(plan: ShotPlan) -> Iterator[str]:
+def _lines(plan: "ShotPlan") -> Iterator[str]:
     sides = [" ".join(side) for side in plan.sides]
     paired = zip(sides[::2], sides[1::2], strict=False)
     goal = (

@@ -1,7 +1,5 @@
 """Implements `ballfg diagnose`, which finds effects that a model lacks from the tracks of a dataset."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -104,7 +102,7 @@ def _typed(
     return shlex.join([*words, "--out", str(out)])
 
 
-def _summary(diagnosis: Diagnosis) -> Iterator[str]:
+def _summary(diagnosis: "Diagnosis") -> Iterator[str]:
     """The diagnosis in lines: the sentence, effects, errors on the held-out half, the rest."""
     from ballfg.checks import aligned
     from ballfg.diagnosis.report.headline import headline, of_population

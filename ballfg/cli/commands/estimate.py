@@ -1,7 +1,5 @@
 """Implements `ballfg estimate`, which estimates the states of every track of a dataset."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -87,8 +85,8 @@ class _Estimated:
     """The parts of an estimate that the table and the last lines need: a tenth of it, for other processes."""
 
     name: str
-    columns: list[dict[str, str | np.ndarray]]
-    status: Status
+    columns: "list[dict[str, str | np.ndarray]]"
+    status: "Status"
     notes: tuple[str, ...]
     outside: float | None
     rows: int
@@ -96,7 +94,7 @@ class _Estimated:
     flying: int
 
 
-def _estimated(model: BallModel, estimator: Estimator, track: Track) -> _Estimated:
+def _estimated(model: "BallModel", estimator: "Estimator", track: "Track") -> _Estimated:
     from ballfg.estimation.flights.estimates import in_sections
     from ballfg.estimation.out_of_distribution import out_of_distribution
     from ballfg.estimation.result import Label

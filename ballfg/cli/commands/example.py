@@ -1,7 +1,5 @@
 """Implements `ballfg example`, which writes shots for trying everything."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -67,7 +65,7 @@ def example(
         print(f"  {name}: {what}; https://github.com/{source}; licence {licence}")
 
 
-def _capture(config: SimulationConfig) -> str:
+def _capture(config: "SimulationConfig") -> str:
     """Shots one after another in one table, in a foreign program's units and axes."""
     from ballfg.simulation import simulate
 

@@ -1,7 +1,5 @@
 """Implements `ballfg import`, which turns a user's own files into a dataset."""
 
-from __future__ import annotations
-
 import sys
 from functools import partial
 from pathlib import Path
@@ -73,7 +71,7 @@ def import_(
     typer.echo(f"wrote {len(proposal.tracks)} shots, {samples} samples to {out}; look at {out / 'import.html'}")
 
 
-def _proposed(sources: list[Path], choices: Choices) -> Proposal:
+def _proposed(sources: list[Path], choices: "Choices") -> "Proposal":
     """The proposal; on a terminal the user answers the unsafe guesses."""
     from ballfg.importing.choices import AllUndecidedError, UndecidedError
     from ballfg.importing.proposal import MOST_QUESTIONS, propose
@@ -89,7 +87,7 @@ def _proposed(sources: list[Path], choices: Choices) -> Proposal:
     return propose(sources, choices)
 
 
-def _answered(question: UndecidedError, choices: Choices) -> Choices:
+def _answered(question: "UndecidedError", choices: "Choices") -> "Choices":
     from ballfg.importing.choices import decided
 
     default = question.choices[0] if question.choices else None
@@ -98,7 +96,7 @@ def _answered(question: UndecidedError, choices: Choices) -> Choices:
     return decided(choices, question.option, answer)
 
 
-def _show(proposal: Proposal) -> None:
+def _show(proposal: "Proposal") -> None:
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text

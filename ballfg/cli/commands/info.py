@@ -1,7 +1,5 @@
 """Implements `ballfg info`, `balls` and `effects`, which list what is installed, registered and known."""
 
-from __future__ import annotations
-
 import importlib
 import math
 import os
@@ -158,7 +156,7 @@ def effects(
             typer.echo(f"{name:<24}{effect.kind:<13}{effect.belongs_to:<6}{effect.plain or name.replace('_', ' ')}")
 
 
-def _described(effect: type[Effect]) -> Iterator[str]:
+def _described(effect: "type[Effect]") -> Iterator[str]:
     yield f"{effect.name}: {effect.plain or effect.name.replace('_', ' ')}, an effect of {effect.kind}"
     told = {
         "what": effect.sentence,

@@ -1,7 +1,5 @@
 """Implements `ballfg live`, which answers measured positions with states and predictions in real time."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal
@@ -126,7 +124,7 @@ def _check_out(out: Path) -> None:
         raise ValueError(f"out must be JSON lines or a bag in MCAP; got {out}. Let its name end in .jsonl or .mcap.")
 
 
-def _dataset(folder: Path | None) -> Dataset | None:
+def _dataset(folder: Path | None) -> "Dataset | None":
     """The dataset of a replay, or the one named as similar to the stream."""
     if folder is None:
         return None
@@ -141,13 +139,13 @@ def _dataset(folder: Path | None) -> Dataset | None:
 
 
 def _scene(
-    data: Dataset | None,
+    data: "Dataset | None",
     model: Path | None,
     named: str | None,
     table: float | None,
     noise: float | None,
     group: str | None,
-) -> tuple[BallModel, Surfaces, Settings]:
+) -> "tuple[BallModel, Surfaces, Settings]":
     """Ball, surfaces, noise and the group of shots: the dataset's, or the options'."""
     from dataclasses import replace
 
@@ -179,8 +177,8 @@ def _source(
     idle: float,
     speed: float,
     topic: str | None,
-    data: Dataset | None,
-) -> Source:
+    data: "Dataset | None",
+) -> "Source":
     from ballfg.checks import check_number
     from ballfg.live.sources.bag import bag_samples
     from ballfg.live.sources.sockets import listen as listened
@@ -197,7 +195,7 @@ def _source(
 
 
 @contextlib.contextmanager
-def _output(out: Path | None, source: Source) -> Iterator[Callable[[bytes], None]]:
+def _output(out: Path | None, source: "Source") -> Iterator[Callable[[bytes], None]]:
     """The output of lines: standard output, a recording, or none beside a bag."""
     if out is None:
         stream = sys.stdout.buffer
@@ -217,7 +215,7 @@ def _output(out: Path | None, source: Source) -> Iterator[Callable[[bytes], None
 
 
 @contextlib.contextmanager
-def _watchers(out: Path | None, viewer: bool, horizon: float) -> Iterator[list[Watcher]]:
+def _watchers(out: Path | None, viewer: bool, horizon: float) -> "Iterator[list[Watcher]]":
     with contextlib.ExitStack() as stack:
         found: list[Watcher] = []
         if out is not None and out.suffix == MCAP:
@@ -231,7 +229,7 @@ def _watchers(out: Path | None, viewer: bool, horizon: float) -> Iterator[list[W
         yield found
 
 
-def _run(session: Session, inbox: Inbox) -> None:
+def _run(session: "Session", inbox: "Inbox") -> None:
     """Runs until the input ends, the output closes, or a signal comes: the first finishes the present sample."""
 
     def stop(number: int, frame: object) -> None:

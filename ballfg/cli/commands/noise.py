@@ -1,7 +1,5 @@
 """Implements `ballfg noise`, which estimates the noise of a dataset's tracks, with error bars."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -95,7 +93,7 @@ def noise(
     _write(found, data, ball, out, write)
 
 
-def check_known(found: NoiseEstimate, dataset: Path) -> None:
+def check_known(found: "NoiseEstimate", dataset: Path) -> None:
     """Refuses noise that the tracks do not show, or that no ball has. Raises: ValueError."""
     positions = [error for name, error in found.relative_errors.items() if name.startswith("position")]
     unknown = min(positions, default=0.0) >= PRIOR
@@ -113,7 +111,7 @@ def check_known(found: NoiseEstimate, dataset: Path) -> None:
         )
 
 
-def _table(found: NoiseEstimate) -> list[str]:
+def _table(found: "NoiseEstimate") -> list[str]:
     content: dict[str, Any] = found.noise.to_mapping() | {"coefficients": found.coefficient_factor}
     lines = []
     for name, error in found.relative_errors.items():
@@ -135,7 +133,7 @@ def _limits(low: float, high: float) -> str:
     return f"  ({low:.2g} to {high:.2g})" if low > 0.0 else f"  (below {high:.2g})"
 
 
-def _write(found: NoiseEstimate, data: Dataset, ball: BallModel, out: Path | None, write: bool) -> None:
+def _write(found: "NoiseEstimate", data: "Dataset", ball: "BallModel", out: Path | None, write: bool) -> None:
     from dataclasses import replace
 
     from ballfg.dynamics import save_model

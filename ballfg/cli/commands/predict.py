@@ -1,7 +1,5 @@
 """Implements `ballfg predict`, which predicts the later positions of every track from its first part."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -151,14 +149,14 @@ def predict(
 
 
 def _write_events(
-    table: TableWriter,
-    estimator: Estimator,
-    dataset: Dataset,
+    table: "TableWriter",
+    estimator: "Estimator",
+    dataset: "Dataset",
     observe: float,
-    asked: Mapping[str, Plane | str],
+    asked: "Mapping[str, Plane | str]",
     horizon: float,
     workers: int,
-    outcome: _Outcome,
+    outcome: "_Outcome",
 ) -> None:
     """A row for each track and event, by its text."""
     import numpy as np
@@ -183,12 +181,12 @@ def _write_events(
 
 def _conformal_scales(
     source: Path,
-    dataset: Dataset,
-    estimator: Estimator,
+    dataset: "Dataset",
+    estimator: "Estimator",
     method: str,
     observe: float,
     jobs: int,
-) -> ConformalScales:
+) -> "ConformalScales":
     """Scales from the calibration tracks of a folder, or from a file of scales."""
     from ballfg.estimation import ConformalScales, predict_tracks
     from ballfg.estimation.conformal import check_calibration_tracks, load_conformal
@@ -209,7 +207,7 @@ def _conformal_scales(
     return ConformalScales.of(watched, calibration.info.name, observe, method)
 
 
-def _print_conformal(scales: ConformalScales, outcome: _Outcome) -> None:
+def _print_conformal(scales: "ConformalScales", outcome: "_Outcome") -> None:
     """Prints the coverage of the intervals, on calibration and predicted tracks, and where they are infinite."""
     from ballfg.estimation import Status
     from ballfg.estimation.conformal import BIN, FEWEST
@@ -247,7 +245,7 @@ class _Outcome:
     shares: float = 0.0
     tracks: Outcome = field(default_factory=Outcome)
 
-    def add(self, result: TrackPrediction, own_sigmas: np.ndarray) -> None:
+    def add(self, result: "TrackPrediction", own_sigmas: "np.ndarray") -> None:
         """Counts a track, with the coordinates inside their finite 90 % intervals."""
         import numpy as np
 

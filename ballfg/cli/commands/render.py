@@ -1,7 +1,5 @@
 """Implements `ballfg render`, which films simulated balls over a table, with their true states."""
 
-from __future__ import annotations
-
 import re
 from functools import partial
 from pathlib import Path
@@ -92,7 +90,7 @@ def render(
 
 def _clocks(
     names: list[str], rate: float, seed: int, offsets: tuple[str, ...] | list[str], *, unsynchronised: bool
-) -> dict[str, Clock]:
+) -> "dict[str, Clock]":
     from dataclasses import replace
 
     from ballfg.simulation.scene.config import Clock

@@ -1,7 +1,5 @@
 """Implements `ballfg show`, which writes a page of shots, estimates, predictions and a diagnosis."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -92,7 +90,7 @@ def _rally(given: list[Path]) -> tuple[Path, Path | None] | None:
     return folders[0], videos[0] if videos else None
 
 
-def _dataset(folder: Path) -> Dataset | SightedDataset:
+def _dataset(folder: Path) -> "Dataset | SightedDataset":
     """The tracks of a folder; roughly triangulated ones if there are only detections."""
     from ballfg.tracks.dataset import has_positions, read_dataset
 
@@ -122,7 +120,7 @@ def _check_outputs(out: Path | None, png: Path | None, rerun: Path | None) -> No
         check_rerun()
 
 
-def _write_picture(shown: Shown, png: Path) -> None:
+def _write_picture(shown: "Shown", png: Path) -> None:
     from ballfg.pages.pictures import views
 
     if not shown.shots:

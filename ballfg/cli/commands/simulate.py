@@ -1,7 +1,5 @@
 """Implements `ballfg simulate`, which writes synthetic tracks, with or without undeclared effects."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -82,7 +80,7 @@ def simulate(
     typer.echo(f"wrote the truth to {out}: truth.{file_format}, truth.yaml (undeclared effects: {names})")
 
 
-def _ball(name: str, model: Path | None) -> BallKind:
+def _ball(name: str, model: Path | None) -> "BallKind":
     from ballfg.dynamics import AnalyticModel, load_model
     from ballfg.simulation.balls import ball_kind, with_model
 

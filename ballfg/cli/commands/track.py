@@ -1,7 +1,5 @@
 """Implements `ballfg track`, which turns videos of calibrated cameras into tracks."""
 
-from __future__ import annotations
-
 import enum
 import os
 from collections.abc import Sequence
@@ -93,16 +91,8 @@ def track(
     from ballfg.tracks.info import DatasetInfo
     from ballfg.vision.camera_file import read_cameras
     from ballfg.vision.detection.detections import read_detections
+    from ballfg.vision.tracking import pipeline
     from ballfg.vision.tracking.dataset import check_result_folder, write_tracking
-    from ballfg.vision.tracking.pipeline import (
-        blind_cameras,
-        check_rig,
-        disagreement,
-        no_ball,
-        summary,
-        track_detections,
-        without as others,
-    )
 
     kind = ball_kind(ball)
     if cameras is None:
@@ -116,12 +106,12 @@ def track(
         check_result_folder(out, [cameras, *(Path(text) for text in recordings)], force=force)
         files = " ".join(Path(text).name for text in recordings)
         info = DatasetInfo(name or out.resolve().name, height, kind.ball, source=f"ballfg track {files}")
-        rig = others(read_cameras(cameras), without or ())
+        rig = pipeline.without(read_cameras(cameras), without or ())
         floor = kind.surfaces.floor_height
         floor = None if floor is None else floor + height - kind.surfaces.table_height
         surfaces = replace(kind.surfaces, table_height=height, floor_height=floor)
         if len(rig) != 1:
-            check_rig(rig)
+            pipeline.check_rig(rig)
         elif time_offsets:
             raise ValueError("--time-offsets needs two cameras: they are relative to the first. Leave it out.")
         streams: Streams | None = None
@@ -138,11 +128,11 @@ def track(
             print_notes(strokes.doubts)
             info = replace(info, table_extent=surfaces.extent)
         else:
-            tracking = track_detections(detections, rig)
+            tracking = pipeline.track_detections(detections, rig)
         if time_offsets and tracking.balls:
             tracking = _on_one_clock(tracking, kind.model, surfaces)
-        print_notes(blind_cameras(tracking))
-        if (doubt := disagreement(tracking)) is not None:
+        print_notes(pipeline.blind_cameras(tracking))
+        if (doubt := pipeline.disagreement(tracking)) is not None:
             print_notes([doubt])
         info = replace(info, rate=tracking.rate)
         written = write_tracking(
@@ -150,16 +140,18 @@ def track(
         )
         if not tracking.balls:
             pictures = [one for one in written if not one.endswith((".csv", ".yaml"))]
-            raise ValueError(f"{no_ball(tracking)} {out} holds an empty dataset; look at {', '.join(pictures)} there.")
+            raise ValueError(
+                f"{pipeline.no_ball(tracking)} {out} holds an empty dataset; look at {', '.join(pictures)} there."
+            )
         points = sum(len(ball.times) for ball in tracking.balls)
         print(f"{out}: {len(tracking.balls)} tracks of {points} points; wrote {', '.join(written)}")
-        print(*summary(tracking), sep="\n")
+        print(*pipeline.summary(tracking), sep="\n")
 
 
 def _moving_camera(
     recordings: Sequence[str],
     out: Path,
-    kind: BallKind,
+    kind: "BallKind",
     court: str,
     corners: Path | None,
     candidates: Path | None,
@@ -241,13 +233,13 @@ def _refuse(**options: object) -> None:
 
 def _from_videos(
     recordings: Sequence[str],
-    rig: Sequence[Camera],
+    rig: "Sequence[Camera]",
     stamps: Sequence[str],
     colour: Colour | None,
     detector: str | None,
     jobs: int | None,
     without: Sequence[str],
-) -> tuple[list[Detections], Streams]:
+) -> "tuple[list[Detections], Streams]":
     """The detections, and a function that gives each video's frames again."""
     from ballfg.vision.detection.detect import learn_detector, load_detector
     from ballfg.vision.detection.detector import DetectorSettings
@@ -263,7 +255,7 @@ def _from_videos(
     return found, [open_video(path, files.get(name)).frames for name, path in videos.items()]
 
 
-def _on_one_clock(tracking: Tracking, model: AnalyticModel, surfaces: Surfaces) -> Tracking:
+def _on_one_clock(tracking: "Tracking", model: "AnalyticModel", surfaces: "Surfaces") -> "Tracking":
     """The same candidates with time offsets of the cameras estimated from the balls."""
     from ballfg.estimation import Settings, estimate_time_offsets, sighted_track
     from ballfg.vision.tracking.pipeline import disagreement, track_detections

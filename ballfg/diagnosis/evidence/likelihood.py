@@ -5,8 +5,6 @@ unknowns have their priors; with them integrated out too the likelihood is the e
 approximation.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -45,7 +43,7 @@ class Noise:
         return np.array([self.white, *self.spin, *self.random])
 
     @classmethod
-    def of(cls, vector: Array) -> Noise:
+    def of(cls, vector: Array) -> "Noise":
         """The noise of (9,) logarithms."""
         spin, random = vector[1 : 1 + SPIN_KINDS], vector[1 + SPIN_KINDS :]
         return cls(float(vector[0]), tuple(spin.tolist()), tuple(random.tolist()))
@@ -63,12 +61,12 @@ class Reduced:
     constant: Array
     gram: Array
 
-    def by_track(self, track: Index) -> Reduced:
+    def by_track(self, track: Index) -> "Reduced":
         """Summed over the stretches of each track; track: (n,) their numbers."""
         gram = by_track(self.gram, track)
         return Reduced(by_track(self.constant[:, None, None], track)[:, 0, 0], gram)
 
-    def of(self, tracks: Mask) -> Reduced:
+    def of(self, tracks: Mask) -> "Reduced":
         """The part of some tracks, summed."""
         return Reduced(self.constant[tracks].sum(keepdims=True), self.gram[tracks].sum(axis=0, keepdims=True))
 
@@ -104,7 +102,7 @@ class Posterior:
         """Gain in the logarithm of the density by the step of the first `own` unknowns to their mean; None: of all."""
         return 0.5 * float(self.mean[:own] @ np.linalg.solve(self.covariance[:own, :own], self.mean[:own]))
 
-    def held(self, own: int | None = None) -> Posterior:
+    def held(self, own: int | None = None) -> "Posterior":
         """The same with the density of the tracks where the first `own` unknowns are, and the others follow them."""
         gain, follow = self.gain(own), self.covariance[:, :own] @ np.linalg.inv(self.covariance[:own, :own])
         mean = self.mean - follow @ self.mean[:own]
@@ -192,14 +190,14 @@ class Likelihood:
         right = total[:, :end, -1] - total[:, :end, end:-1] @ common
         return np.asarray(np.linalg.solve(total[:, :end, :end], right[..., None])[..., 0])
 
-    def reweighted(self, noise: Noise) -> Likelihood:
+    def reweighted(self, noise: Noise) -> "Likelihood":
         """With the robust weights of the residual that remains beside the motion, all common unknowns as they are."""
         common = np.zeros(self.rows.by_common.shape[-1])
         motion = self.local_step(noise, common)
         kept = np.broadcast_to(np.append(common, 1.0), (len(motion), len(common) + 1))
         return self.beside(np.concatenate((-motion, kept), axis=1), noise)
 
-    def beside(self, along: Array, noise: Noise) -> Likelihood:
+    def beside(self, along: Array, noise: Noise) -> "Likelihood":
         """With the robust weights of a residual, the sum of columns by factors (n, d)."""
         r, end = self.rows, STATE_DIM + self.rows.kinds.shape[1]
         start, random, common = along[:, :STATE_DIM], along[:, STATE_DIM:end], along[:, end:-1]
@@ -215,7 +213,7 @@ class Batches:
     parts: tuple[Likelihood, ...]
 
     @classmethod
-    def of(cls, rows: Sequence[Rows], weights: Sequence[Weights] | None = None) -> Batches:
+    def of(cls, rows: Sequence[Rows], weights: Sequence[Weights] | None = None) -> "Batches":
         """The likelihood of rows; weights: of each batch, one if None."""
         if weights is None:
             return cls(tuple(unweighted(batch) for batch in rows))
@@ -238,11 +236,11 @@ class Batches:
         constant, gram = (np.concatenate([getattr(r, name) for r, _ in found])[order] for name in ("constant", "gram"))
         return Reduced(constant, gram), [local for _, local in found]
 
-    def reweighted(self, noise: Noise) -> Batches:
+    def reweighted(self, noise: Noise) -> "Batches":
         """As of `Likelihood`."""
         return Batches(tuple(part.reweighted(noise) for part in self.parts))
 
-    def beside(self, along: Sequence[Array], noise: Noise) -> Batches:
+    def beside(self, along: Sequence[Array], noise: Noise) -> "Batches":
         """As of `Likelihood`, by the factors of each batch."""
         return Batches(tuple(part.beside(own, noise) for part, own in zip(self.parts, along, strict=True)))
 

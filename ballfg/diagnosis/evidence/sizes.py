@@ -3,8 +3,6 @@
 What a wrong model cannot explain counts as its noise.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final

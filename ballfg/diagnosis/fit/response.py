@@ -7,8 +7,6 @@ thus serves every pattern of forces. The columns of P for velocity and spin are 
 contact.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -86,7 +84,7 @@ class ArcResponse:
         return self.positions[..., VELOCITY.start :]
 
 
-def fitted_path(fit: Fit) -> FittedPath:
+def fitted_path(fit: "Fit") -> FittedPath:
     """The motion at a fit's minimum."""
     stretches = fit.problem.stretches
     with torch.no_grad():
@@ -98,20 +96,20 @@ def fitted_path(fit: Fit) -> FittedPath:
     return FittedPath(motion, times, states)
 
 
-def responses(fit: Fit, path: FittedPath) -> Iterator[ArcResponse]:
+def responses(fit: "Fit", path: FittedPath) -> Iterator[ArcResponse]:
     """The responses of all arcs, in order of time; path: `fitted_path(fit)`."""
     for number, arc in enumerate(path.motion.arcs):
         for part in torch.split(torch.arange(len(arc.rows)), MOST_STRETCHES):
             yield _arc_response(fit, path, number, part)
 
 
-def weighted(fit: Fit, positions: Array, rows: Index) -> Array:
+def weighted(fit: "Fit", positions: Array, rows: Index) -> Array:
     """(m, 3 k + 3, p) rows as in the fit's system, from derivatives (m, k, 3, p) of positions; zero for labels."""
     moved = fit.position_rows(positions, rows)
     return np.concatenate((moved, np.zeros((len(rows), 3, positions.shape[-1]))), axis=1)
 
 
-def _arc_response(fit: Fit, path: FittedPath, number: int, part: Tensor) -> ArcResponse:
+def _arc_response(fit: "Fit", path: FittedPath, number: int, part: Tensor) -> ArcResponse:
     arc = path.motion.arcs[number]
     rows, begun = arc.rows[part], arc.begun[part]
     contacts, until = path.motion.contacts[rows, number:], path.times[-1, rows]
@@ -145,7 +143,7 @@ def _at(arc: Arc, rows: Tensor, times: Tensor) -> Array:
     return np.asarray(arc.states(asked.unsqueeze(0))[0, where].numpy())
 
 
-def _shot(fit: Fit, path: FittedPath, number: int, part: Tensor, nodes: Tensor) -> tuple[Array, Array, Array]:
+def _shot(fit: "Fit", path: FittedPath, number: int, part: Tensor, nodes: Tensor) -> tuple[Array, Array, Array]:
     """A shot from an arc's first state: states at nodes, and two derivatives by that first state.
 
     Returns: states (m, q, 9), their derivatives (m, q, 9, 9), those of the measured positions (m, k, 3, 9).

@@ -4,7 +4,7 @@ Derivatives are torch's forward mode: the batch is repeated once per direction, 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -108,96 +108,85 @@ def sensitivity(
     """
     wanted = [_Direction(component=number) for number in range(STATE_DIM if by_start else 0)]
     wanted += [_Direction(None, name, shape) for name, shape in zip(names, shapes or [{}] * len(names), strict=True)]
+    asked = _Asked(model, stretches, starts, values, wanted)
     # a fit takes many steps with one model, a score test one step each with many
     functions = compiled(model) if by_start and not shapes else None
     if functions is not None:
         positions, labels = np.zeros((*stretches.positions.shape, len(wanted))), np.zeros((len(starts), 3, len(wanted)))
         for rows, count in of_similar_length(stretches.used.numpy()):
-            part, own = stretches.take(rows).cropped(count), {n: _of_rows(value, rows) for n, value in values.items()}
-            found = _compiled_derivatives(functions, model, part, starts[rows], own, wanted)
+            found = _compiled_derivatives(functions, asked.of_rows(rows, count))
             positions[rows, :count], labels[rows] = found.positions, found.labels
         return Sensitivity(positions, labels)
     size = max(1, most_rows // len(stretches))
-    parts = [
-        _derivatives(model, stretches, starts, values, wanted[first : first + size])
-        for first in range(0, len(wanted), size)
-    ]
+    parts = [_derivatives(replace(asked, wanted=wanted[first : first + size])) for first in range(0, len(wanted), size)]
     both = ([getattr(part, name) for part in parts] for name in ("positions", "labels"))
     return Sensitivity(*(np.concatenate(one, axis=-1) for one in both))
 
 
-def _of_rows(value: float | Array, rows: Index) -> float | Array:
-    """A coefficient of some rows: one number for all, or (n,) one for each."""
-    return value[rows] if isinstance(value, np.ndarray) and value.ndim else value
+@dataclass(frozen=True)
+class _Asked:
+    """The arguments of `sensitivity`, with the directions of the derivatives."""
+
+    model: BallModel
+    stretches: Stretches
+    starts: Array
+    values: Mapping[str, float | Array]
+    wanted: Sequence[_Direction]
+
+    def of_rows(self, rows: Index, count: int) -> "_Asked":
+        """The same of some stretches, with `count` samples each."""
+        own = {n: v[rows] if isinstance(v, np.ndarray) and v.ndim else v for n, v in self.values.items()}
+        part = self.stretches.take(rows).cropped(count)
+        return replace(self, stretches=part, starts=self.starts[rows], values=own)
+
+    def repeated(self) -> tuple[Stretches, BallModel, Tensor]:
+        """Stretches, model and first states (d n, 9), repeated direction by direction, as dual numbers."""
+        n, d = len(self.stretches), len(self.wanted)
+        repeated = self.stretches.take(np.tile(np.arange(n), d))
+        state = torch.from_numpy(np.tile(self.starts, (d, 1)))
+        state_tangent = torch.zeros_like(state)
+        primals = {name: _column(value, n).repeat(d, 1) for name, value in self.values.items()}
+        tangents = {name: torch.zeros(n * d, 1, dtype=torch.float64) for name in self.values}
+        for block, direction in enumerate(self.wanted):
+            rows = slice(block * n, (block + 1) * n)
+            if direction.component is not None:
+                state_tangent[rows, direction.component] = 1.0
+            if direction.name is not None:
+                tangents[direction.name][rows] = 1.0
+            for name, value in direction.values.items():
+                primals[name][rows] = value
+        columns = {name: make_dual(primals[name], tangents[name]) for name in self.values}
+        return repeated, substitute(self.model, columns), make_dual(state, state_tangent)
 
 
-def _compiled_derivatives(
-    functions: CompiledModel,
-    model: BallModel,
-    stretches: Stretches,
-    starts: Array,
-    values: Mapping[str, float | Array],
-    wanted: Sequence[_Direction],
-) -> Sensitivity:
+def _compiled_derivatives(functions: CompiledModel, asked: _Asked) -> Sensitivity:
     """All derivatives with the motion in machine code; measurement effects stay in torch."""
+    model, stretches, starts, wanted = asked.model, asked.stretches, asked.starts, asked.wanted
     n, d = len(stretches), len(wanted)
     moved = np.zeros((*starts.shape, d))
     for block, direction in enumerate(wanted):
         if direction.component is not None:
             moved[:, direction.component, block] = 1.0
     with torch.no_grad():
-        times = _true_times(with_values(model, values, n), stretches)
-    known = coefficients_of(model, n, values, wanted)
+        times = _true_times(with_values(model, asked.values, n), stretches)
+    known = coefficients_of(model, n, asked.values, wanted)
     shot = shoot_compiled(functions, known, starts, moved, stretches.heights, stretches.contacts, times[-1])
     motion = RepeatedMotion(shot.arcs, n, d, 1 if model.measures_plainly else 3)
     if model.measures_plainly:
         return Sensitivity(motion.states(times)[1].numpy(), moved[:, SPIN])
     with dual_level():
-        repeated, dual, state = _repeated(model, stretches, starts, values, wanted)
+        repeated, dual, state = asked.repeated()
         return Sensitivity(*_measured(dual, motion, _true_times(dual, repeated), state))
 
 
-def _derivatives(
-    model: BallModel,
-    stretches: Stretches,
-    starts: Array,
-    values: Mapping[str, float | Array],
-    wanted: Sequence[_Direction],
-) -> Sensitivity:
+def _derivatives(asked: _Asked) -> Sensitivity:
     with dual_level():
-        repeated, dual, state = _repeated(model, stretches, starts, values, wanted)
-        times = _true_times(dual, repeated)
+        repeated, dual, state = asked.repeated()
+        times, d = _true_times(dual, repeated), len(asked.wanted)
         motion = shoot(dual, state, repeated.heights, repeated.contacts, times[-1].detach())
-        d = len(wanted)
         arcs = [MovedArc.of_dual(arc, d) for arc in motion.arcs]
-        moved = RepeatedMotion(arcs, len(stretches), d, 1 if model.measures_plainly else 3)
+        moved = RepeatedMotion(arcs, len(asked.stretches), d, 1 if asked.model.measures_plainly else 3)
         return Sensitivity(*_measured(dual, moved, times, state))
-
-
-def _repeated(
-    model: BallModel,
-    stretches: Stretches,
-    starts: Array,
-    values: Mapping[str, float | Array],
-    wanted: Sequence[_Direction],
-) -> tuple[Stretches, BallModel, Tensor]:
-    """Stretches, model and first states (d n, 9), repeated direction by direction, as dual numbers."""
-    n, d = len(stretches), len(wanted)
-    repeated = stretches.take(np.tile(np.arange(n), d))
-    state = torch.from_numpy(np.tile(starts, (d, 1)))
-    state_tangent = torch.zeros_like(state)
-    primals = {name: _column(value, n).repeat(d, 1) for name, value in values.items()}
-    tangents = {name: torch.zeros(n * d, 1, dtype=torch.float64) for name in values}
-    for block, direction in enumerate(wanted):
-        rows = slice(block * n, (block + 1) * n)
-        if direction.component is not None:
-            state_tangent[rows, direction.component] = 1.0
-        if direction.name is not None:
-            tangents[direction.name][rows] = 1.0
-        for name, value in direction.values.items():
-            primals[name][rows] = value
-    columns = {name: make_dual(primals[name], tangents[name]) for name in values}
-    return repeated, substitute(model, columns), make_dual(state, state_tangent)
 
 
 def coefficients_of(

@@ -11,21 +11,8 @@ import numpy as np
 
 from ballfg.diagnosis.fit.patterns import EVERYWHERE
 from ballfg.diagnosis.generic_test import ALARM
+from ballfg.diagnosis.report import wording
 from ballfg.diagnosis.report.origin import Origin
-from ballfg.diagnosis.report.wording import (
-    BY_GROUP,
-    DRIFT,
-    MOST_CERTAIN,
-    NONE,
-    capital,
-    fixed,
-    in_plain_words,
-    joined,
-    number,
-    plain_name,
-    probability,
-    sized,
-)
 from ballfg.diagnosis.residual_tests.label_check import LABEL
 from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Finding, Outcome, Verdict
 from ballfg.dynamics import EFFECTS
@@ -63,7 +50,9 @@ def not_shown(diagnosis: Diagnosis) -> list[Candidate]:
     if diagnosis.verdict is Verdict.UNEXPLAINED or not diagnosis.rounds:
         return []
     quiet = (
-        c for c in diagnosis.rounds[-1] if c.outcome is Outcome.NOT_NEEDED and not c.name.endswith((BY_GROUP, DRIFT))
+        c
+        for c in diagnosis.rounds[-1]
+        if c.outcome is Outcome.NOT_NEEDED and not c.name.endswith((wording.BY_GROUP, wording.DRIFT))
     )
     return [c for c in quiet if c.seen_from and all(map(math.isfinite, c.seen_from.values()))]
 
@@ -82,7 +71,7 @@ def headline(diagnosis: Diagnosis) -> str:
     elif len(effects) == 1:
         others, what = effects[0].indistinguishable_from, "With it"
         doubt = f" It may also be {_or(others)}: these tracks cannot tell." if others else ""
-        said = in_plain_words(effects[0]) + doubt
+        said = wording.in_plain_words(effects[0]) + doubt
     else:
         count = COUNTS[len(effects)] if len(effects) < len(COUNTS) else f"{len(effects)}"
         said, what = f"{count} effects are missing from the model.", "With them"
@@ -93,9 +82,9 @@ def further(diagnosis: Diagnosis) -> Iterator[str]:
     """Sentences on further findings: several effects one by one, the tracker, and unexplained patterns."""
     effects = [f for f in diagnosis.findings if f.name not in NUMBERS]
     if len(effects) > 1:
-        yield from (in_plain_words(f) for f in effects)
+        yield from (wording.in_plain_words(f) for f in effects)
     for f in (f for f in diagnosis.findings if f.name in NUMBERS):
-        said = in_plain_words(f)
+        said = wording.in_plain_words(f)
         yield f"Not an effect on the ball but noise of the measurements: {said[:1].lower()}{said[1:]}"
     if effects and diagnosis.verdict is Verdict.UNEXPLAINED:
         yield f"Something else is missing too, which no known effect explains: {where(diagnosis.unexplained.where)}."
@@ -135,7 +124,7 @@ def skewed_medians(before: Errors, after: Errors) -> tuple[float, float] | None:
 def certainty(diagnosis: Diagnosis) -> Iterator[str]:
     """The certainty of the answer: a line for each finding, or the basis for finding none."""
     for finding in diagnosis.findings:
-        yield f"{capital(plain_name(finding.name))}: {_sure(finding)}"
+        yield f"{wording.capital(wording.plain_name(finding.name))}: {_sure(finding)}"
     last = diagnosis.rounds[-1] if diagnosis.rounds else ()
     unseen = sum(c.outcome is Outcome.INVISIBLE for c in last)
     if diagnosis.verdict is Verdict.NOTHING and last:
@@ -144,24 +133,24 @@ def certainty(diagnosis: Diagnosis) -> Iterator[str]:
             f"The predictions of {diagnosis.tracks_judged_on} tracks were compared with what was measured."
         )
         quiet = {c.name: c for c in not_shown(diagnosis)}
-        if noticed := joined(tuple(_least(quiet[name]) for name in MAIN if name in quiet)):
+        if noticed := wording.joined(tuple(_least(quiet[name]) for name in MAIN if name in quiet)):
             yield f"These would have been noticed in 9 of 10 recordings like this one, from such a size on: {noticed}."
     if unseen:
         yield f"These tracks say nothing about {unseen} more effect{'s' * (unseen > 1)}, which may be there or not."
     if diagnosis.nameless > 0.5:
         yield (
             "Something that no effect of the catalogue describes is there with a probability of "
-            f"{100.0 * min(diagnosis.nameless, MOST_CERTAIN):.3g} %; named effects are needed beside it."
+            f"{100.0 * min(diagnosis.nameless, wording.MOST_CERTAIN):.3g} %; named effects are needed beside it."
         )
     if diagnosis.verdict is Verdict.UNEXPLAINED and diagnosis.unexplained.tests:
         tests = diagnosis.unexplained.tests
         of_labels = [test.p_value for test in tests if test.name == LABEL and test.p_value < ALARM]
         least = min((test.p_value for test in tests if test.name != LABEL), default=1.0)
         if least < ALARM or not of_labels:
-            said = f"Chance makes such a pattern with probability {probability(least)}."
+            said = f"Chance makes such a pattern with probability {wording.probability(least)}."
             yield f"That something is left: {_sure_word(least)}. {said}"
         for all_right in of_labels:
-            said = f"All of them are right with probability {probability(all_right)}."
+            said = f"All of them are right with probability {wording.probability(all_right)}."
             yield f"That some spin labels are wrong: {_sure_word(all_right)}. {said}"
 
 
@@ -188,7 +177,7 @@ def advice(diagnosis: Diagnosis, origin: Origin) -> Iterator[tuple[str, str]]:
         for name in (finding.name, *finding.indistinguishable_from):
             decide = finding.decide if name == finding.name else EFFECTS[name].decide if name in EFFECTS else ""
             if decide:
-                yield f"To find out whether it is {plain_name(name)}: {decide}", ""
+                yield f"To find out whether it is {wording.plain_name(name)}: {decide}", ""
     if diagnosis.verdict is Verdict.UNEXPLAINED:
         left = diagnosis.unexplained.where
         yield (
@@ -220,8 +209,8 @@ def _least(candidate: Candidate) -> str:
     """The detectable size of an effect; for a vector in any direction along the axes."""
     worst = max(candidate.seen_from, key=candidate.seen_from.__getitem__)
     size, unit = candidate.seen_from[worst], candidate.estimate[worst].unit
-    said = f"{number(100 * size, 2)} %" if unit == "1" else sized(size, unit)
-    return f"{plain_name(candidate.name)} ({said}{' along any axis' if len(candidate.seen_from) > 1 else ''})"
+    said = f"{wording.number(100 * size, 2)} %" if unit == "1" else wording.sized(size, unit)
+    return f"{wording.plain_name(candidate.name)} ({said}{' along any axis' if len(candidate.seen_from) > 1 else ''})"
 
 
 def where(words: str) -> str:
@@ -233,9 +222,11 @@ def where(words: str) -> str:
 
 def _sure(finding: Finding) -> str:
     worst = max(p for p in (finding.p_value, finding.held_out_p, 0.0) if math.isfinite(p))
-    sure = f"{_sure_word(worst)}. Chance makes a trace so strong with probability {probability(finding.p_value)}"
+    sure = (
+        f"{_sure_word(worst)}. Chance makes a trace so strong with probability {wording.probability(finding.p_value)}"
+    )
     if math.isfinite(finding.held_out_p):
-        by_chance = probability(finding.held_out_p)
+        by_chance = wording.probability(finding.held_out_p)
         sure += f"; its strength, fitted to half of the tracks, helps on the other half (by chance: {by_chance})"
     if others := finding.indistinguishable_from:
         sure += f". That something like it is there is sure; but it may be {_or(others)} as well"
@@ -247,9 +238,9 @@ def _sure_word(p: float) -> str:
 
 
 def _or(names: Sequence[str]) -> str:
-    return " or ".join(plain_name(name) for name in names)
+    return " or ".join(wording.plain_name(name) for name in names)
 
 
 def _error(diagnosis: Diagnosis) -> str:
     value = diagnosis.after.prediction_rmse_mm
-    return f"{fixed(value, 1)} mm" if math.isfinite(value) else NONE
+    return f"{wording.fixed(value, 1)} mm" if math.isfinite(value) else wording.NONE

@@ -7,24 +7,12 @@ from matplotlib.figure import Figure
 
 from ballfg.diagnosis.generic_test import ALARM
 from ballfg.diagnosis.label_verdicts import percent
-from ballfg.diagnosis.report import pictures
+from ballfg.diagnosis.report import pictures, wording
 from ballfg.diagnosis.report.candidates import invisible, noticed_from, rankings
 from ballfg.diagnosis.report.glossary import glossary, term
 from ballfg.diagnosis.report.headline import advice, answer, certainty, further, headline, where
 from ballfg.diagnosis.report.origin import Origin, packages
 from ballfg.diagnosis.report.predictions import errors, one_shot, parts_of_error
-from ballfg.diagnosis.report.wording import (
-    NONE,
-    capital,
-    fixed,
-    in_plain_words,
-    joined,
-    number,
-    odds,
-    plain_name,
-    plus_minus,
-    probability,
-)
 from ballfg.diagnosis.result import Diagnosis, Finding, Residuals, Value, Verdict
 from ballfg.dynamics import EFFECTS
 from ballfg.machine import date
@@ -96,31 +84,36 @@ def _made(diagnosis: Diagnosis, origin: Origin | None) -> Html:
 
 def _finding(finding: Finding) -> Html:
     """An added effect, its coefficients and its evidence."""
-    head = tag("h3", capital(plain_name(finding.name)), " ", tag("code", finding.name, kind="quiet"))
+    head = tag("h3", wording.capital(wording.plain_name(finding.name)), " ", tag("code", finding.name, kind="quiet"))
     values = table(
         (term("coefficient"), "value ± standard deviation"),
-        ((tag("code", name), plus_minus(value)) for name, value in finding.parameters.items()),
+        ((tag("code", name), wording.plus_minus(value)) for name, value in finding.parameters.items()),
     )
     verb = "falls" if finding.delta_bic < 0 else "rises"
     gain = "adds" if finding.held_out_gain >= 0 else "takes away"
-    others, evidence = finding.indistinguishable_from, [f"Probability that it is there: {odds(finding.probability)}."]
+    others, evidence = (
+        finding.indistinguishable_from,
+        [f"Probability that it is there: {wording.odds(finding.probability)}."],
+    )
     if others:
-        evidence.append(f"That it or one of those that cannot be told from it is there: {odds(finding.together)}.")
+        evidence.append(
+            f"That it or one of those that cannot be told from it is there: {wording.odds(finding.together)}."
+        )
     if finding.usual:
         evidence.append(f"Stronger than usual: {finding.usual}.")
-    by_chance = f" by chance, all candidates counted: {probability(finding.p_value)}."
+    by_chance = f" by chance, all candidates counted: {wording.probability(finding.p_value)}."
     bic = f" {verb} by {abs(finding.delta_bic):.0f} with it."
-    gained = f" it {gain} {number(abs(finding.held_out_gain))} of "
-    per_track = f" per track; probability of that by chance: {probability(finding.held_out_p)}."
+    gained = f" it {gain} {wording.number(abs(finding.held_out_gain))} of "
+    per_track = f" per track; probability of that by chance: {wording.probability(finding.held_out_p)}."
     evidence += [
         tag("span", "Probability of so strong a ", term("trace"), by_chance),
         tag("span", "The model's ", term("BIC"), bic),
         tag("span", "On the ", term("held-out tracks"), gained, term("log likelihood"), per_track),
-        f"Cannot be told from {joined(others)}."
+        f"Cannot be told from {wording.joined(others)}."
         if others
         else "Of the candidates that were not refused no other explains as much.",
     ]
-    words = (tag("p", in_plain_words(finding)), tag("p", finding.sentence))
+    words = (tag("p", wording.in_plain_words(finding)), tag("p", finding.sentence))
     return tag("article", head, *words, values, items(evidence), kind="card")
 
 
@@ -130,9 +123,9 @@ def _alike(diagnosis: Diagnosis) -> Html:
     for finding in (f for f in diagnosis.findings if f.indistinguishable_from):
         others = finding.indistinguishable_from
         hints = {finding.name: finding.decide} | {n: EFFECTS[n].decide for n in others if n in EFFECTS}
-        names = joined(tuple(map(plain_name, (finding.name, *others))))
+        names = wording.joined(tuple(map(wording.plain_name, (finding.name, *others))))
         words = f"These data cannot tell {names} apart. What would decide it:"
-        lines = items(tag("span", tag("b", plain_name(n)), f": {hint}") for n, hint in hints.items())
+        lines = items(tag("span", tag("b", wording.plain_name(n)), f": {hint}") for n, hint in hints.items())
         cards.append(tag("article", tag("p", words), lines, kind="card"))
     return section("What could not be told apart", *cards)
 
@@ -140,7 +133,7 @@ def _alike(diagnosis: Diagnosis) -> Html:
 def _left_over(diagnosis: Diagnosis) -> Html:
     """The remaining pattern, its tests, and a description without a name."""
     left, share = diagnosis.unexplained, ""
-    words = capital(f"{where(left.where)}.") if left.where else ""
+    words = wording.capital(f"{where(left.where)}.") if left.where else ""
     words = words or "No pattern is left that the tests can see: what remains is noise."
     if left.where and math.isfinite(left.share_of_residual):
         share = f"That is {100 * left.share_of_residual:.0f} % of the pattern that was there at the start."
@@ -148,12 +141,14 @@ def _left_over(diagnosis: Diagnosis) -> Html:
     loud = {t.name for t in alarms}
     quiet = tuple(dict.fromkeys(t.name for t in left.tests if t.name not in loud))
     head = (term("generic test"), term("by chance"), "pattern", "share of it at the start that is left")
-    shares = (f"{100 * t.share:.0f} %" if math.isfinite(t.share) else NONE for t in alarms)
-    tests = table(head, ((t.name, probability(t.p_value), t.where, s) for t, s in zip(alarms, shares, strict=True)))
-    silent = f"Tests that find nothing beyond noise: {joined(quiet)}."
+    shares = (f"{100 * t.share:.0f} %" if math.isfinite(t.share) else wording.NONE for t in alarms)
+    tests = table(
+        head, ((t.name, wording.probability(t.p_value), t.where, s) for t, s in zip(alarms, shares, strict=True))
+    )
+    silent = f"Tests that find nothing beyond noise: {wording.joined(quiet)}."
     quietly, rest = tag("p", silent, kind="quiet") if quiet else Html(), Html()
     if left.fallback is not None:
-        without, within = (fixed(e.prediction_rmse_mm, 1) for e in (left.fallback.before, left.fallback.after))
+        without, within = (wording.fixed(e.prediction_rmse_mm, 1) for e in (left.fallback.before, left.fallback.after))
         purpose = "It describes the rest without naming a cause. Prediction error on the held-out tracks:"
         title, described = tag("h3", "A stopgap: ", left.fallback.kind), tag("code", left.fallback.description)
         helps = tag("p", f"{purpose} {without} mm without, {within} mm with it.")
@@ -202,8 +197,8 @@ def _residuals(diagnosis: Diagnosis) -> Html:
 def _values(values: Mapping[str, Value]) -> Iterator[tuple[str, ...]]:
     for name, value in values.items():
         unit = "" if value.unit == "1" else f" {value.unit}"
-        declared = NONE if value.declared is None else f"{number(value.declared, 4)}{unit}"
-        yield tag("code", name), declared, plus_minus(value)
+        declared = wording.NONE if value.declared is None else f"{wording.number(value.declared, 4)}{unit}"
+        yield tag("code", name), declared, wording.plus_minus(value)
 
 
 def _in_mm(values: Mapping[str, Value]) -> dict[str, Value]:

@@ -1,23 +1,31 @@
-"""Chooses a few generic terms by sparse regression that describe an effect without a name.
+"""Describes a pattern that no named effect explains by a few generic terms, if the model then predicts better.
 
-Forward selection on projected Gram matrices: each step takes the term with the largest additional gain, until none
-exceeds its penalty. Terms that later ones made superfluous are then dropped. Source: J. Chen and Z. Chen 2008,
-"Extended Bayesian information criteria for model selection with large model spaces", with gamma = 1.
+The terms are chosen by forward selection on projected Gram matrices: each step takes the term with the largest
+additional gain, until none exceeds its penalty. Terms that later ones made superfluous are then dropped. Source: J.
+Chen and Z. Chen 2008, "Extended Bayesian information criteria for model selection with large model spaces", gamma = 1.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.fit import fit_problem
+from ballfg.diagnosis.fit.holdout import EvaluationTrack
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect
 from ballfg.diagnosis.hypotheses.signatures import hypothesis_signatures
+from ballfg.diagnosis.result import Errors, Fallback
+from ballfg.diagnosis.search.process_noise import next_shot_model, noise_about
 from ballfg.diagnosis.search.refits import with_hypothesis
+from ballfg.dynamics import AnalyticModel, BallModel
 from ballfg.dynamics.effects.registry import GENERIC
+from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.tracks import Dataset
 
+HELPS = 0.9
+"""Ratio of the prediction errors on the held-out half with and without an accepted fallback."""
 MOST_TERMS = 12
 """Largest number of terms; more describe noise, and are unreadable."""
 LEAST_LEFT = 1e-6
@@ -34,6 +42,39 @@ class SparseTerms:
     hypotheses: tuple[Hypothesis, ...]
     estimates: Mapping[str, float]
     explained: float
+
+
+def fallback(
+    before: Fit,
+    embedding: SpinEmbedding,
+    corrected: AnalyticModel,
+    dataset: Dataset,
+    parts: Sequence[EvaluationTrack],
+    now: Errors,
+    evaluate: Callable[[BallModel], Errors],
+) -> Fallback | None:
+    """A description of the rest without a name; None if nothing predicts better.
+
+    The previous fit and the tracks are those of the search half; `corrected` is the model of that fit, with its noise.
+    Its errors `now` and those from `evaluate` are those on the held-out half.
+    """
+    terms = sparse_terms(before)
+    if terms is None:
+        return None
+    after = fit_with_terms(before, terms)
+    model = next_shot_model(after, embedding, corrected)
+    model.noise = noise_about(model, parts, dataset, corrected.noise)
+    errors = evaluate(model)
+    if errors.prediction_rmse_mm >= HELPS * now.prediction_rmse_mm:
+        return None
+    return Fallback("sparse terms", describe(terms, after), now, errors, model)
+
+
+def describe(terms: SparseTerms, after: Fit) -> str:
+    """The terms with their fitted coefficients, sorted by explained residual."""
+    units = after.problem.model.declared_coefficients()
+    values = {name: after.unknowns.values[name] for name in terms.estimates}
+    return ", ".join(f"{name.split('.', 1)[1]} = {value:.3g} {units[name].unit}" for name, value in values.items())
 
 
 def sparse_terms(before: Fit) -> SparseTerms | None:

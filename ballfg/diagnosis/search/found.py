@@ -1,7 +1,5 @@
 """All models that a search has weighed, the best of them, and the steps that lead to better ones."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -55,7 +53,7 @@ class Round:
 class Found:
     """Everything weighed so far, by the names of the effects, and the best of it."""
 
-    def __init__(self, loop: SearchLoop, first: Fit) -> None:
+    def __init__(self, loop: "SearchLoop", first: Fit) -> None:
         self.loop = loop
         self.first = whole = on_all(first, on_others(first, loop.holdout.held_out))
         self.halves: Mask = unlike_halves(whole)
@@ -317,7 +315,8 @@ class Found:
         """
         whole = self.best
         while True:
-            best, score, smaller = self.best, self.scores[self.best.names], self._smaller(self.best)
+            best, score = self.best, self.scores[self.best.names]
+            smaller = {} if every else self._smaller(best)
             gone = [h for h in best.named if every or smaller.get(best.names - {h.name}, -np.inf) > score]
             least = self.most_probable(self.without([h]) for h in gone)
             if least is None or not self.is_better(least):

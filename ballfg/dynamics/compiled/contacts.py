@@ -35,15 +35,6 @@ from ballfg.dynamics.compiled.signatures import (
     several,
 )
 from ballfg.dynamics.motion import limits
-from ballfg.dynamics.motion.limits import (
-    BEYOND,
-    LEAST_FALL,
-    MAX_STEP,
-    MIN_SPEED,
-    SEARCH_STEPS,
-    TYPICAL_JERK,
-    steps_over,
-)
 
 LEAST = 1e-300  # Keeps a division by zero away
 
@@ -66,7 +57,7 @@ def _common_steps(durations):
     for duration in durations:
         if abs(duration) > longest:
             longest = abs(duration)
-    return steps_over(longest)
+    return limits.steps_over(longest)
 
 
 @machine_code(NOTHING(LAW, LAW, TWO, ONE, REAL, ONE, ONE))
@@ -80,20 +71,20 @@ def _search(rates, surface, state, heights, radius, longest, tau):
     for r in range(m):
         lost[r] = math.isnan(tau[r])
         tau[r] = 0.0 if lost[r] else tau[r]
-    for _ in range(SEARCH_STEPS):
+    for _ in range(limits.SEARCH_STEPS):
         steps, searching = _common_steps(tau), False
         for r in range(m):
             put(at, state[r])
             if tau[r] != 0.0:
                 glide(only(rates, r), at, tau[r], steps)
             gap, rate, fall = _approach(only(rates, r), only(surface, r), at, heights[r], radius)
-            used = max(fall, LEAST_FALL)
+            used = max(fall, limits.LEAST_FALL)
             square = rate * rate + 2.0 * used * gap
             root = math.sqrt(max(square, 0.0))
             comes = rate < 0.0 and square > 0.0
             move = 2.0 * gap / max(root - rate, LEAST) if comes else (rate + root) / used
-            error = (TYPICAL_JERK / 6.0 * abs(move) + abs(used - fall) / 2.0) * move * move
-            settled = abs(gap) < limits.GAP_TOLERANCE and abs(move) < MIN_SPEED
+            error = (limits.TYPICAL_JERK / 6.0 * abs(move) + abs(used - fall) / 2.0) * move * move
+            settled = abs(gap) < limits.GAP_TOLERANCE and abs(move) < limits.MIN_SPEED
             arrived[r] = (comes and error < limits.TIME_TOLERANCE * abs(rate)) or settled
             if lost[r] or not abs(tau[r] + move) <= longest[r]:
                 lost[r], tau[r] = True, 0.0
@@ -113,8 +104,8 @@ def _scan(rates, surface, state, height, radius, longest):
     at = state.copy()
     gap, rate, _ = _approach(rates, surface, at, height, radius)
     forward = not (gap < 0.0 and rate < 0.0)
-    step = MAX_STEP if forward else -MAX_STEP
-    for i in range(math.ceil(longest / MAX_STEP)):
+    step = limits.MAX_STEP if forward else -limits.MAX_STEP
+    for i in range(math.ceil(longest / limits.MAX_STEP)):
         before = gap
         glide(rates, at, step, 1)
         gap, rate, _ = _approach(rates, surface, at, height, radius)
@@ -187,7 +178,7 @@ def meet(laws, start, startt, heights, longest, radius, tau, taut, after, aftert
             Law(rates.compute, rates.c[r : r + 1], ct.reshape(1, *ct.shape), rates.w), x, later, found, by_time, steps
         )
         evaluate(Law(surface.compute, surface.c[r : r + 1], st.reshape(1, *st.shape), surface.w), x, later, o, moved)
-        speed = min(later[2, d] - moved[0, d], -MIN_SPEED)
+        speed = min(later[2, d] - moved[0, d], -limits.MIN_SPEED)
         for q in range(d):  # at the contact the gap is zero: d gap + d gap / d tau d tau = 0
             taut[r, q] = -(later[2, q] - moved[0, q]) / speed
             for i in range(9):
@@ -236,7 +227,7 @@ def travel(
     for r in range(m):
         if math.isinf(dt[r]):
             return False
-        longest[r] = abs(dt[r]) + BEYOND
+        longest[r] = abs(dt[r]) + limits.BEYOND
         for i in range(9):
             x[r, i] = start[r, i]
             if d > 0:

@@ -14,24 +14,14 @@ from torch import Tensor
 from ballfg.arrays import Array
 from ballfg.dynamics.compiled import motion
 from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.motion import limits
 from ballfg.dynamics.motion.flight_step import rk4_step
 from ballfg.dynamics.motion.integrate import batch_jacobian, fly, fly_jacobian, followed, is_plain
-from ballfg.dynamics.motion.limits import (
-    BEYOND,
-    GAP_TOLERANCE,
-    LEAST_FALL,
-    LONGEST_FALL,
-    MAX_STEP,
-    MIN_SPEED,
-    SEARCH_STEPS,
-    TIME_TOLERANCE,
-    TYPICAL_JERK,
-)
 from ballfg.state import Z
 
 
 def contact_time(
-    model: BallModel, state: Tensor, height: Tensor | float, longest: Tensor | float = LONGEST_FALL
+    model: BallModel, state: Tensor, height: Tensor | float, longest: Tensor | float = limits.LONGEST_FALL
 ) -> Tensor:
     """Time until the falling ball touches a surface, on the branch on which it moves down.
 
@@ -70,18 +60,18 @@ def _search(model: BallModel, state: Tensor, height: Tensor | float, start: Tens
     """
     tau, lost = torch.nan_to_num(start), start.isnan()
     at = state if not bool(tau.any()) else fly(model, state, tau)
-    for _ in range(SEARCH_STEPS):
+    for _ in range(limits.SEARCH_STEPS):
         h, vz = model.gap(at, height), model.gap_rate(at)
         fall = -model.gap_acceleration(at)
-        used = fall.clamp_min(LEAST_FALL)
+        used = fall.clamp_min(limits.LEAST_FALL)
         square = vz.square() + 2 * used * h
         root = square.clamp_min(0.0).sqrt()
         falling = vz < 0  # each form of the root where it does not cancel; the apex where the parabola stays below
         move = torch.where(falling & (square > 0), 2 * h / (root - vz).clamp_min(1e-300), (vz + root) / used)
-        error = (TYPICAL_JERK / 6 * move.abs() + (used - fall).abs() / 2) * move.square()
-        arrived = (falling & (square > 0) & (error < TIME_TOLERANCE * vz.abs())) | (h.abs() < GAP_TOLERANCE) & (
-            move.abs() < MIN_SPEED
-        )
+        error = (limits.TYPICAL_JERK / 6 * move.abs() + (used - fall).abs() / 2) * move.square()
+        arrived = (falling & (square > 0) & (error < limits.TIME_TOLERANCE * vz.abs())) | (
+            h.abs() < limits.GAP_TOLERANCE
+        ) & (move.abs() < limits.MIN_SPEED)
         tau = tau + move
         lost |= ~(tau.abs() <= longest)
         if bool((arrived | lost).all()):
@@ -98,10 +88,10 @@ def _scan(model: BallModel, state: Tensor, height: Tensor | float, wanted: Tenso
     """
     found = torch.full_like(state[..., Z], torch.nan)
     h = model.gap(state, height)
-    step = torch.where((h < 0) & (model.gap_rate(state) < 0), -MAX_STEP, MAX_STEP).to(state.dtype)
+    step = torch.where((h < 0) & (model.gap_rate(state) < 0), -limits.MAX_STEP, limits.MAX_STEP).to(state.dtype)
     open_ = wanted.clone()
     furthest = float(longest.max()) if isinstance(longest, Tensor) else longest
-    for i in range(math.ceil(furthest / MAX_STEP)):
+    for i in range(math.ceil(furthest / limits.MAX_STEP)):
         after = rk4_step(model.rates, state, step.unsqueeze(-1))
         h_after, falling = model.gap(after, height), model.gap_rate(after) < 0
         forward = step > 0
@@ -118,7 +108,7 @@ def _scan(model: BallModel, state: Tensor, height: Tensor | float, wanted: Tenso
 
 def _newton_step(model: BallModel, state: Tensor, height: Tensor | float, tau: Tensor) -> Tensor:
     at = fly(model, state, torch.nan_to_num(tau))
-    speed = model.gap_rate(at).clamp_max(-MIN_SPEED)
+    speed = model.gap_rate(at).clamp_max(-limits.MIN_SPEED)
     return -model.gap(at, height) / speed + 0.0 * tau  # keeps NaN
 
 
@@ -143,7 +133,7 @@ def fly_through(
     lost = torch.zeros_like(dt, dtype=torch.bool)
     times = []
     for height in heights:
-        tau = contact_time(model, state, height, dt.abs() + BEYOND)
+        tau = contact_time(model, state, height, dt.abs() + limits.BEYOND)
         lost = lost | tau.isnan()
         tau = tau.masked_fill(lost, 0.0)
         state = model.after_bounce(fly(model, state, tau))
@@ -174,11 +164,11 @@ def fly_through_jacobian(
     times = []
     for height in heights:
         with torch.no_grad():
-            tau = contact_time(model, state, height, dt.abs() + BEYOND)
+            tau = contact_time(model, state, height, dt.abs() + limits.BEYOND)
         before, flight = fly_jacobian(model, state, tau)
         jacobian = flight @ jacobian
         rate, upward = _flow_rate(model, state, tau), gap_jacobian(model, before, height)[1]
-        speed = (upward * rate).sum(-1).clamp_max(-MIN_SPEED)
+        speed = (upward * rate).sum(-1).clamp_max(-limits.MIN_SPEED)
         # at the contact the gap is zero: d gap + speed d tau = 0
         tau_by_state = -(upward.unsqueeze(-2) @ jacobian) / speed[..., None, None]
         jacobian = jacobian + rate.unsqueeze(-1) * tau_by_state

@@ -100,7 +100,7 @@ class _Work:
             self._bent = upstream, gradient
         return self._bent[1]
 
-    def curved(self, upstream: Tensor, v: Tensor, learn: bool) -> "_Curved":
+    def curved(self, upstream: Tensor, v: Tensor, learn: bool) -> _Curved:
         """What bends along one v (n, 9) of the state, with derivatives by the parameters where they `learn`.
 
         Cached for the last v: two nodes of the graph ask for the same, that of the parameters first.

@@ -3,8 +3,6 @@
 docs/estimators_ekf.md has the equations, the rules at contacts, hits and outliers, and the limits.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
@@ -113,7 +111,7 @@ class ExtendedKalmanFilter(Estimator):
         return with_contact_states(estimate, found).dated(written.times)
 
     def _result(
-        self, track: Track, run: _Run, mean: Array, covariance: Array, whitened: Array, status: Status | None = None
+        self, track: Track, run: "_Run", mean: Array, covariance: Array, whitened: Array, status: Status | None = None
     ) -> Estimate:
         states, own = mean[:, :STATE_DIM], slice(STATE_DIM, STATE_DIM + len(run.means))
         estimate = Estimate(
@@ -240,7 +238,7 @@ class _Run:
             self.velocities = window_velocities(self.track.times, self.track.positions, record.hits)
             ball.x, ball.P = record.mean[k - 1].copy(), record.covariance[k - 1].copy()
 
-    def _begin(self) -> BallFilter:
+    def _begin(self) -> "BallFilter":
         """The filter at its first sample, or at the window's end."""
         record, owner = self.record, self.owner
         first, second = self._first_pair(0)
@@ -276,7 +274,7 @@ class _Run:
         sigma = total_sigmas(self.settings, self.sigma, lambda: self.velocities)
         return first_pair(self.track.times, self.track.positions, sigma, near, first)
 
-    def _predict(self, ball: BallFilter, k: int) -> None:
+    def _predict(self, ball: "BallFilter", k: int) -> None:
         times, record = self.track.times, self.record
         used = next((i for i in range(k, len(times)) if i not in self.skipped), k)
         R = self._measurement_noise(used, self.velocities[used])
@@ -310,7 +308,7 @@ class _Run:
         noise[renewed, renewed] = self.fading[1][k - 1] ** 2
         return noise
 
-    def _accept(self, ball: BallFilter, k: int) -> bool:
+    def _accept(self, ball: "BallFilter", k: int) -> bool:
         """Updates with sample k unless it lies beyond the gate; the first sample after a hit always counts."""
         measured = self.track.positions[k]
         whitened = self.record.whitened[k] = ball.innovation(measured)
@@ -321,7 +319,7 @@ class _Run:
         self._store(ball, k, used)
         return used
 
-    def _correct_beside(self, ball: BallFilter, k: int) -> None:
+    def _correct_beside(self, ball: "BallFilter", k: int) -> None:
         """Updates with all other measurements at sample k.
 
         At the first sample a speed, whose Jacobian is zero without a velocity, is skipped with an innovation of NaN.
@@ -334,7 +332,7 @@ class _Run:
                 if not begins or ball.passes(whitened):
                     self.innovations[observation.name][row] = whitened
 
-    def _store(self, ball: BallFilter, k: int, used: bool) -> None:
+    def _store(self, ball: "BallFilter", k: int, used: bool) -> None:
         self.record.mean[k] = ball.x
         self.record.covariance[k] = ball.P = raised(ball.P, self.record.least)
         self.record.quality[k] = Quality.GOOD if used else Quality.OUTLIER

@@ -9,52 +9,8 @@ from numba import types
 from ballfg.arrays import Array
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNT, FLAG, NOTHING, ONE, REAL, TWO
-from ballfg.estimation.flights.modes import (
-    BOUNCE,
-    CARRIED,
-    CHANGE,
-    HAND_SPEED,
-    HANDLED,
-    MODES,
-    QUICK,
-    ROLLING,
-    ROLLING_SLACK,
-    SHIFT,
-    SLOPE,
-    SLOW,
-    STILL,
-    STRIKE,
-    SWAY,
-    SWAYED,
-    bounce,
-    enter,
-    move,
-    shift,
-    stop,
-    strike,
-)
-from ballfg.estimation.segmentation.bank import (
-    BANK,
-    FLYING,
-    HYPOTHESIS,
-    LOG,
-    LOGGED,
-    NO_EVENT,
-    ONE_HYPOTHESIS,
-    SAMPLE,
-    SCENE,
-    USED,
-    WORK,
-    WRITTEN,
-    Record,
-    Records,
-    Sample,
-    Work,
-    add,
-    pass_through,
-    prune,
-    update,
-)
+from ballfg.estimation.flights import modes
+from ballfg.estimation.segmentation import bank
 from ballfg.estimation.segmentation.log import chain, compact
 
 RATE: Final = 1.0  # 1/s. Prior rate of every event
@@ -71,72 +27,73 @@ BRANCHES: Final = 6 * 7 + 4  # Largest number of hypotheses that events add to a
 SPARE: Final = 200_000  # Rows of the log from which it is compacted
 
 
-@machine_code(NOTHING(WORK, COUNT, COUNT, COUNT, REAL))
-def _note(work: Work, row: int, kind: int, index: int, dt: float) -> None:
+@machine_code(NOTHING(bank.WORK, COUNT, COUNT, COUNT, REAL))
+def _note(work: bank.Work, row: int, kind: int, index: int, dt: float) -> None:
     """Lets a hypothesis pass through an event of an interval, at its price; the new mode is written with it."""
     h = work.bank[row]
     h.score += math.log(-math.expm1(-RATE * max(dt, SHORTEST))) - PRICES[kind]
-    pass_through(h, work, kind, index, h.surface, 0.0)
+    bank.pass_through(h, work, kind, index, h.surface, 0.0)
 
 
-@machine_code(REAL(ONE_HYPOTHESIS, REAL))
-def _brevity(h: Record, dt: float) -> float:
+@machine_code(REAL(bank.ONE_HYPOTHESIS, REAL))
+def _brevity(h: bank.Record, dt: float) -> float:
     """nats, the price of the change from flight to a hand, or from anything else to flight: brief modes are rare."""
-    if h.surface == FLYING:
+    if h.surface == bank.FLYING:
         return BRIEF * math.exp(-h.age * dt / BRIEFLY)
     return BRIEF_HOLD * math.exp(-h.age * dt / BRIEFLY_HELD)
 
 
-@machine_code(NOTHING(WORK, BANK, COUNT, COUNT, REAL, FLAG, SCENE))
-def _branch(work: Work, kept: Records, place: int, index: int, dt: float, hands: bool, scene: Record) -> None:
+@machine_code(NOTHING(bank.WORK, bank.BANK, COUNT, COUNT, REAL, FLAG, bank.SCENE))
+def _branch(
+    work: bank.Work, kept: bank.Records, place: int, index: int, dt: float, hands: bool, scene: bank.Record
+) -> None:
     """Adds the changes and events that the best hypothesis of a mode may have in the interval before a sample."""
     mode = kept[place].surface
     brief = _brevity(kept[place], dt)
-    for other in MODES:
-        if other == mode or (HANDLED <= other <= SWAYED and not hands):
+    for other in modes.MODES:
+        if other == mode or (modes.HANDLED <= other <= modes.SWAYED and not hands):
             continue
-        row = add(work, kept, place)
-        enter(work.bank[row], other, scene)
-        _note(work, row, CHANGE, index, dt)
-        if HANDLED <= mode <= SWAYED and HANDLED <= other <= SWAYED:
-            work.bank[row].score += PRICES[CHANGE]
-        if HANDLED <= mode <= SWAYED and other in (ROLLING, FLYING):
+        row = bank.add(work, kept, place)
+        modes.enter(work.bank[row], other, scene)
+        _note(work, row, modes.CHANGE, index, dt)
+        if modes.HANDLED <= mode <= modes.SWAYED and modes.HANDLED <= other <= modes.SWAYED:
+            work.bank[row].score += PRICES[modes.CHANGE]
+        if modes.HANDLED <= mode <= modes.SWAYED and other in (modes.ROLLING, bank.FLYING):
             work.bank[row].score -= LETTING_GO
-        if other <= SWAYED and (mode == FLYING or other == FLYING):
+        if other <= modes.SWAYED and (mode == bank.FLYING or other == bank.FLYING):
             work.bank[row].score -= brief
-    if mode == FLYING:
-        row = add(work, kept, place)
-        strike(work.bank[row], dt, scene)
-        _note(work, row, STRIKE, index, dt)
-        row = add(work, kept, place)
-        shift(work.bank[row], scene)
-        _note(work, row, SHIFT, index, dt)
+    if mode == bank.FLYING:
+        row = bank.add(work, kept, place)
+        modes.strike(work.bank[row], dt, scene)
+        _note(work, row, modes.STRIKE, index, dt)
+        row = bank.add(work, kept, place)
+        modes.shift(work.bank[row], scene)
+        _note(work, row, modes.SHIFT, index, dt)
         if hands:
-            row = add(work, kept, place)
-            stop(work.bank[row], dt)
-            enter(work.bank[row], HANDLED, scene)
-            _note(work, row, CHANGE, index, dt)
+            row = bank.add(work, kept, place)
+            modes.stop(work.bank[row], dt)
+            modes.enter(work.bank[row], modes.HANDLED, scene)
+            _note(work, row, modes.CHANGE, index, dt)
             work.bank[row].score -= brief
-        row = add(work, kept, place)
-        if bounce(work.bank[row], dt, scene):
-            _note(work, row, BOUNCE, index, dt)
+        row = bank.add(work, kept, place)
+        if modes.bounce(work.bank[row], dt, scene):
+            _note(work, row, modes.BOUNCE, index, dt)
         else:
-            work.fill[USED] -= 1
+            work.fill[bank.USED] -= 1
 
 
-@machine_code(NOTHING(WORK, SAMPLE, FLAG, SCENE))
-def _begin(work: Work, sample: Sample, hands: bool, scene: Record) -> None:
+@machine_code(NOTHING(bank.WORK, bank.SAMPLE, FLAG, bank.SCENE))
+def _begin(work: bank.Work, sample: bank.Sample, hands: bool, scene: bank.Record) -> None:
     """One hypothesis for each mode after a first sample."""
-    for mode in MODES:
-        if HANDLED <= mode <= SWAYED and not hands:
+    for mode in modes.MODES:
+        if modes.HANDLED <= mode <= modes.SWAYED and not hands:
             continue
-        row = work.fill[USED]
-        work.fill[USED] += 1
+        row = work.fill[bank.USED]
+        work.fill[bank.USED] += 1
         h = work.bank[row]
-        h.surface, h.age, h.score, h.tip = mode, 0, 0.0, NO_EVENT
-        speed = scene.velocity_spread if mode == FLYING else HAND_SPEED if mode != STILL else 0.0
-        pull = QUICK if mode == HANDLED else SLOW if mode == CARRIED else SWAY if mode == SWAYED else 0.0
-        pull = scene.slack if mode == FLYING else ROLLING_SLACK if mode == ROLLING else pull
+        h.surface, h.age, h.score, h.tip = mode, 0, 0.0, bank.NO_EVENT
+        speed = scene.velocity_spread if mode == bank.FLYING else modes.HAND_SPEED if mode != modes.STILL else 0.0
+        pull = scene.slack if mode == bank.FLYING else modes.PULLS[mode]
         for axis in range(3):
             h.shift[axis] = 0.0
             for i in range(3):
@@ -147,14 +104,14 @@ def _begin(work: Work, sample: Sample, hands: bool, scene: Record) -> None:
             h.cov[axis, 0, 0] = scene.outlier_spread**2
             h.cov[axis, 1, 1] = speed * speed
             h.cov[axis, 2, 2] = pull * pull
-        if mode == ROLLING:
-            h.cov[2, 1, 1], h.cov[2, 2, 2] = SLOPE**2, 0.0
-        pass_through(h, work, CHANGE, -1, mode, 0.0)
-    update(work, 0, sample, scene)
+        if mode == modes.ROLLING:
+            h.cov[2, 1, 1], h.cov[2, 2, 2] = modes.SLOPE**2, 0.0
+        bank.pass_through(h, work, modes.CHANGE, -1, mode, 0.0)
+    bank.update(work, 0, sample, scene)
 
 
-@machine_code(types.Tuple((LOG, REAL))(ONE, TWO, TWO, FLAG, SCENE))
-def decode(times: Array, positions: Array, sigmas: Array, hands: bool, scene: Record) -> Any:
+@machine_code(types.Tuple((bank.LOG, REAL))(ONE, TWO, TWO, FLAG, bank.SCENE))
+def decode(times: Array, positions: Array, sigmas: Array, hands: bool, scene: bank.Record) -> Any:
     """The events of the most likely explanation, oldest first.
 
     Args:
@@ -163,26 +120,26 @@ def decode(times: Array, positions: Array, sigmas: Array, hands: bool, scene: Re
     """
     n, most = len(times), int(scene.most)
     room = 2 * (most + BRANCHES)
-    work = Work(np.empty(room, HYPOTHESIS), np.empty(SPARE + 4 * room, LOGGED), np.zeros(2, np.int64))
-    _begin(work, Sample(positions[0], sigmas[0], 0, times[0]), hands, scene)
-    kept = prune(work.bank, work.fill[USED], scene)
+    work = bank.Work(np.empty(room, bank.HYPOTHESIS), np.empty(SPARE + 4 * room, bank.LOGGED), np.zeros(2, np.int64))
+    _begin(work, bank.Sample(positions[0], sigmas[0], 0, times[0]), hands, scene)
+    kept = bank.prune(work.bank, work.fill[bank.USED], scene)
     for i in range(1, n):
         dt = times[i] - times[i - 1]
-        work.fill[USED] = 0
-        if work.fill[WRITTEN] > SPARE:
+        work.fill[bank.USED] = 0
+        if work.fill[bank.WRITTEN] > SPARE:
             work = _roomy(kept, work, 4 * room)
         for row in range(len(kept)):
-            add(work, kept, row)
+            bank.add(work, kept, row)
         seen = np.zeros(8, np.int64)
         for row in range(len(kept)):
             mode = kept[row].surface
             if seen[mode + 1] == 0:
                 seen[mode + 1] = 1
                 _branch(work, kept, row, i - 1, dt, hands, scene)
-        for row in range(work.fill[USED]):
-            move(work.bank[row], dt, scene)
-        update(work, 0, Sample(positions[i], sigmas[i], i, times[i]), scene)
-        kept = prune(work.bank, work.fill[USED], scene)
+        for row in range(work.fill[bank.USED]):
+            modes.move(work.bank[row], dt, scene)
+        bank.update(work, 0, bank.Sample(positions[i], sigmas[i], i, times[i]), scene)
+        kept = bank.prune(work.bank, work.fill[bank.USED], scene)
     dt, best, last = (times[n - 1] - times[0]) / max(n - 1, 1), 0, -math.inf
     for row in range(len(kept)):
         if kept[row].score - _brevity(kept[row], dt) > last:
@@ -190,13 +147,13 @@ def decode(times: Array, positions: Array, sigmas: Array, hands: bool, scene: Re
     return chain(kept[best].tip, work.log), last
 
 
-@machine_code(WORK(BANK, WORK, COUNT))
-def _roomy(kept: Records, work: Work, spare: int) -> Any:
+@machine_code(bank.WORK(bank.BANK, bank.WORK, COUNT))
+def _roomy(kept: bank.Records, work: bank.Work, spare: int) -> Any:
     """The same work with a compacted log, which is made longer where its events fill most of it."""
-    count = compact(kept, work.log, work.fill[WRITTEN])
-    work.fill[WRITTEN] = count
+    count = compact(kept, work.log, work.fill[bank.WRITTEN])
+    work.fill[bank.WRITTEN] = count
     if 2 * count < len(work.log):
         return work
-    longer = np.empty(2 * len(work.log) + spare, LOGGED)
+    longer = np.empty(2 * len(work.log) + spare, bank.LOGGED)
     longer[:count] = work.log[:count]
-    return Work(work.bank, longer, work.fill)
+    return bank.Work(work.bank, longer, work.fill)

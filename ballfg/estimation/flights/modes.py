@@ -28,17 +28,14 @@ SHORT: Final = 0.02
 """Time constants up to which a series is exact to 2 % and better than differences of rounded numbers."""
 MOST_AIR: Final = 30.0  # m/s^2, of that spread
 
-QUICK: Final = 30.0  # m/s^2. Spread, per axis, of the acceleration of a hand that throws or catches
-QUICK_MEMORY: Final = 0.08  # s. Time constant of that acceleration
+PULLS: Final = (0.0, 30.0, 8.0, 1.0, 0.3, 0.0)
+"""m/s^2. Spread of the acceleration, per axis, by mode: of a hand that throws or catches, of one that carries, of one
+that holds the ball, of a rolling ball along the ground; none of a ball that does not move. `air` is that of flight."""
+MEMORIES: Final = (0.0, 0.08, 0.15, 0.3)  # s. Time constants of the accelerations of hands, by mode
 STOPPING: Final = 120.0  # m/s^2. Spread of the acceleration at the start of a catch
-SLOW: Final = 8.0  # m/s^2. Spread of the acceleration of a hand that carries
-SLOW_MEMORY: Final = 0.15  # s
-SWAY: Final = 1.0  # m/s^2. Spread of the acceleration of a hand that holds the ball
-SWAY_MEMORY: Final = 0.3  # s
 HAND_SPEED: Final = 2.0  # m/s. Spread of the velocity of a hand, per axis
 SLOPE: Final = 0.02
 """m/s. Spread of the vertical velocity of a rolling ball: the surface or the frame is not quite level."""
-ROLLING_SLACK: Final = 0.3  # m/s^2. Spread of the horizontal acceleration of a rolling ball
 ROLLING_DRIFT: Final = 0.02  # m/s per sqrt(s). Random walk of its horizontal velocity
 LANDING: Final = 0.3  # m/s. Spread of the vertical speed with which a ball begins to roll or stops
 STIR: Final = 1e-3  # m per sqrt(s). Random walk of a ball that does not move
@@ -58,12 +55,8 @@ def move(h: Record, dt: float, scene: Record) -> None:
     if h.surface == FLYING:
         carry(h, dt, scene)
         _relax(h, dt, scene)
-    elif h.surface == HANDLED:
-        _wander(h, dt, QUICK, QUICK_MEMORY)
-    elif h.surface == CARRIED:
-        _wander(h, dt, SLOW, SLOW_MEMORY)
-    elif h.surface == SWAYED:
-        _wander(h, dt, SWAY, SWAY_MEMORY)
+    elif HANDLED <= h.surface <= SWAYED:
+        _wander(h, dt, PULLS[h.surface], MEMORIES[h.surface])
     elif h.surface == ROLLING:
         for axis in range(3):
             _transform(h, axis, dt, 0.5 * dt * dt, dt, 1.0)  # constant acceleration
@@ -177,14 +170,8 @@ def enter(h: Record, mode: int, scene: Record) -> None:
     for axis in range(3):
         if mode == FLYING:
             _accelerated(h, axis, 0.0, air(h, scene))
-        elif mode == HANDLED:
-            _accelerated(h, axis, 0.0, STOPPING if before == FLYING else QUICK)
-        elif mode == CARRIED:
-            _accelerated(h, axis, 0.0, SLOW)
-        elif mode == SWAYED:
-            _accelerated(h, axis, 0.0, SWAY)
-        elif mode == ROLLING and axis < 2:
-            _accelerated(h, axis, 0.0, ROLLING_SLACK)
+        elif mode <= SWAYED or (mode == ROLLING and axis < 2):
+            _accelerated(h, axis, 0.0, STOPPING if mode == HANDLED and before == FLYING else PULLS[mode])
         else:
             spread = LANDING * LANDING + h.cov[axis, 1, 1]
             h.score -= 0.5 * h.mean[axis, 1] ** 2 / spread

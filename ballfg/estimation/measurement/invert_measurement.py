@@ -17,13 +17,7 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.rollout import advance
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
-from ballfg.estimation.measurement.as_measured import (
-    LabelMap,
-    measured_positions,
-    plainly_measured,
-    true_times,
-    written_time,
-)
+from ballfg.estimation.measurement import as_measured
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.settings import WIDEST_PRIOR, Settings, sample_sigmas
 from ballfg.estimation.smoother.smoother import PiecewiseSmoother, Smoother
@@ -73,10 +67,10 @@ class InvertMeasurement(Estimator):
 
     def __init__(self, kind: type[Estimator], model: BallModel, surfaces: Surfaces | float, settings: Settings) -> None:
         super().__init__(model, surfaces, settings)
-        self.labels = LabelMap.of(model)
+        self.labels = as_measured.LabelMap.of(model)
         # labels that hold almost nothing of the spin say as little as may be
         own = replace(settings, spin_label_noise=min(settings.spin_label_noise / self.labels.gain, WIDEST_PRIOR))
-        plain = plainly_measured(model)
+        plain = as_measured.plainly_measured(model)
         self.smoother = PiecewiseSmoother(plain, self.surfaces, own)
         self.inner = self.smoother if kind in (Smoother, PiecewiseSmoother) else kind(plain, self.surfaces, own)
 
@@ -87,7 +81,7 @@ class InvertMeasurement(Estimator):
         undone = self.undo(track)
         found = undone.estimate if self.inner is self.smoother else self.inner.estimate(undone.track)
         lost = found.status is Status.OK and not undone.settled
-        contacts = (replace(c, time=written_time(self.model, 0.0, c.time)) for c in found.contacts)
+        contacts = (replace(c, time=as_measured.written_time(self.model, 0.0, c.time)) for c in found.contacts)
         result = replace(
             found,
             times=track.times,
@@ -130,7 +124,7 @@ class InvertMeasurement(Estimator):
             labels = {name: value for name, value in labels.items() if name not in SPIN_LABELS}
             if np.abs(spin).max() <= FASTEST_SPIN:
                 labels |= dict(zip(SPIN_LABELS, spin.tolist(), strict=True))
-        return replace(track, times=true_times(self.model, track.times), labels=labels)
+        return replace(track, times=as_measured.true_times(self.model, track.times), labels=labels)
 
     def _first_shift(self, track: Track) -> Array:
         """(n, 3) m, of balls at rest at the measured positions: exact for a map of positions alone."""
@@ -155,4 +149,4 @@ class InvertMeasurement(Estimator):
             with torch.no_grad():
                 dt = torch.from_numpy(np.diff(estimate.times[-2:]))
                 states = torch.cat((states[:-1], advance(model, states[-2:-1], dt, self.surfaces)))
-        return (measured_positions(model, states, self.surfaces) - states[:, POSITION]).numpy()
+        return (as_measured.measured_positions(model, states, self.surfaces) - states[:, POSITION]).numpy()

@@ -1,7 +1,5 @@
 """Estimates the noise of a set of tracks by the calibration of forecasts within them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
@@ -21,6 +19,7 @@ from ballfg.estimation.measurement.as_measured import plainly_measured
 from ballfg.estimation.measurement.invert_measurement import InvertMeasurement
 from ballfg.estimation.noise.forecasts import EARLIEST_START, START_EVERY, Forecaster
 from ballfg.estimation.noise.linear_tracks import LEAST_SAMPLES, LinearTracks, linearise
+from ballfg.estimation.noise.marginal import scatter_of
 from ballfg.estimation.noise.parameters import (
     COEFFICIENTS,
     Parameter,
@@ -262,9 +261,7 @@ class _Search:
         """(k, k) sum over tracks of the squares of their gradients about the mean."""
         leaf = torch.tensor(np.tile(logs, (self.forecaster.count, 1)), dtype=torch.float64, requires_grad=True)
         score = self.forecaster.score(tensors_of(self.parameters, leaf, self.settings)).value
-        gradients = self.weight * torch.autograd.grad(score, leaf)[0].numpy()
-        count, away = len(gradients), gradients - gradients.mean(axis=0)
-        return np.asarray(away.T @ away * count / max(count - 1, 1))
+        return scatter_of(self.weight * torch.autograd.grad(score, leaf)[0].numpy())
 
     def held(self, logs: Array) -> float:
         """Share of forecast coordinates inside their 90 % intervals."""

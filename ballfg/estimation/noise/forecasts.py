@@ -7,8 +7,6 @@ grow linearly. The same score of the next sample alone, the marginal likelihood,
 separates parts of the noise that forecasts leave undetermined.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 
@@ -140,7 +138,7 @@ class _Ahead:
     offsets: Tensor
 
     @classmethod
-    def of(cls, tracks: LinearTracks, starts: Tensor) -> _Ahead:
+    def of(cls, tracks: LinearTracks, starts: Tensor) -> "_Ahead":
         """All forecasts from some origins (r, 2), track and sample."""
         (track, start), (samples, own) = starts.T, (tracks.times.shape[1], tracks.transitions.shape[-1])
         begin, reached = tracks.times[track, start], torch.zeros(len(track), dtype=torch.float64)

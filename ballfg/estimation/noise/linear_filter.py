@@ -1,7 +1,5 @@
 """Filters linearised tracks with any noise: state, coefficients and the tracker's biases together."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Final
 

@@ -5,8 +5,6 @@ the offset of the estimate itself from the model. F and o come from the dynamics
 contacts with their saltation included. A Kalman filter over deviations then gives forecasts for any noise.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -91,21 +89,8 @@ class LinearTracks:
         return torch.cat((fixed.expand(count, 6), spins, own.expand(count, -1)), dim=1)
 
 
-@dataclass(frozen=True)
-class _Piece:
-    """One linearised track: the fields of `LinearTracks` without the first dimension."""
-
-    times: Array
-    errors: Array
-    white: Array
-    velocities: Array
-    used: Array
-    transitions: Array
-    offsets: Array
-    kicks: Array
-    starts: Array
-    labelled: bool
-    group_sigmas: Array
+_Piece = dict[str, Array]
+"""One linearised track: the fields of `LinearTracks` without the first dimension, by name."""
 
 
 def linearise(
@@ -122,7 +107,7 @@ def linearise(
     pieces, numbers = [], []
     made = map_tracks(partial(_piece, smoother), tracks, len(tracks), jobs)
     for number, piece in enumerate(watch(made, len(tracks), "linearising tracks")):
-        if len(piece.times) >= LEAST_SAMPLES and np.isfinite(piece.errors).all():
+        if len(piece["times"]) >= LEAST_SAMPLES and np.isfinite(piece["errors"]).all():
             pieces.append(piece)
             numbers.append(number)
     if not pieces:
@@ -168,19 +153,19 @@ def _linearised(problem: TrackProblem, solution: Solution) -> _Piece:
         transitions[first, :, SPIN] = transitions[first, :, SPIN] @ label.axes.T
     start[STATE_DIM:] = coefficient_means(problem.model, problem.settings) - values.coefficients[:width]
     samples, intervals_within = slice(first, end), slice(first, end - 1)
-    return _Piece(
-        track.times[samples] - track.times[first],
-        (track.positions - values.states[:, POSITION])[samples],
-        sample_sigmas(problem.settings, len(track), track.sigmas)[samples],
-        values.states[samples, VELOCITY],
-        solution.events.segmentation.quality[samples] == Quality.GOOD,
-        transitions[intervals_within],
-        offsets[intervals_within],
-        kicks[intervals_within],
-        start,
-        label is not None and label.measured,
-        group_sigmas,
-    )
+    return {
+        "times": track.times[samples] - track.times[first],
+        "errors": (track.positions - values.states[:, POSITION])[samples],
+        "white": sample_sigmas(problem.settings, len(track), track.sigmas)[samples],
+        "velocities": values.states[samples, VELOCITY],
+        "used": solution.events.segmentation.quality[samples] == Quality.GOOD,
+        "transitions": transitions[intervals_within],
+        "offsets": offsets[intervals_within],
+        "kicks": kicks[intervals_within],
+        "starts": start,
+        "labelled": np.array(label is not None and label.measured),
+        "group_sigmas": group_sigmas,
+    }
 
 
 def _longest_stretch(times: Array, breaks: NDArray[np.int64]) -> tuple[int, int]:
@@ -202,14 +187,14 @@ PADDED: Final = {
 
 
 def _side_by_side(pieces: Sequence[_Piece], numbers: Array, coefficient_sigmas: Tensor) -> LinearTracks:
-    longest = max(len(piece.times) for piece in pieces)
+    longest = max(len(piece["times"]) for piece in pieces)
 
     def padded(piece: _Piece, name: str) -> Array:
-        array = getattr(piece, name)
+        array = piece[name]
+        if name not in PADDED:
+            return array
         filling = array[-1:] if PADDED[name] == "edge" else np.zeros_like(array[:1])
-        return np.concatenate((array, np.repeat(filling, longest - len(piece.times), axis=0)))
+        return np.concatenate((array, np.repeat(filling, longest - len(piece["times"]), axis=0)))
 
-    fields = {name: np.stack([padded(piece, name) for piece in pieces]) for name in PADDED}
-    fields |= {n: np.stack([getattr(piece, n) for piece in pieces]) for n in ("starts", "labelled", "group_sigmas")}
-    tensors = {name: torch.from_numpy(array) for name, array in fields.items()}
+    tensors = {name: torch.from_numpy(np.stack([padded(piece, name) for piece in pieces])) for name in pieces[0]}
     return LinearTracks(numbers=numbers, coefficient_sigmas=coefficient_sigmas, **tensors)

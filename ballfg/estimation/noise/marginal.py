@@ -1,7 +1,5 @@
 """Maximises the marginal likelihood of linearised tracks: the density of each sample given those before it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final
@@ -16,6 +14,12 @@ from ballfg.estimation.settings import Settings
 
 DIFFERENCE: Final = 0.002
 """Step of a logarithm for the second derivatives behind the error bars."""
+
+
+def scatter_of(gradients: Array) -> Array:
+    """(k, k) squares of the gradients (t, k) of tracks about their mean, summed over t tracks."""
+    count, away = len(gradients), gradients - gradients.mean(axis=0)
+    return np.asarray(away.T @ away * count / max(count - 1, 1))
 
 
 class MarginalFit:
@@ -82,12 +86,7 @@ class MarginalFit:
             hessian[k] = (self.at(self.logs + step)[1].sum(axis=0) - total) / DIFFERENCE
         values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T) + np.diag(self.precision))
         inverse = (vectors / np.maximum(values, self.precision.min())) @ vectors.T
-        return np.asarray(inverse @ (self._scatter() + np.diag(self.precision)) @ inverse)
-
-    def _scatter(self) -> Array:
-        """(k, k) squares of the tracks' gradients about their mean, summed."""
-        away = self.gradients - self.gradients.mean(axis=0)
-        return np.asarray(away.T @ away * len(away) / (len(away) - 1))
+        return np.asarray(inverse @ (scatter_of(self.gradients) + np.diag(self.precision)) @ inverse)
 
     def _objective(self, losses: Array, gradients: Array, logs: Array) -> tuple[float, Array]:
         """Negative log posterior and its (k,) derivatives."""
@@ -102,7 +101,7 @@ class MarginalFit:
         derivatives (Berndt, Hall, Hall and Hausman 1974). A first step may still lead to noise so large that rounding
         leaves no density; it counts as worse than the start, so that the line search shortens the step.
         """
-        root = np.linalg.cholesky(self._scatter() + np.diag(self.precision))
+        root = np.linalg.cholesky(scatter_of(self.gradients) + np.diag(self.precision))
         turn = np.linalg.inv(root).T
         begin, worst = self.logs, self._objective(self.losses, self.gradients, self.logs)[0]
 

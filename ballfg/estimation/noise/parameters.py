@@ -1,7 +1,5 @@
 """Maps the estimated numbers of the noise to a vector of logarithms with a prior, and back to settings."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any, Final
 

@@ -6,8 +6,6 @@ their best, is followed until it has risen by one standard deviation's worth (D.
 Statistics", 1974, section 9.3).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Final
 

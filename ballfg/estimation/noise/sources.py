@@ -6,8 +6,6 @@ gains are held or follow. The share of a source is its variance times that deriv
 whole (docs/derivations/budget.md).
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Final
 

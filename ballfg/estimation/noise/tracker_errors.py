@@ -6,8 +6,6 @@ R. Rao 1948), cleared of other parts of the noise, scatters about zero from trac
 The scatter is the tracks' own, so that noise of another shape is not named.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Final

@@ -4,8 +4,6 @@ Estimators know this interface only. A user's own kind of measurement is a subcl
 (docs/custom_factors.md); most are a `Reading`, which needs one function in torch.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -109,7 +107,7 @@ class Observation(ABC):
         Args: samples: (n,) bool, the selected samples of the track.
         """
 
-    def turned(self, rotation: Tensor, shift: Tensor) -> Observation:
+    def turned(self, rotation: Tensor, shift: Tensor) -> "Observation":
         """The same measurements in another frame: p -> rotation p + shift.
 
         Args: rotation: (3, 3) about the vertical, dimensionless.  shift: (3,) m.
@@ -138,7 +136,7 @@ class Observation(ABC):
         """
         return leave_one_out(rows, covariances)
 
-    def retimed(self, track: Track, estimate: Estimate) -> Track | None:
+    def retimed(self, track: Track, estimate: "Estimate") -> Track | None:
         """The track with stamps corrected by the unknowns; None, the default, if its stamps stay."""
         return None
 
@@ -164,11 +162,11 @@ class Observation(ABC):
         """Further factors that the start of a track needs; by default none."""
         return []
 
-    def judged(self, estimate: Estimate) -> Estimate:
+    def judged(self, estimate: "Estimate") -> "Estimate":
         """The estimate of its track, with a status that says what the observation leaves open; by default nothing."""
         return estimate
 
-    def onto(self, old: Track, new: Track) -> Observation:
+    def onto(self, old: Track, new: Track) -> "Observation":
         """The same measurements on a track of the same ball with other stamps.
 
         Args: old: track of the observation.  new: track without it.
@@ -245,7 +243,7 @@ class GivenFactors(Observation):
         """The factors."""
         return self.factors
 
-    def select(self, samples: NDArray[np.bool_]) -> GivenFactors:
+    def select(self, samples: NDArray[np.bool_]) -> "GivenFactors":
         """The factors of some samples."""
         kept = self.factors.select(np.flatnonzero(samples[self.state]))
         kept.variables = kept.variables.copy()

@@ -7,8 +7,6 @@ included, so that the chosen window holds no bounce. A window of one camera alon
 fit, those at the camera best.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Final
@@ -47,7 +45,7 @@ class Path:
     velocities: Array
     sigmas: Array
 
-    def joined(self, other: Path) -> Path:
+    def joined(self, other: "Path") -> "Path":
         """This path, then another."""
         return Path(*(np.concatenate((getattr(self, f.name), getattr(other, f.name))) for f in fields(self)))
 
@@ -65,7 +63,7 @@ class Rays:
     period: float  # s, of the slowest camera
 
     @classmethod
-    def of(cls, sightings: Sightings, times: Array, cameras: Sequence[Camera]) -> Rays:
+    def of(cls, sightings: Sightings, times: Array, cameras: Sequence[Camera]) -> "Rays":
         """The rays of sightings, with their true times (m,) s and the cameras in the order of their numbers."""
         m = len(sightings)
         plane, root = np.empty((m, 2)), np.linalg.inv(np.linalg.cholesky(sightings.covariances))
@@ -82,13 +80,13 @@ class Rays:
         depth_row = np.concatenate((rotation[:, 2], tvec[:, 2:]), axis=1)
         return cls(times, sightings.camera, matrix, target, root, depth_row, max(periods, default=0.0))
 
-    def thinned(self, most: int) -> Rays:
+    def thinned(self, most: int) -> "Rays":
         """At most so many of these rays, evenly chosen."""
         every = -(-len(self.times) // most)
         arrays = {f.name: getattr(self, f.name)[::every] for f in fields(self) if f.name != "period"}
         return replace(self, **arrays, period=every * self.period)
 
-    def joined(self, later: Rays, most: int, period: float) -> Rays:
+    def joined(self, later: "Rays", most: int, period: float) -> "Rays":
         """These rays and later ones, the newest `most` of them, with a new period, s."""
         arrays = [f.name for f in fields(self) if f.name != "period"]
         both = {name: np.concatenate((getattr(self, name), getattr(later, name)))[-most:] for name in arrays}

@@ -1,7 +1,5 @@
 """Measurements and samples of a stream, the record of an update, and the belief after it."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
@@ -36,7 +34,7 @@ class Measurement:
         self.bridge = Bridge(batch, on_miss="row")
         self.innovation = np.full(batch.dim, np.nan)
 
-    def factor(self, state: int) -> gtsam.CustomFactor:
+    def factor(self, state: int) -> "gtsam.CustomFactor":
         """The factor on a state of the stream."""
         return self.bridge.factor(0, [state])
 

@@ -1,7 +1,5 @@
 """Estimates and predicts a made-up ball through a bounce, so that a real one waits for no compiler."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -25,7 +23,7 @@ HORIZON = 0.5
 """s, long enough for the next bounce."""
 
 
-def warmed_up(online: Online) -> list[OnlineState]:
+def warmed_up(online: "Online") -> list[OnlineState]:
     """The states before the bounce and at the end of a falling ball, estimated by a copy of an estimator."""
     trial, states = online.copy(), []
     trial.reset()
@@ -44,7 +42,7 @@ def warmed_up(online: Online) -> list[OnlineState]:
     return states
 
 
-def falling_ball(online: Online) -> tuple[Array, Array]:
+def falling_ball(online: "Online") -> tuple[Array, Array]:
     """Stamps (40,) s and positions (40, 3) m of a ball that falls onto the table of an estimator, and bounces."""
     table = (*online.surfaces.heights(), 0.0)[0]
     gravity, rise = online.physics.gravity, table + online.physics.radius

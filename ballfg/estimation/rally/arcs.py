@@ -5,8 +5,6 @@ its last points meets a candidate. Over pictures without the ball arcs begin wit
 bars must agree with the motion.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -4,8 +4,6 @@ The score of a sequence is the logarithm of its probability against clutter alon
 backward, as for a hidden Markov model) give the probability of each stroke.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Finds the events of a rally: hits, bounces, net, floor, where the ball is lost; and the numbers of each stroke."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Holds all candidates of a recording as a fixed camera sees them, and how likely each is a ball or clutter."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Final
@@ -117,7 +115,7 @@ class Field:
     seen: float = SEEN
 
     @classmethod
-    def of(cls, seen: Detections, scale: float, ball: float = SEEN) -> Field:
+    def of(cls, seen: Detections, scale: float, ball: float = SEEN) -> "Field":
         """The field of detections of a fixed camera that hold the ball with a probability `ball`."""
         count, pixels = len(seen.frames), seen.pixels
         size = pixels.max(axis=0, initial=-np.inf) - pixels.min(axis=0, initial=np.inf)
@@ -131,7 +129,7 @@ class Field:
         rows = plain(seen.frame), plain(pixels), plain(seen.covariances), bars, density, usual * bars.any()
         return cls(*rows, first, seen.frames, step, scale, seen=ball)
 
-    def smooth(self, density: float) -> Field:
+    def smooth(self, density: float) -> "Field":
         """The field whose clutter moves smoothly: where its motion foretells a candidate, it has a density, 1/px^2."""
         return replace(self, density=np.maximum(self.density, density))
 

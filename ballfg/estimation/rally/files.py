@@ -1,7 +1,5 @@
 """Names the files of a rally, so that a command knows one without the rest of this room."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Final
 

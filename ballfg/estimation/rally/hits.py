@@ -1,7 +1,5 @@
 """Rates the hits that may join two strokes, by how near their paths come between them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final

@@ -6,8 +6,6 @@ a factor of this one. A message holds nothing of the stroke that it goes to, and
 of a hit is unknown between the two strokes: it moves the place along the difference of the velocities.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -39,7 +37,7 @@ class Link:
     width: float
 
     @classmethod
-    def between(cls, model: BallModel, before: Estimate, after: Estimate, step: float) -> Link:
+    def between(cls, model: BallModel, before: Estimate, after: Estimate, step: float) -> "Link":
         """The hit at which two strokes meet. Args: step: s between pictures."""
         event = hit_between(model, before, after, step)
         first, last = float(before.times[-1]) - 0.5 * step, float(after.times[0]) + 0.5 * step

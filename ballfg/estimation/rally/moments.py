@@ -1,7 +1,5 @@
 """Carries a stroke's states to moments beside its samples: events, and the hit at which two strokes meet."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

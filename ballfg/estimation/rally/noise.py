@@ -5,8 +5,6 @@ up to a factor that all candidates of a recording share. The factors are those w
 probable, without what the flights take over of their noise (restricted maximum likelihood, Harville 1977).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -37,11 +35,11 @@ class Noise:
         around, along = parts(stated)
         return np.asarray(self.around * around + self.along * along)
 
-    def changed(self, before: Noise) -> float:
+    def changed(self, before: "Noise") -> float:
         """The larger change of a factor's logarithm."""
         return max(abs(np.log(self.around / before.around)), abs(np.log(self.along / before.along)))
 
-    def likelier(self, stated: Array, off: Array, spread: Array, loss: Loss) -> Noise:
+    def likelier(self, stated: Array, off: Array, spread: Array, loss: Loss) -> "Noise":
         """The factors with which the candidates are likelier, if the flights were found with the factors of today.
 
         The distances have the covariance S - P, with that of the candidates S and that of the flights P: a part of S

@@ -1,7 +1,5 @@
 """Builds the page of a rally: its video with the reprojected flights beside the table, on one time line."""
 
-from __future__ import annotations
-
 import base64
 import os
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Reconstructs the strokes of a shot: candidates as a fixed camera would see them, strokes, estimates and events."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final

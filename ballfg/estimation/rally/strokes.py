@@ -5,8 +5,6 @@ unknowns (`bounced_path`), so that many guesses are compared at once. Its score 
 explains the candidates than clutter does.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -64,7 +62,9 @@ class Grower:
     camera: Camera
 
     @classmethod
-    def of(cls, field: Field, times: Array, camera: Camera, physics: SegmentationPhysics, surfaces: Surfaces) -> Grower:
+    def of(
+        cls, field: Field, times: Array, camera: Camera, physics: SegmentationPhysics, surfaces: Surfaces
+    ) -> "Grower":
         """A grower of the candidates of a field at times (n,) s, seen by a fixed camera without distortion."""
         count, rotation = len(times), camera.rotation
         plane = camera.normalized(field.pixels)

@@ -1,7 +1,5 @@
 """Writes what a video of one moving camera shows: camera motion, events and strokes beside a dataset's files."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """Turns a video of one camera that pans and zooms into strokes: camera, candidates, strokes, events."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any

@@ -9,31 +9,7 @@ from numba import types
 from ballfg.arrays import Array
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNT, NOTHING, ONE, REAL, TWO
-from ballfg.estimation.segmentation.bank import (
-    AS_OUTLIER,
-    BANK,
-    FLYING,
-    HYPOTHESIS,
-    LOG,
-    LOGGED,
-    NO_EVENT,
-    ONE_HYPOTHESIS,
-    SAMPLE,
-    SCENE,
-    SURFACES,
-    USED,
-    WORK,
-    WRITTEN,
-    Record,
-    Records,
-    Sample,
-    Work,
-    add,
-    pass_through,
-    prune,
-    rank,
-    update,
-)
+from ballfg.estimation.segmentation import bank
 from ballfg.estimation.segmentation.log import chain, compact, decide
 from ballfg.estimation.segmentation.result import HIT, LEAVE, OUTLIER, REST, RESTART, SHIFT
 from ballfg.estimation.segmentation.surface_contact import Step, advance, lift, put_down
@@ -46,83 +22,87 @@ MOST_ADDED: Final = 2 + 2 * SHIFTED_PREDICTIONS
 """Largest number of hypotheses from these events, besides one for each surface."""
 
 
-@machine_code(NOTHING(WORK, COUNT, REAL, SAMPLE, SCENE, SURFACES))
-def start(work: Work, tip: int, score: float, sample: Sample, scene: Record, surfaces: Records) -> None:
+@machine_code(NOTHING(bank.WORK, COUNT, REAL, bank.SAMPLE, bank.SCENE, bank.SURFACES))
+def start(
+    work: bank.Work, tip: int, score: float, sample: bank.Sample, scene: bank.Record, surfaces: bank.Records
+) -> None:
     """Hypotheses after a first sample: a flying ball, one that rests on a surface nearby, or the sample an outlier.
 
     All expect the ball within the spread of outliers around the sample, so that their evidences are comparable.
 
     Args: work: empty; afterwards those hypotheses.  tip: the last event before.  score: nats, carried on.
     """
-    work.fill[USED] = 1
-    bank = work.bank
-    _forget(bank[0], sample.position, scene.outlier_spread**2, scene)
-    bank[0].score, bank[0].tip = score, tip
+    work.fill[bank.USED] = 1
+    held = work.bank
+    _forget(held[0], sample.position, scene.outlier_spread**2, scene)
+    held[0].score, held[0].tip = score, tip
     _rested(work, 0, sample, scene, surfaces)
-    flying = bank[:1].copy()
-    update(work, 0, sample, scene)
-    lost = bank[add(work, flying, 0)]
-    lost.score += scene.log_shares[AS_OUTLIER] - 3.0 * math.log(scene.outlier_spread)
-    pass_through(lost, work, OUTLIER, sample.number, -1, sample.time)
+    flying = held[:1].copy()
+    bank.update(work, 0, sample, scene)
+    lost = held[bank.add(work, flying, 0)]
+    lost.score += scene.log_shares[bank.AS_OUTLIER] - 3.0 * math.log(scene.outlier_spread)
+    bank.pass_through(lost, work, OUTLIER, sample.number, -1, sample.time)
 
 
-@machine_code(NOTHING(WORK, BANK, SAMPLE, REAL, SCENE, SURFACES))
-def hit(work: Work, before: Records, sample: Sample, dt: float, scene: Record, surfaces: Records) -> None:
+@machine_code(NOTHING(bank.WORK, bank.BANK, bank.SAMPLE, REAL, bank.SCENE, bank.SURFACES))
+def hit(
+    work: bank.Work, before: bank.Records, sample: bank.Sample, dt: float, scene: bank.Record, surfaces: bank.Records
+) -> None:
     """Adds the best hypothesis without its velocity, in the air and on a near surface; after a gap it is anywhere."""
-    row = add(work, before, 0)
+    row = bank.add(work, before, 0)
     h = work.bank[row]
     at = h.mean[:, 0].copy() if dt < scene.short_gap else sample.position
     reach = scene.hit_spread**2 + (scene.velocity_spread * min(dt, scene.short_gap)) ** 2
     _forget(h, at, reach, scene)
     h.score -= _rarity(scene.hit_rate, dt) + scene.hit_cost * math.exp(-dt / scene.short_gap)
-    pass_through(h, work, HIT, sample.number - 1, -1, sample.time)
+    bank.pass_through(h, work, HIT, sample.number - 1, -1, sample.time)
     _rested(work, row, sample, scene, surfaces)
 
 
-@machine_code(NOTHING(WORK, BANK, SAMPLE, REAL, SCENE))
-def shift(work: Work, predicted: Records, sample: Sample, dt: float, scene: Record) -> None:
+@machine_code(NOTHING(bank.WORK, bank.BANK, bank.SAMPLE, REAL, bank.SCENE))
+def shift(work: bank.Work, predicted: bank.Records, sample: bank.Sample, dt: float, scene: bank.Record) -> None:
     """Adds the best predictions, with the measurements jumping by an unknown offset: from now on, or until now."""
-    n, bank, first = len(predicted), work.bank, work.fill[USED]
+    n, held, first = len(predicted), work.bank, work.fill[bank.USED]
     rows = np.empty(n, np.int64)
-    rank(predicted, 0, n, rows)
+    bank.rank(predicted, 0, n, rows)
     for row in rows[:SHIFTED_PREDICTIONS]:
-        h = bank[add(work, predicted, row)]
+        h = held[bank.add(work, predicted, row)]
         h.score = h.score - _rarity(scene.shift_rate, dt) - scene.shift_cost
         h.age = 0
-        pass_through(h, work, SHIFT, sample.number - 1, -1, sample.time)
+        bank.pass_through(h, work, SHIFT, sample.number - 1, -1, sample.time)
         for axis in range(3):
             h.cov[axis, 0, 0] += scene.shift_spread**2
             # the shift's expectation, not the innovation: after a gap most of that is the path's own uncertainty
             known = scene.shift_spread**2 / (h.cov[axis, 0, 0] + sample.sigma[axis] ** 2)
             offset = (sample.position[axis] - h.mean[axis, 0]) * known
             h.shift[axis] += offset
-            work.log[work.fill[WRITTEN] - 1].offset[axis] = offset
-    for row in range(first, work.fill[USED]):
-        right = bank[add(work, bank, row)]
+            work.log[work.fill[bank.WRITTEN] - 1].offset[axis] = offset
+    for row in range(first, work.fill[bank.USED]):
+        right = held[bank.add(work, held, row)]
         for axis in range(3):
             right.shift[axis] = 0.0
 
 
-@machine_code(NOTHING(WORK, BANK, SAMPLE, REAL, SCENE))
-def leave(work: Work, predicted: Records, sample: Sample, dt: float, scene: Record) -> None:
+@machine_code(NOTHING(bank.WORK, bank.BANK, bank.SAMPLE, REAL, bank.SCENE))
+def leave(work: bank.Work, predicted: bank.Records, sample: bank.Sample, dt: float, scene: bank.Record) -> None:
     """Adds the best resting prediction, in the air from now on."""
     best = -1
     for row in range(len(predicted)):
-        if predicted[row].surface != FLYING and (best < 0 or predicted[row].score > predicted[best].score):
+        if predicted[row].surface != bank.FLYING and (best < 0 or predicted[row].score > predicted[best].score):
             best = row
     if best < 0:
         return
-    h = work.bank[add(work, predicted, best)]
-    pass_through(h, work, LEAVE, sample.number - 1, h.surface, sample.time)
+    h = work.bank[bank.add(work, predicted, best)]
+    bank.pass_through(h, work, LEAVE, sample.number - 1, h.surface, sample.time)
     lift(h, scene)
     h.score = h.score - _rarity(scene.hit_rate, dt) - scene.leave_cost
     h.age = 0
 
 
-@machine_code(NOTHING(ONE_HYPOTHESIS, ONE, REAL, SCENE))
-def _forget(h: Record, position: Array, variance: float, scene: Record) -> None:
+@machine_code(NOTHING(bank.ONE_HYPOTHESIS, ONE, REAL, bank.SCENE))
+def _forget(h: bank.Record, position: Array, variance: float, scene: bank.Record) -> None:
     """Makes a hypothesis fly at a position (3,) m with a variance m^2, with all else unknown."""
-    h.surface, h.age = FLYING, 0
+    h.surface, h.age = bank.FLYING, 0
     for axis in range(3):
         h.shift[axis] = 0.0
         for i in range(3):
@@ -135,15 +115,15 @@ def _forget(h: Record, position: Array, variance: float, scene: Record) -> None:
         h.cov[axis, 2, 2] = scene.slack**2
 
 
-@machine_code(NOTHING(WORK, COUNT, SAMPLE, SCENE, SURFACES))
-def _rested(work: Work, row: int, sample: Sample, scene: Record, surfaces: Records) -> None:
+@machine_code(NOTHING(bank.WORK, COUNT, bank.SAMPLE, bank.SCENE, bank.SURFACES))
+def _rested(work: bank.Work, row: int, sample: bank.Sample, scene: bank.Record, surfaces: bank.Records) -> None:
     """Adds a flying hypothesis as one that rests, for each surface that the sample is near."""
     for surface in range(len(surfaces)):
         if abs(sample.position[2] - surfaces[surface].centre) < scene.rest_range:
-            down = work.bank[add(work, work.bank, row)]
+            down = work.bank[bank.add(work, work.bank, row)]
             put_down(down, surface, surfaces)
             down.score -= scene.start_at_rest_cost
-            pass_through(down, work, REST, sample.number - 1, surface, sample.time)
+            bank.pass_through(down, work, REST, sample.number - 1, surface, sample.time)
 
 
 @machine_code(REAL(REAL, REAL))
@@ -154,119 +134,121 @@ def _rarity(rate: float, dt: float) -> float:
 
 SERIES: Final = 32
 """Bits of the `serial` of an event that count those of one sample; the others are the sample's number."""
-EXPLAINED: Final[Any] = types.Tuple((BANK, LOG))
+EXPLAINED: Final[Any] = types.Tuple((bank.BANK, bank.LOG))
 """Hypotheses, best first, and the events of all hypotheses."""
 
 
-@machine_code(EXPLAINED(BANK, LOG, REAL, REAL, ONE, ONE, COUNT, SCENE, SURFACES))
+@machine_code(EXPLAINED(bank.BANK, bank.LOG, REAL, REAL, ONE, ONE, COUNT, bank.SCENE, bank.SURFACES))
 def explain(
-    bank: Records,
-    log: Records,
+    held: bank.Records,
+    log: bank.Records,
     before: float,
     time: float,
     position: Array,
     sigma: Array,
     index: int,
-    scene: Record,
-    surfaces: Records,
+    scene: bank.Record,
+    surfaces: bank.Records,
 ) -> Any:
     """The likely hypotheses after a sample, best first, and the log of their events, from those before it.
 
     Args:
-        bank: (h,) best first; none before the first sample.  log: of their events.
+        held: (h,) best first; none before the first sample.  log: of their events.
         before: s, stamp of the last sample.
         time, position, sigma, index: of this one, as in `Sample`, with its number.
     """
-    h, dt, now, old = len(bank), time - before, bank.copy(), len(log)
+    h, dt, now, old = len(held), time - before, held.copy(), len(log)
     gap = h > 0 and dt > scene.longest_gap
     steps = 1 if h == 0 or gap else max(1, math.ceil(dt / scene.longest_step))
     branched = max(h, int(scene.most)) * (1 + 2 * len(surfaces))
     room, fill = 2 * (branched + MOST_ADDED + len(surfaces)), np.zeros(2, np.int64)
-    work = Work(np.empty(room, HYPOTHESIS), np.empty(old + steps * branched + 2 * room, LOGGED), fill)
+    work = bank.Work(np.empty(room, bank.HYPOTHESIS), np.empty(old + steps * branched + 2 * room, bank.LOGGED), fill)
     work.log[:old] = log
-    fill[WRITTEN] = old
-    sample = Sample(position, sigma, index, time)
+    fill[bank.WRITTEN] = old
+    sample = bank.Sample(position, sigma, index, time)
     if h == 0:
-        start(work, NO_EVENT, 0.0, sample, scene, surfaces)
+        start(work, bank.NO_EVENT, 0.0, sample, scene, surfaces)
     elif gap:
-        pass_through(now[0], work, RESTART, index - 1, -1, time)
+        bank.pass_through(now[0], work, RESTART, index - 1, -1, time)
         start(work, now[0].tip, now[0].score, sample, scene, surfaces)
     else:
         for row in range(h):
-            add(work, now, row)
+            bank.add(work, now, row)
         for k in range(steps):
             advance(work, Step(dt / steps, index - 1, before + k * dt / steps, steps > 1), scene, surfaces)
             _keep_best(work, int(scene.most))
         _weigh(work, now, dt, sample, scene, surfaces)
-    for row in range(old, fill[WRITTEN]):
+    for row in range(old, fill[bank.WRITTEN]):
         work.log[row].serial = (index << SERIES) + row
-    return prune(work.bank, fill[USED], scene), work.log[: fill[WRITTEN]]
+    return bank.prune(work.bank, fill[bank.USED], scene), work.log[: fill[bank.WRITTEN]]
 
 
-FOLLOWED: Final[Any] = types.Tuple((BANK, LOG, LOG))
+FOLLOWED: Final[Any] = types.Tuple((bank.BANK, bank.LOG, bank.LOG))
 """Hypotheses, best first; their events that are open; the events that became final, oldest first."""
 
 
-@machine_code(FOLLOWED(BANK, LOG, REAL, ONE, TWO, TWO, COUNT, SCENE, SURFACES))
+@machine_code(FOLLOWED(bank.BANK, bank.LOG, REAL, ONE, TWO, TWO, COUNT, bank.SCENE, bank.SURFACES))
 def follow(
-    bank: Records,
-    log: Records,
+    held: bank.Records,
+    log: bank.Records,
     before: float,
     times: Array,
     positions: Array,
     sigmas: Array,
     first: int,
-    scene: Record,
-    surfaces: Records,
+    scene: bank.Record,
+    surfaces: bank.Records,
 ) -> Any:
     """The likely hypotheses after samples, from those before them: those that deny a final event are dropped.
 
     Events `scene.lag` samples old are final.
 
     Args:
-        bank, log, before: as for `explain`; the log has open events only.
+        held, log, before: as for `explain`; the log has open events only.
         times: (n,) s, positions, sigmas: (n, 3) m, of samples from number `first` on.
     """
-    final, count = np.empty(8, LOGGED), 0
+    final, count = np.empty(8, bank.LOGGED), 0
     for k in range(len(times)):
-        bank, log = explain(bank, log, before, times[k], positions[k], sigmas[k], first + k, scene, surfaces)
-        before, row = times[k], bank[0].tip
+        held, log = explain(held, log, before, times[k], positions[k], sigmas[k], first + k, scene, surfaces)
+        before, row = times[k], held[0].tip
         while row >= 0 and log[row].index >= first + k + 1 - scene.lag:
             row = log[row].before
         if row >= 0:
             decided = chain(row, log)
             if count + len(decided) > len(final):
-                longer = np.empty(2 * (count + len(decided)), LOGGED)
+                longer = np.empty(2 * (count + len(decided)), bank.LOGGED)
                 longer[:count] = final[:count]
                 final = longer
             final[count : count + len(decided)] = decided
             count += len(decided)
-            bank = bank[: decide(bank, log, row)]
-        log = log[: compact(bank, log, len(log))].copy()
-    return bank, log, final[:count]
+            held = held[: decide(held, log, row)]
+        log = log[: compact(held, log, len(log))].copy()
+    return held, log, final[:count]
 
 
-@machine_code(NOTHING(WORK, COUNT))
-def _keep_best(work: Work, most: int) -> None:
+@machine_code(NOTHING(bank.WORK, COUNT))
+def _keep_best(work: bank.Work, most: int) -> None:
     """Drops all hypotheses but the best."""
-    n = work.fill[USED]
+    n = work.fill[bank.USED]
     if n > most:
         rows, old = np.empty(n, np.int64), work.bank[:n].copy()
-        rank(old, 0, n, rows)
-        work.fill[USED] = 0
+        bank.rank(old, 0, n, rows)
+        work.fill[bank.USED] = 0
         for place in range(most):
-            add(work, old, rows[place])
+            bank.add(work, old, rows[place])
 
 
-@machine_code(NOTHING(WORK, BANK, REAL, SAMPLE, SCENE, SURFACES))
-def _weigh(work: Work, now: Records, dt: float, sample: Sample, scene: Record, surfaces: Records) -> None:
+@machine_code(NOTHING(bank.WORK, bank.BANK, REAL, bank.SAMPLE, bank.SCENE, bank.SURFACES))
+def _weigh(
+    work: bank.Work, now: bank.Records, dt: float, sample: bank.Sample, scene: bank.Record, surfaces: bank.Records
+) -> None:
     """Takes the sample into all predictions, and into those events that only a surprise suggests."""
-    predicted = work.bank[: work.fill[USED]].copy()
-    surprise = update(work, 0, sample, scene)
-    others = work.fill[USED]
+    predicted = work.bank[: work.fill[bank.USED]].copy()
+    surprise = bank.update(work, 0, sample, scene)
+    others = work.fill[bank.USED]
     leave(work, predicted, sample, dt, scene)
-    if surprise > scene.surprise or now[0].surface != FLYING:
+    if surprise > scene.surprise or now[0].surface != bank.FLYING:
         hit(work, now, sample, dt, scene, surfaces)
         if dt < scene.short_gap:
             shift(work, predicted, sample, dt, scene)
-    update(work, others, sample, scene)
+    bank.update(work, others, sample, scene)

@@ -9,21 +9,7 @@ from numba import types
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNT, FLAG, NOTHING, REAL, several
 from ballfg.dynamics.surfaces import within
-from ballfg.estimation.segmentation.bank import (
-    BANK,
-    FLYING,
-    HYPOTHESIS,
-    ONE_HYPOTHESIS,
-    SCENE,
-    SURFACES,
-    USED,
-    WORK,
-    Record,
-    Records,
-    Work,
-    add,
-    pass_through,
-)
+from ballfg.estimation.segmentation import bank
 from ballfg.estimation.segmentation.result import CONTACT, REST
 
 STRONGEST_DRAG: Final = 0.5
@@ -37,8 +23,8 @@ LANDING_SIGMA: Final = 0.2
 """m/s. Change of the horizontal velocity of a ball that stays down."""
 
 
-@machine_code(NOTHING(ONE_HYPOTHESIS, REAL, SCENE))
-def carry(h: Record, t: float, scene: Record) -> None:
+@machine_code(NOTHING(bank.ONE_HYPOTHESIS, REAL, bank.SCENE))
+def carry(h: bank.Record, t: float, scene: bank.Record) -> None:
     """A hypothesis t s later, without an event: a flying ball flies, a resting one stays down; changes `h`.
 
     Drag is linearised at the present speed, equal on the three axes: v' = (1 - k |v| dt) v + (b - g) dt. Negative steps
@@ -49,7 +35,7 @@ def carry(h: Record, t: float, scene: Record) -> None:
     loss = min(max(scene.drag * speed * t, -STRONGEST_DRAG), STRONGEST_DRAG)
     a, b = t * (1.0 - 0.5 * loss), 1.0 - loss
     left = np.empty((3, 3))
-    for axis in range(3 if h.surface == FLYING else 2):
+    for axis in range(3 if h.surface == bank.FLYING else 2):
         mean, cov = h.mean[axis], h.cov[axis]
         mean[0] = mean[0] + a * mean[1] + half * mean[2]
         mean[1] = b * mean[1] + t * mean[2]
@@ -68,8 +54,8 @@ def carry(h: Record, t: float, scene: Record) -> None:
             mean[1] -= scene.gravity * t
 
 
-@machine_code(NOTHING(ONE_HYPOTHESIS, COUNT, SURFACES))
-def put_down(h: Record, surface: int, surfaces: Records) -> None:
+@machine_code(NOTHING(bank.ONE_HYPOTHESIS, COUNT, bank.SURFACES))
+def put_down(h: bank.Record, surface: int, surfaces: bank.Records) -> None:
     """Makes a hypothesis rest on a surface."""
     h.surface = surface
     h.mean[2, 0] = surfaces[surface].centre + h.shift[2]
@@ -86,10 +72,10 @@ def put_down(h: Record, surface: int, surfaces: Records) -> None:
         h.cov[axis, 1, 1] += LANDING_SIGMA**2
 
 
-@machine_code(NOTHING(ONE_HYPOTHESIS, SCENE))
-def lift(h: Record, scene: Record) -> None:
+@machine_code(NOTHING(bank.ONE_HYPOTHESIS, bank.SCENE))
+def lift(h: bank.Record, scene: bank.Record) -> None:
     """Makes a resting hypothesis fly, with a small unknown vertical speed."""
-    h.surface = FLYING
+    h.surface = bank.FLYING
     h.cov[2, 1, 1] += scene.leave_speed**2
     for axis in range(3):
         h.cov[axis, 2, 2] += scene.slack**2
@@ -127,10 +113,10 @@ class Step(NamedTuple):
 STEP: Final[Any] = types.NamedTuple((REAL, COUNT, REAL, FLAG), Step)
 
 
-@machine_code(NOTHING(WORK, STEP, SCENE, SURFACES))
-def advance(work: Work, step: Step, scene: Record, surfaces: Records) -> None:
+@machine_code(NOTHING(bank.WORK, STEP, bank.SCENE, bank.SURFACES))
+def advance(work: bank.Work, step: Step, scene: bank.Record, surfaces: bank.Records) -> None:
     """All hypotheses of `work` after a step, branched at the contacts that may have happened."""
-    h, lowest = work.fill[USED], math.inf
+    h, lowest = work.fill[bank.USED], math.inf
     before = work.bank[:h].copy()
     for row in range(h):
         free = work.bank[row]
@@ -142,11 +128,13 @@ def advance(work: Work, step: Step, scene: Record, surfaces: Records) -> None:
             _branch(before, work, surface, step, scene, surfaces)
 
 
-@machine_code(NOTHING(BANK, WORK, COUNT, STEP, SCENE, SURFACES))
-def _branch(before: Records, work: Work, surface: int, step: Step, scene: Record, surfaces: Records) -> None:
+@machine_code(NOTHING(bank.BANK, bank.WORK, COUNT, STEP, bank.SCENE, bank.SURFACES))
+def _branch(
+    before: bank.Records, work: bank.Work, surface: int, step: Step, scene: bank.Record, surfaces: bank.Records
+) -> None:
     """Adds the hypotheses that meet one surface on the way: those that stay down, then those that bounce."""
     h = len(before)
-    landed, times, count = np.empty(h, HYPOTHESIS), np.empty(h), 0
+    landed, times, count = np.empty(h, bank.HYPOTHESIS), np.empty(h), 0
     for row in range(h):
         time, speed = _meeting(before[row], surfaces[surface].centre, scene)
         if not _is_tried(before[row], time, speed, surface, step, scene):
@@ -157,21 +145,21 @@ def _branch(before: Records, work: Work, surface: int, step: Step, scene: Record
         carry(here, time, scene)
         here.score -= scene.contact_cost
         here.age = 0
-        pass_through(here, work, CONTACT, step.interval, surface, step.start + time)
+        bank.pass_through(here, work, CONTACT, step.interval, surface, step.start + time)
         if speed < scene.rest_speed and here.cov[2, 1, 1] < KNOWN_SPEED**2:
-            down = work.bank[add(work, landed, count - 1)]
+            down = work.bank[bank.add(work, landed, count - 1)]
             put_down(down, surface, surfaces)
             carry(down, step.dt - time, scene)
             down.score -= scene.rest_cost
-            pass_through(down, work, REST, step.interval, surface, step.start + step.dt)
+            bank.pass_through(down, work, REST, step.interval, surface, step.start + step.dt)
     for k in range(count):
-        up = work.bank[add(work, landed, k)]
+        up = work.bank[bank.add(work, landed, k)]
         _bounce(up, surfaces[surface], scene)
         carry(up, step.dt - times[k], scene)
 
 
-@machine_code(several(REAL, 2)(ONE_HYPOTHESIS, REAL, SCENE))
-def _meeting(h: Record, centre: float, scene: Record) -> Any:
+@machine_code(several(REAL, 2)(bank.ONE_HYPOTHESIS, REAL, bank.SCENE))
+def _meeting(h: bank.Record, centre: float, scene: bank.Record) -> Any:
     """Time s and speed m/s at which the mean path comes down to a surface."""
     height, rise = h.mean[2, 0] - h.shift[2] - centre, h.mean[2, 1]
     drag = scene.drag * math.sqrt(h.mean[0, 1] ** 2 + h.mean[1, 1] ** 2 + rise**2)
@@ -180,10 +168,10 @@ def _meeting(h: Record, centre: float, scene: Record) -> Any:
     return (rise + speed) / pull, speed
 
 
-@machine_code(FLAG(ONE_HYPOTHESIS, REAL, REAL, COUNT, STEP, SCENE))
-def _is_tried(h: Record, time: float, speed: float, surface: int, step: Step, scene: Record) -> bool:
+@machine_code(FLAG(bank.ONE_HYPOTHESIS, REAL, REAL, COUNT, STEP, bank.SCENE))
+def _is_tried(h: bank.Record, time: float, speed: float, surface: int, step: Step, scene: bank.Record) -> bool:
     """Whether a meeting lies in the step, and on the surface as far as is known."""
-    if h.surface != FLYING or not speed > LEAST_FALL:
+    if h.surface != bank.FLYING or not speed > LEAST_FALL:
         return False
     if surface == 0:
         x = h.mean[0, 0] - h.shift[0] + h.mean[0, 1] * time
@@ -198,8 +186,8 @@ def _is_tried(h: Record, time: float, speed: float, surface: int, step: Step, sc
     return -margin < time < step.dt + margin and h.age >= 1
 
 
-@machine_code(NOTHING(ONE_HYPOTHESIS, SURFACES.dtype, SCENE))
-def _bounce(h: Record, surface: Record, scene: Record) -> None:
+@machine_code(NOTHING(bank.ONE_HYPOTHESIS, bank.SURFACES.dtype, bank.SCENE))
+def _bounce(h: bank.Record, surface: bank.Record, scene: bank.Record) -> None:
     """A hypothesis at a contact, bounced: mirrored in z, slowed by the friction of an unknown spin.
 
     Friction changes the tangential velocity by mu (1 + e) v_n at most, either way: half of that is expected, up to the

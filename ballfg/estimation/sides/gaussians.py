@@ -1,7 +1,5 @@
 """Updates, truncates and merges Gaussian mixtures over the state of one ball."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -28,12 +26,12 @@ class GaussianMixture:
     covariances: Array
 
     @classmethod
-    def single(cls, mean: Array, covariance: Array) -> GaussianMixture:
+    def single(cls, mean: Array, covariance: Array) -> "GaussianMixture":
         """One Gaussian (d,) and (d, d) with the weight one."""
         return cls(np.zeros(1), mean[None], covariance[None])
 
     @staticmethod
-    def concatenated(parts: Sequence[GaussianMixture]) -> GaussianMixture:
+    def concatenated(parts: "Sequence[GaussianMixture]") -> "GaussianMixture":
         """All Gaussians of several mixtures."""
         fields = ("log_weights", "means", "covariances")
         return GaussianMixture(*(np.concatenate([getattr(part, field) for part in parts]) for field in fields))
@@ -47,11 +45,11 @@ class GaussianMixture:
         largest = float(self.log_weights.max(initial=-np.inf))
         return largest if largest == -np.inf else largest + float(np.log(np.exp(self.log_weights - largest).sum()))
 
-    def selected(self, rows: NDArray[np.bool_]) -> GaussianMixture:
+    def selected(self, rows: NDArray[np.bool_]) -> "GaussianMixture":
         """A part of the Gaussians, by a mask (n,)."""
         return GaussianMixture(self.log_weights[rows], self.means[rows], self.covariances[rows])
 
-    def updated(self, innovation: Array, noise: Array, H: Array) -> tuple[GaussianMixture, Array]:
+    def updated(self, innovation: Array, noise: Array, H: Array) -> "tuple[GaussianMixture, Array]":
         """The Kalman update, and squared whitened innovations (n,); weights gain the likelihood.
 
         Args:
@@ -69,13 +67,13 @@ class GaussianMixture:
         means = self.means + (gain @ innovation[..., None])[..., 0]
         return GaussianMixture(log_weights, means, covariances), squares
 
-    def updated_by_factor(self, factor: FactorBatch, biases: int) -> GaussianMixture:
+    def updated_by_factor(self, factor: FactorBatch, biases: int) -> "GaussianMixture":
         """The same update with a batch of one factor, which does not see the `biases` at the state's end."""
         found = [FilterInnovation.of(factor, *one, biases) for one in zip(self.means, self.covariances, strict=True)]
         residuals, noise, H = (np.stack([getattr(one, name) for one in found]) for name in ("residual", "R", "H"))
         return self.updated(-residuals, noise, H)[0]
 
-    def truncated(self, gaps: Array, gradients: Array) -> GaussianMixture:
+    def truncated(self, gaps: Array, gradients: Array) -> "GaussianMixture":
         """The part above a surface, from gaps (n,) m and gradients (n, d); weighted by the remaining shares."""
         from scipy import special  # few tracks end near a contact, and it takes a tenth of a second to import
 
@@ -89,7 +87,7 @@ class GaussianMixture:
         covariances = self.covariances + narrowing[:, None, None] * along[:, :, None] * along[:, None, :]
         return GaussianMixture(self.log_weights + log_share, means, covariances)
 
-    def merged(self) -> GaussianMixture:
+    def merged(self) -> "GaussianMixture":
         """One Gaussian with the mean, the covariance and the weight of the whole mixture."""
         log_weight = self.log_weight
         shares = np.exp(self.log_weights - log_weight)
@@ -98,6 +96,6 @@ class GaussianMixture:
         covariance = np.einsum("n,nij->ij", shares, self.covariances) + (shares * apart.T) @ apart
         return GaussianMixture(np.array([log_weight]), mean[None], 0.5 * (covariance + covariance.T)[None])
 
-    def divided(self, log_weight: float) -> GaussianMixture:
+    def divided(self, log_weight: float) -> "GaussianMixture":
         """The mixture with all weights divided by one, given by its logarithm."""
         return replace(self, log_weights=self.log_weights - log_weight)

@@ -21,20 +21,13 @@ from ballfg.estimation.segmentation.result import Contact, Quality, Segmentation
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, total_sigmas
 from ballfg.estimation.smoother.motion import TrackDynamics
 from ballfg.estimation.smoother.second_look.low_hops import LowHops
+from ballfg.factors import prior
 from ballfg.factors.batch import FactorBatch, Values
 from ballfg.factors.correlated_noise import BIAS_DIM, BiasFactors, BiasStartFactors
 from ballfg.factors.dynamics import model_width
 from ballfg.factors.graph import BallGraph
 from ballfg.factors.launcher import LauncherSpinFactors
 from ballfg.factors.linear.covariance import Covariances
-from ballfg.factors.prior import (
-    CoefficientPriorFactors,
-    PriorFactors,
-    coefficient_prior,
-    spin_label,
-    spin_prior,
-    state_prior,
-)
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 from ballfg.tracks import Track
 
@@ -151,9 +144,9 @@ class TrackProblem:
             batches.append(BiasFactors(np.arange(len(dt)), dt, sigma, self.settings.memory_time))
         own, others = self.coefficient_sigmas[: self.width], len(self.unknowns.names)
         if isinstance(self.ball, AugmentedModel):
-            batches.append(CoefficientPriorFactors(self.ball, own, others))
+            batches.append(prior.CoefficientPriorFactors(self.ball, own, others))
         if others:
-            batches.append(coefficient_prior(self.unknowns.means, self.unknowns.sigmas, self.width))
+            batches.append(prior.coefficient_prior(self.unknowns.means, self.unknowns.sigmas, self.width))
         return BallGraph(tuple(batches))
 
     def start(self, states: Array) -> Values:
@@ -206,21 +199,21 @@ def _priors_after_hits(track: Track, segmentation: Segmentation, settings: Setti
         return []
     anew = replace(settings, spin_prior=max(settings.spin_prior, LEAST_SPIN_PRIOR))
     begins = (segmentation.restarts + 1).tolist()
-    return [prior for k in begins for prior in start_priors(k, track.positions[k], None, anew)]
+    return [one for k in begins for one in start_priors(k, track.positions[k], None, anew)]
 
 
 def start_priors(state: int, position: Array, label: SpinLabel | None, settings: Settings) -> list[FactorBatch]:
     """Priors on a state without a link to a previous one, at a measured position (3,) m, with a label of its spin."""
     known, where = spin_start(label, settings), np.array([state])
     if known.measured:
-        about: PriorFactors = spin_label(where, known.spin[None], known.sigmas[None], settings.label_loss)
+        about: prior.PriorFactors = prior.spin_label(where, known.spin[None], known.sigmas[None], settings.label_loss)
     else:
-        about = spin_prior(where, known.spin[None], known.sigmas[None], settings.spin_loss, known.axes)
+        about = prior.spin_prior(where, known.spin[None], known.sigmas[None], settings.spin_loss, known.axes)
     return [_wide_prior(state, position, settings), about]
 
 
-def _wide_prior(state: int, position: Array, settings: Settings) -> PriorFactors:
+def _wide_prior(state: int, position: Array, settings: Settings) -> prior.PriorFactors:
     mean, sigma = np.zeros(STATE_DIM), np.empty(STATE_DIM)
     mean[POSITION] = position
     sigma[POSITION], sigma[VELOCITY], sigma[SPIN] = START_POSITION_SIGMA, settings.velocity_prior, UNINFORMATIVE_SPIN
-    return state_prior(state, mean, sigma)
+    return prior.state_prior(state, mean, sigma)

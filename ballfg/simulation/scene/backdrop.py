@@ -11,18 +11,7 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array
 from ballfg.checks import shown
 from ballfg.simulation.balls import BallKind
-from ballfg.simulation.scene.room import (
-    CEILING_COLOUR,
-    FLOOR_COLOUR,
-    LINE_COLOUR,
-    TABLE_COLOUR,
-    WALL_COLOUR,
-    WALLS,
-    Box,
-    furniture,
-    is_line,
-    middle_line,
-)
+from ballfg.simulation.scene import room
 from ballfg.vision.camera import Camera
 
 Image = NDArray[np.float32]
@@ -52,17 +41,17 @@ def backdrop(camera: Camera, kind: BallKind, rng: np.random.Generator) -> Backdr
     Args: camera: must stand in the room.
     Raises: ValueError: the camera stands outside the room.
     """
-    if not ((WALLS[0] < camera.centre) & (camera.centre < WALLS[1])).all():
+    if not ((room.WALLS[0] < camera.centre) & (camera.centre < room.WALLS[1])).all():
         raise ValueError(
-            f"camera {shown(camera.name)} must stand in the room, {WALLS[0].tolist()} to {WALLS[1].tolist()} m; "
-            f"it stands at {np.round(camera.centre, 2).tolist()} m. Lower the distance."
+            f"camera {shown(camera.name)} must stand in the room, {room.WALLS[0].tolist()} to {room.WALLS[1].tolist()} "
+            f"m; it stands at {np.round(camera.centre, 2).tolist()} m. Lower the distance."
         )
-    look = partial(_look, camera, kind, furniture(kind), _texture(rng))
+    look = partial(_look, camera, kind, room.furniture(kind), _texture(rng))
     width, height = camera.size
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
     colours, distance, faces = look(pixels.reshape(-1, 2))
     image = colours.reshape(height, width, 3)
-    edges = _edges(faces.reshape(height, width), camera.project(middle_line(kind)))
+    edges = _edges(faces.reshape(height, width), camera.project(room.middle_line(kind)))
     places = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
     within = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
     fine, _, _ = look((pixels[edges][:, None] + within).reshape(-1, 2))
@@ -81,12 +70,12 @@ def _edges(faces: NDArray[np.uint8], thin: Array) -> NDArray[np.bool_]:
 
 
 def _look(
-    camera: Camera, kind: BallKind, boxes: list[Box], texture: Image, pixels: Array
+    camera: Camera, kind: BallKind, boxes: list[room.Box], texture: Image, pixels: Array
 ) -> tuple[Image, Image, NDArray[np.uint8]]:
     """Colours (n, 3), distance (n,) m and faces (n,), white lines among them, of what is visible at pixels (n, 2)."""
     rays = (camera.normalized(pixels) @ camera.rotation[:2] + camera.rotation[2]).astype(np.float32)
     start = camera.centre.astype(np.float32)
-    length, axis = _exit(start, rays, *WALLS)
+    length, axis = _exit(start, rays, *room.WALLS)
     points = start + rays * length[:, None]
     colours = _walls(points, axis, texture)
     faces = axis.astype(np.uint8)
@@ -97,14 +86,14 @@ def _look(
         if hits.any():
             hit = window[hits]
             points = start + rays[hit] * near[hits][:, None]
-            lines = box.lined & (across[hits] == 2) & is_line(kind, points[:, 0], points[:, 1])
+            lines = box.lined & (across[hits] == 2) & room.is_line(kind, points[:, 0], points[:, 1])
             colours[hit] = _box_colour(box, points, across[hits], lines, texture)
             faces[hit] = FACES * number + across[hits] + 3 * lines
             length[hit] = near[hits]
     return colours, length * np.linalg.norm(rays, axis=-1), faces
 
 
-def _may_show(camera: Camera, box: Box, pixels: Array) -> NDArray[np.bool_]:
+def _may_show(camera: Camera, box: room.Box, pixels: Array) -> NDArray[np.bool_]:
     """(n,) True for pixels (n, 2) that may show a box; all if the lens cannot show all of its corners."""
     margin = 24 + camera.size[0] // 40  # straight edges bend between their corners
     corners = camera.project(box.corners())
@@ -142,20 +131,22 @@ def _walls(points: Image, axis: NDArray[np.int64], texture: Image) -> Image:
     """(n, 3) colours of points on the walls, the floor and the ceiling."""
     level = points[..., 2]
     colours = np.empty_like(points)
-    colours[...] = WALL_COLOUR
+    colours[...] = room.WALL_COLOUR
     flat = axis == 2
-    colours[flat & (level < 1.0)] = FLOOR_COLOUR
-    colours[flat & (level >= 1.0)] = CEILING_COLOUR
+    colours[flat & (level < 1.0)] = room.FLOOR_COLOUR
+    colours[flat & (level >= 1.0)] = room.CEILING_COLOUR
     return colours * _shade(points, axis, texture)
 
 
-def _box_colour(box: Box, points: Image, axis: NDArray[np.int64], lines: NDArray[np.bool_], texture: Image) -> Image:
+def _box_colour(
+    box: room.Box, points: Image, axis: NDArray[np.int64], lines: NDArray[np.bool_], texture: Image
+) -> Image:
     """(n, 3) colours of points on a box, some of them on the lines of the table."""
     colours = np.empty_like(points)
     colours[...] = box.colour
     if box.lined:
-        colours[axis == 2] = TABLE_COLOUR
-        colours[lines] = LINE_COLOUR
+        colours[axis == 2] = room.TABLE_COLOUR
+        colours[lines] = room.LINE_COLOUR
     return colours * _shade(points, axis, texture)
 
 

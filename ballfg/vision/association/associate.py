@@ -13,16 +13,8 @@ import numpy as np
 from ballfg.checks import check_count, check_range
 from ballfg.tracks.sightings import Sightings
 from ballfg.tracks.stamps import elapsed, written
+from ballfg.vision.association import gathering
 from ballfg.vision.association.flights import is_ball, successions
-from ballfg.vision.association.gathering import (
-    SAME_SHUTTER,
-    Footage,
-    Gathered,
-    SeenBall,
-    complete,
-    gather,
-    shared_stamps,
-)
 from ballfg.vision.association.matching import Piece, match
 from ballfg.vision.association.tracklets import find_tracklets
 from ballfg.vision.camera import Camera
@@ -48,7 +40,7 @@ class AssociationSettings:
 
 def associate(
     detections: Sequence[Detections], cameras: Sequence[Camera], settings: AssociationSettings | None = None
-) -> list[SeenBall]:
+) -> list[gathering.SeenBall]:
     """The balls that several cameras saw, in the order of their first points.
 
     Cameras need not share a shutter or a rate, and frames may be missing. If the cameras share stamps, the points are
@@ -69,14 +61,16 @@ def associate(
     footage, balls = replace(footage, offset=offset), []
     for group in groups:
         rows = [[pieces[i].rows for i in group if pieces[i].camera == c] for c in range(len(cameras))]
-        balls.append(gather(footage, [np.sort(np.concatenate([_NONE, *own])) for own in rows]))
+        balls.append(gathering.gather(footage, [np.sort(np.concatenate([_NONE, *own])) for own in rows]))
     balls = _joined(footage, [ball for ball in balls if len(ball.track.times) >= 2])
-    balls = _joined(footage, complete(footage, balls))
+    balls = _joined(footage, gathering.complete(footage, balls))
     balls = [ball for ball in balls if len(ball.track.times) >= settings.least_points and is_ball(ball.track)]
     return sorted((_seen_ball(footage, ball) for ball in balls), key=lambda ball: float(ball.times[0]))
 
 
-def _footage(detections: Sequence[Detections], cameras: Sequence[Camera], settings: AssociationSettings) -> Footage:
+def _footage(
+    detections: Sequence[Detections], cameras: Sequence[Camera], settings: AssociationSettings
+) -> gathering.Footage:
     names = [camera.name for camera in cameras]
     by_name = {seen.camera: seen for seen in detections}
     if len(names) < 2 or len(set(names)) < len(names):
@@ -92,10 +86,12 @@ def _footage(detections: Sequence[Detections], cameras: Sequence[Camera], settin
     counted = [replace(seen, frames=elapsed(seen.frames, origin)) for seen in ordered]
     chosen = [seen.select(seen.scores >= settings.least_score) for seen in counted]
     frames = [seen.frames - camera.time_offset for seen, camera in zip(chosen, cameras, strict=True)]
-    return Footage(list(cameras), chosen, shared_stamps(frames, SAME_SHUTTER), origin, stamps)
+    return gathering.Footage(
+        list(cameras), chosen, gathering.shared_stamps(frames, gathering.SAME_SHUTTER), origin, stamps
+    )
 
 
-def _joined(footage: Footage, balls: list[Gathered]) -> list[Gathered]:
+def _joined(footage: gathering.Footage, balls: list[gathering.Gathered]) -> list[gathering.Gathered]:
     following = dict(successions([ball.track for ball in balls]))
     later = set(following.values())
     joined = []
@@ -117,17 +113,17 @@ def _joined(footage: Footage, balls: list[Gathered]) -> list[Gathered]:
             rows = np.concatenate(parts)
             _, position, count = np.unique(seen.frame[rows], return_inverse=True, return_counts=True)
             undisputed.append(np.sort(rows[count[position] == 1]))
-        joined.append(gather(footage, undisputed))
+        joined.append(gathering.gather(footage, undisputed))
     return joined
 
 
-def _may_follow(footage: Footage, one: Gathered, other: Gathered) -> bool:
+def _may_follow(footage: gathering.Footage, one: gathering.Gathered, other: gathering.Gathered) -> bool:
     """True if hardly any camera saw both in one frame; where one did, one of the candidates is wrong."""
     pairs = zip(footage.detections, one.rows, other.rows, strict=True)
     return all(np.isin(seen.frame[mine], seen.frame[theirs]).sum() <= _DISPUTED for seen, mine, theirs in pairs)
 
 
-def _seen_ball(footage: Footage, ball: Gathered) -> SeenBall:
+def _seen_ball(footage: gathering.Footage, ball: gathering.Gathered) -> gathering.SeenBall:
     camera = np.repeat(np.arange(len(ball.rows)), [len(rows) for rows in ball.rows])
     pairs = list(zip(footage.detections, ball.rows, strict=True))
     since = np.concatenate([seen.times[rows] for seen, rows in pairs])
@@ -138,4 +134,4 @@ def _seen_ball(footage: Footage, ball: Gathered) -> SeenBall:
     names = tuple(c.name for c in footage.cameras)
     sightings = Sightings(names, camera[order], stamps[order], pixels[order], spread[order])
     times = written(ball.track.times, footage.origin)
-    return SeenBall(times, ball.track.values, ball.covariances, sightings, ball.views)
+    return gathering.SeenBall(times, ball.track.values, ball.covariances, sightings, ball.views)

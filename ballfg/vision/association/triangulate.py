@@ -1,7 +1,5 @@
 """Triangulates the rays of several cameras to points with covariances, and leaves out wrong views."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -54,7 +52,7 @@ class _Views:
         derivatives = (self.rotations[:, :2] - planes[..., None] * self.rotations[:, None, 2]) / safe[..., None]
         return planes, derivatives, depths
 
-    def rows(self, chosen: NDArray[np.intp]) -> _Views:
+    def rows(self, chosen: NDArray[np.intp]) -> "_Views":
         """The same cameras, other rows."""
         return _Views(self.rotations, self.translations, self.planes[chosen], self.weights[chosen], self.seen[chosen])
 

@@ -6,8 +6,6 @@ is by least squares on differences to the background, over the whole edge: the b
 centre.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from typing import Final
@@ -51,7 +49,7 @@ class Look:
     information: Array  # (3, 3), inverse of the covariance of these
 
     @classmethod
-    def unknown(cls) -> Look:
+    def unknown(cls) -> "Look":
         """The expectation before any ball was seen.
 
         A lens blur of 0.6 px and a square pixel make an edge of 0.85 px; a ball under one lamp is brighter by a quarter
@@ -71,7 +69,7 @@ class Patch:
     level: float  # grey levels, that mean
     noise: float  # grey levels, sigma of `change`
 
-    def at(self, rows: NDArray[np.intp]) -> Patch:
+    def at(self, rows: NDArray[np.intp]) -> "Patch":
         """A part of the pixels."""
         return Patch(self.x[rows], self.y[rows], self.change[rows], self.background[rows], self.level, self.noise)
 

@@ -5,8 +5,6 @@ Unknowns of a track of n samples: positions and velocities (n, 3) each and one s
 acceleration is a formula, or a network with two hidden layers of tanh. Runs in any environment that has numpy.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -63,7 +61,7 @@ class Problem:
         np.savez(path, **{field.name: getattr(self, field.name) for field in fields(self)})
 
     @classmethod
-    def load(cls, path: Path | str) -> Problem:
+    def load(cls, path: Path | str) -> "Problem":
         """Read what `save` wrote."""
         with np.load(path) as file:
             return cls(**{name: file[name] for name in file.files})

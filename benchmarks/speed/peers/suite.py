@@ -7,11 +7,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import numpy as np
 
@@ -36,7 +35,7 @@ class LibraryError(Exception):
 
 
 class Session:
-    """A running process; use it in a `with` block.
+    """A running process, which `close` ends.
 
     Args: python: command that starts the library's interpreter.  task: "estimate" or "rollout".
 
@@ -63,16 +62,10 @@ class Session:
         try:
             answer = self._answer()
         except LibraryError:
-            self._end()
+            self.close()
             raise
         self.cold = time.perf_counter() - begun
         self.first, self.peak = float(answer["first"]), 0.0
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._end()
 
     def times(self, count: int) -> list[float]:
         """S of so many solutions, one after another."""
@@ -106,7 +99,8 @@ class Session:
         last = self._process.stderr.read().strip().splitlines()[-1:]
         raise LibraryError(f"{self._library} ended: {' '.join(last) or 'without a word'}")
 
-    def _end(self) -> None:
+    def close(self) -> None:
+        """Ends the process."""
         self._process.kill()
         self._process.communicate()
 
@@ -198,7 +192,7 @@ def _run_task(
         sessions = {}
         for library, python in pythons.items():
             try:
-                sessions[library] = stack.enter_context(Session(python, library, task.kind, path))
+                sessions[library] = stack.enter_context(closing(Session(python, library, task.kind, path)))
             except LibraryError as error:
                 print(f"note: {task.name}: {error}", file=sys.stderr)
         reference = _reference(task, problem, path, sessions["ballfg"])
@@ -231,7 +225,7 @@ def _reference(task: Task, problem: Problem, path: Path, own: Session) -> dict[s
     if task.kind == "rollout":
         return own.solution(path.parent)
     if task.network:
-        with Session([sys.executable], "gtsam", "reference", path) as session:
+        with closing(Session([sys.executable], "gtsam", "reference", path)) as session:
             return session.solution(path.parent)
     if task.kind == "gradient":
         return {"gradient": np.array([_slope(problem, which) for which in range(2)])}

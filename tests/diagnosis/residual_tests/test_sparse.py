@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from ballfg.diagnosis.fit.fit import values_of
-from ballfg.diagnosis.residual_tests.fallback import describe
-from ballfg.diagnosis.residual_tests.sparse import MOST_TERMS, fit_with_terms, select, sparse_terms
+from ballfg.diagnosis.residual_tests.sparse import MOST_TERMS, describe, fit_with_terms, select, sparse_terms
 from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.effects.generic import GenericFlight
 from ballfg.dynamics.model_file import model_from_dict, model_to_dict

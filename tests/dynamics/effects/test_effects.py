@@ -210,8 +210,8 @@ def test_surfaces():
     assert Surfaces() == Surfaces(0.0, None, None)  # the frame's origin lies on it
     state = torch.zeros((3, 9), dtype=torch.float64)
     state[:, 2] = torch.tensor((1.0, 0.71, 0.69))
-    assert surfaces.height_below(state).tolist() == [0.7, 0.7, pytest.approx(-0.06)]
+    assert surfaces.height_below(state, 0.0).tolist() == [0.7, 0.7, pytest.approx(-0.06)]
     beside = Surfaces(0.7, 0.0, (1.0, 2.0, 0.0, 1.0))
-    assert beside.height_below(state).tolist() == [0.0, 0.0, 0.0]
-    assert beside.level_below(state).tolist() == [0.7, 0.7, 0.0]
+    assert beside.height_below(state, 0.0).tolist() == [0.0, 0.0, 0.0]
+    assert beside.level_below(state, 0.0).tolist() == [0.7, 0.7, 0.0]
     assert Surfaces(0.7).lowest() == -math.inf

@@ -9,17 +9,10 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from ballfg.dynamics.motion.contact import (
-    LONGEST_FALL,
-    MAX_STEP,
-    _newton_step,
-    _scan,
-    contact_time,
-    fly_through,
-    fly_through_jacobian,
-)
+from ballfg.dynamics.motion.contact import _newton_step, _scan, contact_time, fly_through, fly_through_jacobian
 from ballfg.dynamics.motion.flight_step import derivative
 from ballfg.dynamics.motion.integrate import batch_jacobian, fly
+from ballfg.dynamics.motion.limits import LONGEST_FALL, MAX_STEP
 
 R = 0.02
 

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from ballfg.simulation.scene.backdrop import FLOOR_COLOUR, TEXTURE_DEPTH, _walls
+from ballfg.simulation.scene.backdrop import TEXTURE_DEPTH, _walls
 from ballfg.simulation.scene.movers import Capsule, _distance_to_segment, draw, movers
+from ballfg.simulation.scene.room import FLOOR_COLOUR
 from ballfg.vision import Camera
 
 

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ballfg.vision.association.associate import AssociationSettings, SeenBall, associate
+from ballfg.vision.association.associate import AssociationSettings, associate
+from ballfg.vision.association.gathering import SeenBall
 from ballfg.vision.detection.detections import Detections
 from tests.vision.filming import Shot, World, film, rig, shots, turned
 from tests.vision.judging import judge

@@ -6,15 +6,7 @@ through the surface, *unbounced*, stands for them: `mixture.py` uses it.
 
 import numpy as np
 
-from ballfg.dynamics.compiled.beliefs.edges import (
-    at_rest,
-    come_down,
-    falls_past,
-    gap_of,
-    level_below,
-    over_table,
-    share_over_table,
-)
+from ballfg.dynamics.compiled.beliefs import edges
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.contacts import meet, times_of
 from ballfg.dynamics.compiled.flight import fly_one, glide, laws_of, laws_of_one, white_acceleration
@@ -92,8 +84,8 @@ def bounce(laws, start, covariance, h, level, world, noise, x, after):
         return False
     past = 0.0  # share of balls that miss the table
     if level == world[0] and elapsed >= 0.0:
-        past = 1.0 - share_over_table(touch[0], covariance, world)
-        if not past < NEGLIGIBLE and not over_table(touch[0], world):
+        past = 1.0 - edges.share_over_table(touch[0], covariance, world)
+        if not past < NEGLIGIBLE and not edges.over_table(touch[0], world):
             return False
     through(jacobian[0], covariance, gathered)
     add_flight(gathered, max(elapsed, 0.0), noise)
@@ -104,7 +96,7 @@ def bounce(laws, start, covariance, h, level, world, noise, x, after):
     left = h - (elapsed + tau[0])
     fly_one(rates, there[0], moved[0], left, -taut[0], 1)
     x[:] = there[0]
-    if x[5] < 0.0 and not gap_of(laws.surface, x, level, radius) >= 0.0:
+    if x[5] < 0.0 and not edges.gap_of(laws.surface, x, level, radius) >= 0.0:
         return False
     through(moved[0], gathered, after)
     add_flight(after, min(left, h), noise)
@@ -162,15 +154,15 @@ def carry(
                 level[k + 1, r] = level[k, r]
             else:
                 age[k + 1, r] = np.nan
-            low, after = level_below(laws.surface, x[:9], world), mean[k + 1, r]
-            if at_rest(laws.surface, x[:9], low, world):
+            low, after = edges.level_below(laws.surface, x[:9], world), mean[k + 1, r]
+            if edges.at_rest(laws.surface, x[:9], low, world):
                 hard[r], stop = 2.0, True
                 continue
-            if after[5] >= 0.0 or gap_of(laws.surface, after[:9], low, world[2]) >= 0.0:
+            if after[5] >= 0.0 or edges.gap_of(laws.surface, after[:9], low, world[2]) >= 0.0:
                 continue
-            if low == world[0] and gap_of(laws.surface, after[:9], world[1], world[2]) >= 0.0:
-                tau = come_down(laws, x[:9], low, world, touch)
-                if falls_past(laws, covariance[k, r], touch, tau, step, world, after, covariance[k + 1, r]):
+            if low == world[0] and edges.gap_of(laws.surface, after[:9], world[1], world[2]) >= 0.0:
+                tau = edges.come_down(laws, x[:9], low, world, touch)
+                if edges.falls_past(laws, covariance[k, r], touch, tau, step, world, after, covariance[k + 1, r]):
                     continue
             beside[k + 1, r], besides[k + 1, r] = after, covariance[k + 1, r]
             level[k + 1, r], age[k + 1, r] = low, 0.0

@@ -1,7 +1,5 @@
 """Collects the lines of a C function while a Python function is translated."""
 
-from __future__ import annotations
-
 import re
 import textwrap
 from collections import Counter
@@ -45,7 +43,7 @@ class Body:
         written: roots of arrays that are written to.
     """
 
-    def __init__(self, translator: Translator, routine: Routine, outer: Body | None = None) -> None:
+    def __init__(self, translator: "Translator", routine: "Routine", outer: "Body | None" = None) -> None:
         self.translator, self.routine, self.names = translator, routine, dict[str, Value]()
         self._outer = outer
         self.lines: list[str] = [] if outer is None else outer.lines
@@ -221,7 +219,7 @@ class Body:
         self.line(f"{call};")
         return tuple(outputs)
 
-    def _inlined(self, routine: Routine, given: Sequence[Value]) -> Value:
+    def _inlined(self, routine: "Routine", given: Sequence[Value]) -> Value:
         inner = Body(self.translator, routine, self)
         for argument, value in zip(routine.tree.args.args, given, strict=True):
             inner.names[argument.arg] = inner.kept(value)

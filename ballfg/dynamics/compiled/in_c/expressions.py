@@ -1,7 +1,5 @@
 """Translates expressions of Python functions to C."""
 
-from __future__ import annotations
-
 import ast
 import builtins
 import math
@@ -69,7 +67,7 @@ def constant_of(value: Value) -> int | float:
     return value.value
 
 
-def expression(body: Body, node: ast.expr) -> Value:
+def expression(body: "Body", node: ast.expr) -> Value:
     """The value of an expression; what it needs is written before, to the lines of the body."""
     match node:
         case ast.Constant():
@@ -99,7 +97,7 @@ def expression(body: Body, node: ast.expr) -> Value:
     raise UntranslatableError(f"{ast.unparse(node)} has no translation to C")
 
 
-def _several(body: Body, nodes: Sequence[ast.expr]) -> list[Value]:
+def _several(body: "Body", nodes: Sequence[ast.expr]) -> list[Value]:
     """Values of arguments, those of a starred tuple among them."""
     found: list[Value] = []
     for node in nodes:
@@ -109,7 +107,7 @@ def _several(body: Body, nodes: Sequence[ast.expr]) -> list[Value]:
     return found
 
 
-def _named(body: Body, name: str) -> Value:
+def _named(body: "Body", name: str) -> Value:
     if name in body.names:
         return body.names[name]
     if name in body.routine.known:
@@ -129,7 +127,7 @@ def _attribute(owner: Value, name: str) -> Value:
     raise UntranslatableError(f"{owner!r} has no attribute '{name}' in C")
 
 
-def _unary(body: Body, operator: ast.unaryop, value: Value) -> Value:
+def _unary(body: "Body", operator: ast.unaryop, value: Value) -> Value:
     if isinstance(operator, ast.Not):
         return (
             Constant(not value.value) if isinstance(value, Constant) else Scalar(f"!{text_of(value, ATOM)}", INT, ANY)
@@ -147,7 +145,7 @@ def _unary(body: Body, operator: ast.unaryop, value: Value) -> Value:
     )
 
 
-def _binary(body: Body, operator: type[ast.operator], a: Value, b: Value) -> Value:
+def _binary(body: "Body", operator: type[ast.operator], a: Value, b: Value) -> Value:
     sign, compute = BINARY[operator]
     if isinstance(a, Constant) and isinstance(b, Constant):
         return Constant(compute(a.value, b.value))
@@ -166,7 +164,7 @@ def _within(rank: int) -> int:
     return rank if rank in (TIMES, PLUS) else TIMES
 
 
-def _power(body: Body, base: Value, exponent: int | float) -> Value:
+def _power(body: "Body", base: Value, exponent: int | float) -> Value:
     if isinstance(exponent, int) and exponent > 0:
         return Scalar(" * ".join([text_of(body.kept(base), ATOM)] * exponent), kind_of(base), TIMES)
     return Scalar(f"pow({text_of(base)}, {text_of(Constant(exponent))})", DOUBLE)
@@ -194,7 +192,7 @@ def _compared(operator: type[ast.cmpop], a: Value, b: Value) -> Value:
     return Scalar(f"{text_of(a, PLUS)} {sign} {text_of(b, PLUS)}", INT, ANY)
 
 
-def _chosen(body: Body, node: ast.IfExp) -> Value:
+def _chosen(body: "Body", node: ast.IfExp) -> Value:
     test = expression(body, node.test)
     if isinstance(test, Constant):
         return expression(body, node.body if test.value else node.orelse)
@@ -202,7 +200,7 @@ def _chosen(body: Body, node: ast.IfExp) -> Value:
     return Scalar(f"{text_of(test, PLUS)} ? {text_of(a, PLUS)} : {text_of(b, PLUS)}", common((a, b)), ANY)
 
 
-def _element(body: Body, node: ast.Subscript) -> Value:
+def _element(body: "Body", node: ast.Subscript) -> Value:
     owner = expression(body, node.value)
     parts = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
     if isinstance(owner, tuple):
@@ -212,7 +210,7 @@ def _element(body: Body, node: ast.Subscript) -> Value:
     return element(body, owner, parts)
 
 
-def element(body: Body, owner: Array, parts: Sequence[ast.expr]) -> Array | Scalar:
+def element(body: "Body", owner: Array, parts: Sequence[ast.expr]) -> Array | Scalar:
     """An entry of an array, or a part of it that lies in one piece."""
     shape, fixed, moving = list[int | str | None](), 0, list[str]()
     for part, length, stride in zip(parts, owner.shape, owner.strides(), strict=False):
@@ -239,7 +237,7 @@ def element(body: Body, owner: Array, parts: Sequence[ast.expr]) -> Array | Scal
     return body.pointed(part_of) if moving else part_of
 
 
-def _bounds(body: Body, part: ast.Slice, length: int | str | None) -> tuple[int, int]:
+def _bounds(body: "Body", part: ast.Slice, length: int | str | None) -> tuple[int, int]:
     low = 0 if part.lower is None else int(constant_of(expression(body, part.lower)))
     high = length if part.upper is None else int(constant_of(expression(body, part.upper)))
     if not isinstance(length, int) or not isinstance(high, int):
@@ -247,7 +245,7 @@ def _bounds(body: Body, part: ast.Slice, length: int | str | None) -> tuple[int,
     return min(low, length), min(high, length)
 
 
-def _called(body: Body, node: ast.Call) -> Value:
+def _called(body: "Body", node: ast.Call) -> Value:
     function, given = expression(body, node.func), _several(body, node.args)
     if isinstance(function, tuple):
         owner, name = function
@@ -274,7 +272,7 @@ def _called(body: Body, node: ast.Call) -> Value:
     return body.call(function, given)
 
 
-def _method(body: Body, owner: Array, name: str, given: Sequence[Value]) -> Array:
+def _method(body: "Body", owner: Array, name: str, given: Sequence[Value]) -> Array:
     if name == "copy":
         copied = body.storage(owner.shape, None)
         body.copy(copied, owner)

@@ -1,7 +1,5 @@
 """Translates statements of Python functions to C."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -24,12 +22,12 @@ if TYPE_CHECKING:
     from ballfg.dynamics.compiled.in_c.values import Value
 
 
-def block(body: Body, statements: Sequence[ast.stmt]) -> bool:
+def block(body: "Body", statements: Sequence[ast.stmt]) -> bool:
     """Translate statements; True if the last one leaves the block, so that nothing after it is reached."""
     return any(_statement(body, statement) for statement in statements)
 
 
-def _statement(body: Body, node: ast.stmt) -> bool:
+def _statement(body: "Body", node: ast.stmt) -> bool:
     match node:
         case ast.Expr(value=ast.Constant()) | ast.Pass():
             return False
@@ -66,7 +64,7 @@ def _statement(body: Body, node: ast.stmt) -> bool:
     return False
 
 
-def bind(body: Body, target: ast.expr, value: Value) -> None:
+def bind(body: "Body", target: ast.expr, value: "Value") -> None:
     """Give a name a value, or write to entries of an array."""
     if isinstance(target, ast.Tuple):
         still = all(isinstance(part, ast.Name) and part.id not in body.routine.changing for part in target.elts)
@@ -87,7 +85,7 @@ def bind(body: Body, target: ast.expr, value: Value) -> None:
             body.fill(into, value)
 
 
-def _if(body: Body, node: ast.If) -> bool:
+def _if(body: "Body", node: ast.If) -> bool:
     test = expression(body, node.test)
     if isinstance(test, Constant):
         return block(body, node.body if test.value else node.orelse)
@@ -102,7 +100,7 @@ def _if(body: Body, node: ast.If) -> bool:
     return left and bool(node.orelse)
 
 
-def _for(body: Body, node: ast.For) -> None:
+def _for(body: "Body", node: ast.For) -> None:
     if isinstance(node.iter, ast.Call) and ast.unparse(node.iter.func) == "range":
         bounds = [expression(body, bound) for bound in node.iter.args]
         low, high = (Constant(0), *bounds)[-2:]
@@ -125,7 +123,7 @@ def _for(body: Body, node: ast.For) -> None:
         body.line("}")
 
 
-def _counted(body: Body, node: ast.For, low: Value, high: Value) -> None:
+def _counted(body: "Body", node: ast.For, low: "Value", high: "Value") -> None:
     """A loop over numbers; of one number it is its body alone, of none nothing."""
     assert isinstance(node.target, ast.Name)
     known = isinstance(low, Constant) and isinstance(high, Constant)

@@ -4,8 +4,6 @@ Loops make an array from numbers of the program and from weights; the program re
 derivatives run forward, by the few numbers through which all inputs depend on those of the program, or backward.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from math import prod
@@ -31,7 +29,7 @@ class View:
     offset: int = 0  # of the first number
 
     @classmethod
-    def whole(cls, block: int | None, shape: Sequence[int], offset: int = 0) -> View:
+    def whole(cls, block: int | None, shape: Sequence[int], offset: int = 0) -> "View":
         """An array whose numbers lie one behind another."""
         strides = tuple(prod(shape[i + 1 :]) for i in range(len(shape)))
         return cls(block, tuple(shape), strides, offset)
@@ -49,7 +47,7 @@ class View:
             found = [place + k * stride for place in found for k in range(length)]
         return found
 
-    def reshaped(self, shape: Sequence[int]) -> View | None:
+    def reshaped(self, shape: Sequence[int]) -> "View | None":
         """The same numbers in another shape; None if that needs a copy."""
         known = [n for n in shape if n != -1]
         full = tuple(self.size // prod(known) if n == -1 else n for n in shape)
@@ -59,27 +57,27 @@ class View:
             return None
         return View.whole(self.block, full, self.offset)
 
-    def permuted(self, dims: Sequence[int]) -> View:
+    def permuted(self, dims: Sequence[int]) -> "View":
         """With its dimensions in another order."""
         return replace(self, shape=tuple(self.shape[d] for d in dims), strides=tuple(self.strides[d] for d in dims))
 
-    def swapped(self, a: int, b: int) -> View:
+    def swapped(self, a: int, b: int) -> "View":
         """With two dimensions exchanged."""
         dims = list(range(len(self.shape)))
         dims[a], dims[b] = dims[b], dims[a]
         return self.permuted(dims)
 
-    def unsqueezed(self, dim: int) -> View:
+    def unsqueezed(self, dim: int) -> "View":
         """With a further dimension of length one."""
         at, (shape, strides) = dim % (len(self.shape) + 1), (self.shape, self.strides)
         return replace(self, shape=(*shape[:at], 1, *shape[at:]), strides=(*strides[:at], 0, *strides[at:]))
 
-    def squeezed(self, dim: int) -> View:
+    def squeezed(self, dim: int) -> "View":
         """Without a dimension, if its length is one."""
         at = dim % len(self.shape)
         return self if self.shape[at] != 1 else self.permuted([d for d in range(len(self.shape)) if d != at])
 
-    def broadcast(self, shape: Sequence[int]) -> View:
+    def broadcast(self, shape: Sequence[int]) -> "View":
         """Repeated to a larger shape."""
         missing = len(shape) - len(self.shape)
         own = ((1,) * missing + self.shape, (0,) * missing + self.strides)

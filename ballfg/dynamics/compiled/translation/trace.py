@@ -15,20 +15,10 @@ from torch import Tensor
 from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 
+from ballfg.dynamics.compiled.translation import rules
 from ballfg.dynamics.compiled.translation.arrays import SMALL, Arrays, Each, Load, Product, Total, View
 from ballfg.dynamics.compiled.translation.program import Number, Operation, Program
 from ballfg.dynamics.compiled.translation.recipe import Recipe
-from ballfg.dynamics.compiled.translation.rules import (
-    COPIES,
-    EACH,
-    RESHAPES,
-    RULES,
-    SQUEEZES,
-    Numbers,
-    Rules,
-    UnknownOperationError,
-    aten,
-)
 from ballfg.dynamics.compiled.translation.weights import Known, Weights
 
 
@@ -40,7 +30,7 @@ def each_of(arrays: Arrays, target: Any, args: Sequence[Any], kwargs: Mapping[st
     inputs = [program.input() for _ in views]
     numbers = iter(inputs)
     given = [np.array(next(numbers), dtype=object) if isinstance(a, View) else a for a in args]
-    result = int(EACH[target](Rules(program), *given, **kwargs).item())
+    result = int(rules.EACH[target](rules.Rules(program), *given, **kwargs).item())
     operands = tuple(view.broadcast(shape) for view in views)
     return arrays.make(Each(program, tuple(inputs), result, operands), shape)
 
@@ -65,7 +55,7 @@ def _product(arrays: Arrays, left: View, right: View, plus: View | None = None) 
 
 def _linear(arrays: Arrays, plus: View, left: View, right: View, beta: float = 1, alpha: float = 1) -> View:
     if beta != 1 or alpha != 1:
-        raise UnknownOperationError("a matrix product with factors cannot be compiled")
+        raise rules.UnknownOperationError("a matrix product with factors cannot be compiled")
     return _product(arrays, left, right, plus)
 
 
@@ -81,22 +71,22 @@ def _total(arrays: Arrays, view: View, dims: Sequence[int] | None = None, keep: 
 
 def _mean(arrays: Arrays, view: View, dims: Sequence[int] | None = None, keep: bool = False, **_: Any) -> View:
     total = _total(arrays, view, dims, keep)
-    return each_of(arrays, aten.mul.Scalar, [total, total.size / view.size], {})
+    return each_of(arrays, rules.aten.mul.Scalar, [total, total.size / view.size], {})
 
 
 ARRAY_RULES: Final[dict[Any, Callable[..., View]]] = {
-    aten.mm.default: _product,
-    aten.addmm.default: _linear,
-    **dict.fromkeys((aten.sum.dim_IntList, aten.sum.default), _total),
-    **dict.fromkeys((aten.mean.dim, aten.mean.default), _mean),
-    **dict.fromkeys(RESHAPES, _reshaped),
-    aten.unsqueeze.default: lambda _, view, dim: view.unsqueezed(dim),
-    **dict.fromkeys(SQUEEZES, lambda _, view, dim: view.squeezed(dim)),
-    aten.expand.default: lambda _, view, shape, **__: view.broadcast(_full(view, shape)),
-    aten.permute.default: lambda _, view, dims: view.permuted(dims),
-    aten.transpose.int: lambda _, view, a, b: view.swapped(a, b),
-    aten.t.default: lambda _, view: view.permuted((1, 0)) if len(view.shape) == 2 else view,
-    **dict.fromkeys(COPIES, lambda _, view, **__: view),
+    rules.aten.mm.default: _product,
+    rules.aten.addmm.default: _linear,
+    **dict.fromkeys((rules.aten.sum.dim_IntList, rules.aten.sum.default), _total),
+    **dict.fromkeys((rules.aten.mean.dim, rules.aten.mean.default), _mean),
+    **dict.fromkeys(rules.RESHAPES, _reshaped),
+    rules.aten.unsqueeze.default: lambda _, view, dim: view.unsqueezed(dim),
+    **dict.fromkeys(rules.SQUEEZES, lambda _, view, dim: view.squeezed(dim)),
+    rules.aten.expand.default: lambda _, view, shape, **__: view.broadcast(_full(view, shape)),
+    rules.aten.permute.default: lambda _, view, dims: view.permuted(dims),
+    rules.aten.transpose.int: lambda _, view, a, b: view.swapped(a, b),
+    rules.aten.t.default: lambda _, view: view.permuted((1, 0)) if len(view.shape) == 2 else view,
+    **dict.fromkeys(rules.COPIES, lambda _, view, **__: view),
 }
 """Rules of further operations by operation."""
 
@@ -150,9 +140,9 @@ class _Tracing:
     weights: Weights = field(default_factory=Weights)
 
     def __post_init__(self) -> None:
-        self.arrays, self.rules = Arrays(self.program), Rules(self.program)
+        self.arrays, self.rules = Arrays(self.program), rules.Rules(self.program)
 
-    def run(self, vectors: Sequence[Numbers], tables: Sequence[Tensor]) -> Numbers:
+    def run(self, vectors: Sequence[rules.Numbers], tables: Sequence[Tensor]) -> rules.Numbers:
         """Operations in their order: the numbers of the result."""
         values: dict[Node, Any] = {}
         given = iter((*vectors, *tables))
@@ -166,7 +156,7 @@ class _Tracing:
                 return self._numbers(values[node.args[0]])
             else:
                 values[node] = self._applied(node, values)
-        raise UnknownOperationError("a function without result")
+        raise rules.UnknownOperationError("a function without result")
 
     def _applied(self, node: Node, values: Mapping[Node, Any]) -> Any:
         inputs = [values[n] for n in node.all_input_nodes]
@@ -181,9 +171,9 @@ class _Tracing:
             if made is not None:
                 return self._numbers(made) if made.block is not None and made.size <= SMALL else made
             args, kwargs = (_parts(a, self._numbers) for a in (args, kwargs))
-        rule = RULES.get(node.target)
+        rule = rules.RULES.get(node.target)
         if rule is None:
-            raise UnknownOperationError(f"torch's {node.target} cannot be compiled")
+            raise rules.UnknownOperationError(f"torch's {node.target} cannot be compiled")
         return rule(self.rules, *args, **kwargs)
 
     def _operand(self, value: Any) -> Any:
@@ -203,7 +193,7 @@ class _Tracing:
         if not isinstance(value, View):
             return value
         if value.size > MOST_READ:
-            raise UnknownOperationError(f"{value.size} numbers cannot be taken apart")
+            raise rules.UnknownOperationError(f"{value.size} numbers cannot be taken apart")
         if value.block is None:
             found = [self.program.place(Operation("weight", where=(place,))) for place in value.places]
         else:
@@ -212,8 +202,8 @@ class _Tracing:
 
     def _of_arrays(self, target: Any, args: Sequence[Any], kwargs: Mapping[str, Any]) -> View | None:
         """The result of an operation on arrays; None where arrays do not have it."""
-        given = [self._loaded(a) if target in EACH or target in LOADS else a for a in args]
-        if target in EACH:
+        given = [self._loaded(a) if target in rules.EACH or target in LOADS else a for a in args]
+        if target in rules.EACH:
             return each_of(self.arrays, target, given, kwargs)
         rule = ARRAY_RULES.get(target)
         return None if rule is None else rule(self.arrays, *given, **kwargs)

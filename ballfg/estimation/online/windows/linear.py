@@ -1,7 +1,5 @@
 """Linear factors keep the information of removed states and of a tracker's bias."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Self
 
@@ -19,8 +17,8 @@ if TYPE_CHECKING:
 
 
 def linear_factor(
-    keys: Sequence[int], blocks: Sequence[Array], right: Array, point: gtsam.Values | None = None
-) -> gtsam.NonlinearFactor:
+    keys: Sequence[int], blocks: Sequence[Array], right: Array, point: "gtsam.Values | None" = None
+) -> "gtsam.NonlinearFactor":
     """The factor r = sum A_k (x_k - p_k) - b of one or two states; being linear, it needs no callback from GTSAM.
 
     Args: blocks: (r, w) each, A_k whitened.  right: (r,) b, whitened.  point: p_k of all states; None: zero.
@@ -37,18 +35,18 @@ def linear_factor(
     return gtsam.LinearContainerFactor(factor, point)
 
 
-def bias_start(key: int, settings: Settings) -> gtsam.NonlinearFactor:
+def bias_start(key: int, settings: Settings) -> "gtsam.NonlinearFactor":
     """The prior of a state's bias, about zero."""
     return _of_biases(BiasStartFactors(np.array([key - STATE_KEY]), settings.bias_sigmas))
 
 
-def bias_link(key: int, dt: float, settings: Settings) -> gtsam.NonlinearFactor:
+def bias_link(key: int, dt: float, settings: Settings) -> "gtsam.NonlinearFactor":
     """The factor between the biases of two states, dt s apart: the bias decays and is renewed."""
     before = np.array([key - STATE_KEY - 1])
     return _of_biases(BiasFactors(before, np.array([dt]), settings.bias_sigmas, settings.memory_time))
 
 
-def _of_biases(batch: BiasStartFactors | BiasFactors) -> gtsam.NonlinearFactor:
+def _of_biases(batch: BiasStartFactors | BiasFactors) -> "gtsam.NonlinearFactor":
     """The single factor of a batch, on biases."""
     keys = [STATE_KEY + int(i) for i in batch.variables[0]]
     origin = np.zeros((1, STATE_DIM + BIAS_DIM))
@@ -73,7 +71,7 @@ class LinearFactors(FactorBatch):
         self.points, self.blocks, self.b = tuple(points), tuple(blocks), b
 
     @classmethod
-    def of_gtsam(cls, factor: gtsam.NonlinearFactor, values: Values, first: int) -> Self:
+    def of_gtsam(cls, factor: "gtsam.NonlinearFactor", values: Values, first: int) -> Self:
         """A linear factor of iSAM2 at the values of the window, whose first state has the number `first`."""
         import gtsam
 

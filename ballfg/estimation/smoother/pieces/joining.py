@@ -5,8 +5,6 @@ Gauss-Newton steps of the whole track follow: each piece passes its information 
 and gets their steps back. Memory holds some numbers a sample, and the matrices of the pieces in progress.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -17,17 +15,8 @@ from typing import TYPE_CHECKING, Final, TypeVar
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.estimation.smoother.pieces import section
 from ballfg.estimation.smoother.pieces.reduction import Chain, Ends, Point, Reduction, Response, moved_rows, solve_chain
-from ballfg.estimation.smoother.pieces.section import (
-    State,
-    bounds_of,
-    cut_between,
-    joined,
-    look,
-    part_of,
-    prior_rows,
-    section_of,
-)
 from ballfg.estimation.smoother.settle import ROUGH
 from ballfg.factors.batch import Values
 from ballfg.factors.graph import AT_KINK, RATE_MARGIN, Convergence, objective
@@ -97,17 +86,17 @@ class Joined:
         convergence, rounds: reason for the end of the search, and number of its linear solutions.
     """
 
-    segmentation: Segmentation
+    segmentation: "Segmentation"
     cuts: Sequence[int]
     rival: Array | None
-    states: Sequence[State]
+    states: Sequence[section.State]
     chain: Chain
     error: float
     convergence: Convergence
     rounds: int
 
 
-def told_by(smoother: Smoother, state: State) -> Told:
+def told_by(smoother: "Smoother", state: section.State) -> Told:
     """The information of a section at its present values."""
     own = state.section.own(smoother.problem(state.section.track, state.section.segmentation))
     rows = state.section.linearized(own, state.values)
@@ -115,27 +104,29 @@ def told_by(smoother: Smoother, state: State) -> Told:
     return Told(state.values, objective(rows), found.inner, found.ends, found.response(REACH))
 
 
-def joined_minimum(smoother: Smoother, track: Track, length: int | None = None) -> Joined | None:
+def joined_minimum(smoother: "Smoother", track: Track, length: int | None = None) -> Joined | None:
     """The minimum of a prepared track, by sections of about `length` samples; None if a piece has none."""
     rough = copy.copy(smoother)
     rough.optimizer = replace(smoother.optimizer, tolerance=max(ROUGH, smoother.optimizer.tolerance))
-    bounds = bounds_of(len(track), length or PIECE, OVERLAP)
-    parts = [(begin, part_of(track, begin, end)) for begin, end in bounds]
-    looks = [one for one in watched(partial(look, rough), parts, "looked at") if one is not None]
+    bounds = section.bounds_of(len(track), length or PIECE, OVERLAP)
+    parts = [(begin, section.part_of(track, begin, end)) for begin, end in bounds]
+    looks = [one for one in watched(partial(section.look, rough), parts, "looked at") if one is not None]
     if len(looks) < len(parts):
         return None
-    inner = [cut_between(*pair) for pair in pairwise(looks)]
-    events = joined(looks, [0, *inner, len(track)])
+    inner = [section.cut_between(*pair) for pair in pairwise(looks)]
+    events = section.joined(looks, [0, *inner, len(track)])
     cuts = [0, *inner, len(track) - 1]
     states = [
-        State(section_of(track, events, first, last, MARGIN), one.select(first, last + 1))
+        section.State(section.section_of(track, events, first, last, MARGIN), one.select(first, last + 1))
         for one, first, last in zip(looks, cuts[:-1], cuts[1:], strict=True)
     ]
     found = _search(smoother, states)
     return None if found is None else Joined(events, cuts, looks[0].rival, *found)
 
 
-def _search(smoother: Smoother, states: list[State]) -> tuple[Sequence[State], Chain, float, Convergence, int] | None:
+def _search(
+    smoother: "Smoother", states: list[section.State]
+) -> tuple[Sequence[section.State], Chain, float, Convergence, int] | None:
     """Gauss-Newton steps of the whole track until those of all sections are shorter than the optimizer's tolerance.
 
     Lengths are distances to the minimum in posterior standard deviations, as in
@@ -144,7 +135,7 @@ def _search(smoother: Smoother, states: list[State]) -> tuple[Sequence[State], C
     tolerance = smoother.optimizer.tolerance
     told = list(watched(partial(told_by, smoother), states, "joined, round 1"))
     problem = smoother.problem(states[0].section.track, states[0].section.segmentation)
-    priors, anchor = prior_rows(problem, states[0].section, told[0].values), told[0].values.coefficients
+    priors, anchor = section.prior_rows(problem, states[0].section, told[0].values), told[0].values.coefficients
     last, share = np.full(len(states), np.inf), np.ones(len(states))
     for number in range(1, ROUNDS + 1):
         points = [Point.of(one.values) for one in told]
@@ -161,14 +152,14 @@ def _search(smoother: Smoother, states: list[State]) -> tuple[Sequence[State], C
             break
         share = np.where(length > last, 0.5 * share, 1.0)
         moving = np.flatnonzero(~near).tolist()
-        tasks = [State(states[k].section, told[k].moved(steps[k].scaled(share[k]))) for k in moving]
+        tasks = [section.State(states[k].section, told[k].moved(steps[k].scaled(share[k]))) for k in moving]
         results = watched(partial(told_by, smoother), tasks, f"joined, round {number + 1}")
         for k, one in zip(moving, results, strict=True):
             told[k] = one
         last[moving] = length[moving]
     error = sum(one.promised(step) for one, step in zip(told, steps, strict=True))
     error += objective([moved_rows(rows, chain.coefficients - anchor) for rows in priors])
-    there = [State(state.section, one.values) for state, one in zip(states, told, strict=True)]
+    there = [section.State(state.section, one.values) for state, one in zip(states, told, strict=True)]
     at_kink = Convergence.AT_KINK if (near | (length < AT_KINK)).all() else Convergence.TOO_MANY_ITERATIONS
     return there, chain, error, Convergence.CONVERGED if near.all() else at_kink, number
 

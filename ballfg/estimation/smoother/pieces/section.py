@@ -1,7 +1,5 @@
 """A section of a long track has samples, margins on both sides, events, and factors of its own."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -175,7 +173,7 @@ def bounds_of(samples: int, length: int, overlap: int) -> list[tuple[int, int]]:
     return [(max(0, a - overlap), min(samples, b + overlap)) for a, b in pairwise(cuts)]
 
 
-def look(smoother: Smoother, part: tuple[int, Track]) -> Look | None:
+def look(smoother: "Smoother", part: tuple[int, Track]) -> Look | None:
     """The events and states of a part, given with its first sample's number; None without a finite explanation."""
     begin, track = part
     solution = smoother.settle(smoother.problem(track))

@@ -1,7 +1,5 @@
 """Assembles the estimate of a long track from the common minimum of its sections."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -56,19 +54,19 @@ class Smoothed:
     contacts: tuple[Contact, ...]
 
 
-def in_pieces(smoother: Smoother, track: Track, length: int | None = None) -> Estimate | None:
+def in_pieces(smoother: "Smoother", track: Track, length: int | None = None) -> Estimate | None:
     """The estimate of a long, prepared track; None if pieces cannot be joined: one has no finite explanation."""
     parts = sections(smoother, track, length)
     return None if parts is None else _assembled(track, parts)
 
 
-def sections(smoother: Smoother, track: Track, length: int | None = None) -> Iterator[Estimate] | None:
+def sections(smoother: "Smoother", track: Track, length: int | None = None) -> Iterator[Estimate] | None:
     """The estimate of a long track, section by section, with the whole's status; None as for `in_pieces`."""
     found = joined_minimum(smoother, track, length)
     return None if found is None else _sections(smoother, track, found)
 
 
-def smoothed(smoother: Smoother, task: tuple[State, Array, Point]) -> Smoothed:
+def smoothed(smoother: "Smoother", task: tuple[State, Array, Point]) -> Smoothed:
     """A section of the estimate, from the joint covariance of its ends and the coefficients, and their target."""
     state, joint, target = task
     section, values = state.section, state.values
@@ -100,7 +98,7 @@ def _contacts(problem: TrackProblem, section: Section, values: Values) -> tuple[
     return tuple(replace(contact, interval=contact.interval - section.first) for contact in found)
 
 
-def _sections(smoother: Smoother, track: Track, found: Joined) -> Iterator[Estimate]:
+def _sections(smoother: "Smoother", track: Track, found: Joined) -> Iterator[Estimate]:
     """The estimates of the sections, in order. The last state of each is the first of the next one."""
     hops = smoother.low_hops(track, found.segmentation)
     doubts = (*smoother.doubts(track), *uncounted_note(hops, track.times))
@@ -130,7 +128,7 @@ def _sections(smoother: Smoother, track: Track, found: Joined) -> Iterator[Estim
 
 
 def _section(
-    smoother: Smoother, track: Track, unknowns: Unknowns, found: Joined, part: Smoothed, others: Array, first: int
+    smoother: "Smoother", track: Track, unknowns: Unknowns, found: Joined, part: Smoothed, others: Array, first: int
 ) -> Estimate:
     """The estimate of the section from sample `first` on, without notes."""
     events, count = found.segmentation, len(others)

@@ -1,7 +1,5 @@
 """Estimates the last state of a track that ends near a contact, where no later sample shows the side."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -26,7 +24,7 @@ MEMORY: Final = 256
 """Number of samples that determine a state at their end."""
 
 
-def with_both_sides(smoother: Smoother, problem: TrackProblem, estimate: Estimate) -> Estimate:
+def with_both_sides(smoother: "Smoother", problem: TrackProblem, estimate: Estimate) -> Estimate:
     """The estimate; if the track ends near a contact, its last state is that of the more probable side.
 
     The samples before the contact are estimated by themselves; from there on both hypotheses are followed
@@ -63,7 +61,7 @@ def _before_contact(estimate: Estimate, model: HypothesisModel, track: Track) ->
     return None
 
 
-def _filtered(smoother: Smoother, track: Track) -> tuple[Array, Array] | None:
+def _filtered(smoother: "Smoother", track: Track) -> tuple[Array, Array] | None:
     """Mean and covariance of state, coefficients and bias at the end of a track; None if undetermined."""
     problem = smoother.problem(track)
     solution = smoother.settle(problem)

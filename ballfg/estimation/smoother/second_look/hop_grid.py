@@ -9,8 +9,6 @@ Source: L. R. Rabiner, "A tutorial on hidden Markov models", Proceedings of the 
 docs/derivations/smoother.md, "Low hops".
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -91,7 +89,7 @@ class HopMoments:
         found[:, 1, 1] = np.maximum(found[:, 1, 1], np.sqrt(np.maximum(about, 0.0) / 3.0))
         return np.asarray(found)
 
-    def select(self, inside: slice) -> HopMoments:
+    def select(self, inside: slice) -> "HopMoments":
         """The moments of some of the samples."""
         whole = (self.mean, self.second, self.higher, self.speed, self.resting)
         mean, second, higher, speed, resting = (part[inside] for part in whole)
@@ -181,7 +179,7 @@ class HopGrid:
             before = found[-1] @ self._step(int(steps[k]))[0]
         return found
 
-    def _step(self, ticks: int) -> tuple[csr_array, csr_array]:
+    def _step(self, ticks: int) -> "tuple[csr_array, csr_array]":
         """(k, k) probabilities of the cells over some ticks, and these times the number of bounces on the way."""
         if ticks not in self._steps:
             from scipy.sparse import csr_array  # few tracks hop low, and it takes a tenth of a second to import
