@@ -7,6 +7,7 @@ lines along which the picture has an edge of their direction ranks them.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 from typing import Final
 
@@ -170,13 +171,13 @@ def cameras_of(quads: Array, court: Court, size: tuple[int, int]) -> list[Pinhol
     flat = court.corners[:, :2].astype(np.float32)
     for quad in quads:
         scale = np.linalg.norm(quad - quad.mean(axis=0), axis=1).mean()
-        for first in range(4):  # clockwise as seen from above is clockwise in the picture
+        for first in range(2):  # clockwise as seen from above is clockwise in the picture
             seen = np.roll(quad[::-1], first, axis=0)
             plane = cv2.getPerspectiveTransform(flat, (seen - middle).astype(np.float32))
             one = _first(np.asarray(plane, dtype=np.float64), seen - middle, court, size)
             if one is not None and _missed(one := _fitted(one, court, seen), court, seen) < MISSED * scale:
                 found.append(one)
-    return [one for one in found if _in_front(one.place) and _possible(*_views(one, court), court).all()]
+    return [_in_front(one) for one in found if _possible(*_views(one, court), court).all()]
 
 
 def _views(camera: Pinhole, court: Court) -> tuple[Array, Array, Array]:
@@ -220,10 +221,13 @@ def _first(plane: Array, seen: Array, court: Court, size: tuple[int, int]) -> Pi
     return Pinhole(turn[best], place[best], float(focal[best]), size) if np.isfinite(missed[best]) else None
 
 
-def _in_front(place: Array) -> bool:
-    """True for a camera at the side of -y, or of -x if it looks along the court: half a turn changes no picture."""
-    x, y, _ = place
-    return bool(x < 0.0 if abs(x) > ALONG * abs(y) else y < 0.0)
+def _in_front(camera: Pinhole) -> Pinhole:
+    """The camera at the side of -y, or of -x if it looks along the court: half a turn changes no picture."""
+    x, y, _ = camera.place
+    if x < 0.0 if abs(x) > ALONG * abs(y) else y < 0.0:
+        return camera
+    half = np.array([-1.0, -1.0, 1.0])
+    return replace(camera, turn=camera.turn * half, place=camera.place * half)
 
 
 def _possible(turn: Array, place: Array, at: Array, court: Court) -> Mask:
