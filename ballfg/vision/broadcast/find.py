@@ -25,7 +25,8 @@ SHORTEST: Final = 0.02
 MOST_LINES: Final = 90
 """Longest ones that are combined."""
 SAME: Final = 2.0
-"""px between the ends of lines that are one: a picture's brightness and its strongest colour show most of them twice."""
+"""px between the ends of lines, or the corners of courts, that are one: a picture's brightness and its strongest colour
+show most lines twice."""
 PARALLEL, ASIDE, GAPS = 0.03, 2.0, (0.15, 0.6)
 """rad and px by which segments of one line differ; the gap between them, of the longer one. A wide gap bridges a player
 before an edge, but continues another edge with what lies in its direction on the floor: lines of both are combined."""
@@ -63,7 +64,9 @@ def find_court(image: Image, court: Court) -> list[tuple[Pinhole, float]]:
     cameras = cameras_of(quads, court, (image.shape[1], image.shape[0]))
     slopes = slopes_of(image)
     rated = [(camera, support(slopes, camera, court)) for camera in cameras]
-    return sorted(rated, key=lambda pair: -pair[1])
+    rated.sort(key=lambda pair: -pair[1])
+    corners = np.array([camera.project(court.corners) for camera, _ in rated]).reshape(len(rated), -1, 2)
+    return [pair for pair, first in zip(rated, _first_of_each(corners, SAME), strict=True) if first]
 
 
 def joined_segments(image: Image) -> Array:
@@ -81,15 +84,14 @@ def joined_segments(image: Image) -> Array:
     lines = np.unique(np.concatenate([_joined(segments, gap) for gap in GAPS]), axis=0)
     length = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)
     lines = lines[np.argsort(-length, kind="stable")][: np.count_nonzero(length > least)]
-    return lines[_first_of_each(lines)][:MOST_LINES]
+    from_left = np.take_along_axis(lines, np.argsort(lines[:, :, :1], axis=1, kind="stable"), axis=1)
+    return from_left[_first_of_each(from_left, SAME)][:MOST_LINES]
 
 
-def _first_of_each(lines: Array) -> Mask:
-    """(n,) False for lines (n, 2, 2) px whose ends are at about those of an earlier one."""
-    ends = lines.reshape(-1, 4)
-    other = lines[:, ::-1].reshape(-1, 4)
-    apart = np.minimum(*(np.abs(ends[:, None] - one).max(axis=2) for one in (ends, other)))
-    return ~np.tril(apart < SAME, -1).any(axis=1)
+def _first_of_each(points: Array, near: float) -> Mask:
+    """(n,) False for sets of points (n, k, 2) px that all lie near to those of an earlier set."""
+    apart = np.abs(points[:, None] - points).max(axis=(2, 3), initial=0.0)
+    return ~np.tril(apart < near, -1).any(axis=1)
 
 
 def _joined(segments: Array, gap: float) -> Array:
