@@ -65,7 +65,8 @@ def find_court(image: Image, court: Court) -> list[tuple[Pinhole, float]]:
     slopes = slopes_of(image)
     rated = [(camera, support(slopes, camera, court)) for camera in cameras]
     rated.sort(key=lambda pair: -pair[1])
-    corners = np.array([camera.project(court.corners) for camera, _ in rated]).reshape(len(rated), -1, 2)
+    corners = np.array([camera.project(court.corners) for camera, _ in rated])
+    corners = corners.reshape(len(rated), len(court.corners), 2)
     return [pair for pair, first in zip(rated, _first_of_each(corners, SAME), strict=True) if first]
 
 
@@ -189,7 +190,7 @@ def _views(camera: Pinhole, court: Court) -> tuple[Array, Array, Array]:
 
 
 def _missed(camera: Pinhole, court: Court, seen: Array) -> float:
-    """px by which a camera misses corners that are seen (4, 2) px; infinite if one is behind it."""
+    """The px by which a camera misses corners that are seen (4, 2) px; infinite if one is behind it."""
     return float(np.nan_to_num(np.linalg.norm(camera.project(court.corners) - seen, axis=1), nan=np.inf).max())
 
 

@@ -51,7 +51,8 @@ def test_a_camera_is_found_though_a_player_hides_a_corner():
     player = np.array([(-2.4, y, z) for y, z in ((-0.8, -0.7), (-0.35, -0.7), (-0.35, 0.55), (-0.8, 0.55))])
     image = picture(camera, np.random.default_rng(2), others=[(player, (40, 40, 190))])
     inside, corner = camera.project(player), camera.project(COURT.corners)[0]
-    assert (inside.min(axis=0) + 30.0 < corner).all() and (corner < inside.max(axis=0) - 30.0).all()
+    assert (inside.min(axis=0) + 30.0 < corner).all()
+    assert (corner < inside.max(axis=0) - 30.0).all()
     (best, _), *_ = likely(image, find_court(image, COURT), COURT)
     assert np.linalg.norm(best.place - camera.place) < 0.02 * np.linalg.norm(camera.place)
     assert best.focal == pytest.approx(camera.focal, rel=0.02)
