@@ -81,7 +81,7 @@ class Minimum:
 
 AT_KINK = 1e-3
 """Posterior standard deviations. A step this short that does not reduce the objective ends the search too: the minimum
-lies at a kink of a loss or of the friction."""
+lies at a kink of a loss or of the friction, or rounding hides it. At the iteration limit it is the minimum, too."""
 NEAR = 0.5
 """Predicted decrease of a step of one posterior standard deviation. Along shorter steps the objective is close enough
 to a parabola for choosing the best share of the step."""
@@ -161,9 +161,10 @@ class LevenbergMarquardt:
                 return point.minimum(solve(point.linearized, point.values), Convergence.STUCK, iteration)
             else:
                 damping, growth = max(self.first_damping, growth * damping), 2.0 * growth
-        return point.minimum(
-            solve(point.linearized, point.values), Convergence.TOO_MANY_ITERATIONS, self.max_iterations
-        )
+        step = solve(point.linearized, point.values)
+        near = step is not None and np.sqrt(2 * abs(step.decrease)) < AT_KINK  # steps of the objective's own rounding
+        ended = Convergence.AT_KINK if near else Convergence.TOO_MANY_ITERATIONS
+        return point.minimum(step, ended, self.max_iterations)
 
     def covariances(self, graph: BallGraph, minimum: Minimum) -> Covariances | None:
         """Covariances at a minimum of a graph; None if they are undetermined."""

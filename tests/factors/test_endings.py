@@ -51,6 +51,16 @@ def test_without_a_bend_it_converges() -> None:
     assert minimum.values.states[0, 0] == pytest.approx(-0.4 / 1.16, abs=1e-9)  # of x^2 + (1 + 0.4 x)^2
 
 
+@pytest.mark.parametrize(("off", "ending"), [(5e-4, Convergence.AT_KINK), (0.5, Convergence.TOO_MANY_ITERATIONS)])
+def test_at_the_iteration_limit_only_what_is_near_the_minimum_is_there(off: float, ending: Convergence) -> None:
+    graph = BallGraph((Bent(1.0, -0.4, 0.4),))
+    start = np.zeros((1, 9))
+    start[0, 0] = -0.4 / 1.16 + off  # a posterior standard deviation is 0.93
+    minimum = LevenbergMarquardt(max_iterations=0).minimize(graph, Values(start, np.zeros(0)))
+    assert minimum.convergence is ending
+    assert minimum.values.states[0, 0] == start[0, 0]
+
+
 class OnCircle(FactorBatch):
     """Residuals of a point at an angle on a circle from a point at a distance of its centre; the angle is x, scaled."""
 

@@ -30,6 +30,9 @@ MOST_BOUNCES: Final = 2
 SERVED, PAUSE = 20.0, 0.5
 """Logarithm of what a second bounce costs so many s or less after another stroke: a service begins a rally. From behind
 a player a hit at the far end may look like a bounce."""
+VOLLEY: Final = 5.0
+"""Logarithm of what it costs that a ball is hit which did not bounce before: rules forbid it, and of a bounce right
+before a hit nothing may be seen."""
 GAINED: Final = 0.1
 """Least gain of an exchange."""
 EXCHANGED: Final = 4
@@ -194,8 +197,8 @@ def best_sequence(grower: Grower, hits: Hits, strokes: Sequence[Stroke]) -> Chos
     # without a hit between them a ball in play was there unseen, or a new rally began at once
     unseen = np.minimum(-np.log(1.0 - grower.field.seen) * (first - last[:, None] - 1), SERVED)
     alone = np.where(later, begins - np.where(soon, unseen, 0.0), -np.inf)
-    met = np.where(later, hits.between(ordered, ordered), -np.inf)
     bounces = np.array([one.path.bounces for one in ordered])
+    met = np.where(later, hits.between(ordered, ordered) - VOLLEY * (bounces == 0)[:, None], -np.inf)
     served = SERVED * (soon & (bounces == MOST_BOUNCES) & (bounces > 0)[:, None])  # a toss before it is no stroke
     link = np.maximum(alone, met) - served
     best, before = score + begins, np.full(count, -1)

@@ -7,6 +7,7 @@ lines along which the picture has an edge of their direction ranks them.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 from typing import Final
 
@@ -16,12 +17,16 @@ import numpy as np
 from ballfg.arrays import Array, Mask
 from ballfg.vision.arrays import Image
 from ballfg.vision.broadcast.court import Court
+from ballfg.vision.broadcast.lines import moved, slopes
 from ballfg.vision.broadcast.pinhole import Pinhole, posed
 
 SHORTEST: Final = 0.02
 """Of the image's diagonal: a shorter segment is not used."""
 MOST_LINES: Final = 90
 """Longest ones that are combined."""
+SAME: Final = 2.0
+"""px between the ends of lines, or the corners of courts, that are one: a picture's brightness and its strongest colour
+show most lines twice."""
 PARALLEL, ASIDE, GAPS = 0.03, 2.0, (0.15, 0.6)
 """rad and px by which segments of one line differ; the gap between them, of the longer one. A wide gap bridges a player
 before an edge, but continues another edge with what lies in its direction on the floor: lines of both are combined."""
@@ -31,8 +36,8 @@ SMALLEST: Final = 0.004
 """Of the image's area."""
 FOCALS: Final = np.geomspace(0.5, 10.0, 22)
 """Focal lengths that are tried, of the image's width."""
-FINER: Final = (FOCALS[1] / FOCALS[0]) ** np.linspace(-1.0, 1.0, 13)
-"""Factors about the best of them that are tried next: one step misses the corners of a large court by too much."""
+ROUNDS: Final = 8
+"""Steps in which the camera of a quadrilateral is found from the best of them."""
 MISSED: Final = 0.03
 """Of the quadrilateral's size: the corners' error by which a pinhole camera may miss them."""
 UPRIGHT: Final = 0.35
@@ -59,7 +64,10 @@ def find_court(image: Image, court: Court) -> list[tuple[Pinhole, float]]:
     cameras = cameras_of(quads, court, (image.shape[1], image.shape[0]))
     slopes = slopes_of(image)
     rated = [(camera, support(slopes, camera, court)) for camera in cameras]
-    return sorted(rated, key=lambda pair: -pair[1])
+    rated.sort(key=lambda pair: -pair[1])
+    corners = np.array([camera.project(court.corners) for camera, _ in rated])
+    corners = corners.reshape(len(rated), len(court.corners), 2)
+    return [pair for pair, first in zip(rated, _first_of_each(corners, SAME), strict=True) if first]
 
 
 def joined_segments(image: Image) -> Array:
@@ -71,12 +79,20 @@ def joined_segments(image: Image) -> Array:
         return np.zeros((0, 2, 2))
     segments = np.concatenate(parts).astype(np.float64)
     length = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
-    segments = segments[length > 0.25 * SHORTEST * np.hypot(*image.shape[:2])]
+    least = SHORTEST * np.hypot(*image.shape[:2])
+    segments = segments[length > 0.25 * least]
     segments = segments[np.argsort(-np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1), kind="stable")]
     lines = np.unique(np.concatenate([_joined(segments, gap) for gap in GAPS]), axis=0)
     length = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)
-    order = np.argsort(-length, kind="stable")[:MOST_LINES]
-    return np.asarray(lines[order][length[order] > SHORTEST * np.hypot(*image.shape[:2])])
+    lines = lines[np.argsort(-length, kind="stable")][: np.count_nonzero(length > least)]
+    from_left = np.take_along_axis(lines, np.argsort(lines[:, :, :1], axis=1, kind="stable"), axis=1)
+    return from_left[_first_of_each(from_left, SAME)][:MOST_LINES]
+
+
+def _first_of_each(points: Array, near: float) -> Mask:
+    """(n,) False for sets of points (n, k, 2) px that all lie near to those of an earlier set."""
+    apart = np.abs(points[:, None] - points).max(axis=(2, 3), initial=0.0)
+    return ~np.tril(apart < near, -1).any(axis=1)
 
 
 def _joined(segments: Array, gap: float) -> Array:
@@ -128,18 +144,20 @@ def quadrilaterals(lines: Array, width: int, height: int) -> Array:
         place = (between[..., 0] * unit[None, :, 1] - between[..., 1] * unit[None, :, 0]) / cross  # px along line i
     tolerance = (OPEN[0] + OPEN[1] * length)[:, None]
     at_start, at_end = np.abs(place) < tolerance, np.abs(place - length[:, None]) < tolerance
-    meet = (np.abs(cross) > np.sin(0.1)) & (at_start | at_end)
-    meet &= meet.T
+    apart = np.abs(cross) > np.sin(0.1)
+    meet, past = apart & (at_start | at_end), apart & ((place < tolerance) | (place > length[:, None] - tolerance))
+    meet, past = meet & meet.T, past & past.T
     corner = start[:, None] + np.nan_to_num(place)[..., None] * unit[:, None]
+    second = place > 0.5 * length[:, None]
     found = list[Array]()
     for a, c in combinations(range(len(lines)), 2):
-        both = np.flatnonzero(meet[a] & meet[c])
-        ends = (place[a, both] > 0.5 * length[a]), (place[c, both] > 0.5 * length[c])
-        for i, j in combinations(range(len(both)), 2):
-            if ends[0][i] != ends[0][j] and ends[1][i] != ends[1][j]:
-                b, d = both[i], both[j]
-                found.append(np.array([corner[a, b], corner[b, c], corner[c, d], corner[d, a]]))
-    quads = np.array(found).reshape(-1, 4, 2)
+        whole, most = meet[a] & meet[c], (meet[a] & past[c]) | (past[a] & meet[c])
+        b, d = (one.ravel() for one in np.meshgrid(np.flatnonzero(whole), np.flatnonzero(most), indexing="ij"))
+        opposite = (second[a, b] != second[a, d]) & (second[c, b] != second[c, d]) & ((b < d) | ~whole[d])
+        opposite &= (second[b, a] != second[b, c]) & (second[d, a] != second[d, c])
+        b, d = b[opposite], d[opposite]
+        found.append(np.stack((corner[a, b], corner[b, c], corner[c, d], corner[d, a]), axis=1))
+    quads = np.concatenate((np.zeros((0, 4, 2)), *found))
     edges = np.roll(quads, -1, axis=1) - quads
     turns = edges[..., 0] * np.roll(edges[..., 1], -1, axis=1) - edges[..., 1] * np.roll(edges[..., 0], -1, axis=1)
     x, y = quads[..., 0], quads[..., 1]
@@ -156,36 +174,63 @@ def cameras_of(quads: Array, court: Court, size: tuple[int, int]) -> list[Pinhol
     flat = court.corners[:, :2].astype(np.float32)
     for quad in quads:
         scale = np.linalg.norm(quad - quad.mean(axis=0), axis=1).mean()
-        for first in range(4):  # clockwise as seen from above is clockwise in the picture
-            seen = np.roll(quad[::-1], first, axis=0) - middle
-            plane = np.asarray(cv2.getPerspectiveTransform(flat, seen.astype(np.float32)), dtype=np.float64)
-            one, missed = _best(plane, seen, court, FOCALS * size[0], size)
-            if np.isfinite(missed):
-                one, missed = _best(plane, seen, court, one.focal * FINER, size)
-            if missed < MISSED * scale:
+        for first in range(2):  # clockwise as seen from above is clockwise in the picture
+            seen = np.roll(quad[::-1], first, axis=0)
+            plane = cv2.getPerspectiveTransform(flat, (seen - middle).astype(np.float32))
+            one = _first(np.asarray(plane, dtype=np.float64), seen - middle, court, size)
+            if one is not None and _missed(one := _fitted(one, court, seen), court, seen) < MISSED * scale:
                 found.append(one)
-    return [one for one in found if _in_front(one.place)]
+    return [_in_front(one) for one in found if _possible(*_views(one, court), court).all()]
 
 
-def _best(plane: Array, seen: Array, court: Court, focal: Array, size: tuple[int, int]) -> tuple[Pinhole, float]:
-    """The camera of those focal lengths (m,) px that sees a court's corners nearest to where they are seen.
+def _views(camera: Pinhole, court: Court) -> tuple[Array, Array, Array]:
+    """Turn, place, and the court's corners in the camera's frame, (1, ...) each."""
+    at = (court.corners - camera.place) @ camera.turn.T
+    return camera.turn[None], camera.place[None], at[None]
+
+
+def _missed(camera: Pinhole, court: Court, seen: Array) -> float:
+    """The px by which a camera misses corners that are seen (4, 2) px; infinite if one is behind it."""
+    return float(np.nan_to_num(np.linalg.norm(camera.project(court.corners) - seen, axis=1), nan=np.inf).max())
+
+
+def _fitted(camera: Pinhole, court: Court, seen: Array) -> Pinhole:
+    """The camera after steps of Gauss and Newton to where the corners are seen (4, 2) px.
+
+    From low behind a court the rotation nearest to a homography misses them by a quarter of the court.
+    """
+    for _ in range(ROUNDS):
+        if not np.isfinite(camera.project(court.corners)).all():
+            break
+        pixels, slope = slopes(camera, court.corners)
+        rows, left = slope.reshape(-1, 7), (seen - pixels).ravel()
+        step = np.linalg.solve(rows.T @ rows + 1e-6 * np.eye(7), rows.T @ left)
+        camera = moved(camera, step * min(1.0, 0.2 / np.abs(step[[0, 1, 2, 6]]).max()))
+    return camera
+
+
+def _first(plane: Array, seen: Array, court: Court, size: tuple[int, int]) -> Pinhole | None:
+    """The camera of `FOCALS` that sees a court's corners nearest to where they are seen; None if none may.
 
     Args: plane: (3, 3), from the court to `seen` (4, 2) px from the image's middle.
-    Returns: it, and by how much it misses them, px; infinite where none is possible.
     """
+    focal = FOCALS * size[0]
     turn, place = posed(np.tile(plane, (len(focal), 1, 1)), focal)
     at = (court.corners - place[:, None]) @ turn.swapaxes(1, 2)
     with np.errstate(divide="ignore", invalid="ignore"):
         missed = np.linalg.norm(focal[:, None, None] * at[..., :2] / at[..., 2:] - seen, axis=2).max(axis=1)
     missed[~_possible(turn, place, at, court)] = np.inf
     best = int(np.argmin(missed))
-    return Pinhole(turn[best], place[best], float(focal[best]), size), float(missed[best])
+    return Pinhole(turn[best], place[best], float(focal[best]), size) if np.isfinite(missed[best]) else None
 
 
-def _in_front(place: Array) -> bool:
-    """True for a camera at the side of -y, or of -x if it looks along the court: half a turn changes no picture."""
-    x, y, _ = place
-    return bool(x < 0.0 if abs(x) > ALONG * abs(y) else y < 0.0)
+def _in_front(camera: Pinhole) -> Pinhole:
+    """The camera at the side of -y, or of -x if it looks along the court: half a turn changes no picture."""
+    x, y, _ = camera.place
+    if x < 0.0 if abs(x) > ALONG * abs(y) else y < 0.0:
+        return camera
+    half = np.array([-1.0, -1.0, 1.0])
+    return replace(camera, turn=camera.turn * half, place=camera.place * half)
 
 
 def _possible(turn: Array, place: Array, at: Array, court: Court) -> Mask:

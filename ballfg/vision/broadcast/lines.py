@@ -61,8 +61,18 @@ class Ridges:
     def fit(self) -> float:
         """Share of the places in the picture with a ridge at most `CLOSE` away, the mean of the lines."""
         seen = self.asked > 0
+        return float(self._close[seen].mean()) if seen.sum() >= 3 else 0.0
+
+    @property
+    def whole_fit(self) -> float:
+        """The same where lines of which no place may be seen do not fit: they may lie anywhere."""
+        return float(self._close.mean())
+
+    @property
+    def _close(self) -> Array:
+        """(l,) share of each line's places."""
         close = np.bincount(self.line[np.abs(self.offset) < CLOSE], minlength=len(self.asked))
-        return float((close[seen] / self.asked[seen]).mean()) if seen.sum() >= 3 else 0.0
+        return np.asarray(close / np.maximum(self.asked, 1))
 
 
 def brightness(image: Image) -> Array32:

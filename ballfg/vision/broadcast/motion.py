@@ -17,7 +17,7 @@ from ballfg.vision.broadcast.background import ALIKE, Match, linked
 from ballfg.vision.broadcast.court import Court
 from ballfg.vision.broadcast.find import cameras_of, find_court
 from ballfg.vision.broadcast.graph import Solved, solve
-from ballfg.vision.broadcast.lines import Ridges, brightness, corrected, moved, ridges, slopes
+from ballfg.vision.broadcast.lines import REACHES, Ridges, brightness, corrected, moved, ridges, slopes
 from ballfg.vision.broadcast.pinhole import Pinhole
 
 Frames = Callable[[], Iterator[tuple[float, Image]]]
@@ -152,7 +152,8 @@ def likely(image: Image, tried: Sequence[tuple[Pinhole, float]], court: Court) -
     for camera, _ in tried:
         better, fit = corrected(picture, camera, court)
         if fit > FITS and better.place[2] > 0.0:
-            fine.append((better, fit))
+            fine.append((better, ridges(picture, better, court, REACHES[-1]).whole_fit))
+    fine = [(camera, fit) for camera, fit in fine if fit > FITS]
     fine.sort(key=lambda pair: -pair[1])
     apart = list[tuple[Pinhole, float]]()
     for camera, fit in fine:

@@ -16,7 +16,7 @@ from scipy.stats import multivariate_normal
 from ballfg.benchmarks.cameras.rallies import Truth
 from ballfg.estimation.rally import hits as hits_of
 from ballfg.estimation.rally.arcs import Foretold
-from ballfg.estimation.rally.choose import BEGINS, MOST_BOUNCES, PAUSE, SERVED, best_sequence
+from ballfg.estimation.rally.choose import BEGINS, MOST_BOUNCES, PAUSE, SERVED, VOLLEY, best_sequence
 from ballfg.estimation.rally.growth import halves, rated
 from ballfg.estimation.rally.hits import Hits
 from ballfg.estimation.rally.strokes import LEAST, Grower, Stroke
@@ -176,7 +176,7 @@ def test_the_best_sequence_and_its_probabilities_are_those_of_all_sequences(seed
             pause = stamps[after.rows[0]] - stamps[before.rows[-1]]
             unseen = -np.log(1.0 - grower.field.seen) * (after.rows[0] - before.rows[-1] - 1)
             alone = begins(after) - min(unseen, SERVED) * (pause < PAUSE)
-            link = max(alone, table[before.number, after.number])
+            link = max(alone, table[before.number, after.number] - VOLLEY * (before.path.bounces == 0))
             served = after.path.bounces == MOST_BOUNCES and before.path.bounces > 0
             total += link - SERVED * (pause < PAUSE and served) + after.score
         return total
