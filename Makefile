@@ -24,10 +24,10 @@ bench: $(WARM)  ## the estimator comparison: table, results/results.json, pictur
 		$(BIN)/ballfg-bench estimators --data "$(DATA)/$$set" --out results/$$set || exit 1; \
 	else echo "no measured tracks at $(DATA)/$$set: skipped"; fi; done
 
-test: $(WARM)  ## the tests but for those marked `thorough`: five minutes on two cores
+test: $(WARM)  ## the tests but for those marked `thorough`: twenty minutes on two slow cores
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not thorough"
 
-test-all: $(WARM)  ## all tests, twelve minutes: also README, tutorials, cold compilation, fuzz, bombs, signals, full disks, videos, campaigns
+test-all: $(WARM)  ## all tests: also README, tutorials, cold compilation, fuzz, bombs, signals, full disks, videos, campaigns
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 check: $(READY)  ## format, lint, types (of the installed package: its folders lie apart in the source tree)

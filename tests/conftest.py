@@ -5,6 +5,8 @@ from __future__ import annotations
 import gc
 import os
 import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import pytest
 
@@ -38,16 +40,31 @@ def every_effect() -> AnalyticModel:
     return AnalyticModel([EFFECTS[name](**v) for name, v in values.items()])
 
 
-@pytest.fixture
-def networks_in_torch(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Networks move in torch, the definition of their machine code, which takes up to half a minute to make."""
+@contextmanager
+def _in_torch() -> Iterator[None]:
     machine_code = motion.functions_of
 
     def functions_of(model: BallModel) -> CompiledModel | None:
         alone = model.model if isinstance(model, AugmentedModel) else model
         return machine_code(model) if isinstance(alone, AnalyticModel) else None
 
-    monkeypatch.setattr(motion, "functions_of", functions_of)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(motion, "functions_of", functions_of)
+        yield
+
+
+@pytest.fixture
+def networks_in_torch() -> Iterator[None]:
+    """Networks move in torch, the definition of their machine code, which takes up to half a minute to make."""
+    with _in_torch():
+        yield
+
+
+@pytest.fixture(scope="module")
+def all_networks_in_torch() -> Iterator[None]:
+    """The same for a whole module, and for fixtures that it shares."""
+    with _in_torch():
+        yield
 
 
 def pytest_collection_finish() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 import yaml
 
 import ballfg as bf
@@ -61,8 +62,13 @@ def test_every_command_runs(tmp_path: Path) -> None:
         ("noise", data),
         ("show", data, states, ahead, "--out", tmp_path / "page.html"),
         ("live", "--replay", data, "--speed", 0, "--plane", "z=2.5,down", "--out", tmp_path / "live.jsonl"),
-        ("diagnose", data, "--out", tmp_path / "diagnosis"),
     ):
         assert status(*command) == 0, command
     events = (tmp_path / "events.csv").read_text().splitlines()[1:]
     assert all(float(row.split(",")[2]) == ("apex" in row) for row in events)  # the probability of each
+
+
+@pytest.mark.thorough
+def test_a_diagnosis_runs(tmp_path: Path) -> None:
+    assert status("import", _throws(tmp_path), "--out", tmp_path / "throws") == 0
+    assert status("diagnose", tmp_path / "throws", "--out", tmp_path / "diagnosis") == 0

@@ -70,7 +70,7 @@ def gone(processes: Sequence[int]) -> bool:
 
 
 @pytest.mark.parametrize(("seconds", "then"), [(60.0, ""), (0.0, ""), (0.0, FORKED)])
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.thorough)])
 def test_processes_end_with_the_one_that_started_them(seconds: float, then: str, number: signal.Signals) -> None:
     """While they work, while they wait, and while a copy of the other one lives on."""
     process, others = started(seconds, then)

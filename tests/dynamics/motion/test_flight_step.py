@@ -37,7 +37,11 @@ MODELS = {
 }
 
 
-@pytest.fixture(params=MODELS)
+SLOW = ("mlp", "residual, spin rate")
+"""Their machine code takes half a minute to make; that of another network stands for it."""
+
+
+@pytest.fixture(params=[pytest.param(name, marks=pytest.mark.thorough if name in SLOW else ()) for name in MODELS])
 def model(request) -> BallModel:
     return MODELS[request.param]()
 

@@ -101,6 +101,7 @@ def test_derivatives_in_the_fading_are_central_differences(model, what, doubt):
     torch.testing.assert_close(exact, torch.stack(columns, dim=-1), rtol=1e-5, atol=1e-7)
 
 
+@pytest.mark.usefixtures("networks_in_torch")
 def test_the_jacobian_of_a_flight_has_the_doubt_of_the_correction(model):
     augmented = AugmentedModel(model, ("fading.flight", "base.flight.drag.k"))
     start = augmented.append(row(HALF_WAY), augmented.means())

@@ -17,6 +17,8 @@ from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.tracks import read_dataset
 from tests.small_networks import SMALL
 
+pytestmark = pytest.mark.usefixtures("all_networks_in_torch")
+
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
