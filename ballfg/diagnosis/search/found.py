@@ -315,9 +315,10 @@ class Found:
         """
         whole = self.best
         while True:
-            best, score = self.best, self.scores[self.best.names]
-            smaller = {} if every else self._smaller(best)
-            gone = [h for h in best.named if every or smaller.get(best.names - {h.name}, -np.inf) > score]
+            best, gone = self.best, self.best.named
+            if not every:
+                score, smaller = self.scores[best.names], self._smaller(best)
+                gone = tuple(h for h in best.named if smaller.get(best.names - {h.name}, -np.inf) > score)
             least = self.most_probable(self.without([h]) for h in gone)
             if least is None or not self.is_better(least):
                 return self.best is not whole
