@@ -3,7 +3,7 @@
 A Kalman filter follows each of them from a sample before the bounce. A bounce somewhat before or after a stamp is a
 smooth continuation of the motion (docs/derivations/contact.md). So one Gaussian per hypothesis is enough for any time
 of the contact; it is truncated where the ball would be below the surface. Friction is not smooth: it has a kink between
-sliding and rolling. So a bounce is computed at nine spins.
+sliding and rolling. So a bounce is computed for nine narrower Gaussians of the spin.
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,8 +39,11 @@ SLOWEST: Final = 0.3
 describe it."""
 STEEPEST_FALL: Final = 2.0 * STANDARD_GRAVITY
 """m/s^2, a bound on the downward acceleration; topspin adds to the weight."""
-NODES: Final = np.array([-(3.0**0.5), 0.0, 3.0**0.5])
-"""Nodes of a Gauss-Hermite quadrature of order three, in standard deviations."""
+NODE_SHARE: Final = 2.0 / 3.0
+"""Share of the spin's variance that lies between the nodes; the rest is within each. Nodes without spread of their own
+leave gaps: where a sample shows the bounce better than the nodes resolve it, one of them would be taken as certain."""
+NODES: Final = NODE_SHARE**0.5 * np.array([-(3.0**0.5), 0.0, 3.0**0.5])
+"""Nodes of a Gauss-Hermite quadrature of order three for that share, in standard deviations."""
 NODE_WEIGHTS: Final = np.array([1.0, 4.0, 1.0]) / 6.0
 """Weights of these nodes."""
 HORIZONTAL_SPIN: Final = slice(SPIN.start, SPIN.start + 2)
@@ -162,13 +165,17 @@ class HypothesisModel:
 
 
 def _at_nodes(balls: GaussianMixture) -> GaussianMixture:
-    """One Gaussian as nine without spread in the horizontal spin."""
+    """One Gaussian as nine with the same moments, narrower in the horizontal spin.
+
+    The nodes lie along the principal axes of that spin, so that a turned room has turned nodes.
+    """
     (mean,), (covariance,) = balls.means, balls.covariances
     spin = covariance[HORIZONTAL_SPIN, HORIZONTAL_SPIN]
     slope = np.linalg.solve(spin, covariance[HORIZONTAL_SPIN]).T
+    variances, axes = np.linalg.eigh(spin)
     nodes = np.stack(np.meshgrid(NODES, NODES), axis=-1).reshape(-1, 2)
-    means = mean + nodes @ np.linalg.cholesky(spin).T @ slope.T
-    conditional = covariance - slope @ spin @ slope.T
+    means = mean + (nodes * np.sqrt(np.maximum(variances, 0.0))) @ axes.T @ slope.T
+    conditional = covariance - NODE_SHARE * slope @ spin @ slope.T
     log_weights = balls.log_weights + np.log(np.outer(NODE_WEIGHTS, NODE_WEIGHTS)).ravel()
     return GaussianMixture(log_weights, means, np.repeat(conditional[None], len(means), axis=0))
 
