@@ -1,18 +1,22 @@
 """Chooses between the nominal, the calibrated and richer models by tracks that they were not fitted to.
 
-All fitted tracks calibrate every candidate; then each fifth of them is judged by the population of the others. Every
-candidate is calibrated and judged with the noise that the tracks show. A richer model must beat the best simpler one
-in the mean log score by more than its standard error over the tracks, calibration by any amount that someone notices;
-docs/train.md.
+All fitted tracks calibrate every candidate; then each fifth of them is judged by the population of the others, by
+forecasts from three times: one alone decides by whether a bounce lies ahead of it. Every candidate is calibrated and
+judged with the noise that the tracks show. A richer model must beat the best simpler one in the mean log score by more
+than its standard error over the tracks, calibration by any amount that someone notices; docs/train.md.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Final
 
 import numpy as np
 
+from ballfg.arrays import Array
 from ballfg.checks import aligned
+from ballfg.dynamics import AnalyticModel
+from ballfg.estimation import Settings
 from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.estimation.noise.parameters import with_noise
 from ballfg.learning.calibration import calibrate
@@ -53,7 +57,7 @@ class Candidate(Plain):
 
     name: str
     tracks: int
-    rmse_median: float  # m
+    rmse_median: float  # m, over forecasts
     coverage_90: float  # Share of measured coordinates inside their 90 % intervals
     log_score: float  # Mean over tracks, per coordinate and metre
     gain: float  # Mean difference from the best simpler candidate; 0 for the first
@@ -103,7 +107,7 @@ def choose_candidate(problem: calibrate.Problem, watch: Watch = unwatched) -> tu
     for name, posed in ((NOMINAL, known), (PER_TRACK, problem)):
         noise = calibrate.fitted_noise(posed, problem.model, posed.settings, watch, errors=False)
         settings = posed.settings if noise is None else noise.settings
-        scores[name] = calibrate.score(_judging(posed, fitted), problem.model, watch, settings)
+        scores[name] = tuple(chain(*_judged(posed, fitted, problem.model, settings, watch)))
     shown = None if noise is None else noise.noise
     for name, posed in ((CALIBRATED, plain), (GROUPED, grouped), (CORRECTED, grouped)):
         try:
@@ -134,8 +138,8 @@ def _fitted(problem: calibrate.Problem, watch: Watch) -> tuple[Fitted, calibrate
 def _folds(
     fitted: Fitted, linear: calibrate.Linear, noise: NoiseEstimate | None, watch: Watch
 ) -> tuple[TrackScore | None, ...]:
-    """Scores of the fitted tracks, each by the population of the other folds, with the noise of all."""
-    problem, found = fitted.problem, dict[str, TrackScore | None]()
+    """Scores of the fitted tracks' forecasts, each by the population of the other folds, with the noise of all."""
+    problem, found = fitted.problem, dict[str, tuple[TrackScore | None, ...]]()
     names = problem.split.fit
     for k in range(min(FOLDS, len(names))):
         held = names[k::FOLDS]
@@ -145,15 +149,21 @@ def _folds(
             factor, own = noise.coefficient_factor, settings.coefficients
             spreads = {name: factor * own[name] for name in noise.noise.coefficients}
             settings = with_noise(settings, replace(noise.noise, coefficients=spreads))
-        judged = calibrate.score(_judging(problem, held), calibrate.population_model(problem, step), watch, settings)
+        judged = _judged(problem, held, calibrate.population_model(problem, step), settings, watch)
         found |= zip(held, judged, strict=True)
-    return tuple(found[name] for name in names)
+    return tuple(score for name in names for score in found[name])
 
 
-def _judging(problem: calibrate.Problem, names: Sequence[str]) -> calibrate.Problem:
-    near = min(NEAR, np.inf if problem.config.horizon is None else problem.config.horizon)
-    config = problem.config.model_copy(update={"horizon": near})
-    return replace(problem, config=config, split=replace(problem.split, judge=tuple(names)))
+def _judged(
+    problem: calibrate.Problem, names: Sequence[str], model: AnalyticModel, settings: Settings, watch: Watch
+) -> Iterator[tuple[TrackScore | None, ...]]:
+    """Scores of each track's forecasts: from the config's share of each track, and half-way before and after it."""
+    share, longest = problem.config.observed_share, problem.config.horizon
+    near = {"horizon": NEAR if longest is None else min(NEAR, longest)}
+    posed = replace(problem, split=replace(problem.split, judge=tuple(names)))
+    shares = (share / 2.0, share, (1.0 + share) / 2.0)
+    each = (replace(posed, config=problem.config.model_copy(update=near | {"observed_share": at})) for at in shares)
+    return zip(*(calibrate.score(one, model, watch, settings) for one in each), strict=True)
 
 
 def config_of(config: CalibrationConfig, chosen: str) -> CalibrationConfig:
@@ -164,23 +174,31 @@ def config_of(config: CalibrationConfig, chosen: str) -> CalibrationConfig:
 
 
 def compared(scores: dict[str, Sequence[TrackScore | None]]) -> Choice:
-    """The choice by the tracks that every candidate could be judged on.
+    """The choice by the forecasts that every candidate could be judged on; those of a track count as one.
 
-    Args: scores: of the same tracks in the same order, by name of the candidate, simple ones first; None: not judged.
-    Raises: ValueError: if no track was judged by every one.
+    Args: scores: of the same forecasts in the same order, by candidate, simple ones first; None: not judged.
+    Raises: ValueError: if no forecast was judged by every one.
     """
     rows = [row for row in zip(*scores.values(), strict=True) if all(row)]
-    kept = {name: [row[k] for row in rows if row[k] is not None] for k, name in enumerate(scores)}
-    logs = {name: np.array([one.log_score for one in kept[name] if one is not None]) for name in scores}
+    kept = {name: [one for row in rows if (one := row[k]) is not None] for k, name in enumerate(scores)}
+    logs = {name: _by_track(found) for name, found in kept.items()}
     chosen, candidates = next(iter(scores)), list[Candidate]()
     for name in scores:
-        found = summary([one for one in kept[name] if one is not None])
+        found = summary(kept[name])
         if found is None:
             raise ValueError("tracks must be judged by every candidate; none was. Look at them with ballfg show.")
-        own, gains, count = logs[name], logs[name] - logs[chosen], found.tracks
+        own, gains, count = logs[name], logs[name] - logs[chosen], len(logs[name])
         gain, error = float(gains.mean()), float(gains.std(ddof=1) / np.sqrt(count)) if count > 1 else 0.0
         numbers = {"rmse_median": found.rmse_median, "coverage_90": found.coverage_90, "log_score": float(own.mean())}
         candidates.append(Candidate(name=name, tracks=count, gain=gain, gain_error=error, **numbers))
         if gain > max(0.0 if name == CALIBRATED else SURELY * error, NOTICED):
             chosen = name
     return Choice(chosen=chosen, candidates=tuple(candidates))
+
+
+def _by_track(scores: Sequence[TrackScore]) -> Array:
+    """(n,) mean log score of each of n tracks."""
+    tracks = dict[str, list[float]]()
+    for one in scores:
+        tracks.setdefault(one.name, []).append(one.log_score)
+    return np.array([np.mean(logs) for logs in tracks.values()])

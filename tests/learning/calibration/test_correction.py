@@ -24,6 +24,7 @@ from ballfg.learning.calibration.auto import (
     CORRECTED,
     GROUPED,
     NOMINAL,
+    PER_TRACK,
     choose_candidate,
     compared,
     config_of,
@@ -283,6 +284,24 @@ def test_a_gain_that_nobody_notices_is_none() -> None:
     assert compared({name: rows[name] for name in CANDIDATES[:2]}).chosen == NOMINAL
     assert compared(rows).chosen == CORRECTED  # 0.008 over the calibrated one, which has as much over the nominal one
     assert compared({name: rows[name] for name in CANDIDATES[:4]}).chosen == CALIBRATED
+
+
+def test_forecasts_of_a_track_count_as_one_and_one_that_a_candidate_lacks_counts_for_none() -> None:
+    rng = np.random.default_rng(6)
+    base, gains = rng.normal(size=(20, 3)), rng.normal(0.1, 0.3, size=(20, 3))
+    before, after = (
+        [one.model_copy(update={"name": str(k // 3)}) for k, one in enumerate(scored(logs.ravel())) if one is not None]
+        for logs in (base, base + gains)
+    )
+    second = compared({NOMINAL: before, PER_TRACK: after}).candidates[1]
+    own = gains.mean(axis=1)
+    np.testing.assert_allclose((second.tracks, second.gain), (20, own.mean()))
+    np.testing.assert_allclose(second.gain_error, own.std(ddof=1) / 20**0.5)
+    without = [None if k == 4 else one for k, one in enumerate(before)]
+    lacking = [None if k in (9, 10, 11) else one for k, one in enumerate(after)]
+    second = compared({NOMINAL: without, PER_TRACK: lacking}).candidates[1]
+    own[1] = (gains[1, 0] + gains[1, 2]) / 2.0
+    np.testing.assert_allclose((second.tracks, second.gain), (19, np.delete(own, 3).mean()))
 
 
 def test_a_run_that_keeps_the_nominal_model_says_so_by_its_status(
