@@ -61,8 +61,9 @@ def agree(model) -> None:
     torch.testing.assert_close(jacobian, right.transpose(0, 1), rtol=1e-10, atol=1e-10)
 
 
-@pytest.mark.parametrize("name", MOTION)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.thorough] * (n in EFFECTS)) for n in MOTION])
 def test_every_effect(name) -> None:
+    """Those of the catalogue stand together in the next test, which the quick suite has too."""
     agree(model_with(MOTION[name]))
 
 
