@@ -92,7 +92,6 @@ def test_a_tracker_with_memory_and_jitter() -> None:
 
 @pytest.mark.usefixtures("networks_in_torch")
 @pytest.mark.parametrize(("kind", "step"), [("mnn+gs", 1e-4), pytest.param("mlp", 3e-5, marks=pytest.mark.thorough)])
-@pytest.mark.usefixtures("networks_in_torch")
 def test_weights_of_networks(kind, step) -> None:
     """Random directions in all weights of a network; small steps, since a residual lies 8e-5 from Huber's bend."""
     architecture = Architecture.of(kind, **SMALL, residual=True, spin_rate=True)
