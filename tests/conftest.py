@@ -13,6 +13,7 @@ import pytest
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.compiled import motion
+from ballfg.dynamics.compiled.beliefs import course
 from ballfg.dynamics.compiled.functions import CompiledModel
 from ballfg.machine import collect_rarely
 from ballfg.progress import VARIABLE
@@ -42,14 +43,18 @@ def every_effect() -> AnalyticModel:
 
 @contextmanager
 def _in_torch() -> Iterator[None]:
-    machine_code = motion.functions_of
+    machine_code, of_beliefs = motion.functions_of, course.compiled
 
     def functions_of(model: BallModel) -> CompiledModel | None:
         alone = model.model if isinstance(model, AugmentedModel) else model
         return machine_code(model) if isinstance(alone, AnalyticModel) else None
 
+    def compiled(model: BallModel) -> CompiledModel | None:
+        return of_beliefs(model) if isinstance(model, AnalyticModel) else None
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(motion, "functions_of", functions_of)
+        patch.setattr(course, "compiled", compiled)
         yield
 
 

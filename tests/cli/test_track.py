@@ -215,6 +215,15 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture
+def one_view(tmp_path: Path) -> Path:
+    """The same room and shots, filmed by one camera."""
+    config = SceneConfig(shots=2, interval=0.7, seed=1, rate=60.0, settings={"speed": [9]})
+    rig = [camera for camera in table_rig((640, 360)) if camera.name == "right"]
+    write_scene(tmp_path / "scene", record(config, rig))
+    return tmp_path / "scene"
+
+
 @pytest.fixture(scope="module")
 def tracked(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The dataset of its videos."""
@@ -286,11 +295,9 @@ def test_states_and_predictions_of_what_was_filmed_agree_with_the_truth(
         assert np.median(np.abs(off / coming[:, 4:])) < 1.5
 
 
-def test_one_camera_gives_states(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out, states = tmp_path / "shots", tmp_path / "states.csv"
-    rig = [camera for camera in read_cameras(scene / "cameras.yaml") if camera.name == "right"]
-    write_cameras(tmp_path / "one.yaml", rig)
-    words = [scene / "right.mp4", "--stamps", f"right={scene}/right_stamps.csv", "--cameras", tmp_path / "one.yaml"]
+def test_one_camera_gives_states(one_view: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene, out, states = one_view, tmp_path / "shots", tmp_path / "states.csv"
+    words = [scene / "right.mp4", "--stamps", f"right={scene}/right_stamps.csv", "--cameras", scene / "cameras.yaml"]
     assert status("track", *words, "--out", out, "--jobs", 1) == 0
     said = capsys.readouterr().out
     assert "wrote dataset.yaml, states.csv, detections.csv, cameras.yaml, overlay.mp4, contact_sheet.png" in said

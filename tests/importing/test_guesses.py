@@ -6,11 +6,13 @@ import os
 import pty
 import subprocess
 import sys
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+from _pytest.mark.structures import ParameterSet
 
 import ballfg as bf
 from ballfg.importing.bounces import Turn, evidence, reverses, surface, turns_of
@@ -156,9 +158,16 @@ def test_a_terminal_is_asked(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_dataset(tmp_path / "out")["000"].times, t, atol=1e-12)
 
 
+def measured() -> Iterator[ParameterSet]:
+    """Every dataset and every way to write it; the quick suite has each once."""
+    ways = [("y", 1e3, 1e3), ("-z", 100.0, 1.0), ("x", 1 / 0.3048, 1e6)]
+    for i, name in enumerate(("aimy", "ballgun", "robot_rallies", "spindoe")):
+        for k, way in enumerate(ways):
+            yield pytest.param(name, *way, marks=[pytest.mark.thorough] * (k != i % len(ways)))
+
+
 @pytest.mark.skipif(not DATA.is_dir(), reason=f"no measured tracks at {DATA}; set BALLFG_DATA")
-@pytest.mark.parametrize("name", ["aimy", "ballgun", "robot_rallies", "spindoe"])
-@pytest.mark.parametrize(("up", "size", "rate"), [("y", 1e3, 1e3), ("-z", 100.0, 1.0), ("x", 1 / 0.3048, 1e6)])
+@pytest.mark.parametrize(("name", "up", "size", "rate"), [*measured()])
 def test_measured_tracks(name: str, up: str, size: float, rate: float) -> None:
     data = read_dataset(DATA / name)
     turn = np.array(TURNS[up], dtype=float)

@@ -14,9 +14,9 @@ from tests.commands import status
 from tests.importing.throws import thrown, write_rows
 
 
-def _throws(folder: Path, count: int = 9) -> Path:
+def _throws(folder: Path, count: int = 9, step: float = 0.01) -> Path:
     """Throws that go up and come down, 0.9 s, with noise of 2 mm."""
-    t = np.arange(0.0, 0.9, 0.01)
+    t = np.arange(0.0, 0.9, step)
     rows = []
     for shot in range(count):
         p = np.stack((3.0 * t, 0.1 * shot * t, 2.0 + 5.0 * t - 4.905 * t**2), axis=1)
@@ -52,7 +52,7 @@ def test_turns_that_may_be_bounces_are_a_doubt() -> None:
 
 def test_every_command_runs(tmp_path: Path) -> None:
     data, states, ahead = tmp_path / "throws", tmp_path / "states.csv", tmp_path / "ahead.csv"
-    assert status("import", _throws(tmp_path), "--out", data) == 0
+    assert status("import", _throws(tmp_path, 5, 0.02), "--out", data) == 0
     assert yaml.safe_load((data / "dataset.yaml").read_text())["frame"] == {"up": "z", "table_height": "none"}
     assert read_dataset(data).info.table_height is None
     for command in (

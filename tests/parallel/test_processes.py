@@ -69,10 +69,12 @@ def gone(processes: Sequence[int]) -> bool:
     return not any(map(lives, processes))
 
 
-@pytest.mark.parametrize(("seconds", "then"), [(60.0, ""), (0.0, ""), (0.0, FORKED)])
+@pytest.mark.parametrize(
+    ("seconds", "then"), [(60.0, ""), pytest.param(0.0, "", marks=pytest.mark.thorough), (0.0, FORKED)]
+)
 @pytest.mark.parametrize("number", [signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.thorough)])
 def test_processes_end_with_the_one_that_started_them(seconds: float, then: str, number: signal.Signals) -> None:
-    """While they work, while they wait, and while a copy of the other one lives on."""
+    """While they work, while they wait, and while they wait and a copy of the other one lives on."""
     process, others = started(seconds, then)
     try:
         assert all(map(lives, others))

@@ -259,6 +259,7 @@ def test_a_nis_is_said_in_words(nis: float, error: float, said: str) -> None:
 
 
 @pytest.mark.usefixtures("blank_pictures")
+@pytest.mark.usefixtures("blank_pictures")
 def test_an_error_stands_beside_its_floor() -> None:
     error = found().after.prediction_rmse_mm
     far = HtmlPage(page(replace(found(), floor_mm=error / 2.0)))

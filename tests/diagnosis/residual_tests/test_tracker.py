@@ -20,10 +20,10 @@ MEMORY, TIME = 0.004, 0.012
 
 @pytest.fixture(scope="module")
 def diagnosis(tmp_path_factory):
-    """Twelve shots, seen by a tracker with a memory; few effects are looked for, to save time."""
+    """Ten shots, seen by a tracker with a memory; few effects are looked for, to save time."""
     folder = tmp_path_factory.mktemp("tracker") / "shots"
     noise = MeasurementNoise(position=0.002, memory=MEMORY, memory_time=TIME)
-    write_simulation(folder, SimulationConfig(tracks=12, rate=90.0, seed=12, noise=noise))
+    write_simulation(folder, SimulationConfig(tracks=10, rate=90.0, seed=12, noise=noise))
     dataset = read_dataset(folder)
     model = load_model(folder / "model.yaml", radius=dataset.ball.radius)
     return diagnose(dataset, model, catalogue=[EFFECTS["wind"]])

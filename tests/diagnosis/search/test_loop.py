@@ -200,6 +200,12 @@ def gusty(make_ball, make_launches, make_shots):
     return SearchLoop(holdout(*data), catalogue, predicts_well, judges_alike, unwatched)
 
 
+@pytest.fixture(scope="module")
+def gusty_first(gusty, make_ball):
+    """The fit that a search on them begins with."""
+    return first_fit(make_ball(), gusty.holdout)
+
+
 def test_what_is_named_beside_something_nameless_is_as_strong_in_the_model(gusty, make_ball):
     """Free, it would make up for the gust that the catalogue lacks."""
     search = gusty.run(make_ball())
@@ -219,9 +225,9 @@ def test_something_nameless_is_weighed_where_no_further_effect_is_left_to_try(gu
     assert abs(tilt.parameters["x"].value - 0.02) < 3 * tilt.parameters["x"].sigma
 
 
-def test_beside_something_nameless_effects_are_found_from_one_linearisation(gusty, make_ball):
+def test_beside_something_nameless_effects_are_found_from_one_linearisation(gusty, gusty_first):
     """Its evidence, strengths, what is left without each, and a fit without patterns."""
-    found = Found(gusty, first_fit(make_ball(), gusty.holdout))
+    found = Found(gusty, gusty_first)
     nothing = found.best
     while found.round():
         pass
@@ -263,9 +269,9 @@ def test_an_effect_keeps_the_form_about_which_its_strength_is_known(make_ball, m
     assert np.isfinite(alone.cost)
 
 
-def test_a_model_that_the_last_round_made_shares_its_probability_with_its_neighbours(gusty, make_ball):
+def test_a_model_that_the_last_round_made_shares_its_probability_with_its_neighbours(gusty, gusty_first):
     """A search that ends with as many effects as may be has not looked beyond them."""
-    found = Found(gusty, first_fit(make_ball(), gusty.holdout))
+    found = Found(gusty, gusty_first)
     assert found.round()
     last = found.best
     assert last.names == {"frame_tilt"}
@@ -276,9 +282,9 @@ def test_a_model_that_the_last_round_made_shares_its_probability_with_its_neighb
     assert neighbours <= set(found.odds.models)
 
 
-def test_the_best_minimum_of_the_same_effects_counts(gusty, make_ball):
+def test_the_best_minimum_of_the_same_effects_counts(gusty, gusty_first):
     """A set that was refitted, and the same set that is left of a larger one."""
-    found = Found(gusty, first_fit(make_ball(), gusty.holdout))
+    found = Found(gusty, gusty_first)
     (better,) = found.models.values()
     poorer = replace(better, evidence=better.evidence - 100.0)
     for models in ([poorer, better], [better, poorer]):
@@ -286,9 +292,9 @@ def test_the_best_minimum_of_the_same_effects_counts(gusty, make_ball):
     assert found.models == {frozenset(): better}
 
 
-def test_a_poorer_minimum_of_a_smaller_model_is_left_once_from_a_larger_one(gusty, make_ball):
+def test_a_poorer_minimum_of_a_smaller_model_is_left_once_from_a_larger_one(gusty, gusty_first):
     """A refit from there starts where the larger one's linearisation leads, and counts from then on."""
-    found = Found(gusty, first_fit(make_ball(), gusty.holdout))
+    found = Found(gusty, gusty_first)
     nothing = found.best
     assert found.round()
     larger = found.best
@@ -301,9 +307,9 @@ def test_a_poorer_minimum_of_a_smaller_model_is_left_once_from_a_larger_one(gust
     assert found._smaller(larger)[frozenset()] == found.scores[frozenset()]
 
 
-def test_what_promises_less_than_was_gained_waits(gusty, make_ball):
+def test_what_promises_less_than_was_gained_waits(gusty, gusty_first):
     """Whatever cannot be foretold comes first, and the order of the rest is that of their promises."""
-    found = Found(gusty, first_fit(make_ball(), gusty.holdout))
+    found = Found(gusty, gusty_first)
     best, told = found.best, []
     _, attempts, _ = try_hypotheses(best, found.motion, gusty.catalogue, unwatched, 3)
     refits = max(attempts, key=lambda attempt: attempt.gain).refits
@@ -336,9 +342,9 @@ def test_no_effect_stays_without_which_a_refit_is_better(make_ball, make_launche
 
 
 @pytest.mark.parametrize("from_linearisation", [True, False])
-def test_an_effect_that_differs_between_tracks_stays_without_its_value_for_all(gusty, make_ball, from_linearisation):
+def test_an_effect_that_differs_between_tracks_stays_without_its_value_for_all(gusty, gusty_first, from_linearisation):
     """Wind for all tracks and its change along the recording are two names: either may go without the other."""
-    found = Found(gusty, first_fit(make_ball(), gusty.holdout))
+    found = Found(gusty, gusty_first)
     late = {f"{i:03d}": 1.0 for i in range(5, 10)}
     drift = Varying.of(EFFECTS["wind"], ("x",), Grouping("track", {"005": late}, "000"))
     wind = Hypothesis(EFFECTS["wind"], {}, ("x",))

@@ -35,6 +35,7 @@ def made(tmp_path_factory) -> tuple[Path, list[str]]:
     return folder, in_process(folder)
 
 
+@pytest.mark.thorough  # quicker ones: kept code in test_kept.py, notes in test_functions.py
 def test_a_second_process_finds_what_the_first_has_made(made) -> None:
     folder, names = made
     stamps = {path: path.stat().st_mtime_ns for path in (folder / "ballfg").rglob("*") if path.is_file()}

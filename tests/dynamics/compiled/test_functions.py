@@ -15,6 +15,7 @@ from ballfg.dynamics.compiled.build import built
 from ballfg.dynamics.compiled.functions import compiled
 from ballfg.dynamics.compiled.kept import cache_folder
 from ballfg.dynamics.compiled.motion import fly_jacobian, fly_through_jacobian, functions_of
+from ballfg.dynamics.domain import Domain
 from ballfg.dynamics.effect import Coefficient, FlightEffect
 from ballfg.dynamics.effects.registry import GENERIC, LEARNED
 from ballfg.dynamics.model import substitute
@@ -60,8 +61,9 @@ def agree(model) -> None:
     torch.testing.assert_close(jacobian, right.transpose(0, 1), rtol=1e-10, atol=1e-10)
 
 
-@pytest.mark.parametrize("name", MOTION)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.thorough] * (n in EFFECTS)) for n in MOTION])
 def test_every_effect(name) -> None:
+    """Those of the catalogue stand together in the next test, which the quick suite has too."""
     agree(model_with(MOTION[name]))
 
 
@@ -115,6 +117,7 @@ def test_what_no_rule_covers_runs_in_torch_and_says_so() -> None:
 def test_copies_share_functions_and_take_their_own_coefficients() -> None:
     model = nominal_model().requires_grad_(False)
     other = copy.deepcopy(model)
+    other.domain = Domain({"speed": (2.0, 9.0)})  # as every fitted model has: it does not belong to the motion
     assert compiled(other) is compiled(model)
     with torch.no_grad():
         dict(other.named_parameters())["flight.drag.k"].fill_(0.4)

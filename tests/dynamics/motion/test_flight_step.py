@@ -12,6 +12,7 @@ from ballfg.dynamics.motion.flight_step import rk4_step
 from ballfg.dynamics.motion.step_twice import flight_step
 from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.dynamics.networks.learned import build
+from tests.small_networks import SMALL
 
 NAMES = ("flight.drag.k", "flight.magnus.k")
 
@@ -29,20 +30,24 @@ def shaken(model: BallModel) -> BallModel:
 MODELS = {
     "analytic": nominal_model,
     "augmented": lambda: AugmentedModel(nominal_model(), NAMES),
-    "mnn+gs": lambda: shaken(build(Architecture.of("mnn+gs"), radius=0.02)),
-    "mlp": lambda: shaken(build(Architecture.of("mlp"), radius=0.02)),
+    "mnn+gs": lambda: shaken(build(Architecture.of("mnn+gs", **SMALL), radius=0.02)),
+    "mlp": lambda: shaken(build(Architecture.of("mlp", **SMALL), radius=0.02)),
     "residual, spin rate": lambda: shaken(
-        build(Architecture.of("skip+gs", residual=True, spin_rate=True), radius=0.02, base=nominal_model())
+        build(Architecture.of("skip+gs", **SMALL, residual=True, spin_rate=True), radius=0.02, base=nominal_model())
     ),
 }
 
 
-SLOW = ("mlp", "residual, spin rate")
-"""Their machine code takes half a minute to make; that of another network stands for it."""
+IN_TORCH = "mnn+gs, in torch"
+QUICK = ("analytic", "augmented", IN_TORCH)
+"""The machine code of a network takes half a minute to make; that of the analytic model is stepped by the same code."""
 
 
-@pytest.fixture(params=[pytest.param(name, marks=pytest.mark.thorough if name in SLOW else ()) for name in MODELS])
-def model(request) -> BallModel:
+@pytest.fixture(params=[pytest.param(n, marks=[pytest.mark.thorough] * (n not in QUICK)) for n in (*MODELS, IN_TORCH)])
+def model(request: pytest.FixtureRequest) -> BallModel:
+    if request.param == IN_TORCH:
+        request.getfixturevalue("networks_in_torch")
+        return MODELS["mnn+gs"]()
     return MODELS[request.param]()
 
 

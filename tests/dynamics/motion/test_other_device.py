@@ -63,7 +63,10 @@ def constants() -> set[int]:
 QUICK = ("nominal", "mnn+gs")
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.thorough] * (n not in QUICK)) for n in models()])
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.thorough] * (n not in QUICK)) for n in ("nominal", *DEFAULT_SIZES)]
+)
+@pytest.mark.usefixtures("networks_in_torch")
 def test_all_tensors_of_a_rollout_are_made_or_brought_where_the_states_are(name: str) -> None:
     model = models()[name]
     with torch.no_grad():

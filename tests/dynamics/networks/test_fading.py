@@ -129,6 +129,7 @@ def test_turning_about_the_vertical_turns_rates_and_bounces(model):
     torch.testing.assert_close(model.inside(point @ whole.T), model.inside(point))
 
 
+@pytest.mark.usefixtures("networks_in_torch")
 def test_uncertainty_grows_with_the_distance_by_at_most_the_usual_correction(model):
     propagator = Propagator(Surfaces(-5.0), ProcessNoise(acceleration=0.01))
     sigmas = []

@@ -103,6 +103,7 @@ def test_same_answer_as_the_smoother(start, robust, coefficients):
     assert result.status is Status.OK
 
 
+@pytest.mark.usefixtures("networks_in_torch")
 def test_network_dynamics():
     model = NetworkModel()
     track, truth = make_track(FLYING, model=model, surfaces=NOWHERE, n=40)

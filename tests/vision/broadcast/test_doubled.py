@@ -54,8 +54,9 @@ def test_single_doubled_pictures_leave_the_stamps_of_the_others(tmp_path: Path) 
     assert [stamp for stamp, _ in kept.frames()] == pytest.approx([k / 25.0 for k in range(21) if k != 8])
 
 
-@pytest.mark.parametrize("images", [flight(12), [np.zeros((90, 160, 3), np.uint8)] * 12], ids=["flight", "black"])
-def test_nothing_is_left_out_where_nothing_is_doubled(images: list[Image], tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["flight", "black"])
+def test_nothing_is_left_out_where_nothing_is_doubled(name: str, tmp_path: Path) -> None:
+    images = flight(12) if name == "flight" else [np.zeros((90, 160, 3), np.uint8)] * 12
     video = open_video(written(tmp_path / "a.mp4", images, 25.0))
     kept = without_doubled(video.frames, video.count)
     assert (kept.doubled, len(kept.numbers)) == (0, 12)
