@@ -20,7 +20,7 @@ from tests.commands import status
 from tests.faults.odd_tracks import INFO, estimator_of, judged, realistic, sound, still, wild
 
 FAST = ("smoother", "sliding-window", "ekf", "online")
-COUNTS = {"smoother": 4, "sliding-window": 8, "ekf": 4, "online": 3}
+COUNTS = {"smoother": 6, "sliding-window": 16, "ekf": 6, "online": 5}
 """Tracks of each sort; the slower estimators see fewer of them here, and all of them in the whole run."""
 
 

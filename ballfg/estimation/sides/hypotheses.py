@@ -41,7 +41,8 @@ STEEPEST_FALL: Final = 2.0 * STANDARD_GRAVITY
 """m/s^2, a bound on the downward acceleration; topspin adds to the weight."""
 NODE_SHARE: Final = 2.0 / 3.0
 """Share of the spin's variance that lies between the nodes; the rest is within each. Nodes without spread of their own
-leave gaps: where a sample shows the bounce better than the nodes resolve it, one of them would be taken as certain."""
+leave gaps: where a sample shows the bounce better than the nodes resolve it, one of them would be taken as certain.
+0.4 to 0.8 do alike on 300 simulated bounces; 500 others judge (`tests.estimation.both_sides`, seed 7)."""
 NODES: Final = NODE_SHARE**0.5 * np.array([-(3.0**0.5), 0.0, 3.0**0.5])
 """Nodes of a Gauss-Hermite quadrature of order three for that share, in standard deviations."""
 NODE_WEIGHTS: Final = np.array([1.0, 4.0, 1.0]) / 6.0

@@ -102,7 +102,7 @@ def hall() -> list[Image]:
     ("images", "message"),
     [
         (black, "must show the whole court"),
-        pytest.param(turned, "must show the whole court", marks=pytest.mark.thorough),
+        (turned, "must show the whole court"),
         (hall, "must show the whole court"),
         (near, "must show the whole court"),
         (lambda: scenes(5), "10 pictures in a row"),
