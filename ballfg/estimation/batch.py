@@ -21,10 +21,12 @@ from ballfg.tracks import Track
 T = TypeVar("T")
 R = TypeVar("R")
 
-PROBED = 10  # Tracks done in this process first, to time one; the first of them warms up and does not count
+PROBED = 9  # Tracks that are done in this process first, to time one
 START_UP = 5.0
-"""s for starting worker processes (they import torch and gtsam): less work than that stays in this process."""
-HAND_OVER = 0.3  # s for handing work to running processes
+"""s for starting worker processes (they import torch and gtsam): less saved work than that stays in this process."""
+_missed = 0.0
+"""s that worker processes would have saved so far, had they been there. They are started once it, with what is left of
+a call, exceeds what starting takes: of many short calls none is worth it by itself, all together are."""
 
 
 def estimate_tracks(
@@ -72,22 +74,29 @@ def map_blocks(
     """
     stream, others = iter(tracks), executor(jobs)
     here = partial(with_jobs, jobs, partial(on_one_thread, function))
-    if isinstance(others, Processes):
-        spent = done = 0.0
-        for size in (1, PROBED - 1) if block is None else (block,):
-            start = time.perf_counter()
-            probed = list(islice(stream, size))
-            yield from here(probed) if probed else ()
-            spent, done = time.perf_counter() - start, done + len(probed)
-        left = spent / size * (count - done)
-        wait = HAND_OVER if others.started else START_UP
-        others = others if left * (1.0 - 1.0 / jobs) > wait else None
+    if isinstance(others, Processes) and not others.started:
+        for first in _chunks(islice(stream, 1), 1) if block is None else ():
+            yield from here(first)  # it warms up, and does not count
+        here, before = partial(_timed, here, 1.0 - 1.0 / jobs), _missed
+        probed = list(islice(stream, block or PROBED))
+        yield from here(probed) if probed else ()
+        coming = (_missed - before) * (count / max(len(probed), 1) - 1.0)
+        others = others if _missed + coming > START_UP else None
     if others is None:
         for chunk in _chunks(stream, block or 1):
             yield from here(chunk)
         return
     size = block or max(1, min(others.batch, -(-count // (4 * (others.slots + others.helped)))))
     yield from in_order(function, _chunks(stream, size), others)
+
+
+def _timed(here: Callable[[Sequence[Track]], Iterable[R]], share: float, chunk: Sequence[Track]) -> Iterable[R]:
+    """The results of a chunk in this process, whose time counts as missed by a share."""
+    global _missed
+    start = time.perf_counter()
+    found = list(here(chunk))
+    _missed += share * (time.perf_counter() - start)
+    return found
 
 
 def _chunks(stream: Iterator[T], size: int) -> Iterator[list[T]]:

@@ -6,8 +6,9 @@ judged with the noise that the tracks show. A richer model must beat the best si
 than its standard error over the tracks, calibration by any amount that someone notices; docs/train.md.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain
 from typing import Final
 
@@ -16,14 +17,18 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.checks import aligned
 from ballfg.dynamics import AnalyticModel
-from ballfg.estimation import Settings
+from ballfg.estimation import Estimator, Settings
+from ballfg.estimation.batch import map_tracks
 from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.estimation.noise.parameters import with_noise
+from ballfg.estimation.registry import make_estimator
 from ballfg.learning.calibration import calibrate
 from ballfg.learning.calibration.groups import OWN, Groups
 from ballfg.learning.config.calibration import CalibrationConfig
-from ballfg.learning.evaluation import Plain, TrackScore, summary
+from ballfg.learning.evaluation import Plain, TrackScore, judge_track, summary
+from ballfg.learning.split import tracks_of
 from ballfg.progress import Watch, unwatched
+from ballfg.tracks import Track
 
 NOMINAL: Final = "nominal"
 PER_TRACK: Final = "per-track coefficients"
@@ -107,7 +112,7 @@ def choose_candidate(problem: calibrate.Problem, watch: Watch = unwatched) -> tu
     for name, posed in ((NOMINAL, known), (PER_TRACK, problem)):
         noise = calibrate.fitted_noise(posed, problem.model, posed.settings, watch, errors=False)
         settings = posed.settings if noise is None else noise.settings
-        scores[name] = tuple(chain(*_judged(posed, fitted, problem.model, settings, watch)))
+        scores[name] = _judged(posed, [(problem.model, settings)], watch)
     shown = None if noise is None else noise.noise
     for name, posed in ((CALIBRATED, plain), (GROUPED, grouped), (CORRECTED, grouped)):
         try:
@@ -139,31 +144,40 @@ def _folds(
     fitted: Fitted, linear: calibrate.Linear, noise: NoiseEstimate | None, watch: Watch
 ) -> tuple[TrackScore | None, ...]:
     """Scores of the fitted tracks' forecasts, each by the population of the other folds, with the noise of all."""
-    problem, found = fitted.problem, dict[str, tuple[TrackScore | None, ...]]()
-    names = problem.split.fit
+    problem, names = fitted.problem, fitted.problem.split.fit
+    made: list[tuple[AnalyticModel, Settings]] = []
     for k in range(min(FOLDS, len(names))):
-        held = names[k::FOLDS]
-        step = calibrate.advanced(problem, fitted.steps[-2], linear.without(held))
+        step = calibrate.advanced(problem, fitted.steps[-2], linear.without(names[k::FOLDS]))
         settings = calibrate.population_settings(problem, step)
         if noise is not None:
             factor, own = noise.coefficient_factor, settings.coefficients
             spreads = {name: factor * own[name] for name in noise.noise.coefficients}
             settings = with_noise(settings, replace(noise.noise, coefficients=spreads))
-        judged = _judged(problem, held, calibrate.population_model(problem, step), settings, watch)
-        found |= zip(held, judged, strict=True)
-    return tuple(score for name in names for score in found[name])
+        made.append((calibrate.population_model(problem, step), settings))
+    return _judged(problem, made, watch)
 
 
 def _judged(
-    problem: calibrate.Problem, names: Sequence[str], model: AnalyticModel, settings: Settings, watch: Watch
-) -> Iterator[tuple[TrackScore | None, ...]]:
-    """Scores of each track's forecasts: from the config's share of each track, and half-way before and after it."""
-    share, longest = problem.config.observed_share, problem.config.horizon
-    near = {"horizon": NEAR if longest is None else min(NEAR, longest)}
-    posed = replace(problem, split=replace(problem.split, judge=tuple(names)))
-    shares = (share / 2.0, share, (1.0 + share) / 2.0)
-    each = (replace(posed, config=problem.config.model_copy(update=near | {"observed_share": at})) for at in shares)
-    return zip(*(calibrate.score(one, model, watch, settings) for one in each), strict=True)
+    problem: calibrate.Problem, made: Sequence[tuple[AnalyticModel, Settings]], watch: Watch
+) -> tuple[TrackScore | None, ...]:
+    """Scores of the fitted tracks' forecasts: from the config's share of each, and half-way before and after it.
+
+    Args: made: model and settings of each fold; one of all tracks is the fold of all.
+    """
+    share, longest, names = problem.config.observed_share, problem.config.horizon, problem.split.fit
+    shares, horizon = (share / 2.0, share, (1.0 + share) / 2.0), NEAR if longest is None else min(NEAR, longest)
+    smoothers = [make_estimator("smoother", model, problem.surfaces, settings) for model, settings in made]
+    of_track = {name: smoothers[k % len(smoothers)] for k, name in enumerate(names)}
+    tracks = tracks_of(problem.dataset, names)
+    scores = map_tracks(partial(_forecasts, of_track, shares, horizon), tracks, len(names), problem.jobs)
+    return tuple(chain(*watch(scores, len(names), "tracks judged")))
+
+
+def _forecasts(
+    smoothers: Mapping[str, Estimator], shares: Sequence[float], horizon: float, track: Track
+) -> list[TrackScore | None]:
+    """Scores of one track's forecasts from each share of it, by its own smoother."""
+    return [judge_track(smoothers[track.name], track, share, horizon) for share in shares]
 
 
 def config_of(config: CalibrationConfig, chosen: str) -> CalibrationConfig:
