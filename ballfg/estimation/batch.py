@@ -23,10 +23,9 @@ R = TypeVar("R")
 
 PROBED = 9  # Tracks that are done in this process first, to time one
 START_UP = 5.0
-"""s for starting worker processes (they import torch and gtsam): less saved work than that stays in this process."""
-_missed = 0.0
-"""s that worker processes would have saved so far, had they been there. They are started once it, with what is left of
-a call, exceeds what starting takes: of many short calls none is worth it by itself, all together are."""
+"""s until worker processes help (they import torch and gtsam): less work stays in this process. Many short calls count
+together: none of them is worth it by itself."""
+_spent = 0.0  # s of work so far that worker processes could have shared, had they been there
 
 
 def estimate_tracks(
@@ -77,11 +76,11 @@ def map_blocks(
     if isinstance(others, Processes) and not others.started:
         for first in _chunks(islice(stream, 1), 1) if block is None else ():
             yield from here(first)  # it warms up, and does not count
-        here, before = partial(_timed, here, 1.0 - 1.0 / jobs), _missed
+        here, before = partial(_timed, here), _spent
         probed = list(islice(stream, block or PROBED))
         yield from here(probed) if probed else ()
-        coming = (_missed - before) * (count / max(len(probed), 1) - 1.0)
-        others = others if _missed + coming > START_UP else None
+        coming = (_spent - before) * (count / max(len(probed), 1) - 1.0)
+        others = others if _spent + coming > START_UP else None
     if others is None:
         for chunk in _chunks(stream, block or 1):
             yield from here(chunk)
@@ -90,12 +89,12 @@ def map_blocks(
     yield from in_order(function, _chunks(stream, size), others)
 
 
-def _timed(here: Callable[[Sequence[Track]], Iterable[R]], share: float, chunk: Sequence[Track]) -> Iterable[R]:
-    """The results of a chunk in this process, whose time counts as missed by a share."""
-    global _missed
+def _timed(here: Callable[[Sequence[Track]], Iterable[R]], chunk: Sequence[Track]) -> Iterable[R]:
+    """The results of a chunk in this process, whose time counts as spent."""
+    global _spent
     start = time.perf_counter()
     found = list(here(chunk))
-    _missed += share * (time.perf_counter() - start)
+    _spent += time.perf_counter() - start
     return found
 
 

@@ -22,8 +22,8 @@ class Pending(Protocol):
     def result(self) -> Any:
         """The result of the chunk, once it is there; raises the function's exceptions."""
 
-    def cancel(self) -> object:
-        """Cancels the chunk, unless a worker has begun it."""
+    def cancel(self) -> bool | None:
+        """Cancels the chunk unless a worker has begun it; True if it did, None if that is not known."""
 
 
 class Executor(Protocol):

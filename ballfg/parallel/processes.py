@@ -61,8 +61,8 @@ class _Chunk:
     """A chunk that goes to a new process if the first one dies."""
 
     def __init__(self, line: "_Line", work: Work, chunk: Sequence[Any], told: Told | None) -> None:
-        self._first, self._told = repr(chunk[0]), told
-        self._call = pickle.dumps((os.getcwd(), work.name, work.content, packed(chunk), own_versions()))
+        self._first, self._told, self._work = repr(chunk[0]), told, work
+        self._call = _call(work, packed(chunk))
         self._future = Future[tuple[str, bytes]]()
         line.put(self)
 
@@ -83,7 +83,9 @@ class _Chunk:
         return self._future.cancel()
 
     def compute(self, crew: "_Crew") -> None:
-        """Computes it in a process."""
+        """Computes it in a process; until there is one that has loaded its function, the chunk can be cancelled."""
+        if not self._future.cancelled():
+            crew.get_ready(self._work)
         if self._future.set_running_or_notify_cancel():
             try:
                 self._future.set_result(self._answered(crew))
@@ -100,6 +102,11 @@ class _Chunk:
             crew.bury(process)
         problem = f"processes must live while they work; {MOST_DEATHS} died over a chunk that begins with {self._first}"
         raise ChildProcessError(f"{problem}. Memory is probably short: use fewer processes.")
+
+
+def _call(work: Work, chunk: bytes | None) -> bytes:
+    """A call of a process: to compute a packed chunk, or only to load its function."""
+    return pickle.dumps((os.getcwd(), work.name, work.content, chunk, own_versions()))
 
 
 _Line = SimpleQueue[_Chunk | None]
@@ -146,6 +153,19 @@ class _Crew:
             self._processes.add(process)
             return process
 
+    def get_ready(self, work: Work) -> None:
+        """Starts a process if none is free, and lets it load its libraries with a function; what fails shows later."""
+        with suppress(CancelledError):
+            process = self.taken()
+            try:
+                if process.fresh:
+                    process.answer(_call(work, None), None)
+                    process.fresh = False
+            except (EOFError, OSError):  # it has died
+                self.bury(process)
+            else:
+                self.put_back(process)
+
     def put_back(self, process: "_Process") -> None:
         with self._lock:
             if self._stopped:
@@ -178,6 +198,8 @@ class _Crew:
 
 
 class _Process:
+    fresh = True  # It has loaded no function yet
+
     def __init__(self) -> None:
         self._calls, theirs = Pipe()
         # Ctrl-C at the terminal is for this process alone; the other one ignores it as soon as it can

@@ -5,11 +5,10 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future
 from functools import partial
-from threading import Thread
 from typing import Final, TypeVar
 
 from ballfg.parallel.executor import Executor, Pending
-from ballfg.parallel.work import alone
+from ballfg.parallel.work import alone, each
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -25,36 +24,45 @@ def in_order(
     """The results of chunks, one after the other, in the order of the stream.
 
     However slowly results are consumed, no more than `AHEAD` chunks per worker and `HELPED` more are begun; and no
-    worker has more than `AHEAD` in its queue.
+    worker has more than `AHEAD` in its queue. This process does not wait, where it helps, while a chunk is left that no
+    worker has begun.
 
     Args: function: takes a chunk and returns its results.  chunks: a stream.  executor: computes them.
     Raises: the function's exceptions.
     """
     send = executor.sender(function)
-    pending: deque[Pending] = deque()
+    pending: deque[tuple[Pending, Sequence[T]]] = deque()
     try:
         while True:
             # finished chunks behind an earlier one must not keep new ones from the workers
-            most, away = AHEAD * executor.slots, sum(not one.done() for one in pending)
+            most, away = AHEAD * executor.slots, sum(not one.done() for one, _ in pending)
             while away < most and len(pending) < most + HELPED and (chunk := next(chunks, None)) is not None:
-                pending.append(send(chunk))
+                pending.append((send(chunk), chunk))
                 away += 1
             if not pending:
                 return
-            if executor.helped and len(pending) < most + HELPED and not pending[0].done():
-                chunk = next(chunks, None)
-                if chunk is not None:
-                    here = Future[Iterable[R]]()
-                    here.set_result(alone(function, chunk))
-                    pending.append(here)
+            if executor.helped and not pending[0][0].done():
+                if len(pending) < most + HELPED and (chunk := next(chunks, None)) is not None:
+                    pending.append((_here(function, chunk), chunk))
                     continue
-            yield from pending.popleft().result()
+                place = next((k for k, (one, _) in enumerate(pending) if one.cancel()), None)
+                if place is not None:
+                    pending[place] = (_here(function, pending[place][1]), ())
+                    continue
+            yield from pending.popleft()[0].result()
     except KeyboardInterrupt:
         executor.stop()
         raise
     finally:
-        for one in pending:
+        for one, _ in pending:
             one.cancel()
+
+
+def _here(function: Callable[[Sequence[T]], Iterable[R]], chunk: Sequence[T]) -> Pending:
+    """The result of a chunk, computed in this process."""
+    done = Future[Iterable[R]]()
+    done.set_result(alone(function, chunk))
+    return done
 
 
 def finished(function: Callable[[T], R], items: Sequence[T], executor: Executor) -> Iterator[tuple[int, R]]:
@@ -74,41 +82,9 @@ def finished(function: Callable[[T], R], items: Sequence[T], executor: Executor)
             one.cancel()
 
 
-def shared(function: Callable[[T], R], items: Sequence[T], executor: Executor) -> list[R]:
+def shared(function: Callable[[T], R], items: Iterable[T], executor: Executor) -> list[R]:
     """The results of items in order; this process computes some of them too. Raises: the function's exceptions."""
-    send = executor.sender(partial(_of_one, function))
-    waiting, found, errors = deque(enumerate(items)), dict[int, R](), list[Exception]()
-
-    def feed() -> None:
-        try:
-            while taken := _taken(waiting):
-                found[taken[0]] = send([taken[1]]).result()
-        except Exception as error:
-            errors.append(error)
-            waiting.clear()
-
-    feeders = [Thread(target=feed) for _ in range(min(executor.slots, len(items) - 1))]
-    for feeder in feeders:
-        feeder.start()
-    try:
-        while taken := _taken(waiting):
-            found[taken[0]] = alone(function, taken[1])
-        for feeder in feeders:
-            feeder.join()
-    except BaseException:
-        waiting.clear()
-        executor.stop()
-        raise
-    if errors:
-        raise errors[0]
-    return [found[number] for number in range(len(items))]
-
-
-def _taken(waiting: deque[T]) -> T | None:
-    try:
-        return waiting.popleft()
-    except IndexError:
-        return None
+    return list(in_order(partial(each, function), ([item] for item in items), executor))
 
 
 def _of_one(function: Callable[[T], R], chunk: Sequence[T]) -> R:

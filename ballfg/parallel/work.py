@@ -41,12 +41,12 @@ def packed(thing: object) -> bytes:
     return bytes(dumps(thing))
 
 
-def compute(name: str, content: bytes, chunk: bytes, versions: dict[str, str]) -> bytes:
+def compute(name: str, content: bytes, chunk: bytes | None, versions: dict[str, str]) -> bytes:
     """Computes a chunk in a worker: the pickled result of the function.
 
     A process computes one chunk at a time, on one thread; nested work stays in this process.
 
-    Args: name, content: of the `Work`.  chunk: pickled.  versions: of the calling process.
+    Args: name, content: of the `Work`.  chunk: pickled; None only loads the function.  versions: of the caller.
     Raises: ValueError: the versions differ from those of this process; and the function's exceptions.
     """
     if different := differences(versions):
@@ -56,7 +56,7 @@ def compute(name: str, content: bytes, chunk: bytes, versions: dict[str, str]) -
         _functions[name] = function  # the last one used stands last
         while len(_functions) > KEPT:
             _functions.popitem(last=False)
-        return packed(alone(function, pickle.loads(chunk)))
+        return packed(None if chunk is None else alone(function, pickle.loads(chunk)))
 
 
 def too_many_deaths(cluster: str, first: str) -> ChildProcessError:

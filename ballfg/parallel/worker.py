@@ -46,7 +46,7 @@ def _send(thing: tuple[str, Any]) -> None:
     _asker.send_bytes(pickle.dumps(thing))
 
 
-def _answer(folder: str, name: str, content: bytes, chunk: bytes, versions: dict[str, str]) -> tuple[str, bytes]:
+def _answer(folder: str, name: str, content: bytes, chunk: bytes | None, versions: dict[str, str]) -> tuple[str, bytes]:
     try:
         os.chdir(folder)  # the calling process may have changed its folder since it started this one
         return "value", compute(name, content, chunk, versions)

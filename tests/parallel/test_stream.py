@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -80,6 +81,29 @@ def test_the_stream_is_read_no_further_than_the_window_while_nothing_is_taken() 
     assert len(taken) < 15
 
 
+class LoadedLate:
+    """Squares, in another process only once a file is there."""
+
+    def __init__(self, own: int, file: Path) -> None:
+        self.own, self.file = own, file
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__ = state
+        until = time.monotonic() + 60.0
+        while os.getpid() != self.own and not self.file.exists() and time.monotonic() < until:
+            time.sleep(0.01)
+
+    def __call__(self, chunk: Sequence[int]) -> list[tuple[int, int]]:
+        return squares(chunk)
+
+
+def test_this_process_does_not_wait_for_one_that_still_loads_its_libraries(tmp_path: Path) -> None:
+    Processes(2).stop()
+    found = list(in_order(LoadedLate(os.getpid(), tmp_path / "loaded"), fours(), Processes(2)))
+    (tmp_path / "loaded").touch()
+    assert found == [(number**2, os.getpid()) for number in NUMBERS]
+
+
 def test_a_stream_that_breaks_off_raises_its_error_and_ends() -> None:
     def broken() -> Iterator[list[int]]:
         yield from list(fours())[:5]
@@ -119,6 +143,7 @@ def test_long_tasks_hand_their_numbers_over_as_they_finish() -> None:
 
 
 def test_an_error_in_another_process_ends_shared_tasks() -> None:
+    Processes(1, helped=False).sender(squares)([0]).result()  # one is there
     with pytest.raises(ValueError, match="seven"):
         shared(partial(_refused_one, os.getpid()), range(8), Processes(2))
 
